@@ -53,7 +53,7 @@ def coverage_parents(
     covered = (share > theta) & (share < theta).T
     if level is not None:
         covered &= level[None, :] < level[:, None]
-    # covered[a, b] implies area[a] < area[b]: chains of parents cannot form a cycle.
+    # covered[a, b] implies area[a] < area[b], so chains of parents cannot form a cycle.
     area_of_cover = np.where(covered, area_px[None, :], np.inf)
     parents = np.where(covered.any(axis=1), area_of_cover.argmin(axis=1), NONE)
     return parents.astype(np.int32)
@@ -81,8 +81,8 @@ def coverage_tree(
 def with_tree_levels(masks: HierarchicalMasks, theta: float) -> HierarchicalMasks:
     """Return the masks with levels set to their depths in the view's tree, in `content_order`.
 
-    Roots become wholes, their children parts, and all other descendants subparts (a comment in the source of
-    the paper, Sec. III-B), regardless of the head that predicted them.
+    Roots become wholes, their children parts, and all other descendants subparts, regardless of the head
+    that predicted them. This rule is from a comment in the source of the paper (Sec. III-B).
     """
     depth = depths(coverage_parents(masks.overlaps_px(), None, theta))
     found = replace(masks, level=np.minimum(depth, len(LEVELS)).astype(np.uint8))
@@ -90,7 +90,7 @@ def with_tree_levels(masks: HierarchicalMasks, theta: float) -> HierarchicalMask
 
 
 def run_coverage_tree(masks_folder: Path, out: Path, settings: CoverageTreeSettings) -> None:
-    """Write `<view>.npz` of every view with `parent` i32 (M) and `depth` u8 (M), and `index.json`.
+    """For every view, write `<view>.npz` with `parent` i32 (M) and `depth` u8 (M); also write `index.json`.
 
     Rows are in the order of the masks. A MisalignedArtifactError is raised if a view's masks differ from
     those recorded in their index.

@@ -102,7 +102,7 @@ def by_head(y, y0, a, a0, x, x0, heads, rows, inner, columns):
 @compiled
 @no_type_check
 def multiply_below(y, y_step, a, a0, x, rows, columns):
-    """Add the product of a square matrix's lower triangle and `x` to `y`."""
+    """Add to `y` the product of a square matrix's lower triangle and `x`."""
     for r in range(0, rows, MOST_ROWS):
         many = min(MOST_ROWS, rows - r)
         multiply(y, r * y_step, y_step, a, a0 + r * rows, rows, x, 0, y_step, many, r + many, columns, False)
@@ -122,7 +122,7 @@ def scale_and_shift(y, x, x0, scale, shift, shift0, rows, pixels):
 @compiled
 @no_type_check
 def token_shares(s, offset, offset0, scale, heads, tokens, pixels, e, e0):
-    """Compute the softmax over the tokens of each head at each pixel, without each head's last token.
+    """Compute each head's softmax over the tokens at each pixel; the last token's share is omitted.
 
     `offset[h, t] * scale[p]` is added to the base-2 scores `s` (H, T, P), which are overwritten; the result
     is `e` (H, T - 1, P).
@@ -199,11 +199,11 @@ def pixel_weights(s, scaled, offset, offset0, u, v, top, top0, sums, sums0, widt
 @compiled
 @no_type_check
 def weighted_sums(sums, sums0, width, w, scaled, values, values0, e_t, factors, heads, tokens, pixels, depth):
-    """Add a block to the weighted sums over pixels of values (H, P, depth) and of factors `e_t` (P, factors).
+    """Add a block to the sums over pixels of weighted values (H, P, depth) and factors `e_t` (P, factors).
 
     Args:
         sums: (H * T, width): values, factors, and the columns of `pixel_weights`.
-        w, scaled: weights (H * T, P) of the factors and of the values, respectively.
+        w, scaled: weights (H * T, P); `w` multiplies the factors, and `scaled` the values.
     """
     for h in range(heads):
         multiply(
@@ -269,7 +269,7 @@ def first_factors(sizes, b, i, rows, queries, s, e, none, ones):
 @compiled
 @no_type_check
 def second_factors(sizes, b, i, rows, low, offset, scaled_q, fixed_q, s1, q, s, e):
-    """Write the shares at the second layer to the rows of `e` after those of the first layer."""
+    """Write the second layer's shares to `e`, in the rows that follow those of the first layer."""
     _, _, heads, tokens, dim, pixels, _ = sizes
     all_rows, factors = heads * tokens, heads * (tokens - 1)
     base = b * heads * dim * pixels
@@ -282,7 +282,7 @@ def second_factors(sizes, b, i, rows, low, offset, scaled_q, fixed_q, s1, q, s, 
 @compiled
 @no_type_check
 def read_by_factors(sizes, b, i, image, prompt, u, v, factors, padded, e, e_t, k, s, scaled, top, sums):
-    """Add a block to token-to-pixel attention, where keys and values are sums of factored terms.
+    """Add a block to a token-to-pixel attention whose keys and values are sums of factored terms.
 
     Args:
         sizes, b, i: as in `read_image`; indices of block and prompt.
@@ -479,11 +479,11 @@ def mask_logits(sizes, fine, eps, weights, image, prompt, s1_in, s2_in, e_in, pa
     """Compute mask logits from the factors of both layers.
 
     Args:
-        fine: compute all 4 x 4 logits of each pixel of the image side; otherwise only the first logit.
+        fine: compute all 4 x 4 logits of each pixel of the embedding; otherwise only the first logit.
         eps: epsilon of the layer norm between the two upscalings.
         weights, image, prompt: `Upscaling`, `MaskImage`, `MaskPrompts`.
         e_in, padded: factors times their scales (prompts, blocks, padded, P).
-        grid_width: width of the image side, pixels.
+        grid_width: width of the image embedding, pixels.
         out: (prompts, masks, rows, columns), flat.
     """
     number, blocks, heads, tokens, _, pixels, _ = sizes

@@ -1,4 +1,4 @@
-"""Digests of each view's masks, recorded by artifacts computed from masks and checked by their readers.
+"""Digests of each view's masks, recorded in artifacts computed from the masks and checked on reading.
 
 CLIP vectors, contributions, coverage trees, nodes and codes refer to masks by row number, so they may be
 combined only if they were computed from the same masks in the same order.
@@ -39,14 +39,14 @@ def index_entry(masks: HierarchicalMasks) -> dict[str, int | str]:
 def digests_in(folder: Path) -> dict[str, str]:
     """Return the digest of each view's masks, as recorded in the masks or an artifact computed from them.
 
-    An ArtifactError is raised if the artifact is missing, incomplete or from another version of hilsplat.
+    An ArtifactError is raised if the artifact is missing, incomplete or from a different version of hilsplat.
     """
     digests: dict[str, str] = {}
     for view, entry in read_index(folder, "views")["views"].items():
         digest = entry.get(MASKS_SHA256) if isinstance(entry, dict) else None
         if not isinstance(digest, str):
             raise ArtifactError(
-                f"{folder} was written by another version of hilsplat",
+                f"{folder} was written by a different version of hilsplat",
                 expected=f"{MASKS_SHA256} of every view in {INDEX}",
                 found=f"none for view {view}",
                 fix=remake(folder),

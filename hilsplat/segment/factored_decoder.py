@@ -1,7 +1,7 @@
 """SAM's mask decoder for many prompts on one image, factored exactly (timings in docs/benchmarks.md).
 
-The plain decoder projects every pixel of the image side ten times per prompt, although prompts differ only
-in a few tokens. Before its layer norm, the image side after layer 1 is
+The plain decoder projects every pixel of the image embedding ten times per prompt, although prompts differ
+only in a few tokens. Before its layer norm, the image embedding after layer 1 is
 
     X + b + F^T B        X: depends on the image alone, channels x pixels
                          F: softmax weights of H heads x T tokens in each pixel, H (T - 1) rows
@@ -9,9 +9,9 @@ in a few tokens. Before its layer norm, the image side after layer 1 is
 
 The weights of a head sum to 1, so the last token contributes the constant b, and each other token its
 difference from the last. The layer norm is then one scale per pixel, computed from |X|^2, from products of X
-that all prompts share, and from B's Gram matrix. Every later projection of the image side is the sum of a
-projection of X, computed once per image, and a projection of few factors: 2 H (T - 1) after layer 2. Masks
-are the first per-prompt arrays as large as the image side. Results differ from the network's only by
+that all prompts share, and from B's Gram matrix. Every later projection of the image embedding is the sum
+of a projection of X, computed once per image, and a projection of few factors: 2 H (T - 1) after layer 2. No
+per-prompt array except the masks is as large as the embedding. Results differ from the network's only by
 rounding; `SamModel` checks this on a few prompts before it uses this class.
 
 The two attentions of a layer, its layer norm and the next attention process one block of pixels at a time
@@ -92,7 +92,7 @@ class Upscaling(NamedTuple):
 
 
 class MaskImage(NamedTuple):
-    """Image arrays for mask logits: the upscaled image side, and the finer features of SAM 2."""
+    """Image arrays for mask logits: the upscaled image embedding, and the finer features of SAM 2."""
 
     scaled: np.ndarray
     detail: np.ndarray
@@ -113,7 +113,7 @@ class MaskPrompts(NamedTuple):
 class ImageTerms:
     """Arrays that the decoder computes once per image."""
 
-    grid_hw: tuple[int, int]  # size of the image side
+    grid_hw: tuple[int, int]  # size of the image embedding
     keys: np.ndarray  # keys and values of the first token-to-pixel attention (`kernels.read_image`)
     values: np.ndarray
     first: FirstLayer
@@ -126,7 +126,7 @@ Kept = Mapping[str, np.ndarray]
 
 
 class FactoredDecoder:
-    """Factored mask decoder of a SAM or SAM 2; raises a ModelError for any other architecture."""
+    """Factored mask decoder of a SAM or SAM 2 model; raises a ModelError for any other architecture."""
 
     def __init__(self, graph: DecoderGraph, heads: int = HEADS_PER_ATTENTION) -> None:
         self.heads = heads
@@ -203,7 +203,7 @@ class FactoredDecoder:
     def image(self, features: Mapping[str, np.ndarray]) -> ImageTerms:
         """Compute the terms shared by all prompts from an encoder's outputs (float32, by name).
 
-        A ModelError is raised if the image side cannot be divided into blocks.
+        A ModelError is raised if the image embedding cannot be divided into blocks.
         """
         sides = _run(self._image_side, features, np.zeros((1, 2)))
         x, with_positions = (wide(side.reshape(side.shape[-2:]).T) for side in sides)  # (channels, pixels)
@@ -278,7 +278,7 @@ class FactoredDecoder:
         """Return predicted IoUs, logits and the arrays that `logits` needs, for one point per prompt.
 
         Points are inside the object, in px of the network's input. With `fine`, all 4 x 4 logits of each
-        pixel of the image side are computed, otherwise only the first logit.
+        pixel of the embedding are computed, otherwise only the first logit.
         """
         pe = _run(self._tokens, self._blank, points_xy)[0]
         pe = pe.reshape(len(points_xy), *pe.shape[-2:])
@@ -381,7 +381,7 @@ class FactoredDecoder:
         return self._logits(image, kept, e, fine=True)
 
     def _logits(self, image: ImageTerms, kept: Kept, e: np.ndarray, *, fine: bool) -> np.ndarray:
-        """Compute logits from the scaled factors of the image side."""
+        """Compute logits from the scaled factors of the image embedding."""
         changes = kept["changes"]
         number, _, others, _ = changes.shape
         through = changes @ self._factor_masks.reshape(2 * self.heads, self.dim, -1)
@@ -415,7 +415,7 @@ class FactoredDecoder:
         return norm(q + found if layer else found)
 
     def _think(self, layer: int, q: np.ndarray) -> np.ndarray:
-        """Apply a layer's two norms after the attention to the image, and the perceptron between them."""
+        """Apply the two norms after a layer's attention to the image, and the perceptron between them."""
         _, norm, last_norm = self._norms[layer]
         q = norm(q)
         return last_norm(q + _layers(self._mlps[layer], q))

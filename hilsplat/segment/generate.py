@@ -1,9 +1,9 @@
 """Automatic mask generation: from a grid of prompts to masks at three levels.
 
 `decode_candidates` runs the networks and depends on few settings; its result is cached.
-`masks_from_candidates` filters, upscales and suppresses them; changing its settings needs no network call.
-The steps are those of SAM's automatic generator, run separately for the three heads as in LangSplat, and of
-LangSplat's suppression. With `generator: official`, each is as published (differences: docs/segment.md).
+`masks_from_candidates` filters, upscales and suppresses them; changing its settings requires no network call.
+The steps are those of SAM's automatic generator, run separately for the three heads as in LangSplat, and then
+LangSplat's suppression. `generator: official` runs each step as published (differences: docs/segment.md).
 """
 
 import math
@@ -59,7 +59,7 @@ class Candidates:
 
     A mask's logits are stored in a window around it, in steps of `sam.LOGIT_STEP` (unrounded for the official
     generator). Logits with no edge within `BAND_PX` are set to +-127, so that windows compress well. This
-    changes no pixel of a mask: the two bilinear resizings up to the view read logits at most three pixels
+    changes no pixel of a mask: the two bilinear resizings to the view's size read logits at most three pixels
     apart. Outside the window, logits are -127.
     """
 
@@ -184,7 +184,7 @@ def calls(prompts: Prompts, batch: int) -> Iterator[tuple[Prompts, int]]:
 
 
 def uses_preview(model: SamModel, settings: MasksSettings) -> bool:
-    """Return whether to skip repeated prompts (needs a model with previews, and suppression of repeats)."""
+    """Return whether to skip repeated prompts (requires previews, and suppression of repeats)."""
     may_repeat = settings.generator == "official" or settings.box_nms_iou >= REPEAT_IOU
     return model.previews and not may_repeat
 
@@ -305,7 +305,7 @@ def masks_from_candidates(
 def _suppressed(
     masks: HierarchicalMasks, first: Float64[np.ndarray, " M"] | None, settings: MasksSettings
 ) -> HierarchicalMasks:
-    """Drop masks whose box repeats that of a better mask, ranked by `first`, then by predicted IoU."""
+    """Drop masks whose box repeats a better mask's; masks are ranked by `first`, then by predicted IoU."""
     suppress = suppress_boxes_officially if settings.generator == "official" else suppress_boxes
     return masks.take(suppress(masks.box_xyxy, masks.predicted_iou, settings.box_nms_iou, first))
 
@@ -351,7 +351,7 @@ def _upscale(
 def clean_masks(
     masks: HierarchicalMasks, min_area_px: int, keep_small: bool = False
 ) -> tuple[HierarchicalMasks, Bool[np.ndarray, " m"]]:
-    """Fill holes and drop islands (8-connected) and masks that are smaller than `min_area_px`.
+    """Fill holes, drop islands (8-connected), and drop masks, if their area is below `min_area_px`.
 
     The largest island of a mask is always kept. With `keep_small`, masks below `min_area_px` are kept and
     count as changed (SAM). Returns the remaining masks, and which of them were changed.

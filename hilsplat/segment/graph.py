@@ -16,7 +16,7 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.segment.masks import HierarchicalMasks, runs_of_labels
 
 WORK_SIDE_PX = 640
-"""Longer side at which images are segmented; finer texture doesn't separate parts of objects."""
+"""Longer side to which images are shrunk for segmentation; finer texture doesn't separate object parts."""
 BASE_SCALE = 80.0
 """Scale `k` of the base segmentation (Felzenszwalb and Huttenlocher), in its colour units."""
 CONTRAST = 6.0
@@ -37,11 +37,11 @@ def segment_graph(
 ) -> HierarchicalMasks:
     """Segment a photograph into regions at three nested scales.
 
-    A fine segmentation (`cv2.ximgproc.segmentation`) is merged pair by pair, cheapest first. A merge
-    across a colour difference D costs D times the width of the smaller region, `min(sqrt(A), 4 A / P)` with
-    its area A and perimeter P. Small or thin regions thus join their most similar neighbour, and large ones
-    stay separate even if they differ less. A level of minimum size s (a share of the image side) is the state
-    in which every remaining merge costs at least `CONTRAST * s * sqrt(image area)`.
+    A fine segmentation (`cv2.ximgproc.segmentation`) is merged pair by pair, cheapest first. A merge across a
+    colour difference D costs D times the width of the smaller region, `min(sqrt(A), 4 A / P)` for area A and
+    perimeter P. Small or thin regions thus join their most similar neighbour, and large ones stay separate
+    even if they differ less. A level of minimum size s (a share of the image side) is the state in which
+    every remaining merge costs at least `CONTRAST * s * sqrt(image area)`.
 
     The result contains one mask per level and region of at least `min_area_px`. `predicted_iou` is the mean
     colour difference along the region's border over `CLEAR_EDGE`, clipped to 1. `stability` is the share of
@@ -87,7 +87,7 @@ def to_lab(image: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
 
 
 def base_regions(image: UInt8[np.ndarray, "H W 3"], finest: float) -> Int32[np.ndarray, "H W"]:
-    """Segment finely, with labels 0..n-1; regions have at least a quarter of the minimum area at `finest`."""
+    """Return fine regions, labelled 0..n-1, of at least a quarter of the minimum area at scale `finest`."""
     least_px = max(4, round((finest**2) * image.shape[0] * image.shape[1] / 4))
     graph = cv2.ximgproc.segmentation.createGraphSegmentation(sigma=0.5, k=BASE_SCALE, min_size=least_px)
     labels = graph.processImage(np.ascontiguousarray(image[..., ::-1]))
@@ -109,7 +109,7 @@ def steps_along(axis: int, labels: Int32[np.ndarray, "H W"], lab: np.ndarray) ->
 def neighbours(
     labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]
 ) -> dict[tuple[int, int], tuple[float, int]]:
-    """Return the summed colour difference across each border of two regions, and the border's length, px."""
+    """Return the summed colour difference across the border of each pair of regions, and its length, px."""
     pairs, contrasts = [], []
     for axis in (0, 1):
         first, second, contrast = steps_along(axis, labels, lab)
@@ -135,7 +135,7 @@ def roughness(labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"])
 
 
 def merge_regions(labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]) -> list[Merge]:
-    """Merge the cheapest pair until one region is left; on a tie, the pair with the lower numbers.
+    """Repeatedly merge the cheapest pair until one region is left; ties go to the lower numbers.
 
     The colour difference of a pair is the mean of two differences: between the regions' mean colours, and
     across their border (minus their mean texture, at least 0). The cost is halved if the larger region

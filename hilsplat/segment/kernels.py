@@ -16,7 +16,7 @@ BAND_WORDS = 2**17
 @compiled
 @no_type_check
 def quantise_logits(logits, per_unit, upper, lower, valid_h, valid_w):
-    """Quantise logits (K, h, w), and compute each mask's box and the areas for its stability.
+    """Quantise logits (K, h, w), and compute each mask's box and the areas that define its stability.
 
     Args:
         per_unit: steps per unit of logit.
@@ -63,7 +63,7 @@ def quantise_logits(logits, per_unit, upper, lower, valid_h, valid_w):
 @compiled
 @no_type_check
 def edge_windows(steps, rows, boxes, reach):
-    """Extract each mask's logits near its edge, flattened to +-127 elsewhere.
+    """Extract a window of each mask's logits; those far from the mask's edge are set to +-127.
 
     Args:
         steps: int8 or float32 (K, h, w).
@@ -89,7 +89,7 @@ def edge_windows(steps, rows, boxes, reach):
         mask = steps[rows[place]]
         x0, y0, x1, y1 = windows[place]
         high, wide = y1 - y0, x1 - x0
-        # number of positive pixels in the (2 reach + 1)^2 around each pixel: sums along x, then along y
+        # number of positive pixels in a square of side 2 reach + 1 around each pixel: along x, then y
         along = np.zeros((high, wide), np.int32)
         for y in range(high):
             total = 0
@@ -126,7 +126,7 @@ def edge_windows(steps, rows, boxes, reach):
 @compiled
 @no_type_check
 def _push(out, count, length):
-    """Append a run; the buffer doubles when it is full."""
+    """Append a run; a full buffer is doubled first."""
     if count == len(out):
         longer = np.empty(2 * len(out), np.uint32)
         longer[:count] = out
@@ -171,7 +171,7 @@ def upscaled_runs(
         line = np.full(wide + 2 * taps_x, np.float32(-127))  # a blended row, padded with outside logits
         middle = line[taps_x : taps_x + wide]
         origin = x0 - taps_x  # low-resolution column of line[0]
-        # windows reach into the padding beside the image, which no pixel of the crop reads
+        # windows may extend into the padding beside the image, which no pixel of the crop reads
         begin, end = reader[min(max(0, x0 - taps_x + 1), low_w)], reader[min(x1, low_w)]
         inside, last, last_end = False, 0, 0
         for y in range(num_y):
@@ -301,7 +301,7 @@ def _region_areas(row, start, stop, value, of, parent, area):
 @compiled
 @no_type_check
 def cleaned_runs(runs, offsets, width, min_area):
-    """Fill holes and drop islands below `min_area` (8-connected); always keep the largest island.
+    """Fill holes and drop islands (8-connected) smaller than `min_area`, but keep the largest island.
 
     Returns runs and offsets of the result, and which masks changed.
     """

@@ -1,4 +1,4 @@
-"""Label of the source of a scene's masks, for table rows and titles."""
+"""Labels of the source of a scene's masks, used in table rows and titles."""
 
 from pathlib import Path
 

@@ -18,7 +18,7 @@ from hilsplat.segment.digests import require_same_masks
 from hilsplat.segment.masks import HierarchicalMasks
 
 GOLDEN = 0.6180339887498949
-"""Hue step between rows: the golden ratio gives consecutive rows clearly different colours."""
+"""Hue step between rows; the golden ratio gives consecutive rows clearly different colours."""
 UNCOVERED = 0.35  # brightness of pixels without a mask
 THUMB_PX = 56  # side of a mask's crop in the tree picture
 MAX_LEAVES = 12  # rows of crops in the tree picture

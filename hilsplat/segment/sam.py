@@ -1,6 +1,6 @@
 """Segment Anything in onnxruntime: three masks per point prompt on an image.
 
-The models are ONNX exports from the transformers library, and images and masks are resized as by the
+The models are ONNX exports from the transformers library, and images and masks are resized as in the
 library's SamProcessor. The rounding of logits (`read_logits`) is ours.
 """
 
@@ -84,7 +84,7 @@ OWN = "mask_generation"  # key of `config.json` under which a model specifies it
 
 
 def resized_size(original_hw: tuple[int, int], longest_edge: int) -> tuple[int, int]:
-    """Return the size with the longer side `longest_edge`, with halves rounded up as in SamProcessor.
+    """Return the size whose longer side is `longest_edge`; halves are rounded up, as in SamProcessor.
 
     Departs: neither side becomes 0 for very thin images.
     """
@@ -107,7 +107,7 @@ class SamModel:
     stretches: bool = False  # images are stretched to a square (SAM 2), not padded (SAM)
     previewer: Network | None = None  # the decoder at half the resolution (`layouts.PREVIEW`)
     factored: FactoredDecoder | None = None  # the much faster decoder, if the graph can be factored
-    as_exported: bool = True  # encoder or decoder run as exported, which takes more memory
+    as_exported: bool = True  # the encoder or decoder runs as exported, which takes more memory
 
     def __init__(self, model: ModelFolder) -> None:
         self.model = model
@@ -226,14 +226,14 @@ class SamModel:
         return padded, frame
 
     def encode(self, image: UInt8[np.ndarray, "H W 3"], encoder: Network | None = None) -> Encoded:
-        """Run the vision encoder, or another version of it."""
+        """Run the vision encoder, or the version of it given as `encoder`."""
         pixels, frame = self.prepare(image)
         names = self.encoder.spec.outputs
         features = dict(zip(names, (encoder or self.encoder)(pixel_values=pixels), strict=True))
         return Encoded(features, frame, self.factored.image(features) if self.factored else None)
 
     def prompts_per_call(self, limit: int, prompts: int) -> int:
-        """Return the number of prompts per decoder call: the decoder's own, or min(limit, prompts)."""
+        """Return the number of prompts per call: the decoder's fixed number, else min(limit, prompts)."""
         if self.factored:
             return PROMPTS
         return self.decoder.fixed_axis("input_points", 1) or min(limit, prompts)
@@ -264,7 +264,7 @@ class SamModel:
     def preview(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "P 2"]
     ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 low_h low_w"], Prompts]:
-        """Decode prompts at a lower resolution, if `previews`; pass the third result to `finish`."""
+        """Decode prompts at a lower resolution (requires `previews`); pass the third result to `finish`."""
         points = in_input(points_xy, encoded.frame)
         if self.factored and encoded.terms:
             iou, logits, kept = self.factored.decode(encoded.terms, points, fine=False)
@@ -294,7 +294,7 @@ def ask_network(
     points_xy: Float[np.ndarray, "P K 2"],
     labels: Float[np.ndarray, "P K"] | None = None,
 ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 h w"]]:
-    """Run a decoder on prompts of K points of its input; labels are 1 inside the object, 0 outside.
+    """Run a decoder on prompts of K points (px of its input); labels are 1 inside the object, 0 outside.
 
     By default all points are inside. Returns predicted IoUs and logits.
     """
@@ -378,7 +378,7 @@ def read_logits(
     rounded, small, large, boxes = quantise_logits(
         np.ascontiguousarray(logits),
         np.float32(1 / LOGIT_STEP),
-        math.floor(steps),  # an integer exceeds x exactly if it exceeds floor(x)
+        math.floor(steps),  # an integer exceeds x if and only if it exceeds floor(x)
         math.floor(-steps),
         height,
         width,
@@ -418,7 +418,7 @@ def frame_taps(low_hw: tuple[int, int], frame: Frame) -> tuple[np.ndarray, ...]:
 def taps(
     low: int, padded: int, resized: int, original: int
 ) -> tuple[Int64[np.ndarray, " N"], Float32[np.ndarray, "N T"]]:
-    """Return, for one axis, the first low-resolution pixel each pixel reads, and the weights from it onwards.
+    """Return the first low-resolution pixel that each pixel along an axis reads, and the weights from there.
 
     The weights combine SamProcessor's steps: bilinear from `low` to the padded input, cropping to the resized
     image, bilinear to the original size.

@@ -56,7 +56,7 @@ def run_masks(
         threads: views processed in parallel if they fit into memory; the result does not depend on it.
         memory_mib: memory that the stage may use; None for all free memory.
         key_views: views to segment; None for every training view.
-        prompts: function that returns a view's prompt points for SAM (x, y, px); None for the settings' grid.
+        prompts: function that returns a view's prompt points for SAM (x, y, px), or None to use the grid.
         finished: earlier output of this stage whose views are reused unchanged.
     """
     scene = Scene.load(scene_folder)
@@ -80,7 +80,7 @@ def run_masks(
     with stage_log("masks", scene.name) as counts:
         if settings.segmenter == "sam":
             model = SamModel.load(Path(settings.model), settings.variant)
-            every = train_views(scene)  # independent of the views to segment
+            every = train_views(scene)  # independent of `key_views`
             checked = [scene.image(view) for view in every[:: max(1, len(every) // CHECKED_VIEWS)]]
             model.choose_precision(settings.precision, checked[:CHECKED_VIEWS], cache, threads)
             identity.update(model=settings.model, model_sha256=model.digest, precision=model.precision)
@@ -90,7 +90,7 @@ def run_masks(
             threads = needs.views_at_once(threads, memory_mib)
             logger.info("masks %s: %d views at once, %.0f MiB each", scene.name, threads, needs.view_mib)
         else:
-            logger.info("masks %s: graph segmenter, without a model; the levels are three scales", scene.name)
+            logger.info("masks %s: graph segmenter (no model); the levels are three scales", scene.name)
         index: dict[str, Any] = {}
         with atomic_folder(out) as folder:
             found = in_order(segment, views, threads)

@@ -1,4 +1,4 @@
-"""Suppression of masks that repeat a better mask: by boxes, then by pixels."""
+"""Suppression of masks that repeat a better mask; first boxes are compared, then pixels."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64

@@ -47,7 +47,7 @@ def test_masks_that_differ_from_the_recorded_digest_are_refused(tmp_path):
 @pytest.mark.parametrize("entry", [{}, {"masks_sha256": 3}, [], None, 7])
 def test_an_index_without_digests_is_refused(tmp_path, entry):
     write_index(tmp_path, {"v": entry})
-    with pytest.raises(ArtifactError, match=r"another version of hilsplat(.|\n)*found +none for view v"):
+    with pytest.raises(ArtifactError, match=r"a different version of hilsplat(.|\n)*found +none for view v"):
         digests_in(tmp_path)
 
 
