@@ -25,7 +25,7 @@ TOLERANCE = 1e-5
 
 
 def decompose(similarity: Float[np.ndarray, "4 4"]) -> tuple[float, Float64[np.ndarray, "3 3"], np.ndarray]:
-    """Return the scale, rotation and translation of x -> scale rotation x + translation.
+    """Return the scale, rotation and translation of the map x -> scale * rotation @ x + translation.
 
     Raises:
         HilsplatError: if the matrix mirrors, shears or projects, or contains non-finite numbers.
@@ -45,10 +45,10 @@ def decompose(similarity: Float[np.ndarray, "4 4"]) -> tuple[float, Float64[np.n
 
 
 def move_gaussians(gaussians: Gaussians, similarity: Float[np.ndarray, "4 4"]) -> Gaussians:
-    """Transform Gaussians from coordinates a to b, given b_from_a.
+    """Transform Gaussians from coordinate system a to b; `similarity` is b_from_a.
 
-    A camera transformed in the same way sees the same image. Spherical harmonics are rotated too, because
-    they are functions of the direction in the world. Errors are as in `decompose`.
+    A camera transformed in the same way renders the same image. Spherical harmonics are rotated too, because
+    they are functions of the world direction. The errors are those of `decompose`.
     """
     scale, rotation, translation = decompose(similarity)
     g = gaussians
@@ -64,10 +64,10 @@ def move_gaussians(gaussians: Gaussians, similarity: Float[np.ndarray, "4 4"]) -
 
 
 def sh_basis(directions: Float64[np.ndarray, "P 3"], degree: int) -> Float64[np.ndarray, "P K"]:
-    """Return real spherical harmonics at unit directions, in the order and with the signs of 3DGS.
+    """Evaluate real spherical harmonics for unit directions, with the order and signs of 3DGS.
 
-    Within a band, orders run from -l to l; negative orders are the sines. 3DGS keeps the Condon-Shortley sign
-    (-1)^m, which real harmonics often omit.
+    Within band l, orders run from -l to l; negative orders are the sine terms. 3DGS keeps the Condon-Shortley
+    sign (-1)^m, which real harmonics often omit.
     """
     x, y, z = directions.T
     polar, azimuth = np.arccos(np.clip(z, -1, 1)), np.arctan2(y, x)
@@ -84,8 +84,8 @@ def sh_rotation(rotation: Float64[np.ndarray, "3 3"], degree: int) -> Float64[np
     """Return the matrix that rotates spherical-harmonics coefficients.
 
     The rotated colour along R d is the original colour along d. A rotated harmonic stays in its band, so the
-    matrix has one block per band. Each block is a least-squares solution over more directions than harmonics,
-    exact up to rounding.
+    matrix has one block per band. Each block is fitted by least squares to more directions than harmonics;
+    it is exact up to rounding.
     """
     number = 64  # directions spread over the sphere along a spiral
     height = 1 - (2 * np.arange(number) + 1) / number
@@ -102,7 +102,7 @@ def sh_rotation(rotation: Float64[np.ndarray, "3 3"], degree: int) -> Float64[np
 
 
 def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dict[str, Any]) -> None:
-    """Write the transform between a PLY's coordinates (the scene's) and those of its source.
+    """Write the transform between the scene's coordinates, which the PLY uses, and those of its source.
 
     The JSON file beside the PLY contains the PLY's digest, because it is valid for that PLY only. It is the
     only record of the coordinates used by our own structure from motion.
@@ -132,10 +132,10 @@ def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dic
 
 
 def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
-    """Return the transform from this package's PLY to its source's coordinates; None without a JSON file.
+    """Return the transform from a PLY's coordinates to its source's, or None if no JSON file contains it.
 
     Raises:
-        ArtifactError: if the JSON file belongs to another PLY, or its transform cannot be used.
+        ArtifactError: if the JSON file belongs to a different PLY, or its transform cannot be used.
     """
     path = ply.with_suffix(".json")
     if not path.is_file():
@@ -160,7 +160,7 @@ def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
 def import_gaussians(
     ply: Path, scene: Scene, dataparser: Path | None = None, transforms: Path | None = None
 ) -> tuple[Gaussians, dict[str, Any]]:
-    """Read a 3DGS PLY, by default in the coordinates of the scene's source poses.
+    """Read a 3DGS PLY, which by default uses the coordinates of the scene's source poses.
 
     A PLY written by this package is transformed to the source's coordinates with the JSON file beside it. A
     PLY in nerfstudio's training coordinates needs its `dataparser_transforms.json`, and the `transforms.json`

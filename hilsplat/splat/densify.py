@@ -34,7 +34,7 @@ opacity reset; larger here, because walls of rooms consist of flat, wide Gaussia
 RESET_OPACITY = 0.01  # 3DGS
 
 MAX_TOGETHER = 51
-"""Maximum number of coincident Gaussians (the paper's code); more would change little."""
+"""Maximum number of coincident Gaussians, as in the paper's code; a higher limit would change little."""
 MAX_OPACITY = 1 - 1e-6
 """Maximum opacity; opacity 1 has no logit."""
 NOISE_SHARPNESS = 100.0
@@ -206,8 +206,8 @@ def add_regularisers(adam: Adam, gradients: Gradients, settings: GaussiansSettin
 def relocate_and_grow(adam: Adam, settings: GaussiansSettings, generator: np.random.Generator) -> None:
     """Move dead Gaussians onto live ones, then add copies of live ones up to the cap.
 
-    Live Gaussians are drawn with a probability proportional to their opacity. A drawn Gaussian and its copies
-    together cover what the original covered.
+    Live Gaussians are sampled with a probability proportional to their opacity. A sampled Gaussian and its
+    copies together cover what the original covered.
     """
     opacity = opacities(adam)
     dead = opacity <= settings.min_opacity
@@ -224,7 +224,7 @@ def relocate_and_grow(adam: Adam, settings: GaussiansSettings, generator: np.ran
 
 
 def opacities(adam: Adam) -> Float[np.ndarray, " N"]:
-    """Return the peak alphas."""
+    """Return the peak alpha of each Gaussian."""
     return expit(adam.parameters["opacity_logits"].astype(np.float64))
 
 
@@ -235,9 +235,9 @@ def _share(
     settings: GaussiansSettings,
     generator: np.random.Generator,
 ) -> dict[str, Float32[np.ndarray, "M ..."]]:
-    """Draw rows with replacement, with probabilities proportional to `weights`, and return copies.
+    """Sample rows with replacement, with probabilities proportional to `weights`, and return copies.
 
-    The drawn rows are changed, so that a row and its copies together cover what the row covered before.
+    The sampled rows are changed, so that a row and its copies together cover what the row covered before.
     """
     p, edges = adam.parameters, np.cumsum(weights)
     source = np.searchsorted(edges, generator.uniform(0, edges[-1], number), side="right")
@@ -246,8 +246,8 @@ def _share(
     old = np.minimum(expit(p["opacity_logits"][rows].astype(np.float64)), MAX_OPACITY)
     new = shared_opacity(old, together)
     p["log_scales"][rows] += np.log(scale_factor(old, new, together)).astype(np.float32)[:, None]
-    # Rows at or below the threshold would be relocated again in the next round. The float32 nearest to the
-    # threshold's logit may be too low by at most 6e-8 of its size (for 0.005, the opacity is 0.0049999995).
+    # Rows at or below the threshold would be relocated again in the next round. The float32 value nearest to
+    # the threshold's logit may be too low by up to 6e-8 of its size (0.005 becomes opacity 0.0049999995).
     exact = float(logit(settings.min_opacity))
     alive = np.float32(exact + 1e-6 * max(abs(exact), 1.0))
     p["opacity_logits"][rows] = np.maximum(logit(new).astype(np.float32), alive)

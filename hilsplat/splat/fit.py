@@ -1,4 +1,4 @@
-"""Base 3D Gaussian Splatting fit (Kerbl et al. 2023), the geometry of all later stages, and its report."""
+"""Base fit of 3D Gaussian Splatting (Kerbl et al. 2023), whose geometry later stages use, and its report."""
 
 import json
 import logging
@@ -47,15 +47,15 @@ from hilsplat.splat.rasterise.device import choose_device
 logger = logging.getLogger(__name__)
 
 CURVE_EVERY = 20
-"""Steps between two points of the training curve."""
+"""Number of steps between two points on the training curve."""
 MIN_SIDE_PX = 64
-"""Minimum shorter side of shrunk images."""
+"""Minimum length of a downscaled image's shorter side."""
 MAX_SHOWN = 8
 """Maximum number of views on the contact sheet of test views."""
 ERROR_GAIN = 4
 """Factor by which displayed errors are multiplied."""
 TABLES = ("parameters", "first", "second")
-"""Names of the tables of `Adam` in a checkpoint."""
+"""Tables of `Adam` that a checkpoint contains."""
 
 
 @dataclass
@@ -94,7 +94,7 @@ class FitState:
 
     @staticmethod
     def load(path: Path, key: str) -> "FitState | None":
-        """Read the checkpoint of this fit; None if it is missing, damaged or from another fit."""
+        """Read this fit's checkpoint; return None if it is missing, damaged or from a different fit."""
         if not path.is_file():
             return None
         try:
@@ -127,7 +127,7 @@ def fit_step(
         state.order = state.generator.permutation(len(views)).tolist()
     view = views[state.order.pop()]
     progress = state.step / settings.iterations
-    # 3DGS adds a degree every 1000 of 30 000 steps; short fits reach degree 3 after 30 % of the steps
+    # 3DGS adds a degree every 1000 of 30 000 steps; here, every fit reaches degree 3 after 30 % of its steps
     degree = min(settings.sh_degree, int(progress * 10))
     if settings.background == "random":
         behind = state.generator.uniform(size=3).astype(np.float32)
@@ -165,7 +165,7 @@ def steps_of(settings: GaussiansSettings, num_views: int) -> int:
 
 
 def scale_at(settings: GaussiansSettings, progress: float, side_px: int) -> float:
-    """Return the scale of the training images at `progress` (a share of the iterations), coarse to fine.
+    """Return the scale of the training images, which grows with `progress` (the share of completed steps).
 
     Coarse images are cheaper, and their wider gradients move Gaussians over larger distances.
     `side_px` is the shorter side of the images at full size.
@@ -179,7 +179,7 @@ def scale_at(settings: GaussiansSettings, progress: float, side_px: int) -> floa
 def control_density(
     state: FitState, settings: GaussiansSettings, progress: float, extent: float, threads: int
 ) -> None:
-    """Add, move and remove Gaussians after a step, depending on the strategy."""
+    """Add, move and remove Gaussians after a step, according to the strategy."""
     is_mcmc = settings.strategy == "mcmc"
     densify_until = int(settings.densify_until * settings.iterations)
     if settings.densify_from * settings.iterations <= state.step <= densify_until:
@@ -213,7 +213,7 @@ def fit_gaussians(
         seed: determines the view order, splits, relocations, noise and random points.
         checkpoint: file to which the state is written every `checkpoint_every` steps, and from which
             an interrupted fit resumes; removed at the end.
-        key: digest of all inputs of the fit; checkpoints with another key are ignored.
+        key: digest of all inputs of the fit; checkpoints with a different key are ignored.
 
     Returns:
         The Gaussians in Morton order (frozen ones in the order of their points), and the
@@ -320,7 +320,7 @@ def write_report(
 
 
 def _draw_curves(path: Path, curve: Float64[np.ndarray, "S 4"]) -> None:
-    """Plot loss, training PSNR and number of Gaussians over the steps."""
+    """Plot the loss, training PSNR and number of Gaussians against the step."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 3), layout="constrained")

@@ -33,10 +33,10 @@ OPTIONS = {"crf": "20", "preset": "veryfast", "x264-params": "threads=1:mbtree=0
 
 
 def closed_path(cameras: list[Camera], frames: int) -> list[Camera]:
-    """Return cameras along a closed tour of the given cameras with little translation and rotation.
+    """Return cameras along a closed tour of the given cameras that keeps translation and rotation small.
 
-    The speed is constant. Position, viewing direction and up vector are smoothed along the tour. Lens and
-    image size are those of the first camera. A single camera is repeated.
+    The speed is constant. Position, viewing direction and up vector are smoothed along the tour. Intrinsics
+    and image size are those of the first camera. A single camera is repeated.
     """
     stops = cameras[:: -(-len(cameras) // MAX_STOPS)]
     centres = np.stack([camera.centre for camera in stops])
@@ -59,8 +59,8 @@ def closed_path(cameras: list[Camera], frames: int) -> list[Camera]:
 def open_path(cameras: list[Camera], frames: int) -> list[Camera]:
     """Return cameras along a smooth curve through two or more given cameras, in order.
 
-    Position and lens follow a monotone cubic, so that the path does not overshoot; the direction rotates at
-    a constant rate between consecutive cameras. The image size is that of the first camera.
+    Positions and intrinsics follow a monotone cubic spline, so that the path does not overshoot. Directions
+    rotate at a constant rate between consecutive cameras. The image size is that of the first camera.
     """
     centres = np.stack([camera.centre for camera in cameras])
     turns = Rotation.from_matrix([camera.cam_from_world[:3, :3] for camera in cameras])
@@ -83,7 +83,7 @@ def _camera(row: Float64[np.ndarray, " 9"], like: Camera) -> Camera:
     """Build a camera from its centre, viewing direction and down direction, which need not be orthogonal."""
     forward = row[3:6] / max(np.linalg.norm(row[3:6]), 1e-12)
     down = row[6:] - forward * (row[6:] @ forward)
-    if np.linalg.norm(down) < 1e-9:  # directions of opposite cameras cancel out; use the first camera's
+    if np.linalg.norm(down) < 1e-9:  # directions of opposite cameras cancel out
         down = like.cam_from_world[1, :3] - forward * (like.cam_from_world[1, :3] @ forward)
     down = down / max(np.linalg.norm(down), 1e-12)
     pose = np.eye(4)
@@ -93,7 +93,7 @@ def _camera(row: Float64[np.ndarray, " 9"], like: Camera) -> Camera:
 
 
 def short_round(distances: Float64[np.ndarray, "S S"]) -> list[int]:
-    """Return a short closed tour: nearest neighbours first, then crossings removed (2-opt)."""
+    """Return a short closed tour, built from nearest neighbours and then improved by 2-opt."""
     number = len(distances)
     tour, left = [0], set(range(1, number))
     while left:
@@ -143,7 +143,7 @@ def encoded_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_s
 
     With a given PyAV version, identical frames produce identical bytes. An odd last row or column is cropped,
     because yuv420p needs even sides. Frames are consumed one by one, with a yield after each, to save memory.
-    The file is complete when the iterator ends; `path` is in a temporary folder or from an atomic writer.
+    The file is complete when the iterator ends, so `path` must be temporary or from an atomic writer.
     """
     frames = iter(frames)
     first = next(frames)
@@ -162,7 +162,7 @@ def encoded_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_s
 
 
 def contact_sheet(pictures: list[UInt8[np.ndarray, "_ _ 3"]], columns: int) -> UInt8[np.ndarray, "H W 3"]:
-    """Arrange pictures on a white sheet, row by row, shrunk by integer factors to at most MAX_SIDE_PX."""
+    """Shrink pictures by integer factors to at most MAX_SIDE_PX and arrange them in rows on a white sheet."""
     cells = [_shrunk(picture, -(-max(picture.shape[:2]) // MAX_SIDE_PX)) for picture in pictures]
     height, width = (max(cell.shape[axis] for cell in cells) + GAP_PX for axis in (0, 1))
     rows = -(-len(cells) // columns)

@@ -1,4 +1,4 @@
-"""Gaussians of a scene, in the unconstrained form that is optimised, and their order in memory."""
+"""Gaussians of a scene, with unconstrained parameters for optimisation, and their order in memory."""
 
 from dataclasses import dataclass, fields
 
@@ -13,7 +13,7 @@ class Gaussians:
     Attributes:
         means: centres, scene units.
         log_scales: natural log of the standard deviation along each axis, scene units.
-        quats: world-from-Gaussian rotation, wxyz; any non-zero length.
+        quats: world-from-Gaussian rotations as quaternions (wxyz) of any non-zero length.
         opacity_logits: inverse sigmoid of the peak alpha.
         sh: colour as spherical harmonics, K = (degree + 1)**2; row 0 is the constant term.
     """
@@ -41,7 +41,7 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        """Degree of the spherical harmonics: K = 1, 4, 9, 16 is degree 0, 1, 2, 3."""
+        """Degree of the spherical harmonics: 0, 1, 2 or 3 for K = 1, 4, 9 or 16."""
         return round(self.sh.shape[1] ** 0.5) - 1
 
 
@@ -53,11 +53,11 @@ BITS = 21
 
 
 def morton_order(means: Float[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
-    """Return the rows of points in the order of a Z-order curve (Morton 1966) through their bounding box.
+    """Return the row order that sorts points along a Z-order curve (Morton 1966) through their bounding box.
 
     Loops over Gaussians and their neighbours, such as products with the language field's G, then mostly hit
     the processor's cache. The box excludes the outermost 1 % of points on each side: otherwise, a few distant
-    Gaussians could force all others into one cell. Rows in one cell keep their relative order.
+    Gaussians could force all others into one cell. Rows in the same cell keep their relative order.
     """
     if not len(means):
         return np.zeros(0, np.int64)

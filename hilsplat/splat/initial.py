@@ -57,7 +57,7 @@ def camera_extent(cameras: list[Camera]) -> float:
 def first_gaussians(
     scene: Scene, cameras: list[Camera], settings: GaussiansSettings, generator: np.random.Generator
 ) -> dict[str, np.ndarray]:
-    """Return round Gaussians at the sparse points, as wide as the mean distance to the nearest 3 (3DGS).
+    """Return round Gaussians at the sparse points, as wide as the mean distance to 3 neighbours (3DGS).
 
     If there are fewer than MIN_POINTS sparse points, random grey points in front of random cameras are added.
     If `settings.initial` is "random", random points replace all sparse points. If it is "frozen", every

@@ -24,7 +24,7 @@ def means_rate(settings: GaussiansSettings, progress: float) -> float:
 
 @compiled
 def _adam_chunks(begin, end, values, gradients, first, second, rates, root_of_rest2):
-    """Take an Adam step for chunks begin..end of 16 numbers, in place.
+    """Take an Adam step, in place, for chunks begin..end, which contain 16 numbers each.
 
     `rates` (divided by 1 - beta1^t) is cyclic: chunk k uses the rates from index 16 k. `root_of_rest2` is
     sqrt(1 - beta2^t).
@@ -83,7 +83,7 @@ class Adam:
         """Take one step; `rate_of_means` is in scene units."""
         self.steps += 1
         of_rest = SH_REST_SHARE * settings.sh_rate
-        rates: dict[str, list[float]] = {  # for each number of one Gaussian, repeated cyclically
+        rates: dict[str, list[float]] = {  # one rate per number of a Gaussian, repeated cyclically
             "means": [rate_of_means],
             "log_scales": [settings.scales_rate],
             "quats": [settings.quats_rate],

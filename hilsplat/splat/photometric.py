@@ -125,7 +125,7 @@ def _gradient_rows(begin, end, num, stride, image, target, slopes, l1_weight, ss
 
 
 def _padded(image: Float32[np.ndarray, "H W 3"]) -> tuple[np.ndarray, int]:
-    """Return the rows padded with zeros, as a flat array, and the padded length of a row."""
+    """Return the image padded with zeros, as a flat array, and the padded length of a row."""
     height, width, _ = image.shape
     stride = -(-3 * width // _LANES) * _LANES + 2 * _SIDE
     out = np.zeros((height + 2 * RADIUS, stride), np.float32)

@@ -1,4 +1,4 @@
-"""Read and write Gaussians as a standard 3DGS PLY, which viewers and other implementations read."""
+"""Read and write Gaussians as standard 3DGS PLY files, which viewers and other implementations support."""
 
 import re
 from pathlib import Path
@@ -64,7 +64,7 @@ def load_ply(path: Path, fix: str = "") -> Gaussians:
     """Read a 3DGS PLY from this or another package; the number of f_rest columns determines the degree.
 
     The file may be binary or ASCII, with properties in any order and of any numeric type. Normals and
-    properties not in 3DGS (colours, labels) are ignored. `fix` is the fix that errors suggest; "": a rerun.
+    properties not in 3DGS (colours, labels) are ignored. Errors suggest `fix` or, if it is empty, a rerun.
 
     Raises:
         ArtifactError: if the file is missing, damaged or not a 3DGS PLY, or contains non-finite numbers.

@@ -1,9 +1,9 @@
-"""Write Gaussians as SPZ, the compressed format of Niantic Labs (version 2), which many viewers read.
+"""Write Gaussians as SPZ (version 2), a compressed format from Niantic Labs that many viewers support.
 
 The file is a gzip stream of a 16-byte header and six columns: positions in 24-bit fixed point, then opacity,
-colour, log scales, rotation and harmonics in one byte each, with axes x right, y up, z backwards. The format
-fixes the quantisation of all but positions and harmonics. At 17 bytes per Gaussian, renders of a synthetic
-scene of degree 2 have a PSNR of 43 dB compared with the original.
+colour, log scales, rotation and harmonics in one byte per number. Axes are x right, y up, z backwards. The
+format fixes the quantisation of everything except positions and harmonics. At 17 bytes per Gaussian, renders
+of a synthetic scene of degree 2 have a PSNR of 43 dB compared with the original.
 """
 
 import gzip
@@ -22,7 +22,7 @@ STEPS_PER_SPREAD = 8192
 """Minimum number of position steps per median distance of the Gaussians from their centre."""
 LARGEST_STEP = 2**23 - 1
 HARMONIC_STEP = 8
-"""Step size of harmonics in 1/128 (5 bits). The usual 4 bits beyond degree 1 lose 2 dB and save 1 byte."""
+"""Step of harmonics in units of 1/128 (5 bits). The usual 4 bits above degree 1 save 1 byte but lose 2 dB."""
 COLOUR_SCALE = 0.15
 GZIP_LEVEL = 6
 

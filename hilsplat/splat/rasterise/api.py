@@ -48,7 +48,7 @@ def render(
     """Render a view with the conventions of gsplat (docs/rasteriser.md); `draw` also computes gradients.
 
     Args:
-        features: additional channels to blend in the same pass; any number.
+        features: any number of additional channels to blend in the same pass.
         threads: CPU threads; the result is byte-identical for any number.
         device: backend; see `device.choose_device`.
 
@@ -75,7 +75,7 @@ def draw(
 ) -> Drawn:
     """Draw the image and alpha of a view without background, and compute gradients on demand.
 
-    Gaussians behind the camera get zero gradient. Gradients are first-order and are not computed for the
+    Gaussians behind the camera get zero gradients. Gradients are first-order and are not computed for the
     camera. Arguments and errors are those of `render`.
     """
     if features is not None and len(features) != len(gaussians):

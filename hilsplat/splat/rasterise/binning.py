@@ -15,15 +15,15 @@ BLOCK_X = np.tile(np.arange(4, dtype=np.float32) * 4, 4) + np.float32(0.5)
 BLOCK_Y = np.repeat(np.arange(4, dtype=np.float32) * 4, 4) + np.float32(0.5)
 """Centre of the first pixel of each 4x4 block, relative to the tile's corner."""
 _SLACK, _RELATIVE = np.float32(1e-2), np.float32(1e-6)
-"""A block is skipped if the exponent is below the cut by more than an absolute slack plus one proportional
-to the squared terms of the exponent (float32 rounding: 6e-8)."""
+"""A block is skipped if the exponent is below the cut by more than the sum of an absolute slack and a slack
+proportional to the squared terms of the exponent (float32 rounding: 6e-8)."""
 AHEAD = 16
 """Rows are prefetched this many list entries ahead."""
 MAX_ENTRIES = 2**22
 """Maximum number of tile list entries in memory: 16 MiB, and 144 MiB of gradients for 3 channels."""
 
 _SPAN = np.float32(3.0)
-"""Distance between a block's first and last pixel centre."""
+"""Distance between a block's first and last pixel centres."""
 _CUT = np.float32(np.log2(MIN_ALPHA))
 
 
@@ -36,7 +36,7 @@ class Tiles:
 
     Attributes:
         order: rows of the drawn Gaussians, front to back; ties in row order.
-        tile_start: number of entries of all preceding tiles.
+        tile_start: number of entries in all preceding tiles.
     """
 
     tiles_x: int
@@ -81,7 +81,7 @@ def _depth_order(rows, keys):
 
 @compiled
 def _count(box, keys, tiles_x, tiles_y):
-    """Return the depth order of drawn Gaussians and each tile's list start (summed from corners of boxes)."""
+    """Return the depth order of drawn Gaussians and each tile's list start (prefix sums of box corners)."""
     corners = np.zeros((tiles_y + 1, tiles_x + 1), np.int64)
     rows, drawn_keys = np.empty(len(box), np.int32), np.empty(len(box), np.uint32)
     drawn = 0
@@ -108,7 +108,7 @@ def _count(box, keys, tiles_x, tiles_y):
 
 @compiled(inline="always")
 def _least(a, b, c, u, v):
-    """Return a u^2 + b u v + c v^2, lowered to a bound that is safe against rounding."""
+    """Return a lower bound of a u^2 + b u v + c v^2 that allows for rounding."""
     uu, vv = a * u * u, c * v * v
     return uu + b * u * v + vv - lanes(_RELATIVE) * (uu + vv)
 
@@ -136,7 +136,7 @@ def _reach(mean_x, mean_y, a, b, c, top, along_x, along_y):
 def fill_lists(begin, end, base, tiles_x, order, tile_start, box, geometry, gaussian, reach, tile_end):
     """Write the lists of tiles begin..end and their ends; entry e is written to gaussian[e - base].
 
-    reach[e - base] has a bit for each block that the Gaussian can reach; Gaussians without bits are omitted.
+    reach[e - base] has a bit for each block that the Gaussian can reach; if it reaches none, it is omitted.
     """
     tile_end[begin:end] = tile_start[begin:end]
     for k in range(len(order)):
@@ -161,7 +161,7 @@ def fill_lists(begin, end, base, tiles_x, order, tile_start, box, geometry, gaus
 def bin_gaussians(box: Int32[np.ndarray, "N 4"], depths: np.ndarray, size_hw: tuple[int, int]) -> Tiles:
     """Sort the drawn Gaussians by depth (positive float32) and count them per tile.
 
-    `box` contains the first and last pixel column, then row; last < first for Gaussians that are not drawn.
+    `box` contains the first and last pixel columns, then rows; last < first for Gaussians that are not drawn.
     """
     tiles_y, tiles_x = ((side + TILE - 1) // TILE for side in size_hw)
     # positive floats and their bits have the same order

@@ -49,7 +49,7 @@ MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4
 """Blending stops at a pixel before the Gaussian that would reduce transmittance below this (3DGS, gsplat)."""
 CHUNK = 128
-"""Number of list entries copied at once: with their lists, 40 kB for 3 channels."""
+"""Number of list entries copied at once; with their lists, they take 40 kB for 3 channels."""
 _CUT = np.float32(np.log2(MIN_ALPHA))
 _TOP = np.float32(MAX_ALPHA)
 _STOP = np.float32(MIN_TRANSMITTANCE)
@@ -58,7 +58,7 @@ BLOCKS = 16
 LANES = 16
 PIXELS = BLOCKS * LANES
 RECORD = 8
-"""Numbers per copied Gaussian: mean x and y from the tile's corner, a, b, c, log2 of the peak alpha."""
+"""Numbers per copied Gaussian: mean x and y from the tile's corner, a, b, c, log2 of peak alpha, 2 spare."""
 GROUP = 4
 """Number of channels that are summed together in registers."""
 
@@ -81,7 +81,7 @@ def start_tile(tile, tiles_x, height, width, transmittance):
 
 @compiled(inline="always")
 def unfinished(transmittance):
-    """Return a bit for each unfinished block."""
+    """Return a bit for each block with an unfinished pixel."""
     bits = 0
     for block in range(BLOCKS):
         if any_ge(load(transmittance, block * LANES), lanes(_STOP)):
@@ -113,7 +113,7 @@ def _exponent(records, at, px, py):
 
 @compiled(inline="always")
 def _shine(exponent, light):
-    """Return a Gaussian's unclipped alpha, alpha, weight at transmittance `light`, and remaining light."""
+    """Return a Gaussian's unclipped alpha, alpha, weight and remaining light at transmittance `light`."""
     uncut = exp2_negative(exponent)
     alpha = keep_ge(exponent, lanes(_CUT), smaller(uncut, lanes(_TOP)))
     weight = light * alpha
@@ -127,7 +127,7 @@ def weigh(block, first, count, reach, records, shades, width, transmittance, ent
 
     Args:
         first, count: entries of the chunk in the band.
-        shades: channels; those of Gaussian k start at k * width.
+        shades: channel values; those of Gaussian k start at k * width.
         entries, weights: outputs: each Gaussian's position in the chunk, and its 16 weights.
 
     Returns:
@@ -162,7 +162,7 @@ def weigh(block, first, count, reach, records, shades, width, transmittance, ent
 
 @compiled(inline="always")
 def _add_group(sums, at, one, two, three, four):
-    """Add to the sums of 4 channels."""
+    """Add one vector to the sums of each of 4 channels."""
     store(sums, at, load(sums, at) + one)
     store(sums, at + LANES, load(sums, at + LANES) + two)
     store(sums, at + 2 * LANES, load(sums, at + 2 * LANES) + three)
@@ -268,8 +268,8 @@ def blend_backward(
 ):
     """Compute the gradient of `blend`, in one slot of `columns` numbers per list entry.
 
-    A slot contains the moments of v = alpha dL/dalpha (see MOMENTS), then dL/dcolour per channel; slots
-    behind finished pixels are zero. `pixels` contains image and alpha, and the gradients of both.
+    A slot contains the moments of v = alpha dL/dalpha (see MOMENTS), then dL/dcolour per channel. Slots of
+    Gaussians behind finished pixels are zero. `pixels` contains image and alpha, and the gradients of both.
     """
     image, alpha, grad_image, grad_alpha = pixels
     height, width, channels = image.shape
@@ -314,7 +314,7 @@ def blend_backward(
                         alive ^= 1 << block
                     at = block * stride
                     shade = load(grads, at)
-                    if channels == 3:  # colour sums in registers: 20 % faster
+                    if channels == 3:  # keeping the colour sums in registers is 20 % faster
                         by_red = load(grads, at + LANES)
                         by_green = load(grads, at + 2 * LANES)
                         by_blue = load(grads, at + 3 * LANES)
@@ -354,7 +354,7 @@ def blend_backward(
 def add_slots(begin, end, tiles, base, tile_start, tile_end, gaussian, slots, columns, sums):
     """Add the slots of Gaussians begin..end to their sums, in the order of the entries.
 
-    Rows of sums are whole vectors; numbers beyond `columns` have no meaning.
+    Rows of `sums` are padded to whole vectors; numbers beyond `columns` have no meaning.
     """
     flat_sums, width = sums.reshape(-1), sums.shape[1]
     for tile in range(tiles[0], tiles[1]):
@@ -431,7 +431,7 @@ def sparse_rows(
 
 @compiled(inline="always")
 def _rank(held, first, size, rank):
-    """Count, for each entry of a row, the smaller columns; as floats, the columns' bits keep their order."""
+    """Count the smaller columns for each entry of a row; bits read as floats keep the order of columns."""
     for begin in range(0, size, LANES):
         own, smaller = load(held, first + begin), lanes(_ZERO)
         for k in range(first, first + size):

@@ -28,7 +28,7 @@ RANGES_PER_THREAD = 4
 def over_ranges(
     work: Callable[..., Any], count: int, threads: int, *arguments: Any, first: int = 0
 ) -> list[Any]:
-    """Call `work(begin, end, *arguments)` for ranges that cover `count` items from `first`, on threads."""
+    """Call `work(begin, end, *arguments)` on threads, for ranges that cover `count` items from `first`."""
     pieces = min(count, RANGES_PER_THREAD * threads) if threads > 1 and count > 1 else 1
     edges = first + np.linspace(0, count, pieces + 1).astype(int)
     return over_edges(work, edges.tolist(), threads, *arguments)
@@ -36,7 +36,7 @@ def over_ranges(
 
 @dataclass(frozen=True)
 class Projected:
-    """Gaussians of a view, ready to blend.
+    """Gaussians projected into a view, ready to blend.
 
     Attributes:
         camera: output of `pack_camera`.
@@ -77,7 +77,7 @@ class Drawn:
     Attributes:
         image: premultiplied RGB, then features, without background.
         alpha: coverage.
-        drawn: whether a Gaussian reaches a pixel of the view.
+        drawn: whether each Gaussian reaches a pixel of the view.
         gradients: function that maps gradients of image and alpha to gradients of the parameters.
     """
 
@@ -91,7 +91,7 @@ def refuse_broken(broken: int, total: int) -> None:
     """Raise HilsplatError if any Gaussian cannot be drawn."""
     if broken:
         raise HilsplatError(
-            f"{broken} of {total} Gaussians cannot be drawn: not finite, or a zero quaternion",
+            f"{broken} of {total} Gaussians cannot be drawn: non-finite parameters or a zero quaternion",
             expected="finite means, log_scales, quats, opacity_logits and sh",
             fix="drop these Gaussians, or rerun the gaussians stage",
         )
@@ -125,7 +125,7 @@ class Band:
     lists: tuple[Any, ...]  # base, tiles_x, tile_start, tile_end, gaussian, reach (a bit per block)
 
     def over_tiles(self, work: Callable[..., Any], threads: int, *arguments: Any) -> None:
-        """Call `work(begin, end, *lists, *arguments)` over ranges that cover the band's tiles, on threads."""
+        """Call `work(begin, end, *lists, *arguments)` on threads, for ranges that cover the band's tiles."""
         over_ranges(work, self.end - self.begin, threads, *self.lists, *arguments, first=self.begin)
 
 

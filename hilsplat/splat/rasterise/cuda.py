@@ -1,4 +1,4 @@
-"""CUDA backend: gsplat (extra `gpu`) with the functions and conventions of the CPU backend.
+"""CUDA backend: gsplat (extra `gpu`) with the same functions and conventions as the CPU backend.
 
 Tests run this backend on the CPU with gsplat's reference implementation in torch, and on a GPU if present.
 CUDA sums are atomic, so gradients are reproducible only up to rounding.
@@ -21,7 +21,7 @@ from hilsplat.splat.rasterise.cpu import Drawn, Gradients, refuse_broken, weight
 from hilsplat.splat.rasterise.project import LOW_PASS_PX2, NEAR
 
 DEVICE = "cuda"
-"""Tests set this to `cpu`, with gsplat's reference implementation in torch."""
+"""Tests set this to `cpu` and use gsplat's reference implementation in torch."""
 
 TILE = 16
 """Side of a gsplat tile, px."""
@@ -30,7 +30,7 @@ EVERYTHING = 2**31 - 1
 
 
 def on_device(gaussians: Gaussians) -> dict[str, Tensor]:
-    """Copy the fields of Gaussians to the device; raise an error if any cannot be drawn (`refuse_broken`)."""
+    """Copy the fields of Gaussians to the device; raise an error if one cannot be drawn (`refuse_broken`)."""
     g = {name: torch.from_numpy(getattr(gaussians, name)).to(DEVICE) for name in FIELDS}
     broken = (g["quats"] == 0).all(dim=1)
     for values in g.values():

@@ -1,4 +1,4 @@
-"""Choice of the rendering backend: ours on the CPU, or gsplat on CUDA."""
+"""Choice of the rendering backend: our own on the CPU, or gsplat on CUDA."""
 
 import ctypes
 import logging
@@ -47,7 +47,7 @@ def choose_device(requested: Literal["auto", "cpu", "cuda"]) -> Device:
     """Return the device that a setting selects on this machine, and log it the first time.
 
     `auto` uses CUDA if torch finds a device, gsplat can be imported, and a self-test agrees with the CPU.
-    If gsplat or a driver is missing, or for `cpu`, torch isn't imported (1.3 to 3 s).
+    For `cpu`, or if gsplat or a driver is missing, torch is not imported, which would take 1.3 to 3 s.
 
     Raises:
         DeviceError: if `cuda` was requested and cannot be used. There is no fallback.

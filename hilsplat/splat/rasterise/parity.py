@@ -1,4 +1,4 @@
-"""Self-test that the CUDA backend draws the same as the CPU backend; its result is cached per machine."""
+"""Self-test that compares the CUDA backend with the CPU backend; its result is cached per machine."""
 
 import numpy as np
 import platformdirs
@@ -52,7 +52,7 @@ def disagreement(one: Device, other: Device) -> str | None:
     for name in FIELDS:
         first, second = (getattr(each, name) for each in grads)
         errors.append(np.linalg.norm(first - second) / np.maximum(np.linalg.norm(first), 1e-12))
-    apart["gradients"] = float(np.max(errors))  # NaN if any is
+    apart["gradients"] = float(np.max(errors))  # NaN if any error is NaN
     wrong = [
         f"{what} by {apart[what]:.2g}" for what, most in MAX_DIFFERENCES.items() if not apart[what] <= most
     ]

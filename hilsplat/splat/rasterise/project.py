@@ -42,7 +42,7 @@ MIN_ALPHA = 1.0 / 255.0
 MAX_LOG_SCALE = np.float32(20.0)
 """Scales are clipped at exp(20), 5e8 scene units; clipped scales get no gradient. A Gaussian that wide covers
 any view evenly along that axis; at exp(40) the columns of its pixel box would overflow 64-bit integers.
-The limit is float32: a float64 would make the scales' computation float64 and change its last bits."""
+The limit is float32, because a float64 limit would make the scales float64 and change their last bits."""
 _LEAST_LOG = np.float32(-60.0)
 LOG2_E, LN_2 = 1.4426950408889634, 0.6931471805599453
 LOG2_MIN_ALPHA = math.log2(MIN_ALPHA)
@@ -161,7 +161,7 @@ def _read(table, width, first, count, rows, columns, column):
 
 @compiled(inline="always")
 def _write(columns, column, width, rows, table, first, count, last):
-    """Invert `_read`, for rows below `last`.
+    """Transpose columns back to rows of a table, for rows below `last` (see `_read`).
 
     The last block of a row overlaps the next row, whose first block is written after it.
     """
@@ -234,7 +234,7 @@ def _clamped(value, low, high):
 
 @compiled
 def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, camera, geometry, box, colours):
-    """Project Gaussians of groups begin..end of 16 into a view.
+    """Project groups begin..end of 16 Gaussians into a view.
 
     Writes for each Gaussian: geometry (see GEOMETRY); box, the first and last pixel column and the first and
     last pixel row where alpha can reach MIN_ALPHA (last < first: not drawn); colours.
