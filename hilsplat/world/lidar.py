@@ -1,4 +1,4 @@
-"""Simulated scan of a synthetic street by a spinning laser scanner on the car's roof; lengths are metres.
+"""Simulated scan of a synthetic street by a spinning laser scanner on the car's roof; lengths are in metres.
 
 The scanner simulates Waymo's top lidar: 64 beams between 17.6 degrees below and 2.4 above the horizon.
 Rays are cast exactly; then noise is added to each range, and some returns are dropped. As in a logged drive,
@@ -32,14 +32,14 @@ GLANCING_COSINE = 0.03
 
 @dataclass(frozen=True, eq=False)
 class LidarScan:
-    """P measured points and the nodes that were hit.
+    """P measured points and the nodes that they belong to.
 
     Attributes:
         points: positions in the frame of the ground-truth cameras, with noise, metres.
         node_ids: whole, part and subpart of each point; -1 for none.
         pose_index: row in `origins` of the position from which each point was measured.
         range_m: measured distance to that position.
-        beam: number of the beam, 0 to 63 from the lowest.
+        beam: number of the beam, from 0 (lowest) to 63.
         origins: positions of the scanner.
     """
 
@@ -62,9 +62,9 @@ def beam_directions() -> Float[np.ndarray, "R 3"]:
 
 
 def scan_street(scene: WorldScene, camera_centres: Float[np.ndarray, "V 3"]) -> LidarScan:
-    """Scan a street from above evenly spaced camera centres; the centres are in the order of the drive.
+    """Scan a street from points above evenly spaced camera centres, which are given in driving order.
 
-    The scene's seed also determines noise and losses. The sky yields no returns.
+    The scene's seed also determines the noise and the dropped returns. The sky yields no returns.
     """
     rng = np.random.default_rng([scene.seed, 31])
     chosen = np.unique(np.linspace(0, len(camera_centres) - 1, POSES).round().astype(int))

@@ -137,7 +137,7 @@ class Paint:
         return self._changed(lambda value: value + (factor - 1) * (0.95 - value))
 
     def recoloured(self, word: str) -> "Paint":
-        """Return the same texture in another colour; a shade of this colour becomes the second colour."""
+        """Return the same texture in a different colour; a shade of that colour becomes the second colour."""
         first = np.array(COLOURS[word])
         second = _relative(first)
         return replace(self, colour=word, first=tuple(first.tolist()), second=tuple(second.tolist()))
@@ -194,7 +194,7 @@ _LAB = lab_from_srgb(np.array(list(COLOURS.values())))
 
 
 def colour_word(colour: Float[np.ndarray, " 3"]) -> str:
-    """Return the word of the listed colour that is nearest to an sRGB colour in L*a*b*.
+    """Return the word for the listed colour that is nearest to an sRGB colour in L*a*b*.
 
     Example:
         >>> colour_word(np.array([0.9, 0.1, 0.1]))
@@ -232,7 +232,7 @@ class PaintBox:
         Args:
             spec: one of `GROUPS`, then the colour words to choose from, as in "plain red blue"; without
                 words, any unused colour is chosen.
-            scale: factor on the pattern's cells per unit.
+            scale: factor by which to multiply the pattern's cells per unit.
         """
         rng = self._rng
         group, *colours = spec.split()
@@ -265,7 +265,7 @@ class PaintBox:
     def _patterned(self, paint: Paint) -> Paint:
         """Return the paint with a visible second colour that does not change its colour word.
 
-        Otherwise texts would be wrong, such as "red mug" for a mug that looks brown from a distance.
+        Otherwise, queries such as "red mug" would be wrong for a mug that looks brown from a distance.
         """
         first = np.array(paint.first)
         for word in self._rng.permutation(list(COLOURS)):

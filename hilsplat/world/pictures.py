@@ -64,7 +64,7 @@ def draw_classes(out: Path, names: Sequence[str] = TABLETOP) -> None:
 
 
 def _alone(model: ObjectModel) -> tuple[WorldScene, Camera]:
-    """Return a scene with one object on plain ground, and a camera whose view is filled by the object."""
+    """Return a scene with one object on plain ground, and a camera whose view the object fills."""
     centre, radius = footprint_of(model.triangles)
     height = float(model.triangles[..., 2].max())
     scale = min(RADIUS / radius, 2.7 * RADIUS / height)
@@ -99,7 +99,7 @@ def draw_scenes(kind: str, seeds: Sequence[int], out: Path) -> None:
         camera = cameras[cameras.names[(17 + 6 * index) % len(cameras)]]
         labels, colours = label_view(scene, camera), node_colours(len(scene.nodes))
         for shade, node in enumerate(sorted(scene.background)):
-            colours[node] = 60 + 18 * shade  # grey because it is never scored
+            colours[node] = 60 + 18 * shade  # grey, because the background is never scored
         panels = [render_view(scene, camera, 3)]
         nearest = labels[0]  # the node at the level, or at the next coarser level that has one
         for level in LEVELS:
@@ -143,9 +143,9 @@ def _write(figure: "Figure", out: Path) -> None:
 
 
 def show_world(world_folder: Path, out: Path) -> None:
-    """Draw views of a finished world stage with labels by level, and the tree of texts, as a PNG.
+    """Draw views of a finished world stage with labels by level, and the tree of nodes, as a PNG.
 
-    Each text is marked with the colour of its region; texts annotated in no view are in brackets.
+    Each node is marked with the colour of its region; nodes that are not scored in any view are in brackets.
 
     Raises:
         ArtifactError: if the folder is missing or incomplete.

@@ -44,7 +44,7 @@ class Hits:
         triangle: row of the triangle; -1 if a ray hits nothing.
         u: weight of the triangle's second corner at the hit.
         v: weight of the triangle's third corner at the hit.
-        distance: distance from the origin, in lengths of the direction; inf if a ray hits nothing.
+        distance: distance from the origin, in multiples of the direction's length; inf without a hit.
     """
 
     triangle: Int32[np.ndarray, " R"]
@@ -95,7 +95,7 @@ class RayCaster:
         directions: Float32[np.ndarray, "R 3"],
         reach: Float32[np.ndarray, " R"],
     ) -> Bool[np.ndarray, " R"]:
-        """Return whether each ray hits something within its reach, given in lengths of its direction."""
+        """Return whether each ray hits something within `reach`, a multiple of its direction's length."""
         found = np.empty(len(directions), np.bool_)
         _blocked(self._scene, *_rows(origins, directions), reach, found)
         return found

@@ -37,7 +37,7 @@ def label_view(scene: WorldScene, camera: Camera) -> Int32[np.ndarray, "3 H W"]:
 
 
 def render_view(scene: WorldScene, camera: Camera, samples: int) -> UInt8[np.ndarray, "H W 3"]:
-    """Render a view with soft shadows, occluded sky light, highlights and solid textures.
+    """Render a view with soft shadows, ambient occlusion, highlights and solid textures.
 
     Args:
         samples: sub-samples per pixel side; use 3 for clean edges, 1 for previews.
@@ -201,7 +201,7 @@ def _surfaces(prim, u, v, directions, mesh, surface):
 
 @compiled
 def _to_light(points, facets, shading, i, light):
-    """Return the light's direction and distance at point i, and its cosine, 0 if it is behind."""
+    """Return the light's direction and distance from point i, and the cosine of incidence (0 from behind)."""
     lx, ly, lz = light[0] - points[i, 0], light[1] - points[i, 1], light[2] - points[i, 2]
     distance = math.sqrt(lx * lx + ly * ly + lz * lz)
     lx, ly, lz = lx / distance, ly / distance, lz / distance
@@ -249,7 +249,7 @@ def _light_rays(
     strata = per_pixel * rays_each
     for n, i in enumerate(rows):
         stratum = (i % per_pixel) * rays_each + ray
-        # A sunflower arrangement has equal areas and all directions, for any number of strata.
+        # A sunflower arrangement has strata of equal area in all directions, for any number of strata.
         radius = light[3] * math.sqrt((stratum + 0.15 + 0.7 * _cell(points, i, cells, 301)) / strata)
         angle = 2.399963 * stratum + 0.9 * (_cell(points, i, cells, 302) - 0.5)
         for c in range(3):

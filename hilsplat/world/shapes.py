@@ -90,7 +90,7 @@ def box(size: Point, centre: Point = (0.0, 0.0, 0.0), bevel: Number = 0.0) -> Me
 
     Args:
         size: lengths along x, y, z.
-        bevel: length cut off each edge; the box has 12 triangles at 0, otherwise 44.
+        bevel: length cut off each edge; a box without a bevel has 12 triangles, otherwise 44.
     """
     half = np.asarray(size, dtype=np.float64) / 2
     bevel = float(min(bevel, 0.45 * 2 * half.min()))
@@ -137,7 +137,7 @@ def lathe(profile: Sequence[tuple[Number, Number]], segments: int = 28) -> Mesh:
     """Return a surface of revolution about z.
 
     Args:
-        profile: distinct (radius, z) from bottom to top along the outside, so that normals point outwards.
+        profile: distinct (radius, z) points from bottom to top of the outside; normals then point outwards.
         segments: number of facets around the axis.
     """
     points = np.asarray(profile, dtype=np.float64)
@@ -195,7 +195,7 @@ def sweep(
 
     Args:
         path: points of the centre line.
-        radius: radius of the tube: one for all points, or one per point.
+        radius: radius of the tube, either one for all points or one per point.
         segments: number of facets around the tube.
     """
     points = np.asarray(path, dtype=np.float64)

@@ -47,7 +47,7 @@ def parse_source(source: str) -> tuple[str, int]:
         raise SceneError(
             f"source {source!r} is a scene that the small models were trained on",
             expected=f"a seed outside {TRAINING_SEEDS.start} to {TRAINING_SEEDS.stop - 1}",
-            fix="use a seed from 200 to 299 for reported scenes, or from 100 to 199 for trials",
+            fix="use a seed from 200 to 299 for reported results, or from 100 to 199 for development",
         )
     return words[1], seed
 
@@ -62,7 +62,7 @@ def run_world(source: str, settings: WorldSettings, out: Path, threads: int) -> 
 
     Raises:
         SceneError: if the source does not name a scene.
-        DiskSpaceError: if the disk is too full.
+        DiskSpaceError: if there is not enough disk space.
     """
     kind, seed = parse_source(source)
     out = Path(out)

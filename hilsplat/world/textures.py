@@ -107,7 +107,7 @@ def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
         x: first coordinate, in pattern cells (y and z correspondingly).
 
     Returns:
-        Share of the second colour in [0, 1], and a factor on brightness.
+        Share of the second colour in [0, 1], and a brightness factor.
     """
     if kind == 1:  # stripes, slightly wavy
         bend = 0.35 * value_noise(0.5 * x, 0.5 * y, 0.5 * z, 11)
@@ -165,9 +165,9 @@ def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
     return mottle, 0.95 + 0.1 * value_noise(4 * x, 4 * y, 4 * z, 7)
 
 
-@compiled(error_model="numpy")  # a loop that may raise is not vectorised
+@compiled(error_model="numpy")  # loops that may raise an exception are not vectorised
 def grains(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Return `fractal_noise(16 x, 16 y, 16 z, 4, 201)` of many points, vectorised and bit-identical.
+    """Compute `fractal_noise(16 x, 16 y, 16 z, 4, 201)` for many points, vectorised but bit-identical.
 
     Grain sizes range from 0.06 to 0.008 scene units; the finest grain is about one pixel of a 256 px view.
     """

@@ -19,14 +19,14 @@ from hilsplat.world.rays import RayCaster
 from hilsplat.world.scenes.scene import WorldScene
 
 MIN_SUBPART_AREA = 100 / 384**2
-"""Minimum visible area of a scored subpart, as a fraction of the view: 100 px of 384 x 384."""
+"""Minimum visible area of a scored subpart, as a fraction of the view: 100 of 384 x 384 px."""
 
 HIDDEN_BY = 2e-3
 """A point is hidden if a surface is nearer to the camera by at least this fraction of the distance."""
 
 
 def smallest_areas(image_px: int, min_area_px: int) -> dict[Level, float | int]:
-    """Return the minimum area of an annotated text in a view, per level, px."""
+    """Return the minimum area, in px, of an annotated query in a view, by level."""
     smallest_subpart = MIN_SUBPART_AREA * image_px**2
     return {Level.WHOLE: min_area_px, Level.PART: min_area_px, Level.SUBPART: smallest_subpart}
 
@@ -46,7 +46,7 @@ def annotated_nodes(
     Args:
         labels: node id per level and pixel, -1 for none.
         background: ids that are never scored (table, floor, walls).
-        smallest: minimum area of a scored text per level, px.
+        smallest: minimum area of a scored query by level, px.
     """
     kept: list[int] = []
     for level in LEVELS:
@@ -64,7 +64,7 @@ def annotated_nodes(
 
 
 def write_mesh(path: Path, scene: WorldScene, cameras: Cameras, longest_edge: float | None = None) -> None:
-    """Write the scene as binary PLY, with node ids of faces and vertices.
+    """Write the scene as a binary PLY with the node ids of faces and vertices.
 
     Vertices have x, y, z, the ids `whole`, `part` and `subpart` (-1: none) and `views`, the number of cameras
     in which they are visible (at most 255). Faces have the same three ids. Corners at one position share a
@@ -102,7 +102,7 @@ def write_mesh(path: Path, scene: WorldScene, cameras: Cameras, longest_edge: fl
 def unique_rows(
     rows: Float32[np.ndarray, "N C"],
 ) -> tuple[Float32[np.ndarray, "U C"], Int64[np.ndarray, " N"]]:
-    """Return `np.unique(rows, axis=0, return_inverse=True)` in a quarter of the time, sorting by column."""
+    """Return `np.unique(rows, axis=0, return_inverse=True)` in a quarter of the time, from `np.lexsort`."""
     order = np.lexsort(rows.T[::-1])
     ordered = rows[order]
     is_new = np.append(True, (ordered[1:] != ordered[:-1]).any(axis=1))
@@ -141,7 +141,7 @@ def refined(
     Whether an edge is halved depends only on its two ends, so no cracks open between adjacent triangles.
 
     Returns:
-        The smaller triangles, and the row in `triangles` that contains each of them.
+        The smaller triangles and, for each, the row in `triangles` that contains it.
     """
     owner = np.arange(len(triangles))
     done, done_owner = [], []
@@ -154,7 +154,7 @@ def refined(
         pieces, owners = [], []
         for number in (1, 2, 3):
             rows = np.flatnonzero(count == number)
-            # Rotate the corners so that the long edges come first: 0; 0 and 1; all.
+            # Rotate the corners so that the long edges come first: edge 0, edges 0 and 1, or all edges.
             first = long[rows].argmax(axis=1) if number == 1 else (long[rows].argmin(axis=1) + 1) % 3
             order = (first[:, None] + np.arange(3)) % 3
             a, b, c = (triangles[rows, order[:, k]] for k in range(3))
@@ -188,7 +188,7 @@ class TrueMesh:
             raise ArtifactError(f"{path} is missing", fix="run the world stage") from error
         except (PlyParseError, KeyError, ValueError) as error:
             raise ArtifactError(
-                f"{path} cannot be read: {error}", fix="delete the truth folder and run the world stage again"
+                f"{path} cannot be read: {error}", fix="delete the truth folder and rerun the world stage"
             ) from error
         corners = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float32)
         return TrueMesh(corners[faces])

@@ -1,9 +1,9 @@
 """The diagnostic segmenter `truth-perturbed`: masks from a synthetic scene's ground truth, with faults.
 
 It separates errors of the method from errors of the small segmenter. It is the only code before `evaluate`
-that reads annotations, and it is never a default: the rule and the command pass the truth folder only if the
-settings request it, the index records the faults, and every row based on such masks has `SEGMENTER` in its
-masks column.
+that reads annotations, and it is never a default. The rule and the command pass the truth folder only if the
+settings request it. The index records the faults, and every table row based on such masks has `SEGMENTER` in
+its masks column.
 
 Every decision about a fault uses a random number derived from a name (seed, scene, kind of fault, view,
 node), so it depends neither on the order of views nor on other kinds of faults. A higher probability keeps
@@ -76,7 +76,7 @@ def run_truth_masks(
     draws = Draws(settings.seed, scene.name)
     label = faults_label(settings)
     with stage_log("masks", scene.name) as counts:
-        logger.warning("%s: masks from the ground truth (%s): for diagnosis, not results", scene.name, label)
+        logger.warning("%s: masks from ground truth (%s): for diagnosis, not for results", scene.name, label)
 
         def segment(view: str) -> tuple[HierarchicalMasks, dict[str, int]]:
             labels = true_labels(annotations, view)
@@ -136,7 +136,7 @@ class Draws:
         return np.random.default_rng(int(digest[:32], 16))
 
     def chance(self, *name: str | int) -> float:
-        """Return a number in [0, 1) derived from a name; events of probability p occur if it is below p."""
+        """Return a number in [0, 1) derived from a name; events with probability p occur if it is below p."""
         return int(sha256_of_json([self.seed, self.scene, *name])[:13], 16) / 16**13
 
 
@@ -161,7 +161,7 @@ class TrueNodes:
         background: Collection[int],
         labels: Iterable[Int32[np.ndarray, "3 H W"]],
     ) -> "TrueNodes":
-        """Measure the borders in all views; `labels` has one image of node ids per view, -1 for none."""
+        """Measure the borders in all views; `labels` contains one node-id image per view (-1: none)."""
         total: Borders = defaultdict(Counter)
         alone = TrueNodes(nodes, frozenset(background), {})
         for view in labels:
@@ -228,7 +228,7 @@ def systematic(fault: str, node: int, view: str, draws: Draws, settings: Perturb
 def cut_in_two(
     mask: Bool[np.ndarray, "H W"], generator: np.random.Generator
 ) -> tuple[Bool[np.ndarray, "H W"], ...]:
-    """Cut a mask along a line that leaves 30 to 70 % on either side; a mask too small to cut is unchanged."""
+    """Cut a mask along a line that leaves 30 to 70 % on each side; a mask too small to cut is unchanged."""
     angle, share = generator.uniform(0, np.pi), generator.uniform(0.3, 0.7)
     y, x = np.nonzero(mask)
     along = x * np.cos(angle) + y * np.sin(angle)
@@ -248,8 +248,8 @@ def displaced(
 ) -> Bool[np.ndarray, "H W"]:
     """Move a mask's boundary along its normal by a smooth random amount.
 
-    A pixel is inside the new mask if its signed distance to the boundary (positive inside, half a pixel next
-    to it) exceeds `amplitude_px` times a random field of unit variance. The field is a sum of plane waves, so
+    A pixel is inside the new mask if its signed distance to the boundary (positive inside, 0.5 at the nearest
+    pixel) exceeds `amplitude_px` times a random field of unit variance. The field is a sum of plane waves, so
     it depends only on the position: with the same generator, a larger amplitude changes all pixels that a
     smaller amplitude changes, and more.
 
@@ -285,12 +285,12 @@ def displaced(
 
 
 def _distance(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Return the distance of inside pixels to the nearest outside pixel, between centres, px; 0 outside."""
+    """Return each inside pixel's distance to the nearest outside pixel (between centres, px); 0 outside."""
     return cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
 
 
 def beside(level: Level, up: bool) -> Level:
-    """Return an adjacent level; `up` selects whole instead of subpart for a part."""
+    """Return an adjacent level; for a part, `up` selects whole instead of subpart."""
     if level is not Level.PART:
         return Level.PART
     return Level.WHOLE if up else Level.SUBPART
@@ -307,7 +307,7 @@ def faulty_masks(
     """Return one view's true regions as masks, with faults applied in this order.
 
     1. Merges: a group of nodes becomes one mask (`merged_groups`).
-    2. Missing masks: a group is dropped by its lowest node's draw, or by any node's systematic fault.
+    2. Missing masks: a group is dropped by its lowest node's random number or any node's systematic fault.
     3. Splits (`cut_in_two`), then boundaries (`displaced`). Each mask is changed separately, so masks may
        then overlap or leave gaps.
     4. Wrong levels: whole becomes part, subpart becomes part, part becomes either.
@@ -319,7 +319,7 @@ def faulty_masks(
 
     Args:
         labels: node id per level and pixel, -1 for none.
-        min_area_px: minimum area of a true region with a mask.
+        min_area_px: minimum area of a true region that becomes a mask.
 
     Returns:
         The masks in `content_order`, and the number of faults of each kind.

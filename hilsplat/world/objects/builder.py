@@ -211,7 +211,7 @@ class Builder:
         return [(row, mesh, repaint.get((row, paint), paint)) for row, mesh, paint in self.pieces]
 
     def _described(self, node: Node, area: dict[Paint, float]) -> ModelNode:
-        """Return a node with its texts: canonical name, then aliases, relations and attributes."""
+        """Return a node with its queries: the canonical name, then aliases, relations and attributes."""
         whole = self.nodes[0]
         text, others = whole.word, list(whole.aliases)
         if node.level > 1:
@@ -244,10 +244,10 @@ def _touch(first: np.ndarray, second: np.ndarray, reach: float) -> bool:
 
 
 def _distinct(paint: Paint, rivals: list[tuple[Paint, float]]) -> Paint:
-    """Return the least changed version of a paint that has the minimum distance to every rival."""
+    """Return the least changed version of a paint that keeps the minimum distance to every rival."""
 
     def short(candidate: Paint) -> float:
-        """Return the largest shortfall in a candidate's distance to a rival; 0 without a shortfall."""
+        """Return the largest shortfall in a candidate's distance to a rival, or 0 if there is none."""
         return max([0.0, *(minimum - difference(candidate, rival) for rival, minimum in rivals)])
 
     shades = [paint if factor == 1 else paint.shaded(factor) for factor in _SHADES]

@@ -9,8 +9,8 @@ from hilsplat.world.objects import belongings, furniture, household, kitchen, st
 from hilsplat.world.objects.builder import Builder, ObjectModel
 
 GENERATOR_VERSION = 2
-"""Incremented whenever a seed yields a different scene or different texts; small models must be trained with
-the same version."""
+"""Incremented whenever a seed yields a different scene or different queries; small models must be trained
+with the same version."""
 
 CLASSES: dict[str, dict[str, tuple[str, Callable[[Builder], None]]]] = {
     "tabletop": {  # objects of about the same size

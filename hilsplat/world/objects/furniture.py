@@ -23,7 +23,7 @@ from hilsplat.world.shapes import (
 
 
 def _legs(b: Builder, x: float, y: float, top: float, paints: list[Paint], width: float) -> None:
-    """Add four square legs at (+-x, +-y), each with a foot; `paints` are those of leg and foot."""
+    """Add four square legs at (+-x, +-y), each with a foot; `paints` contains the paints of leg and foot."""
     foot_height = max(0.05, 0.22 * top)
     shape = box((width, width, top - foot_height), (0, 0, (top + foot_height) / 2), 0.008)
     foot = box((width * 1.3, width * 1.3, foot_height), (0, 0, foot_height / 2), 0.01)

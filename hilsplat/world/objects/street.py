@@ -1,4 +1,4 @@
-"""Full-size street objects and their paints. Lengths are metres; fronts face +x; the base is at z = 0."""
+"""Full-size street objects and their paints. Lengths are in metres; fronts face +x; the base is at z = 0."""
 
 from dataclasses import replace
 
@@ -32,13 +32,13 @@ PASTELS = {
     "red": (0.72, 0.38, 0.32),
     "grey": (0.66, 0.66, 0.66),
 }
-"""sRGB of plastered walls by colour word."""
+"""sRGB values of plastered walls by colour word."""
 
 FOLIAGE = {
     "green": ((0.2, 0.46, 0.14), (0.42, 0.62, 0.22)),
     "orange": ((0.78, 0.42, 0.12), (0.88, 0.62, 0.22)),
 }
-"""sRGB of leaves in shade and in light, by colour word."""
+"""sRGB values of leaves in shade and in light, by colour word."""
 
 
 def _faded(colour: Colour, factor: float) -> Colour:
@@ -268,7 +268,7 @@ def building(b: Builder) -> None:
 
 
 def _awning(b: Builder, low: Node, front: float, y: float, pitch: float) -> None:
-    """Add a sloping cloth over a shop window."""
+    """Add a sloping cloth awning over a shop window."""
     node = low.subpart("awning, canopy")
     first = plain(b, "white")
     second = b.paint("plain red green blue orange")

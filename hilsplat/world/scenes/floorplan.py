@@ -95,7 +95,7 @@ class FloorPlan:
         clear: float,
         gap: float = WALL_GAP,
     ) -> tuple[float, Float[np.ndarray, " 2"]] | None:
-        """Occupy a random free place at a wall for an object that faces the room.
+        """Occupy a random free place against a wall for an object that faces the room.
 
         Args:
             size: depth, width and height of the object in its own frame, m.

@@ -18,7 +18,7 @@ class SceneKind(NamedTuple):
     Attributes:
         build: builds a scene from (seed, objects).
         sights: returns cameras and their field of view in degrees for (scene, views, arc_deg). The cameras
-            are jittered by the scene's seed, and close enough for structure from motion.
+            are jittered with the scene's seed, and close enough together for structure from motion.
         training_sight: draws a random training camera and its field of view for (scene, rng).
     """
 

@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 FURNITURE_SHARE = 0.65
 """Share of furniture among the requested objects; the others are small objects on furniture ("things")."""
 PATTERN_FACTOR = 2.0
-"""Factor on the pattern frequency of things, which are drawn about 0.5 m large and placed at half size."""
+"""Factor on the pattern frequency of things, which are modelled about 0.5 m large and placed at half size."""
 
 
 class Piece(NamedTuple):
@@ -50,10 +50,10 @@ LARGE: tuple[Piece, ...] = (
     Piece("refrigerator", 0.0, 0.4),
     Piece("cabinet", 0.45, 0.3),
 )
-"""Pieces placed at a wall, drawn in random order; no piece repeats before all have been drawn."""
+"""Pieces placed against a wall, in random order; no piece repeats before all have been used."""
 
 SUPPORTS = ("table", "desk", "cabinet", "nightstand", "counter", "tv stand")
-"""Furniture that can carry things, on the part or subpart "top"."""
+"""Furniture that can support things on its part or subpart "top"."""
 
 THING_SIZES: dict[str, tuple[float, float]] = {
     "mug": (0.15, 0.2), "kettle": (0.24, 0.3), "bottle": (0.3, 0.36), "cake": (0.22, 0.28),
@@ -67,7 +67,7 @@ MAX_THING_RADIUS = 0.21
 EDGE = 0.03
 """Minimum distance between things and the edge of their support, or the wall behind a counter, m."""
 MAX_FLAT = 0.05
-"""Maximum height above a board of a flat item that can itself carry things, m."""
+"""Maximum height of a flat item above its board for things to be placed on the item, m."""
 
 WALL_PALE, FLOOR_PALE, CEILING_PALE = 0.6, 0.4, 0.2
 """Shares of grey mixed into the colours of walls, floor and ceiling, so that objects stand out."""
@@ -120,7 +120,7 @@ class Support(NamedTuple):
     stand: list[tuple[np.ndarray, float]]
 
     def height_at(self, spot: np.ndarray, radius: float) -> float:
-        """Return the base height for a footprint: that of the board or the highest flat item below it."""
+        """Return the base height for a footprint: the board's, or that of the highest flat item below it."""
         reach = np.array([radius, radius])
         below = Space((*(spot - reach).tolist(), -1.0), (*(spot + reach).tolist(), 1e3))
         return max([self.top.high[2], *(space.high[2] for space in self.flat if space.meets(below, 0.0))])
@@ -146,7 +146,7 @@ def size_of(model: ObjectModel) -> Float[np.ndarray, " 3"]:
 
 
 def build_room(seed: int, objects: int) -> WorldScene:
-    """Build a room of about 4 x 5 m, in metres, with furniture at the walls and the floor at z = 0.
+    """Build a room of about 4 x 5 m, in metres, with furniture against the walls and the floor at z = 0.
 
     Every room has a door, a window with a curtain, and two pictures (or a picture and a mirror). About two
     thirds of `objects` are furniture; the others are things on furniture, or on the floor if no support is
@@ -196,11 +196,11 @@ def _add_fixtures(work: _Furnishing) -> None:
 
 
 def _furnish(work: _Furnishing, count: int) -> int:
-    """Place large pieces and partners at the walls, and a table in the middle; return the number placed."""
+    """Place pieces and partners against the walls, and a table in the middle; return the number placed."""
     done, failures = 0, 0
     queue: list[Piece] = []
     with_rug = count >= 4 and bool(work.rng.random() < 0.5)
-    # The table is placed last, in the remaining space; lamp and stool need a minimum number of pieces.
+    # The table is placed last, in the remaining space; lamp and stool are added after this many pieces.
     extras = [(5, "lamp"), (7, "stool")]
     table_at = count - 1 - with_rug if count >= 3 else count
     while done < count and failures < 2 * len(LARGE):
@@ -230,7 +230,7 @@ def _furnish(work: _Furnishing, count: int) -> int:
 
 
 def _put_at_wall(work: _Furnishing, piece: Piece, base_z: float = 0.0, gap: float = WALL_GAP) -> bool:
-    """Place a piece at a wall, and return whether it fits."""
+    """Place a piece against a wall, and return whether it fits."""
     model = work.assembly.draw(piece.name)
     size = size_of(model) + np.array([0, 0, piece.above])
     found = work.plan.wall_spot(work.rng, size, base_z, piece.clear, gap)
@@ -322,7 +322,7 @@ def _add_thing(work: _Furnishing, name: str) -> bool:
 
 
 def _thing_spot(work: _Furnishing, radius: float, height: float) -> tuple[np.ndarray, float] | None:
-    """Return a spot and base height on the emptiest support with free space, else on the floor at a wall."""
+    """Return a spot and base height on the emptiest support with free space, else on the floor by a wall."""
     for support in sorted(work.supports, key=lambda each: (len(each.stand), work.rng.random())):
         low = np.array(support.top.low[:2]) + radius + EDGE
         high = np.array(support.top.high[:2]) - radius - EDGE
@@ -413,7 +413,7 @@ def loop_sights(scene: WorldScene, views: int, arc_deg: float | int) -> tuple[li
 
 
 def training_sight(scene: WorldScene, rng: np.random.Generator) -> tuple[Sight, float]:
-    """Draw a training camera: a third are similar to those of `loop_sights`, the others near one object.
+    """Draw a training camera: a third resemble those of `loop_sights`; the others are close to one object.
 
     The position is inside the room and outside all objects.
     """

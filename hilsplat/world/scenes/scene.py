@@ -84,7 +84,7 @@ class WorldScene:
     """A scene as triangles with their nodes. z is up.
 
     Attributes:
-        seed: determines, with the number of objects, everything random in the scene.
+        seed: together with the number of objects, determines all random choices in the scene.
         asked: number of requested objects.
         triangles: corner positions, scene units.
         normals: shading normals at the corners.
@@ -94,7 +94,7 @@ class WorldScene:
         materials: shader parameters (`Paint.row`).
         nodes: all nodes by id. The surroundings (table, floor, wall) are wholes without parts.
         background: ids of the surroundings, which are labelled but never scored, because large, easy regions
-            would raise every mean.
+            would raise every mean score.
         style: light of this scene.
     """
 
@@ -136,9 +136,9 @@ class Assembly:
         self.background: list[int] = []
 
     def draw(self, name: str, kind: str | None = None) -> ObjectModel:
-        """Draw the next object; its class belongs to `kind`, or by default to this kind of scene.
+        """Draw the next object from the classes of a kind of scene, by default of this scene's kind.
 
-        The object's appearance depends on the seed and the number of objects drawn before.
+        The object's appearance depends on the seed and the number of objects drawn so far.
         """
         self.drawn += 1
         return build_object(kind or self.kind, name, np.random.default_rng([self.seed, 22, self.drawn]))

@@ -1,4 +1,4 @@
-"""Street scenes: a drive past houses, vehicles, people, trees and signs, as in Waymo. Lengths are metres.
+"""Street scenes: a drive past houses, vehicles, people, trees and signs, as in Waymo. Lengths are in metres.
 
 x points along the street, y to the left of a driver facing +x, and z up; the road is at z = 0.
 """
@@ -27,9 +27,9 @@ FURNITURE = (
 )  # fmt: skip
 """Objects added to every street if they fit."""
 STREET_X = (-26.0, 42.0)
-"""Extent of the rows of buildings, m; other buildings close both ends of the street."""
+"""Extent of the rows of buildings in x, m; additional buildings close both ends of the street."""
 THINGS_X = (-9.0, 25.0)
-"""Extent of vehicles, people and street furniture, m; all are in view during the drive."""
+"""Extent of vehicles, people and street furniture in x, m; all are in view during the drive."""
 GAP = 0.12
 TRIES = 200
 
@@ -220,7 +220,7 @@ def _add_buildings(street: _Street) -> int:
 def _add_ground(assembly: Assembly, rng: np.random.Generator) -> None:
     """Add the surroundings as wholes without parts.
 
-    The texts are those of the Waymo classes (road, lane marker, curb, sidewalk, other ground).
+    The queries are those of the Waymo classes (road, lane marker, curb, sidewalk, other ground).
     """
     middle, length = (ROAD_X[0] + ROAD_X[1]) / 2, ROAD_X[1] - ROAD_X[0]
     tar, pale = float(rng.uniform(0.34, 0.44)), rng.uniform(0.02, 0.06, 3)
@@ -290,7 +290,7 @@ def _markings() -> Mesh:
 
 
 def _dome(middle: float) -> Mesh:
-    """Return the sky: half an ellipsoid over the scene, so near that clouds show parallax."""
+    """Return the sky: half an ellipsoid over the scene, close enough for clouds to show parallax."""
     angle = np.linspace(-0.02, np.pi / 2, 15)
     profile = [(max(0.0, float(np.cos(a))), float(np.sin(a))) for a in angle]
     profile[-1] = (0.0, 1.0)

@@ -37,7 +37,7 @@ LAYOUTS = 25
 
 
 def build_tabletop(seed: int, objects: int) -> WorldScene:
-    """Build a scene of objects on a table whose top is z = 0.
+    """Build a scene of objects on a table whose top is at z = 0.
 
     The more objects are requested, the smaller they are. No class repeats before all have been used. Objects
     are placed at random without overlapping footprints; objects that do not fit are omitted.
@@ -201,7 +201,7 @@ def ring_sights(scene: WorldScene, views: int, arc_deg: float | int) -> tuple[li
 def training_sight(scene: WorldScene, rng: np.random.Generator) -> tuple[Sight, float]:
     """Draw a training camera that shows the whole table or, in half of the draws, one object."""
     azimuth, elevation, fov_deg = rng.uniform(0, 360), rng.uniform(16, 60), rng.uniform(42, 64)
-    nearer = np.tan(np.radians(FOV_DEG / 2)) / np.tan(np.radians(fov_deg / 2))  # keeps image sizes
+    nearer = np.tan(np.radians(FOV_DEG / 2)) / np.tan(np.radians(fov_deg / 2))  # keeps sizes in the image
     if scene.placed and rng.random() < 0.5:
         thing = scene.placed[int(rng.integers(len(scene.placed)))]
         target = np.array([*thing.centre_xy, thing.height * 0.45]) + rng.uniform(-0.08, 0.08, 3)
