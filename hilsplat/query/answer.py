@@ -1,4 +1,4 @@
-"""Query of a finished scene: a ranked list as text, and a picture."""
+"""Query a finished scene: report the ranked answers as text, and draw a picture."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -37,8 +37,8 @@ def answer(
 ) -> Iterator[str]:
     """Query a scene: yield the report, then write `panel.png` and `selection.ply` and yield their names.
 
-    The answer takes milliseconds; the picture takes one to two seconds, including imports and rendering.
-    Other arguments and errors are those of `LanguageScene.open` and `LanguageScene.query`.
+    The query takes milliseconds; the picture takes one to two seconds, including imports and rendering.
+    For other arguments and for errors, see `LanguageScene.open` and `LanguageScene.query`.
 
     Args:
         views: number of views in the panel; `view`, if given, is the first.
@@ -49,7 +49,7 @@ def answer(
     nodes = scene.select(text, level=level, answerer=answerer, view=view, threshold=threshold)
     hits = scene.hits_of(nodes, LISTED)
     label = masks_label(found.parts.masks)
-    note = f"; a diagnostic, masks made from the true labels: {label}" if made_from_truth(label) else ""
+    note = f"; diagnostic only, with masks made from true labels: {label}" if made_from_truth(label) else ""
     caution = scene.caution_about(text)
     yield "\n".join([report(scene, text, nodes, view) + note, *([caution] if caution else [])])
 
@@ -67,7 +67,7 @@ def answer(
 
 
 def views_of(scene: LanguageScene, hits: Sequence[Hit], count: int) -> list[str]:
-    """Return the views that show the best answers largest, then other views, evenly spaced over the scene."""
+    """Return the views in which the best answers are largest, then views spaced evenly over the scene."""
     best = [view for hit in hits for view in hit.best_views[:1]] + [v for hit in hits for v in hit.best_views]
     every = scene.scene.views()
     spread = [every[number * len(every) // count] for number in range(count)]
@@ -99,7 +99,7 @@ def report(scene: LanguageScene, text: str, found: NodeHits, view: str | None = 
         )
     if more := len(found.ids) - len(hits):
         lines.append(f"and {counted(more, 'weaker answer')}, also shown in the pictures")
-    lines.append('a score of 0.5 is no better than a generic word such as "object"')
+    lines.append('a score of 0.5 means that the query fits no better than a generic word such as "object"')
     if hits[0].route == "fallback":
         first = path_of(text)[0]
         lines.append(f"no answer is part of a match for {first!r}: the whole scene was searched instead")
@@ -109,7 +109,7 @@ def report(scene: LanguageScene, text: str, found: NodeHits, view: str | None = 
 def file_name(text: str) -> str:
     """Return a folder name for a query, such as `bear--nose`, that is valid on every system.
 
-    For a long text or one with other characters, the name ends in part of the text's digest, to be unique.
+    If the text is long or contains other characters, part of its digest makes the name unique.
     """
     parts = [part.split() for part in text.split(PATH_SEPARATOR)]
     if all(parts) and all(re.fullmatch(r"[\w.]*\w", word) for part in parts for word in part):

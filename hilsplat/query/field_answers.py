@@ -58,8 +58,8 @@ class FieldScene(SceneViews):
         Pixels that show mostly Gaussians without a latent at the level get the other pixels' lowest value.
 
         Args:
-            exact: if true, a network decodes every pixel at every call; otherwise it decodes a view once, and
-                results differ by at most 2e-3 (see `LatentRelevancy`). Has no effect for a linear code.
+            exact: whether a network decodes every pixel at every call. If not, it decodes each view once, and
+                results differ by at most 2e-3 (see `LatentRelevancy`). This has no effect for a linear code.
         """
         answer = self._latent_relevancy
         shown, vectors = self.latents(view), self.text_vectors(texts)
@@ -82,7 +82,7 @@ class FieldScene(SceneViews):
     ) -> Float32[np.ndarray, "T 3 P"]:
         """Return the cosines of texts with pixels' rendered and decoded latents, at each level.
 
-        Pixels (row * width + column) that show mostly Gaussians without a latent have -inf.
+        Pixels (row * width + column) that show mostly Gaussians without a latent get -inf.
         """
         vectors = self.text_vectors(texts)
         found = np.full((len(texts), len(LEVELS), len(pixels)), -np.inf, np.float32)
@@ -95,7 +95,7 @@ class FieldScene(SceneViews):
         return found
 
     def gaussian_relevancy(self, text: str, level: str = "auto") -> Float32[np.ndarray, " N"]:
-        """Return each Gaussian's field relevancy at a level, or the maximum over levels; 0 if no latent."""
+        """Return each Gaussian's field relevancy at a level or its maximum over levels; 0 without latents."""
         features = self.trained()[0].features
         out = np.zeros(len(features), np.float32)
         vector = self.text_vectors([text])
@@ -114,12 +114,12 @@ class FieldScene(SceneViews):
 
     @cached_property
     def _decoded_nodes(self) -> Float32[np.ndarray, "n C"]:
-        """Mean latent of each node's Gaussians at the node's level, decoded."""
+        """Decoded mean latent of each node's Gaussians at the node's level."""
         language, code = self.trained()
         return code.decode_array(node_means(self.tree.node_of_gaussian, self.tree.level, language.features))
 
     def latents(self, view: str) -> list[tuple[np.ndarray, Float32[np.ndarray, "P D"]]]:
-        """Return the pixels that show mostly Gaussians with a latent, and their latents, per level."""
+        """Return, for each level, the pixels that show mostly Gaussians with a latent, and their latents."""
         return self._views.get(
             ("latents", view),
             lambda: rendered_latents(self.view_weights(view), self.trained()[0].features),

@@ -16,12 +16,12 @@ LIKELY_CHANCE = 0.05
 
 @dataclass(frozen=True)
 class Doubt:
-    """A text of a query that may match nothing in the scene.
+    """A query text that may match nothing in the scene.
 
     Attributes:
-        level: the level that was searched, if a node of any level matches the text; otherwise None.
+        level: the level that was searched, if a node at any level matches the text; otherwise None.
         chance: share of words for absent objects whose best score is at least as high; None if the doubt has
-            another reason.
+            a different cause.
         unknown: words of the text that are not in the model's vocabulary.
     """
 
@@ -48,15 +48,15 @@ class Hit:
 
     Attributes:
         node: row of the semantic tree.
-        score: relevancy in (0, 1) of the node and, with a lower weight, of its ancestors; answers are sorted
-            by score, and 0.5 is no better than a generic word. For route "like", the cosine with a node or
-            picture.
+        score: relevancy of the node and, with a lower weight, of its ancestors, in (0, 1). Answers are sorted
+            by score; at 0.5, the query fits no better than a generic word. For route "like", the score is the
+            cosine with a node or picture.
         box: lower and upper corner of the axis-aligned box.
         oriented_box: the box along the node's own axes.
         best_views: up to three training views in which the node is largest.
         route: as in `NodeHits`, or "like".
         doubts: texts of the query that may match nothing; if the first text of a path is doubtful, all
-            answers are.
+            answers are doubtful.
         name: the user's name for the node, otherwise its vocabulary name; empty if no name fits.
     """
 
@@ -87,7 +87,7 @@ class Hit:
 
 
 def doubts_of(found: NodeHits) -> tuple[Doubt, ...]:
-    """Return a doubt for each text of a query that may match nothing in the scene."""
+    """Return a doubt for each query text that may match nothing in the scene."""
     doubts = []
     for each in found.texts:
         likely = each.chance is not None and each.chance > LIKELY_CHANCE

@@ -85,7 +85,7 @@ class LanguageScene(FieldScene):
 
     @staticmethod
     def of(found: FinishedScene, *, threads: int = 1, opened: Opened | None = None) -> "LanguageScene":
-        """Open a located finished scene with its own settings and its nodes' names."""
+        """Open a finished scene with its own settings and the names of its nodes."""
         parts = found.parts
         scene = LanguageScene.from_parts(parts, found.evaluate_settings(), threads=threads, opened=opened)
         names = read_names(found.folder, parts.semantic_tree)
@@ -100,14 +100,14 @@ class LanguageScene(FieldScene):
         threads: int = 1,
         opened: Opened | None = None,
     ) -> "LanguageScene":
-        """Read each of a scene's artifacts once, without names, and check that they belong together.
+        """Read each artifact of a scene once, except node names, and check that the artifacts match.
 
         Args:
             opened: artifacts that other variants of the scene have already opened.
 
         Raises:
-            MisalignedArtifactError: the tree or field was made for other Gaussians or cameras, or the field
-                for another autoencoder.
+            MisalignedArtifactError: the tree or field was computed for different Gaussians or cameras, or
+                the field with a different autoencoder.
             ModelError: the CLIP that embedded the masks is not found.
         """
         from hilsplat.embed.clip import open_clip_of
@@ -157,8 +157,8 @@ class LanguageScene(FieldScene):
         Args:
             text: query to run when the page opens.
             height: height of the frame, px.
-            proxy: address, containing `{port}`, at which a browser on another machine reaches a port of this
-                machine: "/user/me/proxy/{port}/" on a JupyterHub.
+            proxy: address containing `{port}` through which browsers on other machines reach a port of this
+                machine, such as "/user/me/proxy/{port}/" on a JupyterHub.
 
         Raises:
             ArtifactError: the scene was assembled from parts, or has too many Gaussians to show.
@@ -191,7 +191,7 @@ class LanguageScene(FieldScene):
             view: name of a view, to find only nodes visible in that view; None searches the whole scene.
             threshold: minimum score of an answer, in (0, 1); None returns the best answer, and answers whose
                 margin is lower by at most (1 - `node_select`) times the range of the level's margins, or
-                three times that if they look like the best.
+                by three times that if they look like the best answer.
             limit: maximum number of answers.
 
         Raises:
@@ -214,7 +214,7 @@ class LanguageScene(FieldScene):
         """Return the nodes of any level that look most like a picture, best first; scores are cosines.
 
         Raises:
-            ModelError: the CLIP of this scene cannot embed pictures.
+            ModelError: the scene's CLIP model cannot embed images.
         """
         if self.encode_picture is None:
             raise ModelError(f"{self.scene.name} was opened without a model that embeds images")
@@ -234,7 +234,7 @@ class LanguageScene(FieldScene):
         return [self._hit(int(nodes[row]), float(cosine[row]), "like", ()) for row in order]
 
     def hits_of(self, found: NodeHits, limit: int) -> list[Hit]:
-        """Return at most `limit` best nodes as answers."""
+        """Return up to `limit` of the best nodes as answers."""
         doubts, hits = doubts_of(found), []
         for node, value in zip(found.ids[:limit].tolist(), found.values[:limit], strict=True):
             score = relevancy_of_margins(np.array([value]), self.settings.relevancy_scale)[0]
@@ -270,7 +270,7 @@ class LanguageScene(FieldScene):
     ) -> NodeHits:
         """Return the answers of `query` as rows of the tree; the path may also be a sequence of texts.
 
-        Arguments and errors are those of `query`; level None means "auto".
+        For arguments and errors, see `query`; level None means "auto".
         """
         path = path_of(path) if isinstance(path, str) else tuple(path)
         if answerer not in ANSWERERS:
@@ -290,7 +290,7 @@ class LanguageScene(FieldScene):
             self.node_margins(path, answerer),
             self.node_vectors(answerer),
             path,
-            threshold=self.settings.node_select if threshold is None else 0.0,  # 0: the whole level
+            threshold=self.settings.node_select if threshold is None else 0.0,  # 0 selects the whole level
             ancestors=self.settings.ancestors,
             level=level,
             shown=shown,
@@ -319,7 +319,7 @@ class LanguageScene(FieldScene):
     def name_of(self, node: int) -> str:
         """Return the user's name for a node, otherwise its vocabulary name; empty if no name fits.
 
-        The vocabulary name of a part gets its whole appended, as in "wheel of car", unless already included.
+        The name of the whole is appended to a part's vocabulary name that lacks it, as in "wheel of car".
         """
         own, parent = self.own_name_of(node), int(self.tree.parent[node])
         if not own or parent == NONE or node in self.names.of_node:
@@ -356,7 +356,7 @@ class LanguageScene(FieldScene):
         return relevancy_of_margins(self.node_margins(texts, answerer), self.settings.relevancy_scale)
 
     def node_vectors(self, answerer: str = "tree") -> Float32[np.ndarray, "n C"]:
-        """Return the nodes' unit vectors: those of the tree, or decoded from the field of their Gaussians."""
+        """Return the nodes' unit vectors: those of the tree, or those decoded from their Gaussians' field."""
         return self.tree.clip if answerer == "tree" else self._decoded_nodes
 
     def node_relevancy_map(self, texts: Sequence[str], view: str) -> Float32[np.ndarray, "T 3 H W"]:
@@ -368,7 +368,7 @@ class LanguageScene(FieldScene):
     ) -> Float32[np.ndarray, "T 3 P"]:
         """Average the text-node cosines over each pixel's Gaussians, weighted by W, at each level.
 
-        Gaussians without a node have the lowest cosine of the level; uncovered pixels have -inf. User-given
+        Gaussians without a node have the lowest cosine of the level; uncovered pixels get -inf. User-given
         names are ignored. A pixel's index is row * width + column.
         """
         cosines = self.text_vectors(texts) @ self.tree.clip.astype(np.float32).T

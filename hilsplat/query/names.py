@@ -1,7 +1,7 @@
-"""User-given names of nodes, which are matched first, without a model.
+"""User-given names of nodes, which queries match first and without a model.
 
 `names.json` in a scene's folder stores the names under the digest of `tree.npz`, because row numbers of one
-tree are meaningless in another. If a tree is rebuilt, the previous tree's names are kept but not used.
+tree are meaningless in other trees. If a tree is rebuilt, the previous tree's names are kept but not used.
 """
 
 from collections.abc import Mapping
@@ -44,7 +44,7 @@ def read_names(folder: Path, semantic_tree: Path) -> NodeNames:
     """Return the names of a tree's nodes from the scene's folder; empty if unnamed.
 
     Raises:
-        ArtifactError: the file is damaged, has another version, or names nodes that do not exist.
+        ArtifactError: the file is damaged, has a different format version, or names nodes that do not exist.
     """
     path = Path(folder) / FILE
     kept = _kept(path).trees.get(tree_digest(semantic_tree), {})
@@ -76,7 +76,7 @@ def write_names(
         if len(name) > LONGEST or PATH_SEPARATOR in name or not name.isprintable():
             raise SettingsError(
                 f"{name!r} is not a valid name",
-                expected=f"at most {LONGEST} characters, without {PATH_SEPARATOR!r}, which separates paths",
+                expected=f"at most {LONGEST} printable characters, without the separator {PATH_SEPARATOR!r}",
             )
     with replacing(path, version, f"the names in {path}"):
         found = _kept(path)

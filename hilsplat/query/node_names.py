@@ -42,8 +42,8 @@ STANDS_OUT = 0.5
 standard deviations of the vocabulary's margins. Chosen on development scenes (docs/experiments.md)."""
 
 FEWEST_ABSENT = 100
-"""Minimum number of known words for absent objects. If there are fewer, vocabulary words that are not the
-nearest word of any node replace them; if these are too few as well, chance is not estimated."""
+"""Minimum number of known words for absent objects. If there are fewer, they are replaced by the vocabulary
+words that are not the nearest word of any node. If these are too few as well, chance is not estimated."""
 
 THINGS, PARTS, SURFACES = range(3)
 
@@ -56,7 +56,7 @@ SECTIONS = ("things", "parts", "surfaces", "absent")
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """Distinct texts by kind; `absent` has words for objects that few scenes contain, and may be empty."""
+    """Distinct texts by kind; `absent` contains words for objects found in few scenes, and may be empty."""
 
     things: tuple[str, ...]
     parts: tuple[str, ...] = ()
@@ -98,7 +98,7 @@ class Vocabulary:
 
 
 def vocabulary_file(setting: str, model: Path) -> Path:
-    """Return a setting's vocabulary file; `auto` means the model's file if any, otherwise the package's."""
+    """Return a setting's vocabulary file; `auto` means the model's file if it exists, else the package's."""
     if setting != AUTO:
         return Path(setting)
     own = Path(model) / VOCABULARY
@@ -121,7 +121,7 @@ class NodeNaming:
 
     @staticmethod
     def load(folder: Path, semantic_tree: Path, clip_folder: Path) -> "NodeNaming | None":
-        """Read the artifact; return None if it is missing or was computed for another tree or vectors.
+        """Read the artifact; return None if it is missing or was computed for a different tree or vectors.
 
         Raises:
             ArtifactError: the artifact is damaged.
@@ -222,7 +222,7 @@ def named(
 ) -> list[dict[str, Any]]:
     """Name each node by the text nearest to its vector, if that text stands out from the others.
 
-    Wholes get names of things or surfaces. Parts and subparts get names of parts or things (a table's plate).
+    Wholes get names of things or surfaces; parts and subparts, of parts or things (a plate on a table).
 
     Args:
         margin: the nodes' cosine margins for the vocabulary's things, parts and surfaces, in this order.

@@ -10,23 +10,23 @@ from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.semantic_tree.tree import SemanticTree
 
-# Chosen on development scenes; docs/experiments.md ("Query") compares them with other values.
+# These values were chosen on development scenes; docs/experiments.md ("Query") compares them with others.
 
 ALIKE = 0.9
-"""Nodes whose vectors have at least this cosine count as similar, such as objects of one kind."""
+"""Minimum cosine of two nodes' vectors to count as similar, such as objects of the same kind."""
 
 ALIKE_REACH = 3.0
-"""Factor on the allowed distance below the best answer, for nodes that look like the best answer."""
+"""Nodes that look like the best answer may be this many times as far below it as other nodes."""
 
 ANCESTORS_SHARE = 0.5
-"""Fraction of an ancestor's shortfall, relative to its level's best, subtracted from a node on a path."""
+"""Fraction of an ancestor's shortfall (its level's best minus its own) subtracted from a path's node."""
 
 PLAUSIBLE = 0.25
 """A node competes on a path only if its ancestor is at most this fraction of the margin range below the best
 answer to the first text: only the nose of a plausible bear is an answer to "bear > nose"."""
 
 WITHOUT_ANCESTOR = 0.1
-"""Assumed shortfall of a missing ancestor, relative to the best, as a fraction of the margin range."""
+"""Shortfall assumed for a missing ancestor, as a fraction of the margin range."""
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,9 @@ class NodeHits:
         ids: rows of the semantic tree, best first.
         values: sort key of each node: its cosine margin for the last text, plus a bonus (one text) or minus a
             penalty (a path) that depends on its ancestors.
-        route: how the best node was found: "flat" for one text. On a path, "child": its parent is at the
-            level of the text before, and ancestors are at the levels of all earlier texts; "descendant": some
-            ancestors are; "fallback": none is, or nothing plausible matches the first text.
+        route: how the best node was found: "flat" for one text. For a path, "child" if it has an ancestor at
+            the level of every earlier text and the nearest of them is its parent; "fallback" if it has no
+            such ancestor or nothing plausible matches the first text; otherwise "descendant".
         texts: the best match of each text of the query, coarse to fine.
     """
 
@@ -96,12 +96,12 @@ def search(
         vectors: unit vectors of every node, which determine which nodes look alike.
         threshold: see `best_nodes`.
         ancestors: fraction of the ancestors' mean margin that is added to a node's own margin; ignored for a
-            path of several texts, which names the ancestors itself.
+            path of several texts, which itself specifies the ancestors.
         level: level of the last text; None lets `automatic_level` or `_search_path` choose it.
         shown: which nodes are allowed as answers; None allows all.
 
     Raises:
-        SettingsError: the path has more texts than there are levels down to its last text.
+        SettingsError: the path has more texts than levels from whole to the level of its last text.
     """
     margin = margin.astype(np.float64)
     anywhere = (margin if shown is None else margin[:, shown]).max(axis=1, initial=-np.inf).tolist()
@@ -125,13 +125,13 @@ def best_nodes(
 ) -> Int64[np.ndarray, " h"]:
     """Return the candidates near the best one, and slightly worse candidates that look like the best.
 
-    Candidates are sorted best first, ties by row. Vectors and `shown` are as in `search`.
+    They are sorted best first, and ties are sorted by row. For `vectors` and `shown`, see `search`.
 
     Args:
         value: sort key of every node: its cosine margin plus its ancestors' bonus.
         candidates: the nodes of a level, which define the range of values.
-        threshold: answers are at most (1 - threshold) times the range below the best candidate shown, or
-            `ALIKE_REACH` times that distance if they look like the best.
+        threshold: answers are below the best shown candidate by at most (1 - threshold) times the range, or
+            by `ALIKE_REACH` times that distance if they look like the best.
     """
     may = candidates if shown is None else candidates[shown[candidates]]
     spread = np.ptp(value[candidates]) if len(candidates) else 0.0
@@ -144,7 +144,7 @@ def _near_best(
     vectors: Float32[np.ndarray, "n C"],
     reach: float,
 ) -> Int64[np.ndarray, " h"]:
-    """Return candidates at most `reach` below the best, or `ALIKE_REACH` times that if they look alike."""
+    """Return candidates at most `reach` below the best, or `ALIKE_REACH` times that if they look like it."""
     if not len(candidates):
         return np.zeros(0, np.int64)
     own = value[candidates]
@@ -156,10 +156,10 @@ def _near_best(
 
 
 def ancestor_margins(tree: SemanticTree, margin: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
-    """Return the mean margin of each node's ancestors: "kettle knob" probably means a knob of a kettle.
+    """Return the mean margin of each node's ancestors, since "kettle knob" likely means a knob on a kettle.
 
-    A node without ancestors gets the lowest margin of all nodes. A whole gets 0, because wholes have no
-    ancestors and compete only with each other. `search` adds a fraction chosen on development scenes.
+    A whole gets 0, because wholes have no ancestors and compete only with each other. Any other node without
+    ancestors gets the lowest margin of all nodes. `search` adds a fraction chosen on development scenes.
     """
     ancestors = tree.ancestors()
     above = (ancestors != NONE) & (ancestors != np.arange(len(tree))[:, None])
@@ -188,8 +188,8 @@ def automatic_level(
 def margin_range(margin: Float64[np.ndarray, " n"]) -> float:
     """Return the range of the nodes' margins for a text, extended to include 0, the margin of a tie.
 
-    A path's penalties are scaled by this range. For a single object, or objects that all match the text, the
-    range of the nodes alone would be close to 0 and penalties would vanish.
+    A path's penalties are scaled by this range. With a single object, or if all objects match the text, the
+    range of the margins themselves would be close to 0, and the penalties would vanish.
     """
     return float(margin.max(initial=0.0) - margin.min(initial=0.0))
 
@@ -207,8 +207,8 @@ def _search_path(
     """Find nodes that match the last text and are part of nodes that match the earlier texts.
 
     Every text has its own level. All nodes at the last text's level compete, each together with its
-    ancestors: a bear that matches "bear" slightly worse than a cushion does still has the better head and
-    nose. A node that is not part of a plausible answer to the first text (`PLAUSIBLE`) does not compete,
+    ancestors. If a cushion matches "bear" slightly better than the bear does, the bear still wins by its head
+    and nose. A node that is not part of a plausible answer to the first text (`PLAUSIBLE`) does not compete,
     unless no node is part of one.
 
     If a path has fewer texts than there are levels, its levels are ambiguous: the handle of a mug may be a
@@ -225,7 +225,7 @@ def _search_path(
             + ("" if level is None else f" at level {level.label}"),
             expected=f"1 to {len(levels)} texts, coarse to fine: {' > '.join(each.label for each in levels)}",
             found=f"{len(path)}",
-            fix="name the object, then its part, then the part of the part",
+            fix="name the object, then its part, then a part of that part",
         )
     ancestors, found = tree.ancestors(), []
     for way in ways:
@@ -244,7 +244,7 @@ def _search_way(
     threshold: float,
     shown: Bool[np.ndarray, " n"] | None,
 ) -> tuple[bool, float, list[float], NodeHits]:
-    """Search for the last text at the last level, and for each earlier text among ancestors at its level.
+    """Search the last level for the last text, and each earlier level's ancestors for the earlier text.
 
     Returns:
         whether the best answer is part of a plausible answer to the first text and has an ancestor for every

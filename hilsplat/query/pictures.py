@@ -1,4 +1,4 @@
-"""Parts of figures: answer overlays, relevancy colours, and a map of the scene from above."""
+"""Parts of figures: answer overlays, relevancy colours, and a top-down map of the scene."""
 
 from pathlib import Path
 from typing import Any
@@ -20,14 +20,14 @@ ANSWER_RGB = (255, 122, 0)
 TRUTH_RGB = (0, 230, 255)
 RELEVANCY_COLOURS = "inferno"
 SH_CONSTANT = 0.28209479177387814
-"""Value of the constant spherical harmonic; colour is 0.5 + this times row 0 of `sh`."""
+"""Value of the constant spherical harmonic; a colour is 0.5 plus this value times row 0 of `sh`."""
 
 DPI = 110
 TITLE_LETTERS = 110
-"""Maximum number of characters in a line of a panel's title."""
+"""Maximum number of characters per line of a panel's title."""
 
 MAX_POINTS = 30_000
-"""Maximum number of Gaussians in a map from above."""
+"""Maximum number of Gaussians drawn in a top-down map."""
 
 
 def grey(image: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
@@ -97,7 +97,7 @@ def label_left(axes: Axes, text: str, level: Level | None = None) -> None:
 def show_from_above(
     axes: Axes, gaussians: Gaussians, cameras: Cameras, selected: Bool[np.ndarray, " N"], title: str
 ) -> None:
-    """Draw Gaussians along the mean up direction, selected ones in orange, and cameras as triangles."""
+    """Draw the scene from above, with selected Gaussians in orange and cameras as triangles."""
     means = gaussians.means.astype(np.float64)
     centres = np.stack([cameras[name].centre for name in cameras.names])
     rotation = _from_above(cameras)
@@ -132,7 +132,7 @@ def _from_above(cameras: Cameras) -> Float[np.ndarray, "3 3"]:
 
 def save_figure(figure: Figure, out: Path) -> None:
     """Write a PNG atomically; the metadata names this package instead of Matplotlib's version."""
-    packed = {"compress_level": 4}  # half the time of the default 6, for 4 % more bytes
+    packed = {"compress_level": 4}  # takes half the time of the default (6), for 4 % more bytes
     own: dict[str, Any] = {"format": "png", "metadata": SOFTWARE, "pil_kwargs": packed}
     with atomic_path(out) as temporary:
         figure.savefig(temporary, dpi=DPI, facecolor="white", **own)

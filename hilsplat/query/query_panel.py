@@ -1,4 +1,4 @@
-"""Picture of a query: the answer and its relevancy in a few views, and the answer from above."""
+"""Picture of a query: the answer and the relevancy in a few views, and the answer from above."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -44,7 +44,7 @@ def query_panel(
     note: str = "",
     answerer: str = "tree",
 ) -> None:
-    """Draw a query: photograph, answer and relevancy at three levels per view, and the scene from above.
+    """Draw each view's photograph, answer and relevancy at three levels, and the scene from above.
 
     `note` is appended to the title; doubts are written below the title. With answerer "field", the field's
     relevancy is drawn.
@@ -102,7 +102,7 @@ class _Page:
     def write(
         self, text: str, x: float, y: float, *, size: float = 8.0, bold: bool = False, rotation: float = 0.0
     ) -> None:
-        """Write a text centred at (x, y)."""
+        """Write text centred at (x, y)."""
         place = (x / self.width_px, 1 - y / self.height_px)
         written = self.figure.text(*place, text, ha="center", va="center", size=size, rotation=rotation)
         written.set_parse_math(False)

@@ -1,13 +1,13 @@
-"""Match between embeddings and texts: cosine margins, and LERF's relevancy computed from these margins.
+"""Similarity of embeddings and texts: cosine margins, and LERF's relevancy, computed from these margins.
 
 `LatentRelevancy` computes relevancy for every pixel of a view from its rendered latents:
 
 - Linear code (PCA): the length of a decoded latent and its nearest canonical phrase do not depend on the
-  text, so they are computed once per view. A text then costs d products per pixel, without decoding.
+  text, so they are computed once per view. A text then needs d products per pixel, without decoding.
 - Network: every pixel of a view is decoded once. The decoded vectors are close to a subspace of few
-  directions (about 65 of 128, 105 of 512). Each vector is stored as its coordinates in the subspace, in 16
-  bits, with the cosine of its nearest canonical phrase, computed from the full vector. A text then costs one
-  product per pixel and direction.
+  directions (about 65 of 128, or 105 of 512). Each vector is stored as its 16-bit coordinates in this
+  subspace, together with its cosine with the nearest canonical phrase, computed from the full vector. A text
+  then needs one product per pixel and direction.
 
 Both forms are stored channel by channel, so that the compiler can process eight or sixteen pixels at once.
 Memory bandwidth is the bottleneck: three levels of a 986 x 728 view at d = 16 take 138 MB.
@@ -25,7 +25,7 @@ from hilsplat.field.code import CHUNK_ROWS, Code, LinearCode
 from hilsplat.query.relevancy_kernels import lengths_and_generic, texts_relevancy
 
 ROWS_AT_A_TIME = 1 << 16
-"""Embeddings or pixels to process at once, so that products with many texts stay small."""
+"""Number of embeddings or pixels processed at once; it limits the size of products with many texts."""
 
 ERROR = 2e-3
 """Maximum relevancy error at any pixel if the code is a network."""
@@ -37,7 +37,7 @@ SAMPLE = 8192
 """Number of latents in the sample from which the directions are computed."""
 
 STEPS = 32767
-"""Quantisation steps of a coordinate from 0 to 1; the rounding error is at most 1.5e-5."""
+"""Number of quantisation steps between coordinates 0 and 1; the rounding error is at most 1.5e-5."""
 
 
 def margins(
@@ -59,7 +59,7 @@ def margins(
 
 
 def relevancy_of_margins(margin: Float[np.ndarray, "*n"], scale: float) -> Float[np.ndarray, "*n"]:
-    """Return the displayed and evaluated score: 1 / (1 + exp(-scale * margin)), 0.5 at margin 0."""
+    """Return the score used for display and evaluation: 1 / (1 + exp(-scale * margin)), 0.5 at margin 0."""
     return 1 / (1 + np.exp(-scale * margin))
 
 
@@ -80,15 +80,15 @@ def relevancy(
     canonical: Float[np.ndarray, "K C"],
     scale: float = 10.0,
 ) -> Float32[np.ndarray, "T B"]:
-    """Return the lowest softmax score of a text against each canonical phrase, in (0, 1).
+    """Return each text's lowest softmax score against any canonical phrase, in (0, 1).
 
     rel = min over k of exp(s e.q) / (exp(s e.q) + exp(s e.c_k)), the logistic function of the scaled margin.
 
     Source: LERF; LangSplat, `eval/openclip_encoder.py`; both use a scale of 10.
 
     Example:
-        cosines 0.30 with the text and 0.25, 0.28, 0.20, 0.22 with the phrases: the nearest phrase
-        decides, 1 / (1 + exp(-10 * 0.02)) = 0.549834.
+        With cosines of 0.30 for the text and 0.25, 0.28, 0.20 and 0.22 for the phrases, only the nearest
+        phrase matters: 1 / (1 + exp(-10 * 0.02)) = 0.549834.
     """
     return relevancy_of_margins(margins(embeddings, texts, canonical), scale)
 
@@ -155,7 +155,7 @@ class LatentRelevancy:
     def fast(
         self, view: LinearView | ProjectedView, texts: Float32[np.ndarray, "T C"]
     ) -> Float32[np.ndarray, "T P"]:
-        """Compute the relevancy of a prepared view from a few products per pixel.
+        """Compute the relevancy at each pixel of a prepared view from a few products.
 
         Each text's weights are computed separately, so that results do not depend on the other texts.
         """
@@ -184,7 +184,7 @@ class LatentRelevancy:
         import cv2
 
         offsets, slopes, mean_square, cross = code.cosine_terms(self._canonical)
-        # ten times as fast as numpy's transposition; cv2 refuses arrays without rows
+        # Ten times as fast as numpy's transposition, but cv2 rejects arrays without rows.
         channels = cv2.transpose(latents) if len(latents) else latents.T
         length, generic = (np.empty(len(latents), np.float32) for _ in range(2))
         lengths_and_generic(channels, cross, np.float32(mean_square), offsets, slopes, length, generic)
@@ -193,9 +193,9 @@ class LatentRelevancy:
     def _prepare_projected(self, latents: Float32[np.ndarray, "P D"]) -> ProjectedView:
         """Decode all pixels, and add directions until no pixel's loss exceeds `lost_for_error`.
 
-        The first directions are computed from a sample. Pixels that lose too much, such as those of a small
-        unsampled object, get more in the same way, orthogonal to all previous ones; the other pixels have
-        coordinate 0 along these. Each round uses at least one of the C directions, so the loop ends.
+        The first directions are computed from a sample. While some pixels lose too much, such as those of a
+        small unsampled object, further directions are computed from them, orthogonal to all previous ones;
+        other pixels get coordinate 0. Each round uses at least one of the C directions, so the loop ends.
         """
         may_lose = lost_for_error(self._scale, self._code.channels)
         directions, others = self._directions(latents, np.eye(self._code.channels))
@@ -213,9 +213,9 @@ class LatentRelevancy:
     def _directions(
         self, latents: Float32[np.ndarray, "P D"], among: Float64[np.ndarray, "A C"]
     ) -> tuple[Float32[np.ndarray, "R C"], Float64[np.ndarray, "B C"]]:
-        """Return the fewest directions that lose at most `RESIDUAL` on a decoded sample, and the others.
+        """Return the fewest directions with a loss of at most `RESIDUAL` on a decoded sample, and the others.
 
-        `among` contains at least one orthonormal row; all directions are in their span (A = R + B).
+        `among` has one or more orthonormal rows; all directions are in their span (A = R + B).
         """
         some = self._code.decode_array(latents[:: max(1, -(-len(latents) // SAMPLE))]).astype(np.float64)
         values, turns = np.linalg.eigh(among @ (some.T @ some / max(len(some), 1)) @ among.T)
@@ -227,7 +227,7 @@ class LatentRelevancy:
     def _decode(
         self, latents: Float32[np.ndarray, "P D"], directions: Float32[np.ndarray, "R C"]
     ) -> tuple[Int16[np.ndarray, "R P"], Float32[np.ndarray, " P"], Float32[np.ndarray, " P"]]:
-        """Return, per pixel, coordinates, cosine with the nearest phrase, and loss outside the directions."""
+        """Return each pixel's coordinates, cosine with the nearest phrase, and loss beyond the directions."""
         coordinates = np.empty((len(directions), len(latents)), np.int16)
         generic, lost = np.empty(len(latents), np.float32), np.empty(len(latents), np.float32)
 

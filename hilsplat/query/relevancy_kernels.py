@@ -5,8 +5,8 @@ import numpy as np
 from hilsplat.base.compiled import compiled
 
 BLOCK = 2048
-"""Pixels to process at once: the pixels' sums fit in the L1 cache, and the block of each channel is long
-enough to be prefetched."""
+"""Number of pixels processed at once: their sums fit in the L1 cache, and each channel's block is long enough
+to be prefetched."""
 
 
 @compiled
@@ -60,10 +60,10 @@ def lengths_and_generic(channels, cross, mean_square, offsets, slopes, length, g
 
 @compiled
 def texts_relevancy(channels, length, generic, first, offsets, slopes, scale, out):
-    """Write the relevancy (T, p) of texts at pixels from `first` on; `channels` has shape (D, P).
+    """Write the relevancy (T, p) of texts at pixels starting with `first`; `channels` has shape (D, P).
 
-    The cosine of a text is (offset + slope . channels) / length; an empty `length` stands for 1. All texts
-    are processed while a block of pixels is in the cache.
+    The cosine of a text is (offset + slope . channels) / length; an empty `length` means length 1. All
+    texts are processed while a block of pixels is in the cache.
     """
     dots = np.empty(BLOCK, np.float32)
     last = first + out.shape[1]
@@ -82,7 +82,7 @@ def _write_relevancy(cosines, generic, scale, out):
     """Write 1 / (1 + exp(-scale (cosine - generic))) for at most `BLOCK` pixels.
 
     exp(-x) = 2^n 2^f with integer n and f in [-1/2, 1/2]. 2^n is set as the bits of a float, and 2^f is
-    approximated by seven terms of its series (relative error 1e-8), so that the compiler can vectorise.
+    approximated by seven terms of its series (relative error 1e-8), so that the compiler can vectorise it.
     """
     fraction, bits = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32)
     power = bits.view(np.float32)

@@ -24,7 +24,7 @@ MARGIN_PX = 84
 
 ROW_PX = CELL_PX + LABEL_PX + 2 * GAP_PX
 COLUMNS = 18
-"""Maximum leaves in a row of the picture; wholes are placed side by side until the row is full."""
+"""Maximum number of leaves in a row of the picture; wholes are placed side by side until the row is full."""
 
 BACKGROUND = 250
 LINE = (150, 150, 150)
@@ -49,10 +49,10 @@ def export_tree(folder: Path, variant: str, out: Path, threads: int) -> str:
 
 
 def tree_picture(scene: LanguageScene) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw the tree: a row of crops per level, and, side by side, a block per whole with its descendants.
+    """Draw the tree with one row of crops per level; each whole and its descendants form a block.
 
-    Nodes of finer levels without a parent have their own blocks. A crop shows the node in the view in which
-    it is largest, with the rest of that view dimmed; the node's name and number are below.
+    A part or subpart without a parent has its own block. A crop shows the node in the view in which it is
+    largest, with the rest of that view dimmed, above the node's name and number.
     """
     tree = scene.tree
     children = [tree.children_of(np.array([node])).tolist() for node in range(len(tree))]
