@@ -132,7 +132,7 @@ class OpenedScene(ShownScene):
         return OpenedScene(self.folder, self.labels, self.variant, self.threads)
 
     def same_photographs(self) -> AbstractContextManager[None]:
-        """Guard reading and annotating of photographs; other parts may change."""
+        """Guard reads and annotations of photographs; other parts may change."""
         return self.unchanged(self.photographs)
 
     def described(self) -> dict[str, Any]:
@@ -182,7 +182,7 @@ class Annotator:
         return guarded(routes, token, MAX_BODY_BYTES)
 
     async def _save(self, request: Request) -> Response:
-        """Replace the annotations of a view; `If-Match` is the version that was read."""
+        """Replace the annotations of a view; the `If-Match` header is the version that the page read."""
         asked = await read(request, Labels)
 
         def write(opened: OpenedScene) -> dict[str, Any]:
@@ -222,7 +222,7 @@ def _shape(opened: OpenedScene, asked: Shape) -> dict[str, Any]:
         mask = mask & (painted == 0) if asked.stroke.erase else mask | (painted > 0)
     if asked.inside is not None:
         mask = mask & fill_polygons(asked.inside, size_hw)
-    is_drawn = len(asked.add) == 1 and np.array_equal(mask, drawn)  # few corners are easier to edit
+    is_drawn = len(asked.add) == 1 and np.array_equal(mask, drawn)  # it has fewer corners to edit
     return {"polygons": asked.add if is_drawn else traced(mask), "area_px": int(np.count_nonzero(mask))}
 
 
@@ -247,7 +247,7 @@ def _carry(opened: OpenedScene, asked: Carry) -> list[dict[str, Any]]:
 
 
 def _import(opened: OpenedScene, asked: Given) -> dict[str, Any]:
-    """Return the annotations merged with those in files, by view number; nothing is written."""
+    """Merge the annotations with those in files, and return them by view number; nothing is written."""
     cameras = opened.scene.cameras
     files = [imported(file.name, file.text, cameras) for file in asked.files]
     sizes_hw = {view: cameras[view].size_hw for view in cameras.names}
@@ -278,7 +278,7 @@ def run_annotate(
 ) -> None:
     """Serve the annotation page of a scene until Ctrl-C.
 
-    Arguments and errors are those of `OpenedScene`, `read_labels` and `serve`.
+    For arguments and errors, see `OpenedScene`, `read_labels` and `serve`.
     """
     opened = OpenedScene(folder, labels, variant, threads)
     annotator, annotated = Annotator(opened), len(opened.known())

@@ -44,10 +44,10 @@ def exported(kind: Kind, known: Mapping[str, Sequence[Label]], cameras: Cameras)
 def export_labels(scene: Scene, folder: Path, data_root: Path, out: Path) -> int:
     """Write a scene's annotations, or a synthetic scene's ground truth, in the layout of LERF-OVS's labels.
 
-    `out`, such as `label/teatime`, is replaced and gets `<view>.json` and the image of each labelled view.
-    Each polygon is an object, as LangSplat's evaluation requires; that evaluation ignores the keys for levels
-    and parents. Annotations are read from `annotated/<dataset>/<scene>` below `data_root`. Return the number
-    of labelled views.
+    The folder `out`, such as `label/teatime`, is replaced. It contains `<view>.json` and the image of each
+    labelled view. Each polygon is an object, as LangSplat's evaluation requires; that evaluation ignores the
+    keys for levels and parents. Annotations are read from `annotated/<dataset>/<scene>` below `data_root`.
+    Return the number of labelled views.
 
     Raises:
         SceneError: the scene has no labels.
@@ -148,9 +148,9 @@ def _json(value: object) -> str:
 
 
 def imported(name: str, text: str, cameras: Cameras) -> dict[str, list[Label]]:
-    """Read the annotations in a file of any of the four formats, by view.
+    """Return the annotations in a file, which may have any of the four formats, by view.
 
-    Ids are counted from 1 unless the file contains ids. The file's name identifies the photograph if the
+    Objects are numbered from 1 unless the file contains ids. The file's name identifies the photograph if the
     content does not.
 
     Raises:
@@ -207,7 +207,7 @@ def _from_isat(name: str, content: Mapping[str, Any], cameras: Cameras) -> dict[
         return {view: labels_of(labels)}
     pieces: list[Piece] = []
     for thing in labels.objects:
-        # Without our keys, groups are ignored: in LERF-OVS's files, the numbers repeat and identify nothing.
+        # Without our keys, groups are ignored: in LERF-OVS's files, they repeat and identify no object.
         group = thing.keys.get("group") if "level" in thing.keys else None
         pieces += [(thing.category, group, polygon, thing.keys) for polygon in thing.polygons]
     return {view: _joined(name, pieces)}
@@ -278,7 +278,7 @@ def _coco_polygons(where: str, value: Any, size_hw: tuple[int, int]) -> list[np.
 def unpacked_counts(text: str) -> list[int]:
     """Decode COCO's compressed run lengths.
 
-    Each character has five bits, low bits first; from the fourth run, values are relative to two runs before.
+    Each character has five bits, low bits first; after three runs, each is relative to the run two earlier.
     """
     runs: list[int] = []
     value = shift = 0
@@ -316,7 +316,7 @@ def _view(name: str, image: str, cameras: Cameras, height: Any, width: Any) -> s
 
 
 SAME_THING = 0.5
-"""Minimum IoU at which two labels of a photograph, with the same text and level, are one object."""
+"""Minimum IoU at which two labels with the same text and level in a photograph are the same object."""
 
 
 def merged(
@@ -332,7 +332,7 @@ def merged(
     A label without a match is a new object.
 
     Returns:
-        all labels of each changed photograph; the number of new labels or labels with another region; and the
+        all labels of each changed photograph; the number of labels that are new or have a new region; and the
         number of labels that already existed.
     """
     views = {view: list(labels) for view, labels in known.items()}

@@ -44,8 +44,8 @@ class Label(Message):
         level: 1 whole, 2 part, 3 subpart.
         parent: id of an object one level up in the same view; None if there is no parent.
         polygons: vertices in whole pixels; the region is the union of the filled polygons.
-        origin: drawn by hand; proposed by a node, a mask or another view; accepted as proposed; or a proposal
-            edited by hand. Labels that are only proposed are not scored.
+        origin: whether the label was drawn by hand, proposed from a node, mask or other view, accepted as
+            proposed, or edited after it was proposed. Labels that are only proposed are not scored.
     """
 
     id: Annotated[int, Field(ge=1, le=1_000_000)]
@@ -78,7 +78,7 @@ def traced(mask: Bool[np.ndarray, "H W"]) -> list[list[tuple[int, int]]]:
 
 
 def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[Label]:
-    """Cut every child to its parent, wholes first, so that a subpart also stays inside the whole.
+    """Cut every child to its parent, coarse to fine, so that subparts also stay inside their wholes.
 
     Raises:
         SettingsError: an id is used twice, a parent is missing or not one level up, or an object has no pixel
@@ -104,13 +104,13 @@ def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[La
                 f"{label.text!r} has an invalid parent",
                 expected=f"a {Level(label.level - 1).label}" if label.level > 1 else "none: it is a whole",
                 found=f"{parent.text!r}, a {Level(parent.level).label}" if parent else missing,
-                fix="choose another parent or level",
+                fix="choose a different parent or level",
             )
         inside = mask & masks[parent.id]
         if not inside.any():
             raise SettingsError(
                 f"{label.text!r} is entirely outside {parent.text!r}",
-                fix="draw it inside, or choose another parent",
+                fix="draw it inside, or choose a different parent",
             )
         if not np.array_equal(inside, mask):
             masks[label.id], cut[label.id] = inside, label.model_copy(update={"polygons": traced(inside)})
@@ -126,7 +126,7 @@ def read_labels(path: Path, size_hw: tuple[int, int]) -> list[Label]:
     """Read the annotations of a view; empty if there is no file.
 
     Raises:
-        SceneError: the file is invalid, or was drawn on a photograph of another size.
+        SceneError: the file is invalid, or was drawn on a photograph of a different size.
     """
     if not path.is_file():
         return []
@@ -136,13 +136,13 @@ def read_labels(path: Path, size_hw: tuple[int, int]) -> list[Label]:
             f"label file {path} does not match the size of its photograph",
             expected=f"{size_hw[1]} x {size_hw[0]} px (width x height)",
             found=f"{found.size_hw[1]} x {found.size_hw[0]} px",
-            fix="annotate the scene that it was drawn on, or move the file to another folder",
+            fix="annotate the scene on which the labels were drawn, or move the file elsewhere",
         )
     return labels_of(found)
 
 
 def known_labels(folder: Path, cameras: Cameras, views: Sequence[str]) -> dict[str, list[Label]]:
-    """Return the annotations of all annotated views; errors are those of `read_labels`."""
+    """Return the annotations of all annotated views; for errors, see `read_labels`."""
     found = {view: read_labels(label_path(folder, view), cameras[view].size_hw) for view in views}
     return {view: labels for view, labels in found.items() if labels}
 
@@ -166,7 +166,7 @@ def labels_of(found: IsatFile) -> list[Label]:
 
 
 def whole_pixels(points: np.ndarray) -> list[tuple[int, int]]:
-    """Truncate vertices to whole pixels, as the polygon filling does."""
+    """Truncate vertices to whole pixels, as polygon filling does."""
     return [(int(x), int(y)) for x, y in points]
 
 
@@ -187,7 +187,7 @@ def write_labels(
 
 
 def as_file(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
-    """Format a view's annotations in our format, one object per line for short files and readable diffs."""
+    """Format a view's annotations in our format: one object per line, for short files and readable diffs."""
     info = {"name": view, "width": size_hw[1], "height": size_hw[0]}
     objects = [
         {

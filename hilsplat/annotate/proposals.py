@@ -1,7 +1,7 @@
 """Outlines that the user can accept or correct: from nodes, masks, labels in other views, or SAM clicks.
 
 A proposal becomes an annotation only when the user accepts it, because ground truth copied from a prediction
-measures nothing.
+would measure nothing.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,15 +35,15 @@ LEAST_PX = 20
 LEAST_SHARE = 0.05
 """Minimum area of a proposal's pieces and holes, relative to the proposal; smaller ones are noise."""
 SMOOTH_PX = 1.0
-"""Maximum deviation of a proposal's outline from its pixels, px; reduces the vertices to correct."""
+"""Maximum deviation of a proposal's outline from its pixels, px; simple outlines are easier to correct."""
 MOST_MASKS = 6
 LEAST_SEEN = 0.25
-"""Minimum share of a pixel that shows Gaussians visible in annotated views, when transferring objects."""
+"""Minimum weight, in a pixel, of Gaussians visible in annotated views, when transferring objects."""
 VIEWS_MIB = 512.0
 KEPT_VIEWS = 3
 """Number of photographs whose SAM features are cached: 4 MB each for ViT-B, up to 40 MB for SAM 2."""
 BOX_GRID = 4
-"""Prompt points along each side of a box, because not all SAM exports accept boxes."""
+"""Number of prompt points along each side of a box; not all SAM exports accept boxes as prompts."""
 OFFERED = 3
 SAME_IOU = 0.9
 """Minimum IoU of two masks that count as the same mask."""
@@ -137,7 +137,7 @@ class Proposals:
         """
         if self.gaussians is None:
             raise SettingsError(
-                "annotations cannot be transferred before the scene has Gaussians", fix="wait for the run"
+                "annotations cannot be transferred before the scene has Gaussians", fix="let the run finish"
             )
         size_hw = self.scene.cameras[view].size_hw
         masks = {label.id: label.mask(size_hw) for label in known.get(view, ())}
@@ -162,7 +162,7 @@ class Proposals:
         return found
 
     def _members(self, shown: Sequence[tuple[str, Label]]) -> tuple[np.ndarray, np.ndarray]:
-        """Return, as 0 or 1, whether each Gaussian belongs to an object, and whether its views show it."""
+        """Return, as 0 or 1, whether each Gaussian belongs to an object and whether given views show it."""
         assert self.gaussians is not None
         inside = np.zeros(len(self.gaussians), np.float64)
         total = np.zeros(len(self.gaussians), np.float64)
@@ -247,10 +247,10 @@ class Clicks:
 
         Args:
             clicks: x, y, and whether the pixel is inside the object.
-            box: left, top, right, bottom, inclusive; only without clicks.
+            box: left, top, right, bottom, inclusive; used only without clicks.
 
         Raises:
-            SettingsError: no click inside the object is in the photograph, or the scene has no SAM.
+            SettingsError: no click is on the object, one is outside the photograph, or there is no SAM.
         """
         height, width = self.scene.cameras[view].size_hw
         points = np.array([[x + 0.5, y + 0.5] for x, y, _ in clicks]).reshape(-1, 2)
@@ -266,7 +266,7 @@ class Clicks:
         asked = points[inside] if clicks else corners[:2] + point_grid(BOX_GRID) * sides
         iou, logits = self.model.decode(encoded, asked)
         iou, logits = iou.reshape(-1), logits.reshape(-1, *logits.shape[2:])
-        if len(clicks) > 1:  # decode all clicks as one prompt, too
+        if len(clicks) > 1:  # also decode all clicks as one prompt
             more_iou, more = self.model.decode_clicks(encoded, points, inside)
             iou, logits = np.concatenate([more_iou, iou]), np.concatenate([more, logits])
         masks = enlarged(logits, encoded.frame)

@@ -77,7 +77,7 @@ class Viewer:
         return Response(data, headers={"etag": tag, "cache-control": "no-cache"})
 
     async def _names(self, request: Request) -> Response:
-        """Replace the names of a tree's nodes; `If-Match` is the version that was read."""
+        """Replace the names of a tree's nodes; the `If-Match` header is the version that the page read."""
         asked = await read(request, wire.Names)
 
         def write(shown: ViewerScene) -> dict[str, Any]:
@@ -117,7 +117,7 @@ def _like(shown: ViewerScene, asked: wire.Like) -> payload.Answer:
 
 
 def _field(shown: ViewerScene, asked: wire.FieldRelevancy) -> bytes:
-    """Return the field relevancy of each Gaussian, as one byte each."""
+    """Return each Gaussian's field relevancy as one byte."""
     found = shown.field_relevancy(asked.variant, asked.text, asked.level)
     return (found[shown.order] if asked.order == "page" else found).tobytes()
 
@@ -151,7 +151,7 @@ def _picture(text: str) -> np.ndarray:
 def run_view(
     folder: Path, *, variant: str, port: int, browser: bool, threads: int, on_ready: Callable[[str], None]
 ) -> None:
-    """Serve the page of a scene until Ctrl-C; arguments and errors are those of `ViewerScene` and `serve`."""
+    """Serve the page of a scene until Ctrl-C; for arguments and errors, see `ViewerScene` and `serve`."""
     shown = ViewerScene(folder, variant, threads)
     viewer = Viewer(shown)
     viewer.thread.worker.submit(shown.warm_up).result()
@@ -160,7 +160,7 @@ def run_view(
 
 
 class EmbeddedViewer:
-    """A notebook frame with the page of a scene; arguments are those of `LanguageScene.show`."""
+    """A notebook frame with the page of a scene; for its arguments, see `LanguageScene.show`."""
 
     def __init__(self, found: FinishedScene, *, text: str, height: int, proxy: str, threads: int) -> None:
         self.token, self.height, self.proxy, self.text = secrets.token_urlsafe(24), height, proxy, text

@@ -29,18 +29,18 @@ STEP = {"mp4": 1, "gif": 2}
 CROP_PX = 160
 CROP_MARGIN = 0.15
 LEAST_ALPHA = 0.1
-"""Lower bound on alpha when a crop's pixels are assigned to the node; enlarged Gaussians leave gaps."""
+"""Lower bound on alpha in the test whether a crop's pixel shows the node; enlarged Gaussians leave gaps."""
 DIMMED, GROUND = 0.2, 110.0
 """Weight of a crop's photograph outside the node, and the grey value that it is blended with."""
 
 Steps = Generator[tuple[int, int], None, bytes]
-"""A file created in steps: yields (steps done, total), starting with 0, and finally returns the file."""
+"""Generator that creates a file: it yields (steps done, total), starting at 0, and returns the file."""
 
 
 def labelled(
     scene: LanguageScene, groups: Sequence[Group]
 ) -> tuple[Int64[np.ndarray, " g"], Int32[np.ndarray, " g"]]:
-    """Return the rows of all groups' Gaussians, ascending, and each one's group, numbered from 1.
+    """Return the rows of all groups' Gaussians in ascending order, and each row's group, numbered from 1.
 
     A Gaussian in several groups gets the group with the fewest Gaussians.
     """
@@ -62,7 +62,7 @@ def selection_ply(gaussians_ply: Path, scene: LanguageScene, groups: Sequence[Gr
 
 
 def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
-    """Make a ZIP of node masks in all views: one PNG per node and view that shows it, and one COCO file.
+    """Make a ZIP of node masks in all views: one PNG per visible node and view, and one COCO file.
 
     Groups are the COCO categories; a node in several groups has one annotation per group.
     """
@@ -94,7 +94,7 @@ def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
 def crop(scene: LanguageScene, node: int, threads: int = 1) -> UInt8[np.ndarray, "S S 3"]:
     """Return a square crop of the photograph in which a node is largest, with the rest dimmed towards grey.
 
-    To find the node's pixels, only the square is rendered, by a camera whose image is that square.
+    To find the node's pixels, only the square is rendered, with a camera whose image is that square.
     """
     tree = scene.tree
     view = tree.view_names[int(tree.view_area_px[node].argmax())]
@@ -115,7 +115,7 @@ def crop(scene: LanguageScene, node: int, threads: int = 1) -> UInt8[np.ndarray,
 
 
 def resampled(image: UInt8[np.ndarray, "H W 3"], x: float, y: float, side: float) -> np.ndarray:
-    """Return the square (x, y, side) of an image at `CROP_PX` px; black beyond the image's borders."""
+    """Resample the square (x, y, side) of an image to `CROP_PX` px; pixels outside the image are black."""
     shrink = max(1.0, side / CROP_PX)  # warping does not average areas, so shrink first
     if shrink > 1:
         image = cv2.resize(image, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
@@ -127,7 +127,7 @@ def resampled(image: UInt8[np.ndarray, "H W 3"], x: float, y: float, side: float
 
 
 def _square_around(points: np.ndarray, camera: Camera) -> tuple[float, float, float]:
-    """Return left, top and side of a square around most of the points, px."""
+    """Return the left edge, top edge and side length, px, of a square around most of the points."""
     local = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     local = local[local[:, 2] > 0.01]
     height, width = camera.size_hw
@@ -158,7 +158,7 @@ def flight(asked: Film, scene: Scene) -> list[Camera]:
 def film(
     gaussians: Gaussians, cameras: Sequence[Camera], paint: Paint | None, *, kind: str, threads: int
 ) -> Steps:
-    """Make a film in the colours of a style (None for the scene's own colours), with one step per frame.
+    """Make a film in one step per frame, in the colours of a style (None: the scene's own colours).
 
     Each frame has one camera, with an even image size; a GIF uses every second camera.
     """

@@ -1,7 +1,7 @@
-"""A scene with answers to some queries, as one HTML file that needs no server, for papers and talks.
+"""A scene and answers to some queries in one HTML file, for papers and talks, that needs no server.
 
 The file is the viewer page: its scripts are data URLs in an import map, with `offline.js` instead of
-`api.js`. Gaussians, nodes, crops and small photographs are embedded as base64. It sends no network requests.
+`api.js`. Gaussians, nodes, crops and small photographs are embedded as base64. The page sends no requests.
 """
 
 import base64
@@ -16,7 +16,7 @@ from hilsplat.web.server import as_json, encoded
 
 PHOTO_PX = 320
 MAX_CROPS = 400
-"""Maximum number of nodes if all have crops; in a larger tree, only wholes and answers have crops."""
+"""Up to this number of nodes, all nodes get crops; in a larger tree, only wholes and answers do."""
 
 POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' data: blob:; style-src 'unsafe-inline'; "

@@ -21,7 +21,7 @@ SENT: tuple[tuple[str, str, str, type[BaseModel] | None, str], ...] = (
     ("post", "/api/like", "Nodes similar to a node or a picture", wire.Like, JSON),
     ("post", "/api/pick", "The nodes at a pixel of a camera, with their shares", wire.Pick, JSON),
     ("post", "/api/frame", "A picture of the scene", wire.Frame, IMAGE),
-    ("post", "/api/field", "The field's relevancy of every Gaussian in 1/255", wire.FieldRelevancy, BYTES),
+    ("post", "/api/field", "Every Gaussian's field relevancy, in 1/255", wire.FieldRelevancy, BYTES),
     ("post", "/api/export/ply", "The Gaussians of nodes as a 3DGS PLY, with labels", wire.Selection, BYTES),
     ("post", "/api/export/spz", "The Gaussians of nodes as SPZ", wire.Selection, BYTES),
     ("post", "/api/export/boxes", "Boxes of nodes", wire.Selection, JSON),

@@ -31,7 +31,7 @@ LISTED = 24
 
 
 def arrival_order(gaussians: Gaussians) -> Int64[np.ndarray, " N"]:
-    """Return the order in which the page loads Gaussians: most visible first, and Morton order in a chunk.
+    """Return the order in which the page loads Gaussians: most visible first, in Morton order within chunks.
 
     The first chunk alone gives an impression of the scene.
     """
@@ -42,7 +42,7 @@ def arrival_order(gaussians: Gaussians) -> Int64[np.ndarray, " N"]:
 
 
 def packed_nodes(tree: SemanticTree, order: Int64[np.ndarray, " N"]) -> bytes:
-    """Pack each Gaussian's nodes as an RGBA16UI texel, one level per channel (from 1; 0: none), gzipped."""
+    """Return gzipped RGBA16UI texels: one node per Gaussian and level, numbered from 1, or 0 if none."""
     assert len(tree) <= MAX_NODES, f"{len(tree)} nodes"
     texels = np.zeros((len(order), 4), np.uint16)
     texels[:, :3] = tree.node_of_gaussian[order] + 1
@@ -95,7 +95,7 @@ def crossing(cameras: Cameras) -> Float64[np.ndarray, " 3"]:
 
 
 def described_nodes(scene: LanguageScene) -> dict[str, Any]:
-    """Describe the outline: one entry per node, in row order."""
+    """Describe the nodes for the page's outline: one entry per node, in row order."""
     tree, names, naming = scene.tree, scene.names, scene.naming
     members = np.bincount(tree.node_of_gaussian.ravel() + 1, minlength=len(tree) + 1)[1:]
     return {

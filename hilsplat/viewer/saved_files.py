@@ -1,7 +1,7 @@
 """Files that users can save from the page.
 
-Slow files are created in steps on the scene thread, which runs other requests between steps. Films read only
-arrays, so they have their own thread. The response contains lines of JSON, then the file:
+Slow files are created in steps on the scene thread, which handles other requests between steps. Films use
+only arrays, so they have their own thread. The response contains lines of JSON, then the file:
 `{"made": 3, "of": 120}` after each step, `{"bytes": 12345}` before the file, or `{"error": "..."}`.
 """
 

@@ -35,13 +35,13 @@ KEPT_RELEVANCIES = 8
 """Number of cached field relevancies (per variant, text and level), each with one byte per Gaussian."""
 
 MAX_GAUSSIANS = 4_000_000
-"""Maximum number of Gaussians; more don't fit in textures of 2048 x 8192 texels or a server's few GiB."""
+"""Maximum number of Gaussians; more do not fit in textures of 2048 x 8192 texels or in a few GiB."""
 
 logger = logging.getLogger(__name__)
 
 
 class ViewerScene(ShownScene):
-    """The existing parts of a scene. Not thread-safe: use it and all objects it returns on one thread.
+    """The existing parts of a scene. Not thread-safe: use it and all returned objects on a single thread.
 
     Args:
         folder: `results/<dataset>/<scene>`, or a copy of that folder.
@@ -193,4 +193,4 @@ class ViewerScene(ShownScene):
             try:
                 self.answering(self.first)
             except HilsplatError as error:  # the page can still show the Gaussians
-                logger.warning("the scene accepts no queries: %s", error)
+                logger.warning("the scene cannot be queried: %s", error)

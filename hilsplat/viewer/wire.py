@@ -65,11 +65,11 @@ class Style(Message):
     @model_validator(mode="after")
     def _ramp_has_text(self) -> "Style":
         if self.ramp and not self.text:
-            raise ValueError("colouring by relevancy needs a text, but the text is empty")
+            raise ValueError("colouring by relevancy requires a text, but the text is empty")
         return self
 
     def rgba(self, num_nodes: int) -> UInt8[np.ndarray, "T1 4"]:
-        """Return the table; if it is empty, every Gaussian is unchanged."""
+        """Return the table; an empty table leaves every Gaussian unchanged."""
         return _rows(self.table, 4, num_nodes + 1)
 
     def colours(self) -> UInt8[np.ndarray, "256 3"]:
@@ -120,7 +120,7 @@ class Like(Asked):
 
 
 class FieldRelevancy(Asked):
-    """A query for each Gaussian's field relevancy, in the order of the PLY file or the page's chunks."""
+    """A query for each Gaussian's field relevancy, in the order of the PLY file or of the page's chunks."""
 
     text: Text
     level: LevelName = "auto"

@@ -1,4 +1,4 @@
-"""Masks in COCO's format, as both pages export them."""
+"""Masks in COCO's format, which both pages export."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -27,7 +27,7 @@ def coco_content(
 
 
 def coco_region(mask: Bool[np.ndarray, "H W"]) -> dict[str, Any]:
-    """Return the keys of an annotation that describe its region, as run lengths."""
+    """Return the annotation keys that describe a mask; the region is encoded as run lengths."""
     return {
         "iscrowd": 0,
         "area": int(mask.sum()),

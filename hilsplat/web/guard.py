@@ -1,9 +1,9 @@
 """Access control of the page's server: only the browser that opened the printed address has access.
 
 Loopback alone is no protection: other users of the machine can reach it, and so can any web page open in the
-same browser. Every request therefore needs a cookie that only the printed address sets, and a Host that is
-this machine (against DNS rebinding). Requests with a body also need the page's own Origin and a content type
-that no form can send.
+same browser. Every request therefore needs a cookie that only the printed address sets, and a Host that
+names this machine (against DNS rebinding). Requests with a body also need the page's own Origin and a content
+type that no form can send.
 """
 
 import hmac

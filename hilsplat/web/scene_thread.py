@@ -45,7 +45,7 @@ class ShownScene:
             self._seen.setdefault(part, _state_of(part))
 
     def changed(self, *parts: Path) -> list[str]:
-        """Return the names of the given parts (default: all) that were rewritten or deleted since."""
+        """Return the names of the given parts (default: all) that were rewritten or deleted after `note`."""
         return sorted({part.name for part in parts or self._seen if _state_of(part) != self._seen[part]})
 
     @contextmanager
@@ -62,7 +62,7 @@ class ShownScene:
     def _require_unchanged(self, parts: tuple[Path, ...]) -> None:
         if changed := self.changed(*parts):
             raise StaleSceneError(
-                f"{', '.join(changed)} of {self.scene.name} changed on the disk since the page was loaded",
+                f"{', '.join(changed)} of {self.scene.name} changed on disk since the page was loaded",
                 fix="reload the page",
             )
 
@@ -98,7 +98,7 @@ Handler = Callable[[Request], Awaitable[Response]]
 
 
 class SceneThread(Generic[Shown]):
-    """A scene and the thread on which all code that reads it runs."""
+    """A scene and the thread that runs all code that reads the scene."""
 
     def __init__(self, shown: Shown) -> None:
         self.shown = shown
@@ -150,11 +150,11 @@ class SceneThread(Generic[Shown]):
     ) -> Made:
         """Run `work` on the scene thread (or `worker`) if the page shows the current state of the scene.
 
-        A page sends the state that it was loaded with as `of`, so that its cameras, nodes and Gaussians are
-        never mixed with those of another state. Without `of`, the current state is used.
+        A page sends, as `of`, the state with which it was loaded, so that its cameras, nodes and Gaussians
+        are never mixed with those of a different state. Without `of`, the current state is used.
 
         Raises:
-            StaleSceneError: the page was loaded with another state.
+            StaleSceneError: the page was loaded with a different state.
         """
         state = request.query_params.get("of")
 
@@ -171,7 +171,7 @@ class SceneThread(Generic[Shown]):
         return await asyncio.get_running_loop().run_in_executor(worker or self.worker, work)
 
     async def _opened_anew(self, request: Request) -> Response:
-        """Send the scene's description to a newly opened page, after reopening a changed scene."""
+        """Send a newly opened page the scene's description; if the scene has changed, reopen it first."""
 
         def run() -> dict[str, Any]:
             if self.shown.changed():

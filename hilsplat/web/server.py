@@ -131,7 +131,7 @@ def listening_at(port: int) -> socket.socket:
         made.bind(("127.0.0.1", port))
     except OSError as error:
         made.close()
-        fix = "choose another port, or omit --port"
+        fix = "choose a different port, or omit --port"
         raise SettingsError(f"port {port} cannot be used: {error}", fix=fix) from error
     made.listen()  # before the address is printed, so that early connections wait instead of failing
     return made
@@ -145,13 +145,13 @@ def configured(app: Guard) -> uvicorn.Config:
 def serve(
     app: Callable[[str], Guard], about: str, *, port: int, browser: bool, on_ready: Callable[[str], None]
 ) -> None:
-    """Serve an application on this machine until Ctrl-C; `port` and errors are those of `listening_at`.
+    """Serve an application on this machine until Ctrl-C; for `port` and errors, see `listening_at`.
 
     Args:
         app: creates the application from its access token.
         about: description of the page for the printed line.
         browser: whether to open the page in a browser.
-        on_ready: called with the text to print, which contains the address, once the page can be opened.
+        on_ready: called once the page can be opened, with the text to print, which contains the address.
     """
     token, listening = secrets.token_urlsafe(24), listening_at(port)
     address = f"http://127.0.0.1:{listening.getsockname()[1]}/?token={token}"

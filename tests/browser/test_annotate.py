@@ -275,14 +275,14 @@ def test_sam_outlines_clicked_things(opened, own_desk, tmp_path):
         page = opened(address)
         page.locator("#view").press("s")
         page.mouse.click(*place(page, 28, 20))
-        page.get_by_text("Enter accepts this outline").wait_for()
+        page.get_by_text("Press Enter to accept this outline").wait_for()
         assert page.locator("#drawing .inside").count() == 1
         assert page.locator("#drawing .offer").count() == 1
         page.keyboard.down("Alt")
         page.mouse.click(*place(page, 4, 20))
         page.keyboard.up("Alt")
         page.locator("#drawing .outside").wait_for(state="attached")
-        page.get_by_text("Enter accepts this outline").wait_for()
+        page.get_by_text("Press Enter to accept this outline").wait_for()
         saved(page)
         page.locator("#view").press("Enter")
         saved(page)
@@ -290,7 +290,7 @@ def test_sam_outlines_clicked_things(opened, own_desk, tmp_path):
         assert found.origin == "proposed" and found.mask(SIZE)[20, 28] and not found.mask(SIZE)[20, 4]
         page.locator("#view").press("s")
         drag(page, (1, 2), (14, 21))  # a box
-        page.get_by_text("Enter accepts this outline").wait_for()
+        page.get_by_text("Press Enter to accept this outline").wait_for()
         page.keyboard.press("Escape")
         page.locator("#drawing .offer").wait_for(state="detached")
         page.close()

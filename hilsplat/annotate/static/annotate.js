@@ -146,7 +146,7 @@ async function segment() {
   found = outlines;
   offer = found[0]?.polygons ?? null;
   listOffers(found, offer);
-  tell(found.length ? "Enter accepts this outline, or choose another on the left. Click to include more, Alt-click to exclude." : "No outline was found.");
+  tell(found.length ? "Press Enter to accept this outline, or choose another one on the left. Click to include more, Alt-click to exclude." : "No outline was found.");
   draw();
 }
 
@@ -203,13 +203,13 @@ function take(each) {
 }
 
 async function carry() {
-  tell("Transferring the things of other photographs…");
+  tell("Transferring things from other photographs…");
   await store.saving;
   const view = number, ids = [...store.things.keys()].filter((id) => !store.has(view, id));
-  if (!ids.length) { tell("All things of other photographs are already in this one.", true); return; }
+  if (!ids.length) { tell("All things from other photographs are already in this one.", true); return; }
   const found = await ask("/api/carry", { ids, view });
   if (found.length) store.change([[view, [...store.labels(view), ...found]]]);
-  tell(found.length ? `${found.length} proposed: accept (A), correct or delete each.` : "No accepted thing of another photograph is visible here.");
+  tell(found.length ? `${found.length} proposed: accept (A), correct or delete each.` : "No accepted thing from another photograph is visible here.");
 }
 
 // -- things ----------------------------------------------------------------------------------------
@@ -375,7 +375,7 @@ async function begin() {
   document.title = `Annotate ${name} · hilsplat`;
   $("propose-label").hidden = !scene.proposes;
   $("segment-label").hidden = !scene.segments;
-  $("about").textContent = `${scene.name}${scene.proposes ? `. Proposals: ${scene.proposes}` : ""}${scene.carries ? ", things of other photographs" : ""}.`;
+  $("about").textContent = `${scene.name}${scene.proposes ? `. Proposals: ${scene.proposes}` : ""}${scene.carries ? ", things from other photographs" : ""}.`;
   makeStrip(scene.views, stand);
   await store.load();
   store.recall(scene.folder);

@@ -1,4 +1,4 @@
-// Annotations of all photographs. Each change can be undone, and is saved at once, with the file version that was read.
+// Annotations of all photographs. Each change can be undone. It is saved at once, together with the file version that was read.
 
 import * as api from "./api.js";
 

@@ -17,7 +17,7 @@ export function showAnswers(outline, answer, acts, beside) {
   $("beside").hidden = !beside?.answer;
   if (!beside?.answer) { $("answers-beside").replaceChildren(); return; }
   const both = theirs.filter((hit) => !only(hit, own)).length;
-  $("beside-title").textContent = `On the right, by ${beside.by}${sameTree ? `: ${both} of ${theirs.length} are on the left too` : ", in another tree"}`;
+  $("beside-title").textContent = `On the right, by ${beside.by}${sameTree ? `: ${both} of ${theirs.length} are on the left too` : ", from a different tree"}`;
   $("answers-beside").replaceChildren(...theirs.map((hit, rank) => item(beside.outline, hit, rank, sameTree ? acts : null, only(hit, own) ? ", only on the right" : "")));
 }
 

@@ -1,4 +1,4 @@
-// The camera: OpenCV axes (x right, y down, z forward), rows of R are its axes in the world.
+// The camera, with OpenCV axes (x right, y down, z forward). The rows of R are its axes in the world.
 
 export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 export const add = (a, b, s = 1) => [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]];
@@ -12,7 +12,7 @@ export function turned(v, k, angle) {
   return [v[0] * c + x[0] * s + k[0] * d, v[1] * c + x[1] * s + k[1] * d, v[2] * c + x[2] * s + k[2] * d];
 }
 
-const FARTHEST = 20;   // in mean distances of the photographs; at this distance, the scene covers a few pixels
+const FARTHEST = 20;   // in multiples of the photographs' mean distance; from there, the scene covers a few pixels
 
 export class Camera {
   constructor(scene) {

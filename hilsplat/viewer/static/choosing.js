@@ -50,7 +50,7 @@ export async function tapped(x, y) {
   host.focus({ preventScroll: true });
   const at = paneAt(x);
   if (!main()) { tell("Nothing to select yet: the semantic tree is not loaded."); return; }
-  if (variantOf(panes[at.k]) !== variantOf(panes[0])) { tell("This side shows another tree: select nodes on the left."); return; }
+  if (variantOf(panes[at.k]) !== variantOf(panes[0])) { tell("This side shows a different tree. Select nodes on the left."); return; }
   try { choose(deeper(api.offline ? quickPick(at, y) : await exactPick(at, y))); } catch (error) { failed(error); }
 }
 

@@ -27,7 +27,7 @@ function addToPath() {
   page.path.push(page.camera.copy());
   showPath();
   if (page.path.length > 1) $("path").value = "path";
-  tell(page.path.length < 2 ? "The path begins here. Add another view, and saved films follow the path." : `${counted(page.path.length, "view")} in the path. Saved films follow it.`);
+  tell(page.path.length < 2 ? "The path begins here. Add another view to make saved films follow the path." : `${counted(page.path.length, "view")} in the path. Saved films follow it.`);
 }
 
 const MODES = ["tint", "ghost", "isolate", "plain"];
@@ -91,7 +91,7 @@ export function attachHands() {
   const selected = () => page.chosen >= 0 ? [{ name: nameOf(main(), page.chosen), nodes: [page.chosen] }] : groups();
   $("save").addEventListener("toggle", () => {
     const chosen = selected(), count = chosen.reduce((sum, group) => sum + group.nodes.length, 0);
-    $("save-what").textContent = page.chosen >= 0 ? `Of ${chosen[0].name}` : chosen.length ? `Of ${counted(count, "answer")} to ${chosen.map((group) => group.name).join(", ")}` : "Run a query or select a node to save its Gaussians, boxes and masks.";
+    $("save-what").textContent = page.chosen >= 0 ? `For ${chosen[0].name}` : chosen.length ? `For ${counted(count, "answer")} to ${chosen.map((group) => group.name).join(", ")}` : "Run a query or select a node to save its Gaussians, boxes and masks.";
     for (const button of $("save").querySelectorAll("[data-nodes]")) button.disabled = !count || ("long" in button.dataset && !$("saving").hidden);
   });
   $("save").addEventListener("click", async (event) => {

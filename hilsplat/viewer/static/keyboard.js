@@ -1,4 +1,4 @@
-// Keyboard shortcuts, which are ignored during typing and don't override keys of the browser or of controls.
+// Keyboard shortcuts, which are ignored while the user types and don't override the keys of the browser or of controls.
 
 const STEPS_PER_MS = 0.012, EASE_MS = 70;
 const ORBITS = { ArrowLeft: [-1, 0, 0], ArrowRight: [1, 0, 0], ArrowUp: [0, 1, 0], ArrowDown: [0, -1, 0] };

@@ -12,7 +12,7 @@ export const texts = data.asked.map((query) => query.text), opening = data.openi
 const unpacked = (id) => Uint8Array.from(atob(held(id)), (c) => c.charCodeAt(0)).buffer;
 
 const image = (text) => text ? `data:image/jpeg;base64,${text}` : "data:,";
-const none = async () => { throw new Refused("This page has no server."); };
+const none = async () => { throw new Refused("This exported page has no server, so this action is not available."); };
 
 export const scene = async () => data.scene;
 export const variant = async () => data.variant;

@@ -207,7 +207,7 @@ def test_a_rewritten_tree_is_reported_and_not_used_until_a_reload(copied, labels
     for path, sent in (("at", pixel), ("carry", {"ids": [1], "view": 1})):
         refused = client.post(f"/api/{path}", json=sent, params=of)
         assert refused.status_code == 409
-        assert "semantic_tree of photos/desk changed on the disk" in refused.json()["error"]
+        assert "semantic_tree of photos/desk changed on disk" in refused.json()["error"]
     assert put(client, 0, [MUG], "none").status_code == 200  # what is drawn on the same photographs is kept
     again = client.get("/api/scene").json()["of"]
     assert again != of["of"]

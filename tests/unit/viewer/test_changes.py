@@ -80,7 +80,7 @@ def test_rebuilt_parts_are_not_read_together_with_opened_ones(page, desk):
     for send in refused:
         answer = send()
         assert answer.status_code == 409, answer.request.url
-        assert "gaussians.ply of photos/desk changed on the disk" in answer.json()["error"]
+        assert "gaussians.ply of photos/desk changed on disk" in answer.json()["error"]
     assert not (desk / "names.json").exists()
 
 
@@ -94,7 +94,7 @@ def test_an_export_of_a_page_fails_if_the_scene_changes_meanwhile(page, desk, mo
     monkeypatch.setattr(exports, "crop", crop)
     lines = page.post("/api/export/page", json={}).text.splitlines()
     assert lines[0].startswith('{"made":0')
-    assert len(lines) == 2 and "semantic_tree of photos/desk changed on the disk" in lines[1]
+    assert len(lines) == 2 and "semantic_tree of photos/desk changed on disk" in lines[1]
 
 
 def test_a_later_variant_is_not_opened_together_with_old_parts(page, desk):
