@@ -222,7 +222,7 @@ def _shape(opened: OpenedScene, asked: Shape) -> dict[str, Any]:
         mask = mask & (painted == 0) if asked.stroke.erase else mask | (painted > 0)
     if asked.inside is not None:
         mask = mask & fill_polygons(asked.inside, size_hw)
-    is_drawn = len(asked.add) == 1 and np.array_equal(mask, drawn)  # it has fewer corners to edit
+    is_drawn = len(asked.add) == 1 and np.array_equal(mask, drawn)  # the given polygon has fewer corners
     return {"polygons": asked.add if is_drawn else traced(mask), "area_px": int(np.count_nonzero(mask))}
 
 

@@ -207,7 +207,7 @@ def _from_isat(name: str, content: Mapping[str, Any], cameras: Cameras) -> dict[
         return {view: labels_of(labels)}
     pieces: list[Piece] = []
     for thing in labels.objects:
-        # Without our keys, groups are ignored: in LERF-OVS's files, they repeat and identify no object.
+        # Without our keys, groups are ignored: in LERF-OVS's files, group numbers are not unique.
         group = thing.keys.get("group") if "level" in thing.keys else None
         pieces += [(thing.category, group, polygon, thing.keys) for polygon in thing.polygons]
     return {view: _joined(name, pieces)}
@@ -328,8 +328,8 @@ def merged(
 
     Ids are compared only among objects with the same text and level, because shapes without ids are numbered
     from 1 in every photograph. Among the scene's objects with the same text and level, a label is matched to
-    an object that it overlaps, else to one with the same id, else to one without a label in the photograph.
-    A label without a match is a new object.
+    an object that it overlaps. If there is none, it is matched to one with the same id, and otherwise to one
+    without a label in the photograph. A label without a match is a new object.
 
     Returns:
         all labels of each changed photograph; the number of labels that are new or have a new region; and the

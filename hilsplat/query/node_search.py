@@ -59,8 +59,8 @@ class NodeHits:
 
     Attributes:
         ids: rows of the semantic tree, best first.
-        values: sort key of each node: its cosine margin for the last text, plus a bonus (one text) or minus a
-            penalty (a path) that depends on its ancestors.
+        values: each node's sort key, which is its cosine margin for the last text, plus a bonus (one text) or
+            minus a penalty (a path) that depends on its ancestors.
         route: how the best node was found: "flat" for one text. For a path, "child" if it has an ancestor at
             the level of every earlier text and the nearest of them is its parent; "fallback" if it has no
             such ancestor or nothing plausible matches the first text; otherwise "descendant".

@@ -29,7 +29,7 @@ STEP = {"mp4": 1, "gif": 2}
 CROP_PX = 160
 CROP_MARGIN = 0.15
 LEAST_ALPHA = 0.1
-"""Lower bound on alpha in the test whether a crop's pixel shows the node; enlarged Gaussians leave gaps."""
+"""Minimum alpha assumed in deciding whether a crop's pixel shows the node; enlarged Gaussians leave gaps."""
 DIMMED, GROUND = 0.2, 110.0
 """Weight of a crop's photograph outside the node, and the grey value that it is blended with."""
 

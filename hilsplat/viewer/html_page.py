@@ -1,4 +1,4 @@
-"""A scene and answers to some queries in one HTML file, for papers and talks, that needs no server.
+"""One HTML file, for papers and talks, that shows a scene and answers to some queries without a server.
 
 The file is the viewer page: its scripts are data URLs in an import map, with `offline.js` instead of
 `api.js`. Gaussians, nodes, crops and small photographs are embedded as base64. The page sends no requests.

@@ -35,7 +35,7 @@ KEPT_RELEVANCIES = 8
 """Number of cached field relevancies (per variant, text and level), each with one byte per Gaussian."""
 
 MAX_GAUSSIANS = 4_000_000
-"""Maximum number of Gaussians; more do not fit in textures of 2048 x 8192 texels or in a few GiB."""
+"""Maximum number of Gaussians; more do not fit in textures of 2048 x 8192 texels or a few GiB of memory."""
 
 logger = logging.getLogger(__name__)
 
