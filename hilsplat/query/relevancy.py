@@ -195,7 +195,7 @@ class LatentRelevancy:
 
         The first directions are computed from a sample. While some pixels lose too much, such as those of a
         small unsampled object, further directions are computed from them, orthogonal to all previous ones;
-        other pixels get coordinate 0 there. Each round uses at least one of the C directions, so the loop ends.
+        others get 0 along them. Each round uses at least one of the C directions, so the loop ends.
         """
         may_lose = lost_for_error(self._scale, self._code.channels)
         directions, others = self._directions(latents, np.eye(self._code.channels))
