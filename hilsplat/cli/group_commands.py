@@ -52,28 +52,6 @@ def world_show(
     typer.echo(f"wrote {target}")
 
 
-@world_app.command("classes")
-def world_classes(out: Annotated[Path, typer.Option(help="PNG")] = Path("world_classes.png")) -> None:
-    """Draw one object of each class."""
-    from hilsplat.world.pictures import draw_classes
-
-    draw_classes(out)
-    typer.echo(f"wrote {out}")
-
-
-@world_app.command("gallery")
-def world_gallery(
-    kind: Annotated[str, typer.Argument(help="kind of scene: tabletop, room or street")],
-    seeds: Annotated[list[int], typer.Argument(help="seeds of the scenes")],
-) -> None:
-    """Draw one view of each scene, with its ground-truth labels by level, as world_KIND.png."""
-    from hilsplat.world.pictures import draw_scenes
-
-    target = Path(f"world_{kind}.png")
-    draw_scenes(kind, seeds, target)
-    typer.echo(f"wrote {target}")
-
-
 @world_app.command("inconsistency")
 def world_inconsistency(
     scene: SceneWithMasks, variant: MeasuredMasks = "default", results: Results = Path("results")

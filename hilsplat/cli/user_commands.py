@@ -165,44 +165,42 @@ def export(
     if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ArtifactError(f"--out {out} exists", fix="choose a new folder, or remove this one first")
     name = form.value if variant == "default" else f"{form.value}-{variant}"
-    typer.echo(_write(form, folder, out or folder / "export" / name, variant, data_root, threads))
-
-
-def _write(form: Form, folder: Path, out: Path, variant: str, data_root: Path, threads: int) -> str:
-    """Write an export, and return a human-readable summary."""
-    from hilsplat.scene.scene import Scene
-
+    out = out or folder / "export" / name
     if form is Form.TREE:
         from hilsplat.query.tree_picture import export_tree
 
-        return export_tree(folder, variant, out, threads)
+        typer.echo(export_tree(folder, variant, out, threads))
+        return
     if form is Form.PLY:
         from hilsplat.splat.coordinates import write_source_ply
 
         ply = out / "point_cloud.ply"
-        return f"wrote {write_source_ply(folder / 'gaussians.ply', ply)} Gaussians to {ply}"
+        typer.echo(f"wrote {write_source_ply(folder / 'gaussians.ply', ply)} Gaussians to {ply}")
+        return
+    from hilsplat.scene.scene import Scene
+
     opened = Scene.load(folder / "scene")
     views = len(opened.cameras)
-    if form is Form.COLMAP:
-        from hilsplat.scene.exporting import write_colmap
+    if form is Form.LABELS:
+        from hilsplat.annotate.exchange import export_labels
 
-        write_colmap(opened, out)
-        return f"wrote images and sparse/0 of {views} views to {out}"
-    if form is Form.NERFSTUDIO:
-        from hilsplat.scene.exporting import write_nerfstudio
-
-        write_nerfstudio(opened, out)
-        return f"wrote images, transforms.json and points.ply of {views} views to {out}"
-    if form is Form.LANGSPLAT:
+        views, what = export_labels(opened, folder, data_root, out), "labels"
+    elif form is Form.LANGSPLAT:
         from hilsplat.embed.langsplat_export import export_langsplat
         from hilsplat.scene.finished import FinishedScene
 
         parts = FinishedScene.locate(folder, variant).parts
         export_langsplat(opened, parts.masks, parts.clip, parts.gaussians, out)
-        return f"wrote images, sparse/0, point_cloud.ply and language_features of {views} views to {out}"
-    from hilsplat.annotate.exchange import export_labels
+        what = "images, sparse/0, point_cloud.ply and language_features"
+    else:
+        from hilsplat.scene.exporting import write_colmap, write_nerfstudio
 
-    return f"wrote labels of {export_labels(opened, folder, data_root, out)} views to {out}"
+        write, what = {
+            Form.COLMAP: (write_colmap, "images and sparse/0"),
+            Form.NERFSTUDIO: (write_nerfstudio, "images, transforms.json and points.ply"),
+        }[form]
+        write(opened, out)
+    typer.echo(f"wrote {what} of {views} views to {out}")
 
 
 Port = Annotated[int, typer.Option(min=0, max=65535, help="port of the page; 0: any free port")]

@@ -45,7 +45,7 @@ from hilsplat.hub.catalogue import (
     read_listing,
     usual_files,
 )
-from hilsplat.models.onnx_graph import split_whole, whole_clip
+from hilsplat.models.onnx_graph import split_clip, whole_clip
 from hilsplat.models.store import RECOMMENDED, real_model, user_models
 
 logger = logging.getLogger(__name__)
@@ -241,9 +241,10 @@ def _download(listing: Listing, file: HubFile, staging: Path) -> None:
 
 def _place(found: Prepared, made: Path, **more: Any) -> str:
     """Check a complete folder, write `origin.json` into it, and rename it to the target."""
-    if whole_clip(made) is not None:
+    if whole := whole_clip(made):
         with explain_full_disk(made):
-            split_whole(made)
+            split_clip(made)
+        whole.unlink()
     text = check_model(made).replace(str(made), str(found.target))
     files = [path for path in sorted(made.rglob("*")) if path.is_file() and path.name != ORIGIN]
     fetched = []

@@ -224,9 +224,3 @@ def split_clip(folder: Path) -> list[Path]:
             temporary.write_bytes(half.SerializeToString())
         written.append(path)
     return written
-
-
-def split_whole(folder: Path) -> None:
-    """Replace a CLIP model's `model.onnx` with the networks of `split_clip`; a weight file is kept."""
-    vision, _ = split_clip(folder)
-    vision.with_name(WHOLE).unlink()

@@ -34,7 +34,6 @@ from hilsplat.segment.suppression import (
     distinct_boxes,
     last_inside,
     suppress_boxes,
-    suppress_boxes_officially,
     suppress_masks,
 )
 from hilsplat.settings import MasksSettings
@@ -212,7 +211,7 @@ def distinct_prompts(
     for head in range(len(HEADS)):
         rows = np.flatnonzero(likely[:, head])
         at = rows, head
-        distinct = distinct_boxes(boxes[at], predicted_iou[at], stability[at], REPEAT_IOU, REPEAT_SLACK)
+        distinct = distinct_boxes(boxes[at], predicted_iou[at], REPEAT_IOU, stability[at], REPEAT_SLACK)
         chosen[rows[distinct]] = True
     chosen[0] |= not chosen.any()
     return {name: np.concatenate([each.pop(name) for each in kept])[chosen] for name in list(kept[0])}
@@ -306,8 +305,10 @@ def _suppressed(
     masks: HierarchicalMasks, first: Float64[np.ndarray, " M"] | None, settings: MasksSettings
 ) -> HierarchicalMasks:
     """Drop masks whose box repeats a better mask's; masks are ranked by `first`, then by predicted IoU."""
-    suppress = suppress_boxes_officially if settings.generator == "official" else suppress_boxes
-    return masks.take(suppress(masks.box_xyxy, masks.predicted_iou, settings.box_nms_iou, first))
+    boxes, score, iou_max = masks.box_xyxy, masks.predicted_iou, settings.box_nms_iou
+    if settings.generator == "official":
+        return masks.take(distinct_boxes(last_inside(boxes), score if first is None else first, iou_max))
+    return masks.take(suppress_boxes(boxes, score, iou_max, first))
 
 
 def _upscale(

@@ -49,36 +49,24 @@ def suppress_boxes(
     return np.sort(order[_greedy(boxes_xyxy[order], iou_max)])
 
 
-def suppress_boxes_officially(
-    boxes_xyxy: Int[np.ndarray, "M 4"],
-    score: Float[np.ndarray, " M"],
-    iou_max: float,
-    first: Float[np.ndarray, " M"] | None = None,
-) -> Int64[np.ndarray, " k"]:
-    """Return the rows kept by SAM's suppression as published, the best first.
-
-    Box maxima are inclusive. Boxes are ranked by `first`, or by score if `first` is None; ties by row.
-    """
-    order = np.argsort(-(score if first is None else first), kind="stable")
-    return order[_greedy(last_inside(boxes_xyxy)[order], iou_max)]
-
-
 def distinct_boxes(
     boxes_xyxy: Int[np.ndarray, "M 4"],
     score: Float[np.ndarray, " M"],
-    stability: Float[np.ndarray, " M"],
     iou_max: float,
-    slack: float,
+    stability: Float[np.ndarray, " M"] | None = None,
+    slack: float = 0.0,
 ) -> Int64[np.ndarray, " k"]:
     """Return the rows kept by a suppression that is valid for any thresholds, the best first.
 
     The box with the highest score (on a tie, the lower row) is kept and drops every other box whose IoU with
-    it exceeds `iou_max` and whose stability is at most `slack` above the kept box's; this is repeated for
-    the remaining boxes. Except for the slack, a box that passes a threshold is dropped only by a box that
-    also passes it.
+    it exceeds `iou_max` and whose stability, if given, is at most `slack` above the kept box's; this is
+    repeated for the remaining boxes. Except for the slack, a box that passes a threshold is dropped only by
+    a box that also passes it. Without stabilities, for boxes with inclusive maxima (`last_inside`), this is
+    SAM's suppression as published.
     """
     order = np.argsort(-score, kind="stable")
-    return order[_greedy(boxes_xyxy[order], iou_max, stability[order], slack)]
+    boxes = boxes_xyxy[order]
+    return order[_greedy(boxes, iou_max, None if stability is None else stability[order], slack)]
 
 
 def _greedy(

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int32
 
 from hilsplat.base.levels import NONE
+from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
 from hilsplat.world.paints import COLOURS, Paint, PaintBox, difference
 from hilsplat.world.shapes import Mesh, joined
 
@@ -26,30 +27,12 @@ _SHADES = (1.0, 0.85, 1.15, 0.72, 1.3, 0.6, 1.45, 0.5, 1.6)
 _TOUCH = 0.03  # maximum gap between touching boxes, relative to the object's size
 
 
-@dataclass(frozen=True)
-class ModelNode:
-    """A whole, part or subpart of one object.
-
-    Attributes:
-        level: 1 whole, 2 part, 3 subpart.
-        parent: row of the parent node in the object, -1 for the whole.
-        text: canonical query for the node, such as "bear head"; `synonyms` are equivalent.
-        colour: word for the node's prevailing colour.
-    """
-
-    level: int
-    parent: int
-    text: str
-    synonyms: tuple[str, ...]
-    colour: str
-
-
 @dataclass(frozen=True, eq=False)
 class ObjectModel:
     """One object in its own frame, with its lowest point at z = 0 and its front towards +x.
 
     Attributes:
-        nodes: tree of the object; row 0 is the whole.
+        nodes: tree of the object, with ids and parents as rows; row 0 is the whole.
         triangles: corner positions; `normals` are the shading normals at the corners.
         node_ids: rows in `nodes` for each triangle (whole, part, subpart; -1: none).
         material_ids: row in `materials` for each triangle.
@@ -57,7 +40,7 @@ class ObjectModel:
     """
 
     name: str
-    nodes: tuple[ModelNode, ...]
+    nodes: tuple[AnnotatedNode, ...]
     triangles: Float[np.ndarray, "F 3 3"]
     normals: Float[np.ndarray, "F 3 3"]
     node_ids: Int32[np.ndarray, "F 3"]
@@ -210,7 +193,7 @@ class Builder:
                 repaint[row, main] = settled[key]
         return [(row, mesh, repaint.get((row, paint), paint)) for row, mesh, paint in self.pieces]
 
-    def _described(self, node: Node, area: dict[Paint, float]) -> ModelNode:
+    def _described(self, node: Node, area: dict[Paint, float]) -> AnnotatedNode:
         """Return a node with its queries: the canonical name, then aliases, relations and attributes."""
         whole = self.nodes[0]
         text, others = whole.word, list(whole.aliases)
@@ -230,7 +213,7 @@ class Builder:
             others.append(f"{material} {text}")
             if coloured:
                 others.append(f"{colour} {material} {text}")
-        return ModelNode(node.level, node.parent, text, tuple(dict.fromkeys(others)), colour)
+        return AnnotatedNode(node.row, node.level, node.parent, text, tuple(dict.fromkeys(others)))
 
 
 def _surface(mesh: Mesh) -> float:

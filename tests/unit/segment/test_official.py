@@ -6,7 +6,7 @@ import pytest
 from benchmarks.canned_sam import CannedSam, NetworkClock
 from hilsplat.segment.generate import clean_masks
 from hilsplat.segment.sam import HEADS, Frame, SamModel, full_stability, read_logits
-from hilsplat.segment.suppression import suppress_boxes, suppress_boxes_officially
+from hilsplat.segment.suppression import distinct_boxes, last_inside, suppress_boxes
 from hilsplat.settings import MasksSettings
 from tests.unit.segment import official
 from tests.unit.segment.handmade import generate, pack
@@ -60,7 +60,7 @@ def test_end_exclusive_boxes_have_a_different_iou_than_official_ones():
     boxes = np.array([[0, 0, 4, 9], [0, 0, 3, 9]])
     score = np.array([0.9, 0.8])
     assert suppress_boxes(boxes, score, 0.7).tolist() == [0]
-    assert suppress_boxes_officially(boxes, score, 0.7).tolist() == [0, 1]
+    assert distinct_boxes(last_inside(boxes), score, 0.7).tolist() == [0, 1]
 
 
 def test_scores_above_one_do_not_outweigh_the_first_rank():
@@ -70,7 +70,7 @@ def test_scores_above_one_do_not_outweigh_the_first_rank():
 
 def test_ties_are_broken_by_row_officially_and_by_area_here():
     boxes, score = np.array([[0, 0, 10, 9], [0, 0, 10, 10]]), np.ones(2)
-    assert suppress_boxes_officially(boxes, score, 0.5).tolist() == [0]
+    assert distinct_boxes(last_inside(boxes), score, 0.5).tolist() == [0]
     assert suppress_boxes(boxes, score, 0.5).tolist() == [1]
 
 

@@ -53,7 +53,7 @@ def test_a_box_repeats_a_better_one_unless_it_is_more_stable():
     stability = np.array([0.25, 0.5, 0.75, 0.75 + 2**-20, 0.125])  # exact in binary
     # 1 is best; 0 and 2 repeat it, although 2 is more stable by exactly the slack; 3 is more stable by more
     # than that; 4 has an IoU of 0.8 with all others
-    assert distinct_boxes(boxes, score, stability, iou_max=0.85, slack=0.25).tolist() == [1, 3, 4]
+    assert distinct_boxes(boxes, score, 0.85, stability, slack=0.25).tolist() == [1, 3, 4]
 
 
 @given(st.integers(0, 1000), st.sampled_from([0.2, 0.5, 0.8]), st.sampled_from([0.2, 0.5, 0.8]))
@@ -67,7 +67,7 @@ def test_distinct_boxes_lead_to_the_same_suppression_at_any_threshold(seed, scor
         rows = rows[(score[rows] > score_min) & (stability[rows] >= stability_min)]
         return rows[suppress_boxes(boxes[rows], score[rows], iou_max=0.7)].tolist()
 
-    assert best(np.sort(distinct_boxes(boxes, score, stability, 0.9, slack=0.0))) == best(np.arange(40))
+    assert best(np.sort(distinct_boxes(boxes, score, 0.9, stability))) == best(np.arange(40))
 
 
 def test_a_contained_mask_is_dropped_even_with_the_better_score():

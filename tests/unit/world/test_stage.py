@@ -1,5 +1,7 @@
 """The world stage writes images for the next stages, and ground truth only for evaluation and pictures."""
 
+from runpy import run_path
+
 import numpy as np
 import pytest
 
@@ -12,7 +14,7 @@ from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnota
 from hilsplat.scene.cameras import Cameras
 from hilsplat.settings import WorldSettings
 from hilsplat.world.objects.catalogue import GENERATOR_VERSION, TABLETOP
-from hilsplat.world.pictures import draw_classes, draw_scenes, node_colours, show_world, tree_lines
+from hilsplat.world.pictures import node_colours, show_world, tree_lines
 from hilsplat.world.render import label_view
 from hilsplat.world.scenes.kinds import build_scene
 from hilsplat.world.stage import parse_source, run_world
@@ -111,13 +113,13 @@ def test_the_manual_lists_all_tabletop_classes():
     assert f"The {len(TABLETOP)} classes are {', '.join(names)} and {last}." in text
 
 
-def test_pictures_of_classes_and_scenes_are_drawn(tmp_path, monkeypatch):
-    draw_classes(tmp_path / "classes.png", ("burger",))
+def test_pictures_of_the_manual_are_drawn(tmp_path):
+    script = run_path(str(PROJECT / "docs/draw_world.py"))
+    script["draw_classes"](tmp_path / "classes.png", ("burger",))
     # The ground and the page are grey.
     colourful = np.ptp(read_image(tmp_path / "classes.png").astype(int), axis=2) > 60
     assert 0.01 < colourful.mean() < 0.2
-    monkeypatch.setattr("hilsplat.world.pictures.SCENE_PX", 48)
-    draw_scenes("tabletop", [100], tmp_path / "scenes.png")
+    script["draw_scenes"]("tabletop", [100], tmp_path / "scenes.png")
     height, width, _ = read_image(tmp_path / "scenes.png").shape
     assert width > height
 
