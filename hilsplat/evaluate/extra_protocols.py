@@ -1,4 +1,4 @@
-"""Protocols that score a scene: its data set's, or those of the benchmarks that it substitutes for."""
+"""Protocols that score a scene: those of its data set, or of the benchmarks that it substitutes for."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

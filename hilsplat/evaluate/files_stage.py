@@ -33,13 +33,13 @@ from hilsplat.settings import EvaluateSettings
 logger = logging.getLogger(__name__)
 
 METHOD = "files"
-"""Method in the score rows; their variant names the program."""
+"""Method in the score rows; the variant is the program's name."""
 
 WORDS = "masks of files"
 """Bracketed suffix of a protocol's name: masks were supplied, so the protocol's map rule was not applied."""
 
 MASK_METRICS = (*cards.MASK, "acc_25", "acc_50")
-"""Mask metrics; metrics of relevancy maps cannot be computed."""
+"""Metrics computed for masks from files; the other metrics need relevancy maps."""
 
 FOREGROUND = 128
 """Pixels with a grey value above this are foreground, as in Gaussian Grouping's script."""
@@ -206,7 +206,7 @@ def _cosine(
 
 
 def _level_rows(masks: Masks, truth: ViewTruth) -> Iterator[Measured]:
-    """Yield the rows of masks at levels, and their hierarchical consistency."""
+    """Yield the rows of masks with levels, and their hierarchical consistency."""
     protocol = cards.LEVEL_GIVEN.labelled([WORDS])
     for query in truth.queries:
         assert query.level is not None
@@ -237,7 +237,7 @@ def _point_rows(
             continue
         found = [path for file in _files_of(card) if (path := predictions / file).is_file()]
         if not found:
-            logger.info("%s: not scored: there is no %s", card.name, " or ".join(_files_of(card)))
+            logger.info("%s is not scored, because there is no %s", card.name, " or ".join(_files_of(card)))
             continue
         is_scored, points = True, truth[labelling]
         if card is cards.INSTANCES:
@@ -258,11 +258,11 @@ def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.nd
     """Return the masks of one view by (level, text); the level is "" for masks without a level.
 
     Files are `<view>/<text>.png`, `<view>/<level>/<text>.png` (level whole, part or subpart), or `<view>.npz`
-    with an array per text, "<text>" or "<level>/<text>". The view is named without its suffix. A view without
-    predictions has an empty folder.
+    with one array per text, named "<text>" or "<level>/<text>". `<view>` is the view's name without suffix.
+    A view without predictions has an empty folder.
 
     Raises:
-        ArtifactError: the view has neither folder nor file, or both, or a file cannot be used.
+        ArtifactError: the view has neither a folder nor a file, or has both, or a file cannot be used.
     """
     stem = Path(view).stem
     place, packed = folder / stem, folder / f"{stem}.npz"
@@ -314,7 +314,7 @@ def read_point_classes(path: Path, num_points: int) -> Int64[np.ndarray, " P"]:
 def read_point_instances(
     path: Path, num_points: int
 ) -> tuple[Bool[np.ndarray, "M P"], Int64[np.ndarray, " M"], Float64[np.ndarray, " M"]]:
-    """Read masks, class ids and confidences in ScanNet's format: lines of mask file, class id and confidence.
+    """Read instances in ScanNet's format: one line per instance, with mask file, class id and confidence.
 
     A mask file, relative to the folder of `path`, has one integer per point, non-zero inside the instance.
 
@@ -352,7 +352,7 @@ def _read_png(path: Path) -> Bool[np.ndarray, "h w"]:
         with open_image(path) as image:
             grey = np.asarray(image.convert("L"))
     except (OSError, SyntaxError) as error:
-        raise ArtifactError(f"mask {path} cannot be read: {error}", fix="write it again") from error
+        raise ArtifactError(f"mask {path} cannot be read: {error}", fix="save it as PNG again") from error
     return _as_mask(grey, str(path))
 
 

@@ -24,7 +24,7 @@ COLUMNS: tuple[str, ...] = (
 
 @dataclass(frozen=True)
 class Measured:
-    """One number, without its scene and variant."""
+    """One measured number, without its scene and variant."""
 
     method: str  # `tree`, `tree-path`, `field`, or `truth` for the annotations' own HC
     query: str  # empty if the number describes a whole view

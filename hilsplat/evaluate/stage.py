@@ -33,7 +33,7 @@ from hilsplat.settings import EvaluateSettings
 logger = logging.getLogger(__name__)
 
 MAX_CAMERA_ERROR_M = 0.1
-"""Median camera error above which point scores are meaningless; a larger error logs a warning."""
+"""Median camera error above which point scores are meaningless and a warning is logged."""
 
 TIMED_TEXTS = 3
 """Number of timed queries, all in one view."""
@@ -60,7 +60,7 @@ def run_evaluate(
 
     With the labels of a published data set, every labelled view is scored, even if it was used for training,
     because most benchmarks train on all views. `times.csv` (seconds per query) and `instances.npz` are
-    written beside `scores.csv`, which contains only the header if there are neither truth nor labels.
+    written beside `scores.csv`. Without truth and labels, `scores.csv` contains only its header.
 
     Args:
         dataset: data set recorded in every row, as are `scene` and `variant`.
@@ -109,7 +109,7 @@ def run_evaluate(
                     if not seconds and of_view.categories:
                         texts = [query.text for query in of_view.categories[:TIMED_TEXTS]]
                         seconds = time_queries(answers, view, texts, settings)
-                    answers.forget(view)  # the freed memory is reused, which avoids clearing new pages
+                    answers.forget(view)  # reusing the freed memory avoids clearing new pages
                 if isinstance(known, Path) and truths and settings.view_consistency:
                     for view, row in measure_world_consistency(selections, truths, kept, known, settings):
                         keep(data, view, row)
@@ -143,7 +143,7 @@ def point_rows(
         points = labelled_points(known.parent, kind)
         transform, error = scene_from_true(Cameras.load(known / "cameras.npz"), answers.scene.cameras)
         if error > MAX_CAMERA_ERROR_M:
-            sentence = "%s: cameras are %.2f m from the truth (median); point scores are meaningless"
+            sentence = "%s: the median camera error is %.2f m, so point scores are meaningless"
             logger.warning(sentence, answers.scene.name, error)
     methods, mode = settings.methods, settings.points
     yield from measure_scene_points(answers, points, transform, extra.points, methods, mode, threads)
@@ -194,7 +194,7 @@ def scene_from_true(true: Cameras, found: Cameras) -> tuple[Float64[np.ndarray, 
 def time_queries(
     answers: LanguageScene, view: str, texts: Sequence[str], settings: EvaluateSettings
 ) -> dict[str, float]:
-    """Return the seconds per query of field and tree: text encoding, view weights, relevancy and mask.
+    """Return the seconds per query by field and by tree: text encoding, view weights, relevancy and mask.
 
     The view's weights and the text's vector are timed once and added, because later queries reuse them. The
     rest is timed with weights and vectors cached, as the median over the texts.

@@ -1,4 +1,4 @@
-"""Best IoU of any mask or node with annotated regions, by level: the upper limit for any query."""
+"""Highest IoU of any mask or node with each annotated region, by level: an upper limit for any query."""
 
 import math
 from collections import defaultdict
@@ -34,11 +34,11 @@ COLUMNS = (
 
 @dataclass
 class Fits:
-    """Results for the regions of one level, over some views."""
+    """Results for the regions of one level, collected over views."""
 
     best: list[float] = field(default_factory=list)  # IoU of the best mask or node of the same level, or 0
     anywhere: list[float] = field(default_factory=list)  # IoU of the best mask or node of any level
-    # per region with a parent: share of its best mask inside the parent's best mask; 0 if either has none
+    # regions with a parent: share of the best mask that is in the parent's best mask; 0 if either is missing
     containment: list[float] = field(default_factory=list)
 
     def row(self) -> list[str]:
@@ -91,7 +91,7 @@ def nodes_of_view(tree: SemanticTree, weights: sp.csr_matrix) -> dict[Level, np.
 
 
 def masks_of_view(path: Path) -> dict[Level, Bool[np.ndarray, "M P"]]:
-    """Load the masks of a view, by level; a level may have none."""
+    """Load the masks of a view by level; a level may have no masks."""
     masks = HierarchicalMasks.load(path)
     rows = {level: masks.rows_of(level) for level in LEVELS}
     return {
@@ -102,10 +102,10 @@ def masks_of_view(path: Path) -> dict[Level, Bool[np.ndarray, "M P"]]:
 def run_label_fits(
     folder: Path, variant: str, labels: str, data_root: Path, out: Path, threads: int = 1
 ) -> str:
-    """Write and return a table of fits: masks in annotated views with masks, nodes in all annotated views.
+    """Compare nodes and masks with the labels of annotated views; write and return a table.
 
     The scene folder contains `scene`, `gaussians.ply` and the variant's `masks` and `semantic_tree`. The
-    labels, such as "annotated/photos/desk", must have levels.
+    labels, such as "annotated/photos/desk", must have levels. Without masks, only nodes are compared.
 
     Raises:
         SceneError: the labels cannot be read or do not fit the scene.

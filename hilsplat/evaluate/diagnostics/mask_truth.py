@@ -83,7 +83,7 @@ def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, o
 
 
 def median_and_worst(fits: Mapping[str, dict[Level, ViewFit]]) -> list[str]:
-    """Return the views with the median and the lowest mean over all regions."""
+    """Return the views whose mean IoU over all regions is the median and the lowest."""
 
     def mean_of(view: str) -> float:
         best = np.concatenate([fit.best for fit in fits[view].values()])
@@ -124,7 +124,7 @@ def draw_fits(
 
 
 def paint_fits(image: np.ndarray, labels: np.ndarray, fit: ViewFit) -> np.ndarray:
-    """Colour outlined ground-truth regions by the IoU of the best mask; unscored regions stay grey."""
+    """Outline ground-truth regions and colour each by its best mask's IoU; unscored regions stay grey."""
     painted = 0.5 * grey(image)
     for node, value in zip(fit.ids, fit.best, strict=True):
         colour = np.array(colormaps[COLOURS](float(value))[:3]) * 255

@@ -34,8 +34,8 @@ class TreeMeasure:
     precision: float  # share of nodes matched one to one with a true node at IoU 0.5
     recall: float  # share of true nodes matched
     mean_iou: float  # mean over true nodes of the matched node's IoU, 0 if unmatched
-    purity: float  # share of the nodes' mass that belongs to each node's main true node
-    parent_accuracy: float  # share of matches whose parent mainly covers the true parent; nan without parents
+    purity: float  # share of the nodes' mass that is in the true node that each overlaps most
+    parent_accuracy: float  # share of matches whose parent overlaps the true parent most; nan if no parents
     view_consistency: float  # mean pooled IoU of the nodes' masks across views
     pairs: tuple[tuple[int, int], ...] = ()  # (matched node, its true node)
 
@@ -46,7 +46,7 @@ def measure_tree(
     """Compare the tree's nodes with ground-truth ("true") nodes.
 
     At each level, a Gaussian belongs to the true node that has most of its visible weight, and is weighted by
-    its total weight in labelled pixels. `votes` has the visible weight of each Gaussian in each true node.
+    its total weight in labelled pixels. `votes` is the visible weight of each Gaussian in each true node.
     """
     true_level = np.array([node.level for node in truth.nodes])
     true_parent = np.array([node.parent for node in truth.nodes])

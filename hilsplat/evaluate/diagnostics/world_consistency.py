@@ -28,7 +28,7 @@ from hilsplat.settings import EvaluateSettings
 from hilsplat.world.truth import TrueMesh
 
 TRUTH = "true regions"
-"""Row name of the labels, an upper limit for any masks (below 1: label borders are off by up to a pixel)."""
+"""Row of the labels: an upper limit for any masks, below 1 as label borders are off by up to a pixel."""
 
 COLUMNS = (
     *("scene", "masks", "level", "view_pairs", "masks_compared"),
@@ -36,7 +36,7 @@ COLUMNS = (
 )
 
 DEPTH_TOLERANCE = 0.01
-"""Two views show the same point if its depths differ relatively by at most this much."""
+"""Maximum relative difference in depth at which two views are taken to show the same surface point."""
 
 MIN_POINTS = 16
 """Masks with fewer shared points are not compared."""
@@ -63,7 +63,7 @@ class Agreement:
     index); 0 is perfect. The value is always small if most pairs are in different masks in both views."""
 
     joined_disagreement: float
-    """The same share among pairs in one mask in at least one view (a Jaccard distance); nan if none."""
+    """The same share among pairs that share a mask in at least one view (a Jaccard distance); nan if none."""
 
 
 def shared_points(
@@ -78,10 +78,10 @@ def shared_points(
 
     At most `max_points` of A's pixel centres are used, evenly spaced.
 
-    A point is lifted by A's depth and projected into B. It is visible in B if B's depth at the projection
-    equals its own up to `tolerance`. B's depth between pixel centres is interpolated as inverse depth, which
+    A point is lifted by A's depth and projected into B. It is visible in B if its depth there equals B's
+    depth at the projection up to `tolerance`. Between pixel centres, B's inverse depth is interpolated, which
     is exact on planes of any slant. Next to a depth jump the interpolated value belongs to neither side, so
-    points at occluding borders are dropped. Depths are along the optical axis, inf without a surface.
+    points at occluding borders are dropped. Depths are along the optical axis; inf means no surface.
     """
     pixel = np.flatnonzero(np.isfinite(depth_a))
     depth = depth_a.reshape(-1)[pixel].astype(np.float64)
@@ -117,7 +117,7 @@ def shared_points(
 def best_ious(
     inside_a: Bool[np.ndarray, "Ma P"], inside_b: Bool[np.ndarray, "Mb P"], min_points: int = MIN_POINTS
 ) -> Float[np.ndarray, " m"]:
-    """Return each sufficiently large A mask's highest IoU, in points, with any mask of B."""
+    """Return the highest IoU, in points, of each sufficiently large mask of A with any mask of B."""
     large = inside_a[inside_a.sum(axis=1) >= min_points]
     return iou_matrix(large, inside_b).max(axis=1, initial=0)
 
@@ -180,7 +180,7 @@ def view_agreement(
 
 
 def mean_agreement(parts: Sequence[Agreement]) -> Agreement:
-    """Sum the counts, and average the shares over the pairs of views in which they are defined."""
+    """Sum the counts, and average the shares over the pairs of views for which they are defined."""
 
     def mean(name: str) -> float:
         values = [value for part in parts if (value := getattr(part, name)) == value]
@@ -203,7 +203,7 @@ def neighbours(cameras: Cameras, views: Sequence[str], count: int) -> list[tuple
 
 
 def load_masks(folder: Path, view: str, size_hw: tuple[int, int]) -> HierarchicalMasks:
-    """Load the masks of a view; raise MisalignedArtifactError if they differ from its labels in size."""
+    """Load the masks of a view; raise MisalignedArtifactError if its labels have a different size."""
     masks = HierarchicalMasks.load(Path(folder) / f"{view}.npz")
     if masks.size_hw != tuple(size_hw):
         raise MisalignedArtifactError(
@@ -272,7 +272,7 @@ def measure_world_consistency(
     truth: Path,
     settings: EvaluateSettings,
 ) -> Iterator[tuple[str, Measured]]:
-    """Yield the rows of `world/view-consistency`: each annotated view with its nearest neighbour.
+    """Yield the rows of `world/view-consistency`, which compares annotated views with their nearest views.
 
     The IoU compares the answers in the two views over shared surface points; `n` is the number of points in
     the union, and texts without an answer are omitted. Nothing is yielded without a ground-truth mesh (as for

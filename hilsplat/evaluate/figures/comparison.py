@@ -34,7 +34,7 @@ VIEWS = 4
 
 @dataclass(frozen=True)
 class Answerer:
-    """One compared method: "tree" or "field" of a variant's scene, titled as in tables."""
+    """One compared method: the "tree" or "field" of a variant, with its title in tables."""
 
     title: str
     method: str
@@ -47,7 +47,7 @@ class Answerer:
         rule, texts_of = rule_of(evaluate), defaultdict[str, list[str]](list)
         for shown in rows:
             texts_of[shown.view].append(shown.path[-1])
-        maps = {  # all texts of a view together, because a network decodes its pixels at every call
+        maps = {  # one call for all texts of a view, because each call decodes the view's pixels
             view: dict(zip(texts, np.asarray(self.scene.field_relevancy(texts, view)), strict=True))
             for view, texts in texts_of.items()
         }
@@ -71,11 +71,11 @@ def run_comparison(
     queries: Sequence[str] = (),
     threads: int = 1,
 ) -> None:
-    """Draw the three figures of a scene as PNG and PDF, from ground-truth regions, or else `queries`.
+    """Draw the three figures of a scene as PNG and PDF; without ground-truth regions, `queries` are shown.
 
     Args:
-        folder: `results/<dataset>/<scene>`, finished under every variant.
-        variants: variants to compare, each with the settings it was evaluated with. "default" has rows for
+        folder: `results/<dataset>/<scene>`, in which every variant is finished.
+        variants: variants to compare, each under its own evaluation settings. "default" has rows for
             its tree and its field, other variants only for the field.
         names: variant -> its name in tables.
         out: PNG of the comparison; `views.png` and `features.png` are written beside it.
@@ -122,7 +122,7 @@ def over_views(
 ) -> list[Shown]:
     """Return one query in several views: the first part or subpart in `rows`, else the first query.
 
-    Views with known ground truth are first, in order, then other views, evenly spaced over the scene.
+    Views with ground truth come first, in order, followed by other views, evenly spaced over the scene.
     """
     if not rows:
         return []

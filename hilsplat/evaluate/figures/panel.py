@@ -45,7 +45,7 @@ class Shown:
     """One row of the panel: a query in a view."""
 
     text: str  # texts separated by ">" form a path
-    path: tuple[str, ...]  # texts from the whole down; without annotations, the query's texts
+    path: tuple[str, ...]  # chain of texts that starts at the whole; without annotations, the query's texts
     level: Level | None  # of the annotation, if any
     view: str
     truth: Bool[np.ndarray, "H W"] | None  # ground-truth region; None if unknown
@@ -85,7 +85,7 @@ def run_figures(
     queries: Sequence[str] = (),
     threads: int = 1,
 ) -> None:
-    """Draw the panel from ground-truth regions, or else queries; copy the pose and fit pictures beside it.
+    """Draw the panel (without ground truth, of `queries`); copy the pose and fit pictures beside it.
 
     Args:
         fit: report folder of the fit; None copies nothing.

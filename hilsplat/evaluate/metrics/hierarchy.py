@@ -24,7 +24,7 @@ class Family:
 
 
 def children_consistency(family: Family, reading: Reading) -> list[float]:
-    """Return one term per child of a parent.
+    """Return the consistency of each child with its parent.
 
     `containment`: area(p and c) / area(c), the paper's wording; 1 for perfect nesting.
     `literal`: area(p and c) / area(p), the printed formula, with l = 1 for wholes.
@@ -44,7 +44,7 @@ def hierarchical_consistency(
 ) -> tuple[float, float]:
     """Return the HC of one view (paper, Sec. IV, Eq. 7), and the mean over the parents of all levels pooled.
 
-    HC is averaged over children, parents and levels in turn, so every parent of a level has the same weight,
+    HC is averaged over children, then parents, then levels, so every parent of a level has the same weight,
     regardless of its number of children. A scene's value is the mean over its views with at least one parent;
     then scenes are averaged.
 
@@ -53,7 +53,7 @@ def hierarchical_consistency(
     contributes 0, as max(N_l, 1) implies: in a view without subparts, even perfect nesting scores 0.5.
 
     Args:
-        transitions: families per level of the parent: wholes first, then parts.
+        transitions: families grouped by the parent's level: wholes first, then parts.
     """
     scores = [
         [float(np.mean(children_consistency(family, reading))) for family in families]

@@ -75,15 +75,15 @@ def argmax_masks(similarity: Float[np.ndarray, "K H W"]) -> Bool[np.ndarray, "K 
 def pixel_accuracy(prediction: Bool[np.ndarray, "K H W"], truth: Bool[np.ndarray, "K H W"]) -> float:
     """Return the share of pixels whose predicted classes exactly match the ground truth.
 
-    A pixel with no ground-truth class or two is never correct, because the prediction has one class.
+    A pixel with zero or two ground-truth classes is never correct, because the prediction has one class.
     """
     return float((prediction == truth).all(axis=0).mean())
 
 
 def peak_points(filtered: Float[np.ndarray, "L H W"], level: Level | None) -> Int[np.ndarray, "P 2"]:
-    """Return all pixels (x, y) with the maximum of the filtered map of a level.
+    """Return all pixels (x, y) at which the filtered map of a level has its maximum.
 
-    If `level` is None, the map with the highest maximum is used; the finest wins ties, as in LangSplat.
+    If `level` is None, the map with the highest maximum is used; the finest level wins ties, as in LangSplat.
     """
     chosen = max(filtered[::-1], key=np.max) if level is None else filtered[level.index]
     pixels = np.flatnonzero(chosen == chosen.max())  # np.nonzero in two dimensions is six times slower

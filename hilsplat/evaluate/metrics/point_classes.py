@@ -1,7 +1,7 @@
 """Semantic segmentation of points: ScanNet, ScanNet200, Replica and Waymo.
 
 Labels are 1 .. K; 0 means no class, which is ignored in the ground truth and a miss in the prediction.
-Benchmarks differ in whether counts are summed per scene or over all scenes, and in the classes averaged.
+Benchmarks differ in whether counts are summed per scene or over all scenes, and in which classes count.
 """
 
 from collections.abc import Iterable
@@ -41,7 +41,7 @@ class ClassCounts:
 
 
 def pooled(counts: Iterable[ClassCounts]) -> ClassCounts:
-    """Sum the counts of all scenes; unlike in a mean over scenes, a large scene has more weight."""
+    """Sum the counts of all scenes; unlike in a mean over scenes, large scenes have more weight."""
     scenes = list(counts)
     sums = (sum(getattr(scene, each.name) for scene in scenes) for each in fields(ClassCounts))
     return ClassCounts(*sums)

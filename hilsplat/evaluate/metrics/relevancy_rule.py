@@ -25,10 +25,10 @@ class RelevancyRule:
     """How a map becomes a mask, and which level's mask is used. The defaults follow LangSplat's code.
 
     LangSplat's mean filter is 30 px wide at an image height of 730 px; its text and the paper state 20. Level
-    rules: `max` takes the level whose (mixed) map has the highest value, `mean_in_mask` the highest mean
-    inside its own mask (LangSplat's text on 3D-OVS). The finest level wins ties, because LangSplat stacks
-    levels from fine to coarse. At the border, `langsplat` reflects in the mean filter and omits the last row
-    and column in the majority filter; `inside` omits pixels outside the image (LangSplatV2).
+    rules: `max` uses the level whose (mixed) map has the highest value, `mean_in_mask` the level with the
+    highest mean inside its own mask (LangSplat's text on 3D-OVS). The finest level wins ties, because
+    LangSplat stacks levels from fine to coarse. At the border, `langsplat` reflects in the mean filter and
+    omits the last row and column in the majority filter; `inside` skips pixels off the image (LangSplatV2).
     """
 
     filter_px: int = 0  # side of the mean filter; 0 scales 30 with the height of the map
@@ -44,7 +44,7 @@ class RelevancyRule:
     empty_wins: bool = False
 
     def departures(self, reference: "RelevancyRule") -> tuple[str, ...]:
-        """Return the differences from another rule that settings can cause, for protocol names."""
+        """Return the differences from `reference` that settings can cause, for protocol names."""
         words = {
             "filter_px": f"filter {self.filter_px}" if self.filter_px else "filter scaled",
             "mix": "mix" if self.mix else "no mix",
@@ -57,7 +57,7 @@ class RelevancyRule:
 
 
 def filter_side_px(filter_px: int, height_px: int) -> int:
-    """Return the side of the mean filter; 0 scales 30 px at a height of 730 px to this height, at least 1."""
+    """Return the side of the mean filter; 0 means 30 px per 730 px of height, and at least 1 px."""
     return filter_px or max(1, round(30 * height_px / 730))
 
 
@@ -106,7 +106,7 @@ def majority_smooth(mask: Bool[np.ndarray, "H W"], border: Border = "langsplat")
 def _majority_windows(
     shape: tuple[int, int], border: Border
 ) -> tuple[UInt8[np.ndarray, "H W"], UInt8[np.ndarray, "H W"]]:
-    """Return the pixels used, and their number in each window."""
+    """Return which pixels are used, and their number in each window."""
     seen = np.ones(shape, np.uint8)
     if border == "langsplat":
         seen[-1, :] = seen[:, -1] = 0
@@ -145,7 +145,7 @@ def relevancy_mask(
 ) -> Bool[np.ndarray, "H W"]:
     """Return the mask of a level, or of the level that the rule chooses if `level` is None; finer wins ties.
 
-    `united` is the unfiltered relevancy of another text, whose mask is merged with the first text's mask
+    `united` is the unfiltered relevancy of a second text, whose mask is merged with the first text's mask
     before the majority filter; the level is chosen by the first text alone.
     """
 
