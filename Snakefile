@@ -6,7 +6,7 @@
 #   snakemake --report results/report.html                          the report of a finished run
 #
 # `hilsplat run` starts Snakemake with checks and all cores (docs/workflow.md). rules/common.smk reads
-# config/config.yaml, also in a `module:`, whose `config:` replaces any configfile here.
+# config/config.yaml, because the `config:` of a `module:` would replace a configfile here.
 
 
 report: "workflow/report/overview.rst"

@@ -20,7 +20,7 @@ from hilsplat.workflow.progress import estimates
 from hilsplat.workflow.resources import JobResources
 from hilsplat.workflow.run import mark_run, prepare_process, unmark_run
 
-# A plan of many scenes creates millions of permanent objects; rarer garbage collection saves 10 % of its time.
+# Planning many scenes creates millions of permanent objects; less frequent collection saves 10 % of the time.
 gc.set_threshold(200_000, 50, 100)
 
 LOCK = prepare_process()
@@ -38,7 +38,7 @@ def own_cores():
 
 
 def cache_folder(wildcards, input):
-    """Return the cache in the results folder, which a module may prefix."""
+    """Return the cache folder in the results folder, whose path a module may prefix."""
     return str(Path(input.scene).parents[2] / ".cache")
 
 

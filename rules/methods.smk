@@ -1,4 +1,4 @@
-# Baselines: another method computes the field of a variant (variants with method.name, hilsplat/methods).
+# Baselines: for variants with method.name, a different method computes the field (hilsplat/methods).
 rule method:
     input:
         scene="<results>/{dataset}/{scene}/scene",

@@ -29,7 +29,7 @@ RULES = ("poses", "gaussians", "masks", "contributions", "semantic_tree", "clip"
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of a check; a note concerns something optional; a fault makes runs fail or results wrong."""
+    """Result of a check: a note concerns something optional, a fault causes failed runs or wrong results."""
 
     check: str
     state: Literal["ok", "note", "fault"]
@@ -47,7 +47,7 @@ def examine() -> Iterator[Finding]:
         try:
             yield from check()
         except Exception as error:  # a broken installation can raise anything
-            yield Finding(check.__name__, "fault", f"{type(error).__name__}: {error}", "see the message")
+            yield Finding(check.__name__, "fault", f"{type(error).__name__}: {error}", "report this output")
 
 
 def python() -> Iterator[Finding]:
@@ -55,7 +55,7 @@ def python() -> Iterator[Finding]:
     found = platform.python_version()
     problem = "" if SpecifierSet(required).contains(found) else f"{found}, but {required} is required"
     sound = f"{found} on {platform.system()} {platform.machine()}"
-    yield verdict("python", problem, sound, "use another Python version")
+    yield verdict("python", problem, sound, "use a different Python version")
 
 
 def libraries() -> Iterator[Finding]:
@@ -148,7 +148,7 @@ def models() -> Iterator[Finding]:
 
 
 def space() -> Iterator[Finding]:
-    """Compare free disk space and memory with the needs of the configured scenes."""
+    """Compare free disk space and memory with the requirements of the configured scenes."""
     try:
         plan = Plan(merged_config([]))
     except HilsplatError as error:

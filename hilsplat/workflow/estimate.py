@@ -25,7 +25,7 @@ RTX 3090: SAM ViT-H's generator takes 4 s per picture, CLIP B/16 5 ms per crop."
 OTHERS = "tables"  # row for jobs without a scene
 
 NOTES = (
-    "Hours are scaled by the time that Python takes to start here. Memory is that of the largest job.",
+    "Hours are scaled by how long Python takes to start here. Memory is that of the largest job.",
     "GPU: published times of a 24 GB card for fits, SAM and CLIP; other jobs run on the CPU.",
 )
 
@@ -72,7 +72,7 @@ class RunEstimate:
 
 
 def machine_scale() -> float:
-    """Return the CPU time in which a stage's process starts on this machine, relative to `START_S`."""
+    """Return the CPU time that a stage's process takes to start on this machine, relative to `START_S`."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run([sys.executable, "-c", "import hilsplat.cli.main, hilsplat.evaluate.stage"], check=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -107,7 +107,7 @@ def _aligned(rows: Sequence[tuple[str, ...]]) -> Iterator[str]:
 
 
 def forecasts(plan: Plan, cores: int) -> list[str]:
-    """Return a line per scene of photographs that full-size SAM and CLIP models have not yet processed."""
+    """Return a line for each photograph scene that full-size SAM and CLIP models have not yet processed."""
     resources = JobResources(plan)
     lines = []
     for row in plan.scenes:

@@ -11,7 +11,7 @@ from hilsplat.scene.sheet import PHOTOS
 
 
 def check_models(stages: StageSettings, where: str) -> None:
-    """Raise an error if a model folder is missing or has the wrong kind; `stages` must not contain `auto`."""
+    """Raise an error if a model is missing or of the wrong kind; `stages` must not contain `auto`."""
     models = [("clip", "clip", stages.clip.model, stages.clip.variant)]
     if stages.masks.segmenter == "sam":
         models.append(("masks", "sam", stages.masks.model, stages.masks.variant))
@@ -23,7 +23,7 @@ def check_models(stages: StageSettings, where: str) -> None:
 
 
 def check_device(stages: StageSettings, where: str) -> None:
-    """Refuse a setting `device: cuda` if this machine has no usable CUDA device."""
+    """Raise an error for `device: cuda` if this machine has no usable CUDA device."""
     from hilsplat.splat.rasterise.device import choose_device
 
     for section, values in stages:
@@ -45,7 +45,7 @@ def _require_model(folder: Path, kind: str, variant: str) -> None:
 
 
 def describe_models(stages: StageSettings, features: Path | None = None) -> str:
-    """Describe the segmenter and CLIP of settings without `auto`, or LangSplat's files that replace them."""
+    """Describe the segmenter and CLIP in settings without `auto`, or LangSplat's files that replace them."""
     if features is not None:
         return f"masks and their vectors from {features}; text queries by {Path(stages.clip.model).name}"
     masks = {
@@ -65,7 +65,7 @@ def doubt_about_photographs(stages: StageSettings) -> str:
 def models_of_photographs(config: Path, scene: str, features: Path | None = None) -> list[str]:
     """Return lines about the models that a scene of photographs will use.
 
-    If the project has no such configuration, the installed one is read.
+    If `config` does not exist, the installed configuration is read.
     """
     run = parse_run(read_config(config if config.is_file() else INSTALLED / CONFIG))
     stages = run.stages("default", (PHOTOS, f"{PHOTOS}/{scene}")).with_models()

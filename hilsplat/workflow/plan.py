@@ -38,7 +38,7 @@ def any_of(names: Iterable[str]) -> str:
 
 
 def inert(text: str) -> str:
-    """Return the same JSON without `<`: Snakemake copies parameters unescaped into a script in its report."""
+    """Return the same JSON with `<` escaped: Snakemake's report copies parameters unescaped into a script."""
     return text.replace("<", "\\u003c")
 
 
@@ -46,12 +46,12 @@ class Plan:
     """Scenes, settings and targets of a configuration.
 
     Attributes:
-        rows: scenes in the sheet, and scenes on disk of data sets whose scenes differ between users.
+        rows: scenes in the sheet, and scenes found on disk for data sets whose scenes differ between users.
         absent: skipped scene -> reason.
     """
 
     def __init__(self, config: Mapping[str, Any]) -> None:
-        """Read the sheet; raise HilsplatError if sheet or configuration is invalid, or no scenes are left."""
+        """Read the sheet; raise HilsplatError if it or the configuration is invalid, or no scene is left."""
         self.run = run = parse_run(dict(config))
         self.results = Path(run.results)
         for name in run.every_variant():
@@ -190,7 +190,7 @@ class Plan:
         return lambda job: self.path(job, self.shared_variant(stage, job), path)
 
     def compared(self, stage: str, path: str) -> Callable[[Job], list[str]]:
-        """Return the input function for a stage's output for every variant in the main tables."""
+        """Return the input function for a stage's outputs under all variants in the main tables."""
         return lambda job: list(dict.fromkeys(map(self.shared(stage, path), self._main_jobs(job))))
 
     def compared_scores(self, job: Job) -> list[str]:
@@ -215,7 +215,7 @@ class Plan:
         return variant
 
     def scopes(self, row: SceneRow) -> tuple[str, ...]:
-        """Return the keys of `overrides` that apply to a scene and exist, the more general first."""
+        """Return the existing keys of `overrides` that apply to a scene, the more general key first."""
         return tuple(scope for scope in (row.group, row.name) if scope in self.run.overrides)
 
     def masks_stage(self, job: VariantJob) -> str:
@@ -240,7 +240,7 @@ class Plan:
         return [self.shared(stage, stage)(of_variant(job, KEY_VIEWS))] if is_guided else []
 
     def first_answer(self, job: VariantJob) -> list[str]:
-        """Return an input of `masks` that only orders jobs: key views are embedded before full-size SAM."""
+        """Return an input of `masks` that only orders jobs, so that key views are embedded first."""
         row, masks = self.row(job), self.stages(job).masks
         of_photographs = job.variant == "default" and row.group == PHOTOS and not row.features
         if not of_photographs or KEY_VIEWS not in self.run.variants:

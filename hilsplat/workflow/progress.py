@@ -45,7 +45,7 @@ LOOPS = {
 
 @dataclass(frozen=True)
 class RunningJob:
-    """A running job; `start_s` is on the run's clock."""
+    """A running job; `start_s` is read from the run's clock."""
 
     rule: str
     wildcards: Mapping[str, str]
@@ -179,14 +179,14 @@ class RunProgress:
         return f"{job.name}{loop} {progress[1]} of {progress[2]}"
 
     def seconds_left(self) -> float:
-        """Return the core seconds left divided by the cores, but at least the longest job's time left."""
+        """Return the remaining core seconds per core, but at least the longest job's remaining time."""
         waiting = sum(number * estimates.seconds(rule) for rule, number in self.waiting.items() if number)
         running = [(self._left(job), job.threads) for job in self.running.values()]
         spread = (waiting + sum(left * threads for left, threads in running)) / self.cores
         return max([spread, *(left for left, _ in running)])
 
     def _left(self, job: RunningJob) -> float:
-        """Return the seconds left of a running job, from the job's progress if it has reported any."""
+        """Return a running job's remaining seconds, from the job's progress if it has reported any."""
         elapsed, progress = self.clock() - job.start_s, job.progress()
         if progress is not None and progress[1] and progress[0] == LOOPS.get(job.rule):
             return elapsed * (progress[2] / progress[1] - 1)
@@ -267,7 +267,7 @@ class ProgressDisplay:
 
 
 def duration(seconds: float) -> str:
-    """Return a time as text, rounded to the accuracy of an estimate."""
+    """Return a duration as text, rounded because it is an estimate."""
     if seconds < 10:
         return "less than 10 s"
     if seconds < 55:

@@ -1,6 +1,6 @@
 """Comparison of artifacts with their provenance, and of the provenance with the plan of a run.
 
-Snakemake compares times and its own metadata. It does not detect a file that was deleted inside a folder or
+Snakemake compares times and its own metadata. It does not detect a file that was deleted from a folder or
 an unfinished output of a killed job, and it detects nothing if its metadata is lost.
 """
 
@@ -151,7 +151,7 @@ class Records:
     """Comparison of artifacts' provenance with their files.
 
     Args:
-        results: results folder; provenance records its paths as `results/...`, even if the folder was moved.
+        results: results folder; provenance refers to it as `results/...`, even if the folder was moved.
         every_byte: compare contents instead of sizes.
     """
 

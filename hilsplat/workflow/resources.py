@@ -1,12 +1,12 @@
 """Threads, memory, time and GPUs of a job, from the size of its scene and its settings.
 
 `resources.tsv` lists each rule's core seconds per megapixel of all views, and the terms of its memory in
-megabytes: a base, per megapixel of all views (`mp`, and `capped_mp` up to `cap`), per megapixel of one view
-(`view_mp`, and `thread_mp` per thread), and per thousand Gaussians. It also lists megabytes on disk (with
-caches) per megapixel of all views and per thousand Gaussians (for fields: times latent channels). These
-estimates exceed the peaks in Snakemake's `benchmark:` records (tests/unit/workflow/peak_memory.tsv; `source`
-and `train_models` were not measured). Times were measured on benchmark scenes and can be off by a factor of
-three elsewhere. A killed job is retried with twice the memory and time limit.
+megabytes: a base, and amounts per megapixel of all views (`mp`, and `capped_mp` up to `cap`), per megapixel
+of one view (`view_mp`, and `thread_mp` per thread), and per thousand Gaussians. It also lists megabytes on
+disk (with caches) per megapixel of all views and per thousand Gaussians (for fields: times latent channels).
+These estimates exceed the peaks in Snakemake's `benchmark:` records (tests/unit/workflow/peak_memory.tsv;
+`source` and `train_models` were not measured). Times were measured on benchmark scenes and can be off by a
+factor of three elsewhere. A killed job is retried with twice the memory and time limit.
 """
 
 import csv
@@ -44,8 +44,8 @@ TIME_FACTOR, LEAST_MINUTES = 6, 10  # time limit of a job divided by its estimat
 START_S = 2.0  # seconds to start Python, load libraries and read the inputs of a job
 
 FIT_S_PER_MP, FIT_S_PER_GAUSSIAN, GRAPH_S_PER_MP = 0.14, 0.9e-6, 4.0
-"""Core seconds per fit step, for each megapixel of the view and for each of the maximum number of Gaussians;
-core seconds per megapixel of the graph segmenter."""
+"""Core seconds of a fit step per megapixel of the view, and per Gaussian that the fit may have; core seconds
+of the graph segmenter per megapixel."""
 
 TRAINED_S_PER_MP, LITERAL_S_PER_MP = 0.08, 0.15
 """Core seconds per step, level and megapixel of a trained baseline, and of the literal trainer."""
@@ -55,7 +55,7 @@ NETWORK_S = 10.0  # core seconds to train an autoencoder
 EMBEDDED_S = {"masks": 1.5, "clip": 0.1}  # core seconds of the embedded models per view
 
 SAM_S, OTHER_SAM_S = {"huge": 87.0, "large": 44.0, "base": 14.1}, 5.7
-"""Part of a SAM model's name -> core seconds per picture; otherwise, SAM 2.1 small's (docs/benchmarks.md)."""
+"""Part of a SAM model's name -> core seconds per picture; others use SAM 2.1 small's (docs/benchmarks.md)."""
 
 PROMPT_S, PICTURE_S, CROP_S = 0.02, 1.0, 0.3
 """Core seconds per SAM prompt, per picture from logits to masks, and per crop in CLIP B/16."""
@@ -81,7 +81,7 @@ class Size(NamedTuple):
 class JobResources:
     """Resources of the jobs of a plan, as functions of wildcards that Snakemake calls.
 
-    With the `cores` of this machine, jobs get one thread each if there are enough jobs for all cores. On a
+    Given this machine's `cores`, jobs get one thread each if there are enough jobs for all cores. On a
     cluster, `cores` is None: a job recomputes its resources on its node, so they must not depend on cores.
     """
 
@@ -237,7 +237,7 @@ def _first_mp(images: Iterable[str], max_side_px: int) -> float:
 
 @functools.cache
 def _model_memory_mb(folder: Path, variant: str, batch: int | str, threads: int) -> int:
-    """Return the memory of a stage with a model, MB; 0 if the folder is unreadable (the stage reports it)."""
+    """Return the memory of a stage's model, MB; 0 if the folder is unreadable (the stage reports it)."""
     from hilsplat.models.folder import open_model_folder
     from hilsplat.models.memory import MIB, needs_of  # onnxruntime is slow to import
     from hilsplat.segment.sam import own_thresholds

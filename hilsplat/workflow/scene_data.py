@@ -64,7 +64,7 @@ class SceneData:
         return self._row_of[job.dataset, job.scene]
 
     def images(self, job: Job, input: Sequence[str]) -> str:
-        """Return the parameter of `poses`: the folder of the images."""
+        """Return the parameter of `poses`: the image folder."""
         row = self.row(job)
         return input[0] if row.world or is_exported(row.source) else str(row.folder)
 
@@ -159,7 +159,7 @@ class SceneData:
         ]
 
     def truth(self, job: Job) -> list[str]:
-        """Return the input with the annotations of a synthetic scene; empty for other scenes."""
+        """Return the input that contains a synthetic scene's annotations; empty for other scenes."""
         return [self.path(job, "world/truth")] if self.row(job).world else []
 
     def truth_or_labels(self, job: Job) -> list[str]:

@@ -1,4 +1,4 @@
-"""Registry of the function of each stage."""
+"""Registry of stages and their functions."""
 
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.identity import code_digest
@@ -38,7 +38,7 @@ STAGES: dict[str, str] = {
 
 
 def stage_code(stage: str, plugins: tuple[str, ...] = ()) -> str:
-    """Return the digest of the code of a stage and of the readers or baselines that it uses in this run."""
+    """Return the digest of a stage's code, including the readers or baselines that it uses in this run."""
     if stage not in STAGES:
         raise HilsplatError(f"unknown stage {stage!r}", expected=f"one of {', '.join(STAGES)}")
     return code_digest(STAGES[stage], *plugins)

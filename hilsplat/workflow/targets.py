@@ -115,7 +115,7 @@ def summary(plan: Plan) -> list[str]:
 
 
 def figures(plan: Plan) -> list[str]:
-    """Return panels, node names, masks against ground truth, and method comparisons (for sweep scenes)."""
+    """Return panels, node names, masks against ground truth and, for sweep scenes, method comparisons."""
     found = []
     for row in plan.scenes:
         compared = not plan.run.sweep_scenes or row.scene in plan.run.sweep_scenes

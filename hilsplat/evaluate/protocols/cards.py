@@ -1,4 +1,4 @@
-"""Protocols: name, version and everything else that determines a number measured under a protocol.
+"""Protocols: the name, the version and everything else that determines a number measured under each.
 
 The same model scores 51.4 under `lerf/langsplat` and 9.66 under `lerf/opengaussian`, so each row of
 `scores.csv` has the full name, such as `lerf/langsplat@2`, then non-default settings in brackets. A change to
@@ -47,10 +47,10 @@ class ProtocolCard:
     version: int  # incremented when a change below affects the numbers
     metrics: tuple[str, ...]
     averaging: Averaging
-    selection: str  # how a prediction is chosen, threshold and level, in words
+    selection: str  # how a prediction is chosen (threshold, level), in words
     source: str  # source code and departures from it; begins with "none" if no code is public
     rule: RelevancyRule | None = None  # how relevancy maps become masks, if they do
-    missing: Literal["zero", "left out"] = "zero"  # for pairs without a prediction; omission inflates scores
+    missing: Literal["zero", "left out"] = "zero"  # pairs without a prediction; omitting them inflates scores
     classes: str = ""  # name of the queried `ClassSet`, if it is fixed
     # `labels`: the region that the data set defines; `any grey`: all non-black pixels of its mask file
     truth: Literal["labels", "any grey"] = "labels"
@@ -142,7 +142,7 @@ SCENE_WIDE = ProtocolCard(
     OURS,
 )
 ANNOTATIONS = ProtocolCard(
-    "hierarchy/annotations", 1, CONSISTENCY, "views", "the annotations: scores of perfect masks", OURS
+    "hierarchy/annotations", 1, CONSISTENCY, "views", "the annotations, to score perfect masks", OURS
 )
 VIEW_CONSISTENCY = ProtocolCard(
     "world/view-consistency",
@@ -354,7 +354,7 @@ BY_NAME: dict[str, ProtocolCard] = {name: card for card in CARDS for name in (ca
 
 
 def card_of(label: str) -> ProtocolCard:
-    """Return the protocol named by a row (any non-default settings are ignored) or a data set (no version).
+    """Return the protocol with a name, with or without its version; settings in brackets are ignored.
 
     Raises:
         ArtifactError: no protocol has that name and version.

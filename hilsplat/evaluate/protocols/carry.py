@@ -4,7 +4,7 @@
 |---|---|
 | `frozen` | the Gaussian with the point's index, fitted without moving (OpenGaussian) |
 | `nearest` | the nearest Gaussian that is opaque enough |
-| `vote` | an opacity-weighted vote of the k nearest Gaussians within a radius; none beyond the radius |
+| `vote` | an opacity-weighted vote of the k nearest Gaussians within a radius; nothing if there are none |
 | `density` | the mean of the k nearest Gaussians, weighted by opacity times Gaussian falloff at the point |
 
 Scores depend on the mode, so every row names it. The search tree breaks ties between equidistant Gaussians
@@ -142,7 +142,7 @@ def classify(features: Float[np.ndarray, "P D"], texts: Float[np.ndarray, "K D"]
 def _neighbours(
     points: np.ndarray, means: np.ndarray, opacities: np.ndarray, k: int, radius: float, threads: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return index and distance (P, k) of the nearest opaque Gaussians; infinite beyond the last one."""
+    """Return index and distance (P, k) of the nearest opaque Gaussians; missing ones have distance inf."""
     opaque = np.flatnonzero(opacities >= OPACITY_MIN)
     if not opaque.size:
         raise MisalignedArtifactError(

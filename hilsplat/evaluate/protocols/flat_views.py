@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 class FlatProtocols:
-    """Scores one view under further protocols, one text at a time.
+    """Scores one view under additional protocols, one text at a time.
 
     Only texts of `level` are queried, unless the data has no levels (None). The protocol names contain
     `words`, the settings that change the relevancy.
@@ -119,8 +119,8 @@ def argmax_rows(
 
     Args:
         cosine_of: cosines of texts with pixels (row * width + column), at any number of levels; -inf if none.
-        words: departures, for the protocol's name.
-        is_stand_in: whether pixels around the objects have no text; such pixels are then not compared.
+        words: non-default settings, for the protocol's name.
+        is_stand_in: whether pixels around the objects have no text; if so, they are not compared.
     """
     if not queries:
         return

@@ -22,7 +22,7 @@ EIGHTH = 8
 """3D-OVS compares masks at one eighth of the image's height and width."""
 
 SHAPE_TOLERANCE = 0.01
-"""Tolerated relative difference in aspect ratio between labels and view, due to earlier rounding."""
+"""Tolerated relative difference in aspect ratio between labels and view, which rounding can cause."""
 
 
 @dataclass(frozen=True)
@@ -89,11 +89,11 @@ class ViewTruth:
     ) -> "ViewTruth":
         """Return the ground truth of a view from its regions, with or without levels.
 
-        Regions of one text and level are merged, keeping all their boxes. A region with a broken chain of
+        Regions of one text and level are merged; all boxes are kept. A region with a broken chain of
         parents is queried but belongs to no family.
 
         Args:
-            size_hw: size of the predictions; labels of another size are resized by nearest neighbour.
+            size_hw: size of the predictions; labels of a different size are resized by nearest neighbour.
             image_hw: size of the image, if it differs from `size_hw`.
             min_px: texts and paths with fewer pixels in the view are omitted.
         """
@@ -134,7 +134,7 @@ class ViewTruth:
         return answer & ~(np.any(others, axis=0) & ~self.regions[parent])
 
     def families(self) -> list[list[tuple[tuple[str, ...], list[tuple[str, ...]]]]]:
-        """Return (parent path, child paths) pairs per transition whole -> part, part -> subpart."""
+        """Return (parent path, child paths) pairs, by transition: whole -> part, then part -> subpart."""
         children: dict[tuple[str, ...], list[tuple[str, ...]]] = {}
         for path in self.regions:
             children.setdefault(path[:-1], []).append(path)

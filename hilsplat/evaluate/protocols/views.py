@@ -30,7 +30,7 @@ from hilsplat.evaluate.scores import Measured
 from hilsplat.settings import EvaluateSettings
 
 RELEVANCY_CHUNK_MIB = 512
-"""Memory limit for relevancy maps, which sets the chunk size; each chunk of texts decodes the view again."""
+"""Memory limit for relevancy maps, which limits the texts per chunk; each chunk decodes the view again."""
 
 
 def rule_of(settings: EvaluateSettings) -> RelevancyRule:

@@ -39,7 +39,7 @@ ABLATIONS = {
         "Ablation",
         "ablation",
         "Initial-2D: 2D mask levels from the coverage tree. 3D-HC: 3D hierarchical clustering (L_h). "
-        "Instance, Part: contrastive losses (L_ins, L_part). docs/paper.md describes how we read each.",
+        "Instance, Part: contrastive losses (L_ins, L_part). docs/paper.md states our reading of each.",
     ),
     "components": (
         "Parts of the default field",

@@ -27,7 +27,7 @@ LEVELLED = ("tabletop", "lerf_ovs", "3d_ovs")
 class TableKind:
     """One table: its builder, the kinds of scenes and data sets that it covers, and its variants.
 
-    `variants` is the configuration key that lists the variants; `shows_costs` also reads job and query times.
+    `variants` is the configuration key that lists the variants; `shows_costs` adds job and query times.
     """
 
     build: Callable[[Sources], Table]

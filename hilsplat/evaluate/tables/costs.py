@@ -32,8 +32,8 @@ SECONDS = "-seconds"
 COST_NOTE = (
     "Measured rows are means over scenes on this machine. Preparation: masks, coverage trees and CLIP. "
     "Training: contributions, semantic tree, autoencoder and field. Neither includes the 3D Gaussians. "
-    "Memory is the peak main memory of the training jobs (in the paper, GPU memory). A query is one text "
-    "in one view: text encoding, the view's compositing weights, relevancy and mask."
+    "Memory is the peak main memory of the training jobs (in the paper, GPU memory). The time of a "
+    "query (one text in one view) covers text encoding, the view's compositing weights, relevancy and mask."
 )
 
 
@@ -86,7 +86,7 @@ def read_costs(scores: Iterable[Path]) -> list[Cost]:
 
 
 def jobs_of(scores: Path) -> dict[str, Job | None]:
-    """Map each stage behind a score file to its job, whichever variant ran it, or to None without a record.
+    """Map each stage behind a score file to its job, run by any variant, or to None if it has no record.
 
     The score file's provenance lists the artifacts that `evaluate` read; the field's provenance lists the
     rest. Stages whose output was not read are absent, such as trees for a baseline.
@@ -119,7 +119,7 @@ def run_efficiency(results: Path, out: Path) -> str:
     """Write a CSV of all jobs below `results` and, beside it, a Markdown table of stages; return the table.
 
     Raises:
-        ArtifactError: there is no benchmark file, one is unreadable, or an output path has another file.
+        ArtifactError: there is no benchmark file, one is unreadable, or an output path has an unrelated file.
     """
     files = sorted(Path(results).glob("**/benchmarks/*.jsonl"))
     if not files:

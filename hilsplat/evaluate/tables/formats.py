@@ -1,7 +1,7 @@
 """A table as CSV, Markdown, LaTeX and HTML.
 
-pandas' Styler is not used: it does not escape < and ± in LaTeX and has no footnotes, the code would be as
-long, and an id and three classes per cell would make HTML files 1.6 to 2.5 times as large.
+pandas' Styler is not used, because it does not escape < and ± in LaTeX and has no footnotes, would need as
+much code, and writes an id and three classes per cell, so HTML files would be 1.6 to 2.5 times as large.
 """
 
 import csv

@@ -76,7 +76,7 @@ def column_of_data(data: str, column: str) -> str | None:
 
 
 def frames_table(sources: Sources, data: str) -> Table:
-    """Build a table of the paper's frames and the views queried at levels, with the texts per view."""
+    """Build a table of the paper's frames and the views queried at levels, with numbers of texts."""
     texts: dict[tuple[str, str, str], set] = {}
     for row in sources.scores.itertuples():
         if row.metric == "iou" and row.protocol.startswith(LEVEL_GIVEN.full_name):
@@ -116,9 +116,9 @@ def lerf_table(sources: Sources) -> Table:
         )
     footnotes = (
         "All values in %. mIoU and mBIoU are means over (view, text) pairs of a scene; Average is the mean "
-        "over scenes. Localization: the point of highest smoothed relevancy is in a box of the text.",
+        "over scenes. Localization: the point of highest smoothed relevancy is in one of the text's boxes.",
         "lerf/langsplat: mean filter (30 px at a height of 730, scaled), min-max above 0.7, 7 x 7 majority, "
-        "level of the highest relevancy. lerf/tree-nodes: tree nodes visible in the view, level chosen by "
+        "level with the highest relevancy. lerf/tree-nodes: tree nodes visible in the view, level chosen by "
         "the tree.",
         "lerf-mask/gaussian-grouping: one mask per text and view, mean over the views of a text, then over "
         "texts; a missing prediction counts as 0. On the stand-in, the texts are those of whole objects, "
@@ -153,7 +153,7 @@ def ovs_table(sources: Sources) -> Table:
         "(LangSplat's supplement; its code is not released). 3d-ovs/langsplat-raw takes the printed 0.4 "
         "literally. 3d-ovs/langsplat-v2: LangSplatV2's code: smoothed relevancy above 0.625, whole or part. "
         "These are rules for maps; 3d-ovs/tree-nodes scores the nodes selected by the tree.",
-        "3d-ovs/argmax: every pixel gets the text of the highest cosine, at an eighth of the image's size; "
+        "3d-ovs/argmax: every pixel gets the text with the highest cosine, at an eighth of the image's size; "
         "accuracy is the share of pixels with the right text. The level used is in brackets.",
         "On the stand-in, the texts are those of whole objects in view. Their surroundings have no text, so "
         "the argmax protocol scores only pixels with a text.",

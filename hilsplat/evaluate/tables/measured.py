@@ -1,4 +1,4 @@
-"""Averages of scores (`scores.read_scores`) in the order that the protocol defines, and measured rows.
+"""Averages of scores (`scores.read_scores`), in the order that each protocol defines, and measured rows.
 
 A (view, query) pair without a prediction has a row with value 0 unless its protocol omits such pairs.
 """

@@ -46,8 +46,8 @@ MODE_NOTE = (
 )
 
 INTERVAL_NOTE = (
-    "95 %: bootstrap interval of the mIoU, resampling scenes and their class names. Names: number of "
-    "ground-truth names, and of scenes. Rows with overlapping intervals cannot be ranked by these scenes."
+    "95 %: bootstrap interval of the mIoU, resampling scenes and their class names. Names: numbers of "
+    "ground-truth names and of scenes. Rows with overlapping intervals cannot be ranked by these scenes."
 )
 
 
@@ -101,8 +101,8 @@ def scannet_table(sources: Sources) -> Table:
         "Head, common, tail: the benchmark's splits; mIoU with the counts of all scenes pooled, over the "
         "classes that occur in the ground truth or the prediction.",
         "AP, AP@25, AP@50: OpenMask3D's copy of ScanNet's script, over all scans together. An instance is a "
-        "tree node at level whole; its class has the highest cosine of 198, and its confidence is that "
-        "cosine. A field has no instances.",
+        "tree node at level whole; its class has the highest cosine of all 198, and its confidence is "
+        "that cosine. A field has no instances.",
         "*: reproduced by the paper's authors.",
     )
     return sources.finished("scannet", "ScanNet and ScanNet200: segmentation of points", blocks, footnotes)
@@ -216,7 +216,7 @@ def bootstrap_mean(
 
 
 def interval_cells(part: "pd.DataFrame", name: str, pooled: bool) -> dict[str, Cell]:
-    """Return interval, scenes and names for one protocol, method and seed; empty if no row is per class."""
+    """Return the interval and the numbers of names and scenes; empty if no row describes a class."""
     ious = part[part["metric"] == "class_iou"]
     true = part[part["metric"] == "class_accuracy"]
     if ious.empty or true.empty:
