@@ -30,13 +30,13 @@ rule clip:
         " --threads {threads} --memory {resources.mem_mib} --cache {params.cache:q} --out {output.clip:q}"
 
 
-# Vocabulary names of the nodes, and vectors of words for absent things, to estimate chance.
+# Names of the nodes from a vocabulary, and vectors of words for absent objects, to estimate chance scores.
 rule names:
     input:
         scene="<results>/{dataset}/{scene}/scene",
         semantic_tree=PLAN.shared("semantic_tree", "semantic_tree"),
         clip=PLAN.shared("clip", "clip"),
-        vocabulary=PLAN.vocabulary,  # empty, except for your own file
+        vocabulary=PLAN.vocabulary,  # empty, unless you supply a file
     output:
         names=directory("<results>/{dataset}/{scene}/{variant}/names"),
     log:

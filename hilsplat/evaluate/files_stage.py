@@ -70,13 +70,13 @@ def run_evaluate_files(
     Args:
         method: name of the program, used as the variant in its rows.
         labels: labels of a published data set, such as "lerf_ovs/figurines".
-        truth: alternatively, the ground truth of a synthetic scene, with its posed `scene` (which defines the
-            test views), `kind` as in `run_evaluate`, and data set and name for the rows.
+        truth: a synthetic scene's ground truth, instead of `labels`; needs the posed `scene` (which defines
+            the test views), `kind` as in `run_evaluate`, and the data set and name for the rows.
         min_region_px: smaller regions of a synthetic scene are not scored; None for the default setting.
 
     Raises:
         ArtifactError: a view has no predictions, or a file is missing or malformed.
-        MisalignedArtifactError: a prediction and its labels differ in size, or the labels lack its text.
+        MisalignedArtifactError: a prediction and its labels differ in size, or no label has its text.
         SettingsError: neither labels nor truth and scene are given, or both are.
     """
     if bool(labels) == (truth is not None) or (truth is None) != (scene is None):
@@ -146,7 +146,7 @@ def _mask_rows(
 
 
 def _check(view: str, masks: Masks, truth: ViewTruth, texts: Mapping[str, set[str]]) -> None:
-    """Check the sizes and texts of a view's masks, with errors that name the view."""
+    """Check the sizes and texts of a view's masks; error messages name the view."""
     for (level, text), mask in masks.items():
         where = f"{view}: {level}/{text}" if level else f"{view}: {text}"
         known = sorted(texts.get(level, ()))

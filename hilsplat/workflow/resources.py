@@ -39,7 +39,7 @@ RUNNER_MB = 700  # memory of the two Snakemake processes that a cluster job star
 
 COMPARED_MB = (450, 4)  # memory of `comparison` per method: base, and per thousand Gaussians
 
-TIME_FACTOR, LEAST_MINUTES = 6, 10  # time limit of a job divided by its estimate, and the minimum limit
+TIME_FACTOR, LEAST_MINUTES = 6, 10  # ratio of a job's time limit to its estimate, and minimum limit
 
 START_S = 2.0  # seconds to start Python, load libraries and read the inputs of a job
 

@@ -230,7 +230,7 @@ def _snakefile(configs: Sequence[Path]) -> Path:
 
 
 def _has(words: Sequence[str], *options: str) -> bool:
-    """Return whether words contain an option, also in the form `--option=value` or `-o8`."""
+    """Return whether words contain an option, including the forms `--option=value` and `-o8`."""
     return any(
         word.split("=")[0] == option or (len(option) == 2 and word.startswith(option))
         for word in words

@@ -12,7 +12,7 @@ from hilsplat.workflow.plan import Plan, some
 
 
 def scores(plan: Plan, table: str, name: str = "scores.csv") -> list[str]:
-    """Return a table's score files, or files next to them; sweeps use the scenes configured for sweeps."""
+    """Return a table's score files, or the files `name` beside them; sweeps use `sweep_scenes`, if set."""
     kind = TABLES[table]
     rows = [row for row in labelled(plan) if data_of(row) in kind.data]
     if kind.is_sweep and plan.run.sweep_scenes:
