@@ -28,7 +28,7 @@ def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Li
     Dimensions with the same name must have the same size.
 
     Raises:
-        ArtifactError: an array has the wrong type or shape, or a value that is not finite or is out of range.
+        ArtifactError: an array has the wrong type or shape, or contains a non-finite or out-of-range value.
     """
     hints = get_type_hints(maker)
     with jaxtyped("context"):
@@ -63,11 +63,11 @@ def described(declared: type[AbstractArray]) -> str:
 
 
 def read_into(maker: type[Made], path: Path, limits: Limits | None = None, **more: Any) -> Made:
-    """Create a dataclass instance from the arrays of an .npz file and the other fields, `more`.
+    """Create a dataclass instance from the arrays in an .npz file and from additional fields, `more`.
 
     Raises:
-        ArtifactError: the file is missing, damaged or written by another version of the program, or an array
-            does not match the dataclass.
+        ArtifactError: the file is missing, damaged or written by a different version of hilsplat, or an
+            array does not match the dataclass.
     """
     return made(maker, read_npz(path), more, path, limits)
 
@@ -79,11 +79,11 @@ def made(
     path: Path,
     limits: Limits | None = None,
 ) -> Made:
-    """Create a dataclass instance from the arrays of a file and other fields; see `read_into`."""
+    """Create a dataclass instance from a file's arrays and additional fields; see `read_into`."""
     expected = {field.name for field in fields(maker) if field.init}  # type: ignore[arg-type]
     if {*arrays, *more} != expected:
         raise ArtifactError(
-            f"{path} was written by another version of hilsplat",
+            f"{path} was written by a different version of hilsplat",
             expected=", ".join(sorted(expected - set(more))),
             found=", ".join(sorted(arrays)) or "no arrays",
             fix=remake(path),
@@ -93,7 +93,7 @@ def made(
 
 
 TENSORS_KEY = "hilsplat"
-"""Metadata key in a .safetensors file; its value is JSON that describes the arrays, with their checksum."""
+"""Metadata key in .safetensors files; the value is JSON with a description and a checksum of the arrays."""
 
 
 def write_tensors(path: Path, arrays: Mapping[str, np.ndarray], **about: Any) -> None:
@@ -105,7 +105,7 @@ def write_tensors(path: Path, arrays: Mapping[str, np.ndarray], **about: Any) ->
 
 
 def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return the arrays and information from a `write_tensors` file; raise ArtifactError for other files."""
+    """Return the arrays and metadata of a `write_tensors` file; raise ArtifactError for any other file."""
     try:
         with safe_open(path, framework="np") as file:
             about = parse_json(file.metadata()[TENSORS_KEY])

@@ -1,4 +1,4 @@
-"""Atomic writers, readers and digests of artifacts, view caches and output locks."""
+"""Atomic writing, reading and hashing of artifacts; view caches; output locks."""
 
 import copy
 import ctypes
@@ -25,12 +25,12 @@ from hilsplat.base.processes import FORMER, UNFINISHED, is_unfinished, unfinishe
 
 ZIP64_BYTES = 2**30  # arrays above this size get an archive entry that may exceed 2 GiB
 
-INDEX = "index.json"  # written last into a folder artifact: its presence means that the folder is complete
+INDEX = "index.json"  # written last in a folder artifact, so its presence means that the folder is complete
 
 DAMAGE = (
     *(EOFError, MemoryError, NotImplementedError, OSError, SyntaxError, TokenError, ValueError),
     *(zipfile.BadZipFile, zlib.error),
-    AttributeError,  # a .npy file instead of .npz
+    AttributeError,  # an .npy file instead of .npz
 )
 """Errors that numpy and zipfile raise on damaged files."""
 
@@ -46,7 +46,7 @@ def remake(path: Path) -> str:
     places = [place for place in (Path(path), *Path(path).parents) if provenance_path(place).is_file()]
     if not places:
         return "rerun the stage that writes it"
-    place = places[0] / "images" if places[0].name == "world" else places[0]  # its rule declares two folders
+    place = places[0] / "images" if places[0].name == "world" else places[0]  # its rule writes two subfolders
     parts = place.parts  # Snakemake identifies files by their paths relative to the project
     start = len(parts) - 1 - parts[::-1].index("results") if "results" in parts else 0
     return f"snakemake --cores 2 --forcerun {shlex.quote(str(Path(*parts[start:])))}"
@@ -81,7 +81,7 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
 
 @contextmanager
 def _keep_mode(path: Path) -> Iterator[None]:
-    """Create a file with the umask's mode, and restore it at the end: safetensors sets 0600."""
+    """Create a file with the umask's mode, and restore this mode at the end; safetensors would set 0600."""
     path.touch()
     mode = path.stat().st_mode & 0o777
     yield
@@ -150,10 +150,10 @@ def _exchange(one: Path, other: Path) -> bool:
 
 
 FULL_DISK = ("No space left on device", "disk is full", "Disk quota exceeded")
-"""Parts of disk-full messages from C++ and Rust libraries with their own error types: safetensors, SQLite."""
+"""Parts of disk-full messages from libraries that raise their own error types: safetensors, SQLite."""
 
 LIBRARY_ERRORS = (RuntimeError, ChildProcessError)
-"""Errors from C++ libraries, and from libraries that terminate their process."""
+"""Exceptions raised by C++ libraries, or because a library terminated its process."""
 FULL_BELOW_MIB = 1.0
 """Free space below which `LIBRARY_ERRORS` are attributed to a full disk, which COLMAP does not report."""
 
@@ -184,7 +184,7 @@ def explain_full_disk(path: Path) -> Iterator[None]:
 
 
 def existing_folder(folder: Path) -> Path:
-    """Return a folder, or its innermost parent that exists."""
+    """Return the folder, or its nearest existing parent."""
     return next(place for place in (folder, *folder.absolute().parents) if place.exists())
 
 
@@ -326,7 +326,7 @@ def visible_files(folder: Path) -> list[Path]:
 
 
 def write_index(folder: Path, views: Mapping[str, Any], **more: Any) -> None:
-    """Complete a folder artifact by writing its index, with an entry per view and checksums of all files."""
+    """Complete a folder artifact by writing its index: one entry per view, and the checksums of all files."""
     folder = Path(folder)
     files = sorted(path for path in folder.rglob("*") if path.suffix in SEALED)
     sums = {path.relative_to(folder).as_posix(): _crc32_of_file(path) for path in files}
@@ -347,7 +347,7 @@ def read_index(folder: Path, *entries: str) -> dict[str, Any]:
     index = copy.deepcopy(_index(Path(folder)))
     if missing := [entry for entry in entries if entry not in index]:
         raise ArtifactError(
-            f"{folder} was written by another version of hilsplat",
+            f"{folder} was written by a different version of hilsplat",
             expected=f"{', '.join(missing)} in {INDEX}",
             fix=remake(Path(folder)),
         )
@@ -408,13 +408,13 @@ def _crc32_of_file(path: Path) -> int:
 
 
 class ViewCache:
-    """Cache of a stage's finished views, as .npz files outside its output, reused if a killed stage reruns.
+    """Cache of a stage's finished views as .npz files, which a rerun uses if the stage was killed.
 
-    Keys must cover all inputs of the result: the digests of image, model and code, and the settings.
+    Keys must cover all inputs of the result: the settings, and the digests of the image, model and code.
 
     Args:
         folder: cache folder, such as `results/.cache/masks`.
-        compressed: compress entries; not useful for floating-point numbers, which shrink little.
+        compressed: whether to compress entries; floating-point numbers shrink too little to benefit.
     """
 
     def __init__(self, folder: Path, *, compressed: bool = True) -> None:
@@ -449,8 +449,8 @@ class ViewCache:
 
     def put(self, key: str, arrays: dict[str, np.ndarray]) -> None:
         """Store an entry, replacing any existing one."""
-        # A power failure may truncate entries or fill them with zeros. Reading detects this by checksums, and
-        # the entry is recomputed, so entries are not flushed to disk (milliseconds each).
+        # A power failure may truncate entries or fill them with zeros. Checksums reveal this on reading, and
+        # the entry is recomputed. A flush to disk, which takes milliseconds, is therefore unnecessary.
         _write_zip(self.path(key), arrays, self._method, durable=False)
 
 

@@ -12,17 +12,17 @@ VIEW_CACHES = ("masks", "clip", "contributions")
 
 CHECKPOINTS = "gaussians"  # cache of fit checkpoints
 FIT_DAYS = 1.0
-"""Age below which a checkpoint is kept, because its fit may still be running; fits save more often."""
+"""Checkpoints younger than this are kept, because fits save more often and may still be running."""
 
 
 def caches(folder: Path) -> dict[str, list[Path]]:
-    """Map the folder or file name of each cache in a cache folder to the cache's complete entries."""
+    """Map the name of each cache, a subfolder or file of `folder`, to the cache's complete entries."""
     places = sorted(Path(folder).glob("[!.]*"))
     return {place.name: visible_files(place) if place.is_dir() else [place] for place in places}
 
 
 def size_table(folder: Path) -> str:
-    """Return the size of each cache, as text."""
+    """Return a text table of the cache sizes."""
     lines, total = [f"{folder}"], 0.0
     for name, files in caches(folder).items():
         size_mib = sum(path.stat().st_size for path in files) / 2**20
@@ -37,9 +37,9 @@ def prune_cache(
     """Delete unfinished files of killed jobs, then cache entries, least recently used first.
 
     Args:
-        stages: caches to prune; an empty list selects the view caches and, with `days`, the checkpoints.
+        stages: caches to prune; if empty, the view caches, and also the checkpoints if `days` is set.
         days: delete entries not used for this many days.
-        max_mib: then delete entries down to this total size. If both limits are None, no entries are deleted.
+        max_mib: then delete entries until at most this size is left; no entries if both limits are None.
 
     Returns:
         Number of deleted entries, and their size in MiB.

@@ -1,4 +1,4 @@
-"""Loops compiled by numba and cached on disk, with a notice when they must be compiled."""
+"""Loops compiled by numba and cached on disk; a notice is logged when they must be compiled."""
 
 import functools
 import inspect
@@ -16,7 +16,7 @@ logger = logging.getLogger(__name__)
 
 
 def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """Apply `numba.njit` without the GIL, and cache the result on disk until code that the loop uses changes.
+    """Apply `numba.njit` with the GIL released; cache the result on disk until code used by the loop changes.
 
     By default, numba recompiles a cached loop if and only if the loop's own file changes. It would miss edits
     to functions that the loop calls from other files, and recompile after an edit to a comment.
@@ -61,7 +61,7 @@ class _Stamp:
 
 
 class _Notice(event.Listener):
-    """Listener that logs once that loops are being compiled; loops loaded from the cache raise no event."""
+    """Listener that logs one notice when loops are compiled; loading them from the cache raises no event."""
 
     given = False
 

@@ -14,14 +14,14 @@ NEUTRAL_DECORATORS = {
     *("cache", "cached_property", "compiled", "contextmanager", "dataclass", "lru_cache"),
     *("no_type_check", "overload"),
 }
-"""Decorators that register nothing: a definition that has no others counts only if it is reached."""
+"""Decorators that register nothing: a definition with only these decorators counts only if it is reached."""
 
 PROSE = {
     "knob": ("unit", "origin"),
     "Dataset": ("licence", "terms", "citation", "layout"),
     "Segments": ("licence", "terms", "citation", "layout"),
 }
-"""Name of a called function or class -> its keyword arguments that are documentation only."""
+"""Name of a called function or class -> the keyword arguments that only document it."""
 
 LOG_METHODS = {"debug", "info", "warning", "error", "exception"}
 
@@ -59,7 +59,7 @@ class Statement:
 
 @dataclass
 class Module:
-    """Statements of a module: bindings by name, and statements with effects on import."""
+    """Statements of a module: those that bind names, by name, and those that have effects on import."""
 
     bindings: dict[str, Statement] = field(default_factory=dict)
     effects: list[Statement] = field(default_factory=list)
@@ -221,7 +221,7 @@ _COMPREHENSIONS = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
 
 @dataclass
 class _Scope:
-    """Names that a function, comprehension or class binds, with the target of each imported one."""
+    """Names bound by a function, comprehension or class, each with its import target or None."""
 
     bound: dict[str, Import | None]
     is_class: bool = False
@@ -292,7 +292,7 @@ def _own(body: Iterable[ast.AST]) -> Iterator[ast.AST]:
 
 
 def _bound_in(body: Iterable[ast.AST], package: str) -> dict[str, Import | None]:
-    """Return the names that a block binds in its own scope, with the target of each imported one."""
+    """Return the names that a block binds in its own scope, each with its import target or None."""
     names: set[str] = set()
     imports: dict[str, Import] = {}
     declared_global: set[str] = set()

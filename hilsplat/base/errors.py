@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 class HilsplatError(Exception):
-    """Error caused by a file, a setting or a user; commands print it without a traceback and exit with 1.
+    """Error caused by a file, a setting or a user; commands print no traceback and exit with status 1.
 
     The message is one sentence that names the file, scene, view or key.
     """
@@ -38,7 +38,7 @@ def system_error(error: BaseException) -> HilsplatError | None:
     return HilsplatError(
         f"{error.filename or 'standard output or an open file'} {PLACES[error.errno]}",
         found=error.strerror,
-        fix="correct the problem, or choose another path",
+        fix="correct the problem, or choose a different path",
     )
 
 
@@ -99,7 +99,7 @@ class DownloadError(HilsplatError):
 
 
 class ArtifactError(HilsplatError):
-    """A stage's output is missing, incomplete, damaged or made from other inputs."""
+    """A stage's output is missing, incomplete, damaged or made from different inputs."""
 
 
 class MisalignedArtifactError(ArtifactError):

@@ -1,4 +1,4 @@
-"""Rules for names in paths, lists of the images in a folder, and paths in the installed project."""
+"""Rules for names in paths, image lists of folders, and paths in the installed project."""
 
 import re
 from collections.abc import Collection
@@ -14,7 +14,7 @@ INSTALLED = _PACKAGE / "_project" if (_PACKAGE / "_project").is_dir() else _PACK
 """Folder of the installed project: Snakefile, rules, config, models. In a wheel, it is inside the package."""
 
 MAX_NAME = 100
-"""Maximum length of the name of a data set, scene, group or variant, used in paths and commands."""
+"""Maximum length of data set, scene, group and variant names, which are part of paths and commands."""
 
 NAME_RULE = "letters a-z A-Z, digits, dot, dash and underscore, beginning with a letter or digit"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")

@@ -74,7 +74,7 @@ def _digest(roots: tuple[str, ...], root: Path) -> str:
 
 
 def _read_state(root: Path) -> str:
-    """Return a digest of all modules' paths, times and sizes; Python detects changes from the same data."""
+    """Return a digest of each module's path, modification time and size, as Python uses to detect changes."""
     found, folders = [], [str(root)]
     for folder in folders:
         with os.scandir(folder) as entries:
@@ -162,7 +162,7 @@ def _reach(roots: tuple[str, ...], root: Path) -> dict[Key, list[bytes]]:
             name = rest[0]
         if path_of(source, root) is None:
             raise HilsplatError(f"{module} imports {source}, which does not exist under {root}")
-        if not name:  # the module itself is passed around
+        if not name:  # the module itself is used as a value
             for each in module_of(source, root).bindings:
                 follow(source, (each,))
         elif name in module_of(source, root).bindings:

@@ -86,7 +86,7 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def _frames(image: Image.Image) -> int:
-    """Return the number of animation frames; previews and a phone's additional pictures are not counted."""
+    """Return the number of animation frames, without previews and the additional pictures of phones."""
     num_frames = int(getattr(image, "n_frames", 1))
     if num_frames < 2 or image.format in ("MPO", "HEIF"):
         return 1
@@ -122,7 +122,7 @@ def _srgb_profile() -> ImageCms.ImageCmsProfile:
 def write_png(
     path: Path, pixels: np.ndarray, compression: int = 6, text: Mapping[str, str] | None = None
 ) -> None:
-    """Write an image (H W 3 or H W; 16-bit only if grey) as PNG atomically, with `text` as its metadata."""
+    """Write an image (H W 3, or grey H W, which may be 16-bit) as PNG atomically, with `text` as metadata."""
     metadata = PngImagePlugin.PngInfo()
     for key, value in (text or {}).items():
         metadata.add_text(key, value)
@@ -138,7 +138,7 @@ def to_float(pixels: UInt8[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]
 
 
 def to_uint8(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
-    """Convert float in [0, 1] to uint8, rounded and clipped."""
+    """Convert floats to uint8: clip them to [0, 1], scale them to 255, and round."""
     return (np.clip(values, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 

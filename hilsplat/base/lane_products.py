@@ -1,4 +1,4 @@
-"""Products of a matrix with few rows and one with 16 or 32 columns; all sums stay in registers."""
+"""Products of a matrix that has few rows and one that has 16 or 32 columns; all sums stay in registers."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from numba.extending import intrinsic
 from hilsplat.base.lanes import LANES, WIDTH, splat
 
 _HAS_AVX512 = bool(binding.get_host_cpu_features().get("avx512f"))
-"""With AVX-512, a core has 32 registers of 16 numbers, otherwise 16 registers of at most 8."""
+"""With AVX-512, a core has 32 registers of 16 numbers each; without it, 16 registers of at most 8 numbers."""
 
 MOST_ROWS = 8 if _HAS_AVX512 else 6
 WIDE_COLUMNS = 2 * WIDTH if _HAS_AVX512 else WIDTH  # rows and columns whose sums fit into the registers
@@ -25,7 +25,7 @@ def rows_of_products(rows: int) -> Any:
     Returns:
         A numba function of (y, y0, y_step, a, a0, a_step, x, x0, x_step, inner, begin, wide): flat float32
         arrays, each followed by the index of its first element and the step between rows; the number of terms
-        per sum; whether y starts at zero; whether there are `WIDE_COLUMNS` columns or `WIDTH`.
+        per sum; whether sums start at zero, not at y; whether there are `WIDE_COLUMNS` columns, not `WIDTH`.
     """
 
     @intrinsic

@@ -115,7 +115,7 @@ def aligned(count):
 
 @intrinsic
 def lanes(typingctx, scalar):
-    """Return lanes that all equal one float32 number."""
+    """Return lanes that all contain the same float32 number."""
 
     def codegen(context, builder, sig, args):
         return splat(builder, args[0])
@@ -180,7 +180,7 @@ def exp2_negative(typingctx, value):
     """Compute 2**x for x in [-126, 0], with a relative error below 3e-7.
 
     Truncation gives x = k + f with f in (-1, 0]; a degree-6 polynomial approximates 2**f, and k is added to
-    the exponent bits. Lanes outside the range get an arbitrary finite or infinite number; nothing traps.
+    the exponent bits. Lanes outside the range get an arbitrary, possibly infinite number and no trap.
     """
 
     def codegen(context, builder, sig, args):
@@ -272,7 +272,7 @@ def bits_ge(typingctx, left, right):
 
 @intrinsic
 def prefetch(typingctx, array, index):
-    """Start loading the cache line of an array index, which may be outside the array."""
+    """Start loading the cache line of an array element; the index may be outside the array."""
 
     def codegen(context, builder, sig, args):
         data = context.make_array(sig.args[0])(context, builder, args[0]).data

@@ -16,7 +16,7 @@ class Level(IntEnum):
 
     @property
     def label(self) -> str:
-        """Lower-case name, as in files and tables."""
+        """Lower-case name used in files and tables."""
         return self.name.lower()
 
     @property

@@ -15,10 +15,10 @@ def load(place: str) -> Any:
 
 
 class Plugins(Mapping[str, Part], Generic[Part]):
-    """Components by name.
+    """Components by name, imported on first access.
 
-    The code identity (`base.identity`) does not follow the entries: a stage that uses one component depends
-    on that component alone, and adds its import path to its roots.
+    The code identity (`base.identity`) does not follow the entries. A stage that uses one component depends
+    only on that one, and adds the component's import path to the roots of its digest.
 
     Attributes:
         places: name -> "module:constant".

@@ -27,7 +27,7 @@ Result = TypeVar("Result")
 logger = logging.getLogger(__name__)
 
 PARENT = "HILSPLAT_PARENT"
-"""Environment variable with the id of the process that its jobs must end with (rules/common.smk)."""
+"""Environment variable with the id of the Snakemake process; jobs end with it (rules/common.smk)."""
 
 PR_SET_PDEATHSIG = 1  # from Linux's <sys/prctl.h>
 
@@ -36,7 +36,7 @@ def end_with_parent(parent: int) -> None:
     """Kill this process as soon as the process that started it ends for any reason.
 
     Otherwise, jobs of a killed Snakemake process would continue, and write outputs with old settings during
-    the next run. Linux does this unless a shell is in between; otherwise, a thread checks every second.
+    the next run. Linux kills the process unless a shell is in between; then, a thread checks every second.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -54,7 +54,7 @@ def _watch(parent: int) -> None:
 
 def end_with_workflow() -> None:
     """End this process with the Snakemake process that started it, if any."""
-    parent = os.environ.pop(PARENT, "")  # popped, because the children of this process have another parent
+    parent = os.environ.pop(PARENT, "")  # popped, because this process's children have a different parent
     if parent.isdecimal():
         end_with_parent(int(parent))
 
@@ -113,10 +113,10 @@ def _discard(folder: Path, lock: IO[bytes]) -> None:
 
 
 def remove_leftovers(folder: Path) -> list[Path]:
-    """Delete unfinished files that dead processes of this host left in a folder; return the deleted folders.
+    """Delete unfinished files left in a folder by dead processes on this host; return the deleted folders.
 
-    Files of live processes, including those in other containers, are kept. So are files of other hosts that
-    share the folder, because their locks may be invisible here.
+    Files of live processes, including those in other containers, are kept. If the folder is shared, files
+    from other hosts are also kept, because their locks may be invisible here.
     """
     removed = []
     for place, folders, _ in os.walk(folder):
@@ -152,7 +152,7 @@ def in_processes(
     """Yield the results of `work(*item)` in the order of `items`, computed in several processes.
 
     Use this for work that holds the GIL. Processes are spawned, because forking a process with threads may
-    hang; `work` must be a module-level function or a `functools.partial` of one. A process takes `chunk`
+    hang. `work` must be a module-level function or a `functools.partial` of one. A process takes `chunk`
     items at a time. With one worker or one item, no process is started.
     """
     if workers <= 1 or len(items) <= 1:
@@ -175,7 +175,7 @@ def in_own_process(work: Callable[..., Result], *given: Any) -> Result:
 
     Raises:
         ChildProcessError: the process ended without a result; the message contains the last 2000 characters
-            of its stderr, which is not shown otherwise.
+            of its stderr, which is otherwise not shown.
     """
     from concurrent.futures.process import BrokenProcessPool
     from tempfile import TemporaryDirectory
@@ -204,7 +204,7 @@ def _threads(number: int) -> ThreadPoolExecutor:
 
 
 def over_edges(work: Callable[..., Any], edges: list[int], threads: int, *arguments: Any) -> list[Any]:
-    """Call `work(begin, end, *arguments)` for adjacent `edges` in threads; return the results in order."""
+    """Call `work(begin, end, *arguments)` for each adjacent pair of `edges` in threads; keep their order."""
     if threads <= 1:
         return [work(begin, end, *arguments) for begin, end in itertools.pairwise(edges)]
     return list(_threads(threads).map(lambda begin, end: work(begin, end, *arguments), edges[:-1], edges[1:]))

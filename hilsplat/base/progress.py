@@ -78,7 +78,7 @@ def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterato
 
 @contextmanager
 def stage_log(stage: str, scene: str) -> Iterator[dict[str, object]]:
-    """Yield a dict for a stage's counts; log when the stage starts and, with the counts, when it ends."""
+    """Yield a dict for a stage's counts; log the start of the stage, and its end together with the counts."""
     counts: dict[str, object] = {}
     logger.info("%s %s: start", stage, scene)
     start = time.monotonic()

@@ -48,7 +48,7 @@ class Inputs:
         self.records = {name: self._record(path) for name, path in paths.items()}
 
     def require_unchanged(self) -> None:
-        """Raise HilsplatError if an input changed; files with unchanged size, time and inode are not read."""
+        """Raise HilsplatError if an input changed; files with the same size, time and inode are skipped."""
         now = self._signatures()
         for name, path in self._paths.items():
             before, after = self._files[name], now[name]
@@ -79,7 +79,7 @@ class Inputs:
 
 
 def files_of(path: Path | Sequence[Path]) -> list[Path]:
-    """Return the files in a folder that are not hidden, or the given file or files."""
+    """Return the non-hidden files in a folder, or the given file or files that exist."""
     if not isinstance(path, Path):
         return [file for each in path for file in files_of(each)]
     if not path.is_dir():
@@ -105,7 +105,7 @@ def write_provenance(
     Args:
         beside: other outputs.
         plugins: import paths of the readers or baselines that the stage used.
-        device: device that the setting `device` resolves to, if the stage has this setting.
+        device: device to which the setting `device` resolves, if the stage has this setting.
     """
     folder = Path(artifact).parent
     write_json(
@@ -257,7 +257,7 @@ def _is_own_picture(path: Path) -> bool:
 
 
 def require_beginning(path: Path, line: str) -> None:
-    """Raise ArtifactError if a table would replace a file that does not begin with the same line."""
+    """Raise ArtifactError if a table would replace a file whose first line is not `line`."""
     if not _is_something(path):
         return
     try:

@@ -1,6 +1,6 @@
 """Quaternions (wxyz), rotation matrices and conversions between them."""
 
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
@@ -14,10 +14,7 @@ RIGID_TOLERANCE = 1e-3
 @compiled(inline="always")
 @no_type_check
 def matrix_entries(w, x, y, z):
-    """Return the nine entries of a unit quaternion's rotation matrix, row by row.
-
-    The function is inlined into compiled loops; `rotation_matrices` applies it to arrays.
-    """
+    """Return the nine entries of a unit quaternion's rotation matrix, row by row; for compiled loops."""
     return (
         1.0 - 2.0 * (y * y + z * z),
         2.0 * (x * y - w * z),
@@ -37,14 +34,8 @@ def unit_quaternions(quats: Float[np.ndarray, "N 4"]) -> Float64[np.ndarray, "N 
     return quats / np.linalg.norm(quats, axis=1, keepdims=True)
 
 
-def rotation_matrices(quats: Float[np.ndarray, "N 4"]) -> Float64[np.ndarray, "N 3 3"]:
-    """Convert quaternions of any nonzero length to matrices: `matrices[i] @ v` rotates v by `quats[i]`."""
-    entries: Any = matrix_entries.py_func(*unit_quaternions(quats).T)
-    return np.stack(entries, axis=1).reshape(-1, 3, 3)
-
-
 def quaternion_of(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, " 4"]:
-    """Convert a rotation matrix to a unit quaternion; the sign is scipy's."""
+    """Convert a rotation matrix to a unit quaternion; scipy chooses the sign."""
     from scipy.spatial.transform import Rotation
 
     x, y, z, w = Rotation.from_matrix(rotation).as_quat()
@@ -64,7 +55,7 @@ def rotate(
 def multiply(
     left: Float64[np.ndarray, " 4"], right: Float64[np.ndarray, "N 4"]
 ) -> Float64[np.ndarray, "N 4"]:
-    """Compose rotations: first `right`, then `left`; lengths multiply."""
+    """Compose rotations: first `right`, then `left`; their lengths are multiplied."""
     w, u = left[0], left[1:]
     scalar = w * right[:, 0] - right[:, 1:] @ u
     vector = w * right[:, 1:] + right[:, :1] * u + np.cross(u, right[:, 1:])
@@ -72,7 +63,7 @@ def multiply(
 
 
 def are_rotations(matrices: Float[np.ndarray, "*n 3 3"], tolerance: float) -> Bool[np.ndarray, "*n"]:
-    """Return whether each matrix is a rotation: finite, no reflection, R R' close to the identity."""
+    """Return whether each matrix is a rotation: finite, not a reflection, and R R' close to the identity."""
     finite = np.isfinite(matrices).all(axis=(-2, -1))
     safe = np.where(finite[..., None, None], matrices, 0.0)
     distance = np.abs(safe @ np.swapaxes(safe, -1, -2) - np.eye(3)).max(axis=(-2, -1))

@@ -17,7 +17,7 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object
 
 
 def read_csv(path: Path, columns: Sequence[str], fix: str) -> list[dict[str, str]]:
-    """Return the rows of a CSV file; raise ArtifactError with `fix` if it is missing or has other columns."""
+    """Return the rows of a CSV file; raise ArtifactError with `fix` if it is missing or has wrong columns."""
     try:
         with Path(path).open(encoding="utf-8", newline="") as stream:
             reader = csv.DictReader(stream)

@@ -299,7 +299,7 @@ def test_arrays_of_another_version_are_recognised(tmp_path):
         name: str
 
     artifacts.write_npz(tmp_path / "old.npz", left=np.zeros(2), middle=np.ones(1))
-    with pytest.raises(ArtifactError, match=r"another version(.|\n)*left, right(.|\n)*left, middle"):
+    with pytest.raises(ArtifactError, match=r"a different version(.|\n)*left, right(.|\n)*left, middle"):
         read_into(Pair, tmp_path / "old.npz", name="a")
     artifacts.write_npz(tmp_path / "new.npz", left=np.zeros(2), right=np.ones(1))
     assert read_into(Pair, tmp_path / "new.npz", name="a").name == "a"
