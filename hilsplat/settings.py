@@ -539,11 +539,10 @@ class EvaluateSettings(Section):
     view_consistency: bool = knob(
         True, "score whether answers agree in neighbouring views (synthetic scenes)"
     )
-    points: Literal["nearest", "vote", "density", "frozen"] = knob(
+    points: Literal["nearest", "frozen"] = knob(
         "nearest",
-        "Gaussians used for a labelled point; nearest: the nearest opaque one; vote: up to 5 within "
-        "10 cm; density: the 8 densest; frozen: the one at the point (gaussians.initial: frozen, or your own "
-        "PLY with one Gaussian per point)",
+        "Gaussian used for a labelled point; nearest: the nearest opaque one; frozen: the one at the point "
+        "(gaussians.initial: frozen, or your own PLY with one Gaussian per point)",
         origin="OpenGaussian: frozen",
     )
 

@@ -38,9 +38,6 @@ MEANS: dict[str, Callable[[ClassCounts], float]] = {
 }
 """Metrics with one number per scene, or one number for all scenes under a pooled protocol."""
 
-VOTE_RADIUS_M = 0.1
-"""Vote radius: 10 cm."""
-
 LEVEL = Level.WHOLE
 """Level of all predictions: the classes of these data sets are objects and surfaces, not parts."""
 
@@ -122,7 +119,7 @@ def measure_instances(
 def classes_of_points(
     scene: "LanguageScene", carried: CarriedPoints, method: str, texts: Sequence[str]
 ) -> Int32[np.ndarray, " P"]:
-    """Return point labels 1 .. K from the "tree" or "field"; 0 if a point has no Gaussian."""
+    """Return point labels 1 .. K from the "tree" or "field"; 0 if a point's Gaussian has none."""
     vectors = scene.text_vectors(texts)
     if method == "tree":
         of_node = classify(scene.tree.clip.astype(np.float32), vectors)
@@ -182,7 +179,6 @@ def measure_scene_points(
     Labelled points are keyed by labelling, in metres; `scene_from_points` is a similarity transform.
     Protocols whose labelling is absent are skipped.
     """
-    radius = VOTE_RADIUS_M * float(np.cbrt(np.linalg.det(scene_from_points[:3, :3])))
     carried_of: dict[int, CarriedPoints] = {}  # labellings of the same mesh share its vertices
     labels_of: dict[tuple[str, str], np.ndarray] = {}  # several protocols have the same classes
     for card in cards:
@@ -192,7 +188,7 @@ def measure_scene_points(
         points = truth[labelling]
         if id(points.xyz) not in carried_of:
             places = points.xyz @ scene_from_points[:3, :3].T + scene_from_points[:3, 3]
-            carried_of[id(points.xyz)] = carried_to(places, scene.gaussians, mode, radius, threads)
+            carried_of[id(points.xyz)] = carried_to(places, scene.gaussians, mode, threads)
         carried = carried_of[id(points.xyz)]
         if card is INSTANCES:
             if "tree" in methods:

@@ -192,7 +192,7 @@ def test_targets_of_masks_without_vectors_are_refused(boxes_with_tree):
     change_index(world.clip)
     inputs = world.clip, tree, contributions, world.folder / "autoencoder"
     own_vectors = AutoencoderSettings(latent=2, targets="mask")
-    with pytest.raises(ArtifactError, match=r"1 of 24 masks have no CLIP vector(.|\n)*clip\.crops: masks"):
+    with pytest.raises(ArtifactError, match=r"1 of 24 masks have no (.|\n)*set clip\.crops to masks"):
         run_autoencoder(*inputs, own_vectors, 0)
     run_autoencoder(*inputs, AutoencoderSettings(latent=2), 0)
 
