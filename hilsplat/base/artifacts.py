@@ -459,7 +459,7 @@ def output_lock(output: Path) -> Iterator[None]:
     """Lock an output for writing; raise ArtifactError if another process is writing it.
 
     If a writer fails or is killed, its lock file stays non-empty, because the output may then match
-    neither its provenance nor that writer's inputs.
+    neither the provenance record nor the inputs of that writer.
     """
     output = Path(output)
     output.parent.mkdir(parents=True, exist_ok=True)

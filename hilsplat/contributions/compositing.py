@@ -1,4 +1,4 @@
-"""Normalised compositing weights of a view, and latents rendered with them at its pixels."""
+"""Normalised compositing weights of a view, and latents rendered at its pixels with these weights."""
 
 import numpy as np
 import scipy.sparse as sp
@@ -12,11 +12,11 @@ MIN_ALPHA = 0.5
 """Pixels with a smaller alpha are ignored, because their features would be extrapolated."""
 
 MIN_LATENT_SHARE = 0.5
-"""A pixel has a latent at a level if Gaussians with a latent have more than this share of its weight."""
+"""A pixel has a latent at a level if Gaussians with a latent make up more than this share of its weight."""
 
 
 def normalised_weights(weights: sp.csr_matrix) -> sp.csr_matrix:
-    """Divide the weights of each pixel by their sum, the accumulated alpha, in place.
+    """Divide each pixel's weights in place by their sum, which is the accumulated alpha.
 
     The weights then sum to 1, so that a rendered feature is an average of features; pixels with an alpha
     below `MIN_ALPHA` become empty rows. The sum excludes weights that the rasteriser dropped as too small.
@@ -45,7 +45,7 @@ def _normalise(indptr, indices, data, min_alpha):
 
 
 def visible_mass(weights: sp.csr_matrix) -> Float32[np.ndarray, " N"]:
-    """Return the sum of each Gaussian's weights over the pixels, px; summed in float64."""
+    """Return each Gaussian's sum of weights over all pixels (px), computed in float64."""
     out = np.zeros(weights.shape[1], np.float64)
     _add_columns(weights.indices, weights.data, out)
     return out.astype(np.float32)
@@ -60,10 +60,10 @@ def _add_columns(indices, data, out):
 def rendered_latents(
     weights: sp.csr_matrix, features: Float32[np.ndarray, "N 3 D"]
 ) -> list[tuple[np.ndarray, Float32[np.ndarray, "P D"]]]:
-    """Return, per level, the pixels dominated by Gaussians with a latent, and their rendered latents.
+    """Return, per level, the pixels dominated by Gaussians that have a latent, and these pixels' latents.
 
-    Gaussians without a latent have zeros, which a code would decode like any latent. They are omitted, and
-    the remaining normalised weights are divided by their sum. Results are bit-identical to sparse products.
+    Gaussians without a latent are omitted, because a code would decode their zeros like any other latent.
+    The remaining normalised weights are divided by their sum. Results are bit-identical to sparse products.
     """
     rows = weights.indptr, weights.indices, weights.data
     shares = weights @ (features != 0).any(axis=2).astype(np.float32)
@@ -91,7 +91,7 @@ def _render(indptr, indices, data, pixels, share, features, wide, out):
 
 
 def padded(rows: Float32[np.ndarray, "*rows D"]) -> Float32[np.ndarray, "*rows E"]:
-    """Pad channels with zeros to a multiple of sixteen, the lanes of a vector, and make rows contiguous."""
+    """Pad channels with zeros to a multiple of sixteen (a vector's lanes), and make rows contiguous."""
     missing = -rows.shape[-1] % WIDTH
     if missing:
         rows = np.concatenate([rows, np.zeros((*rows.shape[:-1], missing), np.float32)], axis=-1)
@@ -100,7 +100,7 @@ def padded(rows: Float32[np.ndarray, "*rows D"]) -> Float32[np.ndarray, "*rows E
 
 @intrinsic
 def plus(typingctx, total, scales, row):
-    """Return total + scales * row; each product is rounded before it is added, as in the plain loops."""
+    """Return total + scales * row; each product is rounded before it is added, as in plain loops."""
 
     def codegen(context, builder, sig, args):
         return builder.fadd(args[0], builder.fmul(args[1], args[2]))  # without flags, so never fused

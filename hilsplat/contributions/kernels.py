@@ -9,7 +9,7 @@ from hilsplat.base.compiled import compiled
 from hilsplat.base.lanes import prefetch, splat
 
 SUMS = 4
-"""Numbers per pair that are summed as one vector: a sum per level, and padding."""
+"""Number of sums per pair that are stored as one vector: one per level, plus padding."""
 
 AHEAD = 8
 """Weights of W are fetched into the cache this many pixels before they are needed."""
@@ -26,11 +26,11 @@ def summed_masks(first, last, runs, offsets, level_index, labels, half, indptr, 
         runs, offsets: as in `HierarchicalMasks`.
         labels: painted mask of each pixel and level, -1 for none.
         half: whether each pixel is in the random half.
-        indptr, indices, data: W; pixels without weights are ignored.
+        indptr, indices, data: W in CSR form; pixels without weights are ignored.
 
     Returns:
-        pixel counts (masks x 2): painted pixels, and those in the half; row sizes; columns; sums over raw
-        masks, painted pixels, and those in the half (entries x 3, float64, in pixel order).
+        counts (masks x 2) of painted pixels and of painted pixels in the half; row sizes; columns; sums over
+        raw masks, painted pixels, and painted pixels in the half (entries x 3, float64, in pixel order).
     """
     sums, found = np.zeros(num_gaussians * SUMS), np.empty(num_gaussians, np.int32)
     counts = np.zeros((last - first, 2), np.int64)
@@ -82,9 +82,9 @@ def move_to_front(rows, indptr, indices, data):
 
 @compiled
 def transpose(indptr, indices, begins, cells):
-    """Return each column's start, and the cells of its values: row * 2**32 + place.
+    """Write each column's start to `begins`, and the cells of its values, row * 2**32 + place, to `cells`.
 
-    `begins` must be zero. All integers are unsigned, which skips the checks for negative indices.
+    `begins` must contain zeros. All integers are unsigned, which skips the checks for negative indices.
     """
     for k in range(np.uint64(indptr[-1])):
         begins[np.uint64(indices[k]) + np.uint64(1)] += 1
@@ -100,9 +100,9 @@ def transpose(indptr, indices, begins, cells):
 
 @intrinsic
 def add_products(typingctx, sums, at, whole, part, subpart, value):
-    """Add `value` times three numbers to the sums at `at`, as one vector and without fusing.
+    """Add `value` times three numbers to the sums at `at`, as one vector and without fused operations.
 
-    Returns the first sum as it was before.
+    Returns the previous value of the first sum.
     """
 
     def codegen(context, builder, sig, args):
@@ -136,8 +136,8 @@ def add_to_block(
 ):
     """Add the pixels of a part to rows begin..end of G.
 
-    Pairs in `rows` are summed in place; pairs in `late` and new pairs are written to the output. The sums of
-    one row fit into the fastest cache: its pairs are numbered from 1, first those of `rows`, then of `late`.
+    Pairs in `rows` are summed in place; pairs in `late` and new pairs are written to the output. A row's
+    pairs are numbered from 1, first those of `rows`, then of `late`, so its sums fit into the fastest cache.
 
     Args:
         part: row starts, columns and values of W, and whether each pixel has a mask at each level.
@@ -145,7 +145,7 @@ def add_to_block(
         rows, late: row starts, columns, and sums by level (E x 3); no pair is in both.
         number: an integer per Gaussian, zero before and after the call.
         sums: buffer for SUMS numbers per Gaussian.
-        fresh: buffer for all columns.
+        fresh: buffer for new columns, one number per Gaussian.
         out_indptr, out_indices, out_values: late pairs; columns are sorted within rows.
 
     Returns:
@@ -227,7 +227,7 @@ def _number(first, last, indices, values, before, number, sums):
 
 @compiled
 def merge_rows(indptr, indices, values, late_indptr, late_indices, late_values):
-    """Merge late pairs into the rows, in place from the end; `indices` and `values` have room for all."""
+    """Merge late pairs into the rows in place, from the end; `indices` and `values` must have enough room."""
     at = indptr[-1] + late_indptr[-1]
     for i in range(len(indptr) - 2, -1, -1):
         k, t = indptr[i + 1] - 1, late_indptr[i + 1] - 1

@@ -39,7 +39,7 @@ def run_key_masks(
 
 
 def key_views(scene: Scene, gaussians_ply: Path, share: float, threads: int = 1) -> list[str]:
-    """Return the share of the training views (rounded up) that adds the most Gaussians, in camera order.
+    """Return the `share` of the training views (rounded up) that covers the most Gaussians, in camera order.
 
     A Gaussian is weighted by its mean visible mass, halved for each chosen view that shows it, so that views
     of uncovered regions are preferred. The result does not depend on `threads`.

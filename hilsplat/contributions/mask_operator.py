@@ -1,6 +1,6 @@
 """Mask means as a linear map of the field, its adjoint, and averages of latents over masks.
 
-Products of float32 rows use vectors of sixteen channels, with the bytes of plain loops over the channels.
+Products of float32 rows use vectors of sixteen channels and are bit-identical to loops over the channels.
 """
 
 from dataclasses import dataclass
@@ -21,12 +21,12 @@ BLOCK = 2**15
 """Number of Gaussians per pass of a wide product with A: their features fit into the processor's cache."""
 
 SPREAD_PARTS = 4
-"""Gaussian ranges per thread; several balance the load, as the masks per Gaussian vary."""
+"""Number of Gaussian ranges per thread; several balance the load, as the mask count per Gaussian varies."""
 
 
 @dataclass(frozen=True)
 class MaskOperator:
-    """Products with A for all levels: from features of Gaussians to means of masks, and back.
+    """Products with A for all levels: from Gaussian features to mask means, and back.
 
     A (CSR; rows are masks, with sorted columns) is used in place, for example memory-mapped. The order
     of sums does not depend on the number of threads. `level_index` is each mask's level, from 0.
@@ -78,7 +78,7 @@ def lifted_average(
     pixels: Float32[np.ndarray, " M"],
     latents: Float32[np.ndarray, "M D"],
 ) -> Float32[np.ndarray, "N 3 D"]:
-    """Average the latents of the pixels that show each Gaussian, weighted by its weight there; 0 if unseen.
+    """Average the latents of the pixels that show each Gaussian, with compositing weights; 0 if unseen.
 
     This needs only one sparse product and is within about 10 % of the regression's optimum.
     """
@@ -95,9 +95,9 @@ def lifted_median(
 ) -> Float32[np.ndarray, "N 3 D"]:
     """Compute the geometric median of the latents averaged by `lifted_average`, with the same weights.
 
-    LangSplat's L1 loss converges to it. Masks that merge or miss objects shift an average much more. Each
-    Weiszfeld iteration, one pass over A, divides weights by the distance to the latest estimate; 15 of them
-    give about three correct digits. Gaussians outside all masks keep `start`, the lifted average.
+    LangSplat's L1 loss converges to this median. Masks that merge or miss objects shift an average more. Each
+    Weiszfeld iteration, one pass over A, divides weights by the distance to the latest estimate. Fifteen
+    iterations give about three correct digits. Gaussians outside all masks keep `start`, the lifted average.
     """
     features = np.array(start, np.float32, order="C")
     for _ in range(steps):

@@ -29,7 +29,7 @@ logger = logging.getLogger(__name__)
 
 BLOCKS = 64
 """G is built in this many blocks of rows, one per thread at a time; any number gives the same result. Blocks
-without Gaussians visible in a part are skipped; Morton order makes such blocks frequent."""
+that contain no Gaussian visible in a part are skipped, which Morton order makes frequent."""
 
 MERGE_AT = 8
 """A block's late pairs are merged with its rows once they exceed its row pairs divided by this number."""
@@ -38,7 +38,7 @@ CHUNK_WEIGHTS = 2**25
 """Number of non-zeros of W collected before they are added to G; collecting and adding need 0.6 GiB."""
 
 LARGE_PART = 2**23
-"""Parts with this many or more non-zeros are added to G directly, because copying them would gain little."""
+"""Parts with at least this many non-zeros are added to G directly, because copying them would gain little."""
 
 MAX_WEIGHTS = 2**28
 """Maximum number of non-zeros of W (all views) in memory, 2 GiB."""
@@ -53,7 +53,7 @@ ROWS = ("indptr", "indices", "values")
 
 
 class _Rows:
-    """Some rows of G, in reused memory because first writes to new pages take time and memory."""
+    """A range of rows of G; memory is reused, because first writes to new pages take time and memory."""
 
     def __init__(self, rows: int) -> None:
         self.indptr = np.zeros(rows + 1, np.int64)
@@ -86,7 +86,7 @@ class _Rows:
 
 
 class GramBuilder:
-    """Sum of G over parts of W, such as one view after another; memory grows only with the size of G.
+    """Builder that sums G over parts of W, such as views; its memory grows only with the size of G.
 
     Entries are summed in float64 in the order of the pixels, so results depend neither on the division of
     pixels into parts nor on the number of threads. A part shows about 10 % of the Gaussians of a large scene,
@@ -143,7 +143,7 @@ class GramBuilder:
         return rows
 
     def _columns(self, weights: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray]:
-        """Return where each Gaussian's list begins, and lists of the pixel and place of each weight in W.
+        """Return the start of each Gaussian's list, and the lists of the pixel and place of each weight in W.
 
         A place is where the upper triangle's columns begin in the pixel's row of W. The lists are reused
         for the next part, because allocating memory takes longer than filling it.
@@ -184,7 +184,7 @@ class GramBuilder:
 
 
 class _Waiting:
-    """Stacked parts of W, in reused memory because new memory takes longer to fill."""
+    """Stacked parts of W; memory is reused, because new memory takes longer to fill."""
 
     def __init__(self, num_gaussians: int) -> None:
         self._num_gaussians = num_gaussians
@@ -208,7 +208,7 @@ class _Waiting:
         self.nonzeros = after
 
     def held(self) -> StackedWeights:
-        """Return all parts; the arrays are valid until another part is appended."""
+        """Return all parts; the arrays are valid until the next part is appended."""
         indptr = np.concatenate(self._indptr)
         arrays = (self._data[: self.nonzeros], self._indices[: self.nonzeros], indptr)
         matrix = sp.csr_matrix(arrays, shape=(len(indptr) - 1, self._num_gaussians), copy=False)

@@ -80,7 +80,7 @@ class Contributions:
         """Memory-map G or W, depending on which the stage kept; products with W use one thread.
 
         Raises:
-            ArtifactError: if the folder contains neither.
+            ArtifactError: the folder contains neither G nor W.
         """
         if (self.folder / "G").is_dir():
             indptr, indices, values = (self._mapped(f"G/{name}") for name in ("indptr", "indices", "values"))
@@ -103,7 +103,7 @@ class Contributions:
         """Read the rows of a finished contributions folder.
 
         Raises:
-            ArtifactError: if it is missing, damaged or from another version.
+            ArtifactError: it is missing, damaged or from a different version of hilsplat.
         """
         folder, names = Path(folder), ("num_gaussians", "gaussians_sha256", "cameras_sha256", "min_weight")
         index = read_index(folder, *names)

@@ -54,11 +54,11 @@ WEIGHTS_PER_PIXEL = 40
 """Weights per pixel of a typical scene."""
 
 MAX_WEIGHTS_TOGETHER = 2**25
-"""Views with more weights than this (256 MiB) are prepared one at a time; up to four views may be waiting."""
+"""Views with more weights (256 MiB) are prepared one at a time; up to four finished views may be waiting."""
 
 
 class ArrayStream:
-    """A .npy file written row by row, so that the stage never keeps all of its output in memory.
+    """An .npy file written row by row, so that the stage never keeps all of its output in memory.
 
     `row_shape` is the shape of one row: () for an array of numbers.
     """
@@ -92,7 +92,7 @@ class ArrayStream:
 
 
 def views_together(scene: Scene, threads: int) -> int:
-    """Return how many views to prepare at once: two if W fits, because half the work is single-threaded."""
+    """Return the number of views prepared at once: two if W fits, because half the work uses one thread."""
     most_px = max((int(np.prod(scene.cameras[name].size_hw)) for name in scene.views("train")), default=0)
     return min(2, max(1, threads)) if most_px * WEIGHTS_PER_PIXEL <= MAX_WEIGHTS_TOGETHER else 1
 
@@ -111,12 +111,12 @@ def run_contributions(
     One or two views are prepared while rows of previous views are written and added to G. Memory contains
     these views, the sum of G so far, and weights not yet added to G (`quadratic_builder`). After an
     interruption, a rerun reads the matrices of finished views from the cache, and G from a checkpoint at most
-    `CHECKPOINT_SECONDS` (and one view) old; it rasterises W again for views missing from that G.
+    `CHECKPOINT_SECONDS` (and one view) old; it rasterises W again for views not yet in that G.
 
     Raises:
-        MisalignedArtifactError: if masks and images differ in size, or the masks of a view differ from those
+        MisalignedArtifactError: masks and images differ in size, or the masks of a view differ from those
             recorded in their index.
-        ArtifactError: if no training view has masks.
+        ArtifactError: no training view has masks.
     """
     scene = Scene.load(scene_folder)
     gaussians = load_ply(gaussians_ply)

@@ -67,7 +67,7 @@ def view_contributions(
 
 
 def labelled_rows(weights: sp.csr_matrix, labels: Int32[np.ndarray, "P 3"]) -> StackedWeights:
-    """Return the rows of W with Gaussians and a mask at any level, reusing the memory of `weights`."""
+    """Return the rows of W that have Gaussians and a mask at any level; the memory of `weights` is reused."""
     sizes = np.diff(weights.indptr)
     valid = (labels >= 0) & (sizes > 0)[:, None]
     rows = np.flatnonzero(valid.any(axis=1))

@@ -1,4 +1,4 @@
-"""Adam for training with hand-written gradients, in one pass over the parameters, and the order of views."""
+"""Adam for hand-written gradients, in one pass over the parameters per step, and a random order of views."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -44,7 +44,7 @@ class Adam:
 
 
 @compiled(error_model="numpy")
-@no_type_check  # the shape checks of the test-suite cannot be compiled
+@no_type_check  # the shape checks of the test suite cannot be compiled
 def _step(values, gradient, first, second, rate, scale, eps):
     """Take one step in place; `rate` is divided by 1 - beta1^t, and `scale` is 1 / sqrt(1 - beta2^t)."""
     for k in range(len(values)):

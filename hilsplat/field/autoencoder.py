@@ -68,7 +68,7 @@ def run_autoencoder(
     Writes `autoencoder.safetensors`, `latents.npz` (rows as in the contributions) and `index.json`.
 
     Raises:
-        MisalignedArtifactError: the semantic tree or the CLIP vectors belong to other masks.
+        MisalignedArtifactError: the semantic tree or the CLIP vectors belong to different masks.
         ArtifactError: a mask needs its own vector and has none.
     """
     require_same_masks(semantic_tree_folder, contributions_folder)
@@ -109,7 +109,7 @@ def run_autoencoder(
 def train_autoencoder(
     vectors: Float32[np.ndarray, "B C"], settings: AutoencoderSettings, seed: int
 ) -> Autoencoder:
-    """Train on one scene's unit vectors: Adam with cosine decay, full batches drawn without replacement.
+    """Train on one scene's unit vectors, using Adam with cosine decay and full batches without replacement.
 
     Identical inputs and seeds produce identical bytes for any number of stage threads (the command line
     limits BLAS to one thread). The seed determines the initial weights and the order of vectors.
@@ -196,7 +196,7 @@ def statistics(parameters: Arrays, data: Float32[np.ndarray, "B C"], latent: int
 
 
 def _forward(parameters: Arrays, layers: list[Layer], values: np.ndarray) -> tuple[np.ndarray, list[Passed]]:
-    """Return the layers' outputs, using the batch's statistics, and the values for the backward pass."""
+    """Return the layers' outputs, normalised with batch statistics, and the values for the backward pass."""
     passed = []
     for layer in layers:
         scaled, spread = values[:0], values[:0, 0]
@@ -231,7 +231,7 @@ def _backward(
 
 
 def _slope_before_unit(values: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Return the gradient before `unit_rows` from that after it; the component along the vectors vanishes."""
+    """Convert the gradient with respect to the output of `unit_rows` to that with respect to its input."""
     length = np.sqrt(np.square(values).sum(axis=1, keepdims=True))
     units = values / length
     return (slope - units * (units * slope).sum(axis=1, keepdims=True)) / length

@@ -32,9 +32,9 @@ _add_products = rows_of_products(UNITS)
 class LinearCode:
     """Code e = unit(m + U z) with d principal directions about the mean.
 
-    m is the mean, and U the basis with orthonormal rows. The code needs no training and no randomness. Unlike
-    for a network, the code of an average is the average of the codes, and a cosine with any vector takes d
-    products, so relevancy needs no decoding. But a network can adapt nonlinearly to the scene's vectors.
+    m is the mean, and U the basis with orthonormal rows. The code needs no training and no randomness. The
+    code of an average is the average of the codes, and a cosine with any vector takes d products, so
+    relevancy needs no decoding. A network has neither property, but adapts nonlinearly to the vectors.
     """
 
     def __init__(self, mean: Float32[np.ndarray, " C"], basis: Float32[np.ndarray, "D C"]) -> None:
@@ -80,7 +80,7 @@ class LinearCode:
 
 
 class PackedLayers(NamedTuple):
-    """Dense layers with ReLUs between them, in the memory layout of a compiled loop.
+    """Dense layers with ReLUs between them, in the memory layout that the compiled loop needs.
 
     The values fit in the L1 cache. Rows are SIMD lanes, and as many outputs are summed together as fit in
     the registers. The summation order in a row does not depend on other rows.
@@ -224,7 +224,7 @@ class Autoencoder:
 
     @staticmethod
     def drawn(channels: int, latent: int, twister: np.random.RandomState) -> "Autoencoder":
-        """Draw the weights that torch draws from this generator state; BatchNorm is the identity."""
+        """Draw the weights that torch draws from this generator state; BatchNorm starts as the identity."""
         arrays: dict[str, np.ndarray] = {}
         for layer in (layer for side in layers_of(channels, latent) for layer in side):
             if layer.norm:
@@ -246,7 +246,7 @@ Code = LinearCode | Autoencoder
 
 
 def load_code(folder: Path) -> Code:
-    """Read the network or linear code of a finished folder; raise ArtifactError if missing or damaged."""
+    """Read the code (network or linear) in a finished folder; raise ArtifactError if missing or damaged."""
     path = autoencoder_file(folder)
     state, about = read_tensors(path)
     try:
@@ -259,7 +259,7 @@ def load_code(folder: Path) -> Code:
             model.arrays[name] = state[name]
         return model
     except (KeyError, ValueError) as error:
-        raise ArtifactError(f"{path} is from another version: {error}", fix=remake(path)) from error
+        raise ArtifactError(f"{path} is from a different version: {error}", fix=remake(path)) from error
 
 
 def autoencoder_file(folder: Path) -> Path:
@@ -271,7 +271,7 @@ def load_latents(folder: Path, contributions: Contributions) -> Float32[np.ndarr
     """Return the latent of each mask, in the contributions' row order.
 
     Raises:
-        MisalignedArtifactError: the latents belong to other masks.
+        MisalignedArtifactError: the latents belong to different masks.
     """
     require_same_masks(folder, contributions.folder)
     return read_npz(sealed(folder, "latents.npz"), "latents")["latents"]

@@ -71,9 +71,9 @@ def view_relations(
 def distinct(
     means: Float32[np.ndarray, "m D"], depth: Int64[np.ndarray, "m m"], most_alike: float
 ) -> Int64[np.ndarray, " k"]:
-    """Prune contrastive samples: return rows that are not similar to any unrelated row kept before.
+    """Return the rows to keep as contrastive samples: those unlike every unrelated row that was kept earlier.
 
-    The paper keeps the most distinct samples and specifies no numbers. A pair of masks that are similar but
+    The paper keeps the most distinct samples but specifies no numbers. A pair of masks that are similar but
     unrelated in the tree adds almost no information to the gradients of the kept pairs. Rows are in order of
     preference, `depth` is their `common_ancestor_depth`, and `most_alike` is a cosine.
     """
@@ -86,7 +86,7 @@ def distinct(
 
 
 def compared(relations: list[ViewRelations]) -> tuple[int, int]:
-    """Return the numbers of views averaged in L_ins and (view, level) pairs averaged in L_part."""
+    """Return the number of views averaged in L_ins, and of (view, level) pairs averaged in L_part."""
     instance = sum(len(view.rows) > 1 for view in relations)
     part = sum(
         len(rows) > 1 and bool((parent != NONE).any()) for view in relations for rows, parent in view.parts
@@ -162,7 +162,7 @@ class Contrast:
         return {"instance": instance, "part": part}
 
     def weighted(self, features: Float32[np.ndarray, "N 3 D"]) -> tuple[float, Float32[np.ndarray, "N 3 D"]]:
-        """Return the weighted sum of L_ins and L_part, and its gradient; losses of weight 0 are skipped."""
+        """Return the weighted sum of L_ins and L_part, and its gradient; losses with weight 0 are skipped."""
         settings, (means, halves, others) = self.settings, self._means(features)
         total, by_means, by_halves = 0.0, np.zeros(means.shape), None
         if settings.weight_instance:

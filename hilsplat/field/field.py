@@ -39,8 +39,8 @@ def run_field(
     name). The result does not depend on `threads`.
 
     Raises:
-        MisalignedArtifactError: an input belongs to other masks, Gaussians or codes.
-        SettingsError: an input that the settings require is missing.
+        MisalignedArtifactError: an input belongs to different masks, Gaussians or codes.
+        SettingsError: an input that the settings require is missing, or one that they do not use is given.
     """
     for name, value, given, options in (
         ("trainer", "literal", rendered, "--scene, --gaussians and --masks"),
@@ -119,7 +119,7 @@ def read_parents(tree_folder: Path, contributions: Contributions) -> dict[str, n
     """Return the parent of each mask in the coverage trees, by view.
 
     Raises:
-        MisalignedArtifactError: the trees were computed from other masks.
+        MisalignedArtifactError: the trees were computed from different masks.
     """
     require_same_masks(tree_folder, contributions.folder)
     return {

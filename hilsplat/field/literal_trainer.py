@@ -1,4 +1,4 @@
-"""Train the field as in the paper: render a view, compute its losses, take an Adam step on the features.
+"""Train the field as in the paper: render a view, compute its losses, and update the features with Adam.
 
 This is the slow reference for the sparse solver (`solver.solve_field`). Both minimise the same objective,
 term by term. Here each step computes every term on the rendered maps of one random view; the mean over all
@@ -40,7 +40,7 @@ CURVE_POINTS = 30  # number of points of the loss curve in the report
 
 @dataclass(frozen=True)
 class ViewTargets:
-    """Masks of one view in the view's covered pixels."""
+    """Masks of one view, restricted to the view's covered pixels."""
 
     rows: Int64[np.ndarray, " m"]  # rows of the view's masks in the contributions
     level: Int64[np.ndarray, " m"]  # level of each mask, 0 to 2
@@ -54,7 +54,7 @@ def view_losses(
     view: ViewTargets,
     latents: Float32[np.ndarray, "M D"],  # latent of every mask of the scene
     settings: FieldSettings,
-    shares: tuple[int, float, int, int],  # of the scene: views, labelled pixels, counts of `compared`
+    shares: tuple[int, float, int, int],  # totals of the scene: views, labelled pixels, `compared`
 ) -> tuple[dict[str, float], Float64[np.ndarray, "P 3 D"]]:
     """Compute all losses on the rendered maps of one view, and the gradient of their weighted sum.
 
@@ -121,13 +121,13 @@ def train_literally(
     seed: int,
     threads: int,
 ) -> tuple[Float32[np.ndarray, "N 3 D"], dict[str, object]]:
-    """Run Adam from the field's start, one random view per step; views repeat only after all were used.
+    """Run Adam from the field's start, one random view per step; each is used once before any is repeated.
 
     Returns:
-        the features, and a report with every term of the objective before and after, and the loss curve.
+        the features, and a report with the loss curve and every term of the objective before and after.
 
     Raises:
-        MisalignedArtifactError: the contributions belong to other Gaussians or other masks.
+        MisalignedArtifactError: the contributions belong to different Gaussians or masks.
     """
     settings, (scene_folder, gaussians_ply, masks_folder) = contrast.settings, rendered
     scene = Scene.load(scene_folder)

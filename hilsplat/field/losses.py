@@ -20,11 +20,11 @@ SHORTEST = 1e-6  # added in quadrature to lengths in denominators, so that the c
 def log_distance_loss(
     means: Float[np.ndarray, "M D"], log_wanted: Float[np.ndarray, "M M"]
 ) -> tuple[float, Float64[np.ndarray, "M D"]]:
-    """Return the mean over ordered pairs i != j of the squared difference of log distances, and its gradient.
+    """Return the mean squared difference between actual and target log distances of pairs, and its gradient.
 
-    The distance is sqrt(|m_i - m_j|^2 + SOFTENING^2). Squares are computed from dot products, which needs
-    M x M numbers instead of M x M x D. In float64 the cancellation error is far below the softening. At least
-    two means are required; `log_wanted` is the natural logarithm of each pair's target distance.
+    The distance is sqrt(|m_i - m_j|^2 + SOFTENING^2), i != j. Squares are computed from dot products, which
+    need M x M numbers instead of M x M x D. In float64, the cancellation error is far below the softening. At
+    least two means are required; `log_wanted` is the natural logarithm of each pair's target distance.
     """
     rows = len(means)
     centred = means - means.mean(axis=0)

@@ -104,7 +104,7 @@ class QuadraticProblem:
 def conjugate_gradient(problem: QuadraticProblem, steps: int) -> Float32[np.ndarray, "N 3 D"]:
     """Minimise the quadratic part in a few steps from the lifted start, preconditioned by the visible mass.
 
-    Levels and channels do not interact, so each pair has its own step size.
+    Levels and channels do not interact, so each pair of level and channel has its own step size.
     """
     scale = problem.mass * np.float32(max(sum(problem.weights), 1e-12))
     inverse = np.where(scale > 0, 1 / np.maximum(scale, 1e-20), 0).astype(np.float32)
@@ -127,7 +127,7 @@ def conjugate_gradient(problem: QuadraticProblem, steps: int) -> Float32[np.ndar
 def _ratio(
     above: Float64[np.ndarray, "3 D"], below: Float64[np.ndarray, "3 D"]
 ) -> Float32[np.ndarray, "3 D"]:
-    """Return the quotient, or 0 if a channel is already solved."""
+    """Return the quotient, or 0 where a channel is already solved."""
     return np.where(below > 0, above / np.where(below > 0, below, 1), 0).astype(np.float32)
 
 
@@ -190,7 +190,7 @@ def redirect(scale, residual, ratio, direction):
 
 @compiled
 def add_slope(factor, curved, right, scale, out):
-    """Add the slope factor (curved - right) of a quadratic form to `out`, and multiply by scale (N, 3)."""
+    """Add a quadratic form's slope, factor * (curved - right), to `out`; multiply the sum by scale (N, 3)."""
     for n in range(len(out)):
         for level in range(out.shape[1]):
             for c in range(out.shape[2]):

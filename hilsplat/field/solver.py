@@ -1,4 +1,4 @@
-"""Solve the field: lifted average, conjugate gradient, then L-BFGS if any contrastive loss has a weight.
+"""Solve the field: lifted average, conjugate gradient, then L-BFGS if a contrastive loss is used.
 
 Both solvers stop early, because more steps would fit the noise of mask borders.
 """
@@ -81,7 +81,7 @@ def keep_labelled(
 def lbfgs(objective: Objective, point: np.ndarray, steps: int, first_step: float) -> np.ndarray:
     """Minimise by limited-memory BFGS with step halving; every sum is computed in a fixed order.
 
-    The start `point` is overwritten. Each step evaluates value and gradient once, plus once per halving.
+    The start `point` is overwritten. Each step evaluates the value and gradient once, plus once per halving.
     `first_step` is the inverse curvature assumed for the first step.
     """
     value, gradient = objective(point)
@@ -114,7 +114,7 @@ def lbfgs(objective: Objective, point: np.ndarray, steps: int, first_step: float
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the dot product in float64, without BLAS, whose summation order depends on the threads."""
+    """Return the dot product in float64, without BLAS, whose summation order varies with the thread count."""
     return float(_dot(np.ascontiguousarray(a).reshape(-1), np.ascontiguousarray(b).reshape(-1)))
 
 
