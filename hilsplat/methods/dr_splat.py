@@ -1,12 +1,12 @@
 """Dr. Splat: averaged mask vectors from the pixels that a Gaussian dominates, stored as a few bytes.
 
-For every pixel the published code selects the 45 Gaussians with the largest compositing weights, adds each
-weight to (Gaussian, mask), averages the masks' unit CLIP vectors with these sums, scales the average to unit
-length and stores its product-quantised bytes (kaist-ami/Dr-Splat `train.py`). No field is trained.
+For every pixel, the published code adds the weights of the 45 Gaussians with the largest compositing weights
+to sums per Gaussian and mask. It averages the masks' unit CLIP vectors with these sums, scales the average to
+unit length and stores its product-quantised bytes (kaist-ami/Dr-Splat `train.py`). No field is trained.
 
 Departs from the published code:
     - the product quantiser is trained on the scene's own mask vectors, not on general images;
-    - one byte per four vector elements (128 bytes for 512); the published index file determines its number;
+    - one byte per four vector elements (128 bytes for 512); the published index file sets its own number;
     - weights of a pixel are divided by its alpha, those below `contributions.min_weight` are dropped, and
       pixels with alpha below `MIN_ALPHA` are ignored;
     - all three levels are used instead of one (`--feature_level`);
@@ -42,7 +42,7 @@ def heaviest(weights: sp.csr_matrix, count: int) -> sp.csr_matrix:
 def register(
     inputs: MethodInputs, vectors: Float32[np.ndarray, "M C"], count: int
 ) -> Float32[np.ndarray, "N 3 C"]:
-    """Return unit averages of unit mask vectors over the pixels each Gaussian dominates; zero if none.
+    """Return unit averages of unit mask vectors over the pixels that each Gaussian dominates; zero if none.
 
     The `count` Gaussians with the largest weights dominate a pixel.
     """

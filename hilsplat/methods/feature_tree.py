@@ -1,7 +1,7 @@
 """A semantic tree from clustered features: a literal reading of the paper's 3D hierarchical clustering.
 
-1. Every Gaussian learns an identity feature for each level by L = L_h + lambda_1 L_ins + lambda_2 L_part
-   alone (paper, Sec. III-C), without language.
+1. Every Gaussian learns an identity feature for each level from the loss L = L_h + lambda_1 L_ins + lambda_2
+   L_part (paper, Sec. III-C) alone, without language.
 2. Gaussians are clustered coarse to fine: wholes by whole-level features, then parts inside wholes, then
    subparts inside parts. Clusters closer than half the median distance of two masks that share a view and a
    parent are merged.
@@ -84,7 +84,7 @@ def run_feature_tree(
     Results do not depend on `threads`.
 
     Raises:
-        MisalignedArtifactError: an input belongs to other masks.
+        MisalignedArtifactError: an input belongs to different masks.
     """
     contributions = Contributions.load(contributions_folder)
     parents = read_parents(coverage_folder, contributions)

@@ -6,7 +6,7 @@
 3. A Gaussian gets its most probable identity, and the mean CLIP vector of that identity's masks.
 
 Source: Ye et al., Gaussian Grouping, ECCV 2024; lkeab/gaussian-grouping `train.py`, `utils/loss_utils.py`.
-The authors' values are the constants below, `steps` 30,000, and `rate` 0.0025 (0.0005 for the classifier).
+The constants below are the authors'; they use `steps` 30,000 and `rate` 0.0025 (classifier: 0.0005).
 
 Departs:
     - identities come from masks linked by shared Gaussians, as in our tree, not from a video tracker (DEVA),
@@ -14,7 +14,7 @@ Departs:
     - each level is trained separately; the authors use one set of masks;
     - pixels without an identity are ignored; the authors assign them a separate class;
     - geometry is frozen instead of trained together with the codes;
-    - fewer steps, on 4096 pixels of a view; classifier and codes share a learning rate;
+    - fewer steps, each on 4096 pixels of a view; classifier and codes share a learning rate;
     - the KL is computed at every step instead of every fifth, with 1000 samples as in the original;
     - text queries use the identities' CLIP vectors, not Grounding-DINO and SAM in the first view.
 """
@@ -56,7 +56,7 @@ def mask_identities(contributions: Contributions, level: Level, threads: int) ->
 def neighbour_loss(
     logits: Float[Tensor, "s K"], others: Float[Tensor, "s n K"], num_classes: int
 ) -> Float[Tensor, ""]:
-    """Return the mean KL divergence of class probabilities from those of the neighbours, per class."""
+    """Return the mean KL divergence from the neighbours' class probabilities, divided by the class count."""
     log_p, log_q = log_softmax(logits, -1)[:, None], log_softmax(others, -1)
     return (log_p.exp() * (log_p - log_q)).sum(-1).mean() / num_classes
 
@@ -64,7 +64,7 @@ def neighbour_loss(
 def identity_of_gaussians(
     views: list[LabelledView],
     contributions: Contributions,
-    identity: Int64[np.ndarray, " M"],  # of every mask of the scene at the level, -1 for none
+    identity: Int64[np.ndarray, " M"],  # of every mask of the scene, -1 for none or at other levels
     level: Level,
     settings: MethodSettings,
     seed: int,

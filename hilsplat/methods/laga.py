@@ -1,7 +1,7 @@
 """LaGa: contrastive features nested by prefix; objects from all views' masks, with several descriptors each.
 
-1. Every Gaussian learns 32 numbers: wholes use the first 16, parts 24, subparts all. Pixels are attracted to
-   the prototype of their mask and repelled from other prototypes. Pixels that share a finer mask must agree
+1. Every Gaussian learns 32 numbers: wholes use the first 16, parts the first 24, and subparts all. Pixels are
+   attracted to their mask's prototype and repelled from others. Pixels that share a finer mask must agree
    in the coarser prefix; pixels that a coarser mask separates must differ in the finer prefix.
 2. Mask prototypes from all views are clustered by density: each cluster is an object, and a Gaussian belongs
    to the nearest object.
@@ -9,16 +9,16 @@
    up to 20. A descriptor's weight is its cosine with the object's average.
 
 Source: Cen et al., LaGa, ICML 2025; SJTU-DeepVisionLab/LaGa `train_affinity_features.py`, `inference.ipynb`.
-The authors' values are the constants below, `steps` 30,000, and `rate` 0.0025.
+The constants below are the authors'; they use `steps` 30,000 and `rate` 0.0025.
 
 Departs:
-    - an object's descriptors are summed by weight, because a field here has one code per Gaussian and level;
-      the authors take, for each text, the maximum of relevancy times weight;
+    - an object's descriptors are combined in a weighted sum, because a field here has one code per Gaussian
+      and level; the authors take, for each query, the maximum of relevancy times weight;
     - levels are queried separately; the authors average the three scores and smooth them over neighbours;
     - DBSCAN* clusters at the authors' radius; they use it as the minimum radius of HDBSCAN clusters;
     - one k-means start per number of descriptors instead of ten;
-    - painted masks; fewer steps, on 2048 pixels of a view; almost identical initial features; object
-      prototypes from exact mask means; masks below the authors' share of the image are ignored.
+    - masks are painted; fewer steps, each on 2048 pixels of a view; almost identical initial features; object
+      prototypes from exact mask means; masks below the authors' minimum share of the image are ignored.
 """
 
 import numpy as np
@@ -37,7 +37,7 @@ from hilsplat.settings import MethodSettings
 
 SLICES = (16, 8, 8)
 PREFIX = (16, 24, 32)
-MIN_SHARE = 400 / (988 * 731)  # minimum share of the image in a mask: 400 px of a LERF view
+MIN_SHARE = 400 / (988 * 731)  # minimum share of the image that a mask covers: 400 px in a LERF view
 SAME_IOU = 0.8
 HARD_COSINE = 0.5
 RADIUS = (0.3, 0.2, 0.1)  # radius of density clusters for wholes, parts, subparts
@@ -74,7 +74,7 @@ def nested_loss(
 ) -> Float[Tensor, ""]:
     """Return the pixel-to-prototype contrast per prefix, plus a penalty on slice lengths other than 1.
 
-    `masks` contains the pixels of each mask at whole, part and subpart. Outside a mask, all hard pixels are
+    `masks` contains the pixels of each mask, level by level. Outside a mask, all hard pixels are
     used, plus as many random pixels as there are pixels inside.
     """
     inside = [torch.from_numpy(each) for each in masks]
@@ -155,7 +155,7 @@ def object_latents(
 ) -> Float32[np.ndarray, "T D"]:
     """Return the code of the weighted sum of each object's descriptors.
 
-    A weighted sum of vectors m + U z has the direction of the vector whose z is their weighted average.
+    A weighted sum of vectors m + U z has the direction of the vector whose z is the weighted average of z.
     """
     vectors = as_vectors(latents, code)
     length = np.linalg.norm(vectors, axis=1)

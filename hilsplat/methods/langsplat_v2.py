@@ -42,7 +42,7 @@ def largest_shares(
 
 
 def as_vectors(latents: Float32[np.ndarray, "B D"], code: LinearCode) -> Float32[np.ndarray, "B D+1"]:
-    """Return m + U z in D + 1 coordinates that preserve lengths and angles: along U, and the rest of m."""
+    """Return m + U z in D + 1 coordinates that preserve lengths and angles: D along U, one for the rest."""
     along = code.basis @ code.mean
     rest = np.linalg.norm(code.mean - along @ code.basis)
     return np.column_stack([latents + along, np.full(len(latents), rest)]).astype(np.float32)
@@ -51,7 +51,7 @@ def as_vectors(latents: Float32[np.ndarray, "B D"], code: LinearCode) -> Float32
 def cosine_loss(
     rendered: Float32[np.ndarray, "P C"], targets: Float32[np.ndarray, "P C"]
 ) -> tuple[float, Float32[np.ndarray, "P C"]]:
-    """Return the mean of 1 - cosine with unit targets, and its gradient for `rendered`."""
+    """Return the mean of 1 - cosine with unit targets, and its gradient with respect to `rendered`."""
     length = np.maximum(np.linalg.norm(rendered, axis=1), 1e-6)[:, None]
     unit = rendered / length
     cosine = (unit * targets).sum(axis=1, keepdims=True)
@@ -65,7 +65,7 @@ def step(
     targets: Float32[np.ndarray, "p D"],  # code of the mask painted at each pixel
     code: LinearCode,
 ) -> tuple[float, Float32[np.ndarray, "N E"], Float32[np.ndarray, "E D"]]:
-    """Return the loss over a view's labelled pixels, and its gradients for logits and codebook."""
+    """Return the loss over a view's labelled pixels and its gradients with respect to logits and codebook."""
     chosen, shares = largest_shares(logits)
     kept = np.arange(0, chosen.size + 1, chosen.shape[1])
     mixture = sp.csr_matrix((shares.ravel(), chosen.ravel(), kept), shape=logits.shape)
@@ -91,7 +91,7 @@ def train_level(
     settings: MethodSettings,
     seed: int,
 ) -> Float32[np.ndarray, "N D"]:
-    """Train logits (from zero) and codebook; return the mixture of every Gaussian."""
+    """Train the logits (from zero) and the codebook; return the mixture of every Gaussian."""
     logits, entries = np.zeros((num_gaussians, len(codebook)), np.float32), codebook.copy()
     of_logits, of_entries = Adam(logits, settings.rate), Adam(entries, settings.rate)
     for view in in_random_order(views, np.random.default_rng(seed), settings.steps):

@@ -7,8 +7,8 @@
    more strongly if they are uncertain.
 
 Source: Shi et al., Language Embedded 3D Gaussians, CVPR 2024; buaavrcg/LEGaussians `train.py`,
-`scene/index_decoder.py`, `arguments/__init__.py`. The authors' values are the constants below, `steps`
-30,000, and `rate` 0.001 for codes and networks.
+`scene/index_decoder.py`, `arguments/__init__.py`. The constants below are the authors' unless stated
+otherwise; they use `steps` 30,000, and `rate` 0.001 for codes and networks.
 
 Departs:
     - mask CLIP vectors are indexed with a k-means codebook per level; the authors quantise a pyramid of
@@ -16,8 +16,8 @@ Departs:
     - geometry is frozen instead of trained together with the codes;
     - fewer steps, on 1024 pixels of a view; almost identical initial codes; networks learn at a fifth of the
       rate; no weight decay (the authors use 1e-5);
-    - smoothing at every step on 1000 Gaussians with 10 % of its weight, instead of every tenth step on all
-      Gaussians; positions are scaled to a standard deviation of 1;
+    - 1000 Gaussians are smoothed at every step with 10 % of the weight, instead of all Gaussians at every
+      tenth step; positions are scaled to a standard deviation of 1;
     - each Gaussian gets the entry with the largest logit, which is then rendered; the authors decode rendered
       codes at each pixel to the most probable entry or a softmax mixture.
 """
@@ -68,14 +68,14 @@ def index_loss(
 def smoothing_loss(
     codes: Float[Tensor, "s 8"], predicted: Float[Tensor, "s 8"], uncertainty: Float[Tensor, " s"]
 ) -> Float[Tensor, ""]:
-    """Return squared distances that pull predictions towards codes, and uncertain codes to predictions."""
+    """Return squared distances that pull predictions to codes, and uncertain codes to predictions."""
     weight = MIN_SMOOTHING + (1 - MIN_SMOOTHING) * uncertainty.detach()
     follow = (predicted - codes.detach()).square().mean(1).mean()
     return follow + ((predicted.detach() - codes).square().mean(1) * weight).mean()
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
-    """Quantise, train, and look up the entries; Gaussians in no mask of a level get zeros."""
+    """Quantise the codes, train, and look up the entries; Gaussians in no mask of a level get zeros."""
     contributions, latents = inputs.contributions, inputs.latents
     codebooks, entry = [], np.zeros(len(latents), np.int64)
     for level in LEVELS:

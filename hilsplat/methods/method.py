@@ -78,7 +78,7 @@ class MethodInputs:
         return np.zeros((self.contributions.num_gaussians, len(LEVELS), self.latents.shape[1]), np.float32)
 
     def seen(self) -> Bool[np.ndarray, "N 3"]:
-        """Return whether each Gaussian is visible in a mask, per level."""
+        """Return whether each Gaussian is visible in any mask of each level."""
         masks = MaskOperator.of(self.contributions.matrix("A"), self.contributions.level)
         return masks.spread(np.ones((len(self.latents), 1), np.float32))[:, :, 0] > 0
 
@@ -94,7 +94,7 @@ class MethodInputs:
                 f"method {method} needs a linear code",
                 expected="autoencoder.code pca",
                 found="autoencoder.code network",
-                fix="set autoencoder: {code: pca, latent: 64, targets: mask} in its variant",
+                fix="set autoencoder: {code: pca, latent: 64, targets: mask} in the variant",
             )
         return code
 

@@ -1,4 +1,4 @@
-"""OmniSeg3D: features contrasted by the number of masks two patches share; thresholds set the granularity.
+"""OmniSeg3D: features contrasted by the number of masks that patches share; thresholds set the granularity.
 
 1. Masks of all levels divide a view into patches. Two patches share the masks that contain both: for nested
    masks, the number of shared masks is the depth of the deepest common ancestor in the coverage tree.
@@ -7,12 +7,12 @@
 3. Gaussians are clustered by cosine at three thresholds, one per level; a cluster is assigned the CLIP
    vectors of the masks that fit it best in each view.
 
-Source: Ying et al., OmniSeg3D, CVPR 2024; OceanYing/OmniSeg3D-GS `train.py`. The authors' values are the
-constants below, `steps` 10,000, and `rate` 0.01.
+Source: Ying et al., OmniSeg3D, CVPR 2024; OceanYing/OmniSeg3D-GS `train.py`. The constants below are the
+authors' unless stated otherwise; they use `steps` 10,000 and `rate` 0.01.
 
 Departs:
     - larger masks do not first absorb smaller ones; patches come from our painted masks;
-    - fewer steps, on 4096 (not 32,768) pixels of a view, and prototypes of at least 3 (not 20) pixels;
+    - fewer steps, each on 4096 (not 32,768) pixels of a view; prototypes of at least 3 (not 20) pixels;
     - initial vectors are almost identical instead of independent (see `training.alike`);
     - pixel vectors are divided by their length instead of constrained by a penalty of weight 100;
     - the authors threshold the cosine with a clicked pixel and don't support text: here 256 k-means centres
@@ -33,7 +33,7 @@ from hilsplat.settings import MethodSettings
 
 CHANNELS = 16
 MIN_PATCH_PX = 3
-LEVEL_WEIGHT = 0.2  # factor on a patch's weight for each shared mask fewer
+LEVEL_WEIGHT = 0.2  # factor on a patch's weight for each mask fewer that it shares
 SPREAD, MIN_TEMPERATURE, MAX_TEMPERATURE = 10.0, 0.5, 1.0
 THRESHOLDS = (0.5, 0.8, 0.95)
 

@@ -6,12 +6,12 @@
 3. A group (an instance) is assigned the CLIP vectors of the masks that fit it best in each view, by IoU times
    feature similarity. No language features are trained.
 
-Source: Wu et al., OpenGaussian, NeurIPS 2024; yanmin-wu/OpenGaussian `train.py`. The authors' values are the
-constants below, `codebook` (64, 10), `steps` 10,000 and `rate` 0.001.
+Source: Wu et al., OpenGaussian, NeurIPS 2024; yanmin-wu/OpenGaussian `train.py`. The constants below are the
+authors'; they use `codebook` (64, 10), `steps` 10,000 and `rate` 0.001.
 
 Departs:
     - each of our levels is processed separately; the authors use one level (wholes on LERF);
-    - fewer steps and a larger rate; a step uses 4096 pixels of a view, and exact means of the view's masks;
+    - fewer steps and a larger rate; a step uses 4096 pixels of a view, and the exact means of its masks;
     - features are not trained further towards the codebooks (published: 10,000 and 20,000 steps);
     - positions are scaled to a standard deviation of 1 in the scene before the weight of 0.5;
     - Gaussians in no mask of the level keep their random features and belong to no instance;

@@ -16,7 +16,7 @@ NAMES = (
 METHODS: Plugins["Fit"] = Plugins({name: f"hilsplat.methods.{name}:fit" for name in NAMES})
 
 OURS: str = MethodSettings().name
-"""The method of this repository; the stage `field` computes its field."""
+"""The method of this repository; the `field` stage computes its field."""
 
 
 def require_method(name: str) -> None:

@@ -1,19 +1,19 @@
-"""SAGA: affinity features of Gaussians that a gate adapts to a scale (GARField's idea for Gaussians).
+"""SAGA: Gaussians with affinity features that a gate adapts to a scale (GARField's idea for Gaussians).
 
 1. Every mask has a 3D scale. Every Gaussian learns 32 numbers, averaged over its neighbours and multiplied by
    a gate that depends on the scale: two pixels can be grouped at a large scale and separate at a small scale.
-2. At a scale, two pixels belong together if they share a mask up to that scale, or if the smallest larger
-   mask that contains each is the same.
+2. At a scale, two pixels belong together if they share a mask up to that scale, or if the smallest mask
+   above that scale is the same for both.
 3. Features gated at the median scale of each level's masks are clustered; a cluster is assigned the CLIP
    vectors of the masks that fit it.
 
 Source: Cen et al., Segment Any 3D Gaussians, AAAI 2025; Jumpat/SegAnyGAussians `get_scale.py`,
 `train_contrastive_feature.py`; scales and their quantiles from GARField (Kim et al., CVPR 2024,
-chungmin99/garfield). The authors' values are the constants below, `steps` 10,000, and `rate` 0.0025.
+chungmin99/garfield). The constants below are the authors'; they use `steps` 10,000 and `rate` 0.0025.
 
 Departs:
     - a mask's scale is the spread of its Gaussians, not of unprojected depths;
-    - painted masks, at most three per pixel; fewer steps, on 256 pixels of a view instead of 1000;
+    - masks are painted, at most three per pixel; fewer steps, each on 256 pixels of a view, not 1000;
     - almost identical initial features; all 16 neighbours are used at every step;
     - the authors click at a chosen scale or cluster by HDBSCAN, and don't support text: here the scales are
       the levels' medians, 256 k-means centres are merged by average cosine as for OmniSeg3D, and clusters
@@ -64,8 +64,8 @@ def together(
 ) -> Bool[np.ndarray, "p p"]:
     """Return whether two pixels share a mask at or below the scale, or the smallest mask above the scale.
 
-    `labels` contains each pixel's mask at each level (-1: none), and `scales` the masks' scales; each mask
-    has only one level.
+    `labels` contains each pixel's mask at each level (-1: none), and `scales` contains the masks' scales;
+    each mask has only one level.
     """
     above = (labels >= 0) & (scales > scale)
     smallest = np.where(above, scales, np.inf).argmin(axis=1)
@@ -88,9 +88,9 @@ def affinity_loss(
     weight: Float32[np.ndarray, "p p"],  # of each pair
     random: np.random.Generator,
 ) -> Float[Tensor, ""]:
-    """Return a loss that raises cosines in groups, lowers positive cosines between groups, keeps lengths 1.
+    """Return a loss that raises cosines in groups and lowers positive ones between them; lengths stay near 1.
 
-    It uses pairs whose grouping depends on the scale, pairs hard at any scale, and as many easy pairs.
+    It uses pairs whose grouping depends on the scale, pairs hard at some scale, and as many easy pairs.
     """
     gated = unit(rendered[None] * gates[:, None])
     cosine = gated @ gated.transpose(1, 2)

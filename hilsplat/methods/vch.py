@@ -1,20 +1,20 @@
 """View-consistent hierarchy: features whose ultrametric reproduces the coverage trees of the views.
 
-1. Every Gaussian learns a vector. Pixels are joined to their 10 nearest pixels by edges as long as the
-   distance of their vectors; the ultrametric is the longest edge on a pair's minimum spanning tree path.
+1. Every Gaussian learns a vector. Pixels are joined to their 10 nearest pixels by edges whose length is
+   their vectors' distance; the ultrametric is the longest edge on a pair's minimum spanning tree path.
 2. For every mask, a pixel inside must be closer to other pixels inside than to pixels outside that are in the
    mask's parent, by dot product and by ultrametric.
 3. Gaussians are connected to those of their 16 nearest neighbours within a given feature distance; nested
    components at three distances form the levels. A component gets its best mask's CLIP vector in each view.
 
 Source: He et al., View-Consistent Hierarchical 3D Segmentation Using Ultrametric Feature Fields, CVPR 2024;
-hardyho/ultrametric_feature_fields. The authors' values are the constants below, 20 epochs, and `rate` 0.01.
+hardyho/ultrametric_feature_fields. The constants below are the authors'; they use 20 epochs and `rate` 0.01.
 
 Departs:
     - vectors of 16 numbers on frozen Gaussians, not an instant-NGP field of 128 with its own density;
     - unit length by division, without a penalty on the norm; depth is not smoothed;
-    - parents are those in our coverage tree (0.9 inside), not 0.95 inside and IoU below 0.9;
-    - components of Gaussians, not of 0.002 voxels; those not among the 200 largest join the nearest;
+    - a parent contains 0.9 of a mask, as in our coverage tree, not 0.95 with an IoU below 0.9;
+    - components consist of Gaussians, not of 0.002 voxels; all but the 200 largest join the nearest of these;
     - the authors don't support text.
 """
 
@@ -47,7 +47,7 @@ THRESHOLDS = (0.6, 0.5, 0.45)
 
 @compiled
 def joining_edges(num, edge_a, edge_b, first, second):
-    """Return the edge, when adding edges in the given order, that connects each pair of pixels, or -1."""
+    """Return the edge that first connects each pair of pixels if edges are added in this order, or -1."""
     top = np.arange(num)  # union-find over pixels
     node = np.arange(num)  # dendrogram node of the root's component
     up = np.full(num + len(edge_a), -1, np.int64)
@@ -121,9 +121,9 @@ def triplets(
     parent: Int32[np.ndarray, " m"],
     random: np.random.Generator,
 ) -> Int64[np.ndarray, "3 k"]:
-    """Draw, per mask, `PAIRS` pixels a and b inside, and c outside but in the parent (a root: anywhere).
+    """For each mask, draw `PAIRS` pixels a, b inside, and c outside but in the parent (a root: anywhere).
 
-    `labels` contains the mask row at each pixel and level; `parent`, each mask's parent row or -1.
+    `labels` contains the mask row at each pixel and level; `parent` contains each mask's parent row, or -1.
     """
     found = []
     for mask in np.unique(labels[labels >= 0]):
@@ -143,7 +143,7 @@ def components(
 ) -> Int64[np.ndarray, "N 3"]:
     """Return each Gaussian's component at every distance, numbered from the largest component.
 
-    Gaussians in other components than the 200 largest join the component of the nearest Gaussian in these.
+    Gaussians outside the 200 largest components join the component of the nearest Gaussian in one of these.
     """
     num = len(means)
     near = nearest(means, NEIGHBOURS + 1)

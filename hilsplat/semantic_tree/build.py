@@ -52,7 +52,7 @@ def crop_ranks(
 ) -> Int32[np.ndarray, " M"]:
     """Rank the masks of each node by score, reduced for directions close to those of higher-ranked masks.
 
-    For the same scores, crops from different sides describe an object better (docs/experiments.md).
+    At equal scores, crops from different sides describe an object better (docs/experiments.md).
 
     Args:
         node: node that each mask shows, -1 for none.
@@ -89,7 +89,7 @@ def build_tree(
 
     Args:
         threads: number of threads; it does not affect the result.
-        join_wholes: join regions touching in 3D into wholes, for segmenters that detect only colour regions.
+        join_wholes: join regions that touch in 3D, for segmenters that detect only colour regions.
         nodes_of: function that finds the nodes of a level; None to link masks.
     """
     S, mass, means = contributions.matrix("S"), contributions.mass(), contributions.means()
@@ -179,7 +179,7 @@ def run_semantic_tree(
     `nodes_of` is as in `build_tree`.
 
     Raises:
-        MisalignedArtifactError: the contributions were computed from other masks.
+        MisalignedArtifactError: the contributions were computed from different masks.
         ArtifactError: the masks do not record their segmenter.
     """
     contributions = Contributions.load(contributions_folder)

@@ -53,7 +53,7 @@ def mask_evidence(
 
     Two masks of one view show different objects, so they are evidence against a link (intersection 0, union:
     both full sizes). Masks that share Gaussians are ignored if each view shows less than `min_covisible` of
-    the other mask. If they share none, a mask counts if the other view shows at least that share of it.
+    the other mask. Of masks that share none, each counts if the other view shows at least that share of it.
 
     `shares` has one row per mask of a level, and zeros for Gaussians not visible in the mask's view.
     The result does not depend on the number of threads.

@@ -36,10 +36,10 @@ def readable_nodes(tree: SemanticTree) -> list[dict]:
 def write_tree_ply(gaussians_ply: Path, tree: SemanticTree, out: Path) -> None:
     """Copy a 3DGS PLY and add three properties per Gaussian: `node_whole`, `node_part`, `node_subpart`.
 
-    Gaussian viewers ignore these; tools that display scalar fields can use them as colours. -1 means no node.
+    Gaussian viewers ignore them; tools that display scalar fields can show them as colours. -1 means no node.
 
     Raises:
-        MisalignedArtifactError: the tree was computed from another PLY.
+        MisalignedArtifactError: the tree was computed from a different PLY.
     """
     require_same("semantic tree", str(gaussians_ply.parent), gaussians_ply, tree.gaussians_sha256)
     nodes = {f"node_{level.label}": tree.node_of_gaussian[:, level.index] for level in LEVELS}

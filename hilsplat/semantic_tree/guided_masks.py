@@ -1,4 +1,4 @@
-"""Masks of the views other than the key views: one prompt per node, and grid prompts only elsewhere."""
+"""Segment views that are not key views: one prompt per node, and grid prompts only elsewhere."""
 
 from pathlib import Path
 
@@ -34,10 +34,10 @@ def run_guided_masks(
 
     The masks of the key views are kept unchanged; `semantic_tree_folder` contains their semantic tree.
 
-    Departs: SAM and LangSplat use a grid of prompts in every view (measured in docs/experiments.md).
+    Departs: SAM and LangSplat use a grid of prompts in every view (docs/experiments.md compares both).
 
     Raises:
-        MisalignedArtifactError: the tree was computed from other Gaussians.
+        MisalignedArtifactError: the tree was computed from different Gaussians.
     """
     scene, gaussians = Scene.load(scene_folder), load_ply(gaussians_ply)
     tree = SemanticTree.load(semantic_tree_folder)

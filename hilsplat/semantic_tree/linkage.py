@@ -1,7 +1,7 @@
 """Pooled average linkage of the masks of one level across views.
 
 Everything is sparse: only masks that share Gaussians can be joined, and the mutual visibility of two clusters
-is a sum over the views of their members. The run time grows with the number of pairs that share Gaussians.
+is summed over the views of their members. The run time grows with the number of pairs that share Gaussians.
 """
 
 import numpy as np
@@ -42,7 +42,7 @@ def pooled_linkage(
 
 @compiled
 def _neighbours(indptr, indices, intersection, union, seen, view):
-    """Return the initial pool of neighbours for `_link`, with 25 % spare room, and each mask's run bounds."""
+    """Return the initial pool of neighbours for `_link`, with 25 % spare room, and the bounds of each run."""
     num = len(view)
     start = np.zeros(num + 1, np.int64)
     for a in range(num):
@@ -67,7 +67,7 @@ def _neighbours(indptr, indices, intersection, union, seen, view):
 
 @compiled
 def _merged_run(begin, end, first, neighbour, inter, extra, root, place_of, self_a, self_b):
-    """Copy a run of neighbours to position `first`, and sum neighbours joined since the run was written.
+    """Copy a run of neighbours to position `first`, and sum those that were merged after it was written.
 
     Entries copied there from an earlier run of the cluster are summed too. Entries that refer to the
     cluster itself are omitted. Returns the end of the run and the two sums of the omitted entries.
@@ -92,7 +92,7 @@ def _merged_run(begin, end, first, neighbour, inter, extra, root, place_of, self
 
 @compiled
 def _plus_sizes(total, i, j, seen, members, shown, shows):
-    """Add to `total`, per view, each cluster's size there times the number of the other's members there."""
+    """For each view, add to `total` each cluster's size times the number of the other's members there."""
     num_views = seen.shape[1]
     at_i = at_j = 0
     while at_i < shows[i] or at_j < shows[j]:
@@ -177,7 +177,7 @@ def _link(start, stop, neighbour, inter, extra, seen, view, threshold, root, wit
     (`inter`), and the sum of the differences between the unions of stored pairs and `seen` (`extra`, never
     positive, because sizes count the overlap of two masks twice). The union of two clusters is `extra` plus,
     over views, the size of each cluster in the view times the number of the other cluster's members there.
-    Neighbours joined since a run was written are summed when it is next read. The run of a merged cluster is
+    Neighbours merged after a run was written are summed when it is next read. The run of a merged cluster is
     written at the end of the pool, which is compacted when full.
     """
     num, num_views = seen.shape

@@ -16,7 +16,7 @@ MIN_VISIBLE_PX = 0.3
 """A Gaussian counts as visible in a view if its mass there exceeds this."""
 
 MIN_COVISIBLE = 0.2
-"""A pair of masks is not used as evidence if each view shows less than this share of the other's mask."""
+"""Two masks are not used as evidence if each mask's view shows less than this share of the other mask."""
 
 MIN_MEMBER_SHARE = 0.05
 """A Gaussian joins its best node if that node contains more than this share of its weight."""
@@ -25,7 +25,7 @@ MIN_FIT = 0.25
 """A mask is assigned to its best-fitting node if their IoU in the mask's view exceeds this."""
 
 PRIOR_VIEWS = 3
-"""Number of views without the node added to the views that show it, to limit a single view's influence."""
+"""Number of average views added to the views that show a node, to limit the influence of a single view."""
 
 NEIGHBOURS = 11
 """Number of nearest Gaussians (including itself) to which each Gaussian of a node is connected."""
@@ -64,7 +64,7 @@ class LevelNodes:
 
 
 NodesOf = Callable[[Level, Int64[np.ndarray, " m"]], LevelNodes]
-"""Function from a level and the rows of its masks to its nodes."""
+"""Function that returns the nodes of a level, given the level and the rows of its masks."""
 
 
 def linked_nodes(
@@ -76,7 +76,7 @@ def linked_nodes(
 ) -> NodesOf:
     """Return the function that links the masks of a level into nodes and assigns Gaussians to them.
 
-    A cluster whose Gaussians all belong to other clusters, such as a duplicate, would select nothing. A
+    A cluster whose Gaussians all belong to other clusters, such as a duplicate, would select no Gaussians. A
     cluster therefore becomes a node only if it is the best fit of at least `min_views` masks.
 
     `S` and `mass`, the visible mass of each Gaussian in each view, are in px.
@@ -328,7 +328,7 @@ def nest_nodes(
 def renumbered_without_empty(
     node_of_gaussian: Int32[np.ndarray, "..."], num_nodes: int
 ) -> Int32[np.ndarray, " T1"]:
-    """Return each node's new id, in the old order; NONE for nodes without Gaussians, which select nothing.
+    """Return each node's new id, in the old order; NONE for nodes without Gaussians.
 
     Nesting may remove a node's last Gaussian; its children are then empty too, so no parent is lost. The
     result has an additional last entry, NONE, so that indexing with NONE returns NONE.

@@ -15,7 +15,7 @@ from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.embed.vectors import mask_embeddings
 
 LIMITS = {"level": (1, 3), "quality": (0, 1), "membership": (0, 1 + 1e-5), "views": (0, 2**31 - 1)}
-"""Valid range of the values of a stored tree."""
+"""Valid range of each array in a stored tree."""
 
 BOX_PERCENTILES = (2.0, 98.0)
 """Percentiles of a node's Gaussian centres that bound its box, so that stray Gaussians do not inflate it."""
@@ -25,7 +25,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class OrientedBox:
-    """A box along its own axes.
+    """A box with its own axes.
 
     Attributes:
         centre: scene units.
@@ -100,7 +100,7 @@ class SemanticTree:
         return len(self.level)
 
     def _require_whole(self, path: Path) -> None:
-        """Raise ArtifactError if an array refers to a missing node, or if a parent is not coarser."""
+        """Raise ArtifactError if an array refers to a missing node or a parent isn't coarser than a child."""
         most = len(self) - 1
         rows = {"parent": self.parent, "node_of_gaussian": self.node_of_gaussian}
         rows |= {"node_of_mask": self.node_of_mask, "linked_node": self.linked_node}
@@ -135,7 +135,7 @@ class SemanticTree:
         return found
 
     def with_vectors(self, vectors: Float32[np.ndarray, "M C"]) -> "SemanticTree":
-        """Return the tree with node vectors: the normalised sum of the masks' vectors times `crop_score`.
+        """Return the tree with node vectors: the normalised sum of mask vectors, weighted by `crop_score`.
 
         The vector of a mask whose crop was not embedded is zero.
         """
@@ -150,8 +150,8 @@ class SemanticTree:
         """Read a finished semantic tree; node vectors are computed from the CLIP vectors in `clip_folder`.
 
         Raises:
-            ArtifactError: the tree is missing, damaged or from another version.
-            MisalignedArtifactError: the vectors are of other masks, or of another tree of these masks.
+            ArtifactError: the tree is missing, damaged or from a different version of hilsplat.
+            MisalignedArtifactError: the vectors belong to different masks, or to a different tree of them.
         """
         folder, names = Path(folder), ("gaussians_sha256", "cameras_sha256", "min_weight")
         index = read_index(folder, *names)

@@ -42,7 +42,7 @@ def joined_regions(
         region_of_gaussian: region of each Gaussian, -1 for none.
         means: centres of the Gaussians, scene units.
         mass: visible mass of each Gaussian in each view, px.
-        most: limit of the cost, as a share of the side of a view.
+        most: limit of the cost, as a share of a view's side.
 
     Returns:
         whole of each region, numbered by first appearance.

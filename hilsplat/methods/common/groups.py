@@ -21,8 +21,8 @@ from hilsplat.settings import MethodSettings
 ROUNDS = 20  # Lloyd iterations; more would reduce the error by less than 1 %
 CENTRES = 256  # k-means centres that `clusters` merges
 KMEANS_ROUNDS = 10  # Lloyd iterations for these centres
-MIN_SCORE = 0.2  # minimum score of a mask for a group's code: OpenGaussian's value for ScanNet
-MIN_VIEWS = 2  # minimum number of views for a group's code: as above; OpenGaussian's number for LERF is 5
+MIN_SCORE = 0.2  # minimum score of masks averaged for a group's code; OpenGaussian's value for ScanNet
+MIN_VIEWS = 2  # minimum number of views for a group's code; OpenGaussian's value for ScanNet (for LERF, 5)
 
 
 def kmeans(
@@ -30,7 +30,7 @@ def kmeans(
 ) -> tuple[Float32[np.ndarray, "E C"], Int64[np.ndarray, " n"]]:
     """Return k-means centroids from distant starts (k-means++), and each vector's nearest centroid.
 
-    If at most `count` vectors are distinct, these are the centroids, and the first is repeated. In the
+    If at most `count` vectors are distinct, these are the centroids, and the first fills the rest. In the
     `rounds` Lloyd iterations, a centroid that loses its last vector keeps its position.
     """
     if not len(vectors):
@@ -46,7 +46,7 @@ def kmeans(
 def _distant_rows(
     data: Float[np.ndarray, "n C"], count: int, random: np.random.Generator
 ) -> Float[np.ndarray, "E C"]:
-    """Draw rows by squared distance from previously drawn rows; scipy's sampling takes E times as long."""
+    """Draw k-means++ starts, in proportion to squared distance; scipy's function takes E times as long."""
     chosen = np.full(count, -1, np.int64)
     square, chances = np.full(len(data), np.inf), np.arange(1.0, len(data) + 1)
     for place in range(count):
@@ -94,14 +94,14 @@ def associated_codes(
     rows: Int64[np.ndarray, " m"],  # candidate masks
     features: Float32[np.ndarray, "N C"] | None = None,
 ) -> Float32[np.ndarray, "N D"]:
-    """Return the code of each Gaussian's group, averaged over its best-fitting masks of all views.
+    """Return the code of each Gaussian's group: the average over the best-fitting mask of each view.
 
     Source: yanmin-wu/OpenGaussian `train.py`. Departs: the IoU uses visible weights instead of a group
     rendered alone, so that hidden Gaussians do not count.
 
-    A mask's score is its IoU with the group, times 1 minus the mean absolute difference between the mean
-    `features` of mask and group, if given. Only masks with scores above `MIN_SCORE` are chosen. Groups with
-    masks in fewer than `MIN_VIEWS` views get 0; in a scene with one view, one is enough.
+    A mask's score is its IoU with the group, multiplied (if `features` is given) by 1 minus the mean absolute
+    difference between the mean features of mask and group. It must exceed `MIN_SCORE`. Groups with masks in
+    fewer than `MIN_VIEWS` views get 0; in a scene with only one view, one is enough.
     """
     contributions = inputs.contributions
     weights, mass = contributions.matrix("S")[rows].astype(np.float64), contributions.mass()

@@ -1,6 +1,6 @@
 """Train Gaussians' features on rendered mask pixels, with frozen geometry, for grouping methods.
 
-A step renders random labelled pixels of one random view, by a product with compositing weights that are
+A step renders random labelled pixels of one random view as a product with compositing weights, which are
 computed once per view. Losses are written in torch and differentiated automatically.
 """
 
@@ -38,7 +38,7 @@ def one_torch_thread() -> Iterator[None]:
 
 
 class _Product(torch.autograd.Function):
-    """Product of a constant sparse matrix and features; scipy's, because torch's is slower and in beta."""
+    """Product of a constant sparse matrix and features, by scipy, because torch's is slower and in beta."""
 
     @staticmethod
     def forward(ctx: Any, features: Tensor, matrix: sp.csr_matrix) -> Tensor:
@@ -56,7 +56,7 @@ def product(matrix: sp.csr_matrix, features: Float[Tensor, "N D"]) -> Float[Tens
 
 
 def of_seen(matrix: sp.csr_matrix) -> tuple[sp.csr_matrix, Int64[Tensor, " s"]]:
-    """Return the non-empty columns and their indices; a step's pixels show only a few Gaussians."""
+    """Return the matrix without empty columns, and the indices of the others; a step shows few Gaussians."""
     columns, place = np.unique(matrix.indices, return_inverse=True)
     parts = matrix.data, place.reshape(-1), matrix.indptr
     small = sp.csr_matrix(parts, shape=(matrix.shape[0], len(columns)))
@@ -106,7 +106,7 @@ def train(
 def segment_means(
     values: Float[Tensor, "p D"], segment: Int64[Tensor, " p"], num: int
 ) -> tuple[Float[Tensor, "m D"], Float[Tensor, " m"]]:
-    """Return the mean of the rows of each segment (0 if empty), and the number of rows."""
+    """Return the mean of each segment's rows (0 if empty), and the number of its rows."""
     counts = torch.bincount(segment, minlength=num).to(values.dtype)
     sums = torch.zeros(num, values.shape[1], dtype=values.dtype).index_add(0, segment, values)
     return sums / counts.clamp(min=1)[:, None], counts
