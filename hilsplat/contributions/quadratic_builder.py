@@ -34,12 +34,6 @@ that contain no Gaussian visible in a part are skipped, which Morton order makes
 MERGE_AT = 8
 """A block's late pairs are merged with its rows once they exceed its row pairs divided by this number."""
 
-CHUNK_WEIGHTS = 2**25
-"""Number of non-zeros of W collected before they are added to G; collecting and adding need 0.6 GiB."""
-
-LARGE_PART = 2**23
-"""Parts with at least this many non-zeros are added to G directly, because copying them would gain little."""
-
 MAX_WEIGHTS = 2**28
 """Maximum number of non-zeros of W (all views) in memory, 2 GiB."""
 
@@ -183,38 +177,6 @@ class GramBuilder:
         return Gram(indptr, indices, values)
 
 
-class _Waiting:
-    """Stacked parts of W; memory is reused, because new memory takes longer to fill."""
-
-    def __init__(self, num_gaussians: int) -> None:
-        self._num_gaussians = num_gaussians
-        room = CHUNK_WEIGHTS + LARGE_PART  # parts are smaller than LARGE_PART; CHUNK_WEIGHTS triggers adding
-        self._indices, self._data = np.empty(room, np.int32), np.empty(room, np.float32)
-        self.clear()
-
-    def clear(self) -> None:
-        """Remove all parts."""
-        self.nonzeros = 0
-        self._indptr = [np.zeros(1, np.int64)]
-        self._valid = [np.zeros((0, len(LEVELS)), np.bool_)]
-
-    def append(self, part: StackedWeights) -> None:
-        """Append a copy of a part."""
-        before, after = self.nonzeros, self.nonzeros + part.nonzeros
-        self._indices[before:after] = part.weights.indices
-        self._data[before:after] = part.weights.data
-        self._indptr.append(part.weights.indptr[1:].astype(np.int64) + before)
-        self._valid.append(part.valid)
-        self.nonzeros = after
-
-    def held(self) -> StackedWeights:
-        """Return all parts; the arrays are valid until the next part is appended."""
-        indptr = np.concatenate(self._indptr)
-        arrays = (self._data[: self.nonzeros], self._indices[: self.nonzeros], indptr)
-        matrix = sp.csr_matrix(arrays, shape=(len(indptr) - 1, self._num_gaussians), copy=False)
-        return StackedWeights(matrix, np.concatenate(self._valid))
-
-
 class QuadraticBuilder:
     """Builder of G or W, part by part; the matrix with fewer non-zeros is kept.
 
@@ -229,7 +191,6 @@ class QuadraticBuilder:
         self._keeps_weights = keep != "gram"
         self._may_drop = keep == "auto"
         self._parts: list[StackedWeights] = []
-        self._waiting = _Waiting(num_gaussians)
         self.weights_nonzeros = 0
 
     def add(self, part: StackedWeights) -> None:
@@ -240,27 +201,15 @@ class QuadraticBuilder:
             self._parts.append(StackedWeights(part.weights.copy(), part.valid))
         most = MAX_WEIGHTS
         if self._gram is not None:
-            is_large = part.nonzeros >= LARGE_PART
-            if not is_large:
-                self._waiting.append(part)
-            if is_large or self._waiting.nonzeros >= CHUNK_WEIGHTS:
-                self._add_waiting(self._gram)
-                if is_large:
-                    self._gram.add(part)
-                most = min(most, CLEARLY_MORE * self._gram.nonzeros)
+            self._gram.add(part)
+            most = min(most, CLEARLY_MORE * self._gram.nonzeros)
         if self._may_drop and self.weights_nonzeros > most:
             self._parts, self._keeps_weights = [], False
-
-    def _add_waiting(self, gram: GramBuilder) -> None:
-        if self._waiting.nonzeros:
-            gram.add(self._waiting.held())
-            self._waiting.clear()
 
     def state(self) -> dict[str, np.ndarray]:
         """Return all parts added so far as arrays."""
         out = {"nonzeros": np.array([self.weights_nonzeros, self._keeps_weights], np.int64)}
         if self._gram is not None:
-            self._add_waiting(self._gram)
             out |= self._gram.state()
         if self._parts:
             held = stack_weights(self._parts)
@@ -282,7 +231,6 @@ class QuadraticBuilder:
         """Return G or W of all added parts."""
         if self._gram is None:
             return stack_weights(self._parts)
-        self._add_waiting(self._gram)
         if self._keeps_weights and self.weights_nonzeros < self._gram.nonzeros:
             return stack_weights(self._parts)
         return self._gram.finish()
@@ -293,7 +241,7 @@ class QuadraticCheckpoint:
 
     def __init__(self, folder: Path, keys: list[str], keep: str) -> None:
         self._keys = keys
-        digest = sha256_of_json({"views": keys, "keep": keep, "max": MAX_WEIGHTS, "chunk": CHUNK_WEIGHTS})
+        digest = sha256_of_json({"views": keys, "keep": keep, "max": MAX_WEIGHTS})
         self._folder = Path(folder) / digest
         self._last = time.monotonic()
 

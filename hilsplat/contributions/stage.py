@@ -109,9 +109,9 @@ def run_contributions(
     """Write A, A_half, S, mass, and G or W, in one pass over the training views.
 
     One or two views are prepared while rows of previous views are written and added to G. Memory contains
-    these views, the sum of G so far, and weights not yet added to G (`quadratic_builder`). After an
-    interruption, a rerun reads the matrices of finished views from the cache, and G from a checkpoint at most
-    `CHECKPOINT_SECONDS` (and one view) old; it rasterises W again for views not yet in that G.
+    these views and the sum of G so far. After an interruption, a rerun reads the matrices of finished views
+    from the cache, and G from a checkpoint at most `CHECKPOINT_SECONDS` (and one view) old; it rasterises W
+    again for views not yet in that G.
 
     Raises:
         MisalignedArtifactError: masks and images differ in size, or the masks of a view differ from those

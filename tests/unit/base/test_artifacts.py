@@ -28,10 +28,11 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> 
     assert path.read_text() == "old"
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.txt"]
     with (
-        pytest.raises(RuntimeError),  # the error of the block, though it has not created the file
+        pytest.raises(RuntimeError),  # the error of the block, though the file is gone
         artifacts.atomic_folder(tmp_path / "out") as folder,
-        artifacts.atomic_path(folder / "b.txt"),
+        artifacts.atomic_path(folder / "b.txt") as temporary,
     ):
+        temporary.unlink()
         raise RuntimeError
 
 
@@ -178,6 +179,16 @@ def test_npz_of_the_same_arrays_has_the_same_bytes(tmp_path: Path) -> None:
     back = artifacts.read_npz(tmp_path / "1.npz")
     assert sorted(back) == ["a", "b"]
     np.testing.assert_array_equal(back["b"], arrays["b"])
+
+
+def test_a_file_that_changed_after_its_index_was_written_is_found(tmp_path: Path) -> None:
+    with artifacts.atomic_folder(tmp_path / "out") as folder:
+        artifacts.write_npy(folder / "a.npy", np.arange(3))
+        artifacts.write_index(folder, {})
+    assert artifacts.read_npy(artifacts.sealed(tmp_path / "out", "a.npy")).tolist() == [0, 1, 2]
+    artifacts.write_npy(tmp_path / "out/a.npy", np.arange(4))
+    with pytest.raises(ArtifactError, match=r"a\.npy was changed after it was written"):
+        artifacts.sealed(tmp_path / "out", "a.npy")
 
 
 @pytest.mark.parametrize(

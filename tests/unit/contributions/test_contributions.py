@@ -132,8 +132,6 @@ def test_gram_depends_neither_on_threads_nor_on_how_the_pixels_are_divided(merge
     one = built([stack_weights(parts)])
     assert_same_gram(built(parts), one)
     assert_same_gram(built(parts, threads=2), one)
-    # large parts (here two) are added in turn
-    monkeypatch.setattr(quadratic_builder, "LARGE_PART", sorted(part.nonzeros for part in parts)[2])
     assert_same_gram(built(parts, keep="gram"), one)
     # too many weights to hold: G of any size
     monkeypatch.setattr(quadratic_builder, "MAX_WEIGHTS", parts[0].nonzeros)
@@ -141,9 +139,8 @@ def test_gram_depends_neither_on_threads_nor_on_how_the_pixels_are_divided(merge
 
 
 @pytest.mark.parametrize("keep", ["auto", "weights", "gram"])
-def test_a_builder_resumes_from_its_state(keep, monkeypatch):
+def test_a_builder_resumes_from_its_state(keep):
     parts = [labelled_part(seed) for seed in range(3)]
-    monkeypatch.setattr(quadratic_builder, "CHUNK_WEIGHTS", parts[0].nonzeros + 1)
     first, second = (QuadraticBuilder(40, keep, threads=1) for _ in range(2))
     first.add(parts[0])
     first.add(parts[1])

@@ -122,6 +122,9 @@ def test_small_instances_and_predictions_and_other_classes_do_not_count():
     # B has 3 points, fewer than 4. Its prediction is in an ignored instance, so it is ignored too.
     scan = scan_of(EXAMPLE, [(0, 4, 0.9), (4, 8, 0.8)])
     assert precisions(scan, min_points=4).tolist() == [[1.0] * 10]
+    # Half of the first prediction is in B and half in void: together, all of it is ignored.
+    half_each = precisions(scan_of(EXAMPLE, [(4, 10, 0.9), (0, 4, 0.8)]), min_points=4)
+    assert half_each.tolist() == [[1.0] * 10]
     scan = scan_of(EXAMPLE, [(0, 3, 0.9), (0, 4, 0.8)], classes=[CLASS, 77])
     assert precisions(scan, min_points=4).tolist() == [[0.0] * 10]
 
