@@ -1,13 +1,13 @@
 """The matrices of one view: masks by Gaussians, and the rows of W for pixels inside a mask."""
 
 import hashlib
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Int32
 
 from hilsplat.base.levels import LEVELS
+from hilsplat.base.processes import over_edges
 from hilsplat.contributions.compositing import visible_mass
 from hilsplat.contributions.kernels import move_to_front, summed_masks
 from hilsplat.contributions.quadratic import StackedWeights
@@ -43,16 +43,10 @@ def view_contributions(
     shares = np.linspace(0, total_px[-1], max(1, threads) + 1)[1:-1]
     edges = [0, *np.searchsorted(total_px, shares).tolist(), len(masks)]
     pixels = label_maps(masks), random_half(view, weights.shape[0])
-    W = weights.indptr, weights.indices, weights.data
-    level_index = masks.level.astype(np.int64) - 1
-
-    def some(first: int, last: int) -> tuple[np.ndarray, ...]:
-        runs = masks.runs, masks.offsets, level_index
-        return summed_masks(first, last, *runs, *pixels, *W, weights.shape[1])
-
-    with ThreadPoolExecutor(max(1, threads)) as pool:
-        parts = zip(*pool.map(some, edges[:-1], edges[1:]), strict=True)
-        counts, sizes, columns, sums = (np.concatenate(each) for each in parts)
+    runs = masks.runs, masks.offsets, masks.level.astype(np.int64) - 1
+    W = weights.indptr, weights.indices, weights.data, weights.shape[1]
+    parts = over_edges(summed_masks, edges, threads, *runs, *pixels, *W)
+    counts, sizes, columns, sums = (np.concatenate(each) for each in zip(*parts, strict=True))
     starts = np.concatenate([[0], np.cumsum(sizes)])
     shown, in_half = counts.T
     arrays = {"pixels": shown.copy(), "half_pixels": in_half.copy(), "mass": visible_mass(weights)}

@@ -225,14 +225,9 @@ def node_parents(
             other = node_of_gaussian[:, coarser.index]
             both = (own >= 0) & (other >= 0)
             shared = sp.csr_matrix((mass[both], (own[both], other[both])), shape=(num, num))
-            shared.sum_duplicates()
-            for node in np.flatnonzero((level == int(child_level)) & (parent == NONE)):
-                row = slice(shared.indptr[node], shared.indptr[node + 1])
-                if row.start == row.stop:
-                    continue
-                best = row.start + int(shared.data[row].argmax())
-                if shared.data[best] > min_coverage * size[node]:
-                    parent[node] = shared.indices[best]
+            best, weight = best_fits(shared)
+            found = (level == int(child_level)) & (parent == NONE) & (weight > min_coverage * size)
+            parent[found] = best[found]
     return parent
 
 
