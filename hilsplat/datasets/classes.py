@@ -23,7 +23,7 @@ class ClassSet:
 
     @staticmethod
     def of(name: str, query_of: Mapping[int, str], ids: Iterable[int] | None = None) -> "ClassSet":
-        """Return the set of classes with the given ids (default: all), from a data set's queries by id."""
+        """Return the classes with the given ids (default: all); `query_of` maps ids to the queries."""
         chosen = tuple(query_of if ids is None else ids)
         return ClassSet(name, chosen, tuple(query_of[label] for label in chosen))
 
@@ -56,8 +56,8 @@ the paper writes class 28 as two words."""
 BENCHMARK_20 = (*range(1, 13), 14, 16, 24, 28, 33, 34, 36, 39)
 """Classes of ScanNet's own benchmark."""
 
-# The sets of 19, 15 and 10 classes are OpenGaussian's (yanmin-wu/OpenGaussian `scripts/eval_scannet.py`); the
-# paper also lists them. 19 lacks otherfurniture; 15 also picture, refrigerator, shower curtain and bathtub.
+# The sets of 19, 15 and 10 classes are those of yanmin-wu/OpenGaussian `scripts/eval_scannet.py` and of the
+# paper. The 19 omit otherfurniture; the 15 also omit picture, refrigerator, shower curtain and bathtub.
 SCANNET_19 = ClassSet.of("scannet-19", NYU40, [label for label in BENCHMARK_20 if label != 39])
 SCANNET_15 = ClassSet.of("scannet-15", NYU40, [n for n in SCANNET_19.ids if n not in (11, 24, 28, 36)])
 SCANNET_10 = ClassSet.of("scannet-10", NYU40, [1, 2, 4, 5, 6, 7, 8, 9, 10, 33])
@@ -158,8 +158,7 @@ _QUERIES = {label: name.replace("-", " ") for label, name in REPLICA_NAMES.items
 """Class id -> query: hyphens become spaces. OpenYOLO3D keeps hyphens."""
 
 REPLICA_51 = ClassSet.of("replica-51", _QUERIES, REPLICA_EVALUATED_51)
-# The 48 classes are those of aminebdj/OpenYOLO3D, without wall, floor and ceiling; the paper states the same
-# number.
+# The 48 classes of aminebdj/OpenYOLO3D omit wall, floor and ceiling; the paper states the same number.
 REPLICA_48 = ClassSet.of("replica-48", _QUERIES, sorted(set(REPLICA_EVALUATED_51) - {93, 40, 31}))
 
 _WAYMO = """
@@ -171,5 +170,5 @@ WAYMO_22 = ClassSet.of("waymo-22", dict(enumerate(words_of(_WAYMO), start=1)))
 """The 22 classes of Waymo's 3D semantic segmentation; 0 is undefined.
 
 Source: waymo-research/waymo-open-dataset `protos/segmentation.proto`. The benchmark has no text queries, so
-the queries are ours: the names in words, and "walkable ground" for TYPE_WALKABLE.
+the queries are ours: the class names in plain words, and "walkable ground" for TYPE_WALKABLE.
 """

@@ -29,14 +29,14 @@ class Dataset:
     Attributes:
         name: key in the registry, and name in table rows and paths.
         title: name as written in papers.
-        labels: "images" if image pixels are labelled, "points" if points of a mesh or scan are.
+        labels: "images" for labelled pixels, "points" for labelled mesh vertices or lidar points.
         folder: the data set's folder below `data_root`; all other paths are relative to it.
         scenes: scenes in the paper's tables.
         terms: obligations of the user under the licence, in one sentence.
         layout: the expected file tree, as user-facing text.
         required: paths that a scene needs.
-        open: reads a scene from the data set's folder, as a `LabelledScene` or a `PointScene`.
-        protocols: protocols of the data set (`evaluate.protocols.cards`), besides those for all image labels.
+        open: function that reads a scene from the data set's folder into a `LabelledScene` or `PointScene`.
+        protocols: keys in `evaluate.protocols.cards`, in addition to the protocols for all image labels.
         label_places: glob patterns of a scene's files that only evaluation reads.
     """
 
@@ -86,7 +86,7 @@ class Dataset:
         )
 
     def require(self, root: Path, scene: str) -> None:
-        """Raise SceneError if a scene lacks a required path, for instance after unpacking only part of it."""
+        """Raise SceneError if a scene lacks a required path, for instance if it was only partly unpacked."""
         missing = self.missing(root, scene)
         if missing:
             here = [place for place in self.required(scene) if place not in missing]
@@ -103,12 +103,12 @@ class Dataset:
         return any((root / place).exists() for place in inside)
 
     def _has_begun(self, root: Path) -> bool:
-        """Return whether a folder has a part of a known scene or, if none are known, any scene."""
+        """Return whether a folder contains part of a known scene or, if no scenes are known, any scene."""
         return any(self.has_part(root, scene) for scene in self.scenes) or bool(self.found(root))
 
 
 def _at(root: Path, place: str) -> Path:
-    """Return a path relative to a folder; if it contains `..`, the folder need not exist."""
+    """Join a folder and a relative path, resolving `..` even if the folder does not exist."""
     return Path(os.path.normpath(Path(root) / place))
 
 
@@ -118,7 +118,7 @@ def _folders(folder: Path) -> list[Path]:
 
 
 def listing(folder: Path) -> str:
-    """Return the first names in a folder, for messages."""
+    """List the first eight files and folders in a folder, for messages."""
     if not folder.is_dir():
         return f"no folder {folder}"
     names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))

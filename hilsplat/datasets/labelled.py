@@ -1,4 +1,4 @@
-"""Scenes with labelled images, as returned by every reader of such a data set.
+"""Scenes with labelled images, the output of every reader of an image-labelled data set.
 
 Labels, images and poses are keyed by view name ("frame_00041.png", see `scene.view_names.view_name`), so that
 a label matches its image and camera even if other views are missing.
@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # imports pycolmap, which evaluation doesn't need
     from hilsplat.scene.importers.known_views import KnownView
 
 ROUNDING_PX = 1.0
-"""Maximum difference in side length, after scaling, between an image and a label of the same shape."""
+"""Rounding tolerance, px, for the height of a label scaled to the width of its image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +38,11 @@ class LabelledRegion:
     Attributes:
         text: the query, spelt as in the labels.
         size_hw: size of the label, px.
-        pixels: reads the region at the label's size; called whenever the mask is needed.
-        boxes_xyxy: annotated boxes, borders included, label px; None if the data set has none.
+        pixels: function that reads the region at the label's size; called whenever the mask is needed.
+        boxes_xyxy: annotated boxes, borders included, px of the label; None if the data set has no boxes.
         level: None if the data set has no levels.
         path: texts from the whole down to this region; only its own text if there are no levels.
-        any_grey: reads all non-black pixels, the ground truth of some protocols; None if equal to `pixels`.
+        any_grey: like `pixels`, but includes all non-black pixels, as in some protocols; None if identical.
     """
 
     text: str
@@ -56,9 +56,9 @@ class LabelledRegion:
     def mask(
         self, size_hw: tuple[int, int] | None = None, *, any_grey: bool = False
     ) -> Bool[np.ndarray, "H W"]:
-        """Return the region at the label's size, or resized by nearest neighbour.
+        """Return the region's mask at the label's size, or resized by nearest neighbour.
 
-        Each new pixel takes the value at its top-left corner, as in public evaluators (OpenCV's nearest).
+        Each new pixel takes the value at its top-left corner (`cv2.INTER_NEAREST`), as in public evaluators.
         """
         mask = self.any_grey() if any_grey and self.any_grey else self.pixels()
         if size_hw is None or mask.shape == tuple(size_hw):
@@ -66,10 +66,10 @@ class LabelledRegion:
         return cv2.resize(mask.astype(np.uint8), size_hw[::-1], interpolation=cv2.INTER_NEAREST).astype(bool)
 
     def boxes(self, size_hw: tuple[int, int] | None = None) -> Int[np.ndarray, "B 4"]:
-        """Return the boxes, borders included; the region's own extent if no box is annotated.
+        """Return the annotated boxes, borders included, or the region's extent if no box is annotated.
 
-        For another size, each side is scaled and rounded to the pixel that contains it. A region with neither
-        pixels nor annotated boxes has no boxes.
+        For a different size, each side is scaled and rounded to the pixel that contains it. A region with
+        neither pixels nor annotated boxes has no boxes.
         """
         boxes = self.boxes_xyxy
         if boxes is None:
@@ -114,7 +114,7 @@ class LabelledScene:
         return sum(len({region.text for region in regions}) for regions in self.views.values())
 
     def check_posed(self, names: Collection[str]) -> None:
-        """Raise SceneError, which lists the views, if any labelled view has no pose."""
+        """Raise a SceneError that lists the labelled views without a pose, if there are any."""
         missing = [view for view in self.views if view not in names]
         if missing:
             shown = [*sorted(names)[:5], *(["..."] if len(names) > 5 else [])]
@@ -140,7 +140,7 @@ class LabelledScene:
             "images": len(self.images),
             "labelled views": len(self.views),
             "regions": sum(map(len, self.views.values())),
-            "pairs of view and text": self.num_pairs,
+            "(view, text) pairs": self.num_pairs,
             "texts": len(self.prompts),
         }
         if self.poses is None:
@@ -188,12 +188,12 @@ def mask_region(
     share: float = 0.0,
     least_grey: int | None = None,
 ) -> LabelledRegion:
-    """Return the region of a grey mask file that is named after its text; extend `warnings` if it is resized.
+    """Return the region in a grey mask file, named after its query; append to `warnings` if it is resized.
 
     Args:
         foreground: lowest grey value of the region.
         share: as in `check_label_size`.
-        least_grey: lowest value of the region under protocols with `any_grey`, if it differs.
+        least_grey: lowest grey value of the region under protocols that use `any_grey`, if different.
     """
     size_hw = image_size_hw(path)
     warnings += check_label_size(f"mask {path}", size_hw, image_hw, share)
@@ -203,7 +203,7 @@ def mask_region(
 
 
 def read_mask_file(path: Path, least: int) -> Bool[np.ndarray, "H W"]:
-    """Return where a grey mask file's values are at least `least`; raise ImageError if it is damaged."""
+    """Return which pixels of a grey mask file are at least `least`; raise ImageError if it is damaged."""
     with _opened("mask", path) as image:
         return np.asarray(image.convert("L")) >= least
 
@@ -222,10 +222,10 @@ def _opened(kind: str, path: Path) -> Iterator[Image.Image]:
 def check_label_size(
     where: str, label_hw: tuple[int, int], image_hw: tuple[int, int], share: float = 0.0
 ) -> list[str]:
-    """Compare a label's size with its image's; return a sentence, starting with `where`, if it is resized.
+    """Compare a label's size with its image's; return a warning, which starts with `where`, if they differ.
 
-    `share` is the tolerated difference in height after scaling to the same width, relative to the height;
-    rounding is always tolerated.
+    `share` is the tolerated relative difference in height after scaling to the same width; rounding
+    differences are always tolerated.
 
     Raises:
         SceneError: one is not a scaled copy of the other.
@@ -262,8 +262,8 @@ def posed_images(folder: Path, dataset: str) -> dict[str, "KnownView"]:
     """Return the posed views of a scene folder by view name, sorted by stem.
 
     Raises:
-        SceneError: the folder has no poses, they cannot be read, or the lenses have distortion, so that
-            labels of undistorted images would not fit.
+        SceneError: the folder has no poses, they cannot be read, or the lenses have distortion, which
+            would misalign labels drawn on undistorted images.
     """
     from hilsplat.scene.importers.known_views import read_source
 

@@ -2,11 +2,11 @@
 
 Labels on disk take precedence: these lists only help to report missing, misspelt or mismatched labels.
 
-Sources. `FRAMES`: LERF-OVS from the released labels (minghanqin/LangSplat); 3D-OVS from third-party loaders,
-bed, bench and lawn also from a second repository; Hi-LERF and Hi-3DOVS from the table of the Hi-LSplat paper
-(its `frame_01` of a 3D-OVS scene is image 01). `PROMPTS`: LERF-OVS from yanmin-wu/OpenGaussian, LERF-Mask
-from lkeab/gaussian-grouping, 3D-OVS bed to sofa from published evaluation code; blue_sofa, snacks and
-office_desk from figure captions in LangSplat's supplement, perhaps incomplete; covered_desk and table: none.
+Sources. `FRAMES`: LERF-OVS from the released labels (minghanqin/LangSplat); 3D-OVS from third-party loaders
+(for bed, bench and lawn, also from a second repository); Hi-LERF and Hi-3DOVS from the table of the Hi-LSplat
+paper (its `frame_01` of a 3D-OVS scene is image 01). `PROMPTS`: LERF-OVS from yanmin-wu/OpenGaussian,
+LERF-Mask from lkeab/gaussian-grouping, 3D-OVS bed to sofa from published evaluation code; blue_sofa, snacks
+and office_desk from captions in LangSplat's supplement (perhaps incomplete); none for covered_desk and table.
 """
 
 import json
@@ -22,8 +22,8 @@ PROMPTS: dict[str, dict[str, list[str]]] = _LISTS["prompts"]
 """Prompts by data set and scene, sorted."""
 
 PAIRS: dict[str, int] = {"figurines": 56, "ramen": 71, "teatime": 59, "waldo_kitchen": 22}
-"""Number of (frame, category) pairs of LERF-OVS, derived as the smallest counts for which whole numbers of
-hits give all published localization figures."""
+"""Number of (frame, category) pairs in each LERF-OVS scene: the smallest counts for which whole numbers of
+hits yield all published localization scores."""
 
 
 def differences(

@@ -11,7 +11,7 @@ from hilsplat.base.errors import HilsplatError, SceneError
 from hilsplat.base.plugins import Plugins
 from hilsplat.datasets.dataset import Dataset
 
-if TYPE_CHECKING:  # imports OpenCV and SciPy, which the start of the workflow and the tables don't need
+if TYPE_CHECKING:  # imports OpenCV and SciPy, which workflow start-up and tables don't need
     from hilsplat.datasets.labelled import LabelledScene
     from hilsplat.datasets.points.labelled_points import PointScene
 
@@ -65,7 +65,7 @@ def open_labels(name: str, data_root: Path) -> "LabelledScene | PointScene":
 
 
 def dataset_of(name: str) -> Dataset:
-    """Return a data set by name; raise SceneError, which lists the known names, if it is unknown."""
+    """Return a data set by name; raise a SceneError that lists the known names if it is unknown."""
     if name not in DATASETS:
         raise SceneError(
             f"data set {name!r} is unknown", expected=f"one of {', '.join(DATASETS)}", fix=LISTED
@@ -74,7 +74,7 @@ def dataset_of(name: str) -> Dataset:
 
 
 def overview(data_root: Path | None) -> str:
-    """Describe all data sets, with the scenes present below a folder if one is given."""
+    """Describe all data sets and, if a folder is given, list the scenes found in it."""
     paragraphs = []
     for dataset in DATASETS.values():
         lines = [

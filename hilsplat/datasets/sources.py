@@ -12,7 +12,7 @@ from hilsplat.datasets.registry import DATASETS, dataset_of, open_labels
 from hilsplat.scene.sheet import DATA_PREFIX
 
 LABELS_ON = {"lerf_ovs": "hi_lerf", "3d_ovs": "hi_3dovs"}
-"""Data set -> the data set that also labels its images, with levels."""
+"""Data set -> a second data set that labels the same images at several levels."""
 
 LEVELLED = tuple(LABELS_ON.values())
 
@@ -43,9 +43,9 @@ def absence(source: str, data_root: str) -> str | None:
 
 
 def unlisted(sources: Collection[str], groups: Collection[str], data_root: str) -> list[str]:
-    """Return scenes on disk that no row has as its source, for data sets without a list of scenes (Waymo).
+    """Return scenes on disk that are not the source of any row, for data sets without a scene list (Waymo).
 
-    Such a data set has the name of its group; `data_root` is empty if not set.
+    Such a data set has the same name as its group; `data_root` is empty if not set.
     """
     open_ended = [DATASETS[name] for name in groups if name in DATASETS and not DATASETS[name].scenes]
     found = [
@@ -57,9 +57,9 @@ def unlisted(sources: Collection[str], groups: Collection[str], data_root: str) 
 
 
 def label_sets(source: str, data_root: str, row: str) -> tuple[str, ...]:
-    """Return the label sets (`data set/scene`) for scoring a row's scene (`dataset/scene`), its own first.
+    """Return the label sets (`data set/scene`) of a row's scene (`dataset/scene`), its source's own first.
 
-    If `data_root` is empty, your own annotations may be in the working folder.
+    If `data_root` is empty, your own annotations are looked up in the working folder.
     """
     drawn = (Path(data_root).expanduser() / "annotated" / row).glob("*.json")
     own = (f"annotated/{row}",) if any(drawn) else ()
@@ -80,7 +80,7 @@ def _folder(dataset: Dataset, data_root: str) -> Path:
 
 
 def label_files(labels: str, data_root: str) -> tuple[Path, ...]:
-    """Return the files of `data set/scene` that only evaluation reads, sorted; edits rerun nothing else."""
+    """Return the sorted files of `data set/scene` that only evaluation reads; edits rerun only that."""
     name, _, scene = labels.partition("/")
     dataset = dataset_of(name)
     root = _folder(dataset, data_root)
@@ -89,7 +89,7 @@ def label_files(labels: str, data_root: str) -> tuple[Path, ...]:
 
 
 def image_files(source: str, data_root: str) -> tuple[Path, ...]:
-    """Return the data set's files that contain images and poses of an exported scene."""
+    """Return the data set's files from which a scene's images and poses are exported."""
     place = published(source)
     assert place is not None, source
     name, scene = place
@@ -103,13 +103,13 @@ def image_files(source: str, data_root: str) -> tuple[Path, ...]:
 
 
 def is_exported(source: str) -> bool:
-    """Return whether images and poses must first be exported, as for data sets with labels on points."""
+    """Return whether images and poses must first be exported: true for data sets with labelled points."""
     place = published(source)
     return place is not None and dataset_of(place[0]).labels == "points"
 
 
 def export_images(name: str, data_root: Path, out: Path) -> int:
-    """Write images and poses of `data set/scene` to a folder for the `poses` stage; return the image count.
+    """Write the images and poses of `data set/scene` for the `poses` stage; return the number of images.
 
     The vertices of a labelled mesh are also written (`points.ply`), without labels, as initial (or frozen)
     Gaussian positions. Lidar points are not written, because the sky and distant objects have none.

@@ -28,14 +28,14 @@ IMAGES_OF = {"hi_lerf": "lerf_ovs", "hi_3dovs": "3d_ovs"}
 """Data set -> folder with its images, next to the data set's own folder."""
 
 PROPOSED = "proposed"
-"""`origin` of an object that a program proposed; it is ignored until the user accepts it."""
+"""Value of `origin` for objects proposed by a program, which are ignored until the user accepts them."""
 
 OUTSIDE_SHARE = 0.01
 """Share of a child's area that may be outside its parent, to allow for rasterised borders."""
 
 
 def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
-    """Read the labels of a scene of `dataset`: one region per object; objects may have the same text."""
+    """Read the labels of a scene in `dataset`: one region per object; objects may share a text."""
     HI_DATASETS[dataset].require(root, scene)
     source = root.parent / IMAGES_OF[dataset] / scene
     images = images_by_view(source / "images")
@@ -208,8 +208,8 @@ ANNOTATED = Annotated(
     labels="images",
     folder="annotated",
     scenes=(),
-    licence="yours; the photographs keep their own",
-    terms="Draw them with: hilsplat annotate SCENE",
+    licence="your choice; the photographs keep their licence",
+    terms="Draw annotations with: hilsplat annotate SCENE",
     citation="none",
     layout="""annotated/
   <dataset>/<scene>/DSC_0001.json ...   our format (docs/datasets.md), one file per photograph""",

@@ -1,4 +1,4 @@
-"""Label files of the ISAT annotation tool, the format of LERF-OVS's labels; rasterising and tracing polygons.
+"""Reader of label files from the ISAT annotation tool, as in LERF-OVS; rasterising and tracing of polygons.
 
 `objects` is a list. In each object, `category` is the text, `segmentation` is one polygon as a list of [x, y]
 (a list of polygons is also accepted), and `bbox` is [x1, y1, x2, y2]. `group` does not identify an object,
@@ -187,7 +187,7 @@ def _polygons(where: str, value: Any) -> tuple[Float[np.ndarray, "_ 2"], ...]:
 def _box(
     where: str, value: Any, points: Float[np.ndarray, "P 2"], warnings: list[str]
 ) -> Int64[np.ndarray, " 4"]:
-    """Return the whole pixels inside the box [x1, y1, x2, y2]; without a box, inside the polygon's extent."""
+    """Return the whole pixels inside the box [x1, y1, x2, y2] or, if missing, the polygon's extent."""
     extent = np.concatenate([points.min(axis=0), points.max(axis=0)])
     try:
         box = extent if value is None else np.array(value, dtype=np.float64)

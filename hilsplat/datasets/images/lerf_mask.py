@@ -1,8 +1,8 @@
-"""LERF-Mask: three scenes of LERF with the masks of Gaussian Grouping.
+"""LERF-Mask: three LERF scenes with Gaussian Grouping's masks.
 
 Test views are the posed images missing from `images_train`, sorted by name; the folder `test_mask/0` contains
 the masks of the first view, `test_mask/1` those of the second. Every mask file is named after its prompt.
-Missing parts, and mask folders that don't match the test views, raise SceneError.
+Missing files or folders, and mask folders that don't match the test views, raise SceneError.
 """
 
 from dataclasses import replace

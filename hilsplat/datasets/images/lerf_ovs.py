@@ -1,10 +1,10 @@
-"""LERF-OVS: four scenes of LERF with the labels of LangSplat.
+"""LERF-OVS: four LERF scenes with LangSplat's labels.
 
 Labels are polygons. Objects of one category in one image form one region with several boxes, and a view is
 queried only for the categories labelled in it. Labels are in `label/<scene>`, beside the scenes. Images are
 matched by name, never by position: LangSplat's own evaluation uses the index of the rendering, which shifts
-if an earlier image was not registered. A missing part, a labelled frame without an image, or an unusable
-label file raises SceneError.
+if an earlier image was not registered. A missing file or folder, a labelled frame without an image, or an
+unusable label file raises SceneError.
 """
 
 from dataclasses import replace
@@ -51,7 +51,7 @@ def label_files(folder: Path) -> dict[str, Path]:
             f"{folder} has no label files",
             expected="one .json file per labelled frame",
             found=", ".join(sorted(path.name for path in folder.glob("*"))[:5]) or "nothing",
-            fix="unpack the labels again, or move them up if they are in a subfolder",
+            fix="unpack the labels again, or move them up one level if they are in a subfolder",
         )
     return files
 

@@ -1,8 +1,8 @@
-"""3D-OVS: ten small scenes with five views each, segmented into the classes of the scene.
+"""3D-OVS: ten small scenes, each with five views that are segmented into the scene's classes.
 
-`segmentations/classes.txt` names the classes; the class index is the position in the **sorted** list. Each
-test view is a folder with one mask per class. Only the value 255 is foreground, except under protocols with
-ground truth `any grey`. A missing part, mask or image, or an unusable classes.txt, raises SceneError.
+`segmentations/classes.txt` lists the classes; a class's index is its position in the **sorted** list. Each
+test view is a folder with one mask per class. Only pixels of value 255 are foreground, except under protocols
+with ground truth `any grey`. A missing file or folder, or an unusable classes.txt, raises SceneError.
 """
 
 from pathlib import Path
@@ -25,7 +25,7 @@ FOREGROUND = 255
 """The original loader computes int8(value / 255), which is 0 for smaller values."""
 
 SHAPE_TOLERANCE = 0.01
-"""Relative tolerance for the aspect ratios of a view's masks and photograph, which differ slightly."""
+"""Relative tolerance between the aspect ratios of a view's masks and its image, which differ slightly."""
 
 
 def open_scene(root: Path, scene: str) -> LabelledScene:

@@ -81,7 +81,7 @@ class LabelledPoints:
 
 @dataclass(frozen=True, eq=False)
 class PointScene:
-    """A scene of a data set with labelled points.
+    """A scene with labelled points.
 
     Attributes:
         images: posed images; frames without a pose are omitted.

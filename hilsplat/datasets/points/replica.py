@@ -40,7 +40,7 @@ logger = logging.getLogger(__name__)
 
 
 LAYOUTS = (("traj.txt", "results", "frame"), ("traj_w_c.txt", "rgb", "rgb_"))
-"""Pose file, image folder and image name prefix of NICE-SLAM, and of Semantic-NeRF and vMAP."""
+"""Pose file, image folder and image name prefix, for NICE-SLAM, then for Semantic-NeRF and vMAP."""
 
 
 def layout_of(folder: Path) -> tuple[str, str, str]:
@@ -75,8 +75,8 @@ def read_lens(path: Path) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
 def read_images(folder: Path) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
     """Return the posed images of a rendered sequence, by frame number.
 
-    Line n of the pose file is frame n; lines without an image are skipped. Also return a sentence for each
-    item that was skipped.
+    Line n of the pose file is the pose of frame n. Lines without an image are skipped, and a warning with
+    their number is also returned.
     """
     pose_file, image_folder, prefix = layout_of(folder)
     path = folder / pose_file
@@ -155,7 +155,7 @@ def class_of_objects(path: Path) -> Int32[np.ndarray, " O"]:
 def object_of_vertices(
     faces: Int[np.ndarray, "F c"], object_of_face: Int[np.ndarray, " F"], num_vertices: int
 ) -> Int32[np.ndarray, " P"]:
-    """Return the most frequent object of each vertex's faces, -1 if it has none; the lowest id wins ties."""
+    """Return the most frequent object among each vertex's faces (lowest id if tied), -1 without faces."""
     corners, owners = faces.reshape(-1).astype(np.int64), np.repeat(object_of_face, faces.shape[1])
     pairs, votes = np.unique(np.stack([corners, owners]), axis=1, return_counts=True)
     # The first pair of each vertex has the most votes and, among ties, the smallest id.
@@ -173,9 +173,9 @@ def triangles_of(quads: Int32[np.ndarray, "F 4"]) -> Int32[np.ndarray, "T 3"]:
 
 
 def read_semantic_mesh(habitat: Path) -> LabelledPoints:
-    """Return the vertices of `mesh_semantic.ply` with the class and instance of most of their faces.
+    """Return the vertices of `mesh_semantic.ply`, each labelled with the most frequent object of its faces.
 
-    The file numbers objects from 0; `instance_id` is that number + 1, and 0 if the class is undefined.
+    The file numbers objects from 0; `instance_id` is that number + 1, or 0 if the class is undefined.
     """
     path = habitat / "mesh_semantic.ply"
     mesh = PlyMesh(path, 4)

@@ -35,11 +35,11 @@ logger = logging.getLogger(__name__)
 
 LABEL_TABLE = "scannetv2-labels.combined.tsv"
 SAME_PLACE_M = 1e-4
-"""Tolerance between corresponding vertices of the labelled and unlabelled mesh; some copies are rounded."""
+"""Tolerance between corresponding vertices of the labelled and unlabelled meshes; some copies are rounded."""
 
 
 def scan_folder(root: Path, scan: str) -> Path:
-    """Return a scan's folder; refuse one in the wrong place, or with frames still in a `.sens` archive."""
+    """Return a scan's folder; refuse one in the wrong place or whose frames are in a `.sens` archive."""
     folder = root / "scans" / scan
     for wrong in (folder / scan, root / scan, root / "scans" / "scans" / scan):
         if not (folder / f"{scan}_vh_clean_2.ply").is_file() and wrong.is_dir():
@@ -79,7 +79,7 @@ def read_label_table(path: Path) -> dict[str, int]:
 
 
 def read_scan_info(path: Path) -> dict[str, str]:
-    """Read `<scan>.txt`: lines `key = value`; some values are not numbers."""
+    """Read the lines `key = value` of `<scan>.txt`, with values as text because some are not numbers."""
     lines = require_file(path).read_text(encoding="utf-8").splitlines()
     pairs = (line.split(" = ", 1) for line in lines if " = " in line)
     return {key.strip(): value.strip() for key, value in pairs}
@@ -105,7 +105,7 @@ def read_images(folder: Path, scan: str) -> tuple[tuple[PosedImage, ...], tuple[
     ScanNet's coordinates are relative to the first pixel's centre (the depth camera's centre is 319.5 of
     640), so half a pixel is added to the principal point in K.
 
-    Also return a sentence for each item that was skipped.
+    Also return a warning for each reason that frames were skipped.
     """
     frames = by_number(list_images(folder / "color"))
     K = read_matrix(folder / "intrinsic" / "intrinsic_color.txt")[:3, :3] + HALF_PIXEL

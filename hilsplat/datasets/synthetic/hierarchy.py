@@ -115,8 +115,8 @@ def write_hierarchy(
 ) -> None:
     """Write annotations: label images first, `annotations.json` last.
 
-    Nodes are in the order of their ids 0, 1, 2, ...; `labels` contains, per view and level, the node id per
-    pixel (-1 for none), and `views` the ids of the annotated nodes.
+    Nodes are in the order of their ids 0, 1, 2, ...; `labels` contains the node id of each pixel (-1 for
+    none) by view and level, and `views` contains the ids of the nodes annotated in each view.
     """
     for view, levels in labels.items():
         for level in LEVELS:

@@ -80,10 +80,10 @@ def waymo_labels(node_ids: Int32[np.ndarray, "P 3"], texts: Sequence[str]) -> In
 
 
 def labelled_points(world: Path, kind: str) -> dict[str, LabelledPoints]:
-    """Return points with classes by labelling, in metres, in the frame of the world's ground-truth cameras.
+    """Return a world's points for each labelling, in metres, in the frame of its ground-truth cameras.
 
     For a room, these are the mesh vertices visible to a camera (a scanner would miss the others), labelled as
-    nyu40, scannet200 and replica; for a street, its lidar returns, labelled as waymo.
+    nyu40, scannet200 and replica. For a street, they are its lidar returns, labelled as waymo.
 
     Raises:
         SceneError: the world is of a different kind.
@@ -96,7 +96,7 @@ def labelled_points(world: Path, kind: str) -> dict[str, LabelledPoints]:
         return {"waymo": LabelledPoints(scan["points"].astype(np.float64), classes, instance, "waymo")}
     if kind != "room":
         raise SceneError(
-            f"a world of kind {kind!r} has no labelled points", expected="room or street", fix="score images"
+            f"a {kind!r} world has no labelled points", expected="room or street", fix="score its images"
         )
     mesh = PlyMesh(world / "truth" / "mesh.ply", 3)
     seen = mesh.column("vertex", "views") > 0

@@ -33,7 +33,7 @@ class LidarReturn:
     """One return of the top lidar.
 
     Attributes:
-        image: range (metres; zero or negative without a return), intensity, elongation, no-label zone.
+        image: range (metres; zero or negative if there is no return), intensity, elongation, no-label zone.
         labels: instance and class; None if the frame is not labelled.
         projection: first camera, x, y, second camera, x, y; camera 0 means no camera. None if not stored.
     """
@@ -50,7 +50,7 @@ class LidarFrame:
     Attributes:
         inclinations: inclinations of the rows, radians, highest first.
         pixel_pose: roll, pitch, yaw (radians), x, y, z (metres) of the vehicle in the world at each pixel.
-        returns: first and, if there is one, second return.
+        returns: the first return and, if there is one, the second.
     """
 
     timestamp_micros: int
@@ -145,7 +145,7 @@ def range_image_points(
     inclinations: Float[np.ndarray, " H"],
     vehicle_from_lidar: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, "H W 3"]:
-    """Return positions of all pixels in the vehicle's frame at the time of each pixel, metres.
+    """Return the position of each pixel, metres, in the vehicle's frame at the time of that pixel.
 
     Positions of pixels without a positive range are meaningless.
     """
@@ -214,7 +214,7 @@ def joined_points(parts: Sequence[LabelledPoints]) -> LabelledPoints:
 
 
 def shot_image(shot: CameraShot, segment_from_world: Float[np.ndarray, "4 4"]) -> PosedImage:
-    """Return an image with its camera in the segment's frame, named after time and camera."""
+    """Return an image with its camera in the segment's frame, named after its timestamp and camera."""
     in_segment = segment_from_world @ shot.world_from_vehicle
     return PosedImage(
         f"{shot.timestamp_micros}_{shot.camera.name}.jpg",

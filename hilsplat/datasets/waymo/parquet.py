@@ -46,7 +46,7 @@ def component_path(split: Path, tag: str, segment: str) -> Path:
 def read_component(
     split: Path, tag: str, segment: str, columns: list[str], only: dict[str, int] | None = None
 ) -> list[dict[str, Any]]:
-    """Return the rows of a component in file order: lists as arrays, other values unchanged.
+    """Return the rows of a component in file order, with lists converted to arrays.
 
     `only` maps columns to required values; rows with other values are not decoded.
     """
@@ -178,7 +178,7 @@ def _cameras(split: Path, segment: str) -> dict[int, WaymoCamera]:
 
 
 def camera_shots(split: Path, segment: str, every: int = 1) -> Iterator[CameraShot]:
-    """Yield the images of every n-th frame, sorted by time, then camera."""
+    """Yield the images of every n-th frame, sorted by time and camera."""
     known = _cameras(split, segment)
     pose = "[CameraImageComponent].pose.transform"
     rows = read_component(split, "camera_image", segment, [FRAME, CAMERA])

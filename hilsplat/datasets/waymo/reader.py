@@ -1,4 +1,4 @@
-"""Waymo perception: labelled points of the top lidar and the images of the five cameras of a segment.
+"""Waymo perception: a segment's labelled points from the top lidar, and images from its five cameras.
 
 Reads release 2.0.1 (parquet) or 1.4.3 (TFRecord), which contain the same data. Coordinates are relative to
 the vehicle at the segment's first frame, because positions in the files (kilometres) are too large
@@ -100,7 +100,7 @@ def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
 
 @dataclass(frozen=True)
 class Segments(Dataset):
-    """A data set for which the paper names no scenes; its scenes are the segments present."""
+    """A data set whose scenes are the segments on disk, because the paper names none."""
 
     def check(self, root: Path, scene: str) -> SceneReport:
         """Read a segment with only some of its images, and report what was found."""
@@ -116,7 +116,7 @@ class Segments(Dataset):
         return tuple(sorted(found))
 
     def missing(self, root: Path, scene: str) -> tuple[str, ...]:
-        """Return the missing paths of a segment; empty if the segment is a file of release 1."""
+        """Return the missing paths of a segment; empty if it has a file from release 1."""
         if find_record(root, scene) is not None:
             return ()
         split = find_parquet(root, scene) or root / SPLITS[0]

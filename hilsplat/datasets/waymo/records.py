@@ -1,8 +1,8 @@
 """Waymo v1 (1.4.3): TFRecord files of Frame messages, read without TensorFlow.
 
 protobuf decodes the messages; this module reads the records around them, because the package `tfrecord` would
-add two dependencies and, given a damaged length, allocate that much memory. All readers raise SceneError if
-the file is missing, damaged or truncated.
+add two dependencies and allocate as much memory as a damaged record length states. All readers raise
+SceneError if the file is missing, damaged or truncated.
 """
 
 import struct
@@ -108,7 +108,7 @@ def records(path: Path) -> Iterator[bytes]:
 
 
 def frames(path: Path) -> Iterator[tuple[str, Any]]:
-    """Yield each frame with its location, for messages."""
+    """Yield the location of each frame, for messages, and the frame itself."""
     for number, record in enumerate(records(path)):
         where = f"{path}, frame {number}"
         try:
@@ -132,7 +132,7 @@ def _transform(message: Any, where: str) -> np.ndarray:
 
 
 def lidar_frames(path: Path) -> Iterator[LidarFrame]:
-    """Yield the frames of a file in which the top lidar is labelled."""
+    """Yield a file's frames that have labels for the top lidar."""
     for where, frame in frames(path):
         try:
             laser = _named(frame.lasers, TOP)
@@ -169,7 +169,7 @@ def lidar_frames(path: Path) -> Iterator[LidarFrame]:
 
 
 def _named(messages: Iterable[Any], name: int) -> Any:
-    """Return the message of a sensor."""
+    """Return the message from the sensor with the number `name`."""
     for message in messages:
         if message.name == name:
             return message
@@ -177,7 +177,7 @@ def _named(messages: Iterable[Any], name: int) -> Any:
 
 
 def camera_shots(path: Path, every: int = 1) -> Iterator[CameraShot]:
-    """Yield the images of every n-th frame, sorted by frame, then camera."""
+    """Yield the images of every n-th frame, sorted by frame and camera."""
     for number, (where, frame) in enumerate(frames(path)):
         if number % every:
             continue
