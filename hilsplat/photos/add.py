@@ -86,7 +86,7 @@ class PhotoReport:
         if self.unreadable:
             lines.append(f"  {len(self.unreadable):>5}  cannot be read:")
             lines += [f"           {name}: {reason}" for name, reason in self.unreadable]
-        lines += [f"  doubt  {doubt}" for doubt in self.doubts]
+        lines += [f"  warning: {doubt}" for doubt in self.doubts]
         return "\n".join(lines)
 
 
@@ -161,9 +161,9 @@ def add_scene(
         poses: a COLMAP model or transforms file, used instead of structure from motion.
         gaussians: a 3DGS PLY in the coordinates of the poses or in nerfstudio's training coordinates, used
             instead of a fit.
-        features: LangSplat's folder of masks and vectors, used instead of SAM and CLIP.
-        labels: folder of label files of LERF-OVS or `hilsplat annotate`, used only for evaluation and copied
-            to `annotated/photos/<name>/` in the project.
+        features: folder of LangSplat's masks and CLIP vectors, used instead of SAM and CLIP.
+        labels: folder of label files from LERF-OVS or `hilsplat annotate`, used only for evaluation and
+            copied to `annotated/photos/<name>/` in the project.
 
     Raises:
         SceneError: the name is invalid or taken, photographs cannot be read, or there are fewer than three

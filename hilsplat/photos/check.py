@@ -138,8 +138,8 @@ def _motion_doubts(photos: Sequence[CheckedPhoto]) -> list[str]:
     if turned >= MIN_TURN_PAIRS and turned > 2 * moved:
         doubts.append(
             f"the camera seems to turn in place: rotation alone explains {turned} of the {turned + moved} "
-            "pairs of neighbours that could be compared; depth requires different positions: walk around the "
-            "scene, or step sideways between photographs"
+            "pairs of neighbours that could be compared. To measure depth, walk around the scene, or step "
+            "sideways between photographs"
         )
     return doubts
 
@@ -152,7 +152,7 @@ def _listed(names: Sequence[str], photos: Sequence[CheckedPhoto]) -> str:
 
 
 def blur(grey: UInt8[np.ndarray, "h w"]) -> float:
-    """Return the blur of a picture, 0 to 1: the share of its gradient magnitude that another blur preserves.
+    """Return the blur of a picture, 0 to 1: the share of its gradient magnitude that a second blur preserves.
 
     Crete et al., "The blur effect" (2007), with a box of 11 px; the result is the larger of the values along
     x and y. Unlike the Laplacian's variance, it depends little on the content. A flat picture has blur 1.

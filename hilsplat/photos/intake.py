@@ -27,9 +27,9 @@ POSE_SUFFIXES = frozenset({".json", ".txt", ".bin", ".npy", ".ply"})
 def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tuple[Path, list[str]]]:
     """Yield a scene's folder, with notes on its conversion and on skipped files.
 
-    The folder is the source itself or, for videos and archives, is made at `target`. The source is a folder
-    of photographs or of videos only, a video, or a .zip (or Record3D's .r3d). At most `frames` frames are
-    extracted from videos. If the block raises an error, the converted folder is removed.
+    The folder is the source itself or, for videos and archives, a new folder at `target`. The source is a
+    folder of photographs or of videos only, a video, or a .zip (or Record3D's .r3d). At most `frames` frames
+    are extracted from videos. If the block raises an error, the converted folder is removed.
 
     Raises:
         SceneError: the source cannot be used, or the target exists and was made from other files.
@@ -66,7 +66,7 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tu
                 notes = [f"{source.name} unpacked to {target}"]
             write_json(folder / MARK, mark)
     elif (target / MARK).is_file() and read_json(target / MARK) == mark:
-        notes = [f"{target} already exists, made from the same files"]  # left by a run that was killed
+        notes = [f"{target} already exists and was made from the same files"]  # left by a run that was killed
     else:
         fix = "choose another name for the scene, or move that folder"
         raise SceneError(f"{target} already exists", fix=fix)

@@ -74,9 +74,9 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
     """Write selected frames of videos as photographs to a folder, with `origin.json`; return notes.
 
     The camera path through all videos, measured by the displacement of image corners, is divided into `count`
-    sections of equal length, and the sharpest frame of each is selected. A camera at rest gives one frame; a
-    short path gives fewer frames. Frames are rotated upright according to the stream's display matrix and
-    stored as 0001.jpg, 0002.jpg, ... at full size and quality 95. The same videos produce the same bytes.
+    sections of equal length, and the sharpest frame of each is selected. A camera at rest yields one frame; a
+    short path yields fewer than `count`. Frames are rotated upright according to the stream's display matrix,
+    and stored as 0001.jpg, 0002.jpg, ... at full size and quality 95. The same videos produce the same bytes.
 
     A video is decoded twice, once to select and once to write frames, so that only small copies are kept
     in memory.
@@ -114,7 +114,7 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
             )
     chosen = choose_frames(candidates, count)
     if len(chosen) < count:
-        notes.append(f"{len(chosen)} frames instead of {count}: the others are too similar")
+        notes.append(f"{len(chosen)} of {count} requested frames selected: the others are too similar")
     named = {f"{row:04d}.jpg": frame for row, frame in enumerate(chosen, start=1)}
     for position, video in enumerate(videos):
         names = {frame.number: name for name, frame in named.items() if frame.video == position}
@@ -193,8 +193,8 @@ def _decoded(
 def _candidates(video: Path, position: int, most: int, decoding: Decoding) -> list[Frame]:
     """Return the sharpest frame of each of at most `most` equal time spans.
 
-    The stated duration may be wrong, or missing as in browser recordings. If there are too many spans, they
-    are therefore merged in pairs, keeping the sharper frame.
+    The stated duration may be wrong, or missing, as in browser recordings. If this leads to too many spans,
+    they are merged in pairs, keeping the sharper frame.
     """
     best: dict[int, Frame] = {}
     with _opened(video) as (container, stream):

@@ -21,7 +21,7 @@ HLG_SYSTEM_GAMMA = 1.2
 """Reference display for HLG (ITU-R BT.2100)."""
 
 KNEE = 0.6
-"""Linear light, white = 1, above which HDR highlights are compressed towards 1."""
+"""Linear light (white = 1) above which HDR highlights are compressed towards 1."""
 
 BAND_ROWS = 32
 """Number of rows tone-mapped at once, so that they fit into the processor's cache."""

@@ -22,12 +22,12 @@ MIN_VIEWS_FOR_TEST = 8
 """Number of views below which none is held out, because the fit needs all of them."""
 
 MIN_LEVELNESS_GAP = 3.0
-"""Minimum ratio of the second-smallest to the smallest eigenvalue of the cameras' x axes to define up."""
+"""Minimum ratio of the second-smallest to the smallest eigenvalue for the cameras' x axes to define up."""
 
 
 @dataclass(frozen=True)
 class PosedView:
-    """One view: a PNG, the camera of that PNG (before or after undistortion), and the pose in the source."""
+    """One view: a PNG, its camera (before or after undistortion), and its pose in source coordinates."""
 
     view: str
     image: Path
@@ -126,7 +126,7 @@ def move_cameras(
 def split_views(names: Sequence[str], test_every: int) -> dict[str, str]:
     """Hold out every `test_every`-th view by sorted name, starting with the first (3DGS: index % 8 == 0).
 
-    No view is held out if `test_every` is 0 or 1 (1 would leave no training view) or for fewer than 8 views.
+    No view is held out if `test_every` is 0 or 1 (1 leaves no training view) or there are fewer than 8 views.
     """
     ordered = sorted(names)
     holds_out = test_every > 1 and len(ordered) >= MIN_VIEWS_FOR_TEST
@@ -230,7 +230,7 @@ def plot_registration(path: Path, scene: Scene, report: Mapping[str, Any]) -> No
 
 
 def stack_pictures(upper: Path, lower: Path) -> None:
-    """Append a picture below another one, in place, and pad the narrower one with white."""
+    """Append the picture `lower` below `upper`, in place, padding the narrower one with white."""
     pictures = [read_image(path) for path in (upper, lower)]
     width = max(picture.shape[1] for picture in pictures)
     stacked = np.full((sum(map(len, pictures)), width, 3), 255, np.uint8)

@@ -1,4 +1,4 @@
-"""pycolmap, loaded after Pillow (import it from here, never directly), and its models as arrays.
+"""pycolmap, loaded after Pillow (import it only from here), and conversions of its models to arrays.
 
 Measured with pycolmap 4.2.1 and Pillow 13.0: if pycolmap is loaded before Pillow's core, writing a PNG with
 Pillow corrupts the heap, and the process aborts or hangs. The other order works.

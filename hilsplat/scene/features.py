@@ -119,7 +119,7 @@ def prepare_images(sources: Sequence[Path], folder: Path, max_side_px: int) -> l
 
 
 def lenses_of(images: Sequence[WorkImage], camera_model: str, single_camera: str) -> list[Lens]:
-    """Group views that share intrinsics: same size and EXIF focal length ("auto"), all ("yes") or none."""
+    """Group views by lens: by size and EXIF focal length ("auto"), all together ("yes") or singly ("no")."""
     groups: dict[object, list[WorkImage]] = {}
     for image in images:
         key = {"yes": image.size_hw, "no": image.view}.get(single_camera, (image.size_hw, image.focal_px))
@@ -130,7 +130,7 @@ def lenses_of(images: Sequence[WorkImage], camera_model: str, single_camera: str
             "poses.single_camera is yes, but the images have several sizes",
             expected="one size (width x height) for all images",
             found=", ".join(sizes),
-            fix="set poses.single_camera to auto, or remove the images of other sizes",
+            fix="set poses.single_camera to auto, or remove the images with different sizes",
         )
     lenses: list[Lens] = []
     for group in groups.values():
@@ -148,7 +148,7 @@ def find_matches(
     """Add images to a new database, extract features and match them; return the matcher that was used.
 
     Features are extracted on the CPU; the result does not depend on `threads`. Call this in a separate
-    process: if the database cannot be written, COLMAP throws in a C++ thread.
+    process: if the database cannot be written, COLMAP throws an exception in a C++ thread.
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
     pycolmap.Database.open(database).close()  # creates the file
@@ -193,7 +193,7 @@ def incremental_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
 
 
 def verified_matches(database: Path) -> dict[str, dict[str, int]]:
-    """Return the number of verified matches of each view with each other view, by view names."""
+    """Return the number of verified matches between each pair of views, by view name."""
     with pycolmap.Database.open(database) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
         pair_ids, inliers = opened.read_two_view_geometry_num_inliers()

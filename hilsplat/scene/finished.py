@@ -43,7 +43,7 @@ class SceneParts:
 
 @dataclass(frozen=True)
 class FinishedScene:
-    """One variant of a finished scene; it may share artifacts with another variant."""
+    """One variant of a finished scene; it may share artifacts with other variants."""
 
     folder: Path
     variant: str
@@ -53,7 +53,7 @@ class FinishedScene:
     def locate(folder: Path, variant: str = "default") -> "FinishedScene":
         """Find the parts of a variant, all within the scene's folder.
 
-        Inputs are read from provenance; without it, an input is expected beside the artifact made from it. A
+        Input paths are read from provenance; without it, each is expected beside the artifact made from it. A
         variant without a field was scored with another variant's field, recorded in the provenance of its
         scores. During a run, the variant's own CLIP vectors are sufficient, and `default` falls back to those
         of the key views, with a warning.
@@ -113,7 +113,7 @@ class FinishedScene:
         else:
             found = {}
             logger.warning(
-                "%s: no scores or panel record the query settings; using the defaults",
+                "%s: neither scores nor a panel record the query settings; using the defaults",
                 self.folder,
             )
         known = {name: value for name, value in found.items() if name in EvaluateSettings.model_fields}
@@ -146,7 +146,7 @@ def refining(folder: Path) -> str:
 
 
 def is_drawn(scene: Path) -> bool:
-    """Return whether a `Scene` artifact was made from renders of the synthetic world, per its provenance."""
+    """Return whether a `Scene` artifact was made from a synthetic world's renders (from its provenance)."""
     record = read_provenance(scene)
     images = record.inputs.get("images") if record else None
     return images is not None and Path(images.path).parts[-2:] == ("world", "images")
@@ -168,7 +168,7 @@ def _input_of(artifact: Path, name: str, folder: Path) -> Path:
 
 
 def _recorded_input(artifact: Path, name: str, folder: Path) -> Path | None:
-    """Return the path of an artifact's recorded input in the scene folder, which may have moved, or None."""
+    """Return an artifact's recorded input in the scene folder, which may have been moved, or None."""
     record = read_provenance(artifact)
     if record is None or name not in record.inputs:
         return None
@@ -178,12 +178,12 @@ def _recorded_input(artifact: Path, name: str, folder: Path) -> Path | None:
 
 
 def require_same(what: str, scene: str, path: Path, expected_sha256: str) -> None:
-    """Refuse a file that the artifact `what` was not made for."""
+    """Raise MisalignedArtifactError if the artifact `what` was made for a different file."""
     require_made_for(path, sha256_of_file(path), scene, {what: expected_sha256})
 
 
 def require_made_for(path: Path, found_sha256: str, scene: str, made_for: dict[str, str]) -> None:
-    """Refuse a file that artifacts were not made for; `made_for` maps artifacts to expected digests."""
+    """Raise MisalignedArtifactError if a digest in `made_for` (by artifact) differs from the file's."""
     for what, expected in made_for.items():
         if found_sha256 != expected:
             raise MisalignedArtifactError(

@@ -1,4 +1,4 @@
-"""Layouts of folders of photographs and known poses; this module imports fast, for workflow start-up."""
+"""Folder layouts of photographs and known poses. This module imports quickly, for workflow start-up."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ TRAINED = ("output", "outputs", "exports", "language_features")
 """Folders that 3DGS, nerfstudio and LangSplat write beside photographs."""
 
 MODELS = ("sparse/0", "sparse")
-"""Folders of a COLMAP model, in order of preference."""
+"""Possible folders of a COLMAP model, in order of preference."""
 
 MODEL_FILES = ("cameras", "images", "points3D")
 
@@ -79,7 +79,7 @@ def langsplat_features(folder: Path) -> Path | None:
 
 
 def label_files(folder: Path) -> list[Path]:
-    """Return the label files of a LERF-OVS scene, in its `label/` folder or in the one beside the scene."""
+    """Return the label files of a LERF-OVS scene, from its `label/` folder or the one beside the scene."""
     folder = folder.resolve()
     for place in (folder / "label", folder.parent / "label" / folder.name):
         if found := sorted(place.glob("*.json")):
@@ -88,7 +88,7 @@ def label_files(folder: Path) -> list[Path]:
 
 
 def photo_folder(folder: Path) -> Path:
-    """Return the folder of a source's photographs: the source itself, or else an export's image folder."""
+    """Return the folder of a source's photographs: the source itself, its `images/`, or an export's."""
     if list_images(folder):
         return folder
     if (folder / "images").is_dir():
@@ -98,7 +98,7 @@ def photo_folder(folder: Path) -> Path:
 
 
 def has_known_poses(folder: Path, named: Path | None = None) -> bool:
-    """Return whether poses are given, or a folder has poses that `find_known_poses` finds or refuses."""
+    """Return whether poses are given or in the folder, even if `find_known_poses` refuses them."""
     try:
         return find_known_poses(folder, named) is not None
     except SceneError:
@@ -198,7 +198,7 @@ def record3d_export(folder: Path) -> tuple[Path, Path] | None:
 
 
 def unwrapped(folder: Path) -> Path:
-    """Return the folder of the actual content, because archives often wrap it in a single folder."""
+    """Return the folder with the actual files, because archives often wrap them in a single folder."""
     while photo_folder(folder) == folder and not list_images(folder) and not has_known_poses(folder):
         inside = [path for path in folder.iterdir() if not path.name.startswith(".")]
         if len(inside) != 1 or not inside[0].is_dir():

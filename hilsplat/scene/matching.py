@@ -1,7 +1,7 @@
 """Matching of SIFT features between views, and verification by two-view geometry.
 
 The distance measure and limits are COLMAP's. COLMAP's matcher uses approximate neighbours (FAISS); here, all
-inner products of descriptors are computed, in integers, in a third of the time.
+inner products of descriptors are computed in integers, which takes a third of the time.
 """
 
 import copy
@@ -126,7 +126,7 @@ def _is_clear(best: Int32[np.ndarray, " N"], second: Int32[np.ndarray, " N"]) ->
 
 
 def _multiplier(columns: Int8[np.ndarray, "128 N"]) -> Callable[[UInt8[np.ndarray, "R 128"]], np.ndarray]:
-    """Return a function for exact inner products of up to `_BLOCK` descriptors with these columns."""
+    """Return a function that multiplies up to `_BLOCK` descriptors with these columns, exactly."""
     session = _integer_products()
     if session is not None:
         return lambda rows: session.run(None, {"rows": rows, "columns": columns})[0]
@@ -164,7 +164,7 @@ def _integer_products() -> onnxruntime.InferenceSession | None:
 
 
 @compiled
-@no_type_check  # the shape checks of the test-suite cannot be compiled
+@no_type_check  # the test suite's shape checks cannot be compiled
 def _nearest(products, first, best, second, column, best_of_column, second_of_column, row_of_column):
     """Update the two largest products per row and column with a block that starts at row `first`."""
     columns = products.shape[1]

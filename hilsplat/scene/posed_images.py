@@ -19,7 +19,7 @@ OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 """Conversion of camera axes, which is its own inverse."""
 
 HALF_PIXEL = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
-"""Offset added to a K with integer pixel centres; here, the centre of the first pixel is (0.5, 0.5)."""
+"""Offset added to a K with integer pixel centres; in this project, the first pixel's centre is (0.5, 0.5)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""The stage `poses`: a posed scene from photographs, or from images with known poses."""
+"""The `poses` stage: a posed scene from photographs, or from images with known poses."""
 
 import logging
 import shutil
@@ -34,7 +34,7 @@ from hilsplat.settings import PosesSettings
 logger = logging.getLogger(__name__)
 
 INIT_MIN_INLIERS = 50
-"""Minimum number of matches of a model's first pair (COLMAP: 100)."""
+"""Minimum number of matches in a model's first pair (COLMAP: 100)."""
 
 POSE_MIN_INLIERS = 15
 """Minimum number of visible points for posing each further view (COLMAP: 30)."""
@@ -43,7 +43,7 @@ LOST_PICTURE = "not_registered.png"
 """Picture written beside the scene folder if too few photographs were registered."""
 
 WEAK_POINTS_PER_VIEW = 13
-"""Minimum points per registered view in good runs on renders; unusable runs had 4 to 18."""
+"""Fewest points per registered view in any good run on renders; unusable runs had 4 to 18."""
 
 NEIGHBOURS = 3
 """Number of registered photographs reported for each unregistered one."""
@@ -54,8 +54,8 @@ MAX_ROWS = 12
 THUMBNAIL_PX = 400
 
 ADVICE = (
-    "Take more photographs between each of these and those on its right, in steps of less than 10 degrees; "
-    "leave out those that show something else or are blurred."
+    "Take more photographs between each of these and its neighbours on the right, less than 10 degrees "
+    "apart; remove photographs that are blurred or show something else."
 )
 
 
@@ -74,7 +74,7 @@ def run_poses(
 
     A folder with known poses, such as a COLMAP model (`sparse/`) or a `transforms*.json`, is imported; any
     other folder is posed by structure from motion. The result depends on images, settings and seed, but not
-    on `threads`: features and matches are computed pair by pair, and the mapping runs on one thread.
+    on `threads`: each image and pair is processed independently, and the mapping runs on one thread.
 
     Args:
         unit: "metre" or "arbitrary": the unit of imported poses. Structure from motion cannot recover metric
@@ -276,7 +276,7 @@ def _why_not(view: str, entry: Mapping[str, Any], members: Sequence[set[str]]) -
 
 
 def check_registration(images: Path, name: str, report: Mapping[str, Any], settings: PosesSettings) -> None:
-    """Refuse a reconstruction with too few views or several models; log warnings about an accepted one."""
+    """Refuse a reconstruction with too few views or several models; otherwise log its warnings."""
     total, registered = report["images"], report["registered"]
     lost = [entry for entry in report["views"].values() if not entry["registered"]]
     listing = "".join(f"\n            {entry['file']}: {entry['why_not']}" for entry in lost)
@@ -306,7 +306,7 @@ def check_registration(images: Path, name: str, report: Mapping[str, Any], setti
             f"the photographs of {name} form {len(report['models'])} separate models",
             expected="one model (poses.several_models is stop)",
             found=f"models of {sizes} views; not in the largest:{listing}",
-            fix=f"{advice}; to continue with the largest, set poses.several_models to largest",
+            fix=f"{advice}; to use only the largest model, set poses.several_models to largest",
         )
     for warning in report["warnings"]:
         logger.warning("%s: %s", name, warning)

@@ -14,7 +14,7 @@ from hilsplat.scene.cameras import Cameras
 
 @dataclass(frozen=True)
 class Scene:
-    """A posed scene: the output `scene/` of the stage `poses`, which all later stages read.
+    """A posed scene: the output `scene/` of the `poses` stage, which all later stages read.
 
     Attributes:
         folder: the scene artifact; images are `folder/images/<view name>`.

@@ -47,7 +47,7 @@ WORLD_SOURCE = re.compile(r"world:([a-z][a-z0-9_-]*):([0-9]{1,9})")
 
 @dataclass(frozen=True)
 class SceneRow:
-    """One scene in the sheet. Paths are resolved; `data:` paths are None without a data root.
+    """One scene in the sheet. Paths are resolved; `data:` paths are None if no data root is set.
 
     Attributes:
         dataset: first part of the scene's path under `results/`; `scene` is the second.
@@ -99,9 +99,9 @@ def read_sheet(
 
     Args:
         checked_groups: groups whose source folders must exist and contain images; None for all. A run checks
-            only the groups it runs, so that a missing folder of another group does not stop it.
-        data_root: folder of the published data sets, the base of `data:` sources, which may not exist; empty
-            if not set.
+            only the groups it runs, so that a missing folder in a different group does not stop it.
+        data_root: folder of the published data sets, to which `data:` sources are relative (they need not
+            exist); empty if not set.
 
     Raises:
         SceneError: the sheet cannot be used; the message names line, column and fix.
@@ -139,7 +139,7 @@ def read_sheet(
 
 
 def row_of_data(name: str, data_root: str) -> SceneRow:
-    """Return the row of a scene in metres that is not listed in a sheet, such as `waymo/<segment>`."""
+    """Return a row, in metres, for a scene that is not listed in a sheet, such as `waymo/<segment>`."""
     dataset, _, scene = name.partition("/")
     folder = Path(data_root).expanduser() / name
     return SceneRow(dataset, scene, dataset, f"{DATA_PREFIX}{name}", "metre", folder)

@@ -83,8 +83,8 @@ def import_poses(
         origin_of_points = "triangulated from the known poses"
         if len(points[0]) < MIN_TRIANGULATED:
             warnings.append(
-                f"only {len(points[0])} points could be triangulated; replaced by "
-                f"{NUM_RANDOM_POINTS} random ones in front of the cameras"
+                f"only {len(points[0])} points could be triangulated, so "
+                f"{NUM_RANDOM_POINTS} random points in front of the cameras are used instead"
             )
             points = random_points(views, seed)
             origin_of_points = "random"
@@ -185,7 +185,7 @@ def _read_as_described(path: Path, camera: pycolmap.Camera) -> UInt8[np.ndarray,
 def triangulate(
     views: Sequence[PosedView], work: Path, settings: PosesSettings, seed: int, threads: int
 ) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
-    """Triangulate sparse points of pinhole views at their known poses, after feature matching."""
+    """Match features of pinhole views, and triangulate sparse points from their known poses."""
     if len(views) < 2:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)
     folder, database = views[0].image.parent, work / "triangulation.db"

@@ -34,7 +34,7 @@ FARTHEST = 1e9
 """Maximum coordinate, in the source's units; 32-bit numbers cannot resolve scenes beyond it."""
 
 MAX_VIEWS = 300
-"""Maximum number of views of a phone export, sampled evenly, because a recording has many more frames than a
+"""Maximum number of views used from a phone export, sampled evenly: a recording has many more frames than a
 scene needs (nerfstudio: 300 for Record3D, 600 for Polycam)."""
 
 POLYCAM_BORDER_PX = 15
@@ -76,7 +76,7 @@ def read_source(known: KnownPoses) -> tuple[list[KnownView], Points | None]:
 
 
 def checked(views: list[KnownView], known: KnownPoses) -> list[KnownView]:
-    """Return the views; refuse invalid lenses or poses, and three or more views if all poses are the same."""
+    """Return the views; refuse invalid lenses and poses, and three or more views that share one pose."""
     for view in views:
         values = np.array([*view.camera.params, view.camera.width, view.camera.height], np.float64)
         focal = [view.camera.params[row] for row in view.camera.focal_length_idxs()]
@@ -242,9 +242,9 @@ def _read_ply_points(path: Path) -> Points:
 def read_llff(known: KnownPoses) -> list[KnownView]:
     """Read the posed views of an LLFF scene; row i of `poses_bounds.npy` belongs to the i-th image by name.
 
-    The first 15 of its 17 numbers are a 3 x 5 matrix, row by row: rotation columns (down, right, back),
+    The first 15 of a row's 17 numbers are a 3 x 5 matrix, by rows: rotation columns (down, right, back),
     translation, and the column (height, width, focal). OpenCV's axes are x = right, y = down, z = -back. The
-    last two are the near and the far depth. The lens is SIMPLE_PINHOLE with its centre in the middle, for the
+    last two are the near and far depths. The lens is SIMPLE_PINHOLE with its centre in the middle, for the
     image size on disk.
     """
     path, folder = known.files[0], known.root / "images"

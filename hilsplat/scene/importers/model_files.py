@@ -18,7 +18,7 @@ POSE_BYTES = 56
 
 
 def _number(data: mmap.mmap, form: str) -> int:
-    """Read a record's start up to and including its only number; raise struct.error beyond the file's end."""
+    """Read bytes laid out as `form`, and return their only number; raise struct.error past the file's end."""
     (found,) = struct.unpack(f"<{form}", data.read(struct.calcsize(f"<{form}")))
     return int(found)
 

@@ -12,7 +12,7 @@ from hilsplat.scene.layouts import read_json_object
 FIX = "copy it again from nerfstudio"
 
 BEFORE_APPLIED_TRANSFORM = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
-"""Transform of COLMAP's coordinates in versions of `ns-process-data` that record no `applied_transform`."""
+"""How versions of `ns-process-data` that record no `applied_transform` transform COLMAP's coordinates."""
 
 
 def source_from_dataparser(dataparser: Path, transforms: Path | None) -> Float64[np.ndarray, "4 4"]:

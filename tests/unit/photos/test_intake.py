@@ -78,7 +78,7 @@ def test_a_resting_camera_gives_one_frame_despite_jitter(tmp_path):
     video = write_video(tmp_path / "a.mp4", pan(tremble))
     _, notes, origin = extracted([video], tmp_path, 20)
     assert len(origin["frames"]) == 1
-    assert notes == ["1 frames instead of 20: the others are too similar"]
+    assert notes == ["1 of 20 requested frames selected: the others are too similar"]
 
 
 def test_frames_are_spread_over_the_path_rather_than_time(tmp_path):
@@ -286,7 +286,7 @@ def test_a_command_that_was_killed_after_it_unpacked_resumes(tmp_path, sheet):
     with prepared_photographs(video, made, 10):
         before = sorted(path.stat().st_mtime_ns for path in made.glob("*.*"))
     report = add_scene(sheet, "desk", video, frames=10)  # no frame is extracted again
-    assert report.num_readable == 10 and "already exists, made from the same files" in str(report)
+    assert report.num_readable == 10 and "already exists and was made from the same files" in str(report)
     assert sorted(path.stat().st_mtime_ns for path in made.glob("*.*")) == before
 
 
