@@ -26,7 +26,7 @@ NO_POSES = Path("none")
 """Value used instead of a path to ignore the poses in the folder."""
 
 DATAPARSER = "dataparser_transforms.json"
-"""File in which nerfstudio records its training coordinates."""
+"""File in which nerfstudio records the transform to its training coordinates."""
 
 EXPORTED = ("exports/*/splat.ply", "exports/splat.ply", "splat.ply", "point_cloud.ply")
 """Paths of a PLY exported by nerfstudio or a viewer; a PLY written by 3DGS is preferred."""
@@ -54,10 +54,10 @@ def trained_gaussians(folder: Path) -> Path | None:
 
 
 def dataparser_of(ply: Path, source: Path) -> Path | None:
-    """Return the file with the training coordinates of nerfstudio's PLY, or None for other PLYs.
+    """Return the `DATAPARSER` file of a PLY trained by nerfstudio, or None for other PLYs.
 
-    The file is in the PLY's folder or, if the PLY has nerfstudio's file name, in the source's folder or the
-    folder of the latest training run.
+    It is searched for in the PLY's folder and, if the PLY has nerfstudio's file name, in the source folder
+    and the folder of the latest training run.
     """
     places = [ply.parent]
     if ply.name == "splat.ply":
@@ -67,7 +67,7 @@ def dataparser_of(ply: Path, source: Path) -> Path | None:
 
 
 def transforms_of(folder: Path, named: Path | None = None) -> Path | None:
-    """Return the transforms file with a folder's poses (`find_known_poses`); None if it does not exist."""
+    """Return the transforms file if `find_known_poses` selects one for a folder, else None."""
     known = find_known_poses(folder, named)
     return known.files[0] if known is not None and known.kind == "transforms" else None
 
@@ -88,7 +88,7 @@ def label_files(folder: Path) -> list[Path]:
 
 
 def photo_folder(folder: Path) -> Path:
-    """Return the folder of a source's photographs: the source itself, its `images/`, or an export's."""
+    """Return the folder of a source's photographs: the source, its `images/`, or a phone export's images."""
     if list_images(folder):
         return folder
     if (folder / "images").is_dir():
@@ -122,7 +122,7 @@ class KnownPoses:
 
 
 def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | None:
-    """Find poses of COLMAP, transforms files, LLFF, Polycam or Record3D, in this order, or return None.
+    """Find poses from COLMAP, transforms files, LLFF, Polycam or Record3D, in this order, or return None.
 
     If `named` is a COLMAP model, a transforms file, or a folder with either, it is used instead of the poses
     in `folder`; `NO_POSES` ignores all poses.
@@ -153,7 +153,7 @@ def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | No
             f"{folder / 'sparse'} does not contain a complete COLMAP model",
             expected="cameras, images and points3D, all .bin or all .txt, in sparse/0/ or sparse/",
             found=", ".join(sorted(path.name for path in (folder / "sparse").rglob("*"))) or "nothing",
-            fix="complete the model, or rename sparse/ to compute the poses",
+            fix="add the missing files, or rename sparse/ so that the poses are computed",
         )
     return None
 
@@ -180,7 +180,7 @@ def _is_model(folder: Path) -> bool:
 
 
 def polycam_folders(folder: Path) -> tuple[Path, Path] | None:
-    """Return the folders of images and cameras in a raw Polycam export, preferably the corrected ones."""
+    """Return a raw Polycam export's image and camera folders (corrected ones if present), or None."""
     for prefix in ("corrected_", ""):
         images, cameras = (folder / "keyframes" / f"{prefix}{what}" for what in ("images", "cameras"))
         if images.is_dir() and cameras.is_dir():
@@ -189,7 +189,7 @@ def polycam_folders(folder: Path) -> tuple[Path, Path] | None:
 
 
 def record3d_export(folder: Path) -> tuple[Path, Path] | None:
-    """Return the images and pose file of a Record3D export (image sequence or unpacked .r3d), or None."""
+    """Return the image folder and pose file of a Record3D export (images or unpacked .r3d), or None."""
     for metadata in (folder / "metadata.json", folder / "metadata"):
         for images in (folder / "rgb", folder / "rgbd"):
             if metadata.is_file() and images.is_dir():

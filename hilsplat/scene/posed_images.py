@@ -1,4 +1,4 @@
-"""Images with known pose and lens, and the folder format from which `poses` imports them."""
+"""Images with known poses and lenses, and the folder format from which `poses` imports them."""
 
 import json
 import shutil
@@ -48,7 +48,7 @@ class PosedImage:
 
 
 def rigid_pose(world_from_cam: Float[np.ndarray, "..."], where: str) -> Float64[np.ndarray, "4 4"]:
-    """Return a camera-to-world matrix, 3 x 4 or 4 x 4, as 4 x 4; refuse a matrix that is not rigid.
+    """Return a 3 x 4 or 4 x 4 camera-to-world matrix as 4 x 4; raise an error if it is not rigid.
 
     Raises:
         SceneError: it is not 3 x 4 or 4 x 4, is not finite, scales or mirrors, or does not end in 0 0 0 1.
@@ -61,7 +61,7 @@ def rigid_pose(world_from_cam: Float[np.ndarray, "..."], where: str) -> Float64[
     if not usable:
         raise SceneError(
             f"{where}: the pose is not a rotation and translation",
-            expected="a 4 x 4 camera-to-world matrix, last row 0 0 0 1, without scale or mirroring",
+            expected="a 4 x 4 camera-to-world matrix with last row 0 0 0 1 and no scaling or mirroring",
             found=np.array2string(world_from_cam, precision=4, suppress_small=True).replace("\n", ""),
             fix="export the poses again, without scaling the cameras",
         )
@@ -76,9 +76,9 @@ def write_posed_images(
 ) -> None:
     """Write `images/` and `transforms.json` (OpenGL axes, intrinsics per frame) as a source for `poses`.
 
-    Images are copied byte for byte; distortion is kept, because `poses` undistorts them. Points, if any, are
-    in the unit of the poses, and become the scene's sparse points in the same order (`points.ply`). An
-    existing folder is replaced.
+    Images are copied byte for byte; distortion is kept, because `poses` undistorts them. Points, if given,
+    must be in the unit of the poses; `points.ply` stores them, and they become the scene's sparse points in
+    the same order. An existing folder is replaced.
     """
     names = [image.name for image in images]
     twice = sorted(name for name, count in Counter(names).items() if count > 1)

@@ -46,7 +46,7 @@ def import_poses(
     seed: int,
     threads: int,
 ) -> dict[str, Any]:
-    """Write the Scene artifact of a folder with known poses, and return the registration report.
+    """Write the Scene artifact for a folder with known poses, and return the registration report.
 
     Images are matched to poses by name; the report lists poses without an image and images without a pose.
     Pixels are used as stored, because COLMAP ignores the EXIF orientation. The source's axes are kept.
@@ -68,7 +68,7 @@ def import_poses(
             f"too few posed views of {name} have an image in {known.root}",
             expected=f"at least {least:.0%} of {total} (poses.min_registered_share)",
             found=f"{len(present)}; missing: {listed}",
-            fix="put the images where the pose file expects them: in images/ or beside it",
+            fix="put the images where the pose file expects them: in this folder or its images/ folder",
         )
     named = list(zip(present, files, view_names(files), strict=True))
     views = [
@@ -153,7 +153,7 @@ def _with_pixels(view: KnownView, file: Path, view_name: str, folder: Path, max_
 def _without_border(
     pixels: UInt8[np.ndarray, "H W 3"], camera: pycolmap.Camera, border_px: int
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Crop a border, given in px of the camera, from an image, and adapt the camera in place."""
+    """Crop a border, specified in camera px, from an image, and adapt the camera in place."""
     border_px = math.ceil(border_px * pixels.shape[1] / camera.width)
     camera.rescale(pixels.shape[1], pixels.shape[0])
     camera.width -= 2 * border_px
@@ -216,7 +216,7 @@ def random_points(
     generator = np.random.default_rng(seed)
     centres = np.stack([view.centre for view in views])
     looks = np.stack([view.cam_from_source[2, :3] for view in views])
-    # Least-squares point nearest to all axes, with a weak prior one camera spread ahead of the cameras.
+    # Least-squares point nearest to all axes; a weak prior pulls it to one spread ahead of the cameras.
     spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()) or 1.0
     across = np.eye(3)[None] - looks[:, :, None] * looks[:, None, :]
     prior = 1e-3

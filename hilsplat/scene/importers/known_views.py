@@ -1,6 +1,6 @@
 """Readers of posed views: COLMAP, transforms.json (nerfstudio, Blender), LLFF, Polycam, Record3D.
 
-All readers raise SceneError if a file cannot be used. Layouts and axes of phone exports are those of
+All readers raise SceneError if a file cannot be used. The layouts and axes of phone exports match those in
 nerfstudio's `polycam_utils.py`, `record3d_utils.py` and `process_data.py`.
 """
 
@@ -31,7 +31,7 @@ Points = tuple[np.ndarray, np.ndarray]
 AGAIN = "export it again"
 
 FARTHEST = 1e9
-"""Maximum coordinate, in the source's units; 32-bit numbers cannot resolve scenes beyond it."""
+"""Maximum coordinate, in the source's units; beyond it, 32-bit numbers are too coarse."""
 
 MAX_VIEWS = 300
 """Maximum number of views used from a phone export, sampled evenly: a recording has many more frames than a
@@ -76,7 +76,7 @@ def read_source(known: KnownPoses) -> tuple[list[KnownView], Points | None]:
 
 
 def checked(views: list[KnownView], known: KnownPoses) -> list[KnownView]:
-    """Return the views; refuse invalid lenses and poses, and three or more views that share one pose."""
+    """Return the views; refuse invalid lenses and poses, and three or more views that all share one pose."""
     for view in views:
         values = np.array([*view.camera.params, view.camera.width, view.camera.height], np.float64)
         focal = [view.camera.params[row] for row in view.camera.focal_length_idxs()]
@@ -125,7 +125,7 @@ def read_colmap(known: KnownPoses) -> tuple[list[KnownView], Points]:
 
 
 def _find_image(root: Path, name: str) -> Path | None:
-    """Find an image named in a source, with or without a suffix, in the folder or its images/."""
+    """Find an image by the name in the pose file, with or without a suffix, in `root` or its `images/`."""
     _check_inside(root, name)
     for base in (root / "images", root):
         candidate = base / name
@@ -138,7 +138,7 @@ def _find_image(root: Path, name: str) -> Path | None:
 
 
 def _check_inside(root: Path, name: str) -> None:
-    """Refuse names of files outside the source's folder, which downloaded data could otherwise access."""
+    """Refuse paths outside the source folder, so that downloaded data cannot access other files."""
     if Path(name).is_absolute() or Path(os.path.normpath(name)).parts[:1] == ("..",):
         raise SceneError(
             f"the poses in {root} refer to a file outside it: {name}",
@@ -229,8 +229,8 @@ def _read_ply_points(path: Path) -> Points:
         xyz = np.stack([vertex[axis] for axis in ("x", "y", "z")], axis=1).astype(np.float64)
     except (OSError, PlyParseError, KeyError, ValueError) as error:
         raise SceneError(
-            f"the points of {path} cannot be read: {error}",
-            fix="put the file there, or remove ply_file_path from the transforms file to compute points",
+            f"the points in {path} cannot be read: {error}",
+            fix="put the file there, or remove ply_file_path from the transforms file to triangulate points",
         ) from error
     if {"red", "green", "blue"} <= set(vertex.dtype.names):
         rgb = np.stack([vertex[colour] for colour in ("red", "green", "blue")], axis=1).astype(np.uint8)
@@ -275,7 +275,7 @@ def read_llff(known: KnownPoses) -> list[KnownView]:
     if len(images) != len(rows):
         raise SceneError(
             f"{path} has {len(rows)} poses for {len(images)} images",
-            expected="one row per image, in the order of their names",
+            expected="one row per image, in order of file name",
             found=f"{images[0].name} to {images[-1].name}" if images else "no images",
             fix="unpack the images again, and remove files that are not photographs of the scene",
         )
@@ -294,7 +294,7 @@ def read_polycam(known: KnownPoses) -> list[KnownView]:
     """Read the posed views of a raw Polycam export.
 
     `keyframes/cameras/<stem>.json`, or its corrected version, contains fx, fy, cx, cy, width, height in px,
-    and t_00 ... t_23, the camera-to-world matrix by rows, metres, OpenGL axes.
+    and t_00 ... t_23, the rows of the camera-to-world matrix, in metres and OpenGL axes.
     """
     images, cameras = known.files
     border_px = POLYCAM_BORDER_PX if images.name.startswith("corrected") else 0
@@ -323,8 +323,8 @@ def read_polycam(known: KnownPoses) -> list[KnownView]:
 def read_record3d(known: KnownPoses) -> list[KnownView]:
     """Read the posed views of a Record3D export.
 
-    `metadata` contains `K` by columns, `w` and `h` in px, and `poses`, one row per image <number>.jpg:
-    quaternion xyzw and position of the camera in the world, metres, OpenGL axes.
+    `metadata` contains `K` in column order, `w` and `h` in px, and `poses`. Row i of `poses` is the camera's
+    quaternion (xyzw) and position in the world for image <i>.jpg, in metres and OpenGL axes.
     """
     from scipy.spatial.transform import Rotation
 

@@ -1,6 +1,6 @@
 """Check that the binary files of a COLMAP model are complete.
 
-pycolmap does not check record counts: a truncated file or wrong count makes it allocate unlimited memory.
+pycolmap does not check record counts: a truncated file or a wrong count makes it allocate unlimited memory.
 """
 
 import mmap
@@ -41,7 +41,7 @@ def _image(data: mmap.mmap) -> None:
     _skip(data, 4 + POSE_BYTES + 4)
     end = data.find(b"\0")
     if end < 0:
-        raise ValueError("a name is not terminated")
+        raise ValueError("an image name is not terminated")
     data.seek(end + 1)
     _skip(data, 24 * _number(data, "Q"))
 

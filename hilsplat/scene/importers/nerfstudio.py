@@ -1,4 +1,4 @@
-"""nerfstudio's training coordinates: its data parser rotates, centres and scales the poses."""
+"""nerfstudio's training coordinates, for which its data parser rotates, centres and scales the poses."""
 
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from hilsplat.scene.layouts import read_json_object
 FIX = "copy it again from nerfstudio"
 
 BEFORE_APPLIED_TRANSFORM = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
-"""How versions of `ns-process-data` that record no `applied_transform` transform COLMAP's coordinates."""
+"""Transform of COLMAP coordinates by `ns-process-data` versions that do not record `applied_transform`."""
 
 
 def source_from_dataparser(dataparser: Path, transforms: Path | None) -> Float64[np.ndarray, "4 4"]:
@@ -21,7 +21,7 @@ def source_from_dataparser(dataparser: Path, transforms: Path | None) -> Float64
     `dataparser_transforms.json` maps original coordinates, usually COLMAP's, to training coordinates:
     `x_training = scale * (transform @ [x_original, 1])`. The poses in `transforms.json` are in a third
     coordinate system, which `applied_transform` and `applied_scale` in that file relate to the original one.
-    Without `transforms`, the poses are in a COLMAP model.
+    If `transforms` is None, the poses are those of a COLMAP model.
     """
     content = read_json_object(dataparser, FIX)
     applied, applied_scale = np.eye(4), 1.0
