@@ -19,7 +19,7 @@ from hilsplat.scene.scene import Scene
 logger = logging.getLogger(__name__)
 
 MIN_VIEWS_FOR_TEST = 8
-"""Number of views below which none is held out, because the fit needs all of them."""
+"""Minimum number of views for a test split; with fewer, the fit needs all of them."""
 
 MIN_LEVELNESS_GAP = 3.0
 """Minimum ratio of the second-smallest to the smallest eigenvalue for the cameras' x axes to define up."""
@@ -36,7 +36,7 @@ class PosedView:
 
     @property
     def centre(self) -> Float64[np.ndarray, " 3"]:
-        """Camera centre, source coordinates."""
+        """Camera centre in source coordinates."""
         return -self.cam_from_source[:3, :3].T @ self.cam_from_source[:3, 3]
 
 
@@ -96,8 +96,8 @@ def normalising_similarity(
 
     The origin is the median of the sparse points, or of the camera centres if there are no points. The unit
     is the median distance of the cameras from the origin, so every scene has a size of a few units; metric
-    sources keep the metre. With `turn`, +z is the cameras' up direction, because the rotation from structure
-    from motion is arbitrary; imported poses keep their axes.
+    sources keep the metre. If `turn` is set, +z becomes the cameras' up direction, because structure from
+    motion produces an arbitrary rotation; imported poses keep their axes.
     """
     rotations = cam_from_source[:, :3, :3]
     centres = -np.einsum("vji,vj->vi", rotations, cam_from_source[:, :3, 3])
@@ -153,9 +153,9 @@ def write_scene(
 
     Args:
         unit: "metre" keeps the source's scale; for any other unit, the scale is normalised.
-        report: registration report; this function adds split, size and focal length per view.
+        report: registration report; this function adds each view's split, size and focal length.
         turn: rotate the scene so that +z is up.
-        lost: picture of the unregistered photographs, appended to the plot of the cameras.
+        lost: picture of the unregistered photographs, appended to the camera plot.
     """
     views = sorted(views, key=lambda view: view.view)
     source_poses = np.stack([view.cam_from_source for view in views])

@@ -1,7 +1,7 @@
 """pycolmap, loaded after Pillow (import it only from here), and conversions of its models to arrays.
 
 Measured with pycolmap 4.2.1 and Pillow 13.0: if pycolmap is loaded before Pillow's core, writing a PNG with
-Pillow corrupts the heap, and the process aborts or hangs. The other order works.
+Pillow corrupts the heap, and the process aborts or hangs. The reverse order works.
 """
 
 import numpy as np

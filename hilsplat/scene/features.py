@@ -19,10 +19,10 @@ from hilsplat.settings import PosesSettings
 logger = logging.getLogger(__name__)
 
 EXHAUSTIVE_UP_TO = 200
-"""Maximum number of views for which the matcher "auto" tries every pair, not only neighbours by name."""
+"""Maximum number of views for which matcher "auto" tries every pair instead of only neighbours by name."""
 
 SEQUENTIAL_STEPS = sorted({*range(1, 11), *(2**power for power in range(10))})
-"""Distances, in name order, between the two views of a pair in sequential matching."""
+"""Offsets, in name order, between the views that sequential matching pairs."""
 
 MIN_INLIERS = 12
 """Minimum number of verified matches per pair (COLMAP: 15)."""
@@ -34,10 +34,10 @@ MAX_TRIALS = 1000
 """Maximum RANSAC trials per pair (COLMAP: 10000); pairs without overlap use all of them."""
 
 WORK_COMPRESSION = 1
-"""zlib compression level of work images; a third faster than level 6. COLMAP reads each image only once."""
+"""zlib compression level of work images, a third faster than level 6; COLMAP reads each image only once."""
 
 PLANE_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-"""EXIF unit of the focal plane resolution -> mm (default: inch)."""
+"""Millimetres per unit of the focal plane resolution, by EXIF unit code (default: inch)."""
 EXIF_ORIENTATION = ExifTags.Base.Orientation
 DIAGONAL_35MM = 43.2666
 """Diagonal of a 35 mm frame in mm, the reference of the equivalent focal length in EXIF."""
@@ -48,7 +48,7 @@ Lens = tuple[list[str], str, list[float] | None]
 
 @dataclass(frozen=True)
 class WorkImage:
-    """Copy of a photograph (`source`) for structure from motion: upright, shrunk, a PNG named after the view.
+    """Upright, downscaled PNG of a photograph (`source`) for structure from motion, named after the view.
 
     `focal_px` is the focal length from EXIF, in px of the copy, or None.
     """
@@ -60,7 +60,7 @@ class WorkImage:
 
 
 def exif_focal_px(path: Path, size_hw: tuple[int, int]) -> float | None:
-    """Return the focal length from EXIF, in px of the picture shrunk to the given size, or None.
+    """Return the focal length from EXIF, in px of the image resized to `size_hw`, or None.
 
     It is computed from the 35 mm equivalent or else from the focal length and the focal plane resolution.
     """
@@ -69,7 +69,7 @@ def exif_focal_px(path: Path, size_hw: tuple[int, int]) -> float | None:
             tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
             size = image.size
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError):
-        return None  # damaged EXIF is ignored; whether the pixels can be read is checked elsewhere
+        return None  # damaged EXIF is ignored; unreadable pixels are reported elsewhere
 
     def number(tag: ExifTags.Base) -> float:
         try:
@@ -82,14 +82,14 @@ def exif_focal_px(path: Path, size_hw: tuple[int, int]) -> float | None:
         return focal / DIAGONAL_35MM * float(np.hypot(*size_hw))
     unit_mm = PLANE_UNIT_MM.get(int(number(ExifTags.Base.FocalPlaneResolutionUnit)), 25.4)
     pixels_per_mm = number(ExifTags.Base.FocalPlaneXResolution) / unit_mm
-    # The resolution refers to the picture as stored by the camera; programs that shrink it keep these tags.
+    # The resolution refers to the image stored by the camera; programs that downscale it keep these tags.
     stored = (number(ExifTags.Base.ExifImageWidth), number(ExifTags.Base.ExifImageHeight))
     stored_px = max(stored) or max(size)
     return number(ExifTags.Base.FocalLength) * pixels_per_mm * max(size_hw) / stored_px or None
 
 
 def prepare_images(sources: Sequence[Path], folder: Path, max_side_px: int) -> list[WorkImage]:
-    """Write every photograph as an upright PNG with a longer side of at most `max_side_px` to a work folder.
+    """Write each photograph to `folder` as an upright PNG with a longer side of at most `max_side_px`.
 
     Raises:
         ImageError: files cannot be read; the message names all of them.
@@ -130,7 +130,7 @@ def lenses_of(images: Sequence[WorkImage], camera_model: str, single_camera: str
             "poses.single_camera is yes, but the images have several sizes",
             expected="one size (width x height) for all images",
             found=", ".join(sizes),
-            fix="set poses.single_camera to auto, or remove the images with different sizes",
+            fix="set poses.single_camera to auto, or keep only images of one size",
         )
     lenses: list[Lens] = []
     for group in groups.values():
@@ -152,7 +152,7 @@ def find_matches(
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
     pycolmap.Database.open(database).close()  # creates the file
-    # Feature extraction would add images as its threads finish, so ids and results would depend on timing.
+    # Import first: extraction would add images as its threads finish, so results would depend on timing.
     names: list[str] = []
     for views, camera_model, params in lenses:
         reader = pycolmap.ImageReaderOptions()
@@ -205,7 +205,7 @@ def verified_matches(database: Path) -> dict[str, dict[str, int]]:
 
 
 def count_matches(database: Path) -> dict[str, dict[str, int]]:
-    """Return the registration report's entries per view: features, and verified matches with other views.
+    """Count each view's features and its verified matches with other views, for the registration report.
 
     Two views count as matched if they have at least `MIN_INLIERS` verified matches.
     """

@@ -19,10 +19,10 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SceneParts:
-    """Paths of the artifacts that queries of one variant of a scene require.
+    """Paths of the artifacts needed to query one variant of a scene.
 
     Attributes:
-        field: language field; None if it does not exist yet, in which case queries use the tree alone.
+        field: language field; None if it does not exist yet, in which case queries use only the tree.
         autoencoder: decoder from the field's features to CLIP vectors; None if there is no field.
         clip: CLIP vectors of the masks; its index records the model, which also embeds the queries.
     """
@@ -51,12 +51,12 @@ class FinishedScene:
 
     @staticmethod
     def locate(folder: Path, variant: str = "default") -> "FinishedScene":
-        """Find the parts of a variant, all within the scene's folder.
+        """Find the artifacts of a variant, all of which are in the scene folder.
 
         Input paths are read from provenance; without it, each is expected beside the artifact made from it. A
-        variant without a field was scored with another variant's field, recorded in the provenance of its
-        scores. During a run, the variant's own CLIP vectors are sufficient, and `default` falls back to those
-        of the key views, with a warning.
+        variant without a field uses the field recorded in the provenance of its scores. During a run, the
+        variant's own CLIP vectors are sufficient. Until `default` has any, those of the key views are used,
+        with a warning.
 
         Raises:
             ArtifactError: the folder, the variant or a part is missing.
@@ -96,7 +96,7 @@ class FinishedScene:
 
     @property
     def naming(self) -> Path:
-        """Folder of the node names (may not exist), beside the CLIP vectors that they were computed from."""
+        """Folder of node names, beside the CLIP vectors used to compute them; it may not exist."""
         return self.parts.clip.parent / "names"
 
     def evaluate_settings(self) -> EvaluateSettings:
@@ -122,8 +122,8 @@ class FinishedScene:
         except ValidationError as error:
             raise ArtifactError(
                 f"the recorded query settings are not valid: {error.errors(include_url=False)[0]['msg']}",
-                expected="values of EvaluateSettings",
-                fix="remove the damaged provenance of the scores, or run the workflow again",
+                expected="settings that EvaluateSettings accepts",
+                fix="delete the damaged provenance file of the scores, or rerun the workflow",
             ) from error
 
 
@@ -132,14 +132,14 @@ def require_scene_folder(folder: Path) -> None:
     if not folder.is_dir():
         raise ArtifactError(
             f"scene folder {folder} is missing",
-            expected="results/<dataset>/<scene> of a run, or a copy of it",
+            expected="a run's folder results/<dataset>/<scene>, or a copy of it",
             found=f"no such folder in {Path.cwd()}",
             fix="correct the path, or specify the results folder",
         )
 
 
 def refining(folder: Path) -> str:
-    """Return a sentence with the number of key views that are used until the run ends."""
+    """Return a message that states how many key views are used until the run ends."""
     used = len(read_index(folder / KEY_VIEWS / "masks")["views"])
     train = sum(entry["split"] == "train" for entry in read_index(folder / "scene")["views"].values())
     return f"{folder.parent.name}/{folder.name} uses {used} of {train} photographs until the run ends"
@@ -163,12 +163,12 @@ def _unfinished(folder: Path, missing: Path) -> ArtifactError:
 
 
 def _input_of(artifact: Path, name: str, folder: Path) -> Path:
-    """Return the path of an artifact's input: from its provenance, else beside the artifact."""
+    """Return the path of an artifact's input from its provenance or, if not recorded, beside the artifact."""
     return _recorded_input(artifact, name, folder) or artifact.parent / name
 
 
 def _recorded_input(artifact: Path, name: str, folder: Path) -> Path | None:
-    """Return an artifact's recorded input in the scene folder, which may have been moved, or None."""
+    """Return the path of an artifact's recorded input, even if the scene folder was moved, or None."""
     record = read_provenance(artifact)
     if record is None or name not in record.inputs:
         return None

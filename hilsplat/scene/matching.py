@@ -26,11 +26,11 @@ MAX_RATIO = 0.8
 """Maximum ratio of the angles to the nearest and the second-nearest descriptor (as in COLMAP)."""
 
 MIN_MATCHES = 15
-"""Number of matches below which a pair counts as unmatched (as in COLMAP)."""
+"""Minimum number of matches for a pair to count as matched (as in COLMAP)."""
 
 _CHANNELS = 128
 _LENGTH = 512.0  # length of a descriptor in COLMAP's database
-_BLOCK = 128  # descriptors per block, so that the products fit into the processor's cache
+_BLOCK = 128  # descriptors per block; their products fit into the CPU cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,14 +131,14 @@ def _multiplier(columns: Int8[np.ndarray, "128 N"]) -> Callable[[UInt8[np.ndarra
     if session is not None:
         return lambda rows: session.run(None, {"rows": rows, "columns": columns})[0]
     whole = columns.astype(np.float32) + 128
-    space = np.empty((_BLOCK, whole.shape[1]), np.float32)  # allocating it takes longer than the products
+    space = np.empty((_BLOCK, whole.shape[1]), np.float32)  # reused: allocating it is slower than multiplying
     # Sums are below 2**24, so float32 is exact.
     return lambda rows: np.matmul(rows.astype(np.float32), whole, out=space[: len(rows)])
 
 
 @cache
 def _integer_products() -> onnxruntime.InferenceSession | None:
-    """Return a session for exact 8-bit matrix products; None on x86 without VNNI, where sums saturate."""
+    """Return a session for exact 8-bit matrix products, or None on x86 without VNNI, where sums saturate."""
     from onnx import TensorProto, helper
 
     graph = helper.make_graph(

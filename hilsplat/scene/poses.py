@@ -37,7 +37,7 @@ INIT_MIN_INLIERS = 50
 """Minimum number of matches in a model's first pair (COLMAP: 100)."""
 
 POSE_MIN_INLIERS = 15
-"""Minimum number of visible points for posing each further view (COLMAP: 30)."""
+"""Minimum number of visible points needed to pose each additional view (COLMAP: 30)."""
 
 LOST_PICTURE = "not_registered.png"
 """Picture written beside the scene folder if too few photographs were registered."""
@@ -46,7 +46,7 @@ WEAK_POINTS_PER_VIEW = 13
 """Fewest points per registered view in any good run on renders; unusable runs had 4 to 18."""
 
 NEIGHBOURS = 3
-"""Number of registered photographs reported for each unregistered one."""
+"""Number of registered photographs listed as neighbours of each unregistered one."""
 
 MAX_ROWS = 12
 """Maximum number of unregistered photographs in the picture; registration.json lists all of them."""
@@ -79,7 +79,7 @@ def run_poses(
     Args:
         unit: "metre" or "arbitrary": the unit of imported poses. Structure from motion cannot recover metric
             scale, so its scenes always have the unit "arbitrary".
-        is_render: images are renders of a pinhole camera without distortion.
+        is_render: whether the images were rendered with a pinhole camera without distortion.
         named: poses to use instead of those in the folder (`find_known_poses`).
 
     Raises:
@@ -113,7 +113,7 @@ def _reconstruct(
     """Run structure from motion on a folder of photographs, and return the registration report."""
     if not images.is_dir():
         raise SceneError(
-            f"image folder {images} of {name} is missing", fix="correct its source in the scene sheet"
+            f"image folder {images} of {name} is missing", fix="correct the scene's source in the scene sheet"
         )
     sources = list_images(photo_folder(images))
     if len(sources) < MIN_PHOTOS:
@@ -121,7 +121,7 @@ def _reconstruct(
             f"{images} of {name} has too few images to find camera poses",
             expected=f"at least {MIN_PHOTOS} overlapping photographs (20 or more are better)",
             found=f"{len(sources)}",
-            fix="add photographs of the same scene, with neighbours less than about 10 degrees apart",
+            fix="add photographs of the same scene, taken less than about 10 degrees apart",
         )
     camera_model = settings.camera_model
     if camera_model == "auto":
@@ -163,7 +163,7 @@ def _reconstruct(
 def map_views(
     database: Path, images: Path, folder: Path, mapper: str, seed: int
 ) -> list[pycolmap.Reconstruction]:
-    """Run the mapper on one thread with fixed seeds, and return its models, the largest first.
+    """Run the mapper on one thread with fixed seeds, and return its models, largest first.
 
     Despite `min_model_size`, the mapper may return a model of two views; such models are dropped.
     """
@@ -203,7 +203,7 @@ def registration_report(
     matches: Mapping[str, Mapping[str, int]],
     models: Sequence[pycolmap.Reconstruction],
 ) -> dict[str, Any]:
-    """Return the registration report: totals, models and, for each view, whether it was posed or why not."""
+    """Return the registration report: totals, models, and each view's matches and outcome."""
     errors = reprojection_errors(models[0]) if models else {}
     members = [{model.images[i].name for i in model.reg_image_ids()} for model in models]
     views: dict[str, Any] = {}
@@ -250,7 +250,7 @@ def registration_report(
 
 
 def _camera_entries(model: pycolmap.Reconstruction) -> list[dict[str, Any]]:
-    """Return the estimated lenses, before undistortion."""
+    """Return the estimated lens parameters, before undistortion."""
     used = sorted({model.images[image_id].camera_id for image_id in model.reg_image_ids()})
     return [
         {
@@ -267,7 +267,7 @@ def _why_not(view: str, entry: Mapping[str, Any], members: Sequence[set[str]]) -
     if entry["features"] == 0:
         return "no features: the image is flat, dark or out of focus"
     if entry["matched_views"] == 0:
-        return f"too few matches: no other view shares {MIN_INLIERS} verified matches with it"
+        return f"too few matches: no other view shares at least {MIN_INLIERS} verified matches with it"
     for number, names in enumerate(members[1:], start=2):
         if view in names:
             return f"in model {number} ({len(names)} views), not in the largest model"

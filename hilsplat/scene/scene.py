@@ -20,7 +20,7 @@ class Scene:
         folder: the scene artifact; images are `folder/images/<view name>`.
         name: `<dataset>/<scene>`.
         unit: unit of length, "metre" or "arbitrary".
-        split: "train" or "test" per view name. No stage between poses and evaluate uses test views.
+        split: "train" or "test" for each view name. No stage between poses and evaluate uses test views.
         scene_from_source: similarity that maps source coordinates to the scene's.
     """
 
@@ -55,7 +55,7 @@ class Scene:
         return pixels
 
     def save(self) -> None:
-        """Write cameras, points and, last, the index to `folder`, which already contains the images."""
+        """Write cameras, points and finally the index to `folder`, which must already contain the images."""
         self.cameras.save(self.folder / "cameras.npz")
         write_npz(
             self.folder / "points.npz",

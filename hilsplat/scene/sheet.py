@@ -19,7 +19,7 @@ DEFAULT_SHEET = Path("config/scenes.tsv")
 COLUMNS = ("dataset", "scene", "group", "source", "unit")
 OPTIONAL_COLUMNS = ("gaussians", "features", "poses")
 NOTHING = ("", "-")
-"""Values of an empty optional cell."""
+"""Values that mark an optional cell as empty."""
 GROUPS = (
     "benchmark",
     "development",
@@ -78,7 +78,7 @@ class SceneRow:
 
     @property
     def world(self) -> tuple[str, int] | None:
-        """Kind and seed of a synthetic world, else None."""
+        """Kind and seed if the source is a synthetic world, else None."""
         match = WORLD_SOURCE.fullmatch(self.source)
         return (match[1], int(match[2])) if match else None
 
@@ -104,7 +104,7 @@ def read_sheet(
             exist); empty if not set.
 
     Raises:
-        SceneError: the sheet cannot be used; the message names line, column and fix.
+        SceneError: the sheet cannot be used; the message gives the line, column and fix.
     """
     lines = content_lines(path)
     if not lines:
@@ -131,7 +131,7 @@ def read_sheet(
             raise SceneError(
                 f"{path}, line {line}, column scene: {row.name} is listed twice",
                 found=f"also on line {line_of[key]}",
-                fix="remove one of the two lines, or rename its scene",
+                fix="remove one of the two lines, or rename one of the scenes",
             )
         line_of[key] = line
         rows.append(row)
@@ -170,7 +170,7 @@ def choose_scenes(
 
 
 def content_lines(path: Path) -> list[tuple[int, str]]:
-    """Return the numbered lines of the sheet, without comments and empty lines."""
+    """Return the sheet's lines with their line numbers, excluding comments and empty lines."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
@@ -215,7 +215,7 @@ def _row(
 
     for column in ("dataset", "scene"):
         if problem := name_problem(cells[column]):
-            fix = "choose another name, such as my-desk_2"
+            fix = "choose a different name, such as my-desk_2"
             bad = f"{cells[column]!r} is not a valid name"
             raise fault(column, bad, expected=NAME_RULE, found=problem, fix=fix)
     for column, allowed in (("group", GROUPS), ("unit", UNITS)):
@@ -236,7 +236,7 @@ def _row(
             )
     else:
         folder = _resolved(path, source, data_root)
-        # The workflow skips and reports missing scenes of a published data set.
+        # The workflow skips and reports scenes missing from a published data set.
         if folder is not None and is_checked and not source.startswith(DATA_PREFIX):
             _check_source(f"{path}, line {line}, column source", folder)
     gaussians, features = optional("gaussians"), optional("features")
@@ -276,7 +276,7 @@ def _row(
 
 
 def _resolved(sheet: Path, place: str, data_root: str) -> Path | None:
-    """Resolve a path from the project root or, for `data:`, the data root; return None if that is not set."""
+    """Resolve a path against the project root or, for `data:`, the data root (None if that is not set)."""
     start = project_root(sheet)
     if place.startswith(DATA_PREFIX):
         if not data_root:
@@ -297,7 +297,7 @@ def _ply_problem(ply: Path) -> str:
 def _check_source(where: str, folder: Path) -> None:
     if not folder.is_dir():
         raise SceneError(
-            f"{where}: folder {folder} {'is a file' if folder.exists() else 'is missing'}",
+            f"{where}: {folder} {'is not a folder' if folder.exists() else 'is missing'}",
             expected="a folder of images; relative paths start from the project folder",
             fix="correct the path, or remove the line",
         )

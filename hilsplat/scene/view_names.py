@@ -14,7 +14,7 @@ def view_name(stem: str) -> str:
 
 
 LONGEST_NAME = 200
-"""Maximum bytes in a photograph's name; later file names extend it, and file systems allow 255 bytes."""
+"""Maximum length of a photograph's file name, bytes; later stages extend it, and file systems allow 255."""
 
 
 def view_names(sources: Sequence[Path]) -> list[str]:
