@@ -37,7 +37,7 @@ from hilsplat.scene.sheet import (
 from hilsplat.scene.view_names import view_names
 
 OTHER_PHOTO_SUFFIXES = frozenset({".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".gif", ".jxl"})
-"""Suffixes of unsupported photograph formats; such files are reported as skipped, not as "no images"."""
+"""Suffixes of unsupported photograph formats. Such files are counted and reported as skipped."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class PhotoReport:
         duplicates: groups of file names with identical bytes.
         passed_over: number of skipped files in unsupported photograph formats, by suffix.
         doubts: likely problems and what to do about them (`check`).
-        notes: how the folder was made (`intake`), and which other files are used.
+        notes: how the folder was made (`intake`), and which additional files are used.
     """
 
     folder: Path
@@ -82,7 +82,7 @@ class PhotoReport:
         for names in self.duplicates:
             lines.append(f"  {len(names):>5}  are identical: {', '.join(names)}")
         for suffix, count in sorted(self.passed_over.items()):
-            lines.append(f"  {count:>5}  {suffix} skipped: convert them to JPEG or PNG to use them")
+            lines.append(f"  {count:>5}  {suffix} files skipped: convert them to JPEG or PNG to use them")
         if self.unreadable:
             lines.append(f"  {len(self.unreadable):>5}  cannot be read:")
             lines += [f"           {name}: {reason}" for name, reason in self.unreadable]
@@ -91,7 +91,7 @@ class PhotoReport:
 
 
 def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
-    """Read every photograph in a folder (or its `images/`) in full, and report contents and likely problems.
+    """Decode all photographs in a folder (or its `images/`), and report its contents and likely problems.
 
     If given, `poses` are used instead of those in the folder (`has_known_poses`).
 
@@ -149,7 +149,7 @@ def add_scene(
     features: Path | None = None,
     labels: Path | None = None,
 ) -> PhotoReport:
-    """Append your own photographs to the sheet as scene `photos/<name>`; a missing sheet is created.
+    """Append your own photographs to the sheet as scene `photos/<name>`, creating the sheet if it is missing.
 
     A folder is used in place: the sheet refers to it, with a relative path if it is inside the project.
     Frames of a video and the contents of an archive are written to `photos/<name>/` in the project. For the
@@ -160,14 +160,14 @@ def add_scene(
         frames: maximum number of frames extracted from videos.
         poses: a COLMAP model or transforms file, used instead of structure from motion.
         gaussians: a 3DGS PLY in the coordinates of the poses or in nerfstudio's training coordinates, used
-            instead of a fit.
+            instead of fitting Gaussians.
         features: folder of LangSplat's masks and CLIP vectors, used instead of SAM and CLIP.
         labels: folder of label files from LERF-OVS or `hilsplat annotate`, used only for evaluation and
             copied to `annotated/photos/<name>/` in the project.
 
     Raises:
         SceneError: the name is invalid or taken, photographs cannot be read, or there are fewer than three
-            different photographs and no known poses. The sheet is then unchanged.
+            distinct photographs and no known poses. The sheet is then left unchanged.
     """
     sheet, photos = Path(sheet), Path(photos).expanduser().resolve()
     if problem := name_problem(name):
@@ -183,7 +183,7 @@ def add_scene(
         raise SceneError(
             f"scene {row.name} is already in {sheet}",
             found=f"source {row.source}",
-            fix="choose another name, or remove its line from the sheet first",
+            fix="choose a different name, or remove the scene's line from the sheet first",
         )
     root = project_root(sheet)
     with prepared_photographs(photos, root / PHOTOS / name, frames) as (folder, made):
@@ -208,7 +208,7 @@ def add_scene(
 def _trained(folder: Path, named: dict[str, Path | None]) -> dict[str, Path]:
     """Map sheet columns to the user's paths or, by default, to other programs' files in the folder.
 
-    Without known poses, the coordinates of another program's Gaussians are unknown, so they are not used.
+    Without known poses, the coordinates of another program's Gaussians are unknown, so these are ignored.
     """
     for what, path in named.items():
         if path is not None and path != NO_POSES and not path.exists():
@@ -250,7 +250,7 @@ def _labels(folder: Path, named: Path | None) -> list[Path]:
 
 
 def _check(report: PhotoReport, have_poses: bool) -> None:
-    """Refuse unreadable photographs, and sets with too few photographs."""
+    """Raise SceneError if photographs are unreadable or too few."""
     if report.unreadable:
         raise SceneError(
             f"{len(report.unreadable)} photographs in {report.folder} cannot be read",
@@ -285,7 +285,7 @@ def _append(sheet: Path, name: str, photos: Path, extra: dict[str, Path]) -> Non
         first = content_lines(sheet)[0][1]
         header = [cell.strip() for cell in first.split("\t")]
         if new := [column for column in extra if column not in header]:
-            header += new  # existing rows may lack new columns
+            header += new  # existing rows may be shorter than the header
             text = text.replace(first, "\t".join(header), 1)
         if not text.endswith("\n"):
             text += "\n"

@@ -1,4 +1,4 @@
-"""Checks of a set of photographs for likely problems, before the set is processed.
+"""Checks for likely problems in a set of photographs, before the set is processed.
 
 Thresholds were chosen on three sets of real photographs that all register, on blurred, darkened and
 over-exposed copies of them, and on pictures from a camera that only rotates (values: docs/scene.md).
@@ -13,20 +13,20 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 FEW_PHOTOS = 10
-"""Number of photographs below which large parts of a scene are in at most one photograph."""
+"""With fewer photographs, large parts of a scene usually appear in at most one photograph."""
 
 CHECK_SIDE_PX = 800
 FEATURE_SIDE_PX = 640
-"""Longer side of the grey copies for measuring blur and exposure (`CHECK_SIDE_PX`) and motion."""
+"""Longer side of the grey copies: `CHECK_SIDE_PX` for blur and exposure, `FEATURE_SIDE_PX` for motion."""
 
 BLURRED = 0.55
-"""Blur above which a photograph is reported. Measured: photographs 0.16 to 0.40, video frames up to 0.50,
-photographs blurred by a Gaussian of 4 px (of 800) 0.58 to 0.77."""
+"""Blur above which a photograph is reported. Measured: 0.16 to 0.40 for photographs, up to 0.50 for
+video frames, and 0.58 to 0.77 for photographs blurred by a Gaussian of 4 px (at 800 px)."""
 
 REBLUR_PX = 11
 
 DARK_LEVEL = 64
-"""A photograph is dark if 95 % of its pixels are below this level; a lit object on black is not dark."""
+"""A photograph is too dark if 95 % of its pixels are below this level. A lit object on black is not."""
 
 WHITE_LEVEL = 250
 WHITE_SHARE = 0.5
@@ -37,18 +37,18 @@ SAME_PLACE = 0.01
 the same. The median would be too small: around a centred object, half of the matches may barely move."""
 
 MAX_PAIRS = 60
-"""Maximum number of evenly spread pairs of neighbours to match (5 s at 80 ms per photograph)."""
+"""Maximum number of evenly spaced neighbouring pairs to match (5 s at 80 ms per photograph)."""
 
 NUM_FEATURES = 1000
 RATIO = 0.8
 MIN_MATCHES = 40
-"""Number of verified matches below which the motion of a pair is unknown."""
+"""Minimum number of verified matches required to measure the motion between two photographs."""
 
 MATCH_ERROR_PX = 1.5
 TURN_ERROR_PX = 3.0
 TURN_SHARE = 0.85
-"""Share of verified matches explained by a rotation, above which a pair counts as rotated. Measured: rotating
-cameras 0.96 to 1; moving cameras 0.07 to 0.27 (median of a set) and at most 0.87."""
+"""A pair counts as rotated if a rotation explains at least this share of its verified matches. Measured: 0.96
+to 1 for rotating cameras, and 0.07 to 0.27 (median of a set) and at most 0.87 for moving cameras."""
 
 MIN_TURN_PAIRS = 3
 FOCALS = (0.6, 0.75, 0.9, 1.1, 1.35, 1.7, 2.2, 3.0)
@@ -59,10 +59,10 @@ NAMED = 5
 
 @dataclass(frozen=True)
 class CheckedPhoto:
-    """A photograph's data for the checks.
+    """Properties of a photograph that the checks use.
 
-    `focal_px` is the focal length from EXIF, px of the full picture, or None; `grey` is an upright grey copy
-    with a longer side of at most `CHECK_SIDE_PX`.
+    `focal_px` is the focal length from EXIF, in px at full size, or None. `grey` is an upright grey copy
+    whose longer side is at most `CHECK_SIDE_PX`.
     """
 
     name: str
@@ -75,7 +75,7 @@ def photo_doubts(photos: Sequence[CheckedPhoto], *, have_poses: bool) -> list[st
     """Return sentences about likely problems and what to do about them; empty if there are none.
 
     Photographs are in the order of their names, which is assumed to be the capture order. If their poses are
-    known, only the quality of each photograph matters.
+    known, only the quality of each photograph is checked.
     """
     doubts = []
     if len(photos) < FEW_PHOTOS:
@@ -100,14 +100,14 @@ def _lens_doubts(photos: Sequence[CheckedPhoto]) -> list[str]:
     if len(sizes) > 1:
         listed = ", ".join(f"{long} x {short}" for long, short in sizes[:NAMED])
         return [
-            f"the photographs have {len(sizes)} sizes ({listed}): each size gets its own lens, which is "
-            "hard to estimate from few photographs; use one camera, without cropping"
+            f"the photographs have {len(sizes)} sizes ({listed}), and each size needs a separate lens "
+            "model, which is hard to estimate from few photographs: use one camera, and don't crop"
         ]
     focals = sorted(photo.focal_px for photo in photos if photo.focal_px is not None)
     if focals and focals[-1] > 1.1 * focals[0]:
         return [
             f"the focal lengths range from {focals[0]:.0f} to {focals[-1]:.0f} px (zoom or several lenses): "
-            "use one lens, without zooming"
+            "use one lens, and don't zoom"
         ]
     return []
 
@@ -132,8 +132,8 @@ def _motion_doubts(photos: Sequence[CheckedPhoto]) -> list[str]:
     doubts = []
     if same:
         doubts.append(
-            f"{_listed(same, photos)} nearly identical to the previous one: omit such photographs, which "
-            "cost time and add nothing"
+            f"{_listed(same, photos)} nearly identical to the previous one: omit them, because they "
+            "take time to process and add nothing"
         )
     if turned >= MIN_TURN_PAIRS and turned > 2 * moved:
         doubts.append(
@@ -154,8 +154,8 @@ def _listed(names: Sequence[str], photos: Sequence[CheckedPhoto]) -> str:
 def blur(grey: UInt8[np.ndarray, "h w"]) -> float:
     """Return the blur of a picture, 0 to 1: the share of its gradient magnitude that a second blur preserves.
 
-    Crete et al., "The blur effect" (2007), with a box of 11 px; the result is the larger of the values along
-    x and y. Unlike the Laplacian's variance, it depends little on the content. A flat picture has blur 1.
+    Crete et al., "The blur effect" (2007), with an 11 px box. The result is the larger of the values along x
+    and y. Unlike the Laplacian's variance, it depends little on the content. A flat picture has blur 1.
     """
     values = grey.astype(np.float32)
     shares = []
@@ -175,7 +175,7 @@ def _feature_size(grey: UInt8[np.ndarray, "h w"]) -> tuple[int, int]:
 def _features(
     grey: UInt8[np.ndarray, "h w"],
 ) -> tuple[Float32[np.ndarray, "n 2"], Float32[np.ndarray, "n 128"]]:
-    """Compute SIFT positions, in px of the shrunk picture, and RootSIFT descriptors."""
+    """Compute SIFT positions, in px of the downscaled picture, and RootSIFT descriptors."""
     height, width = _feature_size(grey)
     small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
     points, descriptors = cv2.SIFT.create(NUM_FEATURES).detectAndCompute(small, None)
@@ -193,9 +193,9 @@ def pair_motion(
     """Measure the motion between two pictures, or return None if too few matches fit an epipolar geometry.
 
     Return the displacement of the verified matches (90th percentile, as a share of the diagonal) and the
-    share of these matches explained by a rotation of the camera about its centre. A homography would also
-    explain a camera that moves in front of a wall or a carpet (measured: up to 0.97 of the matches), so a
-    rotation (three parameters) is fitted, with the best of several focal lengths.
+    share of these matches explained by a rotation of the camera about its centre. The rotation (three
+    parameters) is fitted with the best of several focal lengths. A homography is not used, because it also
+    fits a camera that moves in front of a wall or a carpet (measured: up to 0.97 of the matches).
     """
     if min(len(one[0]), len(other[0])) < MIN_MATCHES:
         return None
@@ -223,7 +223,7 @@ def pair_motion(
 def _turn_share(
     a: Float64[np.ndarray, "n 2"], b: Float64[np.ndarray, "n 2"], size_hw: tuple[int, int], focal_px: float
 ) -> float:
-    """Return the share of matches explained by the best rotation (Kabsch, refitted to the better half)."""
+    """Return the share of matches that the best rotation explains (Kabsch, refitted to the better half)."""
     centre = np.array([size_hw[1] / 2, size_hw[0] / 2])
 
     def rays(xy: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:

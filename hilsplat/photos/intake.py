@@ -1,4 +1,4 @@
-"""Conversion of videos, and of archives from untrusted sources, into a folder of photographs."""
+"""Conversion of videos and untrusted archives into folders of photographs."""
 
 import shutil
 import stat
@@ -13,11 +13,11 @@ from hilsplat.base.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, list_files, list
 from hilsplat.scene.layouts import has_known_poses, photo_folder, unwrapped
 
 MARK = ".made_from.json"
-"""Hidden file that records the source files of a converted folder."""
+"""Hidden file in a converted folder that records its source files."""
 
 MAX_FILES = 50_000
 MAX_TOTAL_GIB = 20
-"""Limits on the contents of an archive; a capture has a few hundred files and rarely a gigabyte."""
+"""Limits on the contents of an archive. A capture has a few hundred files and rarely exceeds a gigabyte."""
 
 POSE_SUFFIXES = frozenset({".json", ".txt", ".bin", ".npy", ".ply"})
 """Suffixes of files that may contain poses or points; Record3D's `metadata` has no suffix."""
@@ -25,14 +25,14 @@ POSE_SUFFIXES = frozenset({".json", ".txt", ".bin", ".npy", ".ply"})
 
 @contextmanager
 def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tuple[Path, list[str]]]:
-    """Yield a scene's folder, with notes on its conversion and on skipped files.
+    """Yield a scene's folder, and notes on its conversion and on skipped files.
 
-    The folder is the source itself or, for videos and archives, a new folder at `target`. The source is a
-    folder of photographs or of videos only, a video, or a .zip (or Record3D's .r3d). At most `frames` frames
-    are extracted from videos. If the block raises an error, the converted folder is removed.
+    The source is a folder that contains photographs or only videos, a video, or a .zip (or Record3D's .r3d).
+    A folder of photographs is used in place. Videos (at most `frames` frames in all) and archives are
+    converted into a new folder at `target`, which is removed if the block raises an error.
 
     Raises:
-        SceneError: the source cannot be used, or the target exists and was made from other files.
+        SceneError: the source cannot be used, or the target exists and was made from different files.
     """
     source = Path(source)
     if not source.exists():
@@ -60,7 +60,7 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tu
 
                 notes = extract_frames(videos, folder, frames)
                 named = ", ".join(video.name for video in videos)
-                notes.insert(0, f"{len(list_images(folder))} frames of {named} are in {target}")
+                notes.insert(0, f"{len(list_images(folder))} frames of {named} extracted to {target}")
             else:
                 unpack_photographs(source, folder)
                 notes = [f"{source.name} unpacked to {target}"]
@@ -78,7 +78,7 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tu
 
 
 def _videos_of(source: Path) -> list[Path]:
-    """Return the videos to extract frames from: the source, or those in a folder without photographs."""
+    """Return the videos to extract frames from: the source, or those in a source without photographs."""
     if source.is_file():
         return [source] if source.suffix.lower() in VIDEO_SUFFIXES else []
     if list_images(photo_folder(source)) or has_known_poses(source):
@@ -89,11 +89,11 @@ def _videos_of(source: Path) -> list[Path]:
 def unpack_photographs(archive: Path, folder: Path) -> None:
     """Unpack the images and pose files of a zip archive into an existing, empty folder.
 
-    Every entry is checked before anything is written, and at most the declared sizes are written.
+    Every entry is checked before any file is written, and no file can exceed its declared size.
 
     Raises:
         SceneError: the file is not a zip archive, is damaged, encrypted or too large, or contains links or
-            names that lead out of the folder.
+            names that point outside the folder.
         DiskSpaceError: there is too little free space.
     """
     try:
@@ -118,14 +118,14 @@ def unpack_photographs(archive: Path, folder: Path) -> None:
 
 
 def _is_wanted(name: PurePosixPath) -> bool:
-    """Return whether an entry is an image or may contain poses, and was not added by an operating system."""
+    """Return whether an entry is an image or may contain poses, and is neither hidden nor added by macOS."""
     if any(part.startswith(".") or part == "__MACOSX" for part in name.parts):
         return False
     return name.suffix.lower() in IMAGE_SUFFIXES | POSE_SUFFIXES or name.name == "metadata"
 
 
 def _check_entries(archive: Path, entries: list[zipfile.ZipInfo]) -> None:
-    """Refuse an archive that is too large or could write outside the folder."""
+    """Raise SceneError if the archive is too large, or has an unsafe, encrypted or repeated entry."""
     fix = "unpack it yourself with a program that you trust, inspect the files, and pass the folder"
     total_gib = sum(entry.file_size for entry in entries) / 2**30
     if len(entries) > MAX_FILES or total_gib > MAX_TOTAL_GIB:

@@ -1,4 +1,4 @@
-"""Photographs from videos: the sharpest frame of each section of the camera path."""
+"""Extraction of photographs from videos: the sharpest frame of each section of the camera path."""
 
 import logging
 from collections.abc import Iterator, Sequence
@@ -23,15 +23,15 @@ from hilsplat.photos.video_colours import rgb_pixels
 logger = logging.getLogger(__name__)
 
 CANDIDATES_PER_FRAME = 4
-"""Candidate frames per requested frame; the camera path is measured on the candidates."""
+"""Number of candidate frames per requested frame. The camera path is measured on the candidates."""
 
 MIN_STEP = 0.01
-"""Displacement between two frames, as a share of the diagonal, below which they count as the same: about 0.7
-degrees for a phone's 70-degree view. The noise of a static camera is below 0.001."""
+"""Displacement between two frames, as a share of the diagonal, below which they count as the same. For
+a phone's 70-degree view, it is about 0.7 degrees. The noise of a static camera is below 0.001."""
 
 GREY_SIDE_PX = 480
 SHARPNESS_SIDE_PX = 960
-"""Longer side of the copies for measuring motion and sharpness."""
+"""Longer side of the grey copies: `GREY_SIDE_PX` for motion, `SHARPNESS_SIDE_PX` for sharpness."""
 
 JPEG_QUALITY = 95
 USUAL_RATE = 30.0
@@ -50,7 +50,7 @@ MIN_FOLLOWED = 20
 class Frame:
     """A video frame that may become a photograph.
 
-    `number` counts the intact frames of its video; `grey` is a small copy, as stored (not rotated).
+    `number` is its index among the intact frames of its video. `grey` is a small copy, not rotated upright.
     """
 
     video: int
@@ -62,7 +62,7 @@ class Frame:
 
 @dataclass
 class Decoding:
-    """Decoding statistics: duration stated by the file, time of the last intact frame, counts."""
+    """Decoding statistics: duration in the file's metadata, time of the last intact frame, and counts."""
 
     stated_s: float | None = None
     decoded_s: float = 0.0
@@ -71,7 +71,7 @@ class Decoding:
 
 
 def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str]:
-    """Write selected frames of videos as photographs to a folder, with `origin.json`; return notes.
+    """Write selected frames of videos, and `origin.json`, to a folder; return notes.
 
     The camera path through all videos, measured by the displacement of image corners, is divided into `count`
     sections of equal length, and the sharpest frame of each is selected. A camera at rest yields one frame; a
@@ -109,8 +109,8 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
             notes.append(f"{video.name}: {decoding.num_damaged} damaged packets or frames were skipped")
         if decoding.stated_s is not None and decoding.decoded_s < 0.9 * decoding.stated_s - 1:
             notes.append(
-                f"{video.name} ends after {decoding.decoded_s:.1f} of {decoding.stated_s:.1f} s: only that "
-                "part is used; copy it again if you need the rest"
+                f"{video.name} ends after {decoding.decoded_s:.1f} of {decoding.stated_s:.1f} s: only this "
+                "part is used; copy the file again if you need the rest"
             )
     chosen = choose_frames(candidates, count)
     if len(chosen) < count:
@@ -153,7 +153,7 @@ def _opened(video: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
             raise SceneError(
                 f"{video} has no video stream",
                 found=", ".join(stream.type for stream in container.streams) or "no stream",
-                fix="pass the video file",
+                fix="pass a file that contains video",
             )
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
@@ -191,7 +191,7 @@ def _decoded(
 
 
 def _candidates(video: Path, position: int, most: int, decoding: Decoding) -> list[Frame]:
-    """Return the sharpest frame of each of at most `most` equal time spans.
+    """Divide a video into at most `most` equal time spans; return the sharpest frame of each.
 
     The stated duration may be wrong, or missing, as in browser recordings. If this leads to too many spans,
     they are merged in pairs, keeping the sharper frame.
@@ -249,8 +249,8 @@ def _write_frames(video: Path, name_of_frame: dict[int, str], folder: Path) -> N
 def choose_frames(candidates: Sequence[Frame], count: int) -> list[Frame]:
     """Select the sharpest candidate of each of at most `count` equal sections of the camera path.
 
-    Of two selected frames less than `MIN_STEP` apart, only the sharper one is kept. This also removes hand
-    jitter, which adds path length although the camera stays in place.
+    Of two selected frames less than `MIN_STEP` apart, only the sharper one is kept. This also removes
+    frames due to hand jitter, which lengthens the path although the camera stays in place.
     """
     kept: list[Frame] = []
     row_of = _stretches([_step(a, b) for a, b in pairwise(candidates)], count)
@@ -266,7 +266,7 @@ def choose_frames(candidates: Sequence[Frame], count: int) -> list[Frame]:
 def _stretches(steps: Sequence[float], count: int) -> Int64[np.ndarray, " N"]:
     """Return the section number of each candidate, given the steps between candidates.
 
-    Sections are as short as their maximum number `count` allows, but not shorter than `MIN_STEP`. A step
+    Sections are as short as possible, but at least `MIN_STEP` long, and there are at most `count`. A step
     longer than a section cannot be divided, so it counts as one section.
     """
 
@@ -284,14 +284,14 @@ def _stretches(steps: Sequence[float], count: int) -> Int64[np.ndarray, " N"]:
 
 
 def _step(one: Frame, other: Frame) -> float:
-    """Return the displacement between two frames (share of the diagonal), `MIN_STEP` if the videos differ."""
+    """Return the displacement between two frames (share of the diagonal); across videos, `MIN_STEP`."""
     if one.video != other.video or one.grey.shape != other.grey.shape:
         return MIN_STEP
     return displacement(one.grey, other.grey)
 
 
 def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
-    """Compute the variance of the Laplacian (Pech-Pacheco et al. 2000), which is large for steep edges.
+    """Compute the variance of the Laplacian (Pech-Pacheco et al. 2000), which is large for sharp edges.
 
     Values are comparable only between pictures of the same place, because they depend on the content.
     """
@@ -301,9 +301,9 @@ def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
 def displacement(one: UInt8[np.ndarray, "h w"], other: UInt8[np.ndarray, "h w"]) -> float:
     """Return the upper quartile of corner displacements between two pictures, as a share of the diagonal.
 
-    Corners are tracked forwards and backwards with pyramidal Lucas-Kanade; those that end a pixel or more
+    Corners are tracked forwards and backwards with pyramidal Lucas-Kanade. Those that return a pixel or more
     from their start are ignored. Unlike the median, the upper quartile captures an object on a turntable in
-    front of a static background. The result is 0 with too few corners, and `LOST` if too few can be tracked.
+    front of a static background. Return 0 if there are too few corners, and `LOST` if too few can be tracked.
     """
     corners = cv2.goodFeaturesToTrack(one, NUM_CORNERS, qualityLevel=0.01, minDistance=7)
     if corners is None or len(corners) < MIN_FOLLOWED:

@@ -1,4 +1,4 @@
-"""Conversion of video frames to 8-bit sRGB, using the stream's matrix and range, with HDR tone mapping."""
+"""Conversion of video frames to 8-bit sRGB, using the stream's matrix and range, and tone-mapping HDR."""
 
 import functools
 
@@ -24,20 +24,20 @@ KNEE = 0.6
 """Linear light (white = 1) above which HDR highlights are compressed towards 1."""
 
 BAND_ROWS = 32
-"""Number of rows tone-mapped at once, so that they fit into the processor's cache."""
+"""Number of rows tone-mapped at once, chosen to fit into the processor's cache."""
 
 BT709_FROM_BT2020: Float64[np.ndarray, "3 3"] = np.array(
     [[1.660491, -0.587641, -0.072850], [-0.124550, 1.132900, -0.008349], [-0.018151, -0.100579, 1.118730]]
 )
-"""Conversion of linear RGB (inverse of ITU-R BT.2087)."""
+"""Matrix from linear BT.2020 to linear BT.709 RGB (inverse of ITU-R BT.2087)."""
 
 BT2020_LUMA = np.array([0.2627, 0.6780, 0.0593], dtype=np.float32)
 
 
 def rgb_pixels(frame: VideoFrame) -> UInt8[np.ndarray, "H W 3"]:
-    """Convert a decoded frame as stored (not rotated) to 8-bit sRGB.
+    """Convert a decoded frame to 8-bit sRGB, without rotating it.
 
-    If a stream states no matrix, the default of players is used: BT.709 for 720 lines or more, else BT.601.
+    If a stream states no matrix, video players' default is used: BT.709 for 720 lines or more, else BT.601.
     HDR (PQ or HLG) is converted to linear light with BT.709 primaries and compressed highlights.
     """
     exact = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
@@ -58,8 +58,8 @@ def rgb_pixels(frame: VideoFrame) -> UInt8[np.ndarray, "H W 3"]:
 def srgb_from_hdr(signal: UInt16[np.ndarray, "H W 3"], *, is_hlg: bool) -> UInt8[np.ndarray, "H W 3"]:
     """Tone-map an HDR picture (full-range 16-bit RGB, BT.2020 primaries) to 8-bit sRGB.
 
-    Light up to 0.6 of white is unchanged; above that, it is compressed: white becomes 0.8, and brighter light
-    stays below 1. All channels are scaled by the strongest channel's factor, which preserves the hue.
+    Values up to 0.6 of white are unchanged. Higher values are compressed: white becomes 0.8, and brighter
+    values stay below 1. All channels are scaled by the strongest channel's factor, which preserves the hue.
     """
     light = _hlg_light()[signal] if is_hlg else _pq_light()[signal]
     if is_hlg:  # the display's gamma applies to luminance (BT.2100, OOTF)
@@ -75,7 +75,7 @@ def srgb_from_hdr(signal: UInt16[np.ndarray, "H W 3"], *, is_hlg: bool) -> UInt8
 
 @functools.cache
 def _pq_light() -> Float32[np.ndarray, "65536"]:
-    """Return the table from PQ signal to linear light, white = 1 (SMPTE ST 2084)."""
+    """Return the lookup table from PQ signal to linear light, white = 1 (SMPTE ST 2084)."""
     power = (np.arange(65536) / 65535) ** (1 / 78.84375)
     nits = 10000 * (np.maximum(power - 0.8359375, 0) / (18.8515625 - 18.6875 * power)) ** (
         1 / 0.1593017578125
@@ -85,7 +85,7 @@ def _pq_light() -> Float32[np.ndarray, "65536"]:
 
 @functools.cache
 def _hlg_light() -> Float32[np.ndarray, "65536"]:
-    """Return the table from HLG signal to scene light in [0, 1] (ARIB STD-B67)."""
+    """Return the lookup table from HLG signal to scene light in [0, 1] (ARIB STD-B67)."""
     signal = np.arange(65536) / 65535
     a, b, c = 0.17883277, 0.28466892, 0.55991073
     return np.where(signal <= 0.5, signal**2 / 3, (np.exp((signal - c) / a) + b) / 12).astype(np.float32)
@@ -93,7 +93,7 @@ def _hlg_light() -> Float32[np.ndarray, "65536"]:
 
 @functools.cache
 def _srgb_codes() -> UInt8[np.ndarray, "65536"]:
-    """Return the table from linear light in 65536 steps to 8-bit sRGB (IEC 61966-2-1)."""
+    """Return the lookup table from linear light (65536 steps) to 8-bit sRGB (IEC 61966-2-1)."""
     light = np.arange(65536) / 65535
     encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     return (encoded * 255 + 0.5).astype(np.uint8)

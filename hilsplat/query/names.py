@@ -102,7 +102,7 @@ def _kept(path: Path) -> NamesFile:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         raise ArtifactError(
-            f"{path} is damaged or from another version: {'.'.join(map(str, first['loc']))}: {first['msg']}",
+            f"{path} is damaged or in a different format: {'.'.join(map(str, first['loc']))}: {first['msg']}",
             expected='{"format": "hilsplat-names-1", "trees": {<digest of a tree>: {"<row>": "<name>"}}}',
             fix="correct the file, or move it elsewhere to start without names",
         ) from error

@@ -255,7 +255,7 @@ def test_a_video_becomes_photographs_in_the_project(tmp_path, sheet):
     folder = tmp_path / "project/photos/desk"
     assert sorted(path.name for path in folder.glob("[!.]*"))[:2] == ["0001.jpg", "0002.jpg"]
     assert json.loads((folder / "origin.json").read_text())["settings"]["frames"] == 12
-    assert "12 frames of walk.MP4 are in" in str(report)
+    assert "12 frames of walk.MP4 extracted to" in str(report)
 
 
 def test_a_folder_of_videos_is_one_capture_and_a_static_one_leaves_no_files(tmp_path, sheet):
