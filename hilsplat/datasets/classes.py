@@ -121,7 +121,7 @@ SCANNET200_INSTANCES = ClassSet.of("scannet200-instances", _NAMES, _WITH_INSTANC
 
 
 def splits_of(classes: ClassSet) -> dict[str, tuple[bool, ...]]:
-    """Return, for each split, which classes of a set belong to it, in the set's order."""
+    """Return, by split, whether each class of a set belongs to that split, in the set's order."""
     split_of = {label: split for label, _, split in CLASSES}
     return {split: tuple(split_of[label] == split for label in classes.ids) for split in SPLITS}
 

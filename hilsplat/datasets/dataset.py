@@ -1,4 +1,4 @@
-"""Description of a data set, available without reading its files: scenes, layout, licence and reader."""
+"""Descriptions of data sets (scenes, layout, licence, reader), available without reading their files."""
 
 import os
 from collections.abc import Callable
@@ -32,12 +32,12 @@ class Dataset:
         labels: "images" for labelled pixels, "points" for labelled mesh vertices or lidar points.
         folder: the data set's folder below `data_root`; all other paths are relative to it.
         scenes: scenes in the paper's tables.
-        terms: obligations of the user under the licence, in one sentence.
+        terms: the user's obligations under the licence, in one sentence.
         layout: the expected file tree, as user-facing text.
-        required: paths that a scene needs.
+        required: function that returns the paths a scene needs.
         open: function that reads a scene from the data set's folder into a `LabelledScene` or `PointScene`.
         protocols: keys in `evaluate.protocols.cards`, in addition to the protocols for all image labels.
-        label_places: glob patterns of a scene's files that only evaluation reads.
+        label_places: function that returns glob patterns for a scene's labels, which only evaluation reads.
     """
 
     name: str
@@ -98,7 +98,7 @@ class Dataset:
             )
 
     def has_part(self, root: Path, scene: str) -> bool:
-        """Return whether a required path of a scene exists; paths outside the folder do not count."""
+        """Return whether a required path of a scene exists; paths outside `root` are ignored."""
         inside = [place for place in self.required(scene) if not place.startswith("..")]
         return any((root / place).exists() for place in inside)
 

@@ -33,15 +33,15 @@ ROUNDING_PX = 1.0
 
 @dataclass(frozen=True, eq=False)
 class LabelledRegion:
-    """One region of one view, with the text of its query.
+    """A labelled region of one view, and the query text for it.
 
     Attributes:
         text: the query, spelt as in the labels.
         size_hw: size of the label, px.
         pixels: function that reads the region at the label's size; called whenever the mask is needed.
         boxes_xyxy: annotated boxes, borders included, px of the label; None if the data set has no boxes.
-        level: None if the data set has no levels.
-        path: texts from the whole down to this region; only its own text if there are no levels.
+        level: level of the region; None if the data set has no levels.
+        path: texts from the whole down to this region; only this region's text if there are no levels.
         any_grey: like `pixels`, but includes all non-black pixels, as in some protocols; None if identical.
     """
 
@@ -166,7 +166,7 @@ def images_by_view(folder: Path) -> dict[str, Path]:
         view = view_name(path.stem)
         if view in images:
             raise SceneError(
-                f"two images in {folder} differ only in their suffix",
+                f"the names of two images in {folder} differ only in their suffix",
                 found=f"{images[view].name}, {path.name}",
                 fix="remove one of them: labels are matched by file name without the suffix",
             )
@@ -175,7 +175,7 @@ def images_by_view(folder: Path) -> dict[str, Path]:
 
 
 def image_size_hw(path: Path) -> tuple[int, int]:
-    """Return an image's height and width as stored, from its header; raise ImageError if it is unreadable."""
+    """Read an image's height and width, as stored, from its header; raise ImageError if it is unreadable."""
     with _opened("image", path) as image:
         return image.height, image.width
 
@@ -228,7 +228,7 @@ def check_label_size(
     differences are always tolerated.
 
     Raises:
-        SceneError: one is not a scaled copy of the other.
+        SceneError: the label and its image have different aspect ratios.
     """
     if label_hw == image_hw:
         return []

@@ -29,7 +29,7 @@ hits yield all published localization scores."""
 def differences(
     dataset: str, scene: str, present: Mapping[str, Iterable[str]], texts: Iterable[str] = ()
 ) -> list[str]:
-    """Return sentences about published frames that are missing, and texts that are not in the published list.
+    """Return warnings about missing published frames, and about texts that are not in the published list.
 
     `present` maps a kind of file, such as "label", to the views that have one.
     """

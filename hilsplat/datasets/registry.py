@@ -55,7 +55,7 @@ def open_labelled(name: str, data_root: Path) -> "LabelledScene":
 
 
 def open_labels(name: str, data_root: Path) -> "LabelledScene | PointScene":
-    """Open a scene with any labels, such as "scannet/scene0000_00"; raise SceneError if it cannot be read."""
+    """Open a scene with any kind of labels, such as "scannet/scene0000_00"; raise SceneError on failure."""
     dataset_name, _, scene = name.partition("/")
     dataset = dataset_of(dataset_name)
     if not scene:
@@ -93,7 +93,7 @@ def overview(data_root: Path | None) -> str:
 
 
 def _presence(dataset: Dataset, data_root: Path) -> list[str]:
-    """Return lines that list a data set's complete scenes, and what is missing from the other scenes."""
+    """Return lines that list a data set's complete scenes, and the paths missing from its other scenes."""
     try:
         root = dataset.locate(data_root)
     except SceneError as error:
@@ -107,7 +107,7 @@ def _presence(dataset: Dataset, data_root: Path) -> list[str]:
 
 
 def check(dataset: Dataset, data_root: Path, scenes: Sequence[str] = ()) -> tuple[str, int]:
-    """Read whole scenes of a data set (default: all that are at least partly present).
+    """Read whole scenes of a data set (default: every scene that is at least partly present).
 
     Return a report of what was found, and the number of scenes that cannot be read. Raise SceneError if the
     data set's folder is missing.

@@ -1,4 +1,4 @@
-"""Published data sets named in rows of the scene sheet: which parts are present, and which files are labels.
+"""Published data sets named in the scene sheet: which are present, and their image and label files.
 
 The workflow uses this module at start-up, so it reads no data and imports no heavy library at module level.
 """
@@ -24,7 +24,7 @@ def published(source: str) -> tuple[str, str] | None:
 
 
 def absence(source: str, data_root: str) -> str | None:
-    """Return why a `data:` source of the sheet cannot be used, or None; `data_root` is empty if not set."""
+    """Return the reason why a `data:` source cannot be used, or None; `data_root` is empty if not set."""
     if not source.startswith(DATA_PREFIX):
         return None
     if not data_root:
@@ -57,7 +57,7 @@ def unlisted(sources: Collection[str], groups: Collection[str], data_root: str) 
 
 
 def label_sets(source: str, data_root: str, row: str) -> tuple[str, ...]:
-    """Return the label sets (`data set/scene`) of a row's scene (`dataset/scene`), its source's own first.
+    """Return the label sets (`data set/scene`) of a row's scene (`dataset/scene`), those of its source first.
 
     If `data_root` is empty, your own annotations are looked up in the working folder.
     """
@@ -80,7 +80,7 @@ def _folder(dataset: Dataset, data_root: str) -> Path:
 
 
 def label_files(labels: str, data_root: str) -> tuple[Path, ...]:
-    """Return the sorted files of `data set/scene` that only evaluation reads; edits rerun only that."""
+    """Return the sorted files of `data set/scene` that only evaluation reads; edits rerun only evaluation."""
     name, _, scene = labels.partition("/")
     dataset = dataset_of(name)
     root = _folder(dataset, data_root)
@@ -111,7 +111,7 @@ def is_exported(source: str) -> bool:
 def export_images(name: str, data_root: Path, out: Path) -> int:
     """Write the images and poses of `data set/scene` for the `poses` stage; return the number of images.
 
-    The vertices of a labelled mesh are also written (`points.ply`), without labels, as initial (or frozen)
+    For a labelled mesh, the vertices are also written (`points.ply`, without labels) as initial or frozen
     Gaussian positions. Lidar points are not written, because the sky and distant objects have none.
 
     Raises:

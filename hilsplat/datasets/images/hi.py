@@ -1,6 +1,6 @@
-"""Labels at three levels: Hi-LERF and Hi-3DOVS (on images of LERF-OVS and 3D-OVS), and your own scenes.
+"""Labels at three levels: Hi-LERF and Hi-3DOVS (on images of LERF-OVS and 3D-OVS), and your annotations.
 
-The paper publishes frames and levels but neither labels nor a format. We use LERF-OVS's label format with
+The paper publishes the frames and levels, but not the labels or their format. We use LERF-OVS's format with
 three more keys per object: `id`, unique in the file; `level`, 1 whole, 2 part, 3 subpart; `parent`, the
 id of an object one level up, or null. `segmentation` may be a list of polygons. `hilsplat annotate` writes
 this format for your own scenes (data set `annotated`) and adds `origin`: drawn, edited, accepted or proposed.
@@ -71,7 +71,7 @@ def open_annotated(root: Path, scene: str) -> LabelledScene:
 
 
 def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, ...]:
-    """Return one region per object of a file, except for unaccepted proposals; extend `warnings`."""
+    """Return one region per object in a file, skipping unaccepted proposals; append to `warnings`."""
     waiting = [thing for thing in labels.objects if thing.keys.get("origin") == PROPOSED]
     if waiting:
         warnings.append(f"{labels.path.name}: ignored {len(waiting)} unaccepted proposal(s)")
@@ -94,7 +94,7 @@ def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, .
 
 
 def by_id(labels: IsatFile) -> dict[int, IsatObject]:
-    """Return the objects of a file by `id`; without ids, the pieces of an ISAT group form one object."""
+    """Return the objects of a file by `id`; if they have none, each ISAT group forms one object."""
     objects: dict[int, IsatObject] = {}
     for row, thing in enumerate(labels.objects):
         where = f"{labels.path}, object {row} ({thing.category})"
@@ -108,14 +108,14 @@ def by_id(labels: IsatFile) -> dict[int, IsatObject]:
                 f"{where}: invalid id",
                 expected="an integer, unique in the file",
                 found=repr(number),
-                fix="give each object in the file its own id",
+                fix="give each object in the file a unique id",
             )
         if type(level) is not int or level not in list(Level):
             raise SceneError(
                 f"{where}: invalid level",
                 expected="1 (whole), 2 (part) or 3 (subpart)",
                 found=repr(level),
-                fix="correct it; plain LERF-OVS labels have no levels and belong in lerf_ovs/label",
+                fix="correct the level; labels without levels (LERF-OVS) belong in lerf_ovs/label",
             )
         if same is not None:
             low = np.minimum(same.box_xyxy[:2], thing.box_xyxy[:2])
@@ -167,7 +167,7 @@ def _nesting_violations(
 
 
 def _dataset(name: str, title: str, frame: str) -> Dataset:
-    """Return one of the two data sets, which differ only in their names."""
+    """Return the description of Hi-LERF or Hi-3DOVS, which share a layout."""
     images = IMAGES_OF[name]
     return Dataset(
         name=name,

@@ -32,8 +32,8 @@ warning."""
 def fill_polygons(polygons: Sequence[Polygon], size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
     """Return the union of polygons (vertices x, y, truncated to integers): even-odd fill, borders included.
 
-    This is OpenCV's `fillPoly` on int32 vertices, used by LangSplat's evaluation. Vertex (x, y) is the
-    pixel (x, y) itself, so the triangle (0, 0), (2, 0), (0, 2) has 6 pixels. The result is clipped.
+    This is OpenCV's `fillPoly` on int32 vertices, as in LangSplat's evaluation. Vertex (x, y) is the
+    pixel (x, y), so the triangle (0, 0), (2, 0), (0, 2) has 6 pixels. The result is clipped to the image.
     """
     canvas = np.zeros(size_hw, dtype=np.uint8)
     for polygon in polygons:  # a single call would omit pixels that two polygons share
@@ -94,11 +94,11 @@ class IsatFile:
 
 
 def read_isat(path: Path, image: Path | None = None) -> IsatFile:
-    """Read and check one label file, and compare its size with that of its image, if given.
+    """Read and check one label file; if its image is given, also compare their sizes.
 
     Raises:
         SceneError: the file is not JSON, a key is missing or has the wrong type, a polygon is entirely
-            outside the image, a box is [x, y, width, height], or the image is not a scaled copy.
+            outside the image, a box is [x, y, width, height], or the aspect ratios differ.
     """
     labels = parse_isat(path, read_json_object(path, "unpack or export the labels again"))
     if image is None:
@@ -108,7 +108,7 @@ def read_isat(path: Path, image: Path | None = None) -> IsatFile:
 
 
 def parse_isat(path: Path, content: Mapping[str, Any]) -> IsatFile:
-    """Check the contents of a label file, like `read_isat`; `path` is used only in messages."""
+    """Convert and check the contents of a label file, as in `read_isat`; messages quote `path`."""
     if not isinstance(content.get("objects"), list):
         raise SceneError(
             f"label file {path} has no `objects` list",
@@ -139,12 +139,12 @@ def parse_isat(path: Path, content: Mapping[str, Any]) -> IsatFile:
 
 def _read_object(where: str, entry: Any, size_hw: tuple[int, int], warnings: list[str]) -> IsatObject:
     if not isinstance(entry, dict):
-        raise SceneError(f"{where} is not an object", found=repr(entry)[:80], fix="export the labels again")
+        raise SceneError(
+            f"{where} is not a JSON object", found=repr(entry)[:80], fix="export the labels again"
+        )
     category = entry.get("category")
     if not isinstance(category, str) or not category.strip():
-        raise SceneError(
-            f"{where} has no category", found=repr(category), fix="set its category to the query"
-        )
+        raise SceneError(f"{where} has no category", found=repr(category), fix="enter the query text")
     where = f"{where} ({category})"
     polygons = _polygons(where, entry.get("segmentation"))
     height, width = size_hw
@@ -196,7 +196,7 @@ def _box(
         usable = False
     if not usable:
         raise SceneError(
-            f"{where}: invalid bbox", expected="[x1, y1, x2, y2]", found=repr(value), fix="correct it"
+            f"{where}: invalid bbox", expected="[x1, y1, x2, y2]", found=repr(value), fix="edit or remove it"
         )
     if np.abs(box - extent).max() > SLACK_PX:
         as_sizes = np.concatenate([box[:2], box[:2] + box[2:]])

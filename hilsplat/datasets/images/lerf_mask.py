@@ -1,7 +1,7 @@
 """LERF-Mask: three LERF scenes with Gaussian Grouping's masks.
 
-Test views are the posed images missing from `images_train`, sorted by name; the folder `test_mask/0` contains
-the masks of the first view, `test_mask/1` those of the second. Every mask file is named after its prompt.
+Test views are the posed images missing from `images_train`, sorted by name. The folder `test_mask/0` contains
+the masks of the first view, `test_mask/1` those of the second, and so on. Mask files are named after prompts.
 Missing files or folders, and mask folders that don't match the test views, raise SceneError.
 """
 

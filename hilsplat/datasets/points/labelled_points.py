@@ -48,7 +48,7 @@ class LabelledPoints:
         class_id: class number in the data set's files; 0 if undefined.
         instance_id: instance number from 1, unrelated to numbers in other files; 0 for none.
         labelling: meaning of `class_id`, a key of `LABELLINGS`.
-        faces: corners of triangles, as row indices of `xyz`; None if the points are not a mesh.
+        faces: triangle corners, as row indices of `xyz`; None if the points are not a mesh.
         visible: whether the point is visible to a camera; None if unknown.
     """
 
@@ -66,7 +66,7 @@ class LabelledPoints:
         """Return labels 1 .. K in the order of a class set, or 0 for classes that are not in the set.
 
         Raises:
-            MisalignedArtifactError: the set is not defined on this labelling.
+            MisalignedArtifactError: the set is not defined for this labelling.
         """
         fitting = LABELLINGS[self.labelling]
         if classes not in fitting:
@@ -148,14 +148,14 @@ def read_matrix(path: Path) -> np.ndarray:
 
 
 class PlyMesh:
-    """A PLY mesh whose faces have `corners` corners each."""
+    """A PLY mesh in which every face has `corners` corners."""
 
     def __init__(self, path: Path, corners: int) -> None:
         self.path = require_file(path)
         try:
             self._content = PlyData.read(path, known_list_len={"face": {"vertex_indices": corners}})
             for element in ("vertex", "face"):
-                self._content[element]  # KeyError if there is none
+                self._content[element]  # raises KeyError if the element is missing
         except (PlyParseError, KeyError, ValueError, OSError) as error:
             raise SceneError(
                 f"{path} cannot be read: {error}",
@@ -203,7 +203,7 @@ def by_number(paths: Sequence[Path], prefix: str = "") -> list[tuple[int, Path]]
         stem = path.stem.removeprefix(prefix)
         if not (stem.isascii() and stem.isdecimal()):
             raise SceneError(
-                f"{path} does not have a frame's file name",
+                f"{path} is not named like a frame",
                 expected=f"{prefix}<number>{path.suffix}",
                 fix="move images that are not frames to another folder",
             )

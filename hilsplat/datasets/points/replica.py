@@ -73,7 +73,7 @@ def read_lens(path: Path) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
 
 
 def read_images(folder: Path) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
-    """Return the posed images of a rendered sequence, by frame number.
+    """Return the posed images of a rendered sequence, sorted by frame number.
 
     Line n of the pose file is the pose of frame n. Lines without an image are skipped, and a warning with
     their number is also returned.

@@ -1,4 +1,4 @@
-"""ScanNet v2 and ScanNet200: exported frames, the evaluated mesh, NYU40 and ScanNet200 labels, instances.
+"""ScanNet v2 and ScanNet200: exported frames, the evaluated mesh, and its labels and instances.
 
 The layout is that of the ScanNet release, with the frames exported from `.sens` by ScanNet's reader:
 `color/<n>.jpg`, `pose/<n>.txt` (camera-to-world, OpenCV axes), `intrinsic/intrinsic_color.txt`. All readers
@@ -56,7 +56,7 @@ def scan_folder(root: Path, scan: str) -> Path:
 
 
 def read_label_table(path: Path) -> dict[str, int]:
-    """Return each raw category's id in `scannetv2-labels.combined.tsv`; 0 if not one of the 200 classes."""
+    """Map each raw category to its id in the label table, or to 0 if it is not one of the 200 classes."""
     require_file(path, f"download {LABEL_TABLE} from ScanNet's release to the data set's folder")
     found = {}
     with path.open(encoding="utf-8", newline="") as stream:
@@ -100,7 +100,7 @@ def axis_alignment(folder: Path, scan: str) -> Float[np.ndarray, "4 4"]:
 
 
 def read_images(folder: Path, scan: str) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
-    """Return posed colour images by frame number, skipping frames for which tracking failed.
+    """Return posed colour images, sorted by frame number, skipping frames for which tracking failed.
 
     ScanNet's coordinates are relative to the first pixel's centre (the depth camera's centre is 319.5 of
     640), so half a pixel is added to the principal point in K.
@@ -170,7 +170,7 @@ def read_truth(
     warnings = []
     if unknown:
         listed = ", ".join(f"{name} ({count})" for name, count in sorted(unknown.items()))
-        warnings.append(f"categories missing from {LABEL_TABLE} have no ScanNet200 class: {listed}")
+        warnings.append(f"no ScanNet200 class for categories that are not in {LABEL_TABLE}: {listed}")
     points = LabelledPoints(xyz, nyu40, instance, "nyu40", faces)
     truth = {"nyu40": points, "scannet200": replace(points, class_id=fine, labelling="scannet200")}
     return truth, tuple(warnings)
@@ -277,5 +277,5 @@ DATASET = Dataset(
 )
 
 SCANNET200_DATASET = replace(DATASET, name="scannet200", title="ScanNet200")
-"""The same scans and files with other labels. The paper does not state whether it scored these ten scans with
-200 classes, or the benchmark's 312 validation scans (ScanNet's `Tasks/Benchmark/scannetv2_val.txt`)."""
+"""The same scans and files with different labels. The paper does not state whether it scored these ten scans
+with 200 classes, or the benchmark's 312 validation scans (ScanNet's `Tasks/Benchmark/scannetv2_val.txt`)."""

@@ -86,7 +86,7 @@ def labelled_points(world: Path, kind: str) -> dict[str, LabelledPoints]:
     nyu40, scannet200 and replica. For a street, they are its lidar returns, labelled as waymo.
 
     Raises:
-        SceneError: the world is of a different kind.
+        SceneError: the world is neither a room nor a street.
         ArtifactError: a file is missing or damaged.
     """
     texts = [node.text for node in HierarchyAnnotations.load(world / "truth").nodes]

@@ -1,4 +1,4 @@
-"""Lidar frames and cameras of Waymo, independent of the file format.
+"""Waymo's lidar frames and cameras, independent of the file format.
 
 The formulas are those of `utils/range_image_utils.py` and `wdl_limited/camera` of
 waymo-research/waymo-open-dataset (Apache-2.0), reimplemented. Vehicle and camera axes are x forward, y left,
@@ -19,7 +19,7 @@ from hilsplat.scene.posed_images import PosedImage
 CAMERAS = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")
 """Camera names; numbered from 1 in the files."""
 TOP = 1
-"""The roof lidar, the only one with labels and with a pose per pixel."""
+"""Number of the roof lidar, the only one that has labels and a pose for each pixel."""
 INSTANCE, CLASS = 0, 1
 """Channels of a label image."""
 CV_FROM_WAYMO = np.array(
@@ -49,7 +49,7 @@ class LidarFrame:
 
     Attributes:
         inclinations: inclinations of the rows, radians, highest first.
-        pixel_pose: roll, pitch, yaw (radians), x, y, z (metres) of the vehicle in the world at each pixel.
+        pixel_pose: vehicle pose in the world at each pixel: roll, pitch, yaw (radians), x, y, z (metres).
         returns: the first return and, if there is one, the second.
     """
 
@@ -181,7 +181,7 @@ def frame_points(frame: LidarFrame, segment_from_world: Float[np.ndarray, "4 4"]
         hit = part.image[..., 0] > 0
         range_m = part.image[..., 0].astype(np.float64)
         in_vehicle = range_image_points(range_m, frame.inclinations, frame.vehicle_from_lidar)
-        pose = frame.pixel_pose.astype(np.float64)  # of the vehicle at the time of each pixel
+        pose = frame.pixel_pose.astype(np.float64)  # vehicle pose at the time of each pixel
         turned = np.einsum("hwij,hwj->hwi", rotation_of(pose[..., :3]), in_vehicle)
         places = (turned + pose[..., 3:])[hit]
         xyz = places @ segment_from_world[:3, :3].T + segment_from_world[:3, 3]

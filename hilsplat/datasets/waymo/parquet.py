@@ -1,4 +1,4 @@
-"""Waymo v2 (2.0.1): one parquet file per component and segment, read by pyarrow.
+"""Waymo v2 (2.0.1): one parquet file per component and segment, read with pyarrow.
 
 All readers raise SceneError if a component is missing, damaged, or doesn't match the others.
 """
@@ -83,7 +83,7 @@ def read_component(
 
 
 def vehicle_poses(split: Path, segment: str) -> dict[int, Float[np.ndarray, "4 4"]]:
-    """Return the vehicle's pose in the world at each frame, in order."""
+    """Return the vehicle's pose in the world at each frame's timestamp, in order of time."""
     name = "[VehiclePoseComponent].world_from_vehicle.transform"
     rows = read_component(split, "vehicle_pose", segment, [FRAME, name])
     return dict(sorted((row[FRAME], row[name].reshape(4, 4)) for row in rows))
@@ -161,7 +161,7 @@ def _range_images(
 
 
 def _cameras(split: Path, segment: str) -> dict[int, WaymoCamera]:
-    """Return the cameras of the car, by number from 1."""
+    """Return the car's cameras by their number, which starts at 1."""
     base = "[CameraCalibrationComponent]"
     inner = [f"{base}.intrinsic.{name}" for name in INTRINSIC]
     place, width, height = f"{base}.extrinsic.transform", f"{base}.width", f"{base}.height"

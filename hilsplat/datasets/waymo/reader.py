@@ -27,7 +27,7 @@ RECORD = "individual_files_{split}_segment-{segment}_with_camera_labels.tfrecord
 
 
 def find_parquet(root: Path, segment: str) -> Path | None:
-    """Return the split folder that contains a segment in release 2, or None."""
+    """Return the folder of the split that contains a segment's release 2 files, or None."""
     for split in SPLITS:
         if parquet.component_path(root / split, LABELS, segment).is_file():
             return root / split
@@ -35,7 +35,7 @@ def find_parquet(root: Path, segment: str) -> Path | None:
 
 
 def find_record(root: Path, segment: str) -> Path | None:
-    """Return the file of a segment in release 1, in `root` or a split's folder, or None."""
+    """Return a segment's release 1 file, from `root` or the folder of a split, or None if it has none."""
     for split in SPLITS:
         whole = RECORD.format(split=split, segment=segment)
         for name in (whole, whole.removeprefix(f"individual_files_{split}_")):
@@ -46,7 +46,7 @@ def find_record(root: Path, segment: str) -> Path | None:
 
 
 def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
-    """Read a segment: labelled frames of the top lidar with both returns, and images of every n-th frame.
+    """Read a segment: the top lidar's labelled frames (both returns), and the images of every n-th frame.
 
     A segment is named after its context, such as 10023947602400723454_1120_000_1140_000.
 
@@ -103,7 +103,7 @@ class Segments(Dataset):
     """A data set whose scenes are the segments on disk, because the paper names none."""
 
     def check(self, root: Path, scene: str) -> SceneReport:
-        """Read a segment with only some of its images, and report what was found."""
+        """Read a segment with the images of every tenth frame, and report what was found."""
         return open_segment(root, scene, every=10).report()
 
     def found(self, root: Path) -> tuple[str, ...]:

@@ -46,8 +46,8 @@ CameraImage: required int32 name 1, required bytes image 2, required Transform p
 Frame: required Context context 1, required int64 timestamp_micros 2, required Transform pose 3, \
     repeated CameraImage images 4, repeated Laser lasers 5
 """
-"""Fields used from waymo-research/waymo-open-dataset `dataset.proto`, with its names and numbers; fields that
-are always present are marked required."""
+"""Fields used from waymo-research/waymo-open-dataset `dataset.proto`, with its names and numbers. Fields that
+are always present are marked as required."""
 
 
 def message_classes(fields: str) -> dict[str, Any]:
@@ -118,7 +118,7 @@ def frames(path: Path) -> Iterator[tuple[str, Any]]:
 
 
 def first_pose(path: Path) -> Float[np.ndarray, "4 4"]:
-    """Return the vehicle's pose in the world at the first frame."""
+    """Return the vehicle's pose in the world in the first frame."""
     for where, frame in frames(path):
         return _transform(frame.pose, where)
     raise SceneError(f"{path} contains no frames", fix=UNPACK_AGAIN)

@@ -177,7 +177,7 @@ OTHER_TABLE = text_in(f"../../{LABEL_TABLE}", "id,raw_category,nyu40id\n")
         ),
         (
             lambda folder: (folder / "color/0.jpg").rename(folder / "color/first.jpg"),
-            r"first\.jpg does not have a frame's file name\n  expected  <number>\.jpg",
+            r"first\.jpg is not named like a frame\n  expected  <number>\.jpg",
         ),
         (
             lambda folder: folder.rename(folder.parents[1] / SCAN),
