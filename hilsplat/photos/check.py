@@ -72,10 +72,10 @@ class CheckedPhoto:
 
 
 def photo_doubts(photos: Sequence[CheckedPhoto], *, have_poses: bool) -> list[str]:
-    """Return sentences about likely problems and what to do about them; empty if there are none.
+    """Return one message per likely problem, with advice on how to fix it.
 
-    Photographs are in the order of their names, which is assumed to be the capture order. If their poses are
-    known, only the quality of each photograph is checked.
+    Photographs must be sorted by name, which is assumed to be the capture order. If their poses are known,
+    the lens and the motion are not checked.
     """
     doubts = []
     if len(photos) < FEW_PHOTOS:
