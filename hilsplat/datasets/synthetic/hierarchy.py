@@ -74,7 +74,7 @@ class HierarchyAnnotations:
         return {text: tuple(ids) for text, ids in texts.items()}
 
     def mask(self, view: str, ids: Iterable[int]) -> Bool[np.ndarray, "H W"]:
-        """Return the union of nodes' regions in a view; all nodes must have the same level."""
+        """Return the union of the nodes' regions in a view; all nodes must have the same level."""
         ids = tuple(ids)
         level = Level(self.nodes[ids[0]].level)
         return np.isin(self.label_image(view, level), ids)
@@ -89,7 +89,7 @@ class HierarchyAnnotations:
 
     @staticmethod
     def load(folder: Path) -> "HierarchyAnnotations":
-        """Read the folder; raise ArtifactError if annotations.json is missing or has a different format."""
+        """Read a folder's annotations; raise ArtifactError if the file is missing or in another format."""
         record = read_json(folder / "annotations.json")
         if record.get("format") != FORMAT:
             raise ArtifactError(
@@ -115,7 +115,7 @@ def write_hierarchy(
 ) -> None:
     """Write annotations: label images first, `annotations.json` last.
 
-    Nodes are in the order of their ids 0, 1, 2, ...; `labels` contains the node id of each pixel (-1 for
+    The nodes must be sorted by id (0, 1, 2, ...). `labels` contains the node id of each pixel (-1 for
     none) by view and level, and `views` contains the ids of the nodes annotated in each view.
     """
     for view, levels in labels.items():

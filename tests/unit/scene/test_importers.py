@@ -179,7 +179,7 @@ FRAME = r"frame 1 \(images/b\), transform_matrix: the pose is not a rotation"
     [
         ({}, {}, "has no focal length"),
         ({"fl_x": 40, "camera_model": "OPENCV_FISHEYE"}, {}, "OPENCV_FISHEYE .* is not supported"),
-        ({"fl_x": 40, "ply_file_path": "gone.ply"}, {}, r"the points of .*gone\.ply cannot be read"),
+        ({"fl_x": 40, "ply_file_path": "gone.ply"}, {}, r"the points in .*gone\.ply cannot be read"),
         *(({"fl_x": 40}, {"transform_matrix": pose}, FRAME) for pose in NOT_RIGID),
         *(({"fl_x": 40}, {"file_path": name}, f"a file outside it: {name}") for name in OUTSIDE),
         *(({"fl_x": 40, "ply_file_path": name}, {}, f"a file outside it: {name}") for name in OUTSIDE),
