@@ -278,7 +278,7 @@ def test_invalid_parents_and_children_outside_their_parent_are_reported(hi):
         ("id", 0, r"object 1 \(head\): invalid id"),
         ("id", "1", r"object 1 \(head\): invalid id\n.*\n.*'1'"),
         ("level", 4, r"object 1 \(head\): invalid level"),
-        ("level", None, r"plain LERF-OVS labels have no levels"),
+        ("level", None, r"labels without levels \(LERF-OVS\) belong"),
         ("level", True, r"object 1 \(head\): invalid level"),
     ],
 )
