@@ -102,13 +102,7 @@ def unpack_photographs(archive: Path, folder: Path) -> None:
             _check_entries(archive, entries)
             chosen = [entry for entry in entries if _is_wanted(PurePosixPath(entry.filename))]
             require_free_space(folder, sum(entry.file_size for entry in chosen) / 2**20 + 200)
-            for entry in chosen:
-                target = folder / PurePosixPath(entry.filename)
-                target.parent.mkdir(parents=True, exist_ok=True)
-                # zipfile stops at the declared size, and checks the size and the CRC.
-                with opened.open(entry) as source, target.open("xb") as sink:
-                    while block := source.read(1 << 20):
-                        sink.write(block)
+            opened.extractall(folder, chosen)  # stops at the declared size; checks the size and the CRC
     except (zipfile.BadZipFile, NotImplementedError, EOFError, OSError, RuntimeError) as error:
         raise SceneError(
             f"archive {archive} cannot be unpacked: {error}",
