@@ -188,7 +188,7 @@ def mask_region(
     share: float = 0.0,
     least_grey: int | None = None,
 ) -> LabelledRegion:
-    """Return the region in a grey mask file, named after its query; append to `warnings` if it is resized.
+    """Return the region in a grey mask file, which is named after the query; report resizing in `warnings`.
 
     Args:
         foreground: lowest grey value of the region.
@@ -203,7 +203,7 @@ def mask_region(
 
 
 def read_mask_file(path: Path, least: int) -> Bool[np.ndarray, "H W"]:
-    """Return which pixels of a grey mask file are at least `least`; raise ImageError if it is damaged."""
+    """Return which values in a grey mask file are at least `least`; raise ImageError if it is damaged."""
     with _opened("mask", path) as image:
         return np.asarray(image.convert("L")) >= least
 

@@ -1,4 +1,4 @@
-"""Published data sets named in the scene sheet: which are present, and their image and label files.
+"""Published data sets named in the scene sheet: which scenes are present, and their image and label files.
 
 The workflow uses this module at start-up, so it reads no data and imports no heavy library at module level.
 """

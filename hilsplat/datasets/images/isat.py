@@ -187,7 +187,7 @@ def _polygons(where: str, value: Any) -> tuple[Float[np.ndarray, "_ 2"], ...]:
 def _box(
     where: str, value: Any, points: Float[np.ndarray, "P 2"], warnings: list[str]
 ) -> Int64[np.ndarray, " 4"]:
-    """Return the whole pixels inside the box [x1, y1, x2, y2] or, if missing, the polygon's extent."""
+    """Return the whole pixels inside the box [x1, y1, x2, y2] or, if there is none, the polygon's extent."""
     extent = np.concatenate([points.min(axis=0), points.max(axis=0)])
     try:
         box = extent if value is None else np.array(value, dtype=np.float64)

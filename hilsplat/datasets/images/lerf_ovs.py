@@ -37,7 +37,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
     warnings += differences("lerf_ovs", scene, {"label": views}, read.prompts)
     if set(views) == set(FRAMES["lerf_ovs"].get(scene, ())) and read.num_pairs != PAIRS[scene]:
         warnings.append(
-            f"{read.num_pairs} (frame, category) pairs, but the published figures imply {PAIRS[scene]}"
+            f"{read.num_pairs} (frame, category) pairs, but the published scores imply {PAIRS[scene]}"
         )
     return replace(read, warnings=tuple(warnings))
 

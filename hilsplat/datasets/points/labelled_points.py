@@ -28,7 +28,7 @@ from hilsplat.datasets.dataset import SceneReport, listing
 from hilsplat.scene import layouts
 from hilsplat.scene.posed_images import PosedImage
 
-UNPACK_AGAIN = "unpack or download it again; the copy is incomplete"
+UNPACK_AGAIN = "unpack or download the file again; this copy is damaged or incomplete"
 
 LABELLINGS: dict[str, tuple[ClassSet, ...]] = {
     "nyu40": (SCANNET_19, SCANNET_15, SCANNET_10),

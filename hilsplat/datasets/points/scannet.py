@@ -39,7 +39,7 @@ SAME_PLACE_M = 1e-4
 
 
 def scan_folder(root: Path, scan: str) -> Path:
-    """Return a scan's folder; refuse one in the wrong place or whose frames are in a `.sens` archive."""
+    """Return a scan's folder; raise SceneError if it is misplaced or its frames are still in `.sens`."""
     folder = root / "scans" / scan
     for wrong in (folder / scan, root / scan, root / "scans" / "scans" / scan):
         if not (folder / f"{scan}_vh_clean_2.ply").is_file() and wrong.is_dir():

@@ -89,7 +89,7 @@ class HierarchyAnnotations:
 
     @staticmethod
     def load(folder: Path) -> "HierarchyAnnotations":
-        """Read a folder's annotations; raise ArtifactError if the file is missing or in another format."""
+        """Read a folder's annotations; raise ArtifactError if they are missing or have a different format."""
         record = read_json(folder / "annotations.json")
         if record.get("format") != FORMAT:
             raise ArtifactError(
