@@ -265,7 +265,7 @@ class PerturbSettings(Section):
         0.02, "probability per node, drawn once per scene, of the same wrong merge in most views"
     )
     systematic_missing: Share = knob(
-        0.02, "probability per node, drawn once per scene, of having no mask in most views"
+        0.02, "probability that a node has no mask in most views (drawn once per scene)"
     )
     systematic_share: Share = knob(0.9, "probability that a systematic fault occurs in a view")
     score_noise: Share = knob(

@@ -39,7 +39,7 @@ def prune_cache(
     Args:
         stages: caches to prune; if empty, the view caches, and also the checkpoints if `days` is set.
         days: delete entries not used for this many days.
-        max_mib: then delete entries until at most this size is left; no entries if both limits are None.
+        max_mib: then delete entries until the rest is at most this size. No limits: delete nothing.
 
     Returns:
         Number of deleted entries, and their size in MiB.

@@ -69,11 +69,11 @@ class Contributions:
         return self._mapped("mass")
 
     def means(self) -> Float32[np.ndarray, "N 3"]:
-        """Read the centres of the Gaussians, scene units."""
+        """Read the centres of the Gaussians, in scene units."""
         return read_npy(sealed(self.folder, "means.npy"))
 
     def centres(self) -> Float64[np.ndarray, "V 3"]:
-        """Read the centres of the cameras, scene units."""
+        """Read the centres of the cameras, in scene units."""
         return read_npy(sealed(self.folder, "centres.npy"))
 
     def quadratic(self, threads: int = 1) -> Quadratic:

@@ -222,7 +222,7 @@ def _opened(kind: str, path: Path) -> Iterator[Image.Image]:
 def check_label_size(
     where: str, label_hw: tuple[int, int], image_hw: tuple[int, int], share: float = 0.0
 ) -> list[str]:
-    """Compare a label's size with its image's; return a warning, which starts with `where`, if they differ.
+    """Compare a label's size with its image's; if they differ, return a warning that starts with `where`.
 
     `share` is the tolerated relative difference in height after scaling to the same width; rounding
     differences are always tolerated.

@@ -126,7 +126,7 @@ def train_level(
     settings: MethodSettings,
     seed: int,
 ) -> Float32[np.ndarray, "N D"]:
-    """Train with Adam from zero, one random view per step; each view is used once before any is repeated."""
+    """Train with Adam from zeros, on one random view per step; each view is used once before a repeat."""
     channels = latents.shape[1]
     wide = channels + -channels % WIDTH
     features, gradient = np.zeros((2, num_gaussians * wide), np.float32)

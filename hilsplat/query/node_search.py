@@ -207,9 +207,9 @@ def _search_path(
     """Find nodes that match the last text and are part of nodes that match the earlier texts.
 
     Every text has its own level. All nodes at the last text's level compete, each together with its
-    ancestors. If a cushion matches "bear" slightly better than the bear does, the bear still wins by its head
-    and nose. A node that is not part of a plausible answer to the first text (`PLAUSIBLE`) does not compete,
-    unless no node is part of one.
+    ancestors. If a cushion matches "bear" slightly better than the bear does, the bear still wins, because
+    its head and nose match. A node that is not part of a plausible answer to the first text (`PLAUSIBLE`)
+    does not compete, unless no node is part of one.
 
     If a path has fewer texts than there are levels, its levels are ambiguous: the handle of a mug may be a
     part or a subpart, and the head of ("head", "nose") is not a whole. All combinations of levels are

@@ -67,7 +67,7 @@ def _neighbours(indptr, indices, intersection, union, seen, view):
 
 @compiled
 def _merged_run(begin, end, first, neighbour, inter, extra, root, place_of, self_a, self_b):
-    """Copy a run of neighbours to position `first`, and sum those that were merged after it was written.
+    """Copy a run of neighbours to position `first`, and sum entries merged after it was written.
 
     Entries copied there from an earlier run of the cluster are summed too. Entries that refer to the
     cluster itself are omitted. Returns the end of the run and the two sums of the omitted entries.

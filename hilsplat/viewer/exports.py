@@ -42,7 +42,7 @@ def labelled(
 ) -> tuple[Int64[np.ndarray, " g"], Int32[np.ndarray, " g"]]:
     """Return the rows of all groups' Gaussians in ascending order, and each row's group, numbered from 1.
 
-    A Gaussian in several groups gets the group with the fewest Gaussians.
+    A Gaussian in several groups is assigned to the one with the fewest Gaussians.
     """
     members = [scene.gaussians_of(group.nodes) for group in groups]
     label = np.zeros(len(scene.gaussians), np.int32)

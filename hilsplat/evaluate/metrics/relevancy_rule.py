@@ -28,7 +28,7 @@ class RelevancyRule:
     rules: `max` uses the level whose (mixed) map has the highest value, `mean_in_mask` the level with the
     highest mean inside its own mask (LangSplat's text on 3D-OVS). The finest level wins ties, because
     LangSplat stacks levels from fine to coarse. At the border, `langsplat` reflects in the mean filter and
-    omits the last row and column in the majority filter; `inside` skips pixels off the image (LangSplatV2).
+    omits the last row and column in the majority filter; `inside` skips pixels outside it (LangSplatV2).
     """
 
     filter_px: int = 0  # side of the mean filter; 0 scales 30 with the height of the map

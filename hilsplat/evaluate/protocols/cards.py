@@ -138,7 +138,7 @@ SCENE_WIDE = ProtocolCard(
     2,
     (*MASK, *CONSISTENCY),
     "levels",
-    "as hierarchy/level-given for nodes, but all nodes of the scene compete: one answer for all views",
+    "like hierarchy/level-given, but all nodes of the scene compete: one answer for all views",
     OURS,
 )
 ANNOTATIONS = ProtocolCard(
@@ -149,7 +149,7 @@ VIEW_CONSISTENCY = ProtocolCard(
     2,
     ("view_consistency",),
     "levels",
-    "as hierarchy/level-given, in a view and its nearest neighbour; IoU over surface points visible in both",
+    "like hierarchy/level-given, in a view and its nearest neighbour; IoU over points visible in both",
     f"{OURS}; exact geometry of the synthetic world",
 )
 LERF_OPENGAUSSIAN = ProtocolCard(

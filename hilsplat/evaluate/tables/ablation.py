@@ -51,12 +51,12 @@ ABLATIONS = {
         "coverage threshold",
         "theta determines which masks of a view are nested. Rows in the paper's reading take levels from the "
         "coverage tree (masks.levels: tree), so theta moves masks between levels. With levels from SAM's "
-        "heads, theta affects a field only through L_ins and L_part, and not the linked semantic tree.",
+        "heads, theta affects a field only through L_ins and L_part. It never affects the semantic tree.",
     ),
     "omega": (
         "Influence of the similarity degree Omega",
         "similarity degrees",
-        "Omega appears only in L_ins. Rows in the paper's reading use lambda_1 = exp(-6) and "
+        "Omega appears only in L_ins. Rows that follow the paper use lambda_1 = exp(-6) and "
         "lambda_2 = exp(-5); with 1e-6 and 1e-5, all rows are equal.",
     ),
 }

@@ -70,7 +70,7 @@ def replica_table(sources: Sources) -> Table:
     blocks += measured_blocks(sources, ("replica/per-scene",), cells_of, columns_of)
     footnotes = (
         "All values in %. Mean over the classes present in a scene; vertices of other classes are ignored. "
-        "The paper states 48 classes but no evaluation code, so this is our reading.",
+        "The paper mentions 48 classes but has no evaluation code, so this is our reading.",
         MODE_NOTE,
         INTERVAL_NOTE,
         "*: reproduced by the paper's authors.",

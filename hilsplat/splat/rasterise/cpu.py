@@ -28,7 +28,7 @@ RANGES_PER_THREAD = 4
 def over_ranges(
     work: Callable[..., Any], count: int, threads: int, *arguments: Any, first: int = 0
 ) -> list[Any]:
-    """Call `work(begin, end, *arguments)` on threads, for ranges that cover `count` items from `first`."""
+    """Call `work(begin, end, *arguments)` in threads for ranges of `count` items, starting at `first`."""
     pieces = min(count, RANGES_PER_THREAD * threads) if threads > 1 and count > 1 else 1
     edges = first + np.linspace(0, count, pieces + 1).astype(int)
     return over_edges(work, edges.tolist(), threads, *arguments)

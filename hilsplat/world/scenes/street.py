@@ -298,7 +298,7 @@ def _dome(middle: float) -> Mesh:
 
 
 def _daylight(rng: np.random.Generator) -> Style:
-    """Draw sun and sky; the sun is distant, so that its light is nearly constant along the street."""
+    """Draw the sun and sky; the sun is distant, so its light is nearly constant along the street."""
     azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(38, 62))
     warm = rng.uniform(0, 1)
     toward = np.array(
