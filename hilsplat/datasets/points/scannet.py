@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int32
+from jaxtyping import Int32
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import list_images
@@ -83,20 +83,6 @@ def read_scan_info(path: Path) -> dict[str, str]:
     lines = require_file(path).read_text(encoding="utf-8").splitlines()
     pairs = (line.split(" = ", 1) for line in lines if " = " in line)
     return {key.strip(): value.strip() for key, value in pairs}
-
-
-def axis_alignment(folder: Path, scan: str) -> Float[np.ndarray, "4 4"]:
-    """Return the matrix that aligns a scan's walls with the axes; test scans have no such matrix."""
-    words = read_scan_info(folder / f"{scan}.txt").get("axisAlignment", "").split()
-    try:
-        return np.array([float(word) for word in words]).reshape(4, 4)
-    except ValueError as error:
-        raise SceneError(
-            f"{scan} has no usable axisAlignment",
-            expected="16 numbers",
-            found=f"{len(words)} words",
-            fix="do not align the mesh and poses (aligned=False)",
-        ) from error
 
 
 def read_images(folder: Path, scan: str) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
@@ -214,18 +200,12 @@ def _from_aggregation(
     return fine, instance, unknown
 
 
-def open_scan(root: Path, scan: str, aligned: bool = False) -> PointScene:
-    """Read the frames and labels of a scan; `aligned` applies axisAlignment to mesh and poses."""
+def open_scan(root: Path, scan: str) -> PointScene:
+    """Read the frames and labels of a scan."""
     folder = scan_folder(root, scan)
     DATASET.require(root, scan)
     truth, of_labels = read_truth(folder, scan, read_label_table(root / LABEL_TABLE))
     images, of_images = read_images(folder, scan)
-    if aligned:
-        turn = axis_alignment(folder, scan)
-        back = np.linalg.inv(turn)
-        images = tuple(replace(image, cam_from_world=image.cam_from_world @ back) for image in images)
-        xyz = (truth["nyu40"].xyz @ turn[:3, :3].T + turn[:3, 3]).astype(np.float32)
-        truth = {labelling: replace(points, xyz=xyz) for labelling, points in truth.items()}
     for warning in (*of_images, *of_labels):
         logger.warning("%s: %s", scan, warning)
     return PointScene(scan, images, truth, (*of_images, *of_labels))
@@ -258,7 +238,7 @@ DATASET = Dataset(
       scene0000_00_vh_clean_2.labels.ply
       scene0000_00_vh_clean_2.0.010000.segs.json
       scene0000_00.aggregation.json
-      scene0000_00.txt                 optional: image size, axisAlignment""",
+      scene0000_00.txt                 optional: image size""",
     required=lambda scan: (
         *(f"scans/{scan}/{name}" for name in ("color", "pose", "intrinsic/intrinsic_color.txt")),
         f"scans/{scan}/{scan}_vh_clean_2.ply",

@@ -99,20 +99,6 @@ def test_frames_without_a_pose_are_skipped_and_reported(tmp_path):
         open_scan(tmp_path / "scannet", SCAN)
 
 
-def test_alignment_is_off_by_default_and_turns_mesh_and_cameras_together(root):
-    folder = root / "scans" / SCAN
-    turn = turned(90)
-    info = folder / f"{SCAN}.txt"
-    info.write_text(f"axisAlignment = {' '.join(map(str, turn.ravel()))}\nsceneType = Office\n")
-    plain, aligned = open_scan(root, SCAN), open_scan(root, SCAN, aligned=True)
-    np.testing.assert_array_equal(plain.truth["nyu40"].xyz, XYZ)
-    # 90 degrees: x becomes y, then the translation (90, 2, 3)
-    np.testing.assert_allclose(aligned.truth["nyu40"].xyz[1], [90, 3, 3], atol=1e-5)
-    for before, after in zip(plain.images, aligned.images, strict=True):
-        seen = before.cam_from_world @ [1, 0, 0, 1]
-        np.testing.assert_allclose(after.cam_from_world @ [90, 3, 3, 1], seen, atol=1e-9)
-
-
 def test_unknown_categories_and_vertices_of_two_groups(root):
     path = root / "scans" / SCAN / f"{SCAN}.aggregation.json"
     path.write_text(path.read_text().replace('"chair"', '"trashcan"'))
