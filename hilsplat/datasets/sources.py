@@ -126,6 +126,6 @@ def export_images(name: str, data_root: Path, out: Path) -> int:
             f"{name} needs no export: its images are already in a folder",
             fix="enter the folder as the source in the scene sheet",
         )
-    meshes = [points for points in scene.truth.values() if points.faces is not None]
+    meshes = [points for points in scene.truth.values() if points.labelling != "waymo"]
     write_posed_images(out, scene.images, meshes[0].xyz if meshes else None)
     return len(scene.images)

@@ -48,7 +48,6 @@ class LabelledPoints:
         class_id: class number in the data set's files; 0 if undefined.
         instance_id: instance number from 1, unrelated to numbers in other files; 0 for none.
         labelling: meaning of `class_id`, a key of `LABELLINGS`.
-        faces: triangle corners, as row indices of `xyz`; None if the points are not a mesh.
         visible: whether the point is visible to a camera; None if unknown.
     """
 
@@ -56,7 +55,6 @@ class LabelledPoints:
     class_id: Int32[np.ndarray, " P"]
     instance_id: Int32[np.ndarray, " P"]
     labelling: str
-    faces: Int32[np.ndarray, "F 3"] | None = None
     visible: Bool[np.ndarray, " P"] | None = None
 
     def __len__(self) -> int:

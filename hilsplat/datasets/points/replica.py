@@ -1,4 +1,4 @@
-"""Replica: rendered sequences in three layouts, the labelled quad mesh, and text files of vertex labels.
+"""Replica: rendered sequences in three layouts, and the labelled quad mesh.
 
 All readers raise SceneError if a file is missing, damaged, or doesn't match the others.
 
@@ -13,7 +13,6 @@ Poses are camera-to-world in OpenCV axes, 16 numbers per line.
 """
 
 import logging
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +31,6 @@ from hilsplat.datasets.points.labelled_points import (
     by_number,
     read_json_object,
     read_numbers,
-    require_file,
 )
 from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage, rigid_pose
 
@@ -166,12 +164,6 @@ def object_of_vertices(
     return result
 
 
-def triangles_of(quads: Int32[np.ndarray, "F 4"]) -> Int32[np.ndarray, "T 3"]:
-    """Split each quad into triangles (corners 0 1 2 and 0 2 3), and drop degenerate triangles."""
-    triangles = quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
-    return triangles[(triangles != triangles[:, [1, 2, 0]]).all(axis=1)]
-
-
 def read_semantic_mesh(habitat: Path) -> LabelledPoints:
     """Return the vertices of `mesh_semantic.ply`, each labelled with the most frequent object of its faces.
 
@@ -191,79 +183,12 @@ def read_semantic_mesh(habitat: Path) -> LabelledPoints:
     owner = object_of_vertices(quads, of_face, len(mesh.xyz))
     class_id = np.where(owner >= 0, classes[owner], 0).astype(np.int32)
     instance = np.where(class_id > 0, owner + 1, 0).astype(np.int32)
-    return LabelledPoints(mesh.xyz, class_id, instance, "replica", triangles_of(quads))
-
-
-def read_vertex_labels(path: Path, num_vertices: int) -> Int32[np.ndarray, " P"]:
-    """Read `semantic_labels_<scene>.txt`: one known class id per vertex; negative ids become 0."""
-    require_file(path)
-    try:
-        labels = np.array(path.read_text(encoding="utf-8").split(), dtype=np.int32)
-    except ValueError as error:
-        raise SceneError(f"{path} does not contain only integers: {error}", fix=UNPACK_AGAIN) from error
-    if len(labels) != num_vertices:
-        raise SceneError(
-            f"{path} does not match the vertices of its mesh",
-            expected=f"{num_vertices} lines",
-            found=f"{len(labels)}",
-            fix="use a mesh and labels from the same scene and release",
-        )
-    unknown = Counter(labels[~np.isin(labels, [*REPLICA_NAMES, 0, -1, -2])].tolist())
-    if unknown:
-        raise SceneError(
-            f"{path} has classes that are not in Replica",
-            expected=f"1 to {max(REPLICA_NAMES)}, 0, -1 or -2",
-            found=", ".join(f"{number} ({count} lines)" for number, count in sorted(unknown.items())[:5]),
-            fix="use semantic_labels_<scene>.txt, not instance_labels_<scene>.txt",
-        )
-    return np.maximum(labels, 0)
-
-
-def read_labelled_mesh(mesh_path: Path, labels: Path, instances: Path | None = None) -> LabelledPoints:
-    """Read a mesh of the NICE-SLAM package (quads or triangles) with OpenNeRF's text files of vertex labels.
-
-    These are `semantic_labels_<scene>.txt` and, if available, `instance_labels_<scene>.txt`.
-    """
-    try:
-        mesh = PlyMesh(mesh_path, 3)
-        faces = mesh.faces
-    except SceneError:
-        mesh = PlyMesh(mesh_path, 4)
-        faces = triangles_of(mesh.faces)
-    xyz = mesh.xyz
-    class_id = read_vertex_labels(labels, len(xyz))
-    instance = np.zeros(len(xyz), dtype=np.int32)
-    if instances is not None:
-        values = read_numbers(instances, 1)[:, 0].astype(np.int32)
-        if len(values) != len(xyz):
-            raise SceneError(
-                f"{instances} does not match the vertices of {mesh_path}",
-                expected=f"{len(xyz)} lines",
-                found=len(values),
-                fix="use both files from the same scene",
-            )
-        # Values are class * 1000 + instance; values below 1000 are not objects.
-        instance = np.where(values >= 1000, values, 0).astype(np.int32)
-    return LabelledPoints(xyz, class_id, instance, "replica", faces)
+    return LabelledPoints(mesh.xyz, class_id, instance, "replica")
 
 
 def open_scene(root: Path, scene: str) -> PointScene:
-    """Read a scene, such as "room_0": its frames, and the release's labels or, if missing, OpenNeRF's."""
-    habitat, short = root / scene / "habitat", scene.replace("_", "")
-    text = root / f"semantic_labels_{short}.txt"
-    if habitat.is_dir():
-        truth = read_semantic_mesh(habitat)
-    elif text.is_file():
-        instances = root / f"instance_labels_{short}.txt"
-        mesh = root / f"{short}_mesh.ply"
-        truth = read_labelled_mesh(mesh, text, instances if instances.is_file() else None)
-    else:
-        raise SceneError(
-            f"Replica scene {scene} has no labels in {root}",
-            expected=f"{scene}/habitat/mesh_semantic.ply, or {text.name} with {short}_mesh.ply",
-            found=listing(root),
-            fix="unpack the original release there",
-        )
+    """Read the frames and labels of a scene, such as "room_0"."""
+    truth = read_semantic_mesh(root / scene / "habitat")
     images, warnings = read_images(sequence_folder(root, scene))
     for warning in warnings:
         logger.warning("%s: %s", scene, warning)

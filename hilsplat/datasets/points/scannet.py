@@ -139,7 +139,7 @@ def read_truth(
     mesh_path = folder / f"{scan}_vh_clean_2.ply"
     label_path = folder / f"{scan}_vh_clean_2.labels.ply"
     mesh, labelled = PlyMesh(mesh_path, 3), PlyMesh(label_path, 3)
-    xyz, faces = mesh.xyz, mesh.faces
+    xyz = mesh.xyz
     nyu40 = labelled.column("vertex", "label").astype(np.int32)
     if len(nyu40) != len(xyz) or not np.allclose(labelled.xyz, xyz, atol=SAME_PLACE_M):
         raise SceneError(
@@ -157,7 +157,7 @@ def read_truth(
     if unknown:
         listed = ", ".join(f"{name} ({count})" for name, count in sorted(unknown.items()))
         warnings.append(f"no ScanNet200 class for categories that are not in {LABEL_TABLE}: {listed}")
-    points = LabelledPoints(xyz, nyu40, instance, "nyu40", faces)
+    points = LabelledPoints(xyz, nyu40, instance, "nyu40")
     truth = {"nyu40": points, "scannet200": replace(points, class_id=fine, labelling="scannet200")}
     return truth, tuple(warnings)
 

@@ -12,9 +12,7 @@ from hilsplat.datasets.points.replica import (
     object_of_vertices,
     open_scene,
     read_images,
-    read_labelled_mesh,
     read_semantic_mesh,
-    triangles_of,
 )
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.scene.posed_images import PosedImage
@@ -64,11 +62,6 @@ def test_a_vertex_belongs_to_the_object_of_most_faces_or_the_smallest_id_on_ties
     assert object_of_vertices(faces, np.array([3, 3, 1]), 5).tolist() == [3, 3, 3, 1, -1]
 
 
-def test_quads_become_two_triangles_unless_a_corner_repeats():
-    assert triangles_of(np.array([[0, 1, 2, 3]], np.int32)).tolist() == [[0, 1, 2], [0, 2, 3]]
-    assert triangles_of(np.array([[0, 1, 2, 2]], np.int32)).tolist() == [[0, 1, 2]]
-
-
 def test_frames_are_sorted_by_number_and_other_pictures_are_ignored(tmp_path):
     images, warnings = read_images(make_semantic_nerf(tmp_path / "seq", 12, lines=15))
     assert [image.name for image in images] == [f"rgb_{number}.png" for number in range(12)]
@@ -84,25 +77,6 @@ def test_focal_length_is_half_the_width_without_cam_params(tmp_path):
     assert images[0].K.tolist() == [[7, 0, 5], [0, 7, 3], [0, 0, 1]]
     lens = json.loads((tmp_path / "slam" / "cam_params.json").read_text())["camera"]
     assert (lens["cx"], lens["cy"], lens["scale"]) == (4.5, 2.5, 6553.5)  # pixel centres from 0, as 599.5
-
-
-def test_labels_per_vertex_as_text(tmp_path):
-    places = {axis: XYZ[:, column] for column, axis in enumerate("xyz")}
-    for mesh, faces in (("quads", QUADS), ("triangles", QUADS[:, :3])):
-        write_ply(tmp_path / f"{mesh}.ply", places, faces, {})
-    labels, instances = tmp_path / "labels.txt", tmp_path / "instances.txt"
-    labels.write_text("20\n93\n-1\n-2\n20\n20\n20\n20\n")
-    instances.write_text("20001\n93002\n-1\n7\n20001\n20001\n20003\n20003\n")
-    for mesh in ("quads", "triangles"):
-        points = read_labelled_mesh(tmp_path / f"{mesh}.ply", labels, instances)
-        assert points.class_id.tolist() == [20, 93, 0, 0, 20, 20, 20, 20]
-        assert points.instance_id.tolist() == [20001, 93002, 0, 0, 20001, 20001, 20003, 20003]
-        assert points.faces.shape[1] == 3
-    with pytest.raises(SceneError, match=r"(?s)not in Replica.*found     20001 \(3 lines\)"):
-        read_labelled_mesh(tmp_path / "quads.ply", instances)
-    labels.write_text("20\n93\n")
-    with pytest.raises(SceneError, match=r"expected  8 lines\n  found     2"):
-        read_labelled_mesh(tmp_path / "quads.ply", labels)
 
 
 def test_a_scene_is_read_from_either_sequence(tmp_path):
@@ -162,7 +136,7 @@ def sequence_with(folder: Path, poses: str) -> Path:
         ),
         (
             lambda at: open_scene(at, "room_1"),
-            r"Replica scene room_1 has no labels.*mesh_semantic\.ply, or semantic_labels_room1\.txt",
+            r"mesh_semantic\.ply is missing",
         ),
     ],
 )

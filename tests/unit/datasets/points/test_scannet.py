@@ -56,7 +56,6 @@ def test_labels_and_instances_are_those_of_the_files(root):
     scene = open_scan(root, SCAN)
     points = scene.truth["nyu40"]
     np.testing.assert_array_equal(points.xyz, XYZ)
-    np.testing.assert_array_equal(points.faces, FACES)
     assert points.class_id.tolist() == [1, 1, 4, 5, 0]
     assert points.instance_id.tolist() == [1, 1, 2, 3, 0]  # objectId + 1: the first object is not "none"
     assert scene.truth["scannet200"].class_id.tolist() == [1, 1, 1191, 2, 0]
