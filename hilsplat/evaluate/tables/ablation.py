@@ -49,9 +49,9 @@ ABLATIONS = {
     "theta": (
         "Influence of the coverage threshold theta",
         "coverage threshold",
-        "theta determines which masks of a view are nested. Rows in the paper's reading take levels from the "
+        "theta determines which masks of a view are nested. Rows that follow the paper take levels from the "
         "coverage tree (masks.levels: tree), so theta moves masks between levels. With levels from SAM's "
-        "heads, theta affects a field only through L_ins and L_part. It never affects the semantic tree.",
+        "heads, theta affects fields only through L_ins and L_part, and does not affect semantic trees.",
     ),
     "omega": (
         "Influence of the similarity degree Omega",
