@@ -40,7 +40,7 @@ def test_the_printed_address_opens_the_page_and_no_other_does(desk_project):
 
 
 def test_a_taken_port_is_refused():
-    with listening_at(0) as taken, pytest.raises(SettingsError, match="choose another"):
+    with listening_at(0) as taken, pytest.raises(SettingsError, match="choose a different port"):
         listening_at(taken.getsockname()[1])
 
 

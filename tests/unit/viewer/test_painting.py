@@ -129,7 +129,7 @@ def test_invalid_cameras_are_refused(client, camera, change):
     [
         ({"table": "AAAA"}, 422, "reload the page"),
         ({"table": "not base64!"}, 422, "reload the page"),
-        ({"ramp": base64.b64encode(bytes(768)).decode()}, 400, "relevancy needs a text"),  # without a text
+        ({"ramp": base64.b64encode(bytes(768)).decode()}, 400, "relevancy requires a text"),
     ],
 )
 def test_invalid_styles_are_refused(client, camera, style, status, message):
