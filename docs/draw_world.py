@@ -4,7 +4,7 @@ python docs/draw_world.py classes classes.png                  # one object of e
 python docs/draw_world.py tabletop scenes.png 100 101 102      # one view of each scene, with its labels
 """
 
-import sys
+import argparse
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
@@ -110,8 +110,14 @@ def _write(figure: Figure, out: Path) -> None:
 
 
 if __name__ == "__main__":
-    what, target, *seeds = sys.argv[1:]
-    if what == "classes":
-        draw_classes(Path(target))
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("what", help="classes, or a kind of scene: tabletop, room or street")
+    parser.add_argument("out", type=Path, help="PNG to write")
+    parser.add_argument("seeds", type=int, nargs="*", help="seeds of the scenes")
+    given = parser.parse_args()
+    if given.what == "classes":
+        draw_classes(given.out)
+    elif not given.seeds:
+        parser.error("scenes need seeds, such as 100 101")
     else:
-        draw_scenes(what, [int(seed) for seed in seeds], Path(target))
+        draw_scenes(given.what, given.seeds, given.out)

@@ -26,7 +26,7 @@ def summed_masks(first, last, runs, offsets, level_index, labels, half, indptr, 
         runs, offsets: as in `HierarchicalMasks`.
         labels: painted mask of each pixel and level, -1 for none.
         half: whether each pixel is in the random half.
-        indptr, indices, data: W in CSR form; pixels without weights are ignored.
+        indptr, indices, data: W in CSR form, with positive weights; pixels without weights are ignored.
 
     Returns:
         counts (masks x 2) of painted pixels and of painted pixels in the half; row sizes; columns; sums over
@@ -144,7 +144,7 @@ def add_to_block(
         columns: output of `transpose` for the part: starts and cells.
         rows, late: row starts, columns, and sums by level (E x 3); no pair is in both.
         number: an integer per Gaussian, zero before and after the call.
-        sums: buffer for SUMS numbers per Gaussian.
+        sums: buffer for SUMS numbers per Gaussian and SUMS more.
         fresh: buffer for new columns, one number per Gaussian.
         out_indptr, out_indices, out_values: late pairs; columns are sorted within rows.
 

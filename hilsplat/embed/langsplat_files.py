@@ -37,13 +37,14 @@ MAPS: tuple[Level | None, ...] = (None, Level.SUBPART, Level.PART, Level.WHOLE)
 """Levels of the four maps, in order; the first map mixes all levels."""
 
 
-def stems_of(views: list[str]) -> dict[str, str]:
-    """Return the stem of each view's files: its name, truncated at the first dot as in LangSplat.
+def stem_of(view: str) -> str:
+    """Return the stem of a view's files: its name, truncated at the first dot as in LangSplat."""
+    return view.split(".")[0]
 
-    Raises:
-        ArtifactError: if two views have the same stem.
-    """
-    stems = {view: view.split(".")[0] for view in views}
+
+def stems_of(views: list[str]) -> dict[str, str]:
+    """Return the stem of each view, or raise an ArtifactError if two views have the same stem."""
+    stems = {view: stem_of(view) for view in views}
     if twins := [view for view in views if list(stems.values()).count(stems[view]) > 1]:
         shared = f"these views would use the same LangSplat files: {', '.join(twins[:4])}"
         raise ArtifactError(shared, fix="rename the images so that their names differ before the first dot")
@@ -63,7 +64,7 @@ def read_view(
         ArtifactError: a file is missing, damaged, pickled, or in a different format.
         MisalignedArtifactError: the maps' aspect ratio differs from the view's.
     """
-    maps_path, vectors_path = (folder / f"{view.split('.')[0]}_{kind}.npy" for kind in "sf")
+    maps_path, vectors_path = (folder / f"{stem_of(view)}_{kind}.npy" for kind in "sf")
     maps, vectors = read_npy(maps_path), read_npy(vectors_path)
     if maps.ndim != 3 or len(maps) != len(MAPS):
         shape = "an array of shape (4, height, width): default, s, m, l"
@@ -180,7 +181,7 @@ def _require_model(
     """
     view = max(found, key=lambda view: len(found[view][0]))
     masks, vectors = found[view]
-    model.require_width(vectors.shape[1], f"{files / view.split('.')[0]}_f.npy")
+    model.require_width(vectors.shape[1], f"{files / stem_of(view)}_f.npy")
     rows = np.arange(len(masks))[:: max(1, len(masks) // CHECKED_MASKS)]
     own = model.embed_masks(scene.image(view), masks, ClipSettings(crop="langsplat"), rows).astype(np.float32)
     cosine = float(np.median((own * vectors[rows].astype(np.float32)).sum(axis=1))) if len(rows) else 1.0

@@ -62,10 +62,10 @@ def needs_of(model: ModelFolder, batch: int, *, as_exported: bool = False) -> Ne
     if not isinstance(vision, dict):
         picture, as_exported = side * side * UNKNOWN_BYTES_PER_PX / MIB, True
     elif model.kind == "clip":
-        tokens = (side / vision.get("patch_size", 16)) ** 2
+        tokens = (side / _patch_px(vision)) ** 2
         picture = 2 * _attention_mib(vision, side) + CLIP_TOKEN_MIB * tokens
     elif model.layout == "sam" and not as_exported:
-        patches = side / vision.get("patch_size", 16)
+        patches = side / _patch_px(vision)
         features = patches**2 * vision.get("hidden_size", 768) * 4 / MIB
         picture = ACTIVATIONS * features + ATTENTION_COPIES * _attention_mib(vision, side) / patches
     else:
@@ -84,7 +84,11 @@ def _attention_mib(vision: dict[str, Any], side_px: int) -> float:
     """
     stages = (vision.get("backbone_config") or {}).get("num_attention_heads_per_stage")
     heads = stages[2] if stages else vision.get("num_attention_heads", 12)
-    return heads * (side_px / vision.get("patch_size", 16)) ** 4 * 4 / MIB
+    return heads * (side_px / _patch_px(vision)) ** 4 * 4 / MIB
+
+
+def _patch_px(vision: dict[str, Any]) -> int:
+    return vision.get("patch_size", 16)
 
 
 SYSTEM = Path("/")  # parent folder of `proc` and `sys`; tests use other folders
