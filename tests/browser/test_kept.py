@@ -1,6 +1,7 @@
 """Several queries at once, files of them, and films along a path of the user's own."""
 
 import json
+import re
 
 import av
 from PIL import Image
@@ -39,7 +40,7 @@ def test_the_overlap_of_two_queries_is_reported(opened, desk_address):
     page.get_by_text("1 answer inside an answer to another query.").wait_for()
     ask(page, "mug")
     page.get_by_text("White: 1 node found by several queries.").wait_for()
-    assert page.locator("#overlay text").first.text_content().startswith("mug + ")
+    page.locator("#overlay text", has_text=re.compile(r"^mug \+ ")).wait_for()
 
 
 def test_a_kept_query_is_edited_with_its_threshold_at_its_photograph(opened, desk_address):
