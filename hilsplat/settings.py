@@ -85,9 +85,6 @@ class PosesSettings(Section):
     min_registered_share: float = knob(
         0.7, "minimum share of the views in the largest model; below it, poses fail", unit="share", gt=0, le=1
     )
-    several_models: Literal["largest", "stop"] = knob(
-        "largest", "if the photographs form several models: use the largest, or stop"
-    )
     test_every: int = knob(8, "every n-th view is a test view; 0: none", unit="views", ge=0, origin="3DGS")
 
 

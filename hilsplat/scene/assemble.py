@@ -1,6 +1,5 @@
 """Assembly of the scene artifact from posed views: pinhole images, normalised coordinates, split, report."""
 
-import logging
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,8 +14,6 @@ from hilsplat.base.images import read_image, write_png
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.scene import Scene
-
-logger = logging.getLogger(__name__)
 
 MIN_VIEWS_FOR_TEST = 8
 """Minimum number of views for a test split; with fewer, the fit needs all of them."""
@@ -33,11 +30,6 @@ class PosedView:
     image: Path
     camera: pycolmap.Camera
     cam_from_source: Float64[np.ndarray, "4 4"]
-
-    @property
-    def centre(self) -> Float64[np.ndarray, " 3"]:
-        """Camera centre in source coordinates."""
-        return -self.cam_from_source[:3, :3].T @ self.cam_from_source[:3, 3]
 
 
 def undistort(view: PosedView, folder: Path) -> PosedView:

@@ -276,7 +276,7 @@ def _why_not(view: str, entry: Mapping[str, Any], members: Sequence[set[str]]) -
 
 
 def check_registration(images: Path, name: str, report: Mapping[str, Any], settings: PosesSettings) -> None:
-    """Refuse a reconstruction with too few views or several models; otherwise log its warnings."""
+    """Refuse a reconstruction with too few views; otherwise log its warnings."""
     total, registered = report["images"], report["registered"]
     lost = [entry for entry in report["views"].values() if not entry["registered"]]
     listing = "".join(f"\n            {entry['file']}: {entry['why_not']}" for entry in lost)
@@ -291,22 +291,14 @@ def check_registration(images: Path, name: str, report: Mapping[str, Any], setti
             found=f"none{listing}",
             fix=advice,
         )
-    sizes = ", ".join(str(size) for size in report["models"])
     if registered < settings.min_registered_share * total:
-        share = registered / total
+        share, sizes = registered / total, ", ".join(map(str, report["models"]))
         raise RegistrationError(
             f"too few photographs of {name} could be registered",
             expected=f"at least {settings.min_registered_share:.0%} of {total} (poses.min_registered_share)",
             found=f"{registered} ({share:.1%}); models of {sizes} views; not registered:{listing}",
             fix=f"{advice}; to continue with {registered} views, set poses.min_registered_share to "
             f"{np.floor(share * 100) / 100:.2f} or less",
-        )
-    if settings.several_models == "stop" and len(report["models"]) > 1:
-        raise RegistrationError(
-            f"the photographs of {name} form {len(report['models'])} separate models",
-            expected="one model (poses.several_models is stop)",
-            found=f"models of {sizes} views; not in the largest:{listing}",
-            fix=f"{advice}; to use only the largest model, set poses.several_models to largest",
         )
     for warning in report["warnings"]:
         logger.warning("%s: %s", name, warning)

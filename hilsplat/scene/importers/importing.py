@@ -27,11 +27,6 @@ logger = logging.getLogger(__name__)
 ASPECT_TOLERANCE = 0.01
 """Relative tolerance of an image's aspect ratio: a scaled copy is accepted, a different crop is not."""
 
-MIN_TRIANGULATED = 100
-"""Number of triangulated points below which random points in front of the cameras are used instead."""
-
-NUM_RANDOM_POINTS = 20_000
-
 TRAIN_FOLDER = "images_train"
 """Folder of training views, beside `images`, in Gaussian Grouping's data (LERF-Mask)."""
 
@@ -81,13 +76,6 @@ def import_poses(
         views = [undistort(view, work / "pinhole") for view in views]
         points = triangulate(views, work, settings, seed, threads)
         origin_of_points = "triangulated from the known poses"
-        if len(points[0]) < MIN_TRIANGULATED:
-            warnings.append(
-                f"only {len(points[0])} points could be triangulated, so "
-                f"{NUM_RANDOM_POINTS} random points in front of the cameras are used instead"
-            )
-            points = random_points(views, seed)
-            origin_of_points = "random"
     beside, used = known.root / "images", set(files)
     others = list_images(beside) if known.kind == "colmap" and beside.is_dir() else []
     unposed = [path for path in others if path not in used]
@@ -203,36 +191,3 @@ def triangulate(
     target.mkdir()
     model = pycolmap.triangulate_points(model, database, folder, target, options=incremental_options(seed))
     return sparse_points(model)
-
-
-def random_points(
-    views: Sequence[PosedView], seed: int
-) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
-    """Sample random grey points in front of the cameras, to start a fit if too few can be triangulated.
-
-    Each point is on the ray of a random pixel of a random view, at a depth between 0.3 and 2 times the
-    distance from the camera to the point nearest to all optical axes.
-    """
-    generator = np.random.default_rng(seed)
-    centres = np.stack([view.centre for view in views])
-    looks = np.stack([view.cam_from_source[2, :3] for view in views])
-    # Least-squares point nearest to all axes; a weak prior pulls it to one spread ahead of the cameras.
-    spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()) or 1.0
-    across = np.eye(3)[None] - looks[:, :, None] * looks[:, None, :]
-    prior = 1e-3
-    ahead = (centres + spread * looks).mean(axis=0)
-    focus = np.linalg.solve(
-        across.mean(axis=0) + prior * np.eye(3),
-        np.einsum("vij,vj->i", across, centres) / len(views) + prior * ahead,
-    )
-    rows = generator.integers(len(views), size=NUM_RANDOM_POINTS)
-    depth = np.maximum(np.linalg.norm(centres - focus, axis=1), 1e-3 * spread)[rows]
-    depth = depth * generator.uniform(0.3, 2.0, NUM_RANDOM_POINTS)
-    xyz = np.empty((NUM_RANDOM_POINTS, 3))
-    for row, view in enumerate(views):
-        chosen = rows == row
-        pixels = generator.random((int(chosen.sum()), 2)) * [view.camera.width, view.camera.height]
-        K = view.camera.calibration_matrix()
-        rays = np.concatenate([(pixels - K[:2, 2]) / np.diag(K)[:2], np.ones((len(pixels), 1))], axis=1)
-        xyz[chosen] = centres[row] + (rays * depth[chosen, None]) @ view.cam_from_source[:3, :3]
-    return xyz, np.full(xyz.shape, 128, dtype=np.uint8)

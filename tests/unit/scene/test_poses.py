@@ -175,23 +175,17 @@ def found(registered, models):
     return {"images": 10, "registered": registered, "models": models, "warnings": [], "views": views}
 
 
-@pytest.mark.parametrize(
-    ("accepted", "refused", "settings", "message"),
-    [
-        (
-            found(7, [7]),
-            found(6, [6, 4]),
-            {"min_registered_share": 0.7},
-            r"at least 70% of 10.*6 \(60\.0%\); models of 6, 4 .*9\.jpg: no features.*0\.60",
-        ),
-        (found(8, [8]), found(8, [8, 3]), {"several_models": "stop"}, r"2 separate models.*8\.jpg"),
-        (found(8, [8, 3]), found(0, []), {}, r"no camera poses could be found.*0\.jpg: no features"),
-    ],
-)
-def test_too_few_views_and_separate_models_are_refused_as_configured(accepted, refused, settings, message):
-    check_registration(Path("photos"), "photos/test", accepted, PosesSettings(**settings))
+def test_too_few_registered_photographs_are_refused_with_all_reasons():
+    def check(registered, models):
+        settings = PosesSettings(min_registered_share=0.7)
+        check_registration(Path("photos"), "photos/test", found(registered, models), settings)
+
+    check(7, [7, 3])
+    message = r"at least 70% of 10.*6 \(60\.0%\); models of 6, 4 .*9\.jpg: no features.*0\.60"
     with pytest.raises(RegistrationError, match=f"(?s){message}"):
-        check_registration(Path("photos"), "photos/test", refused, PosesSettings(**settings))
+        check(6, [6, 4])
+    with pytest.raises(RegistrationError, match=r"(?s)no camera poses could be found.*0\.jpg: no features"):
+        check(0, [])
 
 
 def database_with(path, shared):
