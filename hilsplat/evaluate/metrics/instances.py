@@ -92,15 +92,8 @@ def match_instances(
             scored, missed = _matches(overlap > threshold, large, ignored > threshold, confidence)
             misses[class_index, overlap_index] = missed
             entries += [(class_index, overlap_index, *each) for each in scored]
-    columns = list(zip(*entries, strict=True)) or [(), (), (), ()]
-    return InstanceMatches(
-        np.array(columns[0], dtype=np.int64),
-        np.array(columns[1], dtype=np.int64),
-        np.array(columns[2], dtype=np.float64),
-        np.array(columns[3], dtype=bool),
-        misses,
-        has_truth,
-    )
+    columns = np.array(entries, dtype="i8, i8, f8, ?")
+    return InstanceMatches(*(columns[f"f{number}"] for number in range(4)), misses, has_truth)
 
 
 def _matches(
@@ -170,21 +163,7 @@ def average_precision(scans: Sequence[InstanceMatches]) -> Float64[np.ndarray, "
     return result
 
 
-def ap(precisions: Float64[np.ndarray, "K T"]) -> float:
-    """Return the mean AP over thresholds 0.50 .. 0.90 (nine) and classes with ground-truth instances."""
-    return _mean_of(precisions[:, :-1])
-
-
-def ap50(precisions: Float64[np.ndarray, "K T"]) -> float:
-    """Return the mean AP over the classes with ground-truth instances, at an IoU above 0.5."""
-    return _mean_of(precisions[:, :1])
-
-
-def ap25(precisions: Float64[np.ndarray, "K T"]) -> float:
-    """Return the mean AP over the classes with ground-truth instances, at an IoU above 0.25."""
-    return _mean_of(precisions[:, -1:])
-
-
-def _mean_of(values: np.ndarray) -> float:
-    known = values[~np.isnan(values)]
+def mean_precision(precisions: Float64[np.ndarray, "k t"]) -> float:
+    """Return the mean over thresholds and classes with ground-truth instances; nan if there are none."""
+    known = precisions[~np.isnan(precisions)]
     return float(known.mean()) if known.size else float("nan")

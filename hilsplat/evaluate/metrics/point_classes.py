@@ -4,8 +4,7 @@ Labels are 1 .. K; 0 means no class, which is ignored in the ground truth and a 
 Benchmarks differ in whether counts are summed per scene or over all scenes, and in which classes count.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
@@ -38,13 +37,6 @@ class ClassCounts:
     def union(self) -> Int64[np.ndarray, " K"]:
         """Number of points labelled or predicted as each class."""
         return self.truth + self.predicted - self.hits
-
-
-def pooled(counts: Iterable[ClassCounts]) -> ClassCounts:
-    """Sum the counts of all scenes; unlike in a mean over scenes, large scenes have more weight."""
-    scenes = list(counts)
-    sums = (sum(getattr(scene, each.name) for scene in scenes) for each in fields(ClassCounts))
-    return ClassCounts(*sums)
 
 
 def class_iou(counts: ClassCounts) -> Float[np.ndarray, " K"]:

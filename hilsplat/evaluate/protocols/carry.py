@@ -1,4 +1,4 @@
-"""Transfer labels and features from Gaussians to labelled points: mesh vertices and lidar returns.
+"""Find the Gaussian of each labelled point (mesh vertex or lidar return), and classify its feature.
 
 | mode | source of a point's label or feature |
 |---|---|
@@ -9,11 +9,10 @@ Scores depend on the mode, so every row names it. The search tree breaks ties be
 deterministically, for the same input and any number of threads.
 """
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int32, Int64
+from jaxtyping import Bool, Float, Int32, Int64
 
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.splat.gaussians import Gaussians
@@ -27,27 +26,10 @@ CHUNK_POINTS = 65536
 """Number of points classified at once; bounds memory use."""
 
 
-@dataclass(frozen=True)
-class CarriedPoints:
-    """The Gaussian of each of P points."""
-
-    mode: Mode
-    index: Int64[np.ndarray, " P"]
-    is_scored: Bool[np.ndarray, " P"]  # False for points that the mode excludes from the evaluation
-
-    def labels(self, of_gaussian: Int[np.ndarray, " N"]) -> Int32[np.ndarray, " P"]:
-        """Return the label of each point's Gaussian; 0 means no label."""
-        return of_gaussian[self.index].astype(np.int32)
-
-    def features(self, of_gaussian: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "P D"]:
-        """Return the features of each point's Gaussian."""
-        return of_gaussian[self.index]
-
-
-def carried_to(
+def gaussians_of_points(
     points: Float[np.ndarray, "P 3"], gaussians: Gaussians, mode: Mode, threads: int = 1
-) -> CarriedPoints:
-    """Assign a Gaussian to each point; positions are in scene units.
+) -> tuple[Int64[np.ndarray, " P"], Bool[np.ndarray, " P"]]:
+    """Return the Gaussian of each point, and whether the point is scored; positions are in scene units.
 
     `frozen`: the fit must not have moved, split or dropped any Gaussian. As in OpenGaussian's
     `scripts/eval_scannet.py`, points whose Gaussian is transparent are not scored.
@@ -65,7 +47,7 @@ def carried_to(
                 found=len(opacities),
                 fix="fit with frozen points, or use mode nearest",
             )
-        return CarriedPoints(mode, np.arange(len(points), dtype=np.int64), opacities >= OPACITY_MIN)
+        return np.arange(len(points), dtype=np.int64), opacities >= OPACITY_MIN
     opaque = np.flatnonzero(opacities >= OPACITY_MIN)
     if not opaque.size:
         raise MisalignedArtifactError(
@@ -78,7 +60,7 @@ def carried_to(
 
     tree = cKDTree(gaussians.means[opaque].astype(float))
     _, place = tree.query(points.astype(float), workers=threads)
-    return CarriedPoints(mode, opaque[place].astype(np.int64), np.ones(len(points), dtype=bool))
+    return opaque[place].astype(np.int64), np.ones(len(points), dtype=bool)
 
 
 def classify(features: Float[np.ndarray, "P D"], texts: Float[np.ndarray, "K D"]) -> Int32[np.ndarray, " P"]:

@@ -13,15 +13,15 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int32
+from jaxtyping import Bool, Float, Int, Int32, Int64
 
 from hilsplat.base.levels import Level
 from hilsplat.datasets.classes import SCANNET200_INSTANCES, ClassSet, splits_of
 from hilsplat.datasets.points.labelled_points import LABELLINGS, LabelledPoints
 from hilsplat.evaluate.metrics import instances, point_classes
-from hilsplat.evaluate.metrics.point_classes import ClassCounts, class_accuracy, class_iou, pooled
+from hilsplat.evaluate.metrics.point_classes import ClassCounts, class_accuracy, class_iou
 from hilsplat.evaluate.protocols.cards import INSTANCES, ProtocolCard
-from hilsplat.evaluate.protocols.carry import CarriedPoints, Mode, carried_to, classify
+from hilsplat.evaluate.protocols.carry import Mode, classify, gaussians_of_points
 from hilsplat.evaluate.scores import Measured
 
 if TYPE_CHECKING:
@@ -70,27 +70,25 @@ def measure_points(
             yield Measured(method, "", "", metric, protocol, MEANS[metric](counts), int(counts.truth.sum()))
 
 
-def pooled_points(card: ProtocolCard, scenes: Iterable[Iterable[Any]], classes: ClassSet) -> dict[str, float]:
-    """Return the means of a pooled protocol from each scene's class rows (or similar named tuples)."""
-    counts = pooled(_counts_of(rows, classes) for rows in scenes)
+def pooled_points(card: ProtocolCard, rows: Iterable[Any], classes: ClassSet) -> dict[str, float]:
+    """Return the means of a pooled protocol from the class rows (or similar named tuples) of all scenes.
+
+    The counts are exact up to 10**6 points per class and scene, because files keep six decimals.
+    """
+    hits, truth, union = np.zeros((3, len(classes)), dtype=np.int64)
+    place = {text: row for row, text in enumerate(classes.texts)}
+    for row in rows:
+        if row.metric == "class_iou":
+            union[place[row.query]] += row.n
+            hits[place[row.query]] += round(row.value * row.n)
+        elif row.metric == "class_accuracy":
+            truth[place[row.query]] += row.n
+    counts = ClassCounts(hits, truth, union - truth + hits)
     values = {metric: MEANS[metric](counts) for metric in card.metrics if metric in MEANS}
     if "miou_head" in card.metrics:
         for split, members in splits_of(classes).items():
             values[f"miou_{split}"] = point_classes.miou_over_occurring(counts, np.array(members))
     return values
-
-
-def _counts_of(rows: Iterable[Any], classes: ClassSet) -> ClassCounts:
-    """Return counts from class rows, exact up to 10**6 points per class because files keep six decimals."""
-    hits, truth, union = np.zeros((3, len(classes)), dtype=np.int64)
-    place = {text: row for row, text in enumerate(classes.texts)}
-    for row in rows:
-        if row.metric == "class_iou":
-            union[place[row.query]] = row.n
-            hits[place[row.query]] = round(row.value * row.n)
-        elif row.metric == "class_accuracy":
-            truth[place[row.query]] = row.n
-    return ClassCounts(hits, truth, union - truth + hits)
 
 
 def measure_instances(
@@ -104,29 +102,27 @@ def measure_instances(
     precisions = instances.average_precision(list(scans.values()))
     if np.isnan(precisions).all():
         return
-    values = {
-        "ap": instances.ap(precisions),
-        "ap50": instances.ap50(precisions),
-        "ap25": instances.ap25(precisions),
-    }
+    # columns of `precisions` follow `instances.OVERLAPS`
+    parts = {"ap": precisions[:, :-1], "ap50": precisions[:, :1], "ap25": precisions[:, -1:]}
     for split, members in splits_of(SCANNET200_INSTANCES).items():
-        values[f"ap_{split}"] = instances.ap(precisions[np.array(members)])
+        parts[f"ap_{split}"] = precisions[np.array(members), :-1]
     protocol = INSTANCES.labelled([f"points: {carried}"])
-    for metric, value in values.items():
+    for metric, part in parts.items():
+        value = instances.mean_precision(part)
         yield Measured(method, "", "", metric, protocol, value, len(scans))
 
 
 def classes_of_points(
-    scene: "LanguageScene", carried: CarriedPoints, method: str, texts: Sequence[str]
+    scene: "LanguageScene", gaussian: Int64[np.ndarray, " P"], method: str, texts: Sequence[str]
 ) -> Int32[np.ndarray, " P"]:
-    """Return point labels 1 .. K from the "tree" or "field"; 0 if a point's Gaussian has none."""
+    """Return point labels 1 .. K from the "tree" or "field"; 0 if the point's `gaussian` has none."""
     vectors = scene.text_vectors(texts)
     if method == "tree":
         of_node = classify(scene.tree.clip.astype(np.float32), vectors)
         node = scene.tree.node_of_gaussian[:, LEVEL.index]
-        return carried.labels(np.append(of_node, 0)[node])  # -1 means no node
+        return np.append(of_node, 0)[node[gaussian]].astype(np.int32)  # node -1 means none
     language, code = scene.trained()
-    latents = carried.features(np.ascontiguousarray(language.features[:, LEVEL.index]))
+    latents = language.features[gaussian, LEVEL.index]
     fitted = np.flatnonzero(latents.any(axis=1))
     labels = np.zeros(len(latents), dtype=np.int32)
     if len(fitted):
@@ -135,13 +131,13 @@ def classes_of_points(
 
 
 def node_instances(
-    scene: "LanguageScene", carried: CarriedPoints, truth: LabelledPoints, classes: ClassSet
+    scene: "LanguageScene", gaussian: Int64[np.ndarray, " P"], truth: LabelledPoints, classes: ClassSet
 ) -> instances.InstanceMatches:
     """Match the nodes at level whole to the ground truth; a node's best cosine gives class and confidence."""
     tree = scene.tree
     nodes = tree.nodes_of(LEVEL)
     cosines = tree.clip[nodes].astype(np.float32) @ scene.text_vectors(classes.texts).T
-    own = carried.labels(tree.node_of_gaussian[:, LEVEL.index] + 1) - 1
+    own = tree.node_of_gaussian[gaussian, LEVEL.index]
     class_ids = np.array(classes.ids)[cosines.argmax(axis=1)]
     return instance_scan(truth, classes, own[None] == nodes[:, None], class_ids, cosines.max(axis=1))
 
@@ -179,25 +175,25 @@ def measure_scene_points(
     Labelled points are keyed by labelling, in metres; `scene_from_points` is a similarity transform.
     Protocols whose labelling is absent are skipped.
     """
-    carried_of: dict[int, CarriedPoints] = {}  # labellings of the same mesh share its vertices
+    carried: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # labellings of the same mesh share its vertices
     labels_of: dict[tuple[str, str], np.ndarray] = {}  # several protocols have the same classes
     for card in cards:
         labelling, classes = class_set(card.classes)
         if labelling not in truth:
             continue
         points = truth[labelling]
-        if id(points.xyz) not in carried_of:
+        if id(points.xyz) not in carried:
             places = points.xyz @ scene_from_points[:3, :3].T + scene_from_points[:3, 3]
-            carried_of[id(points.xyz)] = carried_to(places, scene.gaussians, mode, threads)
-        carried = carried_of[id(points.xyz)]
+            carried[id(points.xyz)] = gaussians_of_points(places, scene.gaussians, mode, threads)
+        gaussian, is_scored = carried[id(points.xyz)]
         if card is INSTANCES:
             if "tree" in methods:
-                yield node_instances(scene, carried, points, classes)
+                yield node_instances(scene, gaussian, points, classes)
             continue
-        labels = np.where(carried.is_scored, points.labels(classes), 0)
+        labels = np.where(is_scored, points.labels(classes), 0)
         for method in ("tree", "field"):
             if method in methods:
                 key = method, classes.name
                 if key not in labels_of:
-                    labels_of[key] = classes_of_points(scene, carried, method, classes.texts)
-                yield from measure_points(card, method, labels, labels_of[key], classes, carried.mode)
+                    labels_of[key] = classes_of_points(scene, gaussian, method, classes.texts)
+                yield from measure_points(card, method, labels, labels_of[key], classes, mode)

@@ -6,7 +6,7 @@ several points.
 
 from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -131,7 +131,7 @@ def scannet_cells(sources: Sources, part: "pd.DataFrame") -> dict[str, Cell]:
     from hilsplat.evaluate.protocols.points import measure_instances, pooled_points
 
     if not of_benchmark.empty:  # the counts of all scenes are pooled
-        means = pooled_points(card_of(BENCHMARK), rows_of_scenes(of_benchmark), SCANNET200)
+        means = pooled_points(card_of(BENCHMARK), of_benchmark.itertuples(), SCANNET200)
         cells |= {column: Cell.percent(means[metric]) for metric, column in SPLIT_COLUMNS.items()}
     if scans:
         rows = measure_instances(first["method"], scans, "nearest")
@@ -146,7 +146,7 @@ def waymo_table(sources: Sources) -> Table:
         from hilsplat.datasets.classes import WAYMO_22
         from hilsplat.evaluate.protocols.points import pooled_points
 
-        means = pooled_points(card_of(part["protocol"].iloc[0]), rows_of_scenes(part), WAYMO_22)
+        means = pooled_points(card_of(part["protocol"].iloc[0]), part.itertuples(), WAYMO_22)
         classes = part[part["metric"] == "class_iou"]["query"].nunique()
         return {
             "mIoU": Cell.percent(means["miou_absent_as_one"]),
@@ -171,11 +171,6 @@ def waymo_table(sources: Sources) -> Table:
         "*: reproduced by the paper's authors.",
     )
     return sources.finished("waymo", "Waymo: segmentation of lidar points", blocks, footnotes)
-
-
-def rows_of_scenes(part: "pd.DataFrame") -> list[list[Any]]:
-    """Return score rows as named tuples, one list per scene."""
-    return [list(of_scene.itertuples()) for _, of_scene in part.groupby("scene", sort=True)]
 
 
 def bootstrap_mean(

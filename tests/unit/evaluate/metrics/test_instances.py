@@ -8,12 +8,10 @@ from hypothesis import strategies as st
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.evaluate.metrics.instances import (
     OVERLAPS,
-    ap,
-    ap25,
-    ap50,
     average_precision,
     curve_area,
     match_instances,
+    mean_precision,
 )
 
 CLASS = 4
@@ -44,9 +42,7 @@ EXAMPLE = [(A, 4), (B, 3), (VOID, 3)]
 def test_worked_example_of_ten_vertices():
     # p1 is A; p2 is in void; p3 = points 3-5 shares 2 of 4 with B
     result = precisions(scan_of(EXAMPLE, [(0, 4, 0.9), (7, 9, 0.8), (3, 6, 0.6)]))
-    assert ap25(result) == 1.0
-    assert ap50(result) == 0.5
-    assert ap(result) == pytest.approx(0.5)
+    assert result[0] == pytest.approx([0.5] * 9 + [1.0])  # above 0.5 .. 0.9, and above 0.25
 
 
 def test_area_under_the_curves_of_the_worked_examples():
@@ -63,7 +59,8 @@ def test_perfect_instances_score_one_missing_ones_zero_and_an_absent_class_nothi
     result = precisions(scan_of(EXAMPLE, []), class_ids=(CLASS, 9))
     assert result[0].tolist() == [0.0] * 10
     assert np.isnan(result[1]).all()
-    assert ap(result) == 0
+    assert mean_precision(result) == 0
+    assert np.isnan(mean_precision(result[1:]))
 
 
 @pytest.mark.parametrize(
@@ -114,8 +111,7 @@ TWO_OTHERS = [(A, 4), (9001, 4), (VOID, 4)]
 def test_predictions_in_void_are_ignored_and_others_are_false_positives(
     truth, predictions, class_ids, expected
 ):
-    result = precisions(scan_of(truth, predictions), class_ids=class_ids)
-    assert ap50(result[:1]) == pytest.approx(expected)
+    assert precisions(scan_of(truth, predictions), class_ids=class_ids)[0, 0] == pytest.approx(expected)
 
 
 def test_small_instances_and_predictions_and_other_classes_do_not_count():
@@ -133,7 +129,7 @@ def test_scans_share_one_curve():
     good = scan_of([(A, 4)], [(0, 4, 0.9)])
     missed = scan_of([(A, 4), (VOID, 4)], [])
     # one match, one miss: P = 1, 1 and R = 1/2, 0: 1/4 + 1/4
-    assert ap50(precisions(good, missed)) == pytest.approx(0.5)
+    assert precisions(good, missed)[0, 0] == pytest.approx(0.5)
 
 
 def test_masks_of_other_points_are_refused():

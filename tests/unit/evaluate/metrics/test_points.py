@@ -17,7 +17,6 @@ from hilsplat.evaluate.metrics.point_classes import (
     miou_over_all,
     miou_over_occurring,
     miou_over_present,
-    pooled,
 )
 from tests.conftest import PROJECT
 
@@ -60,14 +59,6 @@ def test_means_differ_for_a_class_that_occurs_nowhere_and_may_be_among_some_clas
     among = np.array([True, False, False, True, True])
     assert miou_over_occurring(counts, among) == pytest.approx((2 / 5 + 0) / 2)
     assert np.isnan(miou_over_occurring(counts, np.zeros(5, dtype=bool)))
-
-
-def test_mean_over_scenes_and_pooled_scenes_differ():
-    # scene 1: intersection 1, union 2; scene 2: 8 of 8
-    first = ClassCounts.of(np.array([1, 1]), np.array([1, 0]), 1)
-    second = ClassCounts.of(np.ones(8, int), np.ones(8, int), 1)
-    assert (class_iou(first)[0] + class_iou(second)[0]) / 2 == 0.75
-    assert class_iou(pooled([first, second]))[0] == 0.9
 
 
 def test_scene_without_truth_has_no_mean():
@@ -134,7 +125,9 @@ def test_waymo_regression_value():
     truth = frames_of(folder / "fake_segmentation_groundtruths.bin")
     prediction = frames_of(folder / "fake_segmentation_predictions.bin")
     assert len(truth) == 6
-    counts = pooled(ClassCounts.of(labels, prediction[frame], 22) for frame, labels in truth.items())
+    counts = ClassCounts.of(
+        *(np.concatenate([of[frame] for frame in truth]) for of in (truth, prediction)), 22
+    )
     expected = np.zeros(22)
     expected[[0, 6]] = 0.0434832  # 1 CAR, 7 PEDESTRIAN
     np.testing.assert_allclose(class_iou(counts), expected, atol=5e-8)

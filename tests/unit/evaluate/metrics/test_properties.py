@@ -31,7 +31,7 @@ def of_counts(function):
     return lambda prediction, truth: function(ClassCounts.of(truth.ravel(), prediction.ravel(), 3))
 
 
-def of_instances(function):
+def of_instances(thresholds):
     def value(prediction, truth):
         present = [label for label in (1, 2, 3) if (prediction == label).any()]
         matches = instances.match_instances(
@@ -42,7 +42,7 @@ def of_instances(function):
             class_ids=(1,),
             min_points=1,
         )
-        return function(instances.average_precision([matches]))
+        return instances.mean_precision(instances.average_precision([matches])[:, thresholds])
 
     return value
 
@@ -107,10 +107,9 @@ CASES = {
     "macc_all": of_counts(point_classes.macc_over_all),
     "miou_absent_as_one": of_counts(point_classes.miou_absent_as_one),
     "frequency_weighted_iou": of_counts(point_classes.frequency_weighted_iou),
-    "ap": of_instances(instances.ap),
-    "ap50": of_instances(instances.ap50),
-    "ap25": of_instances(instances.ap25),
-    **{f"ap_{split}": of_instances(instances.ap) for split in ("head", "common", "tail")},
+    **dict.fromkeys(("ap", "ap_head", "ap_common", "ap_tail"), of_instances(slice(-1))),
+    "ap50": of_instances([0]),
+    "ap25": of_instances([-1]),
 }
 SYMMETRIC = ("iou", "boundary_iou", "acc_25", "acc_50", "pixel_accuracy", "view_consistency")
 IMPERFECT = ("hc_literal", "hc_literal_pooled", "miou_all", "macc_all")

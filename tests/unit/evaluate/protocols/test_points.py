@@ -17,7 +17,7 @@ from hilsplat.datasets.registry import DATASETS
 from hilsplat.evaluate.extra_protocols import STAND_INS, ExtraProtocols
 from hilsplat.evaluate.metrics.instances import average_precision, match_instances
 from hilsplat.evaluate.protocols.cards import card_of
-from hilsplat.evaluate.protocols.carry import carried_to
+from hilsplat.evaluate.protocols.carry import gaussians_of_points
 from hilsplat.evaluate.protocols.points import (
     classes_of_points,
     measure_instances,
@@ -60,15 +60,12 @@ def test_missed_points_count_zero_and_a_scene_without_truth_has_no_rows():
 def test_pooled_rows_equal_points_put_together_also_after_a_file(tmp_path):
     rng = np.random.default_rng(0)
     scenes = [(rng.integers(0, 6, 997), rng.integers(0, 6, 997)) for _ in range(3)]
-    rows = [list(measure_points(WAYMO, "tree", *scene, WAYMO_22, "nearest")) for scene in scenes]
-    assert all(row.query for each in rows for row in each)  # no number per scene
+    rows = [row for scene in scenes for row in measure_points(WAYMO, "tree", *scene, WAYMO_22, "nearest")]
+    assert all(row.query for row in rows)  # no number per scene
     together = np.concatenate(scenes, axis=1)
-    expected = pooled_points(WAYMO, [measure_points(WAYMO, "t", *together, WAYMO_22, "x")], WAYMO_22)
-    assert pooled_points(WAYMO, rows, WAYMO_22) == expected
-    for number, each in enumerate(rows):
-        write_scores(tmp_path / f"{number}.csv", [score(**vars(row), view="") for row in each])
-    read = [read_scores([tmp_path / f"{number}.csv"]).itertuples() for number in range(3)]
-    assert pooled_points(WAYMO, read, WAYMO_22) == expected
+    expected = pooled_points(WAYMO, measure_points(WAYMO, "t", *together, WAYMO_22, "x"), WAYMO_22)
+    write_scores(tmp_path / "scores.csv", [score(**vars(row), view="") for row in rows])
+    assert pooled_points(WAYMO, read_scores([tmp_path / "scores.csv"]).itertuples(), WAYMO_22) == expected
     # five of 22 classes occur; the other 17 count 1 under Waymo's own mean
     assert expected["miou_absent_as_one"] == pytest.approx((5 * expected["miou_present"] + 17) / 22)
 
@@ -80,7 +77,7 @@ def test_scannet200_is_split_into_head_common_and_tail():
     prediction = truth * np.array([1, 1, 1, 0, 0, 0])  # head right, common half, tail missed
     rows = list(measure_points(card, "tree", truth, prediction, SCANNET200, "nearest"))
     expected = {"miou_occurring": 0.5, "miou_head": 1.0, "miou_common": 0.5, "miou_tail": 0.0}
-    assert pooled_points(card, [rows], SCANNET200) == expected
+    assert pooled_points(card, rows, SCANNET200) == expected
 
 
 def test_class_sets_turn_file_labels_into_rows():
@@ -122,8 +119,8 @@ def points_of(block_world, count=1):
 @pytest.mark.parametrize("mode", ["nearest", "frozen"])
 def test_points_get_the_class_of_the_node_or_latent_of_their_gaussians(block_world, method, mode):
     points, ids = points_of(block_world)
-    carried = carried_to(points.xyz, block_world.answers.gaussians, mode)
-    found = classes_of_points(block_world.answers, carried, method, CLASSES.texts)
+    gaussian, _ = gaussians_of_points(points.xyz, block_world.answers.gaussians, mode)
+    found = classes_of_points(block_world.answers, gaussian, method, CLASSES.texts)
     labelled = ids > 0
     assert np.array_equal(found[labelled], CLASSES.labels(ids)[labelled])
     assert (found[~labelled] == 0).all()  # no node, no latent: no prediction
@@ -131,8 +128,8 @@ def test_points_get_the_class_of_the_node_or_latent_of_their_gaussians(block_wor
 
 def test_a_node_is_an_instance_of_its_best_class_also_after_a_file(block_world, tmp_path):
     points, _ = points_of(block_world, count=2)  # both objects then have 100 points and more
-    carried = carried_to(points.xyz, block_world.answers.gaussians, "nearest")
-    matches = node_instances(block_world.answers, carried, points, CLASSES)
+    gaussian, _ = gaussians_of_points(points.xyz, block_world.answers.gaussians, "nearest")
+    matches = node_instances(block_world.answers, gaussian, points, CLASSES)
     assert matches.has_truth.all()
     assert np.nanmean(average_precision([matches])) == 1.0
     assert matches.misses.sum() == 0
