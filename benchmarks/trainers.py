@@ -22,7 +22,7 @@ from benchmarks.rehearsal import PROJECT
 from hilsplat.base.artifacts import read_json
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN
 from hilsplat.evaluate.scores import read_scores
-from hilsplat.evaluate.tables.measured import level_values, mean_over_levels
+from hilsplat.evaluate.tables.measured import level_cells
 from hilsplat.settings import FieldSettings
 
 PAPER = {
@@ -95,10 +95,10 @@ def row(variant: Path) -> str:
     objective += sum(settings[f"weight_{name}"] * losses[name] for name in terms)
     scores = read_scores([variant / "scores.csv"])
     given = scores[scores["protocol"].str.startswith(f"{LEVEL_GIVEN.name}@")]
-    score = 100 * mean_over_levels(level_values(given, "iou").values())
+    score = level_cells(given)["Avg"].text
     record = (variant / "benchmarks" / "field.jsonl").read_text(encoding="utf-8").splitlines()[-1]
     shown = (f"{value:.5f}" for value in (objective, losses["language"], losses["clustering"]))
-    return f"| {variant.name} | {' | '.join(shown)} | {score:.1f} | {json.loads(record)['cpu_time']:.0f} |"
+    return f"| {variant.name} | {' | '.join(shown)} | {score} | {json.loads(record)['cpu_time']:.0f} |"
 
 
 if __name__ == "__main__":

@@ -9,10 +9,11 @@ from pathlib import Path
 from hilsplat.base.artifacts import write_text
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.files import project_path
+from hilsplat.base.tables import write_csv
 from hilsplat.evaluate.scores import read_instances, read_scores
 from hilsplat.evaluate.tables.ablation import ablation_table
 from hilsplat.evaluate.tables.costs import SECONDS, cost_table, efficiency_table, pruning_table, read_costs
-from hilsplat.evaluate.tables.formats import as_csv, as_html, as_latex, as_markdown
+from hilsplat.evaluate.tables.formats import as_html, as_latex, as_markdown, csv_rows
 from hilsplat.evaluate.tables.image_tables import frames_table, hierarchy_table, lerf_table, ovs_table
 from hilsplat.evaluate.tables.point_tables import replica_table, scannet_table, waymo_table
 from hilsplat.evaluate.tables.rows import Sources, Table, read_published
@@ -104,6 +105,6 @@ def run_table(
     write_text(out.with_suffix(".md"), as_markdown(table))
     write_text(out.with_suffix(".tex"), as_latex(table))
     write_text(out.with_suffix(".html"), as_html(table))
-    write_text(out, as_csv(table))
+    write_csv(out, *csv_rows(table))
     rows = sum(len(block.rows) for block in table.blocks)
     logger.info("table %s: %d blocks, %d rows", name, len(table.blocks), rows)

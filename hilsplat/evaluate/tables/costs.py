@@ -13,7 +13,7 @@ from pathlib import Path
 from hilsplat.base.artifacts import parse_json, write_text
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.provenance import read_provenance, require_beginning
-from hilsplat.base.tables import read_csv, write_csv
+from hilsplat.base.tables import markdown_table, read_csv, write_csv
 from hilsplat.configuration import SECTIONS
 from hilsplat.datasets.sources import LEVELLED
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN
@@ -133,18 +133,16 @@ def run_efficiency(results: Path, out: Path) -> str:
     for job in jobs:
         numbers = (f"{job.elapsed_s:.2f}", f"{job.cpu_s:.2f}", f"{job.peak_mib:.0f}")
         rows.append([job.stage, job.dataset, job.scene, job.variant, *numbers])
-    lines = [
-        "| stage | jobs | mean s | longest s | total s | CPU s | peak MiB |",
-        "|---|---:|---:|---:|---:|---:|---:|",
-    ]
+    shown = ("stage", "jobs", "mean s", "longest s", "total s", "CPU s", "peak MiB")
+    lines = []
     for name in [*dict.fromkeys(job.stage for job in jobs), "all"]:
         of_row = [job for job in jobs if name in (job.stage, "all")]
         times = [job.elapsed_s for job in of_row]
         seconds = (sum(times) / len(times), max(times), sum(times), sum(job.cpu_s for job in of_row))
-        shown = " | ".join(f"{value:.1f}" for value in seconds)
-        lines.append(f"| {name} | {len(of_row)} | {shown} | {max(job.peak_mib for job in of_row):.0f} |")
-    text, beside = "\n".join(lines) + "\n", Path(out).with_suffix(".md")
-    for path, begin in ((Path(out), ",".join(columns)), (beside, lines[0])):
+        peak_mib = f"{max(job.peak_mib for job in of_row):.0f}"
+        lines.append([name, len(of_row), *(f"{value:.1f}" for value in seconds), peak_mib])
+    text, beside = markdown_table(shown, lines, 1) + "\n", Path(out).with_suffix(".md")
+    for path, begin in ((Path(out), ",".join(columns)), (beside, text.partition("\n")[0])):
         require_beginning(path, begin)
     write_csv(Path(out), columns, rows)
     write_text(beside, text)

@@ -4,9 +4,7 @@ pandas' Styler is not used, because it does not escape < and ± in LaTeX and has
 much code, and writes an id and three classes per cell, so HTML files would be 1.6 to 2.5 times as large.
 """
 
-import csv
 import html
-import io
 from collections.abc import Iterator
 
 from hilsplat.base.tables import plain_markdown
@@ -44,20 +42,18 @@ HTML_STYLE = """<style>
 </style>"""
 
 
-def as_csv(table: Table) -> str:
-    """Return all blocks as one CSV: measured values with two decimals, reported values as printed."""
+def csv_rows(table: Table) -> tuple[list[str], list[list[str]]]:
+    """Return the columns and rows of all blocks: measured values with two decimals, others as printed."""
     names = list(dict.fromkeys(name for block in table.blocks for name in block.names()))
     values = list(dict.fromkeys(column for block in table.blocks for column in block.columns))
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(["kind", "data", *(name.lower() for name in names), *values, "notes"])
+    rows = []
     for block in table.blocks:
         for row in block.rows:
             cells = [row.cell(column) if column in block.columns else Cell() for column in values]
             notes = " ".join(dict.fromkeys(cell.note for cell in cells if cell.note))
             shown = [_csv_value(cell, block.kind) for cell in cells]
-            writer.writerow([block.kind, block.data, *(row.names.get(n, "") for n in names), *shown, notes])
-    return stream.getvalue()
+            rows.append([block.kind, block.data, *(row.names.get(n, "") for n in names), *shown, notes])
+    return ["kind", "data", *(name.lower() for name in names), *values, "notes"], rows
 
 
 def _csv_value(cell: Cell, kind: str) -> str:

@@ -5,10 +5,10 @@ A (view, query) pair without a prediction has a row with value 0 unless its prot
 
 import re
 import statistics
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.levels import LEVELS
 from hilsplat.evaluate.protocols import cards
 from hilsplat.evaluate.tables.rows import Block, Cell, Row, Sources
 from hilsplat.segment.origin import made_from_truth
@@ -166,9 +166,10 @@ def scene_cells(
 
 def level_cells(part: "pd.DataFrame", metric: str = "iou") -> dict[str, Cell]:
     """Return L1, L2, L3 and Avg, the mean of the levels that have rows."""
-    values = level_values(part, metric)
-    cells = {f"L{int(level)}": Cell.percent(value) for level, value in values.items()}
-    return {**cells, "Avg": Cell.percent(mean_over_levels(values.values()))}
+    values = {f"L{int(level)}": table_value(part, metric, level.label) for level in LEVELS}
+    present = [value for value in values.values() if value == value]
+    values["Avg"] = sum(present) / len(present) if present else float("nan")
+    return {name: Cell.percent(value) for name, value in values.items()}
 
 
 def same_row(
@@ -206,17 +207,6 @@ def scene_values(rows: "pd.DataFrame", metric: str, level: str | None = None) ->
 def table_value(rows: "pd.DataFrame", metric: str, level: str | None = None) -> float:
     """Return the unweighted mean of the scenes' numbers; nan if there are no rows."""
     return float(scene_values(rows, metric, level).mean())
-
-
-def level_values(rows: "pd.DataFrame", metric: str) -> dict[Level, float]:
-    """Return the table value of each level, L1 to L3; nan for a level without rows."""
-    return {level: table_value(rows, metric, level.label) for level in LEVELS}
-
-
-def mean_over_levels(values: Iterable[float]) -> float:
-    """Return the mean over the levels that have a value (column Avg); nan if no level has one."""
-    present = [value for value in values if value == value]
-    return sum(present) / len(present) if present else float("nan")
 
 
 def level_averages_of_scenes(rows: "pd.DataFrame", metric: str) -> "pd.Series":
