@@ -106,7 +106,10 @@ def settings_error(error: ValidationError, where: str, model: type[BaseModel]) -
         path = [str(part) for part in problem["loc"]]
         place = ".".join([where, *path] if where else path)
         if problem["type"] == "extra_forbidden":
-            known = _known_keys(model, path[:-1])
+            section: Any = model
+            for part in path[:-1]:
+                section = section.model_fields[part].annotation
+            known = sorted(section.model_fields)
             near = difflib.get_close_matches(path[-1], known, n=1)
             hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(known)}"
             lines.append(f"{place}: unknown key; {hint}")
@@ -115,12 +118,6 @@ def settings_error(error: ValidationError, where: str, model: type[BaseModel]) -
             found = found if len(found) <= LONGEST_SHOWN else f"{found[:LONGEST_SHOWN]}..."
             lines.append(f"{place}: {problem['msg']}; found {found}")
     return SettingsError("the settings are not valid:\n  " + "\n  ".join(lines))
-
-
-def _known_keys(model: Any, path: list[str]) -> list[str]:
-    for part in path:
-        model = model.model_fields[part].annotation
-    return sorted(model.model_fields)
 
 
 VARIANT_SECTIONS = (
@@ -226,19 +223,15 @@ class RunSettings(StageSettings):
         variant, _ = _parts_of(variant)
         sections: dict[str, Section] = {name: getattr(self, name) for name in SECTIONS}
         layers = [(f"overrides.{scope}", self.overrides.get(scope, {})) for scope in scopes]
-        if variant != "default" or variant in self.variants:
-            if variant not in self.variants:
-                raise SettingsError(
-                    f"variant {variant!r} is not defined",
-                    expected=f"one of default, {', '.join(self.variants)}",
-                )
+        if variant in self.variants:
             layers.append((f"variants.{variant}", self.variants[variant]))
+        elif variant != "default":
+            raise SettingsError(
+                f"variant {variant!r} is not defined", expected=f"one of default, {', '.join(self.variants)}"
+            )
         for where, layer in layers:
+            require_known(where, layer, SECTIONS)
             for section, values in layer.items():
-                if section not in SECTIONS:
-                    raise SettingsError(
-                        f"{where}.{section}: unknown section", expected=f"one of {', '.join(SECTIONS)}"
-                    )
                 if where.startswith("variants.") and section not in VARIANT_SECTIONS:
                     raise SettingsError(
                         f"{where}.{section}: variants cannot change this section, because they share it",

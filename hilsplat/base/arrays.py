@@ -15,7 +15,7 @@ import safetensors.numpy
 from jaxtyping import AbstractArray, jaxtyped
 from safetensors import SafetensorError, safe_open
 
-from hilsplat.base.artifacts import atomic_path, parse_json, read_npz, remake
+from hilsplat.base.artifacts import atomic_path, parse_json, remake
 from hilsplat.base.errors import ArtifactError
 
 Made = TypeVar("Made")
@@ -62,16 +62,6 @@ def described(declared: type[AbstractArray]) -> str:
     return f"{declared.__name__.partition('[')[0]}[{declared.dim_str.strip()}]"
 
 
-def read_into(maker: type[Made], path: Path, limits: Limits | None = None, **more: Any) -> Made:
-    """Create a dataclass instance from the arrays in an .npz file and from additional fields, `more`.
-
-    Raises:
-        ArtifactError: the file is missing, damaged or written by a different version of hilsplat, or an
-            array does not match the dataclass.
-    """
-    return made(maker, read_npz(path), more, path, limits)
-
-
 def made(
     maker: type[Made],
     arrays: Mapping[str, np.ndarray],
@@ -79,7 +69,11 @@ def made(
     path: Path,
     limits: Limits | None = None,
 ) -> Made:
-    """Create a dataclass instance from a file's arrays and additional fields; see `read_into`."""
+    """Create a dataclass instance from a file's arrays and additional fields, `more`.
+
+    Raises:
+        ArtifactError: a different version of hilsplat wrote the file, or an array does not match its field.
+    """
     expected = {field.name for field in fields(maker) if field.init}  # type: ignore[arg-type]
     if {*arrays, *more} != expected:
         raise ArtifactError(

@@ -8,10 +8,7 @@ import time
 from collections.abc import Iterable, Iterator, Sized
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
-
-if TYPE_CHECKING:
-    from rich.progress import Progress
+from typing import TypeVar
 
 Item = TypeVar("Item")
 logger = logging.getLogger(__name__)
@@ -48,24 +45,17 @@ def _tail(log: Path) -> str:
         return ""
 
 
-def _bar() -> "Progress":
-    from rich.console import Console  # slow to import
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    return Progress(*columns, console=Console(stderr=True), transient=True)
-
-
 def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterator[Item]:
     """Yield the items and show how many are done; `what` is a label such as "masks of views"."""
     if total is None:
         total = len(items) if isinstance(items, Sized) else None
     if sys.stderr.isatty():
-        with _bar() as progress:
-            task = progress.add_task(what, total=total)
-            for item in items:
-                yield item
-                progress.advance(task)
+        from rich.console import Console  # slow to import
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+        with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+            yield from progress.track(items, total, description=what)
         return
     last = time.monotonic()
     for done, item in enumerate(items, start=1):

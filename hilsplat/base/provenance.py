@@ -125,7 +125,7 @@ def write_provenance(
                 for path in (artifact, *beside)
             },
             "python": platform.python_version(),
-            "libraries": library_versions(),
+            "libraries": {name: version_of(name) or "not installed" for name in LIBRARIES},
             "git": git_commit(),
         },
     )
@@ -179,14 +179,12 @@ def sizes_of(path: Path) -> dict[str, int]:
 
 
 @functools.cache
-def library_versions() -> dict[str, str]:
-    versions = {}
-    for name in LIBRARIES:
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            versions[name] = "not installed"
-    return versions
+def version_of(distribution: str) -> str | None:
+    """Return the version of an installed distribution, or None."""
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return None
 
 
 @functools.cache

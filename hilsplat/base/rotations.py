@@ -38,8 +38,7 @@ def quaternion_of(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "
     """Convert a rotation matrix to a unit quaternion; scipy chooses the sign."""
     from scipy.spatial.transform import Rotation
 
-    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
-    return np.array([w, x, y, z])
+    return Rotation.from_matrix(rotation).as_quat(scalar_first=True)
 
 
 def rotate(

@@ -65,7 +65,7 @@ def options(
             os.dup2(file, stream.fileno())  # also redirects libraries that print to the file descriptor
     start_logging()
     if version:
-        from hilsplat.base.provenance import library_versions
+        from hilsplat.base.provenance import version_of
 
-        typer.echo(f"hilsplat {library_versions()['hilsplat']}")
+        typer.echo(f"hilsplat {version_of('hilsplat') or 'not installed'}")
         raise typer.Exit

@@ -8,8 +8,8 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 
-from hilsplat.base.arrays import read_into
-from hilsplat.base.artifacts import read_index, read_npy, sealed
+from hilsplat.base.arrays import made
+from hilsplat.base.artifacts import read_index, read_npy, read_npz, sealed
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.contributions.quadratic import Gram, Quadratic, StackedWeights
@@ -109,4 +109,5 @@ class Contributions:
         index = read_index(folder, *names)
         known = {name: index[name] for name in names}
         views = tuple(index["views"])
-        return read_into(Contributions, sealed(folder, "rows.npz"), folder=folder, views=views, **known)
+        path = sealed(folder, "rows.npz")
+        return made(Contributions, read_npz(path), {"folder": folder, "views": views, **known}, path)

@@ -7,8 +7,8 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float32, Int32, Int64, UInt8
 
-from hilsplat.base.arrays import read_into
-from hilsplat.base.artifacts import read_index, remake, sealed
+from hilsplat.base.arrays import made
+from hilsplat.base.artifacts import read_index, read_npz, remake, sealed
 from hilsplat.base.compiled import compiled
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, NONE, Level
@@ -156,8 +156,9 @@ class SemanticTree:
         folder, names = Path(folder), ("gaussians_sha256", "cameras_sha256", "min_weight")
         index = read_index(folder, *names)
         known = {"view_names": tuple(index["views"]), **{name: index[name] for name in names}}
-        tree = read_into(SemanticTree, sealed(folder, "tree.npz"), LIMITS, **known)
-        tree._require_whole(folder / "tree.npz")
+        path = sealed(folder, "tree.npz")
+        tree = made(SemanticTree, read_npz(path), known, path, LIMITS)
+        tree._require_whole(path)
         if clip_folder is None:
             return tree
         tree = tree.with_vectors(mask_embeddings(clip_folder, folder))

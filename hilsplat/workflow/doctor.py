@@ -15,11 +15,12 @@ from packaging.specifiers import SpecifierSet
 
 from hilsplat.base.artifacts import existing_folder
 from hilsplat.base.errors import HilsplatError
+from hilsplat.base.provenance import version_of
 from hilsplat.configuration import merged_config
 from hilsplat.models.memory import machine_mib
 from hilsplat.models.store import RECOMMENDED, broken_models, present_models, user_models
 from hilsplat.workflow.plan import Plan
-from hilsplat.workflow.resources import JobResources, is_installed
+from hilsplat.workflow.resources import JobResources
 
 PACKAGE = "hilsplat"
 
@@ -65,14 +66,12 @@ def libraries() -> Iterator[Finding]:
         if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
             continue
         number += 1
-        if requirement.name == "onnxruntime" and is_installed("onnxruntime-gpu"):
+        if requirement.name == "onnxruntime" and version_of("onnxruntime-gpu"):
             continue  # onnxruntime-gpu replaces onnxruntime
-        try:
-            found = importlib.metadata.version(requirement.name)
-        except importlib.metadata.PackageNotFoundError:
+        found = version_of(requirement.name)
+        if found is None:
             wrong.append(f"{requirement.name} is missing")
-            continue
-        if not requirement.specifier.contains(found, prereleases=True):
+        elif not requirement.specifier.contains(found, prereleases=True):
             wrong.append(f"{requirement.name} {found} does not satisfy {requirement.specifier}")
     fix = f"pip install --upgrade {PACKAGE}, with the repository's constraints.txt"
     yield verdict("libraries", "; ".join(wrong), f"{number} libraries in the required versions", fix)
@@ -83,7 +82,7 @@ def onnx() -> Iterator[Finding]:
     import onnxruntime
 
     problem = ""
-    if is_installed("onnxruntime") and is_installed("onnxruntime-gpu"):
+    if version_of("onnxruntime") and version_of("onnxruntime-gpu"):
         problem = "onnxruntime and onnxruntime-gpu are both installed; their files overwrite each other"
     sound = f"{onnxruntime.__version__}: {', '.join(onnxruntime.get_available_providers())}"
     fix = "pip uninstall onnxruntime onnxruntime-gpu, then pip install onnxruntime-gpu"

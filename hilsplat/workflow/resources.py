@@ -11,7 +11,6 @@ factor of three elsewhere. A killed job is retried with twice the memory and tim
 
 import csv
 import functools
-import importlib.metadata
 import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -22,6 +21,7 @@ from PIL import Image
 
 from hilsplat.base.errors import ModelError
 from hilsplat.base.levels import LEVELS
+from hilsplat.base.provenance import version_of
 from hilsplat.models.store import model_path, read_model
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.settings import MasksSettings
@@ -139,7 +139,7 @@ class JobResources:
             if section not in ("masks", "clip"):
                 return int(settings.device == "cuda")
             runs = not self.plan.row(wildcards).features and getattr(settings, "segmenter", "sam") == "sam"
-            return int(runs and is_installed("onnxruntime-gpu"))
+            return int(runs and version_of("onnxruntime-gpu") is not None)
 
         return needed
 
@@ -248,12 +248,3 @@ def _model_memory_mb(folder: Path, variant: str, batch: int | str, threads: int)
     except ModelError:
         return 0
     return round(needs_of(model, prompts).total_mib(threads) * MIB / 1e6)
-
-
-@functools.cache
-def is_installed(distribution: str) -> bool:
-    try:
-        importlib.metadata.version(distribution)
-    except importlib.metadata.PackageNotFoundError:
-        return False
-    return True

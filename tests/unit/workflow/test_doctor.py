@@ -12,11 +12,11 @@ import pytest
 from typer.testing import CliRunner
 
 from hilsplat.base.errors import ModelError
+from hilsplat.base.provenance import version_of
 from hilsplat.cli.main import app
 from hilsplat.models.folder import ModelFolder
 from hilsplat.splat.rasterise import api, parity
 from hilsplat.workflow import doctor
-from hilsplat.workflow.resources import is_installed
 from tests.unit.models.test_store import write_model
 
 CPU = "CPUExecutionProvider"
@@ -25,9 +25,9 @@ CPU = "CPUExecutionProvider"
 @pytest.fixture(autouse=True)
 def fresh():
     """Each test looks for distributions anew."""
-    is_installed.cache_clear()
+    version_of.cache_clear()
     yield
-    is_installed.cache_clear()
+    version_of.cache_clear()
 
 
 def test_a_sound_machine_has_no_fault(project, monkeypatch):

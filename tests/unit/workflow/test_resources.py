@@ -91,7 +91,7 @@ def test_threads_grow_with_the_pixels_of_a_scene(tmp_path):
 def test_device_cuda_and_networks_with_onnxruntimes_gpu_build_request_a_gpu(
     tmp_path, monkeypatch, segmenter, build, expected
 ):
-    monkeypatch.setattr("hilsplat.workflow.resources.is_installed", lambda name: build)
+    monkeypatch.setattr("hilsplat.workflow.resources.version_of", lambda name: "1.20" if build else None)
     found = JobResources(plan(tmp_path, masks={"segmenter": segmenter}, gaussians={"device": "cuda"}))
     assert [found.gpus(section)(JOB) for section in ("masks", "clip")] == expected
     assert [found.gpus(section)(JOB) for section in ("gaussians", "contributions")] == [1, 0]
