@@ -34,16 +34,18 @@ _MASKED_STORE = f"llvm.masked.store.v{WIDTH}f32.p0"
 
 
 class LanesType(types.Type):
-    """Numba type of a vector of 16 numbers of the same type."""
+    """Numba type of a vector of numbers of the same type."""
 
-    def __init__(self, dtype: types.Float) -> None:
+    def __init__(self, dtype: types.Float, width: int = WIDTH) -> None:
         self.dtype = dtype
-        self.vector = ir.VectorType(_FLOAT if dtype == types.float32 else ir.DoubleType(), WIDTH)
-        super().__init__(name=f"Lanes16({dtype})")
+        self.vector = ir.VectorType(_FLOAT if dtype == types.float32 else ir.DoubleType(), width)
+        super().__init__(name=f"Lanes{width}({dtype})")
 
 
 LANES = LanesType(types.float32)
 WIDE = LanesType(types.float64)
+QUAD = LanesType(types.float32, 4)
+"""Four lanes, for rows of a few numbers; the only functions for them here are `load_quad` and `store`."""
 _OF = {types.float32: LANES, types.float64: WIDE}
 
 
@@ -94,10 +96,15 @@ def splat(builder: ir.IRBuilder, scalar: ir.Value, count: int = WIDTH) -> ir.Val
 
 
 def _pointer(
-    context: Any, builder: ir.IRBuilder, array_type: Any, array: ir.Value, index: ir.Value
+    context: Any, builder: ir.IRBuilder, array_type: Any, array: ir.Value, index: ir.Value, kind: Any
 ) -> ir.Value:
     data = context.make_array(array_type)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index]), _OF[array_type.dtype].vector.as_pointer())
+    return builder.bitcast(builder.gep(data, [index]), kind.vector.as_pointer())
+
+
+def _load(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+    place = _pointer(context, builder, sig.args[0], *args, sig.return_type)
+    return builder.load(place, align=sig.args[0].dtype.bitwidth // 8)
 
 
 def _is_flat(array: Any) -> bool:
@@ -126,14 +133,13 @@ def lanes(typingctx, scalar):
 @intrinsic
 def load(typingctx, array, index):
     """Load 16 consecutive numbers from a flat float32 or float64 array."""
-    if not _is_flat(array):
-        return None
+    return (_OF[array.dtype](array, types.intp), _load) if _is_flat(array) else None
 
-    def codegen(context, builder, sig, args):
-        place = _pointer(context, builder, sig.args[0], args[0], args[1])
-        return builder.load(place, align=array.dtype.bitwidth // 8)
 
-    return _OF[array.dtype](array, types.intp), codegen
+@intrinsic
+def load_quad(typingctx, array, index):
+    """Load four consecutive numbers from a flat float32 array."""
+    return QUAD(array, types.intp), _load
 
 
 @intrinsic
@@ -151,12 +157,12 @@ def load_same(typingctx, array, index):
 
 @intrinsic
 def store(typingctx, array, index, value):
-    """Store the lanes as 16 consecutive numbers of a flat array of the same type."""
-    if not (_is_flat(array) and value == _OF[array.dtype]):
+    """Store the lanes as consecutive numbers of a flat array of the same type."""
+    if not (_is_flat(array) and isinstance(value, LanesType) and value.dtype == array.dtype):
         return None
 
     def codegen(context, builder, sig, args):
-        place = _pointer(context, builder, sig.args[0], args[0], args[1])
+        place = _pointer(context, builder, sig.args[0], args[0], args[1], value)
         builder.store(args[2], place, align=array.dtype.bitwidth // 8)
         return context.get_dummy_value()
 
@@ -348,7 +354,7 @@ def store_sums(typingctx, array, index, vectors):
         total, owner = held[0]
         order = [owner.index(k) if k < count else 0 for k in range(WIDTH)]
         total = builder.shuffle_vector(total, nothing, ir.Constant(_INTS, order))
-        pointer = _pointer(context, builder, sig.args[0], args[0], args[1])
+        pointer = _pointer(context, builder, sig.args[0], args[0], args[1], LANES)
         bit = ir.IntType(1)
         mask = ir.Constant(
             ir.VectorType(bit, WIDTH), [ir.Constant(bit, int(k < count)) for k in range(WIDTH)]
@@ -406,7 +412,7 @@ def transpose(typingctx, source, source_index, source_step, target, target_index
     def codegen(context, builder, sig, args):
         def place(array, index, step, row):
             row_index = builder.add(args[index], builder.mul(args[step], ir.Constant(args[step].type, row)))
-            return _pointer(context, builder, sig.args[array], args[array], row_index)
+            return _pointer(context, builder, sig.args[array], args[array], row_index, LANES)
 
         rows = [builder.load(place(0, 1, 2, r), align=4) for r in range(WIDTH)]
         for bit in (1, 2, 4, 8):  # exchange the off-diagonal blocks of each size

@@ -16,77 +16,25 @@ Departs from the published code:
 `hilsplat.field.literal_trainer` (loss `l1`) renders at every step and averages over all pixels.
 """
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float32
 from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic, models, register_model
+from numba.extending import intrinsic
 
 from hilsplat.base.compiled import compiled
+from hilsplat.base.lanes import QUAD, load_quad, splat, store
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
 from hilsplat.field.adam import Adam, in_random_order
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 from hilsplat.settings import MethodSettings
 
-# Four float32 channels of a Gaussian as one numba value, for loops over the entries of a sparse matrix.
-# `hilsplat.base.lanes` has sixteen lanes: codes with three channels would waste thirteen of them. Operations
-# are neither fused nor reordered, so results are bit-identical to plain loops over the channels.
+# Loops over the entries of a sparse matrix process four channels of a Gaussian as one vector: with sixteen,
+# codes with three channels would waste thirteen. Operations are neither fused nor reordered, so results are
+# bit-identical to plain loops over the channels.
 WIDTH = 4
-_FLOAT = ir.FloatType()
-_VECTOR = ir.VectorType(_FLOAT, WIDTH)
-_ZEROS = ir.Constant(_VECTOR, [ir.Constant(_FLOAT, 0.0)] * WIDTH)
-
-
-class QuadType(types.Type):
-    """numba type of four float32 values."""
-
-    def __init__(self) -> None:
-        super().__init__(name="Quad")
-
-
-QUAD = QuadType()
-
-
-@register_model(QuadType)
-class _QuadModel(models.PrimitiveModel):
-    def __init__(self, dmm: Any, fe_type: Any) -> None:
-        super().__init__(dmm, fe_type, _VECTOR)
-
-
-def _pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
-    data = context.make_array(array_type)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index]), _VECTOR.as_pointer())
-
-
-def _all(builder: Any, scalar: Any) -> Any:
-    vector = ir.Constant(_VECTOR, ir.Undefined)
-    for lane in range(WIDTH):
-        vector = builder.insert_element(vector, scalar, ir.Constant(ir.IntType(32), lane))
-    return vector
-
-
-@intrinsic
-def load(typingctx, array, index):
-    """Return four consecutive numbers of a flat float32 array."""
-
-    def codegen(context, builder, sig, args):
-        return builder.load(_pointer(context, builder, sig.args[0], *args), align=4)
-
-    return QUAD(array, types.intp), codegen
-
-
-@intrinsic
-def store(typingctx, array, index, value):
-    """Write four consecutive numbers of a flat float32 array."""
-
-    def codegen(context, builder, sig, args):
-        builder.store(args[2], _pointer(context, builder, sig.args[0], args[0], args[1]), align=4)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, QUAD), codegen
+ZEROS = ir.Constant(QUAD.vector, None)
 
 
 @intrinsic
@@ -94,7 +42,7 @@ def plus(typingctx, total, scale, row):
     """Return total + scale * row; each product is rounded before the addition."""
 
     def codegen(context, builder, sig, args):
-        return builder.fadd(args[0], builder.fmul(_all(builder, args[1]), args[2]))
+        return builder.fadd(args[0], builder.fmul(splat(builder, args[1], WIDTH), args[2]))
 
     return QUAD(QUAD, types.float32, QUAD), codegen
 
@@ -102,7 +50,7 @@ def plus(typingctx, total, scale, row):
 @intrinsic
 def zeros(typingctx):
     """Return four zeros."""
-    return QUAD(), lambda context, builder, sig, args: _ZEROS
+    return QUAD(), lambda context, builder, sig, args: ZEROS
 
 
 @intrinsic
@@ -110,9 +58,9 @@ def signs_of_difference(typingctx, a, b, scale):
     """Return scale where a > b, -scale where a < b, and 0 where a == b; NaN is preserved."""
 
     def codegen(context, builder, sig, args):
-        apart, up = builder.fsub(args[0], args[1]), _all(builder, args[2])
-        above = builder.fcmp_ordered(">", apart, _ZEROS)
-        below = builder.fcmp_ordered("<", apart, _ZEROS)
+        apart, up = builder.fsub(args[0], args[1]), splat(builder, args[2], WIDTH)
+        above = builder.fcmp_ordered(">", apart, ZEROS)
+        below = builder.fcmp_ordered("<", apart, ZEROS)
         return builder.select(above, up, builder.select(below, builder.fneg(up), apart))
 
     return QUAD(QUAD, QUAD, types.float32), codegen
@@ -166,11 +114,11 @@ def l1_gradient(indptr, indices, data, labels, codes, channels, wide, features, 
         for c in range(0, wide, WIDTH):
             total = zeros()
             for k in range(begin, end):
-                total = plus(total, data[k], load(features, np.int64(indices[k]) * wide + c))
-            pull = signs_of_difference(total, load(codes, np.int64(labels[p]) * wide + c), share)
+                total = plus(total, data[k], load_quad(features, np.int64(indices[k]) * wide + c))
+            pull = signs_of_difference(total, load_quad(codes, np.int64(labels[p]) * wide + c), share)
             for k in range(begin, end):
                 there = np.int64(indices[k]) * wide + c
-                store(gradient, there, plus(load(gradient, there), data[k], pull))
+                store(gradient, there, plus(load_quad(gradient, there), data[k], pull))
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
