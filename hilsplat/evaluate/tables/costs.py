@@ -178,7 +178,7 @@ def _number(value: object) -> float:
 
 def cost_table(sources: Sources, seconds: bool = False) -> Table:
     """Build the table of training time, memory and seconds per query (paper: computational costs)."""
-    blocks = [reported(sources, "one RTX 3090")]
+    blocks = [sources.reported(PAPER_DATA, "one RTX 3090", families=False)]
     for data, answers in by_answer(sources).items():
         scenes = {cost.scene for *_, of_row in answers for cost in of_row}
         columns = ["Preparation (min)", "Training (min)", "Memory (GB)"]
@@ -187,22 +187,24 @@ def cost_table(sources: Sources, seconds: bool = False) -> Table:
         for variant, method, of_row in answers:
             queries = {f"{cost.scene} query (s)": Cell.number(cost.query_s[method]) for cost in of_row}
             names = {"Method": row_name(variant, method, sources.labels)}
-            rows.append(Row(names, {**time_cells(of_row), **queries}))
-        blocks.append(Block(*kind_and_title(data), tuple(rows), tuple(columns), costs_of(columns)))
+            rows.append(Row(names, {**time_cells(of_row, method), **queries}))
+        blocks.append(Block(*kind_and_title(data), tuple(rows), tuple(columns)))
     return finished(sources, "cost", "Computational cost", blocks, seconds)
 
 
 def efficiency_table(sources: Sources, seconds: bool = False) -> Table:
     """Build the table of quality at three levels beside training time and memory (paper: efficiency)."""
     columns = ("Preparation (min)", "Training (min)", "Memory (GB)")
-    blocks = [reported(sources, "one RTX 3090"), *quality_blocks(sources, columns)]
+    paper = sources.reported(PAPER_DATA, "one RTX 3090", families=False)
+    blocks = [paper, *quality_blocks(sources, columns)]
     return finished(sources, "efficiency", "Efficiency", blocks, seconds)
 
 
 def pruning_table(sources: Sources, seconds: bool = False) -> Table:
     """Build the table of cost and quality with pruned contrastive pairs (paper: sample pruning)."""
     columns = ("Training (min)", "Memory (GB)", "Query (s)")
-    blocks = [reported(sources, "sample pruning"), *quality_blocks(sources, columns, ("field",))]
+    paper = sources.reported(PAPER_DATA, "sample pruning", families=False)
+    blocks = [paper, *quality_blocks(sources, columns, ("field",))]
     footnote = (
         "The paper removes redundant pairs by feature similarity but gives no rule. config/config.yaml "
         "(variants) sets which pairs our variant removes."
@@ -232,17 +234,6 @@ def finished(
     return sources.finished(name, title, repeated, (elsewhere, *footnotes))
 
 
-def reported(sources: Sources, title: str) -> Block:
-    """Return the paper's rows, with the smallest times and memories ranked best."""
-    block = sources.reported(PAPER_DATA, title, families=False)
-    return replace(block, lower_is_better=costs_of(block.columns))
-
-
-def costs_of(columns: Iterable[str]) -> frozenset[str]:
-    """Return the columns of times and memory, in which the smallest value is best."""
-    return frozenset(column for column in columns if column.endswith(("(min)", "(GB)", "(s)")))
-
-
 def quality_blocks(
     sources: Sources, time_columns: tuple[str, ...], methods: tuple[str, ...] = ("field", "tree")
 ) -> list[Block]:
@@ -265,21 +256,19 @@ def quality_blocks(
             if method not in methods or part.empty:
                 continue
             quality = component_cells(scores, part)
-            query_s = statistics.fmean(cost.query_s[method] for cost in of_row)
-            cells = {name: quality[name] for name in quality_columns} | time_cells(of_row)
-            names = {"Method": row_name(variant, method, sources.labels)}
-            rows.append(Row(names, {**cells, "Query (s)": Cell.number(query_s)}))
-        columns = (*quality_columns, *time_columns)
-        blocks.append(Block(*kind_and_title(data), tuple(rows), columns, costs_of(columns)))
+            cells = {name: quality[name] for name in quality_columns} | time_cells(of_row, method)
+            rows.append(Row({"Method": row_name(variant, method, sources.labels)}, cells))
+        blocks.append(Block(*kind_and_title(data), tuple(rows), (*quality_columns, *time_columns)))
     return blocks
 
 
-def time_cells(costs: list[Cost]) -> dict[str, Cell]:
-    """Return the mean times and the maximum memory over scenes."""
+def time_cells(costs: list[Cost], method: str) -> dict[str, Cell]:
+    """Return the mean times and the maximum memory over scenes, for rows of `method`."""
     return {
         "Preparation (min)": Cell.number(statistics.fmean(cost.prepare_s for cost in costs) / 60),
         "Training (min)": Cell.number(statistics.fmean(cost.train_s for cost in costs) / 60),
         "Memory (GB)": Cell.number(max(cost.peak_mib for cost in costs) / 1024),
+        "Query (s)": Cell.number(statistics.fmean(cost.query_s[method] for cost in costs)),
     }
 
 

@@ -79,8 +79,12 @@ class Block:
     title: str
     rows: tuple[Row, ...]
     columns: tuple[str, ...]  # value columns in display order
-    lower_is_better: frozenset[str] = frozenset()  # columns in which the smallest value is best
     unranked: frozenset[str] = frozenset()
+
+    @property
+    def lower_is_better(self) -> frozenset[str]:
+        """Columns of times and memory, in which the smallest value is best."""
+        return frozenset(column for column in self.columns if column.endswith(("(min)", "(GB)", "(s)")))
 
     def names(self) -> list[str]:
         """Return the name columns, in order of appearance."""

@@ -148,17 +148,18 @@ def test_tables_are_the_same_bytes_whatever_the_order_of_rows(tmp_path, name):
     assert built(tmp_path / "forward", name) == built(tmp_path / "backward", name, SCORES[::-1])
 
 
-def block(*values, **more):
-    rows = tuple(Row({"Method": str(number)}, {"x": cell}) for number, cell in enumerate(values))
-    return Block("reported", "d", "t", rows, ("x",), **more)
-
-
-def test_best_three_share_ranks_when_equal():
-    found = [Cell.printed(text) for text in ("10.0", "30.0", "30.0", "20.0", "-", "25x3", "5.0")]
-    assert block(*found).ranks() == {(1, "x"): 1, (2, "x"): 1, (3, "x"): 2, (0, "x"): 3}
-    lower = block(*found, lower_is_better=frozenset({"x"})).ranks()
-    assert lower == {(6, "x"): 1, (0, "x"): 2, (3, "x"): 3}
-    assert block(Cell.printed("10.0")).ranks() == {}  # a single row is not ranked
+@pytest.mark.parametrize(
+    ("column", "texts", "ranks"),
+    [
+        ("x", ["10.0", "30.0", "30.0", "20.0", "-", "25x3", "5.0"], {1: 1, 2: 1, 3: 2, 0: 3}),
+        ("Query (s)", ["10.0", "30.0", "30.0", "20.0", "-", "25x3", "5.0"], {6: 1, 0: 2, 3: 3}),  # lowest
+        ("x", ["10.0"], {}),  # a single row is not ranked
+    ],
+)
+def test_best_three_share_ranks_when_equal(column, texts, ranks):
+    rows = [Row({"Method": str(row)}, {column: Cell.printed(text)}) for row, text in enumerate(texts)]
+    block = Block("reported", "d", "t", tuple(rows), (column,))
+    assert block.ranks() == {(row, column): rank for row, rank in ranks.items()}
 
 
 def test_latex_and_html_contain_every_reported_value_and_the_notes(tmp_path):
