@@ -94,7 +94,8 @@ def search(
     Args:
         margin: cosine margin of every node for each text.
         vectors: unit vectors of every node, which determine which nodes look alike.
-        threshold: see `best_nodes`.
+        threshold: answers are below the best shown node by at most (1 - threshold) times the range of the
+            level's values, or by `ALIKE_REACH` times that distance if they look like the best.
         ancestors: fraction of the ancestors' mean margin that is added to a node's own margin; ignored for a
             path of several texts, which itself specifies the ancestors.
         level: level of the last text; None lets `automatic_level` or `_search_path` choose it.
@@ -110,32 +111,12 @@ def search(
     (own,) = margin
     level = automatic_level(tree, own, shown) if level is None else level
     nodes = tree.nodes_of(level)
+    may = nodes if shown is None else nodes[shown[nodes]]
     value = own + ancestors * ancestor_margins(tree, own)
-    chosen = best_nodes(value, vectors, nodes, threshold, shown)
-    best = own[nodes if shown is None else nodes[shown[nodes]]].max(initial=-np.inf)
+    spread = np.ptp(value[nodes]) if len(nodes) else 0.0
+    chosen = _near_best(value, may, vectors, (1 - threshold) * spread)
+    best = own[may].max(initial=-np.inf)
     return NodeHits(chosen, value[chosen], "flat", (TextAnswer(path[0], level, float(best), *anywhere),))
-
-
-def best_nodes(
-    value: Float64[np.ndarray, " n"],
-    vectors: Float32[np.ndarray, "n C"],
-    candidates: Int64[np.ndarray, " c"],
-    threshold: float,
-    shown: Bool[np.ndarray, " n"] | None = None,
-) -> Int64[np.ndarray, " h"]:
-    """Return the candidates near the best one, and slightly worse candidates that look like the best.
-
-    They are sorted best first, and ties are sorted by row. For `vectors` and `shown`, see `search`.
-
-    Args:
-        value: sort key of every node: its cosine margin plus its ancestors' bonus.
-        candidates: the nodes of a level, which define the range of values.
-        threshold: answers are below the best shown candidate by at most (1 - threshold) times the range, or
-            by `ALIKE_REACH` times that distance if they look like the best.
-    """
-    may = candidates if shown is None else candidates[shown[candidates]]
-    spread = np.ptp(value[candidates]) if len(candidates) else 0.0
-    return _near_best(value, may, vectors, (1 - threshold) * spread)
 
 
 def _near_best(
@@ -144,7 +125,10 @@ def _near_best(
     vectors: Float32[np.ndarray, "n C"],
     reach: float,
 ) -> Int64[np.ndarray, " h"]:
-    """Return candidates at most `reach` below the best, or `ALIKE_REACH` times that if they look like it."""
+    """Return candidates at most `reach` below the best, or `ALIKE_REACH` times that if they look like it.
+
+    They are sorted best first, and ties are sorted by row.
+    """
     if not len(candidates):
         return np.zeros(0, np.int64)
     own = value[candidates]
@@ -183,15 +167,6 @@ def automatic_level(
     if not len(levels):
         return Level.WHOLE
     return Level(int(levels[own == own.max()].min()))
-
-
-def margin_range(margin: Float64[np.ndarray, " n"]) -> float:
-    """Return the range of the nodes' margins for a text, extended to include 0, the margin of a tie.
-
-    A path's penalties are scaled by this range. With a single object, or if all objects match the text, the
-    range of the margins themselves would be close to 0, and the penalties would vanish.
-    """
-    return float(margin.max(initial=0.0) - margin.min(initial=0.0))
 
 
 def _search_path(
@@ -263,7 +238,9 @@ def _search_way(
             rivals = of_level[shown[of_level] | np.isin(of_level, holder[may])]
         margins.append(float(of_text[rivals].max(initial=-np.inf)))
         best = margins[-1] if len(rivals) else 0.0
-        spread = margin_range(of_text[of_level])
+        # Without 0, the margin of a tie, the range of a single object or of several that all match the text
+        # would be close to 0, and the penalties would vanish.
+        spread = np.ptp(np.append(of_text[of_level], 0.0))
         below = np.where(holder != NONE, best - of_text[holder], WITHOUT_ANCESTOR * spread)
         value -= ANCESTORS_SHARE * below
         total += best - below

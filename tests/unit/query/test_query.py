@@ -11,7 +11,7 @@ from hilsplat.field.autoencoder import run_autoencoder
 from hilsplat.field.code import LanguageField, load_code
 from hilsplat.field.field import run_field
 from hilsplat.query.language_scene import LanguageScene
-from hilsplat.query.node_search import ancestor_margins, automatic_level, best_nodes, search
+from hilsplat.query.node_search import ancestor_margins, automatic_level, search
 from hilsplat.query.scene_views import ViewStore
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.scene.scene import Scene
@@ -19,6 +19,7 @@ from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import AutoencoderSettings, EvaluateSettings, FieldSettings, SemanticTreeSettings
 from tests.unit.artifact_changes import write_record
+from tests.unit.evaluate.plain_tree import plain_tree
 from tests.unit.round_gaussians import round_gaussians
 from tests.unit.two_boxes_world import (
     HEIGHT,
@@ -103,29 +104,35 @@ def test_automatic_level_is_the_coarsest_level_of_the_best_nodes(scene):
     assert automatic_level(scene.tree, margin, np.zeros(7, bool)) == Level.WHOLE
 
 
+def best_wholes(margin, threshold, vectors=None, shown=None) -> list[int]:
+    """Answers among wholes, whose vectors are orthogonal unless given."""
+    num = len(margin)
+    tree = plain_tree([1] * num, [-1] * num, [[-1, -1, -1]])
+    vectors = np.eye(num, dtype=np.float32) if vectors is None else vectors
+    margins, options = np.array([margin], np.float32), {"level": Level.WHOLE, "shown": shown}
+    return search(tree, margins, vectors, ("x",), threshold=threshold, ancestors=0.2, **options).ids.tolist()
+
+
 def test_answers_are_within_a_share_of_the_range_of_the_level_below_the_best():
-    every, apart = np.arange(4), np.eye(4, dtype=np.float32)
-    margin = np.array([-0.22, 0.29, 0.39, 0.69])  # a range of 0.91: 0.15 of it is 0.14, a half 0.46
-    assert best_nodes(margin, apart, every, 0.85).tolist() == [3]
-    assert best_nodes(margin, apart, every, 0.5).tolist() == [3, 2, 1]
-    assert best_nodes(np.array([-0.1, 0.2, 0.2]), apart[:3], np.arange(3), 0.95).tolist() == [1, 2]
+    margin = [-0.22, 0.29, 0.39, 0.69]  # a range of 0.91: 0.15 of it is 0.14, a half 0.46
+    assert best_wholes(margin, 0.85) == [3]
+    assert best_wholes(margin, 0.5) == [3, 2, 1]
+    assert best_wholes([-0.1, 0.2, 0.2], 0.95) == [1, 2]
 
 
 @pytest.mark.parametrize(("cosine", "found"), [(0.91, [3, 2]), (0.89, [3])])
 def test_nodes_similar_to_the_best_answer_may_be_three_times_as_far_below(cosine, found):
-    margin = np.array([0.0, 7.0, 8.6, 10.0])  # of a range of 10: 0.05 is 0.5, three times that 1.5
     vectors = np.eye(5, dtype=np.float32)[:4]
     for node in (1, 2):
         vectors[node] = cosine * vectors[3] + np.sqrt(1 - cosine**2) * np.eye(5)[4]
-    assert best_nodes(margin, vectors, np.arange(4), 0.95).tolist() == found
+    # of a range of 10: 0.05 is 0.5, three times that 1.5
+    assert best_wholes([0.0, 7.0, 8.6, 10.0], 0.95, vectors) == found
 
 
 def test_only_shown_nodes_are_answers_but_all_define_the_range():
-    margin, apart = np.array([0.0, 9.4, 9.7, 10.0]), np.eye(4, dtype=np.float32)
-    shown = np.array([True, True, True, False])
-    # within 0.05 of the range of all four, 10
-    assert best_nodes(margin, apart, np.arange(4), 0.95, shown).tolist() == [2, 1]
-    assert not len(best_nodes(margin, apart, np.arange(4), 0.95, np.zeros(4, bool)))
+    margin, shown = [0.0, 9.4, 9.7, 10.0], np.array([True, True, True, False])
+    assert best_wholes(margin, 0.95, shown=shown) == [2, 1]  # within 0.05 of the range of all four, 10
+    assert best_wholes(margin, 0.95, shown=np.zeros(4, bool)) == []
 
 
 def test_parts_of_a_likely_thing_are_ranked_first(scene):
