@@ -115,9 +115,3 @@ def test_jobs_run_without_an_activated_environment(clone: Project) -> None:
     command = [sys.executable, "-m", "snakemake", "--configfile", "config/ci.yaml", "--cores", "2", images]
     subprocess.run(command, cwd=clone.root, env=environment, check=True)
     assert (clone.root / images).is_dir()
-
-
-def test_scenes_are_targets_of_hilsplat_run(plain: Project) -> None:
-    assert "rule field:" in plain.hilsplat_run("tiny", "--", "-n").stdout
-    printed = plain.hilsplat_run("tables", "--", "-n").stdout
-    assert "rule table:" in printed and "rule figures:" not in printed

@@ -1,6 +1,5 @@
 """A command replaces its own earlier outputs and nothing else."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -105,14 +104,6 @@ def test_commands_do_not_replace_unrelated_files(photographs, tmp_path, monkeypa
     with pytest.raises(ArtifactError, match="output"):
         app(words, standalone_mode=False)
     assert files(tmp_path) == before
-
-
-def test_a_stage_replaces_its_output_again(tmp_path):
-    out = tmp_path / "table.csv"
-    for text in ("first", "second"):
-        with stage("table", out):
-            out.write_text(text)
-    assert out.read_text() == "second" and json.loads(provenance_path(out).read_text())["stage"] == "table"
 
 
 def test_an_input_that_changes_during_a_stage_leaves_no_provenance(tmp_path, photographs):

@@ -24,6 +24,7 @@ ROWS = (
 NETWORK = {"code": "network", "latent": 3}
 VARIANTS = {
     "theta": {"coverage_tree": {"theta": 0.6}},
+    "omega": {"field": {"omega": 5.0}},
     "network": {"autoencoder": NETWORK},
     "lifted": {"method": {"name": "lifted"}},
     "truth": {"masks": {"segmenter": "truth-perturbed"}},
@@ -99,6 +100,8 @@ def test_photographs_that_you_annotated_are_scored_without_replacing_the_tables(
         ("contributions", "theta", "default"),
         ("autoencoder", "theta", "default"),
         ("field", "theta", "theta"),
+        ("autoencoder", "omega", "default"),
+        ("field", "omega", "omega"),
         ("autoencoder", "network", "network"),
         ("autoencoder", "network.seed1", "network.seed1"),
         ("semantic_tree", "network.seed1", "default"),
@@ -175,7 +178,7 @@ def test_variants_differ_in_the_method_of_the_field_and_in_the_crops(tmp_path):
     assert found.crops_tree(Job()) == ["results/synthetic/one/default/semantic_tree"]
     assert found.crops_tree(Job(variant="own")) == [], "every mask is embedded"
     assert found.variants(by_baseline=True) == "lifted"
-    assert found.variants(by_baseline=False) == "default|network|own|theta|truth"
+    assert found.variants(by_baseline=False) == "default|network|omega|own|theta|truth"
     assert found.baseline(Job(variant="lifted")) == ("hilsplat.methods.lifted:fit",)
 
 

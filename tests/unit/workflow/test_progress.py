@@ -202,18 +202,6 @@ def test_a_long_last_job_is_not_divided_among_the_cores(screen, run):
     assert run.seconds_left() == 600
 
 
-def test_a_redraw_costs_the_same_for_any_number_of_jobs(screen, run, monkeypatch):
-    estimated, seconds = [], Estimates.seconds
-    monkeypatch.setattr(
-        Estimates, "seconds", lambda self, rule: estimated.append(rule) or seconds(self, rule)
-    )
-    run.begin({"masks": 1000, "field": 20_000})
-    screen.start(1, "masks")
-    estimated.clear()
-    run.line()
-    assert sorted(estimated) == ["field", "masks", "masks"]
-
-
 @pytest.mark.parametrize("rule", LOOPS)
 def test_the_loop_of_a_rule_is_one_that_its_stage_runs(rule):
     module = STAGES[rule].partition(":")[0]
