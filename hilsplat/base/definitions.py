@@ -2,7 +2,7 @@
 
 import ast
 import functools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -186,17 +186,7 @@ def _strip(top: ast.AST) -> None:
                 node.args = node.args[:1]  # the second argument is the description
             elif called == "Plugins":
                 node.args = []
-        waiting += [(child, is_local) for child in _children(node)]
-
-
-_LEAVES = (ast.expr_context, ast.operator, ast.unaryop, ast.boolop, ast.cmpop)
-
-
-def _children(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield the direct children of a node, except leaves such as operators."""
-    for child in ast.iter_child_nodes(node):
-        if not isinstance(child, _LEAVES):
-            yield child
+        waiting += [(child, is_local) for child in ast.iter_child_nodes(node)]
 
 
 def _is_log_call(node: ast.AST) -> bool:
@@ -257,9 +247,9 @@ class _Names:
                 self._visit(outside)
             self._inside(_Scope(_bound_in(node.body, self.package), is_class=True), node.body)
         elif isinstance(node, _COMPREHENSIONS):
-            self._inside(_Scope(_bound_in([node], self.package)), list(_children(node)))
+            self._inside(_Scope(_bound_in([node], self.package)), list(ast.iter_child_nodes(node)))
         else:
-            for child in _children(node):
+            for child in ast.iter_child_nodes(node):
                 self._visit(child)
 
     def _inside(self, scope: _Scope, body: Sequence[ast.AST]) -> None:
@@ -281,22 +271,16 @@ class _Names:
         self.names[chain] = None
 
 
-def _own(body: Iterable[ast.AST]) -> Iterator[ast.AST]:
-    """Yield the nodes of a block, except those inside functions and classes that the block defines."""
-    waiting = list(body)
-    while waiting:
-        node = waiting.pop()
-        yield node
-        if not isinstance(node, (*_FUNCTIONS, ast.ClassDef)):
-            waiting += _children(node)
-
-
 def _bound_in(body: Iterable[ast.AST], package: str) -> dict[str, Import | None]:
     """Return the names that a block binds in its own scope, each with its import target or None."""
     names: set[str] = set()
     imports: dict[str, Import] = {}
     declared_global: set[str] = set()
-    for node in _own(body):
+    waiting = list(body)
+    while waiting:
+        node = waiting.pop()
+        if not isinstance(node, (*_FUNCTIONS, ast.ClassDef)):  # these have their own scope
+            waiting += ast.iter_child_nodes(node)
         if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store | ast.Del):
             names.add(node.id)
         elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
