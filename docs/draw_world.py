@@ -15,12 +15,13 @@ from PIL import Image
 
 from hilsplat.base.levels import LEVELS
 from hilsplat.scene.cameras import Camera
+from hilsplat.segment.pictures import row_colours
 from hilsplat.world.objects.builder import ObjectModel
 from hilsplat.world.objects.catalogue import TABLETOP, build_object
 from hilsplat.world.paints import Paint
-from hilsplat.world.pictures import coloured, node_colours, show_panel
+from hilsplat.world.pictures import coloured, show_panel
 from hilsplat.world.render import label_view, render_view
-from hilsplat.world.scenes.kinds import build_scene, scene_cameras
+from hilsplat.world.scenes.kinds import KINDS, build_scene, scene_cameras
 from hilsplat.world.scenes.scene import Assembly, Style, WorldScene, footprint_of
 from hilsplat.world.shapes import box
 from hilsplat.world.views import on_sphere, square_camera
@@ -64,15 +65,11 @@ def _alone(model: ObjectModel) -> tuple[WorldScene, Camera]:
     sight = middle + on_sphere(AZIMUTH_DEG, ELEVATION_DEG, 1.9), middle
     reach = max(0.90 * RADIUS, 0.60 * height * scale)
     fov_deg = 2 * float(np.degrees(np.arctan(reach / 1.75)))
-    return scene, square_camera("class.png", sight, CLASS_PX, fov_deg)
+    return scene, square_camera(sight, CLASS_PX, fov_deg)
 
 
 def draw_scenes(kind: str, seeds: Sequence[int], out: Path) -> None:
-    """Draw one view per scene with its ground-truth labels by level, as a PNG.
-
-    Raises:
-        SceneError: if the kind is unknown.
-    """
+    """Draw one view per scene with its ground-truth labels by level, as a PNG."""
     across = 2  # scenes side by side, each with four panels
     rows = -(-len(seeds) // across)
     figure = Figure(figsize=(PANEL_INCHES * 4 * across, PANEL_INCHES * rows + 0.25), dpi=100)
@@ -81,7 +78,7 @@ def draw_scenes(kind: str, seeds: Sequence[int], out: Path) -> None:
         scene = build_scene(kind, seed, OBJECTS)
         cameras = scene_cameras(scene, 40, SCENE_PX, 360)
         camera = cameras[cameras.names[(17 + 6 * index) % len(cameras)]]
-        labels, colours = label_view(scene, camera), node_colours(len(scene.nodes))
+        labels, colours = label_view(scene, camera), row_colours(len(scene.nodes))
         for shade, node in enumerate(sorted(scene.background)):
             colours[node] = 60 + 18 * shade  # grey, because the background is never scored
         panels = [render_view(scene, camera, 3)]
@@ -111,7 +108,7 @@ def _write(figure: Figure, out: Path) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", help="classes, or a kind of scene: tabletop, room or street")
+    parser.add_argument("what", choices=("classes", *KINDS), help="classes, or a kind of scene")
     parser.add_argument("out", type=Path, help="PNG to write")
     parser.add_argument("seeds", type=int, nargs="*", help="seeds of the scenes")
     given = parser.parse_args()

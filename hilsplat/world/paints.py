@@ -138,9 +138,7 @@ class Paint:
 
     def recoloured(self, word: str) -> "Paint":
         """Return the same texture in a different colour; a shade of that colour becomes the second colour."""
-        first = np.array(COLOURS[word])
-        second = _relative(first)
-        return replace(self, colour=word, first=tuple(first.tolist()), second=tuple(second.tolist()))
+        return replace(self, colour=word, first=COLOURS[word], second=_relative(np.array(COLOURS[word])))
 
     def _changed(self, change: Callable[[float], float]) -> "Paint":
         """Return the paint with each channel of both colours changed, and the matching colour word."""
@@ -176,9 +174,8 @@ def srgb_from_linear(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "
     return np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055)
 
 
-_XYZ_FROM_RGB = np.array(
-    [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
-)  # of sRGB, white D65
+# For sRGB with the white point D65.
+_XYZ_FROM_RGB = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
 
 
 def lab_from_srgb(colour: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape 3"]:
@@ -213,10 +210,10 @@ def _seen_lab(paint: Paint) -> Float[np.ndarray, " 3"]:
     return lab_from_srgb(paint.seen)
 
 
-def _relative(first: np.ndarray) -> np.ndarray:
+def _relative(first: np.ndarray) -> Colour:
     """Return a shade of a colour: a darker shade of a light colour, a lighter shade of a dark colour."""
-    light = float(first.mean()) > 0.5
-    return np.clip(first * (0.66 if light else 1.4) + (0.0 if light else 0.04), 0.02, 0.95)
+    shade = 0.66 * first if first.mean() > 0.5 else 1.4 * first + 0.04
+    return tuple(np.clip(shade, 0.02, 0.95).tolist())
 
 
 class PaintBox:
@@ -250,7 +247,7 @@ class PaintBox:
             colour,
             kind,
             tuple(first.tolist()),
-            tuple(_relative(first).tolist()),
+            _relative(first),
             scale * float(TEXTURES[kind].cells * rng.uniform(0.8, 1.25)),
             specular * float(rng.uniform(0.7, 1.2)),
             shininess * float(rng.uniform(0.7, 1.4)),

@@ -12,6 +12,7 @@ from hilsplat.base.images import read_image
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.provenance import SOFTWARE, require_own_picture
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnotations
+from hilsplat.segment.pictures import row_colours
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -48,7 +49,7 @@ def show_world(world_folder: Path, out: Path) -> None:
     truth = HierarchyAnnotations.load(truth_folder)
     images = list_images(images_folder)
     picked = [images[i] for i in np.linspace(0, len(images) - 1, min(VIEWS_SHOWN, len(images))).astype(int)]
-    colours = node_colours(len(truth.nodes))
+    colours = row_colours(len(truth.nodes))
     scored = {node for ids in truth.views.values() for node in ids}
     lines = tree_lines(truth.nodes)
     columns = -(-len(lines) // LINES_SHOWN)
@@ -91,15 +92,6 @@ def _panel(
     panel = coloured(labels, colours)
     whole = coloured(truth.label_image(view, Level.WHOLE), colours).mean(axis=-1, keepdims=True)
     return np.where(labels[..., None] >= 0, panel, (0.28 * whole).astype(np.uint8))
-
-
-def node_colours(count: int) -> UInt8[np.ndarray, "N 3"]:
-    """Return a colour per node; consecutive nodes have very different hues (golden-ratio steps)."""
-    from matplotlib.colors import hsv_to_rgb
-
-    row = np.arange(count)
-    hsv = ((0.13 + 0.618034 * row) % 1, 0.55 + 0.35 * (row // 2 % 2), 0.70 + 0.30 * (row // 3 % 2))
-    return (255 * hsv_to_rgb(np.stack(hsv, axis=1))).astype(np.uint8)
 
 
 def coloured(

@@ -158,14 +158,6 @@ def _surfaces(prim, u, v, directions, mesh, surface):
     for i in range(len(prim)):
         f = prim[i]
         if f < 0:
-            for c in range(3):
-                points[i, c] = 0.0
-                facets[i, c] = 0.0
-                shading[i, c] = 0.0
-                colours[i, c] = 0.0
-            facets[i, 2] = 1.0
-            gloss[i, 0] = 0.0
-            gloss[i, 1] = 1.0
             continue
         w0, w1, w2 = 1.0 - u[i] - v[i], u[i], v[i]
         a = triangles[f]

@@ -19,7 +19,6 @@ from hilsplat.world.lidar import scan_street
 from hilsplat.world.objects.catalogue import GENERATOR_VERSION
 from hilsplat.world.render import render_and_label
 from hilsplat.world.scenes.kinds import KINDS, build_scene, scene_cameras
-from hilsplat.world.scenes.scene import WorldScene
 from hilsplat.world.seeds import TRAINING_SEEDS, split_of_seed
 from hilsplat.world.truth import annotated_nodes, smallest_areas, write_mesh
 
@@ -89,26 +88,23 @@ def run_world(source: str, settings: WorldSettings, out: Path, threads: int) -> 
             if kind == "street":
                 centres = np.stack([cameras[name].centre for name in cameras.names])
                 write_npz(folder / "lidar.npz", **vars(scan_street(scene, centres)))
-            write_json(folder / "scene.json", _record(source, scene))
+            record = {
+                "source": source,
+                "kind": kind,
+                "seed": seed,
+                "split": split_of_seed(seed),
+                "generator_version": GENERATOR_VERSION,
+                "objects_asked": scene.asked,
+                "objects_placed": len(scene.placed),
+                "placed": [asdict(thing) for thing in scene.placed],
+                "background": sorted(scene.background),
+                "style": asdict(scene.style),
+            }
+            write_json(folder / "scene.json", record)
             index = {name: {"annotated": len(ids)} for name, ids in annotated.items()}
             write_index(folder, index, source=source)
         counts.update(views=len(cameras), objects=f"{len(scene.placed)} of {scene.asked}")
         counts.update(nodes=len(scene.nodes), triangles=len(scene.triangles))
-
-
-def _record(source: str, scene: WorldScene) -> dict[str, object]:
-    return {
-        "source": source,
-        "kind": scene.kind,
-        "seed": scene.seed,
-        "split": split_of_seed(scene.seed),
-        "generator_version": GENERATOR_VERSION,
-        "objects_asked": scene.asked,
-        "objects_placed": len(scene.placed),
-        "placed": [asdict(thing) for thing in scene.placed],
-        "background": sorted(scene.background),
-        "style": asdict(scene.style),
-    }
 
 
 _scene = lru_cache(maxsize=1)(build_scene)

@@ -23,12 +23,6 @@ def looking_at(centre: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"])
     return transform
 
 
-def pinhole(image_px: int, fov_deg: float | int) -> Float[np.ndarray, "3 3"]:
-    """Return the intrinsics (px) of a square image with the given field of view."""
-    focal = image_px / (2 * np.tan(np.radians(fov_deg) / 2))
-    return np.array([[focal, 0.0, image_px / 2], [0.0, focal, image_px / 2], [0.0, 0.0, 1.0]])
-
-
 def on_sphere(azimuth_deg: float, elevation_deg: float, distance: float) -> Float[np.ndarray, " 3"]:
     """Return the point at the given distance and direction from the origin."""
     azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
@@ -43,17 +37,16 @@ def arc_azimuths(views: int, arc_deg: float | int) -> Float[np.ndarray, " V"]:
     return arc_deg * (share - 0.5)
 
 
-def square_camera(name: str, sight: Sight, image_px: int, fov_deg: float | int) -> Camera:
-    """Return an upright camera with square images."""
-    return Camera(name, looking_at(*sight), pinhole(image_px, fov_deg), (image_px, image_px))
-
-
 def numbered_cameras(sights: Sequence[Sight], image_px: int, fov_deg: float | int) -> Cameras:
-    """Return square views named 000.png, 001.png, ... with shared intrinsics."""
+    """Return upright cameras with square images 000.png, 001.png, ... and the given field of view."""
     views = len(sights)
-    return Cameras(
-        tuple(f"{i:03d}.png" for i in range(views)),
-        np.stack([looking_at(*sight) for sight in sights]),
-        np.tile(pinhole(image_px, fov_deg), (views, 1, 1)),
-        np.full((views, 2), image_px, dtype=np.int32),
-    )
+    focal, middle = image_px / (2 * np.tan(np.radians(fov_deg) / 2)), image_px / 2
+    K = np.array([[focal, 0.0, middle], [0.0, focal, middle], [0.0, 0.0, 1.0]])
+    names = tuple(f"{i:03d}.png" for i in range(views))
+    poses = np.stack([looking_at(*sight) for sight in sights])
+    return Cameras(names, poses, np.tile(K, (views, 1, 1)), np.full((views, 2), image_px, dtype=np.int32))
+
+
+def square_camera(sight: Sight, image_px: int, fov_deg: float | int) -> Camera:
+    """Return the one camera of `numbered_cameras`."""
+    return numbered_cameras([sight], image_px, fov_deg)["000.png"]

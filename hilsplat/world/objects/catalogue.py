@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hilsplat.base.errors import SceneError
 from hilsplat.world.objects import belongings, furniture, household, kitchen, street, toys
 from hilsplat.world.objects.builder import Builder, ObjectModel
 
@@ -114,14 +113,8 @@ def build_object(kind: str, name: str, rng: np.random.Generator) -> ObjectModel:
     Args:
         kind: kind of scene whose classes include the object.
         name: class of the object, one of `CLASSES[kind]`.
-
-    Raises:
-        SceneError: if there is no such class.
     """
-    classes = CLASSES[kind]
-    if name not in classes:
-        raise SceneError(f"unknown {kind} object {name!r}", expected=f"one of {', '.join(classes)}")
-    aliases, draw = classes[name]
+    aliases, draw = CLASSES[kind][name]
     builder = Builder(f"{name}, {aliases}", rng)
     draw(builder)
     return builder.build()

@@ -23,7 +23,7 @@ STONE = Paint("grey", "stone", (0.6, 0.5, 0.4), (0.3, 0.3, 0.3), 8.0, 0.0, 10.0,
 
 
 def camera_at(centre, target=(0.0, 0.0, 0.0), side_px: int = 64, fov_deg: float = 50.0) -> Camera:
-    return square_camera("a.png", (np.array(centre), np.array(target)), side_px, fov_deg)
+    return square_camera((np.array(centre), np.array(target)), side_px, fov_deg)
 
 
 def test_label_image_of_a_box_is_its_analytic_projection():

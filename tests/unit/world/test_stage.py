@@ -14,7 +14,7 @@ from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnota
 from hilsplat.scene.cameras import Cameras
 from hilsplat.settings import WorldSettings
 from hilsplat.world.objects.catalogue import GENERATOR_VERSION, TABLETOP
-from hilsplat.world.pictures import node_colours, show_world, tree_lines
+from hilsplat.world.pictures import show_world, tree_lines
 from hilsplat.world.render import label_view
 from hilsplat.world.scenes.kinds import build_scene
 from hilsplat.world.stage import parse_source, run_world
@@ -127,4 +127,3 @@ def test_pictures_of_the_manual_are_drawn(tmp_path):
 def test_the_tree_lists_a_shared_text_once():
     nodes = tree((1, -1, "chair"), (2, 0, "leg"), (3, 1, "foot"), (2, 0, "leg"), (3, 3, "foot"))
     assert [(depth, node.id) for depth, node in tree_lines(nodes)] == [(0, 0), (1, 1), (2, 2)]
-    assert len(np.unique(node_colours(100), axis=0)) > 95

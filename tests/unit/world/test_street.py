@@ -70,7 +70,7 @@ def test_every_pixel_has_a_label_and_the_sky_is_self_luminous(street):
     assert (label_view(street, scene_cameras(street, 40, 64, 360)["020.png"])[0] >= 0).all()
     # Straight up from the road there is only sky; its colours lie between blue and white.
     up = np.array([0.0, LANE_Y, 1.8]), np.array([0.3, LANE_Y, 12.0])
-    camera = square_camera("up.png", up, 16, 62.0)
+    camera = square_camera(up, 16, 62.0)
     sky = next(node for node in street.background if street.nodes[node].text == "sky")
     assert (label_view(street, camera)[0] == sky).all()
     image = render_view(street, camera, 1).astype(int)
