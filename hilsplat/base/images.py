@@ -142,7 +142,7 @@ def to_uint8(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]
     return (np.clip(values, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
-def resize_to_fit(pixels: UInt8[np.ndarray, "H W 3"], max_side_px: int) -> UInt8[np.ndarray, "h w 3"]:
+def resize_to_fit(pixels: UInt8[np.ndarray, "H W *C"], max_side_px: int) -> UInt8[np.ndarray, "h w *C"]:
     """Shrink an image so that its longer side is at most `max_side_px` (area filter); never enlarge it."""
     import cv2
 

@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
+from hilsplat.base.images import resize_to_fit
+
 FEW_PHOTOS = 10
 """With fewer photographs, large parts of a scene usually appear in at most one photograph."""
 
@@ -116,10 +118,11 @@ def _motion_doubts(photos: Sequence[CheckedPhoto]) -> list[str]:
     """Return problems with the camera's motion, measured by matching neighbouring photographs."""
     last = len(photos) - 1
     rows = sorted(set(np.linspace(0, last - 1, min(last, MAX_PAIRS)).round().astype(int))) if last > 0 else []
-    features = functools.cache(lambda row: _features(photos[row].grey))
+    small = functools.cache(lambda row: resize_to_fit(photos[row].grey, FEATURE_SIDE_PX))
+    features = functools.cache(lambda row: _features(small(row)))
     same, turned, moved = [], 0, 0
     for row in rows:
-        motion = pair_motion(features(row), features(row + 1), _feature_size(photos[row].grey))
+        motion = pair_motion(features(row), features(row + 1), small(row).shape)
         if motion is None:
             continue
         displacement, turn_share = motion
@@ -167,18 +170,11 @@ def blur(grey: UInt8[np.ndarray, "h w"]) -> float:
     return max(shares)
 
 
-def _feature_size(grey: UInt8[np.ndarray, "h w"]) -> tuple[int, int]:
-    scale = min(1.0, FEATURE_SIDE_PX / max(grey.shape))
-    return (round(grey.shape[0] * scale), round(grey.shape[1] * scale))
-
-
 def _features(
     grey: UInt8[np.ndarray, "h w"],
 ) -> tuple[Float32[np.ndarray, "n 2"], Float32[np.ndarray, "n 128"]]:
-    """Compute SIFT positions, in px of the downscaled picture, and RootSIFT descriptors."""
-    height, width = _feature_size(grey)
-    small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
-    points, descriptors = cv2.SIFT.create(NUM_FEATURES).detectAndCompute(small, None)
+    """Compute SIFT positions in px and RootSIFT descriptors."""
+    points, descriptors = cv2.SIFT.create(NUM_FEATURES).detectAndCompute(grey, None)
     if descriptors is None:
         return np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32)
     xy = np.array([point.pt for point in points], dtype=np.float32)

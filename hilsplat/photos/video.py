@@ -213,12 +213,8 @@ def _candidates(video: Path, position: int, most: int, decoding: Decoding) -> li
             best[row] = Frame(position, number, time_s, score, _grey(frame, GREY_SIDE_PX))
             while len(best) > most:
                 span_s *= 2
-                halved: dict[int, Frame] = {}
-                for row, candidate in best.items():
-                    rival = halved.get(row // 2)
-                    if rival is None or candidate.sharpness > rival.sharpness:
-                        halved[row // 2] = candidate
-                best = halved
+                by_sharpness = sorted(best.items(), key=lambda item: (item[1].sharpness, -item[1].number))
+                best = {row // 2: candidate for row, candidate in by_sharpness}  # the sharper one is kept
     return sorted(best.values(), key=lambda candidate: candidate.number)
 
 

@@ -1,7 +1,7 @@
 """Features and verified matches of photographs: upright work images, initial cameras, SIFT, pairs."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -204,12 +204,11 @@ def verified_matches(database: Path) -> dict[str, dict[str, int]]:
     return shared
 
 
-def count_matches(database: Path) -> dict[str, dict[str, int]]:
-    """Count each view's features and its verified matches with other views, for the registration report.
+def count_matches(database: Path, shared: Mapping[str, Mapping[str, int]]) -> dict[str, dict[str, int]]:
+    """Count each view's features and its verified matches, `shared`, for the registration report.
 
     Two views count as matched if they have at least `MIN_INLIERS` verified matches.
     """
-    shared = verified_matches(database)
     counts = {}
     with pycolmap.Database.open(database) as opened:
         for image in opened.read_all_images():

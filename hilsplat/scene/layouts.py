@@ -14,8 +14,6 @@ TRAINED = ("output", "outputs", "exports", "language_features")
 MODELS = ("sparse/0", "sparse")
 """Possible folders of a COLMAP model, in order of preference."""
 
-MODEL_FILES = ("cameras", "images", "points3D")
-
 TRANSFORMS = ("transforms.json", "transforms_train.json")
 """Pose files of nerfstudio and other programs, in order of preference."""
 
@@ -174,9 +172,8 @@ def _named_poses(folder: Path, named: Path) -> KnownPoses:
 
 
 def _is_model(folder: Path) -> bool:
-    return any(
-        all((folder / f"{name}{suffix}").is_file() for name in MODEL_FILES) for suffix in (".bin", ".txt")
-    )
+    names = ("cameras", "images", "points3D")
+    return any(all((folder / f"{name}{suffix}").is_file() for name in names) for suffix in (".bin", ".txt"))
 
 
 def polycam_folders(folder: Path) -> tuple[Path, Path] | None:

@@ -130,23 +130,22 @@ def _reconstruct(
     database, lenses = work / "features.db", lenses_of(work_images, camera_model, settings.single_camera)
     logger.info("%s: extracting and matching the features of %d images", name, len(work_images))
     matcher = in_own_process(find_matches, database, work / "images", lenses, settings, seed, threads)
-    matches = count_matches(database)
+    shared = verified_matches(database)
     logger.info("%s: %s mapping", name, settings.mapper)
     models = map_views(database, work / "images", work / "models", settings.mapper, seed)
     model = models[0] if models else None
-    report = registration_report(work_images, matches, models)
-    name_neighbours(database, report["views"])
+    report = registration_report(work_images, count_matches(database, shared), models)
+    name_neighbours(shared, report["views"])
     how = f"structure from motion, {settings.mapper} mapper, {matcher} matching, {camera_model}"
     report = {"scene": name, "poses": how, "seed": seed, **report}
-    picture = work / LOST_PICTURE
-    has_lost = plot_lost(picture, work / "images", report)
+    lost = plot_lost(work / LOST_PICTURE, work / "images", report)
     kept = out.with_name(LOST_PICTURE)
     kept.unlink(missing_ok=True)  # from an earlier run
     try:
         check_registration(images, name, report, settings)
     except RegistrationError as error:
-        if has_lost:
-            shutil.copyfile(picture, kept)
+        if lost is not None:
+            shutil.copyfile(lost, kept)
             error.add_line("picture", f"{kept} shows the unregistered photographs and where they belong")
         raise
     assert model is not None
@@ -155,7 +154,6 @@ def _reconstruct(
         pose, file = pose_matrix(image.cam_from_world()), work / "images" / image.name
         views.append(PosedView(image.name, file, camera_of(image), pose))
     split = split_views([view.view for view in views], settings.test_every)
-    lost = picture if has_lost else None
     write_scene(out, name, "arbitrary", views, *sparse_points(model), split, report, turn=True, lost=lost)
     return report
 
@@ -176,11 +174,8 @@ def map_views(
         models = pycolmap.incremental_mapping(database, images, folder, options)
     else:
         models = pycolmap.global_mapping(database, images, folder, _global_options(seed))
-    large_enough = [
-        (number, model) for number, model in models.items() if model.num_reg_images() >= MIN_PHOTOS
-    ]
-    large_enough.sort(key=lambda item: (-item[1].num_reg_images(), -item[1].num_points3D(), item[0]))
-    return [model for _, model in large_enough]
+    large_enough = [model for _, model in sorted(models.items()) if model.num_reg_images() >= MIN_PHOTOS]
+    return sorted(large_enough, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
 
 def _global_options(seed: int) -> pycolmap.GlobalPipelineOptions:
@@ -306,9 +301,8 @@ def check_registration(images: Path, name: str, report: Mapping[str, Any], setti
         logger.warning("%s: %s is not registered: %s", name, entry["file"], entry["why_not"])
 
 
-def name_neighbours(database: Path, views: Mapping[str, dict[str, Any]]) -> None:
+def name_neighbours(shared: Mapping[str, Mapping[str, int]], views: Mapping[str, dict[str, Any]]) -> None:
     """Add `belongs_near` to a report's unregistered views: the registered views with the most matches."""
-    shared = verified_matches(database)
     for view, entry in views.items():
         if entry["registered"]:
             continue
@@ -319,11 +313,11 @@ def name_neighbours(database: Path, views: Mapping[str, dict[str, Any]]) -> None
         entry["belongs_near"] = [{"view": other, "matches": count} for count, other in near[:NEIGHBOURS]]
 
 
-def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> bool:
-    """Draw unregistered photographs with their registered neighbours; return False if all are registered."""
+def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> Path | None:
+    """Draw unregistered photographs with their registered neighbours; return None if all are registered."""
     lost = [(view, entry) for view, entry in report["views"].items() if not entry["registered"]]
     if not lost:
-        return False
+        return None
     from matplotlib.figure import Figure
 
     shown = lost[:MAX_ROWS]
@@ -344,4 +338,4 @@ def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> bool:
         if not near:
             row[1].text(0, 0.5, "no verified match with a registered photograph", fontsize=8)
     figure.savefig(path, format="png", dpi=100, metadata={"Software": None})
-    return True
+    return path

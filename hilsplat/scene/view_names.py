@@ -1,7 +1,7 @@
 """View names, derived from the file names of the photographs."""
 
 import os
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -35,20 +35,17 @@ def view_names(sources: Sequence[Path]) -> list[str]:
             limit, problem = f"at most {LONGEST_NAME} bytes", f"the name of photograph {source} is too long"
             raise SceneError(problem, expected=limit, found=num_bytes, fix="rename it")
     stems = Counter(source.stem for source in sources)
-    by_folder = {stem for stem, count in stems.items() if count > 1}
     same_folder = Counter((source.parent, source.stem) for source in sources)
     names = []
-    owners: dict[str, list[Path]] = defaultdict(list)
     for source in sources:
-        apart = source.stem in by_folder and same_folder[source.parent, source.stem] == 1
-        name = view_name(f"{source.parent.name}_{source.stem}" if apart else source.stem)
-        owners[name].append(source)
-        names.append(name)
-    for name, files in owners.items():
-        if len(files) > 1:
+        apart = stems[source.stem] > 1 and same_folder[source.parent, source.stem] == 1
+        names.append(view_name(f"{source.parent.name}_{source.stem}" if apart else source.stem))
+    for name, count in Counter(names).items():
+        if count > 1:
+            files = [str(source) for source, other in zip(sources, names, strict=True) if other == name]
             raise SceneError(
-                f"{len(files)} images have the same view name {name}",
-                found=", ".join(str(file) for file in files),
+                f"{count} images have the same view name {name}",
+                found=", ".join(files),
                 fix="rename or remove all but one: views are named after the file without its suffix",
             )
     return names

@@ -128,12 +128,9 @@ def _find_image(root: Path, name: str) -> Path | None:
     """Find an image by the name in the pose file, with or without a suffix, in `root` or its `images/`."""
     _check_inside(root, name)
     for base in (root / "images", root):
-        candidate = base / name
-        if candidate.is_file():
-            return candidate
-        for suffix in sorted(IMAGE_SUFFIXES):
-            if (with_suffix := candidate.with_name(candidate.name + suffix)).is_file():
-                return with_suffix
+        for suffix in ("", *sorted(IMAGE_SUFFIXES)):
+            if (image := base / f"{name}{suffix}").is_file():
+                return image
     return None
 
 
@@ -177,8 +174,6 @@ def _read_frame(known: KnownPoses, file: Path, number: int, frame: Mapping[str, 
         raise SceneError(
             f"{where}: file_path or transform_matrix is not valid: {error!r}", fix=AGAIN
         ) from error
-    if matrix.shape == (4, 4):
-        matrix = matrix[:3]  # the last row may be omitted
     source_from_cam = rigid_pose(matrix, f"{where} ({name}), transform_matrix") @ OPENGL_TO_OPENCV
     image = _find_image(known.root, name)
     camera = _frame_camera(where, frame, image)
@@ -259,18 +254,6 @@ def read_llff(known: KnownPoses) -> list[KnownView]:
             found=f"shape {rows.shape}",
             fix="unpack it again",
         )
-    matrices = rows.astype(np.float64)[:, :15].reshape(-1, 3, 5)
-    source_from_cam = np.tile(np.eye(4), (len(rows), 1, 1))
-    down, right, back = (matrices[:, :, column] for column in range(3))
-    source_from_cam[:, :3, :3] = np.stack([right, down, -back], axis=2)
-    source_from_cam[:, :3, 3] = matrices[:, :, 3]
-    proper = are_rotations(source_from_cam[:, :3, :3], RIGID_TOLERANCE) & (matrices[:, :, 4] > 0).all(axis=1)
-    if not proper.all():
-        raise SceneError(
-            f"{path}, row {int(np.argmin(proper))}: not a rigid pose with size and focal length",
-            expected="rotation columns down, right, back, then translation, then height, width, focal",
-            fix="export it again with LLFF's axes",
-        )
     images = sorted(list_images(folder if folder.is_dir() else known.root), key=lambda image: image.stem)
     if len(images) != len(rows):
         raise SceneError(
@@ -280,13 +263,15 @@ def read_llff(known: KnownPoses) -> list[KnownView]:
             fix="unpack the images again, and remove files that are not photographs of the scene",
         )
     views = []
-    for image, pose, matrix in zip(images, np.linalg.inv(source_from_cam), matrices, strict=True):
+    for number, (image, row) in enumerate(zip(images, rows.astype(np.float64), strict=True)):
+        down, right, back, position, (_, width_px, focal_px) = row[:15].reshape(3, 5).T
+        matrix = np.stack([right, down, -back, position], axis=1)
+        source_from_cam = rigid_pose(matrix, f"{path}, row {number}")
         with open_image(image) as opened:
             width, height = opened.size
-        _, width_px, focal_px = matrix[:, 4]
         params = [float(focal_px * width / width_px), width / 2, height / 2]
         camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
-        views.append(KnownView(image.name, image, camera, pose))
+        views.append(KnownView(image.name, image, camera, np.linalg.inv(source_from_cam)))
     return views
 
 
