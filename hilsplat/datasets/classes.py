@@ -53,12 +53,10 @@ NYU40: dict[int, str] = dict(enumerate(words_of(_NYU40), start=1))
 """NYU40 id, as in `<scan>_vh_clean_2.labels.ply` -> query. ScanNet's tsv spells class 24 `refridgerator`;
 the paper writes class 28 as two words."""
 
-BENCHMARK_20 = (*range(1, 13), 14, 16, 24, 28, 33, 34, 36, 39)
-"""Classes of ScanNet's own benchmark."""
-
 # The sets of 19, 15 and 10 classes are those of yanmin-wu/OpenGaussian `scripts/eval_scannet.py` and of the
-# paper. The 19 omit otherfurniture; the 15 also omit picture, refrigerator, shower curtain and bathtub.
-SCANNET_19 = ClassSet.of("scannet-19", NYU40, [label for label in BENCHMARK_20 if label != 39])
+# paper. The 19 are the 20 of ScanNet's own benchmark without otherfurniture (39); the 15 also omit picture,
+# refrigerator, shower curtain and bathtub.
+SCANNET_19 = ClassSet.of("scannet-19", NYU40, [*range(1, 13), 14, 16, 24, 28, 33, 34, 36])
 SCANNET_15 = ClassSet.of("scannet-15", NYU40, [n for n in SCANNET_19.ids if n not in (11, 24, 28, 36)])
 SCANNET_10 = ClassSet.of("scannet-10", NYU40, [1, 2, 4, 5, 6, 7, 8, 9, 10, 33])
 
@@ -109,9 +107,7 @@ Source: ScanNet/ScanNet `BenchmarkScripts/ScanNet200`. Ids, up to 1191, are thos
 """
 
 _ENTRIES = [(split, entry.split(" ", 1)) for split, listed in SPLITS.items() for entry in words_of(listed)]
-CLASSES: tuple[tuple[int, str, str], ...] = tuple(
-    sorted((int(label), name, split) for split, (label, name) in _ENTRIES)
-)
+CLASSES = tuple(sorted((int(label), name, split) for split, (label, name) in _ENTRIES))
 """Id, name and split of each class, in the benchmark's order (by id)."""
 _NAMES = {label: name for label, name, _ in CLASSES}
 
@@ -145,13 +141,11 @@ REPLICA_NAMES: dict[int, str] = dict(enumerate(_TEN_PER_LINE.split(), start=1))
 Source: `info_semantic.json` of the release (facebookresearch/Replica-Dataset).
 """
 
-# fmt: off
-REPLICA_EVALUATED_51: tuple[int, ...] = (
+REPLICA_EVALUATED_51 = (
     93, 31, 40, 20, 12, 76, 80, 98, 97, 47, 37, 61, 8, 87, 18, 60, 11, 88, 29, 10, 92, 7, 78, 59,
     44, 34, 26, 54, 71, 91, 63, 3, 64, 52, 62, 56, 35, 95, 13, 15, 22, 70, 83, 17, 82, 65, 14, 19,
     16, 23, 79,
-)
-# fmt: on
+)  # fmt: skip
 """The 51 classes of opennerf/opennerf, in that repository's order."""
 
 _QUERIES = {label: name.replace("-", " ") for label, name in REPLICA_NAMES.items()}
@@ -172,3 +166,11 @@ WAYMO_22 = ClassSet.of("waymo-22", dict(enumerate(words_of(_WAYMO), start=1)))
 Source: waymo-research/waymo-open-dataset `protos/segmentation.proto`. The benchmark has no text queries, so
 the queries are ours: the class names in plain words, and "walkable ground" for TYPE_WALKABLE.
 """
+
+LABELLINGS: dict[str, tuple[ClassSet, ...]] = {
+    "nyu40": (SCANNET_19, SCANNET_15, SCANNET_10),
+    "scannet200": (SCANNET200, SCANNET200_INSTANCES),
+    "replica": (REPLICA_51, REPLICA_48),
+    "waymo": (WAYMO_22,),
+}
+"""Labelling (meaning of the class ids in a data set's files) -> class sets evaluated on it."""

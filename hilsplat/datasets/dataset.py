@@ -60,7 +60,9 @@ class Dataset:
 
     def missing(self, root: Path, scene: str) -> tuple[str, ...]:
         """Return the required paths of a scene that are missing below the data set's folder `root`."""
-        return tuple(place for place in self.required(scene) if not _at(root, place).exists())
+        # `normpath` resolves `..` even if the folder before it does not exist.
+        paths = {place: Path(os.path.normpath(root / place)) for place in self.required(scene)}
+        return tuple(place for place, path in paths.items() if not path.exists())
 
     def found(self, root: Path) -> tuple[str, ...]:
         """Return the known scenes that have all required paths."""
@@ -105,11 +107,6 @@ class Dataset:
     def _has_begun(self, root: Path) -> bool:
         """Return whether a folder contains part of a known scene or, if no scenes are known, any scene."""
         return any(self.has_part(root, scene) for scene in self.scenes) or bool(self.found(root))
-
-
-def _at(root: Path, place: str) -> Path:
-    """Join a folder and a relative path, resolving `..` even if the folder does not exist."""
-    return Path(os.path.normpath(Path(root) / place))
 
 
 def _folders(folder: Path) -> list[Path]:

@@ -3,6 +3,7 @@
 The workflow uses this module at start-up, so it reads no data and imports no heavy library at module level.
 """
 
+import logging
 from collections.abc import Collection
 from pathlib import Path
 
@@ -10,6 +11,8 @@ from hilsplat.base.errors import SceneError
 from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.registry import DATASETS, dataset_of, open_labels
 from hilsplat.scene.sheet import DATA_PREFIX
+
+logger = logging.getLogger(__name__)
 
 LABELS_ON = {"lerf_ovs": "hi_lerf", "3d_ovs": "hi_3dovs"}
 """Data set -> a second data set that labels the same images at several levels."""
@@ -90,9 +93,7 @@ def label_files(labels: str, data_root: str) -> tuple[Path, ...]:
 
 def image_files(source: str, data_root: str) -> tuple[Path, ...]:
     """Return the data set's files from which a scene's images and poses are exported."""
-    place = published(source)
-    assert place is not None, source
-    name, scene = place
+    name, _, scene = source.removeprefix(DATA_PREFIX).partition("/")
     dataset = dataset_of(name)
     files: set[Path] = set()
     for required in dataset.required(scene):
@@ -108,8 +109,8 @@ def is_exported(source: str) -> bool:
     return place is not None and dataset_of(place[0]).labels == "points"
 
 
-def export_images(name: str, data_root: Path, out: Path) -> int:
-    """Write the images and poses of `data set/scene` for the `poses` stage; return the number of images.
+def export_images(name: str, data_root: Path, out: Path) -> None:
+    """Write the images and poses of `data set/scene` for the `poses` stage.
 
     For a labelled mesh, the vertices are also written (`points.ply`, without labels) as initial or frozen
     Gaussian positions. Lidar points are not written, because the sky and distant objects have none.
@@ -126,6 +127,7 @@ def export_images(name: str, data_root: Path, out: Path) -> int:
             f"{name} needs no export: its images are already in a folder",
             fix="enter the folder as the source in the scene sheet",
         )
-    meshes = [points for points in scene.truth.values() if points.labelling != "waymo"]
+    meshes = [points for labelling, points in scene.truth.items() if labelling != "waymo"]
+    for sentence in scene.warnings:
+        logger.warning("%s: %s", name, sentence)
     write_posed_images(out, scene.images, meshes[0].xyz if meshes else None)
-    return len(scene.images)

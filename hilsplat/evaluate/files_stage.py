@@ -96,6 +96,8 @@ def run_evaluate_files(
                 views = truths_of(truth, Scene.load(scene), min_px)
         else:
             dataset, known, extra = ExtraProtocols.open(labels, data_root)
+            for sentence in known.warnings:
+                logger.warning("%s: %s", labels, sentence)
             name = labels.partition("/")[2]
             if isinstance(known, PointScene):
                 points = known.truth
@@ -244,7 +246,8 @@ def _point_rows(
             yield instance_scan(points, classes, *read_point_instances(found[0], len(points)))
         else:
             predicted = classes.labels(read_point_classes(found[0], len(points)))
-            yield from measure_points(card, METHOD, points.labels(classes), predicted, classes, "files")
+            labels = classes.labels(points.class_id)
+            yield from measure_points(card, METHOD, labels, predicted, classes, "files")
     if not is_scored:
         files = dict.fromkeys(file for card in extra.points for file in _files_of(card))
         raise ArtifactError(

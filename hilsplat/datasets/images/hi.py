@@ -19,7 +19,7 @@ import numpy as np
 from hilsplat.base.errors import SceneError
 from hilsplat.base.levels import Level
 from hilsplat.datasets.dataset import Dataset
-from hilsplat.datasets.images.isat import IsatFile, IsatObject, read_isat
+from hilsplat.datasets.images.isat import IsatFile, IsatObject, fill_polygons, read_isat
 from hilsplat.datasets.images.lerf_ovs import label_files, merged_regions
 from hilsplat.datasets.labelled import LabelledRegion, LabelledScene, images_by_view
 from hilsplat.datasets.published import FRAMES, differences
@@ -87,7 +87,8 @@ def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, .
         while ancestor is not None:
             path.insert(0, objects[ancestor].category)
             ancestor = parents[ancestor]
-        pixels, level = partial(thing.mask, labels.size_hw), Level(thing.keys["level"])
+        pixels = partial(fill_polygons, thing.polygons, labels.size_hw)
+        level = Level(thing.keys["level"])
         box = thing.box_xyxy[None]
         regions.append(LabelledRegion(thing.category, labels.size_hw, pixels, box, level, tuple(path)))
     return tuple(regions)
@@ -151,7 +152,7 @@ def _nesting_violations(
     labels: IsatFile, objects: Mapping[int, IsatObject], parents: Mapping[int, int | None]
 ) -> list[str]:
     """Return a sentence for every child with more than `OUTSIDE_SHARE` of its area outside its parent."""
-    masks = {number: thing.mask(labels.size_hw) for number, thing in objects.items()}
+    masks = {number: fill_polygons(thing.polygons, labels.size_hw) for number, thing in objects.items()}
     sentences = []
     for number, parent in parents.items():
         if parent is None:

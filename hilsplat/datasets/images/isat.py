@@ -78,10 +78,6 @@ class IsatObject:
     box_xyxy: Int64[np.ndarray, " 4"]
     keys: Mapping[str, Any]
 
-    def mask(self, size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-        """Rasterise the object (see `fill_polygons`)."""
-        return fill_polygons(self.polygons, size_hw)
-
 
 @dataclass(frozen=True, eq=False)
 class IsatFile:

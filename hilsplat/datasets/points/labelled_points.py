@@ -3,40 +3,21 @@
 Each reader raises SceneError if its file is missing or damaged.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32
+from jaxtyping import Float, Float32, Int32
 from plyfile import PlyData, PlyParseError
 
-from hilsplat.base.errors import MisalignedArtifactError, SceneError
-from hilsplat.datasets.classes import (
-    REPLICA_48,
-    REPLICA_51,
-    SCANNET200,
-    SCANNET200_INSTANCES,
-    SCANNET_10,
-    SCANNET_15,
-    SCANNET_19,
-    WAYMO_22,
-    ClassSet,
-)
+from hilsplat.base.errors import SceneError
 from hilsplat.datasets.dataset import SceneReport, listing
 from hilsplat.scene import layouts
 from hilsplat.scene.posed_images import PosedImage
 
 UNPACK_AGAIN = "unpack or download the file again; this copy is damaged or incomplete"
-
-LABELLINGS: dict[str, tuple[ClassSet, ...]] = {
-    "nyu40": (SCANNET_19, SCANNET_15, SCANNET_10),
-    "scannet200": (SCANNET200, SCANNET200_INSTANCES),
-    "replica": (REPLICA_51, REPLICA_48),
-    "waymo": (WAYMO_22,),
-}
-"""Labelling (meaning of the class ids in a data set's files) -> class sets evaluated on it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,34 +28,14 @@ class LabelledPoints:
         xyz: positions, metres.
         class_id: class number in the data set's files; 0 if undefined.
         instance_id: instance number from 1, unrelated to numbers in other files; 0 for none.
-        labelling: meaning of `class_id`, a key of `LABELLINGS`.
-        visible: whether the point is visible to a camera; None if unknown.
     """
 
     xyz: Float[np.ndarray, "P 3"]
     class_id: Int32[np.ndarray, " P"]
     instance_id: Int32[np.ndarray, " P"]
-    labelling: str
-    visible: Bool[np.ndarray, " P"] | None = None
 
     def __len__(self) -> int:
         return len(self.xyz)
-
-    def labels(self, classes: ClassSet) -> Int32[np.ndarray, " P"]:
-        """Return labels 1 .. K in the order of a class set, or 0 for classes that are not in the set.
-
-        Raises:
-            MisalignedArtifactError: the set is not defined for this labelling.
-        """
-        fitting = LABELLINGS[self.labelling]
-        if classes not in fitting:
-            raise MisalignedArtifactError(
-                f"class set {classes.name} is not defined for {self.labelling} labels",
-                expected=" or ".join(each.name for each in fitting),
-                found=classes.name,
-                fix="use one of this data set's protocols",
-            )
-        return classes.labels(self.class_id)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +44,7 @@ class PointScene:
 
     Attributes:
         images: posed images; frames without a pose are omitted.
-        truth: labelled points by labelling. Only `evaluate` may read them.
+        truth: labelled points by labelling, a key of `classes.LABELLINGS`. Only `evaluate` may read them.
         warnings: one sentence for each item that was skipped or reinterpreted.
     """
 
@@ -100,8 +61,6 @@ class PointScene:
             facts[f"{labelling} points with a class"] = int((points.class_id > 0).sum())
             facts[f"{labelling} classes"] = len(np.unique(points.class_id[points.class_id > 0]))
             facts[f"{labelling} instances"] = len(np.unique(points.instance_id[points.instance_id > 0]))
-            if points.visible is not None:
-                facts[f"{labelling} points visible to a camera"] = int(points.visible.sum())
         return SceneReport(facts, self.warnings)
 
 
@@ -192,18 +151,3 @@ class PlyMesh:
                 fix=UNPACK_AGAIN,
             )
         return faces
-
-
-def by_number(paths: Sequence[Path], prefix: str = "") -> list[tuple[int, Path]]:
-    """Sort files by the number that follows a prefix in their stem, so that 2 comes before 10."""
-    numbered = []
-    for path in paths:
-        stem = path.stem.removeprefix(prefix)
-        if not (stem.isascii() and stem.isdecimal()):
-            raise SceneError(
-                f"{path} is not named like a frame",
-                expected=f"{prefix}<number>{path.suffix}",
-                fix="move images that are not frames to another folder",
-            )
-        numbered.append((int(stem), path))
-    return sorted(numbered)

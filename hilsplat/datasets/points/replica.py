@@ -12,7 +12,6 @@ All readers raise SceneError if a file is missing, damaged, or doesn't match the
 Poses are camera-to-world in OpenCV axes, 16 numbers per line.
 """
 
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -28,30 +27,34 @@ from hilsplat.datasets.points.labelled_points import (
     LabelledPoints,
     PlyMesh,
     PointScene,
-    by_number,
     read_json_object,
     read_numbers,
 )
 from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage, rigid_pose
 
-logger = logging.getLogger(__name__)
-
-
 LAYOUTS = (("traj.txt", "results", "frame"), ("traj_w_c.txt", "rgb", "rgb_"))
 """Pose file, image folder and image name prefix, for NICE-SLAM, then for Semantic-NeRF and vMAP."""
 
 
-def layout_of(folder: Path) -> tuple[str, str, str]:
-    """Return the row of `LAYOUTS` whose pose file and image folder are in a sequence's folder."""
-    for poses, images, prefix in LAYOUTS:
-        if (folder / poses).is_file() and (folder / images).is_dir():
-            return poses, images, prefix
-    inner = sorted(path.parent for poses, _, _ in LAYOUTS for path in folder.glob(f"*/{poses}"))
+def find_sequence(root: Path, scene: str) -> tuple[Path, tuple[str, str, str]]:
+    """Return the folder and the row of `LAYOUTS` of a scene's rendered sequence.
+
+    The folder is `room0` (NICE-SLAM), `room_0/imap/00` (vMAP) or `room_0/Sequence_1`.
+    """
+    places = (scene.replace("_", ""), f"{scene}/imap/00", f"{scene}/Sequence_1")
+    folders = [root / place for place in places if (root / place).is_dir()]
+    for folder in folders:
+        for layout in LAYOUTS:
+            if (folder / layout[0]).is_file() and (folder / layout[1]).is_dir():
+                return folder, layout
+    nested = [path.parent for folder in folders for path in sorted(folder.glob("*/traj*.txt"))]
     raise SceneError(
-        f"{folder} does not contain a rendered sequence",
-        expected="traj.txt with results/, or traj_w_c.txt with rgb/",
-        found=listing(folder),
-        fix=f"use the folder {inner[0]} instead" if inner else "unpack the rendered sequences there",
+        f"{scene} has no rendered sequence in {root}",
+        expected=f"traj.txt with results/, or traj_w_c.txt with rgb/, in {' or '.join(places)}",
+        found=listing([*folders, root][0]),
+        fix=f"move the files in {nested[0]} one level up"
+        if nested
+        else "unpack the rendered sequences there",
     )
 
 
@@ -70,21 +73,20 @@ def read_lens(path: Path) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]) + HALF_PIXEL, size_hw
 
 
-def read_images(folder: Path) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
-    """Return the posed images of a rendered sequence, sorted by frame number.
+def read_images(root: Path, scene: str) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
+    """Return the posed images of a scene's rendered sequence, sorted by frame number.
 
     Line n of the pose file is the pose of frame n. Lines without an image are skipped, and a warning with
     their number is also returned.
     """
-    pose_file, image_folder, prefix = layout_of(folder)
+    folder, (pose_file, image_folder, prefix) = find_sequence(root, scene)
     path = folder / pose_file
     poses = read_numbers(path, 16).reshape(-1, 4, 4)
-    named = [
-        image
+    frames = sorted(
+        (int(image.stem.removeprefix(prefix)), image)
         for image in list_images(folder / image_folder)
         if image.stem.startswith(prefix) and image.stem.removeprefix(prefix).isdecimal()
-    ]  # other images are depth or colour visualisations
-    frames = by_number(named, prefix)
+    )  # other images are depth or colour visualisations
     beyond = [number for number, _ in frames if number >= len(poses)]
     if beyond or not frames:
         missing = f"; the first frame without a line is {beyond[0]}" if beyond else ""
@@ -95,8 +97,7 @@ def read_images(folder: Path) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
             fix=UNPACK_AGAIN,
         )
     lens = folder.parent / "cam_params.json"
-    own = pose_file == LAYOUTS[0][0] and lens.is_file()
-    if own:
+    if pose_file == "traj.txt" and lens.is_file():
         K, size_hw = read_lens(lens)
     else:  # the renderings' stated centre, 599.5 of 1200 px, is relative to the first pixel's centre
         size_hw = height, width = image_size_hw(frames[0][1])
@@ -107,20 +108,6 @@ def read_images(folder: Path) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
         images.append(PosedImage(image.name, image, pose, K, size_hw))
     more = len(poses) - len(frames)
     return tuple(images), (f"{more} poses have no image and are skipped",) if more else ()
-
-
-def sequence_folder(root: Path, scene: str) -> Path:
-    """Return a sequence's folder: `room0` (NICE-SLAM), `room_0/imap/00` (vMAP) or `room_0/Sequence_1`."""
-    places = (scene.replace("_", ""), f"{scene}/imap/00", f"{scene}/Sequence_1")
-    for place in places:
-        if (root / place).is_dir():
-            return root / place
-    raise SceneError(
-        f"{scene} has no rendered sequence in {root}",
-        expected=" or ".join(f"{place}/" for place in places),
-        found=listing(root),
-        fix="unpack the rendered sequences there",
-    )
 
 
 def class_of_objects(path: Path) -> Int32[np.ndarray, " O"]:
@@ -183,15 +170,13 @@ def read_semantic_mesh(habitat: Path) -> LabelledPoints:
     owner = object_of_vertices(quads, of_face, len(mesh.xyz))
     class_id = np.where(owner >= 0, classes[owner], 0).astype(np.int32)
     instance = np.where(class_id > 0, owner + 1, 0).astype(np.int32)
-    return LabelledPoints(mesh.xyz, class_id, instance, "replica")
+    return LabelledPoints(mesh.xyz, class_id, instance)
 
 
 def open_scene(root: Path, scene: str) -> PointScene:
     """Read the frames and labels of a scene, such as "room_0"."""
     truth = read_semantic_mesh(root / scene / "habitat")
-    images, warnings = read_images(sequence_folder(root, scene))
-    for warning in warnings:
-        logger.warning("%s: %s", scene, warning)
+    images, warnings = read_images(root, scene)
     return PointScene(scene, images, {"replica": truth}, warnings)
 
 

@@ -6,7 +6,7 @@ raise SceneError if a file is missing, damaged, or doesn't match the others.
 """
 
 import csv
-import logging
+import re
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -24,14 +24,11 @@ from hilsplat.datasets.points.labelled_points import (
     LabelledPoints,
     PlyMesh,
     PointScene,
-    by_number,
     read_json_object,
     read_matrix,
     require_file,
 )
 from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage, rigid_pose
-
-logger = logging.getLogger(__name__)
 
 LABEL_TABLE = "scannetv2-labels.combined.tsv"
 SAME_PLACE_M = 1e-4
@@ -78,13 +75,6 @@ def read_label_table(path: Path) -> dict[str, int]:
     return found
 
 
-def read_scan_info(path: Path) -> dict[str, str]:
-    """Read the lines `key = value` of `<scan>.txt`, with values as text because some are not numbers."""
-    lines = require_file(path).read_text(encoding="utf-8").splitlines()
-    pairs = (line.split(" = ", 1) for line in lines if " = " in line)
-    return {key.strip(): value.strip() for key, value in pairs}
-
-
 def read_images(folder: Path, scan: str) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
     """Return posed colour images, sorted by frame number, skipping frames for which tracking failed.
 
@@ -93,11 +83,11 @@ def read_images(folder: Path, scan: str) -> tuple[tuple[PosedImage, ...], tuple[
 
     Also return a warning for each reason that frames were skipped.
     """
-    frames = by_number(list_images(folder / "color"))
+    frames = sorted((_frame_number(path), path) for path in list_images(folder / "color"))
     K = read_matrix(folder / "intrinsic" / "intrinsic_color.txt")[:3, :3] + HALF_PIXEL
     lost, without, images = [], [], []
     described = folder / f"{scan}.txt"
-    info = read_scan_info(described) if described.is_file() else {}
+    info = dict(re.findall("(.*) = (.*)", described.read_text("utf-8"))) if described.is_file() else {}
     if "colorHeight" in info and "colorWidth" in info:
         size_hw = int(info["colorHeight"]), int(info["colorWidth"])
     else:
@@ -126,6 +116,16 @@ def read_images(folder: Path, scan: str) -> tuple[tuple[PosedImage, ...], tuple[
     if without:
         warnings.append(f"{len(without)} images (first: {without[0]}) have no file in pose/ and are skipped")
     return tuple(images), tuple(warnings)
+
+
+def _frame_number(path: Path) -> int:
+    if not (path.stem.isascii() and path.stem.isdecimal()):
+        raise SceneError(
+            f"{path} is not named like a frame",
+            expected=f"<number>{path.suffix}",
+            fix="move images that are not frames to another folder",
+        )
+    return int(path.stem)
 
 
 def read_truth(
@@ -157,8 +157,8 @@ def read_truth(
     if unknown:
         listed = ", ".join(f"{name} ({count})" for name, count in sorted(unknown.items()))
         warnings.append(f"no ScanNet200 class for categories that are not in {LABEL_TABLE}: {listed}")
-    points = LabelledPoints(xyz, nyu40, instance, "nyu40")
-    truth = {"nyu40": points, "scannet200": replace(points, class_id=fine, labelling="scannet200")}
+    points = LabelledPoints(xyz, nyu40, instance)
+    truth = {"nyu40": points, "scannet200": replace(points, class_id=fine)}
     return truth, tuple(warnings)
 
 
@@ -206,8 +206,6 @@ def open_scan(root: Path, scan: str) -> PointScene:
     DATASET.require(root, scan)
     truth, of_labels = read_truth(folder, scan, read_label_table(root / LABEL_TABLE))
     images, of_images = read_images(folder, scan)
-    for warning in (*of_images, *of_labels):
-        logger.warning("%s: %s", scan, warning)
     return PointScene(scan, images, truth, (*of_images, *of_labels))
 
 

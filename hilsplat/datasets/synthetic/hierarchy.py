@@ -58,11 +58,8 @@ class HierarchyAnnotations:
     views: Mapping[str, tuple[int, ...]]
 
     def label_image(self, view: str, level: Level) -> Int32[np.ndarray, "H W"]:
-        """Return the node id per pixel, -1 for none; raise ArtifactError if the label image is missing."""
-        path = label_path(self.folder, view, level)
-        if not path.is_file():
-            raise ArtifactError(f"label image {path} is missing", fix="write the annotations again")
-        return np.asarray(Image.open(path)).astype(np.int32) - 1
+        """Return the node id per pixel, -1 for none."""
+        return np.asarray(Image.open(label_path(self.folder, view, level))).astype(np.int32) - 1
 
     def texts(self, view: str, level: Level) -> dict[str, tuple[int, ...]]:
         """Return the texts annotated in a view at a level, with the ids of their nodes."""

@@ -27,29 +27,18 @@ REPLICA_WORDS = {
 }
 """World class -> its name in the data set, if different. Classes missing from the data set are undefined."""
 
-WAYMO_CLASSES: dict[str, str] = {
-    "car": "car",
-    "truck": "truck",
-    "bus": "bus",
+WAYMO_WORDS = {
     "cyclist": "bicyclist",
-    "pedestrian": "pedestrian",
     "traffic sign": "sign",
-    "traffic light": "traffic light",
     "street lamp": "pole",
-    "building": "building",
     "tree": "vegetation",
     "bush": "vegetation",
-    "curb": "curb",
-    "road": "road",
-    "lane marker": "lane marker",
-    "sidewalk": "sidewalk",
     "ground": "other ground",
-    "tree trunk": "tree trunk",
     "traffic sign pole": "pole",
     "traffic light pole": "pole",
 }
-"""Text of a whole or part in a street -> Waymo class name; a part's class overrides that of its whole. Fences
-are undefined, because Waymo has no class for them."""
+"""Text of a whole or part in a street -> Waymo class name, if different. Fences are undefined, because Waymo
+has no class for them."""
 
 COUNTABLE = frozenset({"car", "truck", "bus", "bicyclist", "pedestrian"})
 """Classes with separate instances."""
@@ -70,9 +59,12 @@ def replica_id(text: str) -> int:
 
 
 def waymo_labels(node_ids: Int32[np.ndarray, "P 3"], texts: Sequence[str]) -> Int32[np.ndarray, "P 2"]:
-    """Return the instance and Waymo class of each point, from its nodes (whole, part, subpart)."""
+    """Return the instance and Waymo class of each point, from its nodes (whole, part, subpart).
+
+    A part's class overrides that of its whole.
+    """
     number = dict(zip(WAYMO_22.texts, WAYMO_22.ids, strict=True))
-    of_node = np.array([number.get(WAYMO_CLASSES.get(text, ""), 0) for text in texts] + [0])
+    of_node = np.array([number.get(WAYMO_WORDS.get(text, text), 0) for text in texts] + [0])
     whole, part = of_node[node_ids[:, 0]], of_node[node_ids[:, 1]]
     classes = np.where(part > 0, part, whole)
     countable = np.isin(classes, [number[name] for name in COUNTABLE])
@@ -93,7 +85,7 @@ def labelled_points(world: Path, kind: str) -> dict[str, LabelledPoints]:
     if kind == "street":
         scan = read_npz(world / "truth" / "lidar.npz")
         instance, classes = waymo_labels(scan["node_ids"], texts).T
-        return {"waymo": LabelledPoints(scan["points"].astype(np.float64), classes, instance, "waymo")}
+        return {"waymo": LabelledPoints(scan["points"].astype(np.float64), classes, instance)}
     if kind != "room":
         raise SceneError(
             f"a {kind!r} world has no labelled points", expected="room or street", fix="score its images"
@@ -102,17 +94,11 @@ def labelled_points(world: Path, kind: str) -> dict[str, LabelledPoints]:
     seen = mesh.column("vertex", "views") > 0
     whole = mesh.column("vertex", "whole").astype(np.int32)[seen]
     xyz = mesh.xyz[seen].astype(np.float64)
-    ids = [scannet_ids(text) for text in texts]
-    fine = _of_nodes([fine for fine, _ in ids], whole)
-    nyu40 = LabelledPoints(xyz, _of_nodes([broad for _, broad in ids], whole), whole + 1, "nyu40")
-    of_replica = _of_nodes([replica_id(text) for text in texts], whole)
+    of_node = [(*scannet_ids(text), replica_id(text)) for text in texts] + [(0, 0, 0)]
+    fine, broad, of_replica = np.array(of_node, dtype=np.int32).T[:, whole]  # -1, no node, is the last
+    nyu40 = LabelledPoints(xyz, broad, whole + 1)
     return {
         "nyu40": nyu40,
-        "scannet200": replace(nyu40, class_id=fine, labelling="scannet200"),
-        "replica": replace(nyu40, class_id=of_replica, labelling="replica"),
+        "scannet200": replace(nyu40, class_id=fine),
+        "replica": replace(nyu40, class_id=of_replica),
     }
-
-
-def _of_nodes(class_of_node: list[int], node: Int32[np.ndarray, " P"]) -> Int32[np.ndarray, " P"]:
-    """Return the class of each point's node; 0 for points without a node."""
-    return np.array([*class_of_node, 0], dtype=np.int32)[node]

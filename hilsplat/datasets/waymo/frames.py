@@ -20,8 +20,6 @@ CAMERAS = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")
 """Camera names; numbered from 1 in the files."""
 TOP = 1
 """Number of the roof lidar, the only one that has labels and a pose for each pixel."""
-INSTANCE, CLASS = 0, 1
-"""Channels of a label image."""
 CV_FROM_WAYMO = np.array(
     [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
@@ -30,17 +28,15 @@ CV_FROM_WAYMO = np.array(
 
 @dataclass(frozen=True, eq=False)
 class LidarReturn:
-    """One return of the top lidar.
+    """One labelled return of the top lidar.
 
     Attributes:
         image: range (metres; zero or negative if there is no return), intensity, elongation, no-label zone.
-        labels: instance and class; None if the frame is not labelled.
-        projection: first camera, x, y, second camera, x, y; camera 0 means no camera. None if not stored.
+        labels: instance and class.
     """
 
     image: Float32[np.ndarray, "H W 4"]
-    labels: Int32[np.ndarray, "h w 2"] | None  # h = H and w = W, checked by `frame_points`
-    projection: Int32[np.ndarray, "i j 6"] | None  # i = H and j = W, checked by `frame_points`
+    labels: Int32[np.ndarray, "h w 2"]  # h = H and w = W, checked by `frame_points`
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +46,7 @@ class LidarFrame:
     Attributes:
         inclinations: inclinations of the rows, radians, highest first.
         pixel_pose: vehicle pose in the world at each pixel: roll, pitch, yaw (radians), x, y, z (metres).
-        returns: the first return and, if there is one, the second.
+        returns: one or two returns.
     """
 
     timestamp_micros: int
@@ -66,8 +62,8 @@ class WaymoCamera:
     """One camera of the car.
 
     Attributes:
-        intrinsic: f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3; px with the first pixel's left edge at 0, as in
-            this project.
+        intrinsic: f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3; px with the first pixel's left edge at 0, and
+            distortion in OpenCV's definition, as in this project.
         vehicle_from_cam: pose on the vehicle, in Waymo's camera axes.
     """
 
@@ -75,22 +71,6 @@ class WaymoCamera:
     intrinsic: Float[np.ndarray, " 9"]
     vehicle_from_cam: Float[np.ndarray, "4 4"]
     size_hw: tuple[int, int]
-
-    @property
-    def K(self) -> Float[np.ndarray, "3 3"]:
-        """Intrinsics without distortion, px; the centre of the first pixel is (0.5, 0.5)."""
-        f_u, f_v, c_u, c_v = self.intrinsic[:4]
-        return np.array([[f_u, 0.0, c_u], [0.0, f_v, c_v], [0.0, 0.0, 1.0]])
-
-    @property
-    def distortion(self) -> tuple[float, float, float, float, float]:
-        """k1, k2, p1, p2, k3 in OpenCV's order and definition."""
-        k1, k2, p1, p2, k3 = self.intrinsic[4:].tolist()
-        return k1, k2, p1, p2, k3
-
-    def cam_from_world(self, world_from_vehicle: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-        """Return the world-to-camera transform in OpenCV axes, given the pose stored with the image."""
-        return CV_FROM_WAYMO @ np.linalg.inv(world_from_vehicle @ self.vehicle_from_cam)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,15 +145,10 @@ def frame_points(frame: LidarFrame, segment_from_world: Float[np.ndarray, "4 4"]
     """
     parts = []
     for number, part in enumerate(frame.returns, start=1):
-        if part.labels is None:
-            continue
-        where = f"return {number} of the top lidar at {frame.timestamp_micros}"
         sizes = {part.image.shape[:2], part.labels.shape[:2], frame.pixel_pose.shape[:2]}
-        if part.projection is not None:
-            sizes.add(part.projection.shape[:2])
         if len(sizes) > 1 or len(frame.inclinations) != part.image.shape[0]:
             raise SceneError(
-                f"{where}: ranges, labels, poses and projections do not match",
+                f"return {number} of the top lidar at {frame.timestamp_micros}: its images do not match",
                 expected="images of the same size, and one inclination per row",
                 found=f"{sorted(sizes)}, {len(frame.inclinations)} inclinations",
                 fix="download all components of the segment from the same release",
@@ -185,11 +160,9 @@ def frame_points(frame: LidarFrame, segment_from_world: Float[np.ndarray, "4 4"]
         turned = np.einsum("hwij,hwj->hwi", rotation_of(pose[..., :3]), in_vehicle)
         places = (turned + pose[..., 3:])[hit]
         xyz = places @ segment_from_world[:3, :3].T + segment_from_world[:3, 3]
-        labels = part.labels[hit]
-        visible = None if part.projection is None else part.projection[hit][:, 0] > 0
-        parts.append(LabelledPoints(xyz, labels[:, CLASS], labels[:, INSTANCE], "waymo", visible=visible))
-    nothing = LabelledPoints(np.zeros((0, 3)), np.zeros(0, np.int32), np.zeros(0, np.int32), "waymo")
-    points = joined_points(parts or [nothing])
+        instance, class_id = part.labels[hit].T
+        parts.append(LabelledPoints(xyz, class_id, instance))
+    points = joined_points(parts)
     classes = points.class_id
     if classes.size and (classes.min() < 0 or classes.max() > max(WAYMO_22.ids)):
         raise SceneError(
@@ -202,25 +175,24 @@ def frame_points(frame: LidarFrame, segment_from_world: Float[np.ndarray, "4 4"]
 
 
 def joined_points(parts: Sequence[LabelledPoints]) -> LabelledPoints:
-    """Concatenate the points of one or more frames or returns; keep visibility if every part has it."""
-    seen = [part.visible for part in parts if part.visible is not None]
+    """Concatenate the points of one or more frames or returns."""
     return LabelledPoints(
         np.concatenate([part.xyz for part in parts]),
         np.concatenate([part.class_id for part in parts]),
         np.concatenate([part.instance_id for part in parts]),
-        "waymo",
-        visible=np.concatenate(seen) if len(seen) == len(parts) else None,
     )
 
 
 def shot_image(shot: CameraShot, segment_from_world: Float[np.ndarray, "4 4"]) -> PosedImage:
     """Return an image with its camera in the segment's frame, named after its timestamp and camera."""
-    in_segment = segment_from_world @ shot.world_from_vehicle
+    camera = shot.camera
+    f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3 = camera.intrinsic.tolist()
+    segment_from_cam = segment_from_world @ shot.world_from_vehicle @ camera.vehicle_from_cam
     return PosedImage(
-        f"{shot.timestamp_micros}_{shot.camera.name}.jpg",
+        f"{shot.timestamp_micros}_{camera.name}.jpg",
         shot.encoded,
-        shot.camera.cam_from_world(in_segment),
-        shot.camera.K,
-        shot.camera.size_hw,
-        shot.camera.distortion,
+        CV_FROM_WAYMO @ np.linalg.inv(segment_from_cam),
+        np.array([[f_u, 0.0, c_u], [0.0, f_v, c_v], [0.0, 0.0, 1.0]]),
+        camera.size_hw,
+        (k1, k2, p1, p2, k3),
     )

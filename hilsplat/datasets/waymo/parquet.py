@@ -33,7 +33,6 @@ COMPONENTS = (
     "lidar_segmentation",
     "vehicle_pose",
 )
-"""Required components; `lidar_camera_projection` is read if present."""
 INTRINSIC = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
 FRAME, LASER, CAMERA = "key.frame_timestamp_micros", "key.laser_name", "key.camera_name"
 
@@ -100,32 +99,26 @@ def lidar_frames(split: Path, segment: str) -> Iterator[LidarFrame]:
         raise SceneError(
             f"lidar_calibration of {segment} has {len(lidar)} rows for the top lidar", fix=UNPACK_AGAIN
         )
-    projected = component_path(split, "lidar_camera_projection", segment).is_file()
     labelled = read_component(split, "lidar_segmentation", segment, [FRAME], {LASER: TOP})
     for time in sorted(row[FRAME] for row in labelled):
         read = partial(_range_images, split, segment, time)
         images = read("lidar", "LiDARComponent", depth=4)
         labels = read("lidar_segmentation", "LiDARSegmentationLabelComponent", depth=2)
-        cells: list[np.ndarray | None] = [None, None]
-        if projected:
-            cells = read("lidar_camera_projection", "LiDARCameraProjectionComponent", depth=6)
         (pixel_pose,) = read("lidar_pose", "LiDARPoseComponent", depth=6, returns=1)
         if time not in poses or pixel_pose is None:
             raise SceneError(f"segment {segment}, frame {time} has labels but no pose", fix=UNPACK_AGAIN)
-        returns = [
-            LidarReturn(
-                image.astype(np.float32),
-                None if label is None else label.astype(np.int32),
-                None if cell is None else cell.astype(np.int32),
-            )
-            for image, label, cell in zip(images, labels, cells, strict=True)
-            if image is not None
-        ]
+        returns = tuple(
+            LidarReturn(image.astype(np.float32), label.astype(np.int32))
+            for image, label in zip(images, labels, strict=True)
+            if image is not None and label is not None
+        )
+        if not returns:
+            continue
         values, lowest, highest = (lidar[0][f"{beams}.{name}"] for name in ("values", "min", "max"))
         inclinations = beam_inclinations(values, lowest, highest, pixel_pose.shape[0])
         in_vehicle = lidar[0][place].reshape(4, 4)
         pixel_pose = pixel_pose.astype(np.float32)
-        yield LidarFrame(time, poses[time], in_vehicle, inclinations, pixel_pose, tuple(returns))
+        yield LidarFrame(time, poses[time], in_vehicle, inclinations, pixel_pose, returns)
 
 
 def _range_images(

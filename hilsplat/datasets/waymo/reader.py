@@ -5,7 +5,6 @@ the vehicle at the segment's first frame, because positions in the files (kilome
 for float32.
 """
 
-import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,8 +15,6 @@ from hilsplat.datasets.dataset import Dataset, SceneReport, listing
 from hilsplat.datasets.points.labelled_points import PointScene
 from hilsplat.datasets.waymo import parquet, records
 from hilsplat.datasets.waymo.frames import frame_points, joined_points, shot_image
-
-logger = logging.getLogger(__name__)
 
 SPLITS = ("validation", "training")
 """Splits searched for a segment. Labels of the testing split are not public."""
@@ -61,11 +58,9 @@ def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
         first = next(iter(poses.values()))
         frames = parquet.lidar_frames(split, segment)
         shots = parquet.camera_shots(split, segment, every)
-        release = "2"
     elif record is not None:
         first = records.first_pose(record)
         frames, shots = records.lidar_frames(record), records.camera_shots(record, every)
-        release = "1"
     else:
         found = listing(root)
         fix = "download all components of the segment, or its .tfrecord; the testing split has no labels"
@@ -85,17 +80,10 @@ def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
             fix="use a segment with 3D semantic segmentation labels, from release 1.3.2 or later",
         )
     images = tuple(shot_image(shot, segment_from_world) for shot in shots)
-    truth = joined_points(points)
-    logger.info(
-        "segment %s: release %s, %d labelled frames, %d points, %d images",
-        segment, release, len(points), len(truth), len(images),
-    )  # fmt: skip
-    warnings = []
+    warnings: tuple[str, ...] = ()
     if any(image.distortion[4] for image in images):
-        warnings.append("the lenses have a k3 coefficient, which poses cannot import; undistort the images")
-    if truth.visible is None:
-        warnings.append("lidar_camera_projection is missing, so the points' visibility is unknown")
-    return PointScene(segment, images, {"waymo": truth}, tuple(warnings))
+        warnings = ("the lenses have a k3 coefficient, which poses cannot import; undistort the images",)
+    return PointScene(segment, images, {"waymo": joined_points(points)}, warnings)
 
 
 @dataclass(frozen=True)
@@ -137,7 +125,6 @@ DATASET = Segments(
   validation/                          release 2.0.1, one parquet file per component and segment
     camera_image/<segment>.parquet
     camera_calibration/  lidar/  lidar_calibration/  lidar_pose/  lidar_segmentation/  vehicle_pose/
-    lidar_camera_projection/           optional: which points are visible to a camera
   individual_files_validation_segment-<segment>_with_camera_labels.tfrecord     or release 1.4.3""",
     required=lambda segment: tuple(f"{SPLITS[0]}/{tag}/{segment}.parquet" for tag in parquet.COMPONENTS),
     open=open_segment,

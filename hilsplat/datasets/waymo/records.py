@@ -8,6 +8,7 @@ SceneError if the file is missing, damaged or truncated.
 import struct
 import zlib
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +40,8 @@ LaserCalibration: required int32 name 1, repeated double beam_inclinations 2, \
     optional double beam_inclination_min 3, optional double beam_inclination_max 4, \
     optional Transform extrinsic 5
 Context: repeated CameraCalibration camera_calibrations 2, repeated LaserCalibration laser_calibrations 3
-RangeImage: optional bytes range_image_compressed 2, optional bytes camera_projection_compressed 3, \
-    optional bytes range_image_pose_compressed 4, optional bytes segmentation_label_compressed 6
+RangeImage: optional bytes range_image_compressed 2, optional bytes range_image_pose_compressed 4, \
+    optional bytes segmentation_label_compressed 6
 Laser: required int32 name 1, optional RangeImage ri_return1 2, optional RangeImage ri_return2 3
 CameraImage: required int32 name 1, required bytes image 2, required Transform pose 3
 Frame: required Context context 1, required int64 timestamp_micros 2, required Transform pose 3, \
@@ -111,61 +112,60 @@ def frames(path: Path) -> Iterator[tuple[str, Any]]:
     """Yield the location of each frame, for messages, and the frame itself."""
     for number, record in enumerate(records(path)):
         where = f"{path}, frame {number}"
-        try:
-            yield where, MESSAGES["Frame"].FromString(record)
-        except DecodeError as error:
-            raise SceneError(f"{where} cannot be read: {error}", fix=UNPACK_AGAIN) from error
+        with _readable(where):
+            frame = MESSAGES["Frame"].FromString(record)
+        yield where, frame
+
+
+@contextmanager
+def _readable(where: str) -> Iterator[None]:
+    """Raise SceneError if the data cannot be decoded."""
+    try:
+        yield
+    except (ValueError, IndexError, DecodeError, zlib.error) as error:
+        raise SceneError(f"{where} cannot be read: {error}", fix=UNPACK_AGAIN) from error
 
 
 def first_pose(path: Path) -> Float[np.ndarray, "4 4"]:
     """Return the vehicle's pose in the world in the first frame."""
     for where, frame in frames(path):
-        return _transform(frame.pose, where)
+        with _readable(where):
+            return _matrix4(frame.pose)
     raise SceneError(f"{path} contains no frames", fix=UNPACK_AGAIN)
 
 
-def _transform(message: Any, where: str) -> np.ndarray:
-    try:
-        return np.array(message.transform, dtype=np.float64).reshape(4, 4)
-    except ValueError as error:
-        raise SceneError(f"{where}: a transform cannot be read: {error}", fix=UNPACK_AGAIN) from error
+def _matrix4(transform: Any) -> np.ndarray:
+    return np.array(transform.transform, dtype=np.float64).reshape(4, 4)
 
 
 def lidar_frames(path: Path) -> Iterator[LidarFrame]:
     """Yield a file's frames that have labels for the top lidar."""
     for where, frame in frames(path):
-        try:
+        with _readable(where):
             laser = _named(frame.lasers, TOP)
             calibration = _named(frame.context.laser_calibrations, TOP)
-            returns, pixel_pose = [], None
-            for image in (laser.ri_return1, laser.ri_return2):
-                if not image.range_image_compressed:
-                    continue
-                if image.range_image_pose_compressed:
-                    pixel_pose = matrix(image.range_image_pose_compressed, np.float32)
-                whole = (image.segmentation_label_compressed, image.camera_projection_compressed)
-                labels, cells = (matrix(packed, np.int32) if packed else None for packed in whole)
-                returns.append(LidarReturn(matrix(image.range_image_compressed, np.float32), labels, cells))
-            if all(part.labels is None for part in returns):
+            returns = tuple(
+                LidarReturn(
+                    matrix(image.range_image_compressed, np.float32),
+                    matrix(image.segmentation_label_compressed, np.int32),
+                )
+                for image in (laser.ri_return1, laser.ri_return2)
+                if image.range_image_compressed and image.segmentation_label_compressed
+            )
+            if not returns:
                 continue
-            if pixel_pose is None:
+            packed = laser.ri_return1.range_image_pose_compressed  # the second return has the same poses
+            if not packed:
                 raise SceneError(f"{where} has labels but no pixel poses", fix=UNPACK_AGAIN)
+            pixel_pose = matrix(packed, np.float32)
             inclinations = beam_inclinations(
                 np.array(calibration.beam_inclinations) if calibration.beam_inclinations else None,
                 calibration.beam_inclination_min,
                 calibration.beam_inclination_max,
                 pixel_pose.shape[0],
             )
-        except (ValueError, DecodeError, zlib.error) as error:
-            raise SceneError(f"{where} cannot be read: {error}", fix=UNPACK_AGAIN) from error
-        yield LidarFrame(
-            frame.timestamp_micros,
-            _transform(frame.pose, where),
-            _transform(calibration.extrinsic, where),
-            inclinations,
-            pixel_pose,
-            tuple(returns),
-        )
+            in_world, in_vehicle = _matrix4(frame.pose), _matrix4(calibration.extrinsic)
+        yield LidarFrame(frame.timestamp_micros, in_world, in_vehicle, inclinations, pixel_pose, returns)
 
 
 def _named(messages: Iterable[Any], name: int) -> Any:
@@ -182,11 +182,9 @@ def camera_shots(path: Path, every: int = 1) -> Iterator[CameraShot]:
         if number % every:
             continue
         for image in sorted(frame.images, key=lambda image: image.name):
-            try:
+            with _readable(where):
                 lens = _named(frame.context.camera_calibrations, image.name)
                 name, size_hw = CAMERAS[image.name - 1], (lens.height, lens.width)
-                place = _transform(lens.extrinsic, where)
-                camera = WaymoCamera(name, np.array(lens.intrinsic), place, size_hw)
-            except (ValueError, IndexError) as error:
-                raise SceneError(f"{where} cannot be read: {error}", fix=UNPACK_AGAIN) from error
-            yield CameraShot(frame.timestamp_micros, camera, image.image, _transform(image.pose, where))
+                camera = WaymoCamera(name, np.array(lens.intrinsic), _matrix4(lens.extrinsic), size_hw)
+                pose = _matrix4(image.pose)
+            yield CameraShot(frame.timestamp_micros, camera, image.image, pose)

@@ -1,12 +1,7 @@
 """Score classes and instances of labelled points: ScanNet, ScanNet200, Replica, Waymo and their stand-ins.
 
-| method | class of a point |
-|---|---|
-| `tree` | the class text with the highest cosine to the node of the point's Gaussian at level whole |
-| `field` | the class text with the highest cosine to the latent transferred to the point at level whole |
-
-Instances (ScanNet200) are the tree's nodes at level whole; a field has no instances. `carry` transfers
-predictions from Gaussians to points; every row names its mode.
+Scores depend on the mode by which predictions are transferred from Gaussians to points (`carry`), so every
+row names it. Instances (ScanNet200) are the tree's nodes at level whole; a field has no instances.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -16,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int32, Int64
 
 from hilsplat.base.levels import Level
-from hilsplat.datasets.classes import SCANNET200_INSTANCES, ClassSet, splits_of
-from hilsplat.datasets.points.labelled_points import LABELLINGS, LabelledPoints
+from hilsplat.datasets.classes import LABELLINGS, SCANNET200_INSTANCES, ClassSet, splits_of
+from hilsplat.datasets.points.labelled_points import LabelledPoints
 from hilsplat.evaluate.metrics import instances, point_classes
 from hilsplat.evaluate.metrics.point_classes import ClassCounts, class_accuracy, class_iou
 from hilsplat.evaluate.protocols.cards import INSTANCES, ProtocolCard
@@ -115,7 +110,10 @@ def measure_instances(
 def classes_of_points(
     scene: "LanguageScene", gaussian: Int64[np.ndarray, " P"], method: str, texts: Sequence[str]
 ) -> Int32[np.ndarray, " P"]:
-    """Return point labels 1 .. K from the "tree" or "field"; 0 if the point's `gaussian` has none."""
+    """Return point labels 1 .. K, the text with the highest cosine; 0 if the point's Gaussian has none.
+
+    The cosine is that of the Gaussian's node (`method` "tree") or decoded latent ("field") at level whole.
+    """
     vectors = scene.text_vectors(texts)
     if method == "tree":
         of_node = classify(scene.tree.clip.astype(np.float32), vectors)
@@ -190,7 +188,7 @@ def measure_scene_points(
             if "tree" in methods:
                 yield node_instances(scene, gaussian, points, classes)
             continue
-        labels = np.where(is_scored, points.labels(classes), 0)
+        labels = np.where(is_scored, classes.labels(points.class_id), 0)
         for method in ("tree", "field"):
             if method in methods:
                 key = method, classes.name

@@ -180,11 +180,9 @@ def point_scene(num=400, seed=0):
     rng = np.random.default_rng(seed)
     class_id = rng.choice([0, 1, 2, 3, 4, 5], num).astype(np.int32)
     places = rng.random((num, 3))
-    nyu40 = LabelledPoints(places, class_id, np.ones(num, np.int32), "nyu40")
+    nyu40 = LabelledPoints(places, class_id, np.ones(num, np.int32))
     fine = np.where(np.arange(num) < 150, 2, 0).astype(np.int32)  # 150 points of one chair
-    return PointScene(
-        "s", (), {"nyu40": nyu40, "scannet200": replace(nyu40, class_id=fine, labelling="scannet200")}
-    )
+    return PointScene("s", (), {"nyu40": nyu40, "scannet200": replace(nyu40, class_id=fine)})
 
 
 SEMANTIC = ("scannet/opengaussian-19", "scannet/opengaussian-10")
@@ -200,7 +198,7 @@ def test_class_ids_of_points_score_as_the_same_labels_in_memory(data_set, tmp_pa
     frame = scored(tmp_path)
     for classes, given in ((SCANNET_19, predicted), (SCANNET_10, of_ten)):
         card = card_of(f"scannet/opengaussian-{len(classes)}")
-        truth = known.truth["nyu40"].labels(classes)
+        truth = classes.labels(known.truth["nyu40"].class_id)
         rows = measure_points(card, "files", truth, classes.labels(given), classes, "files")
         expected = {(row.query, row.metric): pytest.approx(row.value, abs=1e-6) for row in rows}
         kept = frame[frame["protocol"] == f"{card.full_name} (points: files)"]

@@ -134,7 +134,7 @@ def test_labels_are_matched_by_name_even_if_an_earlier_image_is_missing(lerf):
 
 def test_a_polygon_that_reaches_outside_the_image_is_clipped_and_reported(tmp_path):
     labels = read_isat(label_file(tmp_path, [thing(segmentation=[[15, 2], [25, 2], [25, 4], [15, 4]])]))
-    assert labels.objects[0].mask((10, 20)).sum() == 3 * 5  # columns 15 to 19
+    assert fill_polygons(labels.objects[0].polygons, (10, 20)).sum() == 3 * 5  # columns 15 to 19
     assert len(labels.warnings) == 1 and "extends 5 px beyond the image; clipped" in labels.warnings[0]
 
 

@@ -15,7 +15,6 @@ from hilsplat.datasets.points.replica import (
     read_semantic_mesh,
 )
 from hilsplat.datasets.registry import DATASETS
-from hilsplat.scene.posed_images import PosedImage
 from tests.unit.datasets.writers.labelled import flat_images
 from tests.unit.datasets.writers.points import write_ply, write_sequence
 
@@ -25,34 +24,42 @@ XYZ = np.array([[x, y, 0] for y in (1, 0) for x in range(4)], np.float32)
 QUADS = np.array([[4, 5, 1, 0], [5, 6, 2, 1], [6, 7, 3, 2]], np.int32)
 OBJECT = np.array([2, 1, 3], np.int32)
 NAMED = [{"id": 20, "name": "chair"}, {"id": 93, "name": "wall"}]
-SOFA = [{"id": 20, "name": "sofa"}]
+MESH, INFO = "room_0/habitat/mesh_semantic.ply", "room_0/habitat/info_semantic.json"
+SEQUENCE = "room_0/imap/00"
 
 
-def make_habitat(folder: Path, labels=(-2, 20, 93, -1)) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
+def info(labels, classes=NAMED):
+    """Return a change that writes the classes of objects."""
+    content = json.dumps({"classes": classes, "id_to_label": labels, "gravity_dir": [0, 0, -1]})
+    return lambda root: (root / INFO).write_text(content)
+
+
+def poses(count: int):
+    """Return a change that writes poses; that of frame n is at x = n."""
+    rows = np.tile(np.eye(4).ravel(), (count, 1))
+    rows[:, 3] = np.arange(count)
+    return lambda root: np.savetxt(root / SEQUENCE / "traj_w_c.txt", rows)
+
+
+def make_frames(root: Path, count: int) -> None:
+    """Write the images of a sequence in the layout of Semantic-NeRF, and a picture that is no frame."""
+    for name in (*(f"rgb_{number}" for number in range(count)), "vis_rgb_0"):
+        write_png(root / SEQUENCE / "rgb" / f"{name}.png", np.zeros((6, 10, 3), np.uint8))
+
+
+@pytest.fixture
+def root(tmp_path) -> Path:
+    (tmp_path / MESH).parent.mkdir(parents=True)
     places = {axis: XYZ[:, column] for column, axis in enumerate("xyz")}
-    write_ply(folder / "mesh_semantic.ply", places, QUADS, {"object_id": OBJECT})
-    info = {"classes": NAMED, "id_to_label": list(labels), "objects": [], "gravity_dir": [0, 0, -1]}
-    (folder / "info_semantic.json").write_text(json.dumps(info))
-    return folder
+    write_ply(tmp_path / MESH, places, QUADS, {"object_id": OBJECT})
+    info([-2, 20, 93, -1])(tmp_path)
+    make_frames(tmp_path, 3)
+    poses(3)(tmp_path)
+    return tmp_path
 
 
-def make_images(folder: Path, frames: int) -> list[PosedImage]:
-    return flat_images(folder, [np.eye(4)] * frames, np.array([[7.0, 0, 5], [0, 7.0, 3], [0, 0, 1]]), (6, 10))
-
-
-def make_semantic_nerf(folder: Path, frames: int, lines: int | None = None) -> Path:
-    """A sequence whose frame n is at x = n."""
-    for name in (*(f"rgb_{number}" for number in range(frames)), "vis_rgb_0"):
-        write_png(folder / "rgb" / f"{name}.png", np.zeros((6, 10, 3), np.uint8))
-    rows = np.tile(np.eye(4).ravel(), (frames if lines is None else lines, 1))
-    rows[:, 3] = np.arange(len(rows))
-    np.savetxt(folder / "traj_w_c.txt", rows)
-    return folder
-
-
-def test_a_vertex_belongs_to_the_object_of_most_faces_or_the_smallest_id_on_ties(tmp_path):
-    points = read_semantic_mesh(make_habitat(tmp_path))
+def test_a_vertex_belongs_to_the_object_of_most_faces_or_the_smallest_id_on_ties(root):
+    points = read_semantic_mesh((root / MESH).parent)
     # vertices 1 and 5 lie on objects 2 and 1, vertices 2 and 6 on 1 and 3: object 1 both times
     assert points.instance_id.tolist() == [3, 2, 2, 0, 3, 2, 2, 0]
     assert points.class_id.tolist() == [93, 20, 20, 0, 93, 20, 20, 0]
@@ -62,84 +69,56 @@ def test_a_vertex_belongs_to_the_object_of_most_faces_or_the_smallest_id_on_ties
     assert object_of_vertices(faces, np.array([3, 3, 1]), 5).tolist() == [3, 3, 3, 1, -1]
 
 
-def test_frames_are_sorted_by_number_and_other_pictures_are_ignored(tmp_path):
-    images, warnings = read_images(make_semantic_nerf(tmp_path / "seq", 12, lines=15))
+def test_frames_are_sorted_by_number_and_other_pictures_are_ignored(root):
+    make_frames(root, 12)
+    poses(15)(root)
+    images, warnings = read_images(root, "room_0")
     assert [image.name for image in images] == [f"rgb_{number}.png" for number in range(12)]
     assert [image.world_from_cam[0, 3] for image in images] == list(range(12))
     assert warnings == ("3 poses have no image and are skipped",)
+    assert images[0].K.tolist() == [[5, 0, 5], [0, 5, 3], [0, 0, 1]]  # half the width of 10 x 6 px
 
 
-def test_focal_length_is_half_the_width_without_cam_params(tmp_path):
-    images, _ = read_images(make_semantic_nerf(tmp_path / "seq", 1))
-    assert images[0].K.tolist() == [[5, 0, 5], [0, 5, 3], [0, 0, 1]]  # of 10 x 6 px
-    write_sequence(tmp_path / "slam" / "room0", make_images(tmp_path / "own", 2))
-    images, _ = read_images(tmp_path / "slam" / "room0")
-    assert images[0].K.tolist() == [[7, 0, 5], [0, 7, 3], [0, 0, 1]]
-    lens = json.loads((tmp_path / "slam" / "cam_params.json").read_text())["camera"]
-    assert (lens["cx"], lens["cy"], lens["scale"]) == (4.5, 2.5, 6553.5)  # pixel centres from 0, as 599.5
-
-
-def test_a_scene_is_read_from_either_sequence(tmp_path):
-    make_habitat(tmp_path / "room_0" / "habitat")
-    with pytest.raises(SceneError, match=r"no rendered sequence(.|\n)*expected  room0/ or room_0/imap/00/"):
-        open_scene(tmp_path, "room_0")
-    make_semantic_nerf(tmp_path / "room_0" / "imap" / "00", 3)
-    assert len(open_scene(tmp_path, "room_0").images) == 3
-    write_sequence(tmp_path / "room0", make_images(tmp_path / "own", 2))
-    scene = open_scene(tmp_path, "room_0")
+def test_a_sequence_of_nice_slam_is_preferred_and_has_its_own_lens(root, tmp_path):
+    K = np.array([[7.0, 0, 5], [0, 7.0, 3], [0, 0, 1]])
+    write_sequence(root / "room0", flat_images(tmp_path / "own", [np.eye(4)] * 2, K, (6, 10)))
+    scene = open_scene(root, "room_0")
     assert [image.name for image in scene.images] == ["frame000000.jpg", "frame000001.jpg"]
-    assert open_scene(tmp_path, "room_0").report().facts["replica classes"] == 2
-    assert DATASETS["replica"].found(tmp_path) == ("room_0",)
-
-
-def habitat_with(folder: Path, **info) -> Path:
-    (make_habitat(folder) / "info_semantic.json").write_text(json.dumps(info))
-    return folder
-
-
-def sequence_with(folder: Path, poses: str) -> Path:
-    (make_semantic_nerf(folder, 1) / "traj_w_c.txt").write_text(poses)
-    return folder
+    assert scene.images[0].K.tolist() == K.tolist()
+    lens = json.loads((root / "cam_params.json").read_text())["camera"]
+    assert (lens["cx"], lens["cy"], lens["scale"]) == (4.5, 2.5, 6553.5)  # pixel centres from 0, as 599.5
+    assert scene.report().facts["replica classes"] == 2
+    assert DATASETS["replica"].found(root) == ("room_0",)
 
 
 @pytest.mark.parametrize(
-    ("read", "message"),
+    ("damage", "message"),
     [
+        (info([-2, 20]), "do not match\n  expected  object ids 0 to 1\n  found     1 to 3"),
+        (info([-2, 20, 205, 93]), "classes that are not in Replica.*found     class id 205"),
+        (info([0, 1, 2, 3], [{"id": 20, "name": "sofa"}]), "found     20 sofa"),
+        (lambda root: (root / INFO).write_text("{}"), "expected  an object with the keys classes, id"),
         (
-            lambda at: read_semantic_mesh(make_habitat(at, labels=(-2, 20))),
-            "do not match\n  expected  object ids 0 to 1\n  found     1 to 3",
+            lambda root: (root / INFO).unlink(),
+            r"info_semantic\.json is missing\n  found     mesh_semantic\.p",
         ),
+        (lambda root: (root / MESH).unlink(), r"mesh_semantic\.ply is missing"),
+        (poses(1), "1 lines, 3 images; the first frame without a line is 1"),
         (
-            lambda at: read_semantic_mesh(make_habitat(at, labels=(-2, 20, 205, 93))),
-            "classes that are not in Replica.*found     class id 205",
-        ),
-        (
-            lambda at: read_semantic_mesh(habitat_with(at, classes=SOFA, id_to_label=[0, 1, 2, 3])),
-            "found     20 sofa",
-        ),
-        (lambda at: read_semantic_mesh(habitat_with(at)), "expected  an object with the keys classes, id"),
-        (
-            lambda at: (make_habitat(at) / "info_semantic.json").unlink() or read_semantic_mesh(at),
-            r"info_semantic\.json is missing\n  found     mesh_semantic\.ply",
-        ),
-        (
-            lambda at: read_images(make_semantic_nerf(at, 3, lines=1)),
-            "1 lines, 3 images; the first frame without a line is 1",
-        ),
-        (
-            lambda at: read_images(make_semantic_nerf(at / "room0", 1).parent),
-            "not contain a rendered sequence.*fix       use the folder .*room0",
-        ),
-        (
-            lambda at: read_images(sequence_with(at, "1 0 0 0\n")),
+            lambda root: (root / SEQUENCE / "traj_w_c.txt").write_text("1 0 0 0\n"),
             "cannot be read: 4 columns\n  expected  16 numbers per line",
         ),
         (
-            lambda at: open_scene(at, "room_1"),
-            r"mesh_semantic\.ply is missing",
+            lambda root: (root / SEQUENCE).rename(root / "00"),
+            "no rendered sequence.*in room0 or room_0/imap/00 or room_0/Sequence_1\n.*unpack the rendered",
+        ),
+        (
+            lambda root: (root / "room_0/imap").rename(root / "room0"),
+            "no rendered sequence.*found     00\n.*move the files in .*room0/00 one level up",
         ),
     ],
 )
-def test_unusable_scenes_are_refused_with_a_fix(tmp_path, read, message):
+def test_unusable_scenes_are_refused_with_a_fix(root, damage, message):
+    damage(root)
     with pytest.raises(SceneError, match=f"(?s){message}"):
-        read(tmp_path)
+        open_scene(root, "room_0")

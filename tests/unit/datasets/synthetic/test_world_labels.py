@@ -80,7 +80,7 @@ def test_room_as_scannet_reads_back_equal(room, data_root):
 
 def test_gaussians_frozen_at_the_vertices_of_a_scan_are_its_points(data_root, tmp_path):
     source = tmp_path / "source"
-    assert export_images("scannet/scene0000_00", data_root, source) == 3
+    export_images("scannet/scene0000_00", data_root, source)
     settings = PosesSettings(test_every=0)
     run_poses(source, tmp_path / "scene", "scannet/scene0000_00", "metre", False, settings, 0, 1)
     scene = Scene.load(tmp_path / "scene")
@@ -130,7 +130,6 @@ def test_a_room_is_labelled_where_a_camera_sees_it(room):
     np.testing.assert_array_equal(found["nyu40"].xyz, mesh.xyz[seen])
     for labelling, expected in classes_of(mesh, seen).items():
         np.testing.assert_array_equal(found[labelling].class_id, expected)
-        assert found[labelling].labelling == labelling
     assert found["nyu40"].xyz is found["replica"].xyz  # one search for neighbours serves all labellings
 
 

@@ -20,6 +20,7 @@ from hilsplat.datasets.waymo.frames import (
     frame_points,
     range_image_points,
     rotation_of,
+    shot_image,
 )
 from hilsplat.datasets.waymo.reader import RECORD, open_segment
 from hilsplat.datasets.waymo.records import MESSAGES, matrix, message_classes
@@ -37,18 +38,16 @@ def turned(degrees: float, x: float = 0.0) -> np.ndarray:
     return pose
 
 
-def camera(*distortion: float) -> WaymoCamera:
-    lens = np.array([2000.0, 2000, 960, 640, *(distortion or (0,) * 5)])
-    return WaymoCamera("FRONT", lens, np.eye(4), (1280, 1920))
+FRONT = WaymoCamera("FRONT", np.array([2000.0, 2000, 960, 640, 1, 2, 3, 4, 5]), np.eye(4), (1280, 1920))
+SIDE = replace(FRONT, name="SIDE_LEFT", vehicle_from_cam=turned(90), size_hw=(886, 1920))
 
 
-def one_return(ranges, classes, instances=0, cameras=0) -> LidarReturn:
+def one_return(ranges, classes, instances=0) -> LidarReturn:
     """A return of one row."""
-    width = len(ranges)
-    image, cells = np.zeros((1, width, 4), np.float32), np.zeros((1, width, 6), np.int32)
-    image[0, :, 0], cells[0, :, 0] = ranges, cameras
+    image = np.zeros((1, len(ranges), 4), np.float32)
+    image[0, :, 0] = ranges
     labels = np.stack(np.broadcast_arrays(instances, classes), axis=1).astype(np.int32)
-    return LidarReturn(image, labels[None], cells)
+    return LidarReturn(image, labels[None])
 
 
 def make_frame(
@@ -58,19 +57,15 @@ def make_frame(
     vehicle = np.eye(4) if vehicle is None else vehicle
     yaw = np.arctan2(vehicle[1, 0], vehicle[0, 0])
     pose = np.tile(np.float32([0, 0, yaw, *vehicle[:3, 3]]), (1, 4, 1))
-    first = one_return([2, 2, 2, 2], [1, 14, 15, 18], [7, 0, 0, 0], [1, 0, 3, 0])
-    second = one_return([-1, 4, 0, 6], [22, 10, 22, 0], [0, 9, 0, 0], [0, 0, 0, 5])
+    first = one_return([2, 2, 2, 2], [1, 14, 15, 18], [7, 0, 0, 0])
+    second = one_return([-1, 4, 0, 6], [22, 10, 22, 0], [0, 9, 0, 0])
     lidar = np.eye(4) if lidar is None else lidar
     return LidarFrame(time, vehicle, lidar, np.zeros(1), pose, (first, second))
 
 
 def make_shots(vehicle: np.ndarray) -> list[CameraShot]:
-    side = replace(camera(), name="SIDE_LEFT", vehicle_from_cam=turned(90), size_hw=(886, 1920))
-    return [
-        CameraShot(time, lens, b"jpeg %d" % time, vehicle)
-        for time in (1000, 2000, 3000)
-        for lens in (camera(), side)
-    ]
+    times = (1000, 2000, 3000)
+    return [CameraShot(time, lens, b"jpeg %d" % time, vehicle) for time in times for lens in (FRONT, SIDE)]
 
 
 @pytest.mark.parametrize("turn", [0, 30, 148])
@@ -103,19 +98,17 @@ def test_rotation_is_yaw_after_pitch_after_roll():
 def test_opencv_axes_yield_the_same_pixel():
     """K is unchanged, because 0 is the left edge of the first pixel in Waymo, as here."""
     vehicle = turned(40, x=7.0)
-    lens = replace(camera(), vehicle_from_cam=turned(90))
-    in_world = vehicle @ turned(90) @ [10, 1, -0.5, 1]
-    x, y, z, _ = lens.cam_from_world(vehicle) @ in_world
+    image = shot_image(CameraShot(1000, SIDE, b"", vehicle), np.eye(4))
+    x, y, z, _ = image.cam_from_world @ vehicle @ turned(90) @ [10, 1, -0.5, 1]
     np.testing.assert_allclose([x, y, z], [-1, 0.5, 10], atol=1e-12)
-    np.testing.assert_allclose((lens.K @ [x, y, z])[:2] / z, [760, 740])
-    assert camera(1, 2, 3, 4, 5).distortion == (1, 2, 3, 4, 5)
+    np.testing.assert_allclose((image.K @ [x, y, z])[:2] / z, [760, 740])
+    assert image.distortion == (1, 2, 3, 4, 5)
 
 
 def test_each_return_has_its_own_mask_and_channel_one_is_the_class():
     points = frame_points(make_frame(), np.eye(4))
     assert points.class_id.tolist() == [1, 14, 15, 18, 10, 0]
     assert points.instance_id.tolist() == [7, 0, 0, 0, 9, 0]
-    assert points.visible.tolist() == [True, False, True, False, False, True]
     np.testing.assert_allclose(points.xyz[4], [2 * SQRT2, 2 * SQRT2, 0])  # range 4 in column 1
     np.testing.assert_allclose(points.xyz[5], [-3 * SQRT2, -3 * SQRT2, 0])  # range 6 in column 3
 
@@ -149,7 +142,6 @@ def test_a_written_segment_reads_back_in_the_frame_of_its_first_vehicle(root):
     np.testing.assert_allclose(truth.xyz, np.tile(one.xyz, (2, 1)), atol=2e-3)  # pixel poses are float32
     assert truth.class_id.tolist() == one.class_id.tolist() * 2
     assert truth.instance_id.tolist() == one.instance_id.tolist() * 2
-    assert truth.visible.tolist() == one.visible.tolist() * 2
     names = [image.name for image in scene.images]
     assert names[:3] == ["1000_FRONT.jpg", "1000_SIDE_LEFT.jpg", "2000_FRONT.jpg"]
     assert scene.images[2].image == b"jpeg 2000" and scene.images[1].size_hw == (886, 1920)
@@ -159,11 +151,8 @@ def test_a_written_segment_reads_back_in_the_frame_of_its_first_vehicle(root):
     dataset = DATASETS["waymo"]
     assert dataset.locate(root.parent) == root and dataset.found(root) == (SEGMENT,)
     assert dataset.missing(root, SEGMENT) == ()
-    assert dataset.check(root, SEGMENT).facts["waymo points visible to a camera"] == 6
-    (root / "validation" / "lidar_camera_projection" / f"{SEGMENT}.parquet").unlink()  # optional
-    scene = open_segment(root, SEGMENT)
-    assert scene.truth["waymo"].visible is None
-    assert scene.warnings[0].startswith("lidar_camera_projection is missing")
+    assert dataset.check(root, SEGMENT).facts["posed images"] == 2  # of every tenth frame
+    assert scene.warnings[0].startswith("the lenses have a k3 coefficient")
     (root / "validation" / "vehicle_pose" / f"{SEGMENT}.parquet").unlink()
     assert dataset.missing(root, SEGMENT) == (f"validation/vehicle_pose/{SEGMENT}.parquet",)
 
@@ -226,7 +215,6 @@ def encoded(frame: LidarFrame, shots: list[CameraShot], labelled: bool = True) -
     for name, part in zip(("ri_return1", "ri_return2"), frame.returns, strict=True):
         target = getattr(top, name)
         target.range_image_compressed = compressed(part.image)
-        target.camera_projection_compressed = compressed(part.projection)
         if labelled:
             target.segmentation_label_compressed = compressed(part.labels)
     top.ri_return1.range_image_pose_compressed = compressed(frame.pixel_pose)
@@ -256,7 +244,7 @@ def test_both_releases_give_the_same_scene(root, tmp_path):
     name = RECORD.format(split="validation", segment=SEGMENT)
     write_records(tmp_path / "old" / name, records)
     old, new = open_segment(tmp_path / "old", SEGMENT), open_segment(root, SEGMENT)
-    for field in ("xyz", "class_id", "instance_id", "visible"):
+    for field in ("xyz", "class_id", "instance_id"):
         np.testing.assert_array_equal(getattr(old.truth["waymo"], field), getattr(new.truth["waymo"], field))
     assert [image.name for image in old.images] == [image.name for image in new.images]
     for first, second in zip(old.images, new.images, strict=True):

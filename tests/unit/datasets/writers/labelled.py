@@ -4,6 +4,7 @@ Readers must return its ground truth. Images are compressed (.jpg), as in the da
 and poses are exact.
 """
 
+import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,10 +48,6 @@ class TrueWorld:
             points = mesh.xyz[mesh.column("vertex", "views") > 0].astype(np.float64)
             points = points[:: max(1, -(-len(points) // MAX_POINTS))]
         return TrueWorld(folder / "images", cameras, annotations, points)
-
-    def image(self, view: str) -> UInt8[np.ndarray, "H W 3"]:
-        """Return the pixels of a view."""
-        return read_image(self.images / view)
 
     def nodes(self, view: str, level: Level | None = None) -> dict[str, tuple[int, ...]]:
         """Return the annotated and visible nodes of a view by text, sorted, for one level or all levels."""
@@ -120,10 +117,11 @@ def write_lerf_mask(
     world: TrueWorld, root: Path, scene: str, views: Sequence[str], level: Level = Level.WHOLE
 ) -> None:
     """Write `root/<scene>` with masks of one level's texts in the given test views."""
-    stems = _write_images(world, root / scene, LERF_STEMS)
+    stems, train = _write_images(world, root / scene, LERF_STEMS), root / scene / "images_train"
+    train.mkdir()
     for view in world.cameras.names:
         if view not in views:
-            write_jpeg(root / scene / "images_train" / f"{stems[view]}.jpg", world.image(view))
+            shutil.copy(root / scene / "images" / f"{stems[view]}.jpg", train)
     for number, view in enumerate(sorted(views)):
         for text, nodes in world.nodes(view, level).items():
             place = root / scene / "test_mask" / str(number)
@@ -175,7 +173,7 @@ def _write_images(
     form, first = pattern
     stems = {view: form.format(row) for row, view in enumerate(world.cameras.names, start=first)}
     for view, stem in stems.items():
-        write_jpeg(folder / "images" / f"{stem}.jpg", world.image(view))
+        write_jpeg(folder / "images" / f"{stem}.jpg", read_image(world.images / view))
     if sparse:
         cameras = [world.cameras[view] for view in stems]
         names = [f"{stem}.jpg" for stem in stems.values()]

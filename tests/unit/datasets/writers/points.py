@@ -4,6 +4,7 @@ import io
 import json
 import shutil
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as parquet
 from jaxtyping import Float, Float32, Int32
 from PIL import Image
+from plyfile import PlyData, PlyElement
 
 from hilsplat.base.artifacts import read_npz, write_json, write_text
 from hilsplat.base.images import read_image
@@ -28,40 +30,26 @@ from hilsplat.datasets.waymo.frames import (
     LidarFrame,
     LidarReturn,
     WaymoCamera,
+    beam_inclinations,
     column_azimuths,
-    rotation_of,
 )
 from hilsplat.datasets.waymo.parquet import CAMERA, FRAME, INTRINSIC, LASER, component_path
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage
-
-PLY_TYPES = {"f4": "float", "u1": "uchar", "u2": "ushort", "i4": "int"}
+from hilsplat.world.lidar import AZIMUTH_STEPS, BEAMS, INCLINATION_DEG
 
 
 def write_ply(
     path: Path, vertices: Mapping[str, np.ndarray], faces: np.ndarray, of_faces: Mapping[str, np.ndarray]
 ) -> None:
-    """Write a binary little-endian mesh: columns of vertices, corners of faces, columns of faces.
-
-    plyfile would be slower, because it writes lists face by face in Python.
-    """
+    """Write a binary mesh: columns of vertices, corners of faces, columns of faces."""
     rows = np.rec.fromarrays([*vertices.values()], names=[*vertices])
-    corners = [("count", "u1"), ("corners", "<i4", faces.shape[1:])]
-    polygons = np.empty(len(faces), [*corners, *((name, column.dtype) for name, column in of_faces.items())])
-    polygons["count"], polygons["corners"] = faces.shape[1], faces
-    for name, column in of_faces.items():
+    corners = ("vertex_indices", "i4", faces.shape[1:])
+    polygons = np.empty(len(faces), [corners, *((name, column.dtype) for name, column in of_faces.items())])
+    for name, column in {"vertex_indices": faces, **of_faces}.items():
         polygons[name] = column
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(rows)}",
-        *(f"property {PLY_TYPES[column.dtype.str[1:]]} {name}" for name, column in vertices.items()),
-        f"element face {len(polygons)}",
-        "property list uchar int vertex_indices",
-        *(f"property {PLY_TYPES[column.dtype.str[1:]]} {name}" for name, column in of_faces.items()),
-        "end_header\n",
-    ]
-    path.write_bytes("\n".join(header).encode() + rows.tobytes() + polygons.tobytes())
+    elements = [PlyElement.describe(rows, "vertex"), PlyElement.describe(polygons, "face")]
+    PlyData(elements, byte_order="<").write(path)
 
 
 SEGMENT_STEP = 7
@@ -178,10 +166,7 @@ def write_segment(
     All frames have the lidar pose and inclinations of the first, and each camera has the calibration of its
     first image.
     """
-
-    def write(tag: str, rows: Sequence[Mapping[str, Any]]) -> None:
-        _write_component(component_path(split, tag, segment), rows)
-
+    write = partial(_write_component, split, segment)
     pose = "[VehiclePoseComponent].world_from_vehicle.transform"
     write("vehicle_pose", [{FRAME: f.timestamp_micros, pose: f.world_from_vehicle.ravel()} for f in frames])
     base = "[LiDARCalibrationComponent]"
@@ -194,14 +179,11 @@ def write_segment(
         f"{base}.beam_inclination.values": beams.astype(np.float64),
     }
     write("lidar_calibration", [calibration])
-    for tag, component, part, kind in (
-        ("lidar", "LiDARComponent", "image", np.float32),
-        ("lidar_segmentation", "LiDARSegmentationLabelComponent", "labels", np.int32),
-        ("lidar_camera_projection", "LiDARCameraProjectionComponent", "projection", np.float32),
+    for tag, component, part in (
+        ("lidar", "LiDARComponent", "image"),
+        ("lidar_segmentation", "LiDARSegmentationLabelComponent", "labels"),
     ):
-        if getattr(frames[0].returns[0], part) is None:  # a component that is optional
-            continue
-        images = [[getattr(each, part).astype(kind) for each in frame.returns] for frame in frames]
+        images = [[getattr(each, part) for each in frame.returns] for frame in frames]
         write(tag, [_cells(component, *pair) for pair in zip(frames, images, strict=True)])
     write("lidar_pose", [_cells("LiDARPoseComponent", frame, [frame.pixel_pose]) for frame in frames])
     camera_of = {shot.camera.name: shot.camera for shot in reversed(shots)}
@@ -244,16 +226,11 @@ def _calibration(camera: WaymoCamera) -> dict[str, Any]:
     }
 
 
-def _write_component(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+def _write_component(split: Path, segment: str, tag: str, rows: Sequence[Mapping[str, Any]]) -> None:
     """Write one row group; the columns have the types of the release."""
-    small = {CAMERA: pa.int8(), LASER: pa.int8(), FRAME: pa.int64()}
-    columns = {}
-    for name in rows[0]:
-        values = [row[name] for row in rows]
-        kind = small.get(name)
-        if isinstance(values[0], np.ndarray):
-            kind = pa.list_(pa.from_numpy_dtype(values[0].dtype))
-        columns[name] = pa.array(values, type=kind)
+    keys = {CAMERA: pa.int8(), LASER: pa.int8(), FRAME: pa.int64()}
+    columns = {name: pa.array([row[name] for row in rows], type=keys.get(name)) for name in rows[0]}
+    path = component_path(split, tag, segment)
     path.parent.mkdir(parents=True, exist_ok=True)
     parquet.write_table(pa.table(columns), path)
 
@@ -261,10 +238,6 @@ def _write_component(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 VEHICLE_FROM_CAM = np.array([[1.0, 0, 0, 1.5], [0, 1, 0, 0], [0, 0, 1, 2.1], [0, 0, 0, 1]])
 LIDAR_AT = (1.4, 0.0, 2.2)
 """Position of the lidar on the vehicle, metres."""
-LIDAR_TURN_DEG = 148.0
-"""Yaw of the lidar on the vehicle, as Waymo's is rotated too; columns still start at the vehicle's rear."""
-AZIMUTH_STEPS, BEAMS = 400, 64
-"""Columns and rows of the range images: directions per revolution, and evenly spaced beams."""
 FRAME_MICROS = 100_000
 
 
@@ -312,15 +285,12 @@ def write_street_as_waymo(world: Path, split: Path, segment: str) -> None:
     images = posed_images(world)
     shots = [_shot(image, FRAME_MICROS * (number + 1)) for number, image in enumerate(images)]
     centres = np.stack([image.world_from_cam[:3, 3] for image in images])
-    up = np.arcsin((scan["points"] - scan["origins"][scan["pose_index"]])[:, 2] / scan["range_m"])
-    slope, start = np.polyfit(scan["beam"], up.astype(np.float64), 1)
-    inclinations = (start + slope * np.arange(BEAMS))[::-1]
     frames = []
     for pose, origin in enumerate(scan["origins"]):
         view = int(np.linalg.norm(centres - origin, axis=1).argmin())
         rows = scan["pose_index"] == pose
         turn = {name: scan[name][rows] for name in ("points", "range_m", "beam")}
-        frames.append(_lidar_frame(turn, labels[rows], origin, inclinations, shots[view].timestamp_micros))
+        frames.append(_lidar_frame(turn, labels[rows], origin, shots[view].timestamp_micros))
     write_segment(split, segment, frames, shots)
 
 
@@ -337,24 +307,17 @@ def _shot(image: PosedImage, time: int) -> CameraShot:
 
 
 def _lidar_frame(
-    scan: dict[str, np.ndarray],
-    labels: np.ndarray,
-    origin: Float[np.ndarray, " 3"],
-    inclinations: Float[np.ndarray, " H"],
-    time: int,
+    scan: dict[str, np.ndarray], labels: np.ndarray, origin: Float[np.ndarray, " 3"], time: int
 ) -> LidarFrame:
     """Return one revolution of the scan as a range image; the vehicle heads along the world's x axis."""
-    height, width = len(inclinations), AZIMUTH_STEPS
-    turn = np.radians(LIDAR_TURN_DEG)
-    vehicle_from_lidar = np.eye(4)
-    vehicle_from_lidar[:3, :3] = rotation_of(np.array([0.0, 0.0, turn]))
+    height, width = BEAMS, AZIMUTH_STEPS
+    inclinations = beam_inclinations(None, *np.radians(INCLINATION_DEG), height)
+    vehicle_from_lidar, world_from_vehicle = np.eye(4), np.eye(4)
     vehicle_from_lidar[:3, 3] = LIDAR_AT
-    world_from_vehicle = np.eye(4)
     world_from_vehicle[:3, 3] = origin - np.array(LIDAR_AT)
     away = scan["points"] - origin
     azimuth = np.arctan2(away[:, 1], away[:, 0])
-    first = column_azimuths(width, vehicle_from_lidar)[0] + turn
-    column = (first - azimuth) / (2 * np.pi / width)
+    column = (column_azimuths(width, vehicle_from_lidar)[0] - azimuth) / (2 * np.pi / width)
     assert np.abs(column - column.round()).max(initial=0) < 0.1  # the scan has the directions of the columns
     place = height - 1 - scan["beam"], column.round().astype(int) % width
     image = np.zeros((height, width, 4), dtype=np.float32)
@@ -363,5 +326,5 @@ def _lidar_frame(
     of_pixel = np.zeros((height, width, 2), dtype=np.int32)
     of_pixel[place] = labels
     pose = np.tile(np.float32([0, 0, 0, *world_from_vehicle[:3, 3]]), (height, width, 1))
-    returns = (LidarReturn(image, of_pixel, None),)
+    returns = (LidarReturn(image, of_pixel),)
     return LidarFrame(time, world_from_vehicle, vehicle_from_lidar, inclinations, pose, returns)

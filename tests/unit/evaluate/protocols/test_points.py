@@ -5,6 +5,7 @@ import pytest
 
 from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.datasets.classes import (
+    LABELLINGS,
     SCANNET200,
     SCANNET200_INSTANCES,
     SCANNET_19,
@@ -12,7 +13,7 @@ from hilsplat.datasets.classes import (
     ClassSet,
     splits_of,
 )
-from hilsplat.datasets.points.labelled_points import LABELLINGS, LabelledPoints
+from hilsplat.datasets.points.labelled_points import LabelledPoints
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.evaluate.extra_protocols import STAND_INS, ExtraProtocols
 from hilsplat.evaluate.metrics.instances import average_precision, match_instances
@@ -112,7 +113,7 @@ def points_of(block_world, count=1):
     node = np.repeat(block_world.answers.tree.node_of_gaussian[:, 0], count)
     xyz = np.repeat(block_world.answers.gaussians.means.astype(np.float64), count, axis=0)
     ids = np.array([9, 7, 0])[np.where(node < 0, 2, np.minimum(node, 1))].astype(np.int32)
-    return LabelledPoints(xyz, ids, (node + 1).astype(np.int32), "drawn"), ids
+    return LabelledPoints(xyz, ids, (node + 1).astype(np.int32)), ids
 
 
 @pytest.mark.parametrize("method", ["tree", "field"])
@@ -147,7 +148,7 @@ def test_rows_name_the_mode_and_are_moved_into_the_frame_of_the_scene(block_worl
         "drawn/points", 1, ("miou_present",), "scenes", "argmax", "drawn", classes="blocks"
     )
     points, _ = points_of(block_world)
-    moved = LabelledPoints(points.xyz / 2 - 1, points.class_id, points.instance_id, "drawn")
+    moved = LabelledPoints(points.xyz / 2 - 1, points.class_id, points.instance_id)
     transform = np.diag([2.0, 2, 2, 1])
     transform[:3, 3] = 2
     asked = ({"drawn": moved}, transform, [card], ("tree", "field"), "nearest")
