@@ -51,7 +51,7 @@ def blob_masks(number: int, size_hw: tuple[int, int], seed: int = 0) -> Hierarch
         parts.append(
             HierarchicalMasks.from_dense(dense, np.ones(1, np.uint8), scores[0, one], scores[1, one])
         )
-    return HierarchicalMasks.concatenate(parts, size_hw)
+    return HierarchicalMasks.concatenate(parts)
 
 
 class CannedSam(SamModel):

@@ -105,7 +105,7 @@ def read_view(
         runs = runs_of_labels(labels[place], chosen)
         parts.append(HierarchicalMasks.from_runs(*runs, level, ones, ones, size_hw))
         vector_rows.append(chosen)
-    masks = HierarchicalMasks.concatenate(parts, size_hw)
+    masks = HierarchicalMasks.concatenate(parts)
     order = masks.content_order()
     found = vectors[np.concatenate(vector_rows)[order]].astype(np.float32)
     return masks.take(order), unit(found).astype(np.float16)

@@ -10,13 +10,14 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int8, Int32, Int64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, Int8, Int32, Int64, Real, UInt8
 
 from hilsplat.base.artifacts import sha256_of_bytes, sha256_of_json
 from hilsplat.base.identity import code_digest
 from hilsplat.base.levels import Level
-from hilsplat.segment.kernels import cleaned_runs, edge_windows, upscaled_runs
+from hilsplat.segment.kernels import cleaned_runs, upscaled_runs
 from hilsplat.segment.masks import HierarchicalMasks, join_rows, take_runs
 from hilsplat.segment.sam import (
     HEADS,
@@ -28,14 +29,10 @@ from hilsplat.segment.sam import (
     frame_taps,
     full_stability,
     point_grid,
+    positive_boxes,
     read_logits,
 )
-from hilsplat.segment.suppression import (
-    distinct_boxes,
-    last_inside,
-    suppress_boxes,
-    suppress_masks,
-)
+from hilsplat.segment.suppression import distinct_boxes, last_inside, suppress_boxes, suppress_masks
 from hilsplat.settings import MasksSettings
 
 LOOSE = 0.1
@@ -237,7 +234,7 @@ def keep_candidates(
     if needs_full_size(settings):
         stability[likely] = full_stability(flat[likely], settings.stability_offset, frame)
     rows = np.flatnonzero(likely & (stability >= stability_floor))
-    values, offsets, windows = edge_windows(steps, rows, boxes, BAND_PX)
+    values, offsets, windows = edge_windows(steps, rows, boxes)
     return Candidates(
         values,
         offsets,
@@ -250,15 +247,26 @@ def keep_candidates(
     )
 
 
-def positive_boxes(logits: Float32[np.ndarray, "K h w"]) -> Int32[np.ndarray, "K 4"]:
-    """Return the box (xyxy, end exclusive) of the positive logits of each mask, all 0 if there are none."""
-    above = np.greater(logits, 0)
-    boxes = np.zeros((len(logits), 4), np.int32)
-    for low, high, along in ((0, 2, above.any(axis=1)), (1, 3, above.any(axis=2))):
-        boxes[:, low] = along.argmax(axis=1)
-        boxes[:, high] = along.shape[1] - along[:, ::-1].argmax(axis=1)
-    boxes[~above.any(axis=(1, 2))] = 0
-    return boxes
+def edge_windows(
+    logits: Real[np.ndarray, "K h w"], rows: Int64[np.ndarray, " m"], boxes: Int32[np.ndarray, "K 4"]
+) -> tuple[Real[np.ndarray, " R"], Int64[np.ndarray, " m_and_1"], Int32[np.ndarray, "m 4"]]:
+    """Return the windows of `Candidates` for the given rows: concatenated logits, offsets and boxes (xyxy).
+
+    `boxes` contains the box of the positive logits of every mask; masks in `rows` have some.
+    """
+    height, width = logits.shape[1:]
+    reach = np.array([-BAND_PX, -BAND_PX, BAND_PX, BAND_PX], np.int32)
+    windows = np.clip(boxes[rows] + reach, 0, np.array([width, height, width, height], np.int32))
+    square = np.ones((2 * BAND_PX + 1, 2 * BAND_PX + 1), np.uint8)
+    parts = [np.zeros(0, logits.dtype)]
+    for row, (x0, y0, x1, y1) in zip(rows, windows, strict=True):
+        window = logits[row, y0:y1, x0:x1].copy()
+        inside = (window > 0).view(np.uint8)
+        window[cv2.dilate(inside, square) == 0] = -127
+        window[cv2.erode(inside, square) > 0] = 127
+        parts.append(window.reshape(-1))
+    offsets = np.cumsum([len(part) for part in parts], dtype=np.int64)
+    return np.concatenate(parts), offsets, windows
 
 
 def masks_from_candidates(
@@ -288,7 +296,7 @@ def masks_from_candidates(
             masks = _suppressed(masks, None, settings)
             per_crop.append(masks)
             ranks.append(np.full(len(masks), preferred[crop], np.float64))
-        masks = HierarchicalMasks.concatenate(per_crop, size_hw)
+        masks = HierarchicalMasks.concatenate(per_crop)
         if settings.crop_layers:
             masks = _suppressed(masks, np.concatenate(ranks), settings)
         # this is the most expensive step, so it follows the suppression by boxes, as in SAM
@@ -296,7 +304,7 @@ def masks_from_candidates(
         if changed.any():  # boxes have changed; unchanged masks are preferred (SAM)
             masks = _suppressed(masks, (~changed).astype(np.float64), settings)
         streams.append(masks)
-    pooled = HierarchicalMasks.concatenate(streams, size_hw)
+    pooled = HierarchicalMasks.concatenate(streams)
     limits = {"iou_max": settings.nms_iou, "score_min": thresholds.nms_score, "inner": settings.nms_inner}
     return suppress_masks(pooled, **limits)
 

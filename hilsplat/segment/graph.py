@@ -70,7 +70,7 @@ def segment_graph(
         scores = clear, life[large].astype(np.float32)
         runs = runs_of_labels(full, large)
         parts.append(HierarchicalMasks.from_runs(*runs, level, *scores, (height, width)))
-    masks = HierarchicalMasks.concatenate(parts, (height, width))
+    masks = HierarchicalMasks.concatenate(parts)
     return masks.take(masks.content_order())
 
 

@@ -12,7 +12,7 @@ from hilsplat.base.arrays import made
 from hilsplat.base.artifacts import read_npz, remake, write_npz
 from hilsplat.base.errors import ArtifactError, EmptyMaskError
 from hilsplat.base.levels import NONE, Level
-from hilsplat.segment.kernels import areas_and_boxes, paint_runs, shared_pixels, window_of_runs
+from hilsplat.segment.kernels import areas_and_boxes, paint_runs, shared_pixels
 
 MAX_SIDE_PX = 2**15
 LIMITS = {"level": (1, 3), "predicted_iou": (-1, 2), "stability": (0, 1)}
@@ -132,15 +132,18 @@ class HierarchicalMasks:
         rows = np.arange(len(self)) if rows is None else rows
         height, width = self.size_hw
         masks = np.empty((len(rows), height * width), dtype=bool)
-        for out, row in enumerate(rows):
-            lengths = self.runs[self.offsets[row] : self.offsets[row + 1]]
-            masks[out] = np.repeat(np.arange(len(lengths)) % 2 == 1, lengths)
+        for out, row in enumerate(rows.tolist()):
+            masks[out] = self.window(row, (0, 0, width, height)).reshape(-1)
         return masks.reshape(len(rows), height, width)
 
     def window(self, row: int, box_xyxy: tuple[int, int, int, int]) -> Bool[np.ndarray, "h w"]:
         """Decode one mask inside a box of the view (xyxy, end exclusive)."""
-        runs = self.runs[self.offsets[row] : self.offsets[row + 1]]
-        return window_of_runs(runs, self.size_hw[1], box_xyxy)
+        x0, y0, x1, y1 = box_xyxy
+        width = self.size_hw[1]
+        ends = np.cumsum(self.runs[self.offsets[row] : self.offsets[row + 1]], dtype=np.int64)
+        lengths = np.diff(ends.clip(y0 * width, y1 * width), prepend=y0 * width)  # within the box's rows
+        band = np.repeat(np.arange(len(lengths)) % 2 == 1, lengths)
+        return band.reshape(y1 - y0, width)[:, x0:x1]
 
     def overlaps_px(self) -> Int64[np.ndarray, "M M"]:
         """Return the exact number of pixels shared by each pair of masks."""
@@ -153,11 +156,9 @@ class HierarchicalMasks:
         return replace(self, runs=runs, offsets=offsets, **others)
 
     @staticmethod
-    def concatenate(parts: "list[HierarchicalMasks]", size_hw: tuple[int, int]) -> "HierarchicalMasks":
-        """Concatenate the rows of all parts."""
-        none = np.zeros(0, np.float32)
-        empty = HierarchicalMasks.from_dense(np.zeros((0, *size_hw), bool), none.astype(np.uint8), none, none)
-        return HierarchicalMasks(size_hw=size_hw, **join_rows([empty, *parts], "runs", PER_MASK))
+    def concatenate(parts: "list[HierarchicalMasks]") -> "HierarchicalMasks":
+        """Concatenate the rows of all parts (at least one)."""
+        return HierarchicalMasks(size_hw=parts[0].size_hw, **join_rows(parts, "runs", PER_MASK))
 
     def content_order(self) -> Int64[np.ndarray, " M"]:
         """Return the rows sorted by content: level, decreasing area, box, predicted IoU, stability, runs.

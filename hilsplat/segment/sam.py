@@ -14,7 +14,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int8, Int32, Int64, UInt8
+from jaxtyping import Bool, Float, Float32, Int8, Int32, Int64, Real, UInt8
 from PIL import Image
 
 from hilsplat.base.artifacts import sha256_of_bytes
@@ -28,7 +28,7 @@ from hilsplat.models.network import Network, execution_providers
 from hilsplat.models.onnx_graph import with_rowwise_attention
 from hilsplat.segment.decoder_weights import DecoderGraph
 from hilsplat.segment.factored_decoder import HEADS_PER_ATTENTION, PROMPTS, FactoredDecoder, ImageTerms
-from hilsplat.segment.kernels import areas_and_boxes, quantise_logits, upscaled_runs
+from hilsplat.segment.kernels import areas_and_boxes, upscaled_runs
 from hilsplat.settings import MasksSettings
 
 logger = logging.getLogger(__name__)
@@ -81,15 +81,6 @@ more than 8 prompts are no faster per prompt."""
 CHECKED_PROMPTS, AGREEMENT = 2, 1e-4
 """Number of prompts for checking the factored decoder against the network, and the maximum difference."""
 OWN = "mask_generation"  # key of `config.json` under which a model specifies its own `Thresholds`
-
-
-def resized_size(original_hw: tuple[int, int], longest_edge: int) -> tuple[int, int]:
-    """Return the size whose longer side is `longest_edge`; halves are rounded up, as in SamProcessor.
-
-    Departs: neither side becomes 0 for very thin images.
-    """
-    scale = longest_edge / max(original_hw)
-    return max(1, int(original_hw[0] * scale + 0.5)), max(1, int(original_hw[1] * scale + 0.5))
 
 
 def point_grid(points_per_side: int) -> Float[np.ndarray, "P 2"]:
@@ -209,10 +200,15 @@ class SamModel:
         return replace(self.own, **{name: value for name, value in chosen.items() if value != "auto"})
 
     def frame(self, original_hw: tuple[int, int]) -> Frame:
-        """Return the position of an image of this size in the network's input."""
+        """Return the position of an image of this size in the network's input.
+
+        Sides are rounded to the nearest pixel, halves up, as in SamProcessor. Departs: no side becomes 0.
+        """
         if self.stretches:
             return Frame(original_hw, self.padded_hw, self.padded_hw, stretched=True)
-        return Frame(original_hw, resized_size(original_hw, self.longest_edge), self.padded_hw)
+        scale = self.longest_edge / max(original_hw)
+        height, width = (max(1, int(side * scale + 0.5)) for side in original_hw)
+        return Frame(original_hw, (height, width), self.padded_hw)
 
     def prepare(self, image: UInt8[np.ndarray, "H W 3"]) -> tuple[Float32[np.ndarray, "1 3 h w"], Frame]:
         """Resize and normalise an image, and pad it with zeros at the right and bottom."""
@@ -374,16 +370,23 @@ def read_logits(
     height, width = (
         -(-frame.resized_hw[axis] * logits.shape[1 + axis] // frame.padded_hw[axis]) for axis in (0, 1)
     )
-    steps = offset / LOGIT_STEP
-    rounded, small, large, boxes = quantise_logits(
-        np.ascontiguousarray(logits),
-        np.float32(1 / LOGIT_STEP),
-        math.floor(steps),  # an integer exceeds x if and only if it exceeds floor(x)
-        math.floor(-steps),
-        height,
-        width,
-    )
-    return rounded, (small / np.maximum(large, 1)).astype(np.float32), boxes
+    # an integer exceeds x if and only if it exceeds floor(x)
+    upper, lower = math.floor(offset / LOGIT_STEP), math.floor(-offset / LOGIT_STEP)
+    steps, stability = np.empty(logits.shape, np.int8), np.empty(len(logits), np.float32)
+    for row, each in enumerate(logits):  # one by one, in the processor's cache
+        steps[row] = np.clip(np.rint(each / np.float32(LOGIT_STEP)), -127, 127)
+        seen = steps[row, :height, :width]
+        stability[row] = np.count_nonzero(seen > upper) / max(1, np.count_nonzero(seen > lower))
+    return steps, stability, positive_boxes(steps)
+
+
+def positive_boxes(logits: Real[np.ndarray, "K h w"]) -> Int32[np.ndarray, "K 4"]:
+    """Return the box (xyxy, end exclusive) of the positive logits of each mask, all 0 if there are none."""
+    boxes = np.empty((len(logits), 4), np.int32)
+    for row, each in enumerate(logits):
+        x, y, width, height = cv2.boundingRect((each > 0).view(np.uint8))
+        boxes[row] = x, y, x + width, y + height
+    return boxes
 
 
 def full_stability(

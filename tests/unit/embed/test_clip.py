@@ -16,7 +16,6 @@ from hilsplat.models.folder import open_model_folder
 from hilsplat.models.int8 import considers_int8
 from hilsplat.models.network import Network
 from hilsplat.segment.digests import digests_in, index_entry
-from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ClipSettings
 from tests.unit.finished_desk import write_colour_clip
 from tests.unit.segment.handmade import pack, save_network, save_scene
@@ -67,7 +66,7 @@ def test_vectors_do_not_depend_on_the_batch(colour_clip):
     expected = model.embed_masks(image, masks)
     np.testing.assert_array_equal(model.embed_masks(image, masks, ClipSettings(batch=2)), expected)
     np.testing.assert_allclose(np.linalg.norm(expected.astype(float), axis=1), 1, atol=2e-3)
-    assert model.embed_masks(image, HierarchicalMasks.concatenate([], (12, 10))).shape == (0, 3)
+    assert model.embed_masks(image, pack(np.zeros((0, 12, 10)))).shape == (0, 3)
 
 
 def test_texts_are_unit_vectors_in_order_and_inserted_into_the_template(colour_clip):

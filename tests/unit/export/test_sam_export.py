@@ -11,7 +11,7 @@ from hilsplat.segment.generate import crop_boxes, decode_candidates, masks_from_
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.sam import Frame, SamModel, enlarged, point_grid
 from hilsplat.settings import MasksSettings
-from tests.unit.segment.plain import quantise
+from tests.unit.segment.handmade import quantise
 
 TOLERANCE = 1e-4
 EVERYTHING = MasksSettings(

@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 import onnx
 from onnx import helper, numpy_helper
@@ -14,7 +15,7 @@ from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.generate import decode_candidates, masks_from_candidates
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.segment.sam import SamModel
+from hilsplat.segment.sam import LOGIT_STEP, SamModel
 from hilsplat.settings import MasksSettings
 
 FRAME, LOW = 32, 16
@@ -34,6 +35,17 @@ def pack(
         ones if predicted_iou is None else np.array(predicted_iou, np.float32),
         ones,
     )
+
+
+def quantise(logits: np.ndarray) -> np.ndarray:
+    """Round logits to steps, clipped to +-127."""
+    return np.clip(np.rint(logits / LOGIT_STEP), -127, 127).astype(np.int8)
+
+
+def smooth_logits(count: int, side: int, seed: int) -> np.ndarray:
+    """Random hills and valleys, float32 (count, side, side)."""
+    noise = np.random.default_rng(seed).normal(size=(count, side, side)).astype(np.float32)
+    return np.stack([36 * cv2.GaussianBlur(one, (0, 0), 3) for one in noise])
 
 
 def assert_equal_masks(found: HierarchicalMasks, expected: HierarchicalMasks) -> None:
@@ -80,13 +92,13 @@ def move_weights(path: Path, location: str) -> None:
     onnx.save(model, path, save_as_external_data=True, location=location, **options)
 
 
-def _write_disc_decoder(path: Path, every: slice, points_name: str, heads: int, cell_px: float) -> None:
+def _write_disc_decoder(path: Path, every: slice, cell_px: float) -> None:
     """Write the decoder of `write_disc_sam`; masks contain only the rows and columns in `every`."""
     centres = ((np.arange(LOW, dtype=np.float32) + 0.5) * FRAME / LOW)[every]
     low = len(centres)
     x, y = np.meshgrid(centres, centres)
-    to_middle_of_cell = f"""
-        in_cells = Div ({points_name}, cell)
+    to_middle_of_cell = """
+        in_cells = Div (input_points, cell)
         corner = Floor (in_cells)
         middle = Add (corner, half)
         centre = Mul (middle, cell)
@@ -94,10 +106,10 @@ def _write_disc_decoder(path: Path, every: slice, points_name: str, heads: int, 
     save_network(
         path,
         f"""discs (
-            float[1,P,1,2] {points_name}, int64[1,P,1] input_labels,
+            float[1,P,1,2] input_points, int64[1,P,1] input_labels,
             float[1,3,{LOW},{LOW}] image_embeddings, float[1,3,{LOW},{LOW}] image_positional_embeddings
-        ) => (float[1,P,{heads}] iou_scores, float[1,P,{heads},{low},{low}] pred_masks) {{
-            {to_middle_of_cell if cell_px else f"centre = Identity ({points_name})"}
+        ) => (float[1,P,3] iou_scores, float[1,P,3,{low},{low}] pred_masks) {{
+            {to_middle_of_cell if cell_px else "centre = Identity (input_points)"}
             offset = Sub (centre, grid)
             distance = ReduceL2 <axes = [3]> (offset)
             apart = Transpose <perm = [0, 1, 3, 2]> (distance)
@@ -110,16 +122,14 @@ def _write_disc_decoder(path: Path, every: slice, points_name: str, heads: int, 
         cell=np.array([cell_px], np.float32),
         half=np.array([0.5], np.float32),
         grid=np.stack([x.reshape(-1), y.reshape(-1)], axis=1)[None, None],
-        radii=np.array((RADII + RADII)[:heads], np.float32)[None, None, :, None],
-        shape=np.array([1, -1, heads, low, low]),
+        radii=np.array(RADII, np.float32)[None, None, :, None],
+        shape=np.array([1, -1, 3, low, low]),
         zero=np.zeros(1, np.float32),
-        scores=np.array((SCORES + SCORES)[:heads], np.float32),
+        scores=np.array(SCORES, np.float32),
     )
 
 
-def write_disc_sam(
-    folder: Path, points_name: str = "input_points", heads: int = 3, cell_px: float = 0
-) -> Path:
+def write_disc_sam(folder: Path, cell_px: float = 0) -> Path:
     """Write a SAM that returns three discs around each point: logit = radius - distance, px of the input.
 
     With `cell_px`, discs are centred in the point's grid cell, and the model has a preview.
@@ -135,7 +145,7 @@ def write_disc_sam(
     )
     networks = {DECODER: slice(None), PREVIEW: slice(None, None, 2)} if cell_px else {DECODER: slice(None)}
     for name, every in networks.items():
-        _write_disc_decoder(folder / "onnx" / f"{name}.onnx", every, points_name, heads, cell_px)
+        _write_disc_decoder(folder / "onnx" / f"{name}.onnx", every, cell_px)
     own = {"predicted_iou_min": 0.35, "stability_min": 0.5, "nms_score": 0.0, "points_per_batch": 64}
     (folder / "config.json").write_text(json.dumps({"model_type": "sam", "mask_generation": own}))
     sizes = {"size": {"longest_edge": FRAME}, "pad_size": {"height": FRAME, "width": FRAME}}

@@ -12,7 +12,6 @@ from benchmarks.canned_sam import CannedSam, NetworkClock
 from hilsplat.base.levels import Level
 from hilsplat.segment.coverage import coverage_tree
 from hilsplat.segment.generate import (
-    Candidates,
     candidates_key,
     clean_masks,
     crop_boxes,
@@ -21,20 +20,10 @@ from hilsplat.segment.generate import (
     keep_candidates,
     masks_from_candidates,
 )
-from hilsplat.segment.sam import (
-    Encoded,
-    Frame,
-    Prompts,
-    SamModel,
-    Thresholds,
-    enlarged,
-    point_grid,
-    resized_size,
-)
+from hilsplat.segment.sam import Encoded, Frame, Prompts, SamModel, Thresholds, enlarged, point_grid
 from hilsplat.settings import MasksSettings
 from tests.unit.segment import official
-from tests.unit.segment.handmade import assert_equal_masks, generate, pack
-from tests.unit.segment.plain import flatten_far, quantise, smooth_logits, unpacked
+from tests.unit.segment.handmade import assert_equal_masks, generate, pack, quantise, smooth_logits
 
 SETTINGS = MasksSettings(points_per_side=2, points_per_batch=3, stability_min=0.0, min_area_px=1)
 IMAGE = np.zeros((32, 32, 3), dtype=np.uint8)
@@ -154,41 +143,24 @@ def test_of_two_predicted_ious_above_1_the_higher_wins(model):
     assert masks.predicted_iou.tolist() == [np.float32(1.06)] * 3
 
 
-def candidates_of(logits: np.ndarray, frame: Frame) -> Candidates:
-    """All heads of all prompts, none dropped."""
-    scores = np.linspace(0.5, 1, len(logits) * 3, dtype=np.float32).reshape(-1, 3)
-    return keep_candidates(scores, logits, frame, 0, EVERYTHING, NOTHING_DROPPED)
-
-
-def test_windows_contain_the_band_around_edges():
-    logits = smooth_logits(12, 48, seed=3)
-    kept = candidates_of(logits.reshape(4, 3, 48, 48), Frame((48, 48), (48, 48), (48, 48)))
-    assert len(kept) == 12
-    np.testing.assert_array_equal(unpacked(kept), [flatten_far(steps) for steps in quantise(logits)])
-
-
 @pytest.mark.parametrize(
     "original_hw", [(32, 24), (100, 128), (256, 256), (480, 640), (728, 986), (300, 3), (1, 200), (64, 1)]
 )
 def test_masks_from_windows_equal_enlarged_masks(original_hw, disc_sam):
     model = SamModel.load(disc_sam)
     model.longest_edge, model.padded_hw = 256, (256, 256)
-    frame = Frame(original_hw, resized_size(original_hw, 256), (256, 256))
+    frame = model.frame(original_hw)
     logits = smooth_logits(30, 64, seed=sum(original_hw))
-    kept = candidates_of(logits.reshape(10, 3, 64, 64), frame)
+    logits[0], logits[1] = -3, 3  # without an edge: an empty and a full mask
+    scores = np.linspace(0.5, 1, 30, dtype=np.float32).reshape(10, 3)
+    heads = logits.reshape(10, 3, 64, 64)
+    kept = keep_candidates(scores, heads, frame, 0, EVERYTHING, NOTHING_DROPPED)
     masks = masks_from_candidates(kept, original_hw, model, EVERYTHING)
     expected = [mask for mask in enlarged(quantise(logits).astype(np.float32), frame) if mask.any()]
     found = list(masks.dense())
     assert len(found) == len(expected) > 5
     for mask in found:  # rounding may decide on the border itself
         assert min((mask != other).mean() for other in expected) < 2e-4
-
-
-def test_full_masks_have_no_edge_and_empty_ones_are_dropped():
-    frame = Frame((8, 8), (8, 8), (8, 8))
-    kept = candidates_of(np.full((1, 3, 8, 8), 3, np.float32), frame)
-    np.testing.assert_array_equal(unpacked(kept), np.full((3, 8, 8), 127))
-    assert len(candidates_of(np.full((2, 3, 8, 8), -3, np.float32), frame)) == 0
 
 
 class Previewed(SamModel):

@@ -9,8 +9,7 @@ from hilsplat.segment.sam import HEADS, Frame, SamModel, full_stability, read_lo
 from hilsplat.segment.suppression import distinct_boxes, last_inside, suppress_boxes
 from hilsplat.settings import MasksSettings
 from tests.unit.segment import official
-from tests.unit.segment.handmade import generate, pack
-from tests.unit.segment.plain import smooth_logits
+from tests.unit.segment.handmade import generate, pack, smooth_logits
 
 
 @pytest.fixture(scope="module")

@@ -4,17 +4,18 @@ import numpy as np
 import pytest
 
 from hilsplat.embed.model_check import check_model
-from hilsplat.segment.generate import positive_boxes
-from hilsplat.segment.sam import REAL_SAM, Frame, SamModel, Thresholds, read_logits, resized_size
+from hilsplat.segment.sam import REAL_SAM, Frame, SamModel, Thresholds, positive_boxes, read_logits
 from hilsplat.settings import MasksSettings
 from models.training.export import OWN_THRESHOLDS
 
 SQUARE = Frame((4, 4), (4, 4), (4, 4))
 
 
-def test_longest_edge_is_kept_and_halves_round_up():
-    originals = (600, 800), (3, 2048), (1, 5000)
-    assert [resized_size(size, 1024) for size in originals] == [(768, 1024), (2, 1024), (1, 1024)]
+def test_longest_edge_is_kept_and_halves_round_up(disc_sam):
+    model = SamModel.load(disc_sam)
+    model.longest_edge = 1024
+    found = [model.frame(size).resized_hw for size in ((600, 800), (3, 2048), (1, 5000))]
+    assert found == [(768, 1024), (2, 1024), (1, 1024)]
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.segment.sam import SamModel, enlarged, point_grid
 from hilsplat.world.objects.catalogue import GENERATOR_VERSION
 from hilsplat.world.render import label_view, render_view
-from hilsplat.world.scenes.kinds import training_camera
 from hilsplat.world.seeds import TRAINING_SEEDS
+from models.training.cameras import training_camera
 from models.training.card import CARD, RECORD, digests
 from models.training.crops import list_crops
 from models.training.data import LabelledViews, normalised
@@ -19,7 +19,7 @@ from models.training.measure_sam import draw_regions
 from models.training.render import phrases_of, scene_of_seed
 from models.training.sam import FRAME_PX, HEADS
 from tests.conftest import PROJECT
-from tests.unit.segment.plain import quantise
+from tests.unit.segment.handmade import quantise
 
 MODELS = PROJECT / "models"
 NAMES = ("sam-tiny", "clip-tiny")

@@ -20,7 +20,6 @@ from hilsplat.evaluate.diagnostics.world_consistency import (
     view_agreement,
 )
 from hilsplat.scene.cameras import Camera
-from hilsplat.segment.masks import HierarchicalMasks
 from tests.unit.evaluate.builders import box, cameras_of, masks_of
 
 HEIGHT, WIDTH, FOCAL = 6, 10, 8.0
@@ -177,7 +176,7 @@ def test_the_table_has_rows_for_masks_and_true_regions(world):
 
 def test_masks_of_another_size_and_single_views_are_refused(world, tmp_path):
     index = read_index(world / "masks")
-    small = HierarchicalMasks.concatenate([], (32, 32))
+    small = masks_of([np.ones((32, 32), bool)], [1])
     for view in index["views"]:
         small.save(tmp_path / f"{view}.npz")
     for views, error, message in (
