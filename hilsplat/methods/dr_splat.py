@@ -18,7 +18,6 @@ import scipy.sparse as sp
 from jaxtyping import Float32
 from scipy.cluster.vq import vq
 
-from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import track
 from hilsplat.contributions.view_matrices import painted_indicator
@@ -34,7 +33,9 @@ UNSEEN = 1e-9  # averages shorter than this have no direction
 def heaviest(weights: sp.csr_matrix, count: int) -> sp.csr_matrix:
     """Return the `count` largest weights of each row; lower columns win ties."""
     kept = weights.copy()
-    _drop_lighter(kept.indptr, kept.data, count)
+    for row in np.flatnonzero(np.diff(kept.indptr) > count):
+        own = kept.data[kept.indptr[row] : kept.indptr[row + 1]]
+        own[np.argsort(-own, kind="stable")[count:]] = 0
     kept.eliminate_zeros()
     return kept
 
@@ -90,22 +91,3 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
         seen = averages[:, level.index].any(axis=1)
         features[seen, level.index] = code.encode_array(quantised(averages[seen, level.index], books))
     return features
-
-
-@compiled
-def _drop_lighter(indptr, data, count):
-    """Set all but the `count` largest values of each row to zero."""
-    for row in range(len(indptr) - 1):
-        begin, end = indptr[row], indptr[row + 1]
-        if end - begin <= count:
-            continue
-        least = np.sort(data[begin:end])[end - begin - count]
-        above = 0
-        for k in range(begin, end):
-            above += data[k] > least
-        equal = count - above
-        for k in range(begin, end):
-            if data[k] == least and equal > 0:
-                equal -= 1
-            elif data[k] <= least:
-                data[k] = 0
