@@ -57,7 +57,8 @@ def times_of(gaussians: Gaussians, camera: Camera, device: Device, threads: int)
     view = TrainingView(camera, (255 * np.clip(seen.image, 0, 1)).astype(np.uint8))
     start = {field: getattr(gaussians, field).copy() for field in FIELDS}
     generator = np.random.default_rng(0)
-    state = FitState(Adam.start(start), ScreenGradients.start(len(gaussians)), generator, step=HALF_WAY)
+    state = FitState(Adam.start(start), ScreenGradients.start(len(gaussians)), generator)
+    state.adam.steps = HALF_WAY
     return [
         median_ms(lambda: draw(gaussians, camera, 3, threads=threads, device=device)),
         median_ms(both_ways),

@@ -66,6 +66,32 @@ class ScreenGradients:
         return self.total / np.maximum(self.seen, 1)
 
 
+def control_density(
+    adam: Adam,
+    gradients: ScreenGradients,
+    settings: GaussiansSettings,
+    rate_of_means: float,  # in units of the extent
+    extent: float,
+    generator: np.random.Generator,
+    threads: int,
+) -> None:
+    """Add, move and remove Gaussians after a step, according to the strategy."""
+    is_mcmc = settings.strategy == "mcmc"
+    densify_until = int(settings.densify_until * settings.iterations)
+    if settings.densify_from * settings.iterations <= adam.steps <= densify_until:
+        if adam.steps % settings.densify_every == 0:
+            if is_mcmc:
+                relocate_and_grow(adam, settings, generator)
+            else:
+                densify(adam, gradients, settings, extent, generator)
+                prune(adam, settings, extent)
+            gradients.total, gradients.seen = np.zeros(len(adam)), np.zeros(len(adam), np.int32)
+        if not is_mcmc and adam.steps % settings.opacity_reset_every == 0 and adam.steps < densify_until:
+            reset_opacities(adam)
+    if is_mcmc:
+        add_noise(adam, settings, rate_of_means, extent, generator, threads)
+
+
 def densify(
     adam: Adam,
     gradients: ScreenGradients,
@@ -95,9 +121,8 @@ def prune(adam: Adam, settings: GaussiansSettings, extent: float) -> None:
     """Drop transparent and huge Gaussians."""
     p = adam.parameters
     threshold = np.log(settings.min_opacity / (1 - settings.min_opacity))
-    keep = (p["opacity_logits"] > threshold) & (
-        p["log_scales"].max(axis=1, initial=-np.inf) < np.log(HUGE * extent)
-    )
+    largest = p["log_scales"].max(axis=1, initial=-np.inf)
+    keep = (p["opacity_logits"] > threshold) & (largest < np.log(HUGE * extent))
     if not keep.all():
         adam.keep(keep)
 

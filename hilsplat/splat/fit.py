@@ -26,15 +26,7 @@ from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.coordinates import import_gaussians, write_coordinates
-from hilsplat.splat.densify import (
-    ScreenGradients,
-    add_noise,
-    add_regularisers,
-    densify,
-    prune,
-    relocate_and_grow,
-    reset_opacities,
-)
+from hilsplat.splat.densify import ScreenGradients, add_regularisers, control_density, prune
 from hilsplat.splat.flyaround import contact_sheet, write_flyaround
 from hilsplat.splat.gaussians import FIELDS, Gaussians, morton_order
 from hilsplat.splat.initial import TrainingView, camera_extent, first_gaussians, load_views
@@ -60,41 +52,31 @@ TABLES = ("parameters", "first", "second")
 
 @dataclass
 class FitState:
-    """State from which a fit resumes exactly.
+    """State from which a fit resumes exactly."""
 
-    Attributes:
-        gradients: screen gradients since the last densification.
-        generator: random generator for view order, splits and backgrounds.
-        order: indices of the remaining views in this epoch.
-        step: completed steps.
-        curve: rows of (step, loss, training PSNR in dB, number of Gaussians).
-    """
+    adam: Adam  # its `steps` are the completed steps of the fit
+    gradients: ScreenGradients  # since the last densification
+    generator: np.random.Generator  # for view order, splits and backgrounds
+    order: list[int] = field(default_factory=list)  # indices of the remaining views in this epoch
+    curve: list[list[float]] = field(default_factory=list)  # step, loss, training PSNR (dB), Gaussians
 
-    adam: Adam
-    gradients: ScreenGradients
-    generator: np.random.Generator
-    order: list[int] = field(default_factory=list)
-    step: int = 0
-    curve: list[tuple[float, float, float, float]] = field(default_factory=list)
-
-    def save(self, path: Path, key: str) -> None:
+    def save(self, path: Path) -> None:
         """Write a checkpoint."""
         arrays = {f"{table}_{name}": getattr(self.adam, table)[name] for table in TABLES for name in FIELDS}
         write_npz(
             path,
-            key=np.array(key),
-            counts=np.array([self.step, self.adam.steps]),
+            steps=np.array(self.adam.steps),
             order=np.array(self.order, dtype=np.int64),
             generator=np.array(json.dumps(self.generator.bit_generator.state)),
             gradient_total=self.gradients.total,
             gradient_seen=self.gradients.seen,
-            curve=np.array(self.curve, dtype=np.float64).reshape(-1, 4),
+            curve=np.array(self.curve).reshape(-1, 4),
             **arrays,
         )
 
     @staticmethod
-    def load(path: Path, key: str) -> "FitState | None":
-        """Read this fit's checkpoint; return None if it is missing, damaged or from a different fit."""
+    def load(path: Path) -> "FitState | None":
+        """Read a checkpoint; return None if it is missing or damaged."""
         if not path.is_file():
             return None
         try:
@@ -102,20 +84,15 @@ class FitState:
         except ArtifactError as error:
             logger.warning("ignoring the checkpoint and restarting the fit: %s", error)
             return None
-        if arrays["key"].item() != key:
-            logger.info("checkpoint %s was written for different inputs; restarting the fit", path)
-            return None
         parameters, first, second = ({name: arrays[f"{table}_{name}"] for name in FIELDS} for table in TABLES)
         generator = np.random.default_rng()
         generator.bit_generator.state = json.loads(arrays["generator"].item())
-        step, adam_steps = (int(count) for count in arrays["counts"])
         return FitState(
-            Adam(parameters, first, second, adam_steps),
+            Adam(parameters, first, second, arrays["steps"].item()),
             ScreenGradients(arrays["gradient_total"], arrays["gradient_seen"]),
             generator,
             arrays["order"].tolist(),
-            step,
-            [tuple(row) for row in arrays["curve"].tolist()],
+            arrays["curve"].tolist(),
         )
 
 
@@ -126,13 +103,12 @@ def fit_step(
     if not state.order:
         state.order = state.generator.permutation(len(views)).tolist()
     view = views[state.order.pop()]
-    progress = state.step / settings.iterations
+    progress = state.adam.steps / settings.iterations
     # 3DGS adds a degree every 1000 of 30 000 steps; here, every fit reaches degree 3 after 30 % of its steps
     degree = min(settings.sh_degree, int(progress * 10))
+    behind = np.full(3, settings.background == "white", np.float32)
     if settings.background == "random":
         behind = state.generator.uniform(size=3).astype(np.float32)
-    else:
-        behind = np.full(3, settings.background == "white", np.float32)
 
     device = choose_device(settings.device)
     seen = draw(state.adam.as_gaussians(), view.camera, degree, threads=threads, device=device)
@@ -145,18 +121,17 @@ def fit_step(
         grad_alpha = -(grad @ behind)
     gradients = seen.gradients(grad, grad_alpha)
     is_frozen = settings.initial == "frozen"
-    rate = 0.0 if is_frozen else extent * means_rate(settings, progress)
+    rate = 0.0 if is_frozen else means_rate(settings, progress)
     if settings.strategy == "mcmc" and not is_frozen:
         add_regularisers(state.adam, gradients, settings, extent)
-    elif not is_frozen and state.step < int(settings.densify_until * settings.iterations):
+    elif not is_frozen and state.adam.steps < int(settings.densify_until * settings.iterations):
         state.gradients.add(gradients.means_px, seen.drawn, view.camera.size_hw)
-    state.adam.step(gradients, settings, rate, threads)
-    state.step += 1
-    if state.step % CURVE_EVERY == 0:
+    state.adam.step(gradients, settings, extent * rate, threads)
+    if state.adam.steps % CURVE_EVERY == 0:
         error = float(np.square(shown - target).mean(dtype=np.float64))
-        state.curve.append((state.step, loss, -10 * np.log10(max(error, 1e-12)), len(state.adam)))
+        state.curve.append([state.adam.steps, loss, -10 * np.log10(max(error, 1e-12)), len(state.adam)])
     if not is_frozen:
-        control_density(state, settings, progress, extent, threads)
+        control_density(state.adam, state.gradients, settings, rate, extent, state.generator, threads)
 
 
 def steps_of(settings: GaussiansSettings, num_views: int) -> int:
@@ -176,26 +151,6 @@ def scale_at(settings: GaussiansSettings, progress: float, side_px: int) -> floa
     return scale
 
 
-def control_density(
-    state: FitState, settings: GaussiansSettings, progress: float, extent: float, threads: int
-) -> None:
-    """Add, move and remove Gaussians after a step, according to the strategy."""
-    is_mcmc = settings.strategy == "mcmc"
-    densify_until = int(settings.densify_until * settings.iterations)
-    if settings.densify_from * settings.iterations <= state.step <= densify_until:
-        if state.step % settings.densify_every == 0:
-            if is_mcmc:
-                relocate_and_grow(state.adam, settings, state.generator)
-            else:
-                densify(state.adam, state.gradients, settings, extent, state.generator)
-                prune(state.adam, settings, extent)
-            state.gradients = ScreenGradients.start(len(state.adam))
-        if not is_mcmc and state.step % settings.opacity_reset_every == 0 and state.step < densify_until:
-            reset_opacities(state.adam)
-    if is_mcmc:
-        add_noise(state.adam, settings, means_rate(settings, progress), extent, state.generator, threads)
-
-
 def fit_gaussians(
     scene: Scene,
     settings: GaussiansSettings,
@@ -203,7 +158,6 @@ def fit_gaussians(
     seed: int,
     threads: int = 1,
     checkpoint: Path | None = None,
-    key: str = "",
 ) -> tuple[Gaussians, Float64[np.ndarray, "S 4"]]:
     """Fit Gaussians to the training views of a scene.
 
@@ -212,8 +166,7 @@ def fit_gaussians(
     Args:
         seed: determines the view order, splits, relocations, noise and random points.
         checkpoint: file to which the state is written every `checkpoint_every` steps, and from which
-            an interrupted fit resumes; removed at the end.
-        key: digest of all inputs of the fit; checkpoints with a different key are ignored.
+            an interrupted fit with the same inputs resumes; removed at the end.
 
     Returns:
         The Gaussians in Morton order (frozen ones in the order of their points), and the
@@ -228,15 +181,15 @@ def fit_gaussians(
     settings = settings.model_copy(update={"iterations": steps_of(settings, len(views))})
     cameras = [view.camera for view in views]
     extent = camera_extent(cameras)
-    state = FitState.load(checkpoint, key) if checkpoint else None
+    state = FitState.load(checkpoint) if checkpoint else None
     if state is None:
         generator = np.random.default_rng(seed)
         adam = Adam.start(first_gaussians(scene, cameras, settings, generator))
         state = FitState(adam, ScreenGradients.start(len(adam)), generator)
     else:
-        logger.info("resuming from the checkpoint at step %d", state.step)
+        logger.info("resuming from the checkpoint at step %d", state.adam.steps)
     sizes = {1.0: views}
-    for step in track(range(state.step, settings.iterations), "fit steps"):
+    for step in track(range(state.adam.steps, settings.iterations), "fit steps"):
         scale = scale_at(settings, step / settings.iterations, min(cameras[0].size_hw))
         if scale not in sizes:
             sizes[scale] = load_views(scene, "train", scale * settings.image_scale)
@@ -246,14 +199,14 @@ def fit_gaussians(
                 f"all Gaussians of {scene.name} became transparent",
                 fix="check the poses (registration.png), or lower gaussians.min_opacity",
             )
-        if checkpoint and state.step % settings.checkpoint_every == 0 and state.step < settings.iterations:
-            state.save(checkpoint, key)
+        if checkpoint and (step + 1) % settings.checkpoint_every == 0 and step + 1 < settings.iterations:
+            state.save(checkpoint)
     if settings.initial != "frozen":
         prune(state.adam, settings, extent)
         state.adam.keep(morton_order(state.adam.parameters["means"]))
     if checkpoint:
         checkpoint.unlink(missing_ok=True)
-    return state.adam.as_gaussians(), np.array(state.curve, dtype=np.float64).reshape(-1, 4)
+    return state.adam.as_gaussians(), np.array(state.curve).reshape(-1, 4)
 
 
 def write_report(
@@ -273,12 +226,11 @@ def write_report(
     background = (float(settings.background == "white"),) * 3
 
     def picture(camera: Camera, threads: int = threads) -> UInt8[np.ndarray, "H W 3"]:
-        color = render(gaussians, camera, background=background, threads=threads).color
+        color = render(gaussians, camera, background=background, threads=threads)
         return np.round(color.clip(0, 1) * 255).astype(np.uint8)
 
-    views, split = load_views(scene, "test", settings.image_scale), "test"
-    if not views:
-        views, split = load_views(scene, "train", settings.image_scale), "train"
+    test, train = (load_views(scene, split, settings.image_scale) for split in ("test", "train"))
+    views, split = (test, "test") if test else (train, "train")
     scores: dict[str, dict[str, float]] = {}
     flat: list[float] = []
     cells: list[UInt8[np.ndarray, "_ _ 3"]] = []
@@ -307,7 +259,7 @@ def write_report(
         )
     with atomic_folder(folder) as temporary:
         write_png(temporary / "test_views.png", contact_sheet(cells, columns=6))
-        path = [view.camera for view in load_views(scene, "train", settings.image_scale) or views]
+        path = [view.camera for view in train or views]
         write_flyaround(temporary, path, lambda camera: picture(camera, 1), threads)
         if curve is not None:
             _draw_curves(temporary / "curves.png", curve)
@@ -367,7 +319,7 @@ def run_gaussians(
             key = sha256_of_json([*inputs, code_digest(fit_gaussians)])
             checkpoint = Path(cache) / "gaussians" / f"{key[:16]}.npz"
             gaussians, curve = fit_gaussians(
-                scene, settings, seed=seed, threads=threads, checkpoint=checkpoint, key=key
+                scene, settings, seed=seed, threads=threads, checkpoint=checkpoint
             )
             origin = {
                 "kind": "fitted",
