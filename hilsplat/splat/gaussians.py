@@ -8,29 +8,16 @@ from jaxtyping import Float, Float32, Int64, UInt64
 
 @dataclass(frozen=True)
 class Gaussians:
-    """N anisotropic 3D Gaussians of one scene, as contiguous arrays.
+    """N anisotropic 3D Gaussians of one scene, as contiguous arrays."""
 
-    Attributes:
-        means: centres, scene units.
-        log_scales: natural log of the standard deviation along each axis, scene units.
-        quats: world-from-Gaussian rotations as quaternions (wxyz) of any non-zero length.
-        opacity_logits: inverse sigmoid of the peak alpha.
-        sh: colour as spherical harmonics, K = (degree + 1)**2; row 0 is the constant term.
-    """
-
-    means: Float32[np.ndarray, "N 3"]
-    log_scales: Float32[np.ndarray, "N 3"]
-    quats: Float32[np.ndarray, "N 4"]
-    opacity_logits: Float32[np.ndarray, " N"]
-    sh: Float32[np.ndarray, "N K 3"]
+    means: Float32[np.ndarray, "N 3"]  # centres, scene units
+    log_scales: Float32[np.ndarray, "N 3"]  # natural log of the standard deviations, scene units
+    quats: Float32[np.ndarray, "N 4"]  # world-from-Gaussian rotations (wxyz), of any non-zero length
+    opacity_logits: Float32[np.ndarray, " N"]  # inverse sigmoid of the peak alpha
+    sh: Float32[np.ndarray, "N K 3"]  # colour; K = (degree + 1)**2, and row 0 is the constant term
 
     def __len__(self) -> int:
         return len(self.means)
-
-    @property
-    def scales(self) -> Float32[np.ndarray, "N 3"]:
-        """Standard deviations, scene units."""
-        return np.exp(self.log_scales)
 
     @property
     def opacities(self) -> Float32[np.ndarray, " N"]:

@@ -20,7 +20,7 @@ def psnr(found: np.ndarray, expected: np.ndarray) -> float:
 
 def rendered(gaussians: Gaussians, page) -> np.ndarray:
     camera = WireCamera.model_validate(wire_camera(page)).camera()
-    return to_uint8(render(gaussians, camera).color)
+    return to_uint8(render(gaussians, camera))
 
 
 def test_webgl_equals_the_pipeline_on_the_same_bytes(opened, cloud, cloud_address):

@@ -33,15 +33,11 @@ class Tiles:
 
     The tile in row y and column x has index t = y * tiles_x + x. Its list contains Gaussians whose box
     touches the tile, front to back, in at most tile_start[t + 1] - tile_start[t] entries.
-
-    Attributes:
-        order: rows of the drawn Gaussians, front to back; ties in row order.
-        tile_start: number of entries in all preceding tiles.
     """
 
     tiles_x: int
-    order: Int32[np.ndarray, " M"]
-    tile_start: Int64[np.ndarray, " num_tiles_plus_1"]
+    order: Int32[np.ndarray, " M"]  # rows of the drawn Gaussians, front to back; ties in row order
+    tile_start: Int64[np.ndarray, " num_tiles_plus_1"]  # number of entries in all preceding tiles
 
     def bands(self) -> list[tuple[int, int]]:
         """Return ranges that cover all tiles, each with at most `MAX_ENTRIES` entries or a single tile."""

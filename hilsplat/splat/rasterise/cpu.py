@@ -36,24 +36,16 @@ def over_ranges(
 
 @dataclass(frozen=True)
 class Projected:
-    """Gaussians projected into a view, ready to blend.
+    """Gaussians projected into a view, ready to blend."""
 
-    Attributes:
-        camera: output of `pack_camera`.
-        degree: degree of spherical harmonics used.
-        geometry: see `project.GEOMETRY`.
-        box: pixel box of each Gaussian; last < first if it is not drawn.
-        colours: RGB in this view.
-        only_band: the filled lists if one band contains all tiles and was already filled.
-    """
-
-    camera: Float64[np.ndarray, " 25"]
+    camera: Float64[np.ndarray, " 25"]  # output of `pack_camera`
     size_hw: tuple[int, int]
-    degree: int
-    geometry: Float32[np.ndarray, "N_padded 16"]
-    box: Int32[np.ndarray, "N 4"]
-    colours: Float32[np.ndarray, "N 3"]
+    degree: int  # of the spherical harmonics used
+    geometry: Float32[np.ndarray, "N_padded 16"]  # see `project.GEOMETRY`
+    box: Int32[np.ndarray, "N 4"]  # pixel box of each Gaussian; last < first if it is not drawn
+    colours: Float32[np.ndarray, "N 3"]  # RGB in this view
     tiles: Tiles
+    # the filled lists, if one band contains all tiles and was already filled
     only_band: list["Band"] = field(default_factory=list, repr=False)
 
 
@@ -72,18 +64,12 @@ class Gradients:
 
 @dataclass(frozen=True)
 class Drawn:
-    """One view as drawn by either backend.
+    """One view as drawn by either backend."""
 
-    Attributes:
-        image: premultiplied RGB, then features, without background.
-        alpha: coverage.
-        drawn: whether each Gaussian reaches a pixel of the view.
-        gradients: function that maps gradients of image and alpha to gradients of the parameters.
-    """
-
-    image: Float32[np.ndarray, "H W C"]
-    alpha: Float32[np.ndarray, "H W"]
-    drawn: Bool[np.ndarray, " N"]
+    image: Float32[np.ndarray, "H W C"]  # premultiplied RGB, then features, without background
+    alpha: Float32[np.ndarray, "H W"]  # coverage in [0, 1], the sum of the blending weights
+    drawn: Bool[np.ndarray, " N"]  # whether each Gaussian reaches a pixel of the view
+    # maps gradients of image and alpha to gradients of the parameters
     gradients: Callable[[np.ndarray, np.ndarray], Gradients]
 
 
@@ -204,13 +190,8 @@ def blend_gradients(
     return out
 
 
-def sparse_weights(
-    view: Projected, min_weight: float, threads: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return blending weights >= min_weight as CSR arrays: row starts (int64), columns, weights.
-
-    Rows are row-major pixels; columns ascend within a row.
-    """
+def sparse_weights(view: Projected, min_weight: float, threads: int) -> csr_matrix:
+    """Return the blending weights >= min_weight; see `api.pixel_weights`."""
     counts = np.zeros(view.size_hw[0] * view.size_hw[1], np.int64)
 
     def over_bands(out: tuple[Any, ...] | None) -> None:
@@ -223,15 +204,13 @@ def sparse_weights(
     columns, weights = np.empty(row_start[-1], np.int32), np.empty(row_start[-1], np.float32)
     if len(columns):
         over_bands((int(counts.max()), row_start, columns, weights))
-    return row_start, columns, weights
+    return weight_matrix(row_start, columns, weights, len(view.box))
 
 
 def weight_matrix(
     row_start: np.ndarray, columns: np.ndarray, weights: np.ndarray, num_gaussians: int
 ) -> csr_matrix:
-    """Build a matrix from CSR arrays with sorted columns; row starts become int32 if they fit."""
-    if row_start[-1] < np.iinfo(np.int32).max:
-        row_start = row_start.astype(np.int32)
+    """Build a matrix from CSR arrays with sorted columns; scipy converts row starts to int32 if they fit."""
     shape = (len(row_start) - 1, num_gaussians)
     matrix = csr_matrix((weights, columns, row_start), shape=shape, copy=False)
     matrix.has_sorted_indices = True

@@ -80,8 +80,6 @@ def pixel_weights(gaussians: Gaussians, camera: Camera, min_weight: float) -> cs
     import gsplat
 
     height, width = camera.size_hw
-    if len(gaussians) == 0:
-        return csr_matrix((height * width, 0), dtype=np.float32)
     with torch.no_grad():
         g = on_device(gaussians)
         _, _, notes = blend(g, camera, torch.zeros(len(gaussians), 1, device=DEVICE))
@@ -133,11 +131,6 @@ def draw(
     import gsplat
 
     features = np.zeros((len(gaussians), 0), np.float32) if features is None else features
-    if len(gaussians) == 0:  # gsplat does not support this
-        empty = np.zeros((*camera.size_hw, 3 + features.shape[1]), np.float32)
-        zeros = {name: np.zeros_like(getattr(gaussians, name)) for name in FIELDS}
-        nothing = Gradients(**zeros, features=features, means_px=np.zeros((0, 2), np.float32))
-        return Drawn(empty, empty[..., 0].copy(), np.zeros(0, np.bool_), lambda *_: nothing)
     g = {name: values.requires_grad_() for name, values in on_device(gaussians).items()}
     blended = torch.from_numpy(features).to(DEVICE).requires_grad_()
     centre = torch.tensor(camera.centre, dtype=torch.float32, device=DEVICE)

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
@@ -12,11 +13,8 @@ from tests.unit.round_gaussians import round_gaussians
 
 def camera(height: int = 40, width: int = 56, focal: float = 50.0) -> Camera:
     """A rotated and shifted camera, so that every entry of the pose matters."""
-    a, b = 0.3, -0.2
-    turn = np.array([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]])
-    tilt = np.array([[1, 0, 0], [0, math.cos(b), -math.sin(b)], [0, math.sin(b), math.cos(b)]])
     pose = np.eye(4)
-    pose[:3, :3] = tilt @ turn
+    pose[:3, :3] = Rotation.from_euler("yx", (0.3, -0.2)).as_matrix()
     pose[:3, 3] = (0.1, -0.2, 0.3)
     K = np.array([[focal, 0, width / 2 + 1.5], [0, focal * 1.1, height / 2 - 2.0], [0, 0, 1]])
     return Camera("view.png", pose, K, (height, width))

@@ -15,24 +15,13 @@ from hilsplat.base.errors import ArtifactError, HilsplatError, SceneError
 from hilsplat.scene.assemble import move_cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
-from hilsplat.splat.coordinates import decompose, import_gaussians, move_gaussians, sh_basis, write_source_ply
+from hilsplat.splat.coordinates import decompose, import_gaussians, move_gaussians, write_source_ply
 from hilsplat.splat.fit import run_gaussians
 from hilsplat.splat.gaussians import FIELDS
 from hilsplat.splat.ply import load_ply, save_ply
 from hilsplat.splat.rasterise.api import render
 from tests.unit.splat.rasterise_scenes import camera, random_gaussians, rows
-from tests.unit.splat.reference import SH
 from tests.unit.splat.three_gaussians_world import mean_psnr, three_gaussians, three_gaussians_scene
-
-
-def turned(seed: int) -> np.ndarray:
-    return Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
-
-
-def test_basis_is_that_of_3dgs():
-    d = Rotation.random(30, rng=np.random.default_rng(5)).as_matrix()[:, 0]
-    expected = np.stack([harmonic(*d.T) for harmonic in SH], axis=1)
-    np.testing.assert_allclose(sh_basis(d, 3), expected, atol=1e-14)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -40,15 +29,15 @@ def test_a_rendered_view_is_unchanged_under_a_similarity(degree):
     some, view = random_gaussians(300, degree, degree), camera()
     gaussians = rows(some, some.means @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3] > 1)
     similarity = np.eye(4)
-    similarity[:3, :3] = 0.37 * turned(7)
+    similarity[:3, :3] = 0.37 * Rotation.random(rng=np.random.default_rng(7)).as_matrix()
     similarity[:3, 3] = (5.0, -3.0, 2.0)
     before = render(gaussians, view)
     moved = replace(view, cam_from_world=move_cameras(view.cam_from_world[None], similarity)[0])
     after = render(move_gaussians(gaussians, similarity), moved)
-    assert before.alpha.mean() > 0.2
+    assert before.mean() > 0.05
     # float32 parameters; a pixel at the cut of 1/255 may fall on either side
-    np.testing.assert_allclose(after.color, before.color, atol=5e-3)
-    assert np.abs(after.color - before.color).mean() < 1e-5
+    np.testing.assert_allclose(after, before, atol=5e-3)
+    assert np.abs(after - before).mean() < 1e-5
 
 
 @pytest.mark.parametrize(
@@ -131,34 +120,27 @@ def test_a_ply_of_this_package_is_moved_by_the_json_beside_it(turned_scene, sour
     assert "JSON" not in origin["taken_as"]
 
 
-def nerfstudio_run(folder: Path, how: str) -> tuple[np.ndarray, dict[str, Path]]:
-    """Return training_from_source as nerfstudio's data parser chooses it, and the files that describe it."""
+@pytest.mark.parametrize("how", ["applied", "old", "colmap"])
+def test_a_nerfstudio_ply_is_moved_to_scene_coordinates(turned_scene, source_ply, tmp_path, how):
     orient = np.eye(4)  # of the poses in transforms.json: turned upright and centred
     orient[:3, :3] = Rotation.from_rotvec([0.7, 0.2, -1.1]).as_matrix()
     orient[:3, 3] = (3.0, -1.0, 0.5)
     scale = 0.21  # so that all cameras are in the unit cube
-    applied = np.eye(4)
-    applied[:3] = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]  # by ns-process-data, from COLMAP
-    applied_scale = 2.5 if how == "applied" else 1.0
-    content = {"applied_transform": applied[:3].tolist(), "applied_scale": 2.5} if how == "applied" else {}
+    applied, content = np.eye(4), {}
+    if how != "colmap":  # by ns-process-data, from COLMAP
+        applied[:3] = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
+    if how == "applied":
+        content = {"applied_transform": applied[:3].tolist(), "applied_scale": 2.5}
     if how == "old":
-        (folder / "colmap/sparse/0").mkdir(parents=True)
-    if how == "colmap":
-        applied = np.eye(4)
-    write_json(folder / "transforms.json", {**content, "frames": []})
-    recorded = {"transform": (orient @ applied)[:3].tolist(), "scale": scale * applied_scale}
-    write_json(folder / "dataparser_transforms.json", recorded)
-    files = {"dataparser": folder / "dataparser_transforms.json"}
-    if how != "colmap":
-        files["transforms"] = folder / "transforms.json"
-    return np.diag([scale, scale, scale, 1.0]) @ orient, files
-
-
-@pytest.mark.parametrize("how", ["applied", "old", "colmap"])
-def test_a_nerfstudio_ply_is_moved_to_scene_coordinates(turned_scene, source_ply, tmp_path, how):
-    training_from_source, files = nerfstudio_run(tmp_path / "run", how)
+        (tmp_path / "colmap/sparse/0").mkdir(parents=True)
+    transforms, dataparser = tmp_path / "transforms.json", tmp_path / "dataparser_transforms.json"
+    write_json(transforms, {**content, "frames": []})
+    recorded = scale * content.get("applied_scale", 1.0)
+    write_json(dataparser, {"transform": (orient @ applied)[:3].tolist(), "scale": recorded})
+    training_from_source = np.diag([scale, scale, scale, 1.0]) @ orient
     save_ply(tmp_path / "splat.ply", move_gaussians(load_ply(source_ply), training_from_source))
-    existing, origin = import_gaussians(tmp_path / "splat.ply", turned_scene, **files)
+    poses = None if how == "colmap" else transforms
+    existing, origin = import_gaussians(tmp_path / "splat.ply", turned_scene, dataparser, poses)
     direct, _ = import_gaussians(source_ply, turned_scene)
     np.testing.assert_allclose(existing.means, direct.means, atol=1e-5)
     assert mean_psnr(turned_scene, existing) == pytest.approx(mean_psnr(turned_scene, direct), abs=0.01)
