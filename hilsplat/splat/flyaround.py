@@ -117,33 +117,26 @@ def write_flyaround(
     folder: Path,
     cameras: list[Camera],
     picture: Callable[[Camera], UInt8[np.ndarray, "H W 3"]],
-    threads: int = 1,
+    threads: int,
 ) -> None:
     """Write `flyaround.mp4` and a contact sheet of every tenth frame, `flyaround.png`.
 
     Frames are rendered while earlier ones are encoded; the bytes do not depend on the number of threads.
     """
-    shown: list[UInt8[np.ndarray, "H W 3"]] = []
-    path = closed_path(cameras, FRAMES)
-
-    def frames() -> Iterator[UInt8[np.ndarray, "H W 3"]]:
-        rendered = in_order(picture, path, threads) if threads > 1 else map(picture, path)
-        for number, frame in enumerate(rendered):
-            if number % (FRAMES // SHEET_FRAMES) == 0:
-                shown.append(frame)
-            yield frame
-
-    for _ in encoded_film(folder / "flyaround.mp4", frames(), FRAMES_PER_S):
-        pass
+    rendered = in_order(picture, closed_path(cameras, FRAMES), threads)
+    film = encoded_film(folder / "flyaround.mp4", rendered, FRAMES_PER_S)
+    shown = [frame for number, frame in enumerate(film) if number % (FRAMES // SHEET_FRAMES) == 0]
     write_png(folder / "flyaround.png", contact_sheet(shown, columns=4))
 
 
-def encoded_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_second: int) -> Iterator[None]:
-    """Encode one or more frames of the same size as MP4.
+def encoded_film(
+    path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_second: int
+) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+    """Encode one or more frames of the same size as MP4, and yield each frame once it is encoded.
 
     With a given PyAV version, identical frames produce identical bytes. An odd last row or column is cropped,
-    because yuv420p needs even sides. Frames are consumed one by one, with a yield after each, to save memory.
-    The file is complete when the iterator ends, so `path` must be temporary or from an atomic writer.
+    because yuv420p needs even sides. Frames are consumed one by one to save memory. The file is complete when
+    the iterator ends, so `path` must be temporary or from an atomic writer.
     """
     frames = iter(frames)
     first = next(frames)
@@ -157,7 +150,7 @@ def encoded_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_s
             # the encoder's own conversion is not always byte-identical
             picture = av.VideoFrame.from_ndarray(even, format="rgb24").reformat(format="yuv420p")
             film.mux(stream.encode(picture))
-            yield
+            yield frame
         film.mux(stream.encode())
 
 

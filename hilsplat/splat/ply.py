@@ -8,7 +8,7 @@ from plyfile import PlyData, PlyElement, PlyParseError
 
 from hilsplat.base.artifacts import atomic_path, remake
 from hilsplat.base.errors import ArtifactError
-from hilsplat.splat.gaussians import FIELDS, Gaussians
+from hilsplat.splat.gaussians import Gaussians
 
 HEADER_BYTES = 2**14
 """Number of bytes that are searched for the vertex count."""
@@ -82,7 +82,8 @@ def load_ply(path: Path, fix: str = "") -> Gaussians:
         raise ArtifactError(f"{path} is a compressed PLY", expected="a plain 3DGS PLY", fix=fix)
     num_rest = sum(name.startswith("f_rest_") for name in found)
     num_bases = num_rest // 3 + 1
-    missing = [name for name in _names(num_bases) if name not in found and name not in ("nx", "ny", "nz")]
+    names = [name for name in _names(num_bases) if name not in ("nx", "ny", "nz")]
+    missing = [name for name in names if name not in found]
     if missing or num_rest not in (0, 9, 24, 45):
         raise ArtifactError(
             f"{path} is not a 3DGS PLY",
@@ -91,27 +92,14 @@ def load_ply(path: Path, fix: str = "") -> Gaussians:
             fix=fix,
         )
 
-    def columns(*names: str) -> np.ndarray:
-        values = [np.asarray(vertex[name], dtype=np.float32) for name in names]
-        return np.stack(values, axis=1) if values else np.zeros((vertex.count, 0), np.float32)
-
-    dc = columns(*(f"f_dc_{k}" for k in range(3)))[:, None]
-    rest = columns(*(f"f_rest_{k}" for k in range(num_rest)))
-    rest = rest.reshape(len(dc), 3, num_bases - 1).transpose(0, 2, 1)
-    gaussians = Gaussians(
-        means=columns("x", "y", "z"),
-        log_scales=columns(*(f"scale_{k}" for k in range(3))),
-        quats=columns(*(f"rot_{k}" for k in range(4))),
-        opacity_logits=columns("opacity")[:, 0],
-        sh=np.ascontiguousarray(np.concatenate([dc, rest], axis=1)),
-    )
-    finite = np.ones(len(gaussians), np.bool_)
-    for name in FIELDS:
-        values = np.isfinite(getattr(gaussians, name))
-        finite &= values.all(axis=tuple(range(1, values.ndim)))
+    values = np.stack([np.asarray(vertex[name], dtype=np.float32) for name in names], axis=1)
+    finite = np.isfinite(values).all(axis=1)
     if not finite.all():
         raise ArtifactError(
-            f"{path}: {int((~finite).sum())} of {len(gaussians)} Gaussians contain a non-finite number",
+            f"{path}: {int((~finite).sum())} of {len(values)} Gaussians contain a non-finite number",
             fix=fix,
         )
-    return gaussians
+    means, dc, rest, opacity, scales, quats = np.split(values, np.cumsum([3, 3, num_rest, 1, 3]), axis=1)
+    rest = rest.reshape(len(values), 3, num_bases - 1).transpose(0, 2, 1)
+    sh = np.concatenate([dc[:, None], rest], axis=1)
+    return Gaussians(*(np.ascontiguousarray(each) for each in (means, scales, quats, opacity[:, 0], sh)))

@@ -18,10 +18,14 @@ from hilsplat.splat.flyaround import (
 from tests.unit.splat.three_gaussians_world import ring
 
 
+def circle(number: int) -> list[Camera]:
+    cameras = ring(number, 48)
+    return [cameras[name] for name in cameras.names]
+
+
 def test_the_closed_path_circles_a_ring_once_in_any_order():
-    cameras = ring(24, 48)
-    order = np.random.default_rng(3).permutation(24)
-    path = closed_path([cameras[cameras.names[row]] for row in order], 60)
+    cameras = circle(24)
+    path = closed_path([cameras[row] for row in np.random.default_rng(3).permutation(24)], 60)
     centres = np.stack([camera.centre for camera in path])
     radius = np.linalg.norm(centres[:, :2], axis=1)
     assert 2.85 < radius.min() <= radius.max() < 3.0  # smoothing cuts the corners a little
@@ -40,8 +44,7 @@ def test_the_closed_path_circles_a_ring_once_in_any_order():
 
 
 def test_an_open_path_goes_through_its_cameras_in_their_order():
-    cameras = ring(8, 48)
-    stops = [cameras[name] for name in cameras.names[:4]]
+    stops = circle(8)[:4]
     path = open_path(stops, 31)
     centres = np.stack([camera.centre for camera in path])
     for stop, frame in zip(stops, (0, 10, 20, 30), strict=True):
@@ -55,27 +58,22 @@ def test_an_open_path_goes_through_its_cameras_in_their_order():
 
 
 def test_camera_shake_is_smoothed():
-    steady = ring(40, 48)
-    generator = np.random.default_rng(0)
-    shaky = []
-    for name in steady.names:
-        pose = steady[name].cam_from_world.copy()
-        pose[:3, 3] += generator.normal(0, 0.1, 3)
-        shaky.append(Camera(name, pose, steady[name].K, (48, 48)))
+    shaky = circle(40)
+    shake = np.random.default_rng(0).normal(0, 0.1, (40, 3))
+    for camera, by in zip(shaky, shake, strict=True):
+        camera.cam_from_world[:3, 3] += by
 
-    def jerk(centres: np.ndarray) -> float:
-        return float(np.abs(np.diff(centres, 2, axis=0)).max())
+    def jerk(cameras: list[Camera]) -> float:
+        return np.abs(np.diff([camera.centre for camera in cameras], 2, axis=0)).max()
 
-    walked = np.stack([camera.centre for camera in closed_path(shaky, 40)])
-    assert jerk(walked) < 0.4 * jerk(np.stack([camera.centre for camera in shaky]))
+    assert jerk(closed_path(shaky, 40)) < 0.4 * jerk(shaky)
 
 
 def test_one_camera_is_repeated_and_opposite_cameras_do_not_break_the_path():
-    camera = ring(1, 48)["000.png"]
+    [camera] = circle(1)
     for stop in closed_path([camera], 5) + open_path([camera, camera], 3):
         np.testing.assert_allclose(stop.cam_from_world, camera.cam_from_world, atol=1e-9)
-    cameras = ring(2, 48)
-    for camera in closed_path([cameras[name] for name in cameras.names], 16):
+    for camera in closed_path(circle(2), 16):
         assert np.isfinite(camera.cam_from_world).all()
 
 
@@ -85,9 +83,8 @@ def flat_picture(camera: Camera) -> np.ndarray:
 
 
 def test_the_film_shows_every_frame_and_the_sheet_every_tenth(tmp_path):
-    cameras = ring(12, 48)
-    path = [cameras[name] for name in cameras.names]
-    write_flyaround(tmp_path, path, flat_picture)
+    path = circle(12)
+    write_flyaround(tmp_path, path, flat_picture, threads=1)
     with av.open(tmp_path / "flyaround.mp4") as film:
         shown = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
         assert film.streams.video[0].average_rate == flyaround.FRAMES_PER_S
