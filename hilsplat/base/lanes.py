@@ -9,6 +9,7 @@ Operations, for use inside `numba.njit` functions: `+ - * /` between lanes or wi
 below. The order of sums is fixed.
 """
 
+import functools
 import operator
 from typing import Any, no_type_check
 
@@ -84,8 +85,8 @@ _binary(operator.mul, lambda builder: builder.fmul)
 _binary(operator.truediv, lambda builder: builder.fdiv)
 
 
-def _constant(value: float) -> ir.Constant:
-    return ir.Constant(_VECTOR, [ir.Constant(_FLOAT, value)] * WIDTH)
+def _constant(value: float | int, kind: ir.VectorType = _VECTOR) -> ir.Constant:
+    return ir.Constant(kind, [ir.Constant(kind.element, value)] * WIDTH)
 
 
 def splat(builder: ir.IRBuilder, scalar: ir.Value, count: int = WIDTH) -> ir.Value:
@@ -120,14 +121,23 @@ def aligned(count):
     return room[skip : skip + count]
 
 
-@intrinsic
-def lanes(typingctx, scalar):
+def _operation(result: types.Type, *kinds: types.Type) -> Any:
+    """Make an intrinsic for operands of these types from a function of the IR builder and their values."""
+
+    def decorate(emit: Any) -> Any:
+        @functools.wraps(emit)
+        def typed(typingctx, *operands):
+            return result(*kinds), lambda context, builder, sig, args: emit(builder, *args)
+
+        return intrinsic(typed)
+
+    return decorate
+
+
+@_operation(LANES, types.float32)
+def lanes(builder, scalar):
     """Return lanes that all contain the same float32 number."""
-
-    def codegen(context, builder, sig, args):
-        return splat(builder, args[0])
-
-    return LANES(types.float32), codegen
+    return splat(builder, scalar)
 
 
 @intrinsic
@@ -169,42 +179,34 @@ def store(typingctx, array, index, value):
     return types.void(array, types.intp, value), codegen
 
 
-@intrinsic
-def wide(typingctx, value):
+@_operation(WIDE, LANES)
+def wide(builder, value):
     """Convert the lanes to float64."""
-    return WIDE(LANES), lambda context, builder, sig, args: builder.fpext(args[0], WIDE.vector)
+    return builder.fpext(value, WIDE.vector)
 
 
-@intrinsic
-def narrow(typingctx, value):
+@_operation(LANES, WIDE)
+def narrow(builder, value):
     """Round the lanes to float32."""
-    return LANES(WIDE), lambda context, builder, sig, args: builder.fptrunc(args[0], LANES.vector)
+    return builder.fptrunc(value, LANES.vector)
 
 
-@intrinsic
-def exp2_negative(typingctx, value):
+@_operation(LANES, LANES)
+def exp2_negative(builder, value):
     """Compute 2**x for x in [-126, 0], with a relative error below 3e-7.
 
     Truncation gives x = k + f with f in (-1, 0]; a degree-6 polynomial approximates 2**f, and k is added to
     the exponent bits. Lanes outside the range get an arbitrary, possibly infinite number and no trap.
     """
-
-    def codegen(context, builder, sig, args):
-        whole = builder.fptosi(args[0], _INTS)
-        rest = builder.fsub(args[0], builder.sitofp(whole, _VECTOR))
-        # Chebyshev fit of 2**f over [-1, 0], degree 6
-        result = _constant(_EXP2[-1])
-        for coefficient in reversed(_EXP2[:-1]):
-            result = builder.fadd(
-                builder.fmul(result, rest, flags=_FLAGS), _constant(coefficient), flags=_FLAGS
-            )
-        bits = builder.shl(
-            builder.add(whole, ir.Constant(_INTS, [ir.Constant(_INT, 127)] * WIDTH)),
-            ir.Constant(_INTS, [ir.Constant(_INT, 23)] * WIDTH),
-        )
-        return builder.fmul(result, builder.bitcast(bits, _VECTOR))
-
-    return LANES(LANES), codegen
+    whole = builder.fptosi(value, _INTS)
+    rest = builder.fsub(value, builder.sitofp(whole, _VECTOR))
+    # Chebyshev fit of 2**f over [-1, 0], degree 6
+    result = _constant(_EXP2[-1])
+    for coefficient in reversed(_EXP2[:-1]):
+        product = builder.fmul(result, rest, flags=_FLAGS)
+        result = builder.fadd(product, _constant(coefficient), flags=_FLAGS)
+    bits = builder.shl(builder.add(whole, _constant(127, _INTS)), _constant(23, _INTS))
+    return builder.fmul(result, builder.bitcast(bits, _VECTOR))
 
 
 def _fit_exp2() -> tuple[float, ...]:
@@ -241,39 +243,32 @@ def _pick(condition: str, doc: str) -> Any:
         if not (isinstance(left, LanesType) and left == right):
             return None
 
-        def codegen(context, builder, sig, args):
-            return builder.select(builder.fcmp_ordered(condition, args[0], args[1]), args[0], args[1])
-
-        return left(left, right), codegen
+        return left(left, right), lambda context, builder, sig, args: _chosen(builder, condition, *args)
 
     pick.__doc__ = doc
     return intrinsic(pick)
+
+
+def _chosen(builder: ir.IRBuilder, condition: str, left: ir.Value, right: ir.Value) -> ir.Value:
+    return builder.select(builder.fcmp_ordered(condition, left, right), left, right)
 
 
 smaller = _pick("<", "Lane-wise minimum.")
 larger = _pick(">", "Lane-wise maximum.")
 
 
-@intrinsic
-def any_ge(typingctx, left, right):
+@_operation(types.boolean, LANES, LANES)
+def any_ge(builder, left, right):
     """Return whether left >= right in any lane."""
-
-    def codegen(context, builder, sig, args):
-        mask = builder.bitcast(builder.fcmp_ordered(">=", args[0], args[1]), ir.IntType(WIDTH))
-        return builder.icmp_unsigned("!=", mask, ir.Constant(ir.IntType(WIDTH), 0))
-
-    return types.boolean(LANES, LANES), codegen
+    mask = builder.bitcast(builder.fcmp_ordered(">=", left, right), ir.IntType(WIDTH))
+    return builder.icmp_unsigned("!=", mask, ir.Constant(ir.IntType(WIDTH), 0))
 
 
-@intrinsic
-def bits_ge(typingctx, left, right):
+@_operation(types.int64, LANES, LANES)
+def bits_ge(builder, left, right):
     """Return a bit mask in which bit k is 0 if left < right in lane k, else 1 (also if either is NaN)."""
-
-    def codegen(context, builder, sig, args):
-        mask = builder.bitcast(builder.fcmp_unordered(">=", args[0], args[1]), ir.IntType(WIDTH))
-        return builder.zext(mask, ir.IntType(64))
-
-    return types.int64(LANES, LANES), codegen
+    mask = builder.bitcast(builder.fcmp_unordered(">=", left, right), ir.IntType(WIDTH))
+    return builder.zext(mask, ir.IntType(64))
 
 
 @intrinsic
@@ -309,14 +304,10 @@ def column_bits(typingctx, words, index, bit):
     return types.int64(words, types.intp, types.intp), codegen
 
 
-@intrinsic
-def first_bit(typingctx, bits):
+@_operation(types.int64, types.int64)
+def first_bit(builder, bits):
     """Return the index of the lowest set bit; `bits` must not be 0."""
-
-    def codegen(context, builder, sig, args):
-        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
-
-    return types.int64(types.int64), codegen
+    return builder.cttz(bits, ir.Constant(ir.IntType(1), 1))
 
 
 @intrinsic
@@ -382,24 +373,16 @@ def _halved(builder: ir.IRBuilder, vector: ir.Value, combine: Any) -> ir.Value:
     return builder.extract_element(vector, ir.Constant(_INT, 0))
 
 
-@intrinsic
-def lane_sum(typingctx, value):
+@_operation(types.float32, LANES)
+def lane_sum(builder, value):
     """Return the sum of the lanes."""
-    return types.float32(LANES), lambda context, builder, sig, args: _halved(builder, args[0], builder.fadd)
+    return _halved(builder, value, builder.fadd)
 
 
-@intrinsic
-def lane_max(typingctx, value):
+@_operation(types.float32, LANES)
+def lane_max(builder, value):
     """Return the largest lane."""
-
-    def codegen(context, builder, sig, args):
-        return _halved(
-            builder,
-            args[0],
-            lambda low, high: builder.select(builder.fcmp_ordered(">", low, high), low, high),
-        )
-
-    return types.float32(LANES), codegen
+    return _halved(builder, value, lambda low, high: _chosen(builder, ">", low, high))
 
 
 @intrinsic
@@ -430,24 +413,19 @@ def transpose(typingctx, source, source_index, source_step, target, target_index
     return types.void(source, types.intp, types.intp, target, types.intp, types.intp), codegen
 
 
-@intrinsic
-def reciprocal(typingctx, value):
+@_operation(LANES, LANES)
+def reciprocal(builder, value):
     """Compute 1 / x in every lane, for positive normal numbers, with a relative error below 3e-7.
 
     Negating the exponent bits gives a first guess within 12 %, and each of three Newton steps squares the
     error. A division of 16 numbers would take as long as 30 such instructions.
     """
-
-    def codegen(context, builder, sig, args):
-        bits = builder.bitcast(args[0], _INTS)
-        start = builder.sub(ir.Constant(_INTS, [ir.Constant(_INT, _RECIPROCAL_BITS)] * WIDTH), bits)
-        result = builder.bitcast(start, _VECTOR)
-        for _ in range(3):
-            error = builder.fsub(_constant(2.0), builder.fmul(args[0], result, flags=_FLAGS), flags=_FLAGS)
-            result = builder.fmul(result, error)
-        return result
-
-    return LANES(LANES), codegen
+    start = builder.sub(_constant(_RECIPROCAL_BITS, _INTS), builder.bitcast(value, _INTS))
+    result = builder.bitcast(start, _VECTOR)
+    for _ in range(3):
+        error = builder.fsub(_constant(2.0), builder.fmul(value, result, flags=_FLAGS), flags=_FLAGS)
+        result = builder.fmul(result, error)
+    return result
 
 
 @intrinsic
