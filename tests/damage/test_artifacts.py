@@ -143,10 +143,6 @@ def damaged(arrays: dict[str, np.ndarray], damage: tuple[str, str, int, int]) ->
     return {**arrays, name: array}
 
 
-def same(found, whole) -> bool:
-    return all(np.array_equal(getattr(found, name), getattr(whole, name)) for name in vars(whole))
-
-
 def read_damaged(kind: type, path: Path, arrays: dict[str, np.ndarray], damage: tuple) -> Any:
     """Read damaged arrays; return None if they are refused by an error that names the file."""
     write_npz(path, **damaged(arrays, damage))
@@ -168,7 +164,7 @@ def test_damaged_masks(damage, tmp_path):
     if (name, kind) == ("level", "value"):
         assert set(found.level.tolist()) <= {1, 2, 3}
         return
-    assert same(found, whole), damage
+    assert equal(found, whole), damage
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -182,7 +178,7 @@ def test_damaged_cameras(damage, tmp_path):
     if damage[1] == "value":  # other numbers are accepted if they are valid for a camera
         assert np.isfinite(found.cam_from_world).all() and (found.size_hw > 0).all()
         return
-    assert same(found, whole), damage
+    assert equal(found, whole), damage
 
 
 @pytest.mark.parametrize(

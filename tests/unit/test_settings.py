@@ -5,26 +5,25 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from jsonschema import Draft202012Validator
-from snakemake.utils import update_config
 
 from hilsplat.base.errors import SettingsError
-from hilsplat.configuration import SECTIONS, config_schema, knob_table, parse_run, parse_section, read_config
+from hilsplat.configuration import (
+    SECTIONS,
+    config_schema,
+    knob_table,
+    merged_config,
+    parse_run,
+    parse_section,
+    read_config,
+)
 from hilsplat.methods.registry import METHODS, OURS
 from hilsplat.settings import MethodSettings
 
 
-def load(project: Path, name: str) -> dict:
-    """Merge a configuration file into config.yaml, as `snakemake --configfile` does."""
-    config = yaml.safe_load((project / "config" / "config.yaml").read_text())
-    update_config(config, yaml.safe_load((project / "config" / name).read_text()))
-    return config
-
-
 @pytest.mark.parametrize("name", ["config.yaml", "paper.yaml", "ci.yaml", "comparison.yaml"])
 def test_shipped_configurations_are_valid(project: Path, name: str) -> None:
-    parse_run(load(project, name))
+    parse_run(merged_config([project / "config" / name]))
 
 
 @pytest.mark.parametrize(
@@ -124,7 +123,7 @@ def test_the_schema_for_editors_accepts_the_shipped_configuration_and_refuses_a_
     project: Path,
 ) -> None:
     validator = Draft202012Validator(json.loads(json.dumps(config_schema())))
-    config = yaml.safe_load((project / "config" / "config.yaml").read_text())
+    config = read_config(project / "config/config.yaml")
     validator.validate(config)
     config["coverage_tree"]["thetaa"] = 0.9
     (error,) = validator.iter_errors(config)
@@ -132,7 +131,7 @@ def test_the_schema_for_editors_accepts_the_shipped_configuration_and_refuses_a_
 
 
 def test_the_paper_configuration_holds_the_papers_numbers(project: Path) -> None:
-    stages = parse_run(load(project, "paper.yaml")).stages("paper")
+    stages = parse_run(merged_config([project / "config/paper.yaml"])).stages("paper")
     assert stages.gaussians.iterations == 30_000
     assert stages.masks.points_per_side == 32
     assert (stages.coverage_tree.theta, stages.field.omega) == (0.9, 10)

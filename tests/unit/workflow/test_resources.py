@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from hilsplat.configuration import RunSettings
 from hilsplat.splat.ply import vertex_count
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.resources import COSTS, RUNNER_MB, JobResources, Size
@@ -120,22 +119,3 @@ def test_memory_grows_with_the_model_and_with_views_at_once(tmp_path):
     for without in ({"segmenter": "graph", "model": str(folder)}, {"model": str(tmp_path / "nowhere")}):
         small = JobResources(plan(tmp_path, masks=without))
         assert small.memory_mb("masks")(JOB, 32, 1) < 1000 + RUNNER_MB
-
-
-def test_settings_are_resolved_as_often_for_many_scenes_as_for_few(tmp_path, monkeypatch):
-    """Every job of every scene uses the plan, so work per job would be slow with a thousand scenes."""
-    resolved, stages = [], RunSettings.stages
-    monkeypatch.setattr(
-        RunSettings, "stages", lambda *which, **more: resolved.append(which) or stages(*which, **more)
-    )
-    numbers = []
-    for scenes in (2, 40):
-        resolved.clear()
-        chosen = plan(tmp_path, scenes)
-        resources = JobResources(chosen)
-        for scene in range(scenes):
-            job = Job(scene=str(scene), variant="theta")
-            chosen.settings("field")(job), chosen.shared("masks", "masks")(job)
-            resources.memory_mb("field")(job, resources.threads(job), 1)
-        numbers.append(len(resolved))
-    assert numbers[0] == numbers[1] > 0
