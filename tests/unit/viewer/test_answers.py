@@ -26,9 +26,9 @@ from hilsplat.query.names import FILE
 from hilsplat.splat.ply import load_ply
 from hilsplat.viewer import exports
 from hilsplat.viewer.exports import encoded_gif
+from hilsplat.viewer.frames import painted
 from hilsplat.viewer.saved_files import SavedFiles
 from hilsplat.viewer.viewer_scene import ViewerScene
-from hilsplat.web.coco import coco_counts
 from hilsplat.web.scene_thread import SceneThread
 from tests.unit.finished_desk import SCENE
 from tests.unit.splat.spz_reader import decoded
@@ -178,37 +178,26 @@ def test_answers_to_several_queries_are_saved_with_their_labels(client, scene, t
     boxes = client.post("/api/export/boxes", json=sent).json()["boxes"]
     found = [(box["group"], box["node"]) for box in boxes]
     assert found == [("mug > hëndle", handle.node), ("mug", mug.node)]
-    _, data = in_steps(client, "masks", groups=[*groups, {"name": "cup", "nodes": [mug.node]}])
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        coco = json.loads(archive.read("coco.json"))
-    assert [each["name"] for each in coco["categories"]] == ["mug > hëndle", "mug", "cup"]
-    first = [(each["category_id"], each["node"]) for each in coco["annotations"] if each["image_id"] == 0]
-    assert sorted(first) == [(1, handle.node), (2, mug.node), (3, mug.node)]
-    assert len({each["id"] for each in coco["annotations"]}) == len(coco["annotations"])
 
 
-def test_saved_masks_are_those_of_the_hits_in_every_view(client, scene):
-    (hit,) = scene.query("mug > handle")
-    progress, data = in_steps(client, "masks", groups=[{"name": "handle", "nodes": [hit.node]}])
+def test_saved_masks_are_those_of_the_hits_in_every_view_and_of_every_group(client, scene):
+    (mug,), (handle,) = scene.query("mug", "whole"), scene.query("mug > handle")
+    named = (("handle", handle), ("mug", mug), ("cup", mug))
+    groups = [{"name": name, "nodes": [hit.node]} for name, hit in named]
+    progress, data = in_steps(client, "masks", groups=groups)
     assert progress == [(made, len(scene.views)) for made in range(len(scene.views) + 1)]
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         coco = json.loads(archive.read("coco.json"))
         assert [image["file_name"] for image in coco["images"]] == list(scene.views)
-        assert len(coco["annotations"]) == len(scene.views)
-        for number, view in enumerate(scene.views):
-            expected = hit.mask(view)
-            png = Image.open(io.BytesIO(archive.read(f"masks/{Path(view).stem}/{hit.node}.png")))
-            np.testing.assert_array_equal(np.asarray(png.convert("L")) > 0, expected)
-            (entry,) = [each for each in coco["annotations"] if each["image_id"] == number]
+        assert [each["name"] for each in coco["categories"]] == ["handle", "mug", "cup"]
+        assert [each["id"] for each in coco["annotations"]] == list(range(1, 1 + 3 * len(scene.views)))
+        for entry in coco["annotations"]:
+            view, (_, hit) = scene.views[entry["image_id"]], named[entry["category_id"] - 1]
+            png = Image.open(io.BytesIO(archive.read(f"masks/{Path(view).stem}/{entry['node']}.png")))
+            np.testing.assert_array_equal(np.asarray(png.convert("L")) > 0, hit.mask(view))
             runs = coco_masks.frPyObjects(entry["segmentation"], *entry["segmentation"]["size"])
-            np.testing.assert_array_equal(coco_masks.decode(runs).astype(bool), expected)
-            assert entry["area"] == expected.sum() and entry["bbox"] == coco_masks.toBbox(runs).tolist()
-
-
-@pytest.mark.parametrize("mask", [np.eye(3) > 0, np.ones((2, 3)) > 0, np.zeros((2, 3)) > 0])
-def test_coco_runs_begin_with_zeros(mask):
-    runs = coco_masks.frPyObjects({"size": list(mask.shape), "counts": coco_counts(mask)}, *mask.shape)
-    np.testing.assert_array_equal(coco_masks.decode(runs).astype(bool), mask)
+            np.testing.assert_array_equal(coco_masks.decode(runs).astype(bool), hit.mask(view))
+            assert entry["area"] == hit.mask(view).sum() and entry["bbox"] == coco_masks.toBbox(runs).tolist()
 
 
 def test_queries_run_between_the_steps_of_a_file(shown):
@@ -239,23 +228,14 @@ def frames_of(film: bytes) -> list[np.ndarray]:
         return [frame.to_ndarray(format="rgb24").astype(float) for frame in opened.decode(video=0)]
 
 
-def test_a_film_follows_a_path(client, camera):
+def test_a_film_follows_a_path(client, shown, camera):
     views = [wire_camera(camera), {**wire_camera(camera), "cam_from_world": np.eye(4).tolist()}]
     progress, data = in_steps(client, "film", frames=5, side_px=64, path=views)
     frames = frames_of(data)
     assert progress == [(made, 5) for made in range(6)] and len(frames) == 5
     assert frames[0].shape == (36, 64, 3) and frames[0].std() > 20
-    still = encoded_frame(client, views[0], frames[0].shape[:2])
+    still = painted(shown.gaussians, camera.scaled((36, 64))).astype(float)
     assert np.abs(frames[0] - still).mean() < 8 < np.abs(frames[-1] - still).mean()
-
-
-def encoded_frame(client, camera, size_hw) -> np.ndarray:
-    """The same view as a picture, at the film's size."""
-    height, width = size_hw
-    scale = np.diag([width / camera["size_hw"][1], height / camera["size_hw"][0], 1.0])
-    small = {**camera, "K": (scale @ np.array(camera["K"])).tolist(), "size_hw": [height, width]}
-    data = client.post("/api/frame", json={"camera": small, "image": "png"}).content
-    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(float)
 
 
 def test_a_gif_around_the_scene_has_every_other_frame_in_the_requested_size(client):
