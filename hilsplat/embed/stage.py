@@ -24,7 +24,6 @@ from hilsplat.base.identity import code_digest
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel, unit
-from hilsplat.models.folder import open_model_folder
 from hilsplat.models.int8 import (
     CHECKED_CROPS,
     WORDS,
@@ -81,7 +80,7 @@ def run_clip(
     if semantic_tree_folder is not None:
         require_same_masks(semantic_tree_folder, masks_folder)
         chosen = chosen_masks(semantic_tree_folder, settings.crops_per_node)
-    model = ClipModel(open_model_folder(Path(settings.model), "clip", variant=settings.variant))
+    model = ClipModel.load(Path(settings.model), settings.variant)
     _choose_precision(model, scene, masks_folder, digests, chosen, cache, settings, threads)
     threads = needs_of(model.model, settings.batch).views_at_once(threads, memory_mib)
     view_cache = ViewCache(cache / "clip")

@@ -3,7 +3,6 @@
 PyTorch weights are exported to ONNX networks by optimum, in a separate process (install the extra `export`).
 """
 
-import importlib.util
 import logging
 import os
 import shutil
@@ -61,8 +60,8 @@ SPARE_BYTES = 200_000_000
 """Disk space that must remain free after a transfer."""
 EXPORT_FACTOR = 4
 """Disk space for an export, as a multiple of the weights' size: weights, complete network, and its halves."""
-NEEDED = ("optimum.exporters.onnx", "transformers", "PIL", "torch")
-"""Modules that an export requires. Without Pillow, optimum silently writes no preprocessor_config.json."""
+NEEDED = ("optimum-onnx", "transformers", "torch")
+"""Packages that an export requires."""
 INSTALL = "pip install --constraint constraints.txt --editable '.[export]'"
 LAST_LINES = 15  # number of lines of the exporter's output shown in an error
 
@@ -328,20 +327,13 @@ def _innermost(error: BaseException) -> str:
 
 def require_exporter(what: str) -> None:
     """Raise a ModelError before anything is downloaded if the exporter's packages are not installed."""
-    if missing := [name for name in NEEDED if not _is_installed(name)]:
+    if missing := [name for name in NEEDED if not any(metadata.distributions(name=name))]:
         raise ModelError(
             f"{what} has no ONNX networks, and the packages that export them are not installed",
-            expected="the extra export: optimum-onnx, transformers, torch, pillow",
+            expected=f"the extra export: {', '.join(NEEDED)}",
             found=f"no {', '.join(missing)}",
             fix=f"{INSTALL}, then run the command again",
         )
-
-
-def _is_installed(module: str) -> bool:
-    try:
-        return importlib.util.find_spec(module) is not None
-    except ModuleNotFoundError:  # the parent package is missing
-        return False
 
 
 def export_networks(weights: Path, out: Path) -> dict[str, str]:
@@ -362,4 +354,4 @@ def export_networks(weights: Path, out: Path) -> dict[str, str]:
             found="\n            ".join(lines) or "no output",
             fix=f"install the tested versions ({INSTALL}), then run the command again",
         )
-    return {name: metadata.version(name) for name in ("optimum-onnx", "transformers", "torch")}
+    return {name: metadata.version(name) for name in NEEDED}

@@ -4,11 +4,10 @@
 vectors depend only on the image and the text vectors only on the text, so each half is a subgraph.
 """
 
+import copy
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.errors import ModelError
@@ -24,8 +23,8 @@ OPTIONAL = {"attention_mask"}
 """Inputs that a network may lack; SigLIP's text network reads the padding instead."""
 
 
-def keep_only(model: Any, outputs: Sequence[str]) -> None:
-    """Reduce a model to the nodes that compute the given values, and make these values its outputs."""
+def reduced(model: Any, outputs: Sequence[str]) -> bytes:
+    """Reduce a model to the nodes that compute the given values, its new outputs, and return its bytes."""
     import onnx
 
     graph = model.graph
@@ -35,13 +34,16 @@ def keep_only(model: Any, outputs: Sequence[str]) -> None:
         "initializer": [each for each in graph.initializer if each.name in needed],
         "input": [each for each in graph.input if each.name in needed],
     }
-    if list(outputs) != [each.name for each in graph.output]:
-        unknown = onnx.TensorProto.FLOAT, None
-        kept["output"] = [onnx.helper.make_tensor_value_info(name, *unknown) for name in outputs]
+    known = {each.name: each for each in graph.output}
+    unknown = onnx.TensorProto.FLOAT, None
+    kept["output"] = [
+        known.get(name) or onnx.helper.make_tensor_value_info(name, *unknown) for name in outputs
+    ]
     for field, values in kept.items():
         target = getattr(graph, field)
         del target[:]
         target.extend(values)
+    return bytes(model.SerializeToString())
 
 
 def needed_names(graph: Any, outputs: Sequence[str]) -> set[str]:
@@ -95,13 +97,12 @@ def with_rowwise_attention(path: Path, layers: Iterable[int], heads: int, side: 
             return None
         (queries, keys), positions = sums
         values, output = readers[0].input[1], readers[0].output[0]
-        nodes = _row_loop(f"rowwise.{layer}", queries, keys, values, positions, output, heads, side)
+        nodes = _row_loop(f"rowwise_{layer}_", queries, keys, values, positions, output, heads, side)
         place = list(graph.node).index(readers[0])
         graph.node.remove(readers[0])
         for offset, node in enumerate(nodes):
             graph.node.insert(place + offset, node)
-    keep_only(model, [each.name for each in graph.output])
-    return bytes(model.SerializeToString())
+    return reduced(model, [each.name for each in graph.output])
 
 
 def _scores(softmax: Any, makers: dict[str, Any]) -> tuple[list[str], list[str]] | None:
@@ -123,58 +124,37 @@ def _scores(softmax: Any, makers: dict[str, Any]) -> tuple[list[str], list[str]]
 
 
 def _row_loop(
-    name: str,
-    queries: str,
-    keys: str,
-    values: str,
-    positions: Sequence[str],
-    output: str,
-    heads: int,
-    side: int,
+    n: str, queries: str, keys: str, values: str, positions: Sequence[str], output: str, heads: int, side: int
 ) -> list[Any]:
-    """Return the nodes of attention in a loop over rows of queries; positions have rows on axis 1."""
-    from onnx import TensorProto, helper, numpy_helper
+    """Return the nodes of attention in a loop over rows of queries; positions have rows on axis 1.
 
-    def shape(of: str, *sides: int) -> Any:
-        value = numpy_helper.from_array(np.array(sides, np.int64))
-        return helper.make_node("Constant", [], [f"{name}.{of}"], value=value)
+    The names of values outside the loop begin with `n`.
+    """
+    from onnx.parser import parse_graph
 
-    def inside(of: str) -> Any:
-        return helper.make_tensor_value_info(f"{name}.{of}", TensorProto.FLOAT, None)
-
-    body = helper.make_graph(
-        [
-            helper.make_node("MatMul", [f"{name}.row", f"{name}.k"], [f"{name}.product"]),
-            helper.make_node("Add", [f"{name}.row_y", f"{name}.row_x"], [f"{name}.position"]),
-            shape("row_shape", heads, side, side * side),
-            helper.make_node("Reshape", [f"{name}.position", f"{name}.row_shape"], [f"{name}.bias"]),
-            helper.make_node("Add", [f"{name}.product", f"{name}.bias"], [f"{name}.score"]),
-            helper.make_node("Softmax", [f"{name}.score"], [f"{name}.weight"], axis=-1),
-            helper.make_node("MatMul", [f"{name}.weight", f"{name}.v"], [f"{name}.mean"]),
-        ],
-        f"{name}.body",
-        [inside("row"), inside("row_y"), inside("row_x")],
-        [inside("mean")],
-    )
-    return [
-        shape("q_shape", heads, side, side, -1),
-        shape("k_shape", heads, -1, side * side),
-        shape("v_shape", heads, side * side, -1),
-        helper.make_node("Reshape", [queries, f"{name}.q_shape"], [f"{name}.q"]),
-        helper.make_node("Reshape", [keys, f"{name}.k_shape"], [f"{name}.k"]),
-        helper.make_node("Reshape", [values, f"{name}.v_shape"], [f"{name}.v"]),
-        helper.make_node(
-            "Scan",
-            [f"{name}.q", *positions],
-            [f"{name}.rows"],
-            body=body,
-            num_scan_inputs=3,
-            scan_input_axes=[1, 1, 1],
-            scan_output_axes=[1],
-        ),
-        helper.make_node("Shape", [queries], [f"{name}.whole_shape"]),
-        helper.make_node("Reshape", [f"{name}.rows", f"{name}.whole_shape"], [output]),
-    ]
+    graph = f"""rowwise () => () {{
+        {n}q_shape = Constant <value = int64[4] {{{heads}, {side}, {side}, -1}}> ()
+        {n}k_shape = Constant <value = int64[3] {{{heads}, -1, {side * side}}}> ()
+        {n}v_shape = Constant <value = int64[3] {{{heads}, {side * side}, -1}}> ()
+        {n}q = Reshape ("{queries}", {n}q_shape)
+        {n}k = Reshape ("{keys}", {n}k_shape)
+        {n}v = Reshape ("{values}", {n}v_shape)
+        {n}rows = Scan <
+            body = of_row (float[] row, float[] row_y, float[] row_x) => (float[] mean) {{
+                product = MatMul (row, {n}k)
+                position = Add (row_y, row_x)
+                shape = Constant <value = int64[3] {{{heads}, {side}, {side * side}}}> ()
+                bias = Reshape (position, shape)
+                score = Add (product, bias)
+                weight = Softmax <axis = -1> (score)
+                mean = MatMul (weight, {n}v)
+            }},
+            num_scan_inputs = 3, scan_input_axes = [1, 1, 1], scan_output_axes = [1]
+        > ({n}q, "{positions[0]}", "{positions[1]}")
+        {n}whole_shape = Shape ("{queries}")
+        "{output}" = Reshape ({n}rows, {n}whole_shape)
+    }}"""
+    return list(parse_graph(graph).node)
 
 
 def whole_clip(folder: Path) -> Path | None:
@@ -192,7 +172,6 @@ def split_clip(folder: Path) -> list[Path]:
         ModelError: `model.onnx` is missing, cannot be read, or lacks an input or output.
     """
     import onnx
-    from onnx.utils import Extractor
 
     whole = whole_clip(folder)
     if whole is None:
@@ -214,13 +193,10 @@ def split_clip(folder: Path) -> list[Path]:
             found=f"{', '.join(sorted(inputs))} -> {', '.join(sorted(outputs))}",
             fix="export it with optimum's task feature-extraction",
         )
-    # Shapes inside the graph are not needed, and inferring them fails above 2 GiB.
-    extractor = Extractor(model)
     written = []
-    for name, (needed, output) in HALVES.items():
+    for name, (_, output) in HALVES.items():
         path = whole.with_name(f"{name}.onnx")
         with atomic_path(path) as temporary:
-            half = extractor.extract_model([input for input in needed if input in inputs], [output])
-            temporary.write_bytes(half.SerializeToString())
+            temporary.write_bytes(reduced(copy.deepcopy(model), [output]))
         written.append(path)
     return written

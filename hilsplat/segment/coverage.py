@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Int32, Int64, UInt8
 
 from hilsplat.base.artifacts import atomic_folder, read_index, write_index, write_npz
-from hilsplat.base.errors import EmptyMaskError
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.progress import stage_log, track
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks
@@ -28,15 +27,13 @@ def coverage_parents(
     coarser than its child's; the parent of a subpart may be a whole.
 
     Args:
-        overlap_px: number of pixels shared by each pair of masks; the diagonal contains the masks' areas.
+        overlap_px: number of pixels shared by each pair of masks; the diagonal contains the masks' areas,
+            which are positive.
         level: `Level` of each mask; None allows parents from any level, as printed in the paper.
         theta: coverage threshold, a share in (0, 1); the paper uses 0.9.
 
     Returns:
         Row of each mask's parent, or `NONE` if no mask covers it.
-
-    Raises:
-        EmptyMaskError: if a mask contains no pixels (its coverage is undefined).
 
     Example:
         >>> overlap_px = np.array([[4, 2], [2, 2]])  # the second mask is inside the first
@@ -44,9 +41,6 @@ def coverage_parents(
         array([-1,  0], dtype=int32)
     """
     area_px = np.diagonal(overlap_px)
-    if not area_px.all():
-        empty = f"masks {np.flatnonzero(area_px == 0).tolist()} of {len(area_px)} contain no pixels"
-        raise EmptyMaskError(empty, fix="drop empty masks before building the coverage tree")
     if not len(area_px):
         return np.zeros(0, dtype=np.int32)
     share = overlap_px / area_px[:, None]  # [a, b]: share of a inside b

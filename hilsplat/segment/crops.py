@@ -3,8 +3,6 @@
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from hilsplat.base.errors import EmptyMaskError
-
 DIM = 0.35  # brightness factor of pixels outside the mask for the background `dim`
 
 
@@ -15,14 +13,11 @@ def square_crop(
     context: float,
     size: int,
 ) -> UInt8[np.ndarray, "size size 3"]:
-    """Crop a mask's box with a margin, and make it square (`crop_to_square`).
+    """Crop the box of a non-empty mask with a margin, and make it square (`crop_to_square`).
 
     `context` is the margin on each side as a share of the box's longer side, clipped at the image's border.
-    Raises an EmptyMaskError for a mask without pixels.
     """
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if not len(rows):
-        raise EmptyMaskError("a mask without pixels cannot be cropped", fix="drop empty masks first")
     (y0, y1), (x0, x1) = ((int(found[0]), int(found[-1]) + 1) for found in (rows, columns))
     margin = round(context * max(y1 - y0, x1 - x0))
     window = np.s_[max(0, y0 - margin) : y1 + margin, max(0, x0 - margin) : x1 + margin]

@@ -1,5 +1,6 @@
 """Read the mask decoder of an ONNX export: weights by module, and subgraphs."""
 
+import copy
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +11,7 @@ from jaxtyping import Float32
 
 from hilsplat.base.errors import ModelError
 from hilsplat.base.lanes import WIDTH
-from hilsplat.models.onnx_graph import keep_only
+from hilsplat.models.onnx_graph import reduced
 from hilsplat.segment import decoder_kernels as kernels
 
 EPS = 1e-6
@@ -125,12 +126,8 @@ class DecoderGraph:
 
     def until(self, *modules: str) -> bytes:
         """Return the serialised subgraph whose outputs are the inputs of the given modules."""
-        import onnx
-
-        part = onnx.ModelProto()
-        part.CopyFrom(self.model)
-        keep_only(part, [self._node(f"{module}/MatMul").input[0] for module in modules])
-        return bytes(part.SerializeToString())
+        ends = [self._node(f"{module}/MatMul").input[0] for module in modules]
+        return reduced(copy.deepcopy(self.model), ends)
 
     def _find(self, ending: str) -> Any:
         matches = [node for name, node in self._nodes.items() if name.endswith(f"/{ending}")]

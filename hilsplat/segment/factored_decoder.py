@@ -81,22 +81,10 @@ SecondPrompts = namedtuple(
 """Prompt arrays that the kernels read at the second layer; names as in `FirstPrompts`."""
 
 
-class Upscaling(NamedTuple):
-    """Weights of the two upscalings and of the layer norm between them."""
-
-    norm_scale: np.ndarray
-    norm_shift: np.ndarray
-    fixed: np.ndarray
-    second: np.ndarray
-    bias: np.ndarray
-
-
-class MaskImage(NamedTuple):
-    """Image arrays for mask logits: the upscaled image embedding, and the finer features of SAM 2."""
-
-    scaled: np.ndarray
-    detail: np.ndarray
-    finest: np.ndarray
+Upscaling = namedtuple("Upscaling", "norm_scale norm_shift fixed second bias")
+"""Weights of the two upscalings and of the layer norm between them."""
+MaskImage = namedtuple("MaskImage", "scaled detail finest")
+"""Image arrays for mask logits: the upscaled image embedding, and the finer features of SAM 2."""
 
 
 class MaskPrompts(NamedTuple):

@@ -338,7 +338,7 @@ def test_weights_that_cannot_be_exported_show_the_exporter_s_last_lines(tmp_path
 
 def test_without_the_extra_nothing_is_fetched_and_the_error_gives_the_command(hub, clip_parts, monkeypatch):
     hub.repositories[REPOSITORY] = clip_parts[2].parent / "torch"
-    monkeypatch.setattr(get, "NEEDED", (*get.NEEDED, "no_such_exporter.onnx"))
-    with pytest.raises(ModelError, match=r"no no_such_exporter.onnx\n  fix +pip install .* '\.\[export\]'"):
+    monkeypatch.setattr(get, "NEEDED", (*get.NEEDED, "no-such-exporter"))
+    with pytest.raises(ModelError, match=r"no no-such-exporter\n  fix +pip install .* '\.\[export\]'"):
         get_models([EXPORTED])
     assert not hub.ranges("model.safetensors")

@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from hilsplat.base.errors import EmptyMaskError
 from hilsplat.base.levels import NONE
 from hilsplat.segment.coverage import coverage_parents, coverage_tree, depths, with_tree_levels
 from tests.unit.segment.handmade import pack
@@ -69,11 +68,6 @@ def test_parents_by_hand(texts, level, expected):
 )
 def test_both_shares_are_compared_with_theta(theta, expected):
     assert parents_of(rows(".#############", "##########...."), theta, [1, 2]) == expected
-
-
-def test_empty_mask_is_named():
-    with pytest.raises(EmptyMaskError, match=r"masks \[1\] of 2"):
-        parents_of(rows("##", ".."), 0.9, [1, 2])
 
 
 @given(nonempty_masks, st.floats(0.51, 0.99), st.data())

@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from hilsplat.base.errors import EmptyMaskError
 from hilsplat.segment.crops import crop_to_square, square_crop
 
 
@@ -32,11 +31,6 @@ def test_backgrounds_differ_outside_the_mask_only(background, outside):
     crop = square_crop(image, mask, background, 0.5, 4)
     assert crop[1, 1:3, 0].tolist() == [200, 200]
     assert crop[0, :, 0].tolist() == [outside] * 4
-
-
-def test_an_empty_mask_is_refused():
-    with pytest.raises(EmptyMaskError, match="without pixels"):
-        square_crop(np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4), bool), "black", 0.0, 2)
 
 
 def published(image: np.ndarray, mask: np.ndarray, size: int) -> np.ndarray:
