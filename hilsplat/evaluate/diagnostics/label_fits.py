@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool
 
-from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.progress import stage_log, track
 from hilsplat.base.tables import markdown_table, write_csv
 from hilsplat.contributions.compositing import normalised_weights
@@ -21,7 +21,7 @@ from hilsplat.evaluate.protocols.view_truth import truths_of
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.origin import masks_label
-from hilsplat.semantic_tree.tree import SemanticTree
+from hilsplat.semantic_tree.tree import SemanticTree, ViewNodes
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 
@@ -79,14 +79,9 @@ def nodes_of_view(tree: SemanticTree, weights: sp.csr_matrix) -> dict[Level, np.
     """Return the pixels in which each visible node has more than half of the weight, by level."""
     found = {}
     for level in LEVELS:
-        nodes = tree.node_of_gaussian[:, level.index]
-        rows = np.flatnonzero(nodes >= 0)
-        member = sp.csr_matrix(
-            (np.ones(len(rows), np.float32), (rows, nodes[rows])), shape=(len(nodes), len(tree))
-        )
-        strong = ((weights @ member) > 0.5).tocsc()
-        chosen = np.flatnonzero(strong.getnnz(axis=0))
-        found[level] = strong[:, chosen].T.toarray()
+        shown = ViewNodes.of(weights, tree.node_of_gaussian[:, level.index])
+        labels = shown.labels((1, weights.shape[0]))
+        found[level] = labels == np.unique(labels[labels != NONE])[:, None]
     return found
 
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import stage_log, track
-from hilsplat.evaluate.figures.panel import Shown, annotated_rows, free_rows, shown_truths
+from hilsplat.evaluate.figures.panel import WIDTH_IN, Shown, annotated_rows, free_rows, shown_truths
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import rule_of
@@ -25,7 +25,6 @@ from hilsplat.scene.finished import FinishedScene
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import EvaluateSettings, FiguresSettings
 
-WIDTH_IN = 13.0
 MAX_COLUMNS = 8
 """Maximum number of methods drawn as columns in the query figure; if there are more, all become rows."""
 VIEWS = 4

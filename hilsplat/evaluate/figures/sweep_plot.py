@@ -10,14 +10,12 @@ from matplotlib.figure import Figure
 from hilsplat.base.errors import ArtifactError
 from hilsplat.query.pictures import save_png_and_pdf
 
-SETTINGS = {"theta": "coverage threshold theta", "omega": "similarity degree Omega"}
-DEFAULTS = {"theta": 0.9, "omega": 10.0}
-"""Settings of the default variant; its table row doesn't state them."""
+SWEEPS = {"theta": ("coverage threshold theta", 0.9), "omega": ("similarity degree Omega", 10.0)}
+"""Sweep -> axis label, and the setting of the default variant, which its table row doesn't state."""
 
 COLUMNS = ("Hi-LERF mIoU", "Hi-LERF HC", "3D-OVS mIoU", "LERF mIoU")
 
 Lines = Mapping[tuple[str, str], list[tuple[float, float]]]
-"""(kind of row, column) -> (setting, percentage) pairs, sorted by the setting."""
 
 
 def run_sweep_plot(name: str, table: Path, out: Path) -> None:
@@ -26,13 +24,13 @@ def run_sweep_plot(name: str, table: Path, out: Path) -> None:
     Raises:
         ArtifactError: the sweep is unknown, or the table is missing.
     """
-    if name not in SETTINGS:
-        raise ArtifactError(f"there is no sweep {name!r}", expected=f"one of {', '.join(SETTINGS)}")
-    save_png_and_pdf(draw_sweep(name, read_lines(table, DEFAULTS[name])), out)
+    if name not in SWEEPS:
+        raise ArtifactError(f"there is no sweep {name!r}", expected=f"one of {', '.join(SWEEPS)}")
+    save_png_and_pdf(draw_sweep(name, read_lines(table, SWEEPS[name][1])), out)
 
 
 def read_lines(table: Path, default: float) -> Lines:
-    """Return the curves of a table: one per kind of row and column with at least two values."""
+    """Map (kind of row, column) to sorted (setting, percentage) pairs; a curve has at least two."""
     try:
         with Path(table).open(encoding="utf-8", newline="") as stream:
             rows = list(csv.DictReader(stream))
@@ -63,7 +61,7 @@ def draw_sweep(name: str, lines: Lines) -> Figure:
                 axes.plot(values, shares, marker="o", label=column)
         if name == "omega":
             axes.set_xscale("log")
-        axes.set_xlabel(SETTINGS[name])
+        axes.set_xlabel(SWEEPS[name][0])
         axes.set_ylabel("%")
         axes.set_title(kind if kind == "reported" else f"{kind}, not comparable", fontsize=10)
         axes.grid(alpha=0.3)

@@ -20,9 +20,7 @@ RELEVANCY_SCALE = 10.0
 """Scale of the cosine in the relevancy (LERF, LangSplat)."""
 
 NODE_SELECT = 0.95
-"""A node matches a text if its margin is close to that of the view's best node: the difference is at most
-(1 - NODE_SELECT) times the range of margins at its level, or three times as much if the cosine between the
-two nodes is at least 0.9."""
+"""`evaluate.node_select`; the selection of `TREE_NODES` states the rule."""
 
 ANCESTORS = 0.2
 """Fraction of the ancestors' mean margin that is added to a node's own margin, except on paths."""
@@ -76,7 +74,8 @@ CONSISTENCY = (
     *("hc_containment_pooled", "hc_literal_pooled", "hc_anchored_pooled", "hc_containment_per_child"),
 )
 PER_CLASS = ("class_iou", "class_accuracy")
-PRESENT = (*PER_CLASS, "miou_present", "macc_present")
+MEAN_LEVEL = {"mix": False, "majority": False, "level_rule": "mean_in_mask"}
+"""Map rule of LangSplat's text on 3D-OVS, except for the threshold."""
 
 OPENGAUSSIAN = "yanmin-wu/OpenGaussian@b70dcc6 scripts/eval_scannet.py"
 GAUSSIAN_GROUPING = "lkeab/gaussian-grouping@c93f24b script/eval_lerf_mask.py"
@@ -240,7 +239,7 @@ def _points(
     name: str,
     classes: str,
     source: str,
-    metrics: tuple[str, ...] = PRESENT,
+    metrics: tuple[str, ...] = (*PER_CLASS, "miou_present", "macc_present"),
     averaging: Averaging = "scenes",
     public: str = "",
 ) -> ProtocolCard:
@@ -273,10 +272,8 @@ CARDS: tuple[ProtocolCard, ...] = (
         "relevancy above 0.4; level of the highest mean in its mask",
         MASK + LOCALIZATION,
         filter_px=20,
-        mix=False,
         threshold_on="raw",
-        majority=False,
-        level_rule="mean_in_mask",
+        **MEAN_LEVEL,
     ),
     LERF_OPENGAUSSIAN,
     LERF_MASK,
@@ -287,19 +284,15 @@ CARDS: tuple[ProtocolCard, ...] = (
         "none: LangSplat's supplement; the scale of the threshold is our reading",
         "min-max relevancy above 0.7, unfiltered; level of the highest mean in its mask",
         MASK,
-        mix=False,
-        majority=False,
-        level_rule="mean_in_mask",
+        **MEAN_LEVEL,
     ),
     _maps(
         "3d-ovs/langsplat-raw",
         "none: LangSplat's supplement, taken literally",
         "relevancy above 0.4, unfiltered; level of the highest mean in its mask",
         MASK,
-        mix=False,
         threshold_on="raw",
-        majority=False,
-        level_rule="mean_in_mask",
+        **MEAN_LEVEL,
     ),
     OVS_LANGSPLAT_V2,
     OVS_NODES,

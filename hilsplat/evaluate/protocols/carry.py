@@ -1,13 +1,4 @@
-"""Find the Gaussian of each labelled point (mesh vertex or lidar return), and classify its feature.
-
-| mode | source of a point's label or feature |
-|---|---|
-| `frozen` | the Gaussian with the point's index, fitted without moving (OpenGaussian) |
-| `nearest` | the nearest Gaussian that is opaque enough |
-
-Scores depend on the mode, so every row names it. The search tree breaks ties between equidistant Gaussians
-deterministically, for the same input and any number of threads.
-"""
+"""Find the Gaussian of each labelled point (mesh vertex or lidar return), and classify its feature."""
 
 from typing import Literal
 
@@ -31,8 +22,10 @@ def gaussians_of_points(
 ) -> tuple[Int64[np.ndarray, " P"], Bool[np.ndarray, " P"]]:
     """Return the Gaussian of each point, and whether the point is scored; positions are in scene units.
 
-    `frozen`: the fit must not have moved, split or dropped any Gaussian. As in OpenGaussian's
-    `scripts/eval_scannet.py`, points whose Gaussian is transparent are not scored.
+    `nearest` uses the nearest Gaussian that is opaque enough. The search tree breaks ties between equidistant
+    Gaussians deterministically, for the same input and any number of threads. `frozen` uses the Gaussian with
+    the point's index, so the fit must not have moved, split or dropped any. As in OpenGaussian's
+    `scripts/eval_scannet.py`, points whose Gaussian is transparent are then not scored.
 
     Raises:
         MisalignedArtifactError: no Gaussian is opaque enough, or under `frozen`, the numbers of Gaussians and

@@ -13,8 +13,6 @@ from hilsplat.evaluate.tables.rows import Cell, Sources, Table
 if TYPE_CHECKING:
     import pandas as pd
 
-FLAT = ("lerf/langsplat@", "lerf/tree-nodes@")
-OVS = ("3d-ovs/langsplat@",)
 PAPER_DATA = "LERF, 3D-OVS, Hi-LERF"
 """Data sets of the paper's ablations."""
 
@@ -88,7 +86,8 @@ def component_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, C
     """
     own = part.iloc[0]["dataset"]
     lerf, ovs3d = ("lerf_ovs", "3d_ovs") if own in LEVELLED else (own, own)
-    flat, ovs = measured.same_row(scores, part, FLAT, lerf), measured.same_row(scores, part, OVS, ovs3d)
+    flat = measured.same_row(scores, part, ("lerf/langsplat@", "lerf/tree-nodes@"), lerf)
+    ovs = measured.same_row(scores, part, ("3d-ovs/langsplat@",), ovs3d)
     levels = measured.level_cells(part)
     return {
         "LERF localization": Cell.percent(measured.table_value(flat, "localization_box")),

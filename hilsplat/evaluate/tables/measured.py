@@ -16,9 +16,6 @@ from hilsplat.segment.origin import made_from_truth
 if TYPE_CHECKING:
     import pandas as pd
 
-SYNTHETIC = "synthetic"
-"""Prefix of the names of synthetic data sets."""
-
 SEED = re.compile(r"(?P<variant>.+)\.seed(?P<seed>[0-9]+)")
 """Variant name with a seed; all seeds of a variant share a row."""
 
@@ -40,9 +37,6 @@ STAND_INS = {
     "synthetic-streets": "generated streets",
 }
 """Synthetic data set -> its description in headings."""
-
-TRUE_MASKS = "diagnostic, true masks: "
-"""Prefix of the method name in rows whose masks were made from ground-truth labels."""
 
 
 def measured_blocks(
@@ -72,8 +66,9 @@ def measured_blocks(
         for (variant, masks, method, label), part in groups:
             is_truth, from_truth = method == "truth", made_from_truth(masks)
             is_diagnostic = from_truth and not is_truth
+            warning = "diagnostic, true masks: " if is_diagnostic else ""
             names = {
-                "Method": (TRUE_MASKS if is_diagnostic else "") + row_name(variant, method, sources.labels),
+                "Method": warning + row_name(variant, method, sources.labels),
                 "Masks": "-" if is_truth else masks,
                 "Protocol": PROTOCOLS.get(label, label),
             }
@@ -145,7 +140,7 @@ def row_name(variant: str, method: str, labels: Mapping[str, str]) -> str:
 
 def kind_and_title(dataset: str) -> tuple[str, str, str]:
     """Return kind, data set and heading of measured rows."""
-    if dataset.startswith(SYNTHETIC):
+    if dataset.startswith("synthetic"):
         what = STAND_INS.get(dataset, dataset)
         return "synthetic stand-in", dataset, f"Measured on a synthetic stand-in ({what}); not comparable"
     return "measured", dataset, f"Measured on {dataset}"

@@ -36,7 +36,6 @@ AP_COLUMNS = {
 }
 
 DRAWS = 1000
-PERCENTILES = (2.5, 97.5)
 
 MODE_NOTE = (
     "Classes are transferred from Gaussians to points by the mode named after 'points:' (nearest: the "
@@ -206,7 +205,7 @@ def bootstrap_mean(
                 if present[s].any()
             ]
             found.append(float(np.mean(each)) if each else 0.0)
-    low, high = np.percentile(found, PERCENTILES)
+    low, high = np.percentile(found, (2.5, 97.5))
     return float(low), float(high)
 
 
