@@ -18,9 +18,10 @@ from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
 from hilsplat.world.objects.builder import ObjectModel
 from hilsplat.world.objects.catalogue import CLASSES, GENERATOR_VERSION, build_object
 from hilsplat.world.render import label_view, render_view
-from hilsplat.world.scenes.kinds import KINDS, build_scene, training_camera
+from hilsplat.world.scenes.kinds import KINDS, build_scene
 from hilsplat.world.scenes.scene import WorldScene
 from hilsplat.world.seeds import TRAINING_SEEDS, split_of_seed
+from models.training.cameras import training_camera
 from models.training.data import LabelledNode, LabelledViews
 from models.training.sam import FRAME_PX
 

@@ -3,12 +3,10 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-import numpy as np
-
-from hilsplat.scene.cameras import Camera, Cameras
+from hilsplat.scene.cameras import Cameras
 from hilsplat.world.scenes import room, street, tabletop
 from hilsplat.world.scenes.scene import WorldScene
-from hilsplat.world.views import Sight, numbered_cameras, square_camera
+from hilsplat.world.views import Sight, numbered_cameras
 
 
 class SceneKind(NamedTuple):
@@ -18,18 +16,16 @@ class SceneKind(NamedTuple):
         build: builds a scene from (seed, objects).
         sights: returns cameras and their field of view in degrees for (scene, views, arc_deg). The cameras
             are jittered with the scene's seed, and close enough together for structure from motion.
-        training_sight: draws a random training camera and its field of view for (scene, rng).
     """
 
     build: Callable[[int, int], WorldScene]
     sights: Callable[[WorldScene, int, float | int], tuple[list[Sight], float]]
-    training_sight: Callable[[WorldScene, np.random.Generator], tuple[Sight, float]]
 
 
 KINDS: dict[str, SceneKind] = {
-    "tabletop": SceneKind(tabletop.build_tabletop, tabletop.ring_sights, tabletop.training_sight),
-    "room": SceneKind(room.build_room, room.loop_sights, room.training_sight),
-    "street": SceneKind(street.build_street, street.drive_sights, street.training_sight),
+    "tabletop": SceneKind(tabletop.build_tabletop, tabletop.ring_sights),
+    "room": SceneKind(room.build_room, room.loop_sights),
+    "street": SceneKind(street.build_street, street.drive_sights),
 }
 """Scene kinds by name in the scene sheet."""
 
@@ -46,9 +42,3 @@ def scene_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float |
     """Return the views of a scene that the world stage renders: square images 000.png, 001.png, ..."""
     sights, fov_deg = KINDS[scene.kind].sights(scene, views, arc_deg)
     return numbered_cameras(sights, image_px, fov_deg)
-
-
-def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int) -> Camera:
-    """Return a random view of a training scene."""
-    sight, fov_deg = KINDS[scene.kind].training_sight(scene, rng)
-    return square_camera(sight, image_px, fov_deg)

@@ -9,7 +9,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from hilsplat.world.objects.builder import ObjectModel
 from hilsplat.world.paints import Colour, Paint
@@ -333,51 +333,3 @@ def drive_sights(scene: WorldScene, views: int, arc_deg: float | int) -> tuple[l
         centre = middle + rng.uniform(-1, 1, 3) * np.array([0.05, 0.15, 0.12])
         sights.append((centre, centre + on_sphere(yaw, float(pitch_rng.uniform(-1, 3)), 1.0)))
     return sights, FOV_DEG
-
-
-def training_sight(scene: WorldScene, rng: np.random.Generator) -> tuple[Sight, float]:
-    """Draw a training camera: a view from the road, or a close-up of a visible object."""
-    fov_deg = float(rng.uniform(56, 66))
-    sight = _close_up(scene, rng) if rng.random() < 0.5 else None
-    if sight is None:
-        centre = np.array([rng.uniform(DRIVE_X[0], 14), rng.uniform(-2.4, -0.8), rng.uniform(1.5, 2.4)])
-        yaw = rng.uniform(-60, 60) if rng.random() < 0.85 else rng.uniform(90, 270)
-        sight = centre, centre + on_sphere(yaw, rng.uniform(-6, 6), 1.0)
-    return sight, fov_deg
-
-
-def _close_up(scene: WorldScene, rng: np.random.Generator) -> Sight | None:
-    """Return a camera on the road side of a random unoccluded object, or None if no object qualifies."""
-    wholes = sorted(set(np.unique(scene.node_ids[:, 0]).tolist()) - scene.background)
-    for _ in range(30):
-        node = wholes[int(rng.integers(len(wholes)))]
-        if scene.nodes[node].text == "building" and rng.random() < 0.6:
-            continue  # houses outnumber all other objects
-        corners = scene.triangles[scene.node_ids[:, 0] == node].reshape(-1, 3).astype(np.float64)
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        if low[0] > 30 or high[0] < -16:
-            continue
-        target = low + (high - low) * rng.uniform(0.35, 0.65, 3)
-        size = float(np.linalg.norm(high - low))
-        toward = np.degrees(np.arctan2(-target[1], 0.3)) + rng.uniform(-70, 70)
-        away = rng.uniform(0.7, 1.5) * size
-        centre = target + away * on_sphere(float(toward), 0.0, 1.0)
-        centre[2] = rng.uniform(0.9, 2.6)
-        inside = (low < centre) & (centre < high)
-        if abs(centre[1]) > FRONT - 0.5 or inside.all():
-            continue
-        if _sees(scene, centre, corners, node, rng):
-            return centre, target
-    return None
-
-
-def _sees(
-    scene: WorldScene, centre: np.ndarray, corners: np.ndarray, node: int, rng: np.random.Generator
-) -> bool:
-    """Return whether most of an object's corners are visible from a point or hidden only by the object."""
-    chosen = corners[rng.integers(len(corners), size=40)]
-    directions = chosen - centre
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    hit = scene.caster.nearest(centre.astype(np.float32)[None], directions.astype(np.float32)).triangle
-    seen: Bool[np.ndarray, " R"] = (hit >= 0) & (scene.node_ids[hit, 0] == node)
-    return bool(seen.mean() > 0.6)

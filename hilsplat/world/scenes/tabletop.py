@@ -196,17 +196,3 @@ def ring_sights(scene: WorldScene, views: int, arc_deg: float | int) -> tuple[li
         centre = target + on_sphere(azimuth, elevation, DISTANCE * rng.uniform(0.97, 1.03))
         sights.append((centre, target + rng.uniform(-0.03, 0.03, 3)))
     return sights, FOV_DEG
-
-
-def training_sight(scene: WorldScene, rng: np.random.Generator) -> tuple[Sight, float]:
-    """Draw a training camera that shows the whole table or, in half of the draws, one object."""
-    azimuth, elevation, fov_deg = rng.uniform(0, 360), rng.uniform(16, 60), rng.uniform(42, 64)
-    nearer = np.tan(np.radians(FOV_DEG / 2)) / np.tan(np.radians(fov_deg / 2))  # keeps sizes in the image
-    if scene.placed and rng.random() < 0.5:
-        thing = scene.placed[int(rng.integers(len(scene.placed)))]
-        target = np.array([*thing.centre_xy, thing.height * 0.45]) + rng.uniform(-0.08, 0.08, 3)
-        distance = nearer * DISTANCE * rng.uniform(0.45, 0.85)
-    else:
-        target = np.array([0.0, 0.0, LOOK_AT_Z]) + rng.uniform(-0.15, 0.15, 3) * np.array([1, 1, 0.5])
-        distance = nearer * DISTANCE * rng.uniform(0.85, 1.12)
-    return (target + on_sphere(azimuth, elevation, distance), target), fov_deg
