@@ -23,8 +23,8 @@ class Family:
     true_parent: Bool[np.ndarray, "H W"]
 
 
-def children_consistency(family: Family, reading: Reading) -> list[float]:
-    """Return the consistency of each child with its parent.
+def family_consistency(family: Family, reading: Reading) -> float:
+    """Return the mean consistency of the children with their parent.
 
     `containment`: area(p and c) / area(c), the paper's wording; 1 for perfect nesting.
     `literal`: area(p and c) / area(p), the printed formula, with l = 1 for wholes.
@@ -36,13 +36,13 @@ def children_consistency(family: Family, reading: Reading) -> list[float]:
     for child in family.children:
         area = np.count_nonzero(family.parent if reading == "literal" else child)
         terms.append(np.count_nonzero(anchor & child) / area if area else 0.0)
-    return terms
+    return float(np.mean(terms))
 
 
 def hierarchical_consistency(
     transitions: Sequence[Sequence[Family]], reading: Reading = "containment"
-) -> tuple[float, float]:
-    """Return the HC of one view (paper, Sec. IV, Eq. 7), and the mean over the parents of all levels pooled.
+) -> float:
+    """Return the HC of one view (paper, Sec. IV, Eq. 7).
 
     HC is averaged over children, then parents, then levels, so every parent of a level has the same weight,
     regardless of its number of children. A scene's value is the mean over its views with at least one parent;
@@ -55,23 +55,5 @@ def hierarchical_consistency(
     Args:
         transitions: families grouped by the parent's level: wholes first, then parts.
     """
-    scores = [
-        [float(np.mean(children_consistency(family, reading))) for family in families]
-        for families in transitions
-    ]
-    parents = [score for of_level in scores for score in of_level]
-    return _mean_over_levels(scores), float(np.mean(parents)) if parents else 0.0
-
-
-def consistency_per_child(transitions: Sequence[Sequence[Family]]) -> float:
-    """Return containment averaged over all children of a level, then over levels."""
-    return _mean_over_levels(
-        [
-            [term for family in families for term in children_consistency(family, "containment")]
-            for families in transitions
-        ]
-    )
-
-
-def _mean_over_levels(scores: Sequence[Sequence[float]]) -> float:
+    scores = [[family_consistency(family, reading) for family in families] for families in transitions]
     return float(np.mean([np.mean(of_level) if of_level else 0.0 for of_level in scores]))

@@ -69,10 +69,7 @@ class ProtocolCard:
 
 MASK = ("iou", "boundary_iou")
 LOCALIZATION = ("localization_box", "localization_mask")
-CONSISTENCY = (
-    *("hc_containment", "hc_literal", "hc_anchored"),
-    *("hc_containment_pooled", "hc_literal_pooled", "hc_anchored_pooled", "hc_containment_per_child"),
-)
+CONSISTENCY = ("hc_containment", "hc_literal", "hc_anchored")
 PER_CLASS = ("class_iou", "class_accuracy")
 MEAN_LEVEL = {"mix": False, "majority": False, "level_rule": "mean_in_mask"}
 """Map rule of LangSplat's text on 3D-OVS, except for the threshold."""

@@ -238,8 +238,5 @@ def consistency_rows(
         for transition in transitions
     ]
     for reading in hierarchy.READINGS:
-        mean, pooled = hierarchy.hierarchical_consistency(families, reading)
-        yield Measured(method, "", "", f"hc_{reading}", protocol, mean, parents)
-        yield Measured(method, "", "", f"hc_{reading}_pooled", protocol, pooled, parents)
-    per_child = hierarchy.consistency_per_child(families)
-    yield Measured(method, "", "", "hc_containment_per_child", protocol, per_child, parents)
+        value = hierarchy.hierarchical_consistency(families, reading)
+        yield Measured(method, "", "", f"hc_{reading}", protocol, value, parents)

@@ -63,7 +63,7 @@ def test_files_of_our_own_run_have_the_same_scores_and_make_a_table(block_world,
     rows = write_answers(tmp_path / "theirs", block_world, packed)
     frame = score(block_world, tmp_path / "theirs", tmp_path / "scores.csv", kind="tabletop")
     flat, levelled = {"iou", "boundary_iou"}, "hierarchy/level-given"
-    both = flat | {"hc_containment", "hc_literal_pooled", "hc_containment_per_child"}
+    both = flat | {"hc_containment", "hc_literal"}
     for ours, theirs, metrics in (("lerf/tree-nodes", "lerf/langsplat", flat), (levelled, levelled, both)):
         expected = {
             (row.query, row.level, row.metric): pytest.approx(row.value, abs=1e-6)

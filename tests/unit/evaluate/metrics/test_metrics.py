@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilsplat.base.levels import LEVELS
-from hilsplat.evaluate.metrics.hierarchy import Family, consistency_per_child, hierarchical_consistency
+from hilsplat.evaluate.metrics.hierarchy import Family, hierarchical_consistency
 from hilsplat.evaluate.metrics.masks import (
     argmax_masks,
     best_threshold_iou,
@@ -228,27 +228,22 @@ def test_mask_hit_is_stricter_than_box_hit():
 # --- hierarchical consistency ---------------------------------------------------------------------
 
 
-def test_children_of_a_parent_share_its_weight_unless_counted_alone():
+def test_children_of_a_parent_share_its_weight():
     left, right = box((0, 10), (0, 5)), box((0, 10), (5, 10))
     inside = Family(left, (box((0, 2), (0, 2)),), left)
     outside = Family(right, tuple(box((row, row + 2), (0, 2)) for row in (2, 4, 6)), right)
-    assert hierarchical_consistency([[inside, outside]]) == (0.5, 0.5)
-    assert consistency_per_child([[inside, outside]]) == 0.25
+    assert hierarchical_consistency([[inside, outside]]) == 0.5
 
 
 def test_perfect_nesting_in_a_view_without_subparts_scores_half():
     whole = box((0, 10), (0, 10))
-    transitions = [[Family(whole, (box((0, 2), (0, 2)),), whole)], []]
-    assert hierarchical_consistency(transitions) == (0.5, 1)  # pooled, the missing parents don't count
-    assert consistency_per_child(transitions) == 0.5
+    assert hierarchical_consistency([[Family(whole, (box((0, 2), (0, 2)),), whole)], []]) == 0.5
 
 
 def test_whole_image_fools_all_readings_but_the_anchored_one():
     full = np.ones((10, 10), dtype=bool)
     a, b, a1 = box((0, 10), (0, 5)), box((0, 5), (5, 10)), box((0, 4), (0, 5))
     fooled = [[Family(full, (full, full), a), Family(full, (full,), b)], [Family(full, (full,), a1)]]
-    assert hierarchical_consistency(fooled, "containment") == (1, 1)
-    assert hierarchical_consistency(fooled, "literal") == (1, 1)
+    assert hierarchical_consistency(fooled, "containment") == hierarchical_consistency(fooled, "literal") == 1
     # area of the true parents: A 50, B 25, a1 20 of 100 px
-    expected = (0.375 + 0.2) / 2, (0.5 + 0.25 + 0.2) / 3
-    assert hierarchical_consistency(fooled, "anchored") == pytest.approx(expected)
+    assert hierarchical_consistency(fooled, "anchored") == pytest.approx((0.375 + 0.2) / 2)

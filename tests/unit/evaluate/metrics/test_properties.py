@@ -1,7 +1,5 @@
 """Properties of every metric; a metric that is not listed fails."""
 
-from functools import partial
-
 import hypothesis.extra.numpy as hnp
 import numpy as np
 import pytest
@@ -9,12 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilsplat.evaluate.metrics import instances, masks, point_classes
-from hilsplat.evaluate.metrics.hierarchy import (
-    READINGS,
-    Family,
-    consistency_per_child,
-    hierarchical_consistency,
-)
+from hilsplat.evaluate.metrics.hierarchy import READINGS, Family, hierarchical_consistency
 from hilsplat.evaluate.metrics.point_classes import ClassCounts
 from hilsplat.evaluate.protocols.cards import CARDS
 from tests.unit.evaluate.builders import region_of
@@ -47,11 +40,11 @@ def of_instances(thresholds):
     return value
 
 
-def of_families(consistency):
+def of_families(reading):
     def value(prediction, truth):
         child = (prediction == 2) | ((prediction == 3) & (truth != 3))  # pixels wrongly labelled 3 spill over
         family = Family(np.isin(prediction, (1, 2)), (child,), np.isin(truth, (1, 2)))
-        return consistency([[family]])
+        return hierarchical_consistency([[family]], reading)
 
     return value
 
@@ -71,10 +64,6 @@ def pixel_accuracy(prediction, truth):
     return masks.pixel_accuracy(*(np.stack([each == n for n in (1, 2, 3)]) for each in (prediction, truth)))
 
 
-def consistency(transitions, reading, which):
-    return hierarchical_consistency(transitions, reading)[which]
-
-
 def first_class_occurring(counts):
     return point_classes.miou_over_occurring(counts, np.array([True, False, False]))
 
@@ -90,12 +79,7 @@ CASES = {
     ),
     "localization_mask": of_points(masks.hits_the_mask),
     "pixel_accuracy": pixel_accuracy,
-    **{
-        f"hc_{reading}{suffix}": of_families(partial(consistency, reading=reading, which=which))
-        for reading in READINGS
-        for which, suffix in enumerate(("", "_pooled"))
-    },
-    "hc_containment_per_child": of_families(consistency_per_child),
+    **{f"hc_{reading}": of_families(reading) for reading in READINGS},
     "view_consistency": of_masks(masks.iou),  # of two views' masks over the points that both show
     "class_iou": of_counts(lambda counts: float(point_classes.class_iou(counts)[0])),
     "class_accuracy": of_counts(lambda counts: float(point_classes.class_accuracy(counts)[0])),
@@ -112,7 +96,7 @@ CASES = {
     "ap25": of_instances([-1]),
 }
 SYMMETRIC = ("iou", "boundary_iou", "acc_25", "acc_50", "pixel_accuracy", "view_consistency")
-IMPERFECT = ("hc_literal", "hc_literal_pooled", "miou_all", "macc_all")
+IMPERFECT = ("hc_literal", "miou_all", "macc_all")
 """Metrics whose value for a perfect prediction depends on the truth."""
 
 label_images = hnp.arrays(np.int64, (4, 5), elements=st.integers(0, 3))

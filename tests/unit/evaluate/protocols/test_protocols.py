@@ -90,11 +90,10 @@ def worked_example(tmp_path, without=()):
 def test_consistency_rows_match_the_worked_example(tmp_path):
     scene, truth = worked_example(tmp_path)
     values = measured(scene, truth, methods=("tree", "tree-path"))
-    names = ("containment", "literal", "containment_pooled", "literal_pooled", "containment_per_child")
-    expected = pytest.approx([0.9375, 0.27, 0.916667, 0.293333, ((1 + 0.5 + 1) / 3 + 1) / 2], abs=1e-6)
     for protocol in ("level-given@5", "level-auto@6", "scene-wide@2", "path@3"):
         key = ("tree-path" if "path" in protocol else "tree", f"hierarchy/{protocol}", "", "")
-        assert [values[*key, f"hc_{name}"] for name in names] == expected
+        assert values[*key, "hc_containment"] == pytest.approx(0.9375)
+        assert values[*key, "hc_literal"] == pytest.approx(0.27)
     # the annotations nest perfectly: a2 is 8 px of A, so literal is ((20 + 8)/50/2 + 10/25)/2 = 0.34
     reference = ("truth", "hierarchy/annotations@1", "", "")
     assert values[*reference, "hc_containment"] == 1
