@@ -4,7 +4,6 @@ import math
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float64
 
 from hilsplat.base.processes import in_order
 from hilsplat.contributions.compositing import visible_mass
@@ -14,11 +13,9 @@ from hilsplat.settings import MasksSettings
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 
-SIDE_PX = 200
-"""Longer side of the renders in which visibility is measured."""
+SIDE_PX = 200  # longer side of the renders in which visibility is measured
 
-MIN_WEIGHT = 1 / 255
-"""Smaller weights of a Gaussian at a pixel are ignored."""
+MIN_WEIGHT = 1 / 255  # smaller weights of a Gaussian at a pixel are ignored
 
 MIN_VISIBLE_PX = 0.02
 """A Gaussian is visible in a view if its mass there exceeds this (0.3 px if the longer side is 800 px)."""
@@ -41,8 +38,8 @@ def run_key_masks(
 def key_views(scene: Scene, gaussians_ply: Path, share: float, threads: int = 1) -> list[str]:
     """Return the `share` of the training views (rounded up) that covers the most Gaussians, in camera order.
 
-    A Gaussian is weighted by its mean visible mass, halved for each chosen view that shows it, so that views
-    of uncovered regions are preferred. The result does not depend on `threads`.
+    Views are chosen greedily. A Gaussian is weighted by its mean visible mass, halved for each chosen view
+    that shows it, so that views of uncovered regions are preferred. The result does not depend on `threads`.
 
     Raises:
         SceneError: there are no training views.
@@ -58,21 +55,11 @@ def key_views(scene: Scene, gaussians_ply: Path, share: float, threads: int = 1)
     masses = np.stack(list(in_order(mass, names, threads)))
     seen = masses > MIN_VISIBLE_PX
     importance = np.where(seen, masses, 0).sum(axis=0, dtype=np.float64) / np.maximum(seen.sum(axis=0), 1)
-    chosen = most_covering(seen, importance, math.ceil(share * len(names)))
-    return [names[number] for number in sorted(chosen)]
-
-
-def most_covering(seen: Bool[np.ndarray, "V N"], worth: Float64[np.ndarray, " N"], number: int) -> list[int]:
-    """Choose rows greedily by the total worth of their visible columns; the first row wins ties.
-
-    Each chosen row halves the worth of its visible columns. Rows are returned in the order of selection.
-    """
-    worth = worth.copy()
     chosen: list[int] = []
-    for _ in range(number):
-        gains = seen @ worth
+    for _ in range(math.ceil(share * len(names))):
+        gains = seen @ importance
         gains[chosen] = -1
         best = int(gains.argmax())
         chosen.append(best)
-        worth[seen[best]] /= 2
-    return chosen
+        importance[seen[best]] /= 2
+    return [names[number] for number in sorted(chosen)]

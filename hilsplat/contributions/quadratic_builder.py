@@ -229,9 +229,7 @@ class QuadraticBuilder:
 
     def finish(self) -> Quadratic:
         """Return G or W of all added parts."""
-        if self._gram is None:
-            return stack_weights(self._parts)
-        if self._keeps_weights and self.weights_nonzeros < self._gram.nonzeros:
+        if self._gram is None or (self._keeps_weights and self.weights_nonzeros < self._gram.nonzeros):
             return stack_weights(self._parts)
         return self._gram.finish()
 

@@ -23,30 +23,20 @@ class Contributions:
     """Contributions artifact, with its rows in memory and its matrices read on request.
 
     The M rows are the masks of all training views, view by view, in the order of each view.
-
-    Attributes:
-        gaussians_sha256: digest of the Gaussians' PLY.
-        cameras_sha256: digest of the scene's cameras.
-        min_weight: smaller weights of a Gaussian at a pixel are dropped.
-        view: index of each row's view in `views`.
-        mask: row among the masks of the view.
-        area_px: pixels of the raw mask.
-        pixels: number n of pixels that show the mask and are covered by Gaussians.
-        half_pixels: number of those pixels that are in the random half.
     """
 
     folder: Path
     views: tuple[str, ...]
     num_gaussians: int
-    gaussians_sha256: str
-    cameras_sha256: str
-    min_weight: float
-    view: Int32[np.ndarray, " M"]
-    mask: Int32[np.ndarray, " M"]
+    gaussians_sha256: str  # digest of the Gaussians' PLY
+    cameras_sha256: str  # digest of the scene's cameras
+    min_weight: float  # smaller weights of a Gaussian at a pixel are dropped
+    view: Int32[np.ndarray, " M"]  # index of each row's view in `views`
+    mask: Int32[np.ndarray, " M"]  # row among the masks of the view
     level: UInt8[np.ndarray, " M"]
-    area_px: Int64[np.ndarray, " M"]
-    pixels: Int64[np.ndarray, " M"]
-    half_pixels: Int64[np.ndarray, " M"]
+    area_px: Int64[np.ndarray, " M"]  # pixels of the raw mask
+    pixels: Int64[np.ndarray, " M"]  # number n of pixels that show the mask and are covered by Gaussians
+    half_pixels: Int64[np.ndarray, " M"]  # number of those pixels that are in the random half
 
     def __len__(self) -> int:
         return len(self.view)

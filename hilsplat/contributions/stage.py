@@ -13,6 +13,7 @@ The language field's losses and the semantic tree need no other data from the im
 """
 
 import logging
+import math
 from functools import cache as cache_calls
 from pathlib import Path
 
@@ -50,8 +51,7 @@ logger = logging.getLogger(__name__)
 MATRICES = ("A", "A_half", "S")
 PARTS = {"data": np.float32, "indices": np.int32, "indptr": np.int64}
 
-WEIGHTS_PER_PIXEL = 40
-"""Weights per pixel of a typical scene."""
+WEIGHTS_PER_PIXEL = 40  # weights per pixel in a typical scene
 
 MAX_WEIGHTS_TOGETHER = 2**25
 """Views with more weights (256 MiB) are prepared one at a time; up to four finished views may be waiting."""
@@ -89,12 +89,6 @@ class ArrayStream:
         self._stream.seek(0)
         self._write_header()
         self._stream.close()
-
-
-def views_together(scene: Scene, threads: int) -> int:
-    """Return the number of views prepared at once: two if W fits, because half the work uses one thread."""
-    most_px = max((int(np.prod(scene.cameras[name].size_hw)) for name in scene.views("train")), default=0)
-    return min(2, max(1, threads)) if most_px * WEIGHTS_PER_PIXEL <= MAX_WEIGHTS_TOGETHER else 1
 
 
 def run_contributions(
@@ -142,7 +136,9 @@ def run_contributions(
         )
         for camera in cameras
     ]
-    together = views_together(scene, threads)
+    # two views are prepared at once if W fits, because half the work uses one thread
+    most_px = max((math.prod(camera.size_hw) for camera in cameras), default=0)
+    together = min(2, max(1, threads)) if most_px * WEIGHTS_PER_PIXEL <= MAX_WEIGHTS_TOGETHER else 1
     threads_each = max(1, threads // together)
     store = ViewCache(Path(cache) / "contributions", compressed=False)
     checkpoint = QuadraticCheckpoint(store.folder / "partial", keys, settings.keep)

@@ -24,7 +24,6 @@ from hilsplat.field.code import (
     LinearCode,
     autoencoder_file,
     layers_of,
-    torch_generator,
     unit_rows,
 )
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, require_same_masks
@@ -38,23 +37,6 @@ Arrays = dict[str, np.ndarray]
 Passed = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
-def mask_targets(
-    clip: Float32[np.ndarray, "M C"], tree: SemanticTree, targets: str
-) -> tuple[Float32[np.ndarray, "M C"], Float32[np.ndarray, "B C"]]:
-    """Return the target vector of each mask, and the distinct vectors to train on.
-
-    Args:
-        clip: each mask's own vector, zero if it has none.
-        targets: "node": the vector of the node that the mask fits best, or the mean over all nodes for a mask
-            that shares no Gaussian with any node; "mask": the mask's own vector, as in the paper; also used
-            if the tree has no nodes.
-    """
-    if targets == "node" and len(tree):
-        or_mean = np.append(tree.clip, tree.clip.mean(axis=0, keepdims=True), axis=0)
-        return or_mean[tree.node_of_mask], tree.clip
-    return clip, clip
-
-
 def run_autoencoder(
     clip_folder: Path,
     semantic_tree_folder: Path,
@@ -63,9 +45,12 @@ def run_autoencoder(
     settings: AutoencoderSettings,
     seed: int,
 ) -> None:
-    """Fit the scene's code and encode every mask.
+    """Fit the scene's code and encode the target vector of every mask.
 
-    Writes `autoencoder.safetensors`, `latents.npz` (rows as in the contributions) and `index.json`.
+    The target is the vector of the node that the mask fits best, or the mean over all nodes for a mask that
+    shares no Gaussian with any node. With `targets: mask`, as in the paper, or without nodes, it is the
+    mask's own vector. Writes `autoencoder.safetensors`, `latents.npz` (rows as in the contributions) and
+    `index.json`.
 
     Raises:
         MisalignedArtifactError: the semantic tree or the CLIP vectors belong to different masks.
@@ -74,9 +59,12 @@ def run_autoencoder(
     require_same_masks(semantic_tree_folder, contributions_folder)
     tree = SemanticTree.load(semantic_tree_folder, clip_folder)
     clip = mask_embeddings(clip_folder, contributions_folder)
-    if settings.targets == "mask" or not len(tree):
+    if settings.targets == "node" and len(tree):
+        or_mean = np.append(tree.clip, tree.clip.mean(axis=0, keepdims=True), axis=0)
+        target, train = or_mean[tree.node_of_mask], tree.clip
+    else:
         require_every_vector(clip, clip_folder, "autoencoder.targets: mask")
-    target, train = mask_targets(clip, tree, settings.targets)
+        target = train = clip
     with stage_log("autoencoder", read_index(contributions_folder)["scene"]) as counts:
         model: Code
         if settings.code == "pca":
@@ -114,7 +102,7 @@ def train_autoencoder(
     Identical inputs and seeds produce identical bytes for any number of stage threads (the command line
     limits BLAS to one thread). The seed determines the initial weights and the order of vectors.
     """
-    twister = torch_generator(seed)
+    twister = np.random.RandomState(seed % 2**32)  # initialised like torch's by `torch.manual_seed(seed)`
     channels, latent = vectors.shape[1], settings.latent
     data = np.ascontiguousarray(vectors)
     if len(data) == 1:

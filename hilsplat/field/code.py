@@ -175,11 +175,6 @@ def layers_of(channels: int, latent: int) -> tuple[list[Layer], list[Layer]]:
     return encoder, decoder
 
 
-def torch_generator(seed: int) -> np.random.RandomState:
-    """Return the generator that `torch.manual_seed(seed)` initialises, a Mersenne Twister."""
-    return np.random.RandomState(seed % 2**32)
-
-
 def unit_rows(rows: Float[np.ndarray, "B C"]) -> Float[np.ndarray, "B C"]:
     """Scale rows to length 1; a row of zeros is unchanged."""
     return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
@@ -252,7 +247,7 @@ def load_code(folder: Path) -> Code:
     try:
         if about.get("code") == "pca":
             return LinearCode(state["mean"], state["basis"])
-        model = Autoencoder.drawn(about["channels"], about["latent"], torch_generator(0))
+        model = Autoencoder.drawn(about["channels"], about["latent"], np.random.RandomState(0))
         for name, values in model.arrays.items():
             if name not in state or state[name].shape != values.shape:
                 raise ValueError(f"array {name} of shape {values.shape} is missing")

@@ -1,8 +1,4 @@
-"""Stage `field`: solve the language field.
-
-Geometry is frozen, so the contributions contain all inputs of the losses. The quadratic part is in `problem`,
-the contrastive losses are in `contrast`, and the minimisation is in `solver`.
-"""
+"""Stage `field`: solve the language field from the contributions, because geometry is frozen."""
 
 from pathlib import Path
 

@@ -141,15 +141,25 @@ def train_literally(
     adam, curve, recent = Adam(features, settings.rate), list[dict[str, float]](), list[float]()
     log_every, begin = max(1, settings.iterations // CURVE_POINTS), time.perf_counter()
     ridge = 2 * settings.ridge / problem.total_pixels * problem.mass[:, :, None]
+
+    def targets_of(number: int, covered: Bool[np.ndarray, " P"]) -> ViewTargets:
+        view = contributions.views[number]
+        masks = load_masks(masks_folder, view, digests_in(contributions.folder))
+        labels = label_maps(masks)
+        painted, half = (
+            painted_indicator(labels, len(masks), pixels)
+            for pixels in (covered, covered & random_half(view, len(labels)))
+        )
+        rows, relations = contributions.rows_of_views()[number], contrast.relations[number]
+        return ViewTargets(rows, masks.level.astype(np.int64) - 1, painted, half, relations)
+
     views = range(len(contributions.views))
     order = in_random_order(views, np.random.default_rng(seed), settings.iterations)
     for step, number in enumerate(order, start=1):
         camera = scene.cameras[contributions.views[number]]
         seen = draw(gaussians, camera, 0, features=features, threads=threads, device=device)
         if number not in targets:
-            covered = seen.alpha.reshape(-1) >= MIN_ALPHA
-            relations = contrast.relations[number]
-            targets[number] = _targets(contributions, masks_folder, number, covered, relations)
+            targets[number] = targets_of(number, seen.alpha.reshape(-1) >= MIN_ALPHA)
         alpha = np.maximum(seen.alpha.reshape(-1, 1), 1e-6)
         shown = (seen.image[..., 3:].reshape(len(alpha), -1) / alpha).astype(np.float64)
         maps = shown.reshape(len(alpha), len(LEVELS), channels)
@@ -170,21 +180,3 @@ def train_literally(
     found = features.reshape(problem.lifted.shape)
     report["trained"] = problem.terms(found) | contrast.values(found)
     return found, {**report, "curve": curve}
-
-
-def _targets(
-    contributions: Contributions,
-    masks_folder: Path,
-    number: int,
-    covered: Bool[np.ndarray, " P"],
-    relations: ViewRelations,
-) -> ViewTargets:
-    view = contributions.views[number]
-    masks = load_masks(masks_folder, view, digests_in(contributions.folder))
-    labels = label_maps(masks)
-    painted, half = (
-        painted_indicator(labels, len(masks), pixels)
-        for pixels in (covered, covered & random_half(view, len(labels)))
-    )
-    rows = contributions.rows_of_views()[number]
-    return ViewTargets(rows, masks.level.astype(np.int64) - 1, painted, half, relations)

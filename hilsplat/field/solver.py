@@ -24,6 +24,7 @@ def solve_field(
 ) -> tuple[Float32[np.ndarray, "N 3 D"], dict[str, object]]:
     """Return the features, and a report with every loss before and after each phase."""
     settings, total = contrast.settings, problem.total_pixels
+    flat = -1, problem.latents.shape[1]  # a shape with one row per Gaussian and level
     # L-BFGS needs much memory, so its variables are only the features visible in masks, scaled by the square
     # root of the mass, which makes the quadratic part nearly isotropic.
     shown = np.flatnonzero(problem.mass)
@@ -33,7 +34,7 @@ def solve_field(
     right = problem.right_side()
 
     def unscale(scaled: np.ndarray) -> None:
-        _rows(features)[shown] = scaled * inverse_root.reshape(-1)[shown][:, None]
+        features.reshape(flat)[shown] = scaled * inverse_root.reshape(-1)[shown][:, None]
 
     def objective(scaled: np.ndarray) -> tuple[float, np.ndarray]:
         unscale(scaled)
@@ -42,7 +43,7 @@ def solve_field(
         contrastive, gradient = contrast.weighted(features)
         add_slope(np.float32(2 / total), curved, right, inverse_root, gradient)
         del curved
-        return value + contrastive, _rows(gradient)[shown]
+        return value + contrastive, gradient.reshape(flat)[shown]
 
     lifted = problem.lifted
     report: dict[str, object] = {"lifted": problem.terms(lifted) | contrast.values(lifted)}
@@ -53,14 +54,9 @@ def solve_field(
         features = lifted.copy()
     if (settings.weight_instance or settings.weight_part) and settings.lbfgs_steps:
         first_step = total / (2 * max(sum(problem.weights), 1e-3))
-        unscale(lbfgs(objective, _rows(features)[shown] * root, settings.lbfgs_steps, first_step))
+        unscale(lbfgs(objective, features.reshape(flat)[shown] * root, settings.lbfgs_steps, first_step))
         report["after_lbfgs"] = problem.terms(features) | contrast.values(features)
     return features.astype(np.float32), report
-
-
-def _rows(features: Float32[np.ndarray, "N 3 D"]) -> Float32[np.ndarray, "R D"]:
-    """Return a view of the same memory with one row per Gaussian and level."""
-    return features.reshape(-1, features.shape[2])
 
 
 def keep_labelled(

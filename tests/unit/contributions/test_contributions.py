@@ -1,7 +1,5 @@
 """A and G compared with their definitions, and the files of the stage."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -25,7 +23,6 @@ from tests.unit.two_boxes_world import (
     NUM_GAUSSIANS,
     REGIONS,
     WIDTH,
-    TwoBoxes,
     build_contributions,
     two_boxes_weights,
 )
@@ -153,10 +150,10 @@ def test_a_builder_resumes_from_its_state(keep):
 
 
 def test_the_smaller_quadratic_is_kept_and_read_back_equal(two_boxes):
-    read = {}
+    read, inputs = {}, (two_boxes.scene, two_boxes.ply, two_boxes.masks)
     for keep in ("gram", "weights", "auto"):
         out = two_boxes.folder / keep
-        run_contributions(*inputs_of(two_boxes), out, out / "cache", ContributionsSettings(keep=keep), 1)
+        run_contributions(*inputs, out, out / "cache", ContributionsSettings(keep=keep), 1)
         read[keep] = Contributions.load(out).quadratic()
     assert (type(read["gram"]), type(read["weights"])) == (Gram, StackedWeights)
     assert read["auto"].nonzeros == min(read["gram"].nonzeros, read["weights"].nonzeros)
@@ -186,17 +183,13 @@ def test_stage_writes_rows_in_view_order_and_masses(two_boxes_contributions):
     assert mask_embeddings(world.clip, found.folder).shape == (24, 16)
 
 
-def inputs_of(world: TwoBoxes) -> tuple[Path, Path, Path]:
-    return world.scene, world.ply, world.masks
-
-
 @pytest.mark.parametrize("is_damaged", [False, True], ids=["whole", "without one file"])
 def test_a_killed_run_resumes_from_its_checkpoint_if_it_is_whole(two_boxes, monkeypatch, is_damaged):
     settings, folder, drawn = ContributionsSettings(keep="gram"), two_boxes.folder, []
-    weights = stage.pixel_weights
+    weights, inputs = stage.pixel_weights, (two_boxes.scene, two_boxes.ply, two_boxes.masks)
 
     def run(out: str, cache: str, threads: int = 1) -> str:
-        run_contributions(*inputs_of(two_boxes), folder / out, folder / cache, settings, threads)
+        run_contributions(*inputs, folder / out, folder / cache, settings, threads)
         return sha256_of_path(folder / out)
 
     def counted(gaussians, camera, **more):

@@ -1,45 +1,22 @@
-"""A as an operator compared with dense algebra, the two lifts by hand, and key views."""
-
-from dataclasses import replace
+"""A as an operator compared with plain loops, the two lifts by hand, and key views."""
 
 import numpy as np
 import pytest
 import scipy.sparse as sp
 
 from hilsplat.contributions import key_views as module
-from hilsplat.contributions.key_views import key_views, most_covering
+from hilsplat.contributions.key_views import key_views
 from hilsplat.contributions.mask_operator import BLOCK, MaskOperator, lifted_average, lifted_median
 from hilsplat.scene.scene import Scene
-from tests.unit.two_boxes_world import NUM_GAUSSIANS, two_boxes_weights
-
-
-def random_operator(gaussians: int, density: float) -> tuple[MaskOperator, np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(0)
-    A = sp.random(14, gaussians, density, random_state=rng, dtype=np.float32, format="csr")
-    level = rng.integers(1, 4, 14).astype(np.uint8)
-    return MaskOperator.of(A, level), A.toarray().astype(np.float64), level
-
-
-def test_means_and_spread_equal_the_dense_products():
-    operator, A, level = random_operator(30, 0.3)
-    rng = np.random.default_rng(1)
-    features = rng.normal(size=(30, 3, 4))
-    values = rng.normal(size=(14, 4)).astype(np.float32)
-    means = np.stack([A[m] @ features[:, level[m] - 1] for m in range(14)])
-    assert operator.means(features) == pytest.approx(means, abs=1e-12)
-    assert operator.means(features.astype(np.float32)) == pytest.approx(means, abs=1e-5)
-    spread = operator.spread(values)
-    for index in range(3):
-        rows = level == index + 1
-        assert spread[:, index] == pytest.approx(A[rows].T @ values[rows], abs=1e-5)
+from tests.unit.two_boxes_world import two_boxes_weights
 
 
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize("channels", [3, 16, 32])
 def test_products_have_the_bytes_of_plain_loops_on_any_number_of_threads(channels, threads):
-    num_gaussians = 2 * BLOCK + 5
-    operator = replace(random_operator(num_gaussians, 0.002)[0], threads=threads)
-    rng = np.random.default_rng(2)
+    num_gaussians, rng = 2 * BLOCK + 5, np.random.default_rng(2)
+    A = sp.random(14, num_gaussians, 0.002, random_state=rng, dtype=np.float32, format="csr")
+    operator = MaskOperator.of(A, rng.integers(1, 4, 14).astype(np.uint8), threads)
     features = rng.normal(size=(num_gaussians, 3, channels)).astype(np.float32)
     values = rng.normal(size=(14, channels)).astype(np.float32)
     means, spread = np.zeros_like(values), np.zeros_like(features)
@@ -49,6 +26,7 @@ def test_products_have_the_bytes_of_plain_loops_on_any_number_of_threads(channel
             means[mask] += weight * features[gaussian, level]
             spread[gaussian, level] += weight * values[mask]
     assert operator.means(features).tobytes() == means.tobytes()
+    assert operator.means(features.astype(np.float64)) == pytest.approx(means, abs=1e-5)
     assert operator.spread(values).tobytes() == spread.tobytes()
 
 
@@ -78,24 +56,19 @@ def test_the_median_of_a_triangle_is_its_fermat_point():
     assert median[0, 0] == pytest.approx([0, 1 / np.sqrt(3)], abs=1e-4)
 
 
-def test_views_that_add_most_are_chosen_first():
-    seen = np.array([[1, 1, 1, 0], [1, 1, 0, 0], [0, 0, 0, 1]], bool)
-    # row 0 sees most; then rows 1 (half of 2) and 2 both add 1, and the first is chosen
-    assert most_covering(seen, np.array([1.0, 1, 1, 1]), 3) == [0, 1, 2]
-    assert most_covering(seen, np.array([1.0, 1, 1, 2]), 2) == [0, 2]
-
-
 def test_a_share_of_the_training_views_is_chosen_in_camera_order(two_boxes, monkeypatch):
-    shown = {"000.png": 4, "001.png": 1, "002.png": 9, "003.png": 2}
+    shown = {"000.png": (0, 9), "001.png": (0, 5), "002.png": (9, 12), "003.png": (0, 2)}
 
     def weights(gaussians, camera, *, min_weight):
+        first, last = shown[camera.name]
         matrix = two_boxes_weights(0).tolil()
-        matrix[:, shown[camera.name] * NUM_GAUSSIANS // 10 :] = 0  # the first Gaussians only
+        matrix[:, : 8 * first] = matrix[:, 8 * last :] = 0
         return matrix.tocsr()
 
     monkeypatch.setattr(module, "load_ply", lambda path: None)
     monkeypatch.setattr(module, "pixel_weights", weights)
     scene = Scene.load(two_boxes.scene)
+    assert key_views(scene, two_boxes.ply, 0.25) == ["000.png"]
+    # 002 adds 24 Gaussians, and 001 half of 40
     assert key_views(scene, two_boxes.ply, 0.5) == ["000.png", "002.png"]
     assert key_views(scene, two_boxes.ply, 0.3) == ["000.png", "002.png"]  # rounded up
-    assert key_views(scene, two_boxes.ply, 0.25) == ["002.png"]

@@ -10,9 +10,9 @@ from torch import nn
 from hilsplat.base.artifacts import read_index, read_npy, write_npy
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.contributions.rows import Contributions
+from hilsplat.embed.vectors import mask_embeddings
 from hilsplat.field.autoencoder import (
     loss_gradients,
-    mask_targets,
     run_autoencoder,
     statistics,
     train_autoencoder,
@@ -23,7 +23,7 @@ from hilsplat.field.code import (
     autoencoder_file,
     load_code,
     load_latents,
-    torch_generator,
+    unit_rows,
 )
 from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.semantic_tree.tree import SemanticTree
@@ -35,8 +35,7 @@ QUICK = AutoencoderSettings(code="network", latent=3, epochs=1, min_steps=200)
 
 
 def unit_vectors(rows: int, channels: int, seed: int = 0) -> np.ndarray:
-    vectors = np.random.default_rng(seed).normal(size=(rows, channels)).astype(np.float32)
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    return unit_rows(np.random.default_rng(seed).normal(size=(rows, channels)).astype(np.float32))
 
 
 def torch_layers(widths: list[int], norm: bool) -> nn.Sequential:
@@ -78,7 +77,7 @@ def without_statistics(model: Autoencoder) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("channels", [16, 300])
 def test_gradients_are_those_of_autograd(channels):
     vectors, weight = unit_vectors(24, channels), 0.3
-    parameters = without_statistics(Autoencoder.drawn(channels, 3, torch_generator(1)))
+    parameters = without_statistics(Autoencoder.drawn(channels, 3, np.random.RandomState(1)))
     found = {name: np.full_like(values, np.nan) for name, values in parameters.items()}
     loss_gradients(parameters, vectors, 3, weight, found)
     model = TorchAutoencoder(parameters, channels, 3)
@@ -92,7 +91,7 @@ def test_gradients_are_those_of_autograd(channels):
 
 def test_a_trained_network_equals_torch_with_the_statistics_of_all_vectors():
     vectors = unit_vectors(50, 16)
-    model = Autoencoder.drawn(16, 3, torch_generator(2))
+    model = Autoencoder.drawn(16, 3, np.random.RandomState(2))
     model.arrays |= statistics(without_statistics(model), vectors, 3)
     reference = TorchAutoencoder(model.arrays, 16, 3)
     for module in reference.modules():
@@ -126,7 +125,7 @@ def test_compiled_layers_equal_matrix_products_with_relu(rows, widths):
 def test_missing_files_and_weights_are_reported(tmp_path):
     with pytest.raises(ArtifactError, match=r"autoencoder\.safetensors cannot be read"):
         load_code(tmp_path)
-    model = Autoencoder.drawn(16, 3, torch_generator(0))
+    model = Autoencoder.drawn(16, 3, np.random.RandomState(0))
     del model.arrays["encoder.4.running_var"]
     model.save(autoencoder_file(tmp_path))
     with pytest.raises(ArtifactError, match=r"encoder.4.running_var of shape \(16,\) is missing"):
@@ -172,16 +171,18 @@ def boxes_with_tree(two_boxes_contributions):
     return world, contributions, tree
 
 
-def test_targets_are_the_vectors_of_the_nodes_that_masks_fit_best(boxes_with_tree):
-    world, _, folder = boxes_with_tree
-    tree = SemanticTree.load(folder, world.clip)
+def test_targets_are_the_vectors_of_nodes_or_of_masks(boxes_with_tree, monkeypatch):
+    world, contributions, folder = boxes_with_tree
+    tree, out = SemanticTree.load(folder, world.clip), world.folder / "autoencoder"
     tree.node_of_mask[3] = -1  # shares no Gaussian with a node
-    own = unit_vectors(len(tree.node_of_mask), 16)
-    target, train = mask_targets(own, tree, "node")
-    np.testing.assert_allclose(target[3], tree.clip.mean(axis=0))
-    assert np.array_equal(target[0], tree.clip[tree.node_of_mask[0]])
-    assert train is tree.clip
-    assert mask_targets(own, tree, "mask")[0] is own
+    monkeypatch.setattr(SemanticTree, "load", lambda *folders: tree)
+    of_nodes = tree.clip[tree.node_of_mask]
+    of_nodes[3] = tree.clip.mean(axis=0)
+    for targets, expected in (("node", of_nodes), ("mask", mask_embeddings(world.clip, contributions))):
+        settings = AutoencoderSettings(latent=2, targets=targets)
+        run_autoencoder(world.clip, folder, contributions, out, settings, 0)
+        latents = load_latents(out, Contributions.load(contributions))
+        np.testing.assert_allclose(latents, load_code(out).encode_array(expected), atol=1e-6)
 
 
 def test_targets_of_masks_without_vectors_are_refused(boxes_with_tree):

@@ -24,7 +24,7 @@ from hilsplat.field.solver import dot, keep_labelled, solve_field
 from hilsplat.methods.method import MethodInputs
 from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.settings import AutoencoderSettings, FieldSettings, SemanticTreeSettings
-from tests.unit.field.torch_losses import clustering_loss, instance_term, latent_regression_loss, part_term
+from tests.unit.field.torch_losses import instance_term, part_term
 from tests.unit.round_gaussians import round_gaussians
 from tests.unit.two_boxes_world import reverse_masks
 
@@ -34,12 +34,11 @@ PIXELS, GAUSSIANS, CHANNELS = 60, 12, 2
 class Toy:
     """One view with three masks a level on 60 pixels and 12 Gaussians, and its dense matrices."""
 
-    def __init__(self, weights: tuple[float, float, float], unseen: int | None = None) -> None:
+    def __init__(self, weights: tuple[float, float, float]) -> None:
         rng = np.random.default_rng(0)
         dense = rng.random((PIXELS, GAUSSIANS)) * (rng.random((PIXELS, GAUSSIANS)) < 0.4)
         dense[:, 0] += 0.01  # no empty row
-        if unseen is not None:
-            dense[:, unseen] = 0
+        dense[:, 5] = 0  # an unseen Gaussian
         self.W = (dense / dense.sum(axis=1, keepdims=True)).astype(np.float32)
         self.labels = rng.integers(-1, 3, (PIXELS, 3)) + np.array([0, 3, 6])
         self.labels[rng.random((PIXELS, 3)) < 0.2] = -1
@@ -78,37 +77,6 @@ class Toy:
         half = MaskOperator.of(sp.csr_matrix(self.A_half), self.level)
         return Contrast(self.problem.masks, half, self.pixels, self.half_pixels, [relations], settings)
 
-    def dense_losses(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Language loss and L_h by rendering every pixel, as means over labelled pixels."""
-        language, clustering = 0, 0
-        for index in range(3):
-            labels = torch.from_numpy(self.labels[:, index])
-            rendered = torch.from_numpy(self.W).double() @ features[:, index]
-            count = (labels >= 0).sum() / self.pixels.sum()
-            latents = torch.from_numpy(self.latents).double()
-            language = language + count * latent_regression_loss(rendered, labels, latents)
-            clustering = clustering + count * clustering_loss(rendered, labels)
-        return language, clustering
-
-
-def test_terms_and_gradient_equal_those_of_rendered_pixels():
-    toy = Toy((0.7, 0.4, 0.0))
-    features = torch.from_numpy(toy.features).double().requires_grad_()
-    language, clustering = toy.dense_losses(features)
-    terms = toy.problem.terms(toy.features)
-    assert terms["language"] == pytest.approx(language.item(), rel=1e-5)
-    assert terms["clustering"] == pytest.approx(clustering.item(), rel=1e-5)
-    (expected,) = torch.autograd.grad(0.7 * language + 0.4 * clustering, features)
-    half = toy.problem.hessian_product(toy.features) - toy.problem.right_side()
-    assert 2 / toy.problem.total_pixels * half == pytest.approx(expected.numpy(), abs=1e-6)
-
-
-def test_unseen_gaussians_stay_zero():
-    problem = Toy((1.0, 0.3, 0.1), unseen=5).problem
-    solved = conjugate_gradient(problem, 5)
-    assert np.isfinite(solved).all()
-    assert (solved[5] == 0).all()
-
 
 def test_conjugate_gradient_reaches_the_dense_solution():
     language, clustering, ridge = weights = (1.0, 0.3, 0.1)
@@ -122,7 +90,8 @@ def test_conjugate_gradient_reaches_the_dense_solution():
         A, n = toy.A[rows].astype(np.float64), np.diag(toy.pixels[rows].astype(np.float64))
         hessian = (language + clustering) * G - clustering * A.T @ n @ A + ridge * mass
         right = language * A.T @ n @ toy.latents[rows] + ridge * mass @ toy.problem.lifted[:, index]
-        assert solved[:, index] == pytest.approx(np.linalg.solve(hessian, right), abs=2e-5)
+        expected, *_ = np.linalg.lstsq(hessian, right, rcond=None)  # 0 for the unseen Gaussian
+        assert solved[:, index] == pytest.approx(expected, abs=2e-5)
 
 
 def test_a_solved_problem_stays_solved():
@@ -169,30 +138,19 @@ def test_contrastive_gradients_equal_autograd_through_the_means(readings):
     assert gradient == pytest.approx(of_part.numpy(), abs=1e-5)
 
 
-def test_contrastive_weights_lower_their_terms():
-    toy = Toy((1.0, 0.0, 0.1))
-    settings = FieldSettings(
-        weight_clustering=0.0, weight_instance=1.0, weight_part=0.1, omega=3.0, lbfgs_steps=15
-    )
-    features, report = solve_field(toy.problem, toy.contrast(settings))
-    assert np.isfinite(features).all()
-    assert report["after_lbfgs"]["instance"] < report["after_cg"]["instance"]
-    without = settings.model_copy(update={"weight_instance": 0.0, "weight_part": 0.0})
-    _, plain = solve_field(toy.problem, toy.contrast(without))
-    assert "after_lbfgs" not in plain
-    assert plain["after_cg"]["language"] < plain["lifted"]["language"]
-
-
 def test_the_first_step_of_lbfgs_starts_at_the_conjugate_gradient_and_lowers_the_objective():
     toy = Toy((1.0, 0.3, 0.1))
     weights = {"language": 1.0, "clustering": 0.3, "ridge": 0.1, "instance": 0.5, "part": 0.1}
     settings = FieldSettings(weight_instance=0.5, weight_part=0.1, cg_steps=3, lbfgs_steps=1)
     _, report = solve_field(toy.problem, toy.contrast(settings))
+    assert report["after_cg"]["language"] < report["lifted"]["language"]
     before, after = (
         sum(weight * report[phase][name] for name, weight in weights.items())
         for phase in ("after_cg", "after_lbfgs")
     )
     assert after < before
+    without = settings.model_copy(update={"weight_instance": 0.0, "weight_part": 0.0})
+    assert "after_lbfgs" not in solve_field(toy.problem, toy.contrast(without))[1]
 
 
 @pytest.mark.parametrize("length", range(9))

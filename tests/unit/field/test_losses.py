@@ -1,12 +1,10 @@
-"""L_lang, L_h, L_ins and L_part against numbers worked out by hand."""
+"""L_ins and L_part against numbers worked out by hand and autograd."""
 
 import math
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from hilsplat.field import losses
 from hilsplat.field.losses import (
@@ -25,16 +23,6 @@ def doubles(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
-def test_reference_of_the_pixel_losses_matches_hand_computation():
-    features = torch.tensor([[1.0], [3.0], [10.0], [7.0]])
-    labels = torch.tensor([0, 0, -1, 1])
-    # mask 0 has mean 2 and squares 1 + 1; mask 1 is one pixel; three labelled pixels
-    assert torch_losses.clustering_loss(features, labels).item() == pytest.approx(2 / 3)
-    # (1 - 2)^2, (3 - 2)^2 and (7 - 4)^2
-    latents = torch.tensor([[2.0], [4.0]])
-    assert torch_losses.latent_regression_loss(features, labels, latents).item() == pytest.approx(11 / 3)
-
-
 def test_depth_of_common_ancestors():
     # 0 contains 1 and 2, 1 contains 3; 4 is unrelated
     depth = common_ancestor_depth(np.array([-1, 0, 0, 1, -1], dtype=np.int32))
@@ -45,12 +33,6 @@ def test_depth_of_common_ancestors():
         [1, 2, 1, 3, 0],
         [0, 0, 0, 0, 1],
     ]
-
-
-def test_distances_are_softened_at_zero():
-    loss, gradient = instance_loss_tree(np.zeros((2, 3)), np.zeros((2, 2), np.int64), 10.0)
-    assert loss == pytest.approx(math.log(SOFTENING) ** 2)
-    assert not gradient.any()
 
 
 @pytest.mark.parametrize(("levels", "distance"), [((1, 1), 1.0), ((1, 2), 0.1), ((1, 3), 0.01)])
@@ -74,20 +56,6 @@ def test_the_tree_instance_loss_depends_on_relation_not_on_level():
     assert instance_loss_tree(means, related, 10.0)[0] == pytest.approx(math.log(10) ** 2, rel=1e-5)
 
 
-@given(st.permutations(range(5)))
-def test_instance_losses_ignore_the_order_of_masks(order):
-    means = doubles(5, 3).numpy()
-    depth = common_ancestor_depth(np.array([-1, 0, 0, 1, -1], dtype=np.int32))
-    level = np.array([1, 2, 2, 3, 1])
-    order = np.array(order)
-    same = depth[order][:, order]
-    for before, after in (
-        (instance_loss_tree(means, depth, 10.0), instance_loss_tree(means[order], same, 10.0)),
-        (instance_loss_literal(means, level, 10.0), instance_loss_literal(means[order], level[order], 10.0)),
-    ):
-        assert after[0] == pytest.approx(before[0])
-
-
 def test_similarity_subtracts_the_anchors_parent():
     anchors, parent = np.array([[2.0, 1.0]]), np.array([[1.0, 1.0]])
     others = np.array([[1.0, 3.0], [0.0, 1.0], [5.0, 1.0]])
@@ -103,15 +71,6 @@ def test_literal_part_loss_matches_hand_computation():
     # -log(exp(0) / exp(-1 / 0.5)) = -2, and -log(exp(0) / exp(0)) = 0; mean -1
     loss, _ = part_loss_literal(means, parent, np.zeros_like(means), tau=0.5)
     assert loss == pytest.approx(-1.0)
-
-
-def test_the_literal_part_loss_ignores_orphans():
-    means = doubles(4, 3).numpy()
-    parents = np.zeros((4, 3))
-    with_orphan = part_loss_literal(means, np.array([7, 7, 8, -1]), parents, 0.1)
-    without = part_loss_literal(means[:3], np.array([7, 7, 8]), parents[:3], 0.1)
-    assert with_orphan[0] == pytest.approx(without[0])
-    assert part_loss_literal(means, np.array([-1] * 4), parents, 0.1)[0] == 0
 
 
 def test_disentangling_part_loss_matches_hand_computation():

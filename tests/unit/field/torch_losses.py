@@ -3,30 +3,12 @@
 import math
 
 import torch
-from jaxtyping import Float, Int
 from torch import Tensor
 
 from hilsplat.base.levels import NONE
 from hilsplat.field.contrast import ViewRelations
 from hilsplat.field.losses import SHORTEST, SOFTENING
 from hilsplat.settings import FieldSettings
-
-
-def latent_regression_loss(
-    features: Float[Tensor, "P D"], labels: Int[Tensor, " P"], latents: Float[Tensor, "M D"]
-) -> Float[Tensor, ""]:
-    """Mean squared distance of the rendered features of labelled pixels to the latents of their masks."""
-    inside = labels >= 0
-    return (features[inside] - latents[labels[inside]]).square().sum() / inside.sum()
-
-
-def clustering_loss(features: Float[Tensor, "P D"], labels: Int[Tensor, " P"]) -> Float[Tensor, ""]:
-    """L_h (Eq. 2): mean squared distance of the rendered features of labelled pixels to their mask's mean."""
-    inside = labels >= 0
-    values, rows = features[inside], labels[inside]
-    one_hot = torch.nn.functional.one_hot(rows).to(values.dtype)
-    means = one_hot.T @ values / one_hot.sum(0).clamp(min=1)[:, None]
-    return (values - means[rows]).square().sum() / inside.sum()
 
 
 def log_distance_loss(means: Tensor, log_wanted: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hilsplat.field.autoencoder import train_autoencoder
-from hilsplat.field.code import Autoencoder, LinearCode, torch_generator
+from hilsplat.field.code import Autoencoder, LinearCode, unit_rows
 from hilsplat.query.relevancy import STEPS, LatentRelevancy, lost_for_error, relevancy
 from hilsplat.settings import AutoencoderSettings
 
@@ -16,21 +16,17 @@ def test_nearest_canonical_phrase_decides():
     assert score == pytest.approx(np.array([[0.549834, 0.5]]), abs=1e-6)
 
 
-def unit(vectors):
-    return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
-
-
 @pytest.fixture(scope="module")
 def vectors():
     """Sixty vectors around six directions, like those of a scene's masks."""
     rng = np.random.default_rng(0)
     centres = rng.normal(size=(6, 32))
-    return unit(np.repeat(centres, 10, axis=0) + 0.3 * rng.normal(size=(60, 32)))
+    return unit_rows(np.repeat(centres, 10, axis=0) + 0.3 * rng.normal(size=(60, 32))).astype(np.float32)
 
 
 @pytest.fixture(scope="module")
 def texts():
-    return unit(np.random.default_rng(1).normal(size=(7, 32)))
+    return unit_rows(np.random.default_rng(1).normal(size=(7, 32))).astype(np.float32)
 
 
 def blends(features, count):
@@ -44,7 +40,7 @@ def blends(features, count):
 
 def pass_through(latent, channels):
     """A network that decodes to the positive part of a latent, then zeros, at unit length."""
-    code = Autoencoder.drawn(channels, latent, torch_generator(0))
+    code = Autoencoder.drawn(channels, latent, np.random.RandomState(0))
     for name, values in code.arrays.items():
         if name.startswith("decoder"):
             values[:] = np.eye(*values.shape) if values.ndim == 2 else 0
@@ -53,7 +49,7 @@ def pass_through(latent, channels):
 
 def distance_from_kept(code, latents, placed):
     """Distance of decoded vectors from their stored form, which bounds the error of any text's cosine."""
-    kept = (placed.coordinates.T / STEPS) @ placed.directions
+    kept = (placed.channels.T / STEPS) @ placed.directions
     return np.linalg.norm(code.decode_array(latents) - kept, axis=1)
 
 
@@ -119,14 +115,8 @@ def test_repeatedly_missed_objects_are_found_until_all_channels_are_directions(m
     placed = fast.prepare(latents)
     assert distance_from_kept(code, latents, placed).max() < 8e-4
     assert placed.directions @ placed.directions.T == pytest.approx(axes, abs=1e-6)
-    assert placed.coordinates.shape == (8, 4000)
-    assert placed.coordinates.base is None  # no larger array stays in memory
-
-
-def test_a_level_without_pixels_gives_empty_maps(vectors, texts):
-    code = train_autoencoder(vectors, AutoencoderSettings(code="network", latent=3, epochs=1, min_steps=1), 0)
-    fast = LatentRelevancy(code, texts[:4], 10.0)
-    assert fast.fast(fast.prepare(np.zeros((0, 3), np.float32)), texts[4:]).shape == (3, 0)
+    assert placed.channels.shape == (8, 4000)
+    assert placed.channels.base is None  # no larger array stays in memory
 
 
 @pytest.mark.parametrize("latent", [3, 8, 11])  # loops take eight channels at a time
@@ -164,3 +154,4 @@ def test_texts_looked_up_together_have_the_bytes_of_each_alone(vectors, texts):
         alone = [fast.fast(placed, texts[row : row + 1])[0] for row in range(len(texts))]
         assert together.tobytes() == np.stack(alone).tobytes()
         assert fast.fast(placed, texts[:0]).shape == (0, len(latents))
+        assert fast.fast(fast.prepare(latents[:0]), texts).shape == (len(texts), 0)
