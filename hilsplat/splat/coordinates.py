@@ -18,10 +18,8 @@ from hilsplat.splat.ply import load_ply, save_ply
 
 logger = logging.getLogger(__name__)
 
-AXES = "right-handed; cameras in OpenCV axes (x right, y down, z forward)"
 FIX = "export it again as an uncompressed 3DGS PLY, or correct the gaussians column of the scene sheet"
-TOLERANCE = 1e-5
-"""Maximum deviation of a matrix from a scaled rotation, relative to the scale."""
+TOLERANCE = 1e-5  # maximum deviation of a matrix from a scaled rotation, relative to the scale
 
 
 def decompose(similarity: Float[np.ndarray, "4 4"]) -> tuple[float, Float64[np.ndarray, "3 3"], np.ndarray]:
@@ -118,7 +116,7 @@ def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dic
             "gaussians": len(gaussians),
             "sh_degree": gaussians.sh_degree,
             "unit": scene.unit,
-            "axes": AXES,
+            "axes": "right-handed; cameras in OpenCV axes (x right, y down, z forward)",
             "source": registration["poses"],
             "convention": "x_scene = scene_from_source @ [x_source, 1]",
             "scene_from_source": scene.scene_from_source.tolist(),

@@ -35,12 +35,10 @@ RESET_OPACITY = 0.01  # 3DGS
 
 MAX_TOGETHER = 51
 """Maximum number of coincident Gaussians, as in the paper's code; a higher limit would change little."""
-MAX_OPACITY = 1 - 1e-6
-"""Maximum opacity; opacity 1 has no logit."""
+MAX_OPACITY = 1 - 1e-6  # maximum opacity; opacity 1 has no logit
 NOISE_SHARPNESS = 100.0
 """Rate at which noise decreases with opacity (paper: k = 100): the noise factor at opacity 0.1 is e^-9.5."""
-MIN_GATE = 1e-6
-"""Gaussians whose noise factor is smaller than this get no noise."""
+MIN_GATE = 1e-6  # Gaussians whose noise factor is smaller than this get no noise
 
 
 @dataclass
@@ -60,10 +58,6 @@ class ScreenGradients:
         x, y = means_px[:, 0] * np.float64(size_hw[1] / 2), means_px[:, 1] * np.float64(size_hw[0] / 2)
         self.total += np.sqrt(x * x + y * y)
         self.seen += drawn
-
-    def mean(self) -> Float64[np.ndarray, " N"]:
-        """Return the average lengths; 0 for Gaussians that were never drawn."""
-        return self.total / np.maximum(self.seen, 1)
 
 
 def control_density(
@@ -100,7 +94,7 @@ def densify(
     generator: np.random.Generator,
 ) -> None:
     """Clone small and split large Gaussians with large screen gradients, largest first, up to the cap."""
-    mean = gradients.mean()
+    mean = gradients.total / np.maximum(gradients.seen, 1)
     selected = np.flatnonzero(mean > settings.densify_gradient)
     room = max(settings.max_gaussians - len(adam), 0)
     if len(selected) > room:

@@ -38,16 +38,11 @@ from hilsplat.splat.rasterise.device import choose_device
 
 logger = logging.getLogger(__name__)
 
-CURVE_EVERY = 20
-"""Number of steps between two points on the training curve."""
-MIN_SIDE_PX = 64
-"""Minimum length of a downscaled image's shorter side."""
-MAX_SHOWN = 8
-"""Maximum number of views on the contact sheet of test views."""
-ERROR_GAIN = 4
-"""Factor by which displayed errors are multiplied."""
-TABLES = ("parameters", "first", "second")
-"""Tables of `Adam` that a checkpoint contains."""
+CURVE_EVERY = 20  # number of steps between two points on the training curve
+MIN_SIDE_PX = 64  # minimum length of a downscaled image's shorter side
+MAX_SHOWN = 8  # maximum number of views on the contact sheet of test views
+ERROR_GAIN = 4  # factor by which displayed errors are multiplied
+TABLES = ("parameters", "first", "second")  # tables of `Adam` that a checkpoint contains
 
 
 @dataclass

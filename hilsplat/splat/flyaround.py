@@ -24,8 +24,7 @@ MAX_STOPS = 80
 SMOOTHING = 1 / 40
 """Width of the smoothing as a share of the tour; smoothing removes the shake of hand-held cameras."""
 
-MAX_SIDE_PX = 320
-"""Longer side of a picture on a contact sheet."""
+MAX_SIDE_PX = 320  # longer side of a picture on a contact sheet
 GAP_PX = 4
 
 OPTIONS = {"crf": "20", "preset": "veryfast", "x264-params": "threads=1:mbtree=0"}

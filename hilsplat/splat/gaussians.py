@@ -32,11 +32,9 @@ class Gaussians:
         return round(self.sh.shape[1] ** 0.5) - 1
 
 
-FIELDS = tuple(field.name for field in fields(Gaussians))
-"""Names of the parameter fields."""
+FIELDS = tuple(field.name for field in fields(Gaussians))  # names of the parameter fields
 
-BITS = 21
-"""Bits per coordinate; three coordinates use 63 of a key's 64 bits."""
+BITS = 21  # bits per coordinate; three coordinates use 63 of a key's 64 bits
 
 
 def morton_order(means: Float[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:

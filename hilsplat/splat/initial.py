@@ -20,10 +20,8 @@ SH_0 = 0.28209479177387814
 FIRST_OPACITY = 0.1  # 3DGS
 MIN_POINTS = 200
 """If there are fewer sparse points than this, random points in front of the cameras are added."""
-ADDED_POINTS = 2_000
-"""Number of random points added if there are too few sparse points."""
-RANDOM_POINTS = 10_000
-"""Number of random points if `gaussians.initial` is "random"."""
+ADDED_POINTS = 2_000  # number of random points added if there are too few sparse points
+RANDOM_POINTS = 10_000  # number of random points if `gaussians.initial` is "random"
 
 
 @dataclass(frozen=True)
@@ -76,10 +74,8 @@ def first_gaussians(
             found=f"{len(xyz)} points, {int((~finite).sum())} not finite",
             fix="specify the points as ply_file_path in transforms.json, or set gaussians.initial to points",
         )
-    xyz, rgb = xyz[finite], rgb[finite]
-    known = xyz
-    if is_random:
-        xyz, rgb = xyz[:0], rgb[:0]
+    known, rgb = xyz[finite], rgb[finite]
+    xyz, rgb = (known[:0], rgb[:0]) if is_random else (known, rgb)
     if len(xyz) > settings.max_gaussians and not is_frozen:
         rows = np.sort(generator.choice(len(xyz), settings.max_gaussians, replace=False))
         xyz, rgb = xyz[rows], rgb[rows]

@@ -10,8 +10,7 @@ from hilsplat.base.artifacts import atomic_path, remake
 from hilsplat.base.errors import ArtifactError
 from hilsplat.splat.gaussians import Gaussians
 
-HEADER_BYTES = 2**14
-"""Number of bytes that are searched for the vertex count."""
+HEADER_BYTES = 2**14  # number of bytes that are searched for the vertex count
 
 
 def _names(num_bases: int) -> list[str]:

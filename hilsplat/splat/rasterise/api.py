@@ -45,7 +45,6 @@ def draw(
     Gradients are first-order and are not computed for the camera.
 
     Args:
-        degree: degree of the spherical harmonics to use.
         features: any number of additional channels to blend in the same pass.
         threads: CPU threads; the result is byte-identical for any number.
         device: backend; see `device.choose_device`.

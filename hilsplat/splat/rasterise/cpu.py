@@ -21,8 +21,7 @@ from hilsplat.splat.rasterise.binning import Tiles, bin_gaussians, fill_lists
 from hilsplat.splat.rasterise.blend import add_slots, blend, blend_backward, sparse_rows
 from hilsplat.splat.rasterise.project import GEOMETRY, MOMENTS, pack_camera, project, project_backward
 
-RANGES_PER_THREAD = 4
-"""Number of work ranges per thread; several ranges balance the load."""
+RANGES_PER_THREAD = 4  # number of work ranges per thread; several ranges balance the load
 
 
 def over_ranges(
@@ -84,11 +83,7 @@ def refuse_broken(broken: int, total: int) -> None:
 
 
 def project_gaussians(gaussians: Gaussians, camera: Camera, degree: int, threads: int) -> Projected:
-    """Project all Gaussians into a view, and count them per tile.
-
-    Raises:
-        HilsplatError: if parameters are not finite or quaternions are zero.
-    """
+    """Project all Gaussians into a view, and count them per tile; raise the errors of `api.draw`."""
     n = len(gaussians)
     groups = (n + WIDTH - 1) // WIDTH
     geometry = aligned(groups * WIDTH * GEOMETRY).reshape(-1, GEOMETRY)
@@ -155,14 +150,14 @@ def blend_forward(
 def blend_gradients(
     gaussians: Gaussians,
     view: Projected,
-    channels: Float32[np.ndarray, "N C"],
+    channels: Float32[np.ndarray, "N C"],  # colours, then features
     image: Float32[np.ndarray, "H W C"],
     alpha: Float32[np.ndarray, "H W"],
     grad_image: Float32[np.ndarray, "H W C"],
     grad_alpha: Float32[np.ndarray, "H W"],
     threads: int,
 ) -> Gradients:
-    """Compute gradients from those of `blend_forward`'s outputs; `channels` are colours, then features."""
+    """Compute gradients from those of `blend_forward`'s outputs."""
     p, n = gaussians, len(gaussians)
     columns = MOMENTS + channels.shape[1]
     width = (columns + WIDTH - 1) // WIDTH * WIDTH

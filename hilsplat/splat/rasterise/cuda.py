@@ -20,13 +20,10 @@ from hilsplat.splat.rasterise.blend import MAX_ALPHA
 from hilsplat.splat.rasterise.cpu import Drawn, Gradients, refuse_broken, weight_matrix
 from hilsplat.splat.rasterise.project import LOW_PASS_PX2, NEAR
 
-DEVICE = "cuda"
-"""Tests set this to `cpu` and use gsplat's reference implementation in torch."""
+DEVICE = "cuda"  # tests set this to `cpu` and use gsplat's reference implementation in torch
 
-TILE = 16
-"""Side of a gsplat tile, px."""
-EVERYTHING = 2**31 - 1
-"""A number larger than any tile's batch index."""
+TILE = 16  # side of a gsplat tile, px
+EVERYTHING = 2**31 - 1  # a number larger than any tile's batch index
 
 
 def on_device(gaussians: Gaussians) -> dict[str, Tensor]:

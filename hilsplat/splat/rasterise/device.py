@@ -2,7 +2,6 @@
 
 import ctypes
 import logging
-import sys
 from functools import cache
 from importlib.util import find_spec
 from typing import Literal
@@ -20,7 +19,9 @@ def cuda_problem() -> str | None:
     # checked before importing torch, which takes 1.3 to 3 s
     if find_spec("gsplat") is None:
         return "gsplat is not installed"
-    if not _has_driver():
+    try:
+        ctypes.CDLL("libcuda.so.1")
+    except OSError:
         return "no NVIDIA driver is installed"
     import torch
 
@@ -31,15 +32,6 @@ def cuda_problem() -> str | None:
     except ImportError as error:
         return f"gsplat cannot be imported: {error}"
     return None
-
-
-def _has_driver() -> bool:
-    """Return whether the library of NVIDIA's driver can be loaded."""
-    try:
-        ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
-    except OSError:
-        return False
-    return True
 
 
 @cache

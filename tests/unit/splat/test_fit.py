@@ -208,7 +208,7 @@ def test_screen_gradient_is_in_units_of_half_the_image():
     for _ in range(2):
         gradients.add(np.float32([[3e-3, 2e-3]]), np.array([True]), (40, 20))
     # x times 10, y times 20: (0.03, 0.04) has length 0.05 in both steps
-    assert gradients.mean()[0] == pytest.approx(0.05, rel=1e-6)
+    assert (gradients.total[0], gradients.seen[0]) == (pytest.approx(0.1, rel=1e-6), 2)
 
 
 def test_first_adam_step_moves_by_the_rate_against_the_sign():

@@ -67,8 +67,8 @@ def test_compiling_is_announced_once_and_only_when_it_happens(tmp_path):
 def no_cuda(monkeypatch):
     """Simulate a machine with gsplat but without CUDA."""
     monkeypatch.setattr(device, "find_spec", lambda name: name)
-    monkeypatch.setattr(device, "_has_driver", lambda: True)
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    monkeypatch.setattr("ctypes.CDLL", lambda name: None)
     device.cuda_problem.cache_clear()
     choose_device.cache_clear()
     yield
