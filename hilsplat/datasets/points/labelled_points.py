@@ -107,8 +107,8 @@ def read_matrix(path: Path) -> np.ndarray:
 class PlyMesh:
     """A PLY mesh in which every face has `corners` corners."""
 
-    def __init__(self, path: Path, corners: int) -> None:
-        self.path = require_file(path)
+    def __init__(self, path: Path, corners: int, fix: str = UNPACK_AGAIN) -> None:
+        self.path, self.fix = require_file(path, fix), fix
         try:
             self._content = PlyData.read(path, known_list_len={"face": {"vertex_indices": corners}})
             for element in ("vertex", "face"):
@@ -118,7 +118,7 @@ class PlyMesh:
                 f"{path} cannot be read: {error}",
                 expected=f"a PLY mesh with {corners} corners per face",
                 found=f"a file of {path.stat().st_size} bytes",
-                fix=UNPACK_AGAIN,
+                fix=fix,
             ) from error
 
     def column(self, element: str, name: str) -> np.ndarray:
@@ -148,6 +148,6 @@ class PlyMesh:
                 f"{self.path}: a face has an invalid vertex index",
                 expected=f"0 to {count - 1}",
                 found=f"{faces.min()} to {faces.max()}",
-                fix=UNPACK_AGAIN,
+                fix=self.fix,
             )
         return faces

@@ -25,7 +25,7 @@ from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.origin import masks_label
 from hilsplat.settings import EvaluateSettings
-from hilsplat.world.truth import TrueMesh
+from hilsplat.world.truth import load_surface, true_depth
 
 TRUTH = "true regions"
 """Row of the labels: an upper limit for any masks, below 1 as label borders are off by up to a pixel."""
@@ -230,11 +230,11 @@ def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> s
     if len(views) < 2:
         raise ArtifactError(f"{masks_folder} has masks for {len(views)} view(s)", expected="at least two")
     cameras = Cameras.load(Path(truth) / "cameras.npz")
-    mesh = TrueMesh.load(Path(truth) / "mesh.ply")
+    surface = load_surface(Path(truth) / "mesh.ply")
     annotations = HierarchyAnnotations.load(truth)
     pairs = neighbours(cameras, views, count)
 
-    depth_of = lru_cache(maxsize=2 * count + 2)(lambda view: mesh.depth(cameras[view]))
+    depth_of = lru_cache(maxsize=2 * count + 2)(lambda view: true_depth(surface, cameras[view]))
 
     @lru_cache(maxsize=2 * count + 2)
     def loaded(view: str) -> HierarchicalMasks:
@@ -281,12 +281,13 @@ def measure_world_consistency(
     if not (truth / "mesh.ply").is_file():
         return
     scene, true = selections.scene, Cameras.load(truth / "cameras.npz")
-    mesh, nothing = TrueMesh.load(truth / "mesh.ply"), PackedMasks((0, 0))
+    surface, nothing = load_surface(truth / "mesh.ply"), PackedMasks((0, 0))
     views = [view for view in scene.scene.cameras.names if view in true.names]
     nearest = dict(neighbours(true, views, 1))
     pairs = [(view, nearest[view]) for view in truths if view in nearest]
     for number, (a, b) in enumerate(pairs):
-        pixel_a, pixel_b = shared_points(true[a], mesh.depth(true[a]), true[b], mesh.depth(true[b]))
+        depth_a, depth_b = (true_depth(surface, true[view]) for view in (a, b))
+        pixel_a, pixel_b = shared_points(true[a], depth_a, true[b], depth_b)
         queries = spread(truths[a]().queries, TEXTS_PER_LEVEL)
         for method in ("field", "tree"):
             if method not in settings.methods:

@@ -15,7 +15,7 @@ from hilsplat.world.scenes.kinds import build_scene, scene_cameras
 from hilsplat.world.scenes.scene import Style
 from hilsplat.world.shapes import box, joined, sphere
 from hilsplat.world.textures import fractal_noise, grains, hash01
-from hilsplat.world.truth import TrueMesh
+from hilsplat.world.truth import true_depth
 from hilsplat.world.views import square_camera
 from tests.unit.world.scenes import scene_of
 
@@ -36,7 +36,7 @@ def test_label_image_of_a_box_is_its_analytic_projection():
     labels = label_view(scene, camera)
     assert np.array_equal(labels[0] == 0, expected)
     assert (labels[1:] == -1).all()
-    assert TrueMesh(scene.triangles).depth(camera)[32, 32] == pytest.approx(3.5, abs=1e-5)
+    assert true_depth(scene.caster, camera)[32, 32] == pytest.approx(3.5, abs=1e-5)
 
 
 def projected(camera: Camera, points: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from hilsplat.world.scenes.kinds import build_scene, scene_cameras
 from hilsplat.world.scenes.scene import WorldScene
 from hilsplat.world.scenes.street import FRONT, KERB, LANE, LANE_Y, MAX_STEP, SWEEP_DEG, WALK_Z, part_boxes
 from hilsplat.world.stage import run_world
-from hilsplat.world.truth import TrueMesh
+from hilsplat.world.truth import true_depth
 from hilsplat.world.views import square_camera
 
 
@@ -137,11 +137,11 @@ def test_the_sky_gives_no_return_and_a_share_of_returns_is_dropped(street, centr
 
 
 def test_visible_points_have_the_label_of_their_pixel(street, cameras, centres):
-    scan, mesh = scan_street(street, centres), TrueMesh(street.triangles)
+    scan = scan_street(street, centres)
     assert 50_000 < len(scan.points) < 150_000
     for name in ("004.png", "021.png"):
         camera = cameras[name]
-        labels, depth = label_view(street, camera), mesh.depth(camera)
+        labels, depth = label_view(street, camera), true_depth(street.caster, camera)
         seen = scan.points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
         ahead = seen[:, 2] > 0.5
         xy = (seen[ahead] @ camera.K.T)[:, :2] / seen[ahead, 2:]
