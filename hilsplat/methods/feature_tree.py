@@ -98,7 +98,8 @@ def run_feature_tree(
     clusters = nested_clusters(features, farthest, seed)
     S, mass = contributions.matrix("S"), contributions.mass()
 
-    def nodes_of(level: Level, rows: Int64[np.ndarray, " m"]) -> LevelNodes:
+    def nodes(level: Level) -> LevelNodes:
+        rows = contributions.rows_of(level)
         own, view = clusters[:, level.index], contributions.view[rows]
         fits, iou = best_fits(level_ious(own.astype(np.int32), S[rows], mass, view))
         of_mask = np.where(iou > MIN_FIT, fits, NONE).astype(np.int64)
@@ -113,4 +114,4 @@ def run_feature_tree(
             renumber[of_mask], of_gaussian, (of_gaussian != NONE).astype(np.float32), quality[kept, 0]
         )
 
-    run_semantic_tree(contributions_folder, masks_folder, out, settings, threads, nodes_of)
+    run_semantic_tree(contributions_folder, masks_folder, out, settings, threads, map(nodes, LEVELS))

@@ -39,17 +39,16 @@ NEIGHBOURS = 5
 SAMPLES = 1000
 
 
-def mask_identities(contributions: Contributions, level: Level, threads: int) -> Int64[np.ndarray, " M"]:
-    """Return each mask's identity at a level, by our default linking via shared Gaussians; -1 for none.
-
-    Masks of other levels have no identity.
-    """
-    S, mass, rows = contributions.matrix("S"), contributions.mass(), contributions.rows_of(level)
+def mask_identities(contributions: Contributions, threads: int) -> Int64[np.ndarray, " M"]:
+    """Return each mask's identity at its level, by our default linking via shared Gaussians; -1 for none."""
+    S, mass = contributions.matrix("S"), contributions.mass()
     settings = SemanticTreeSettings()
     settings = settings.model_copy(update={"min_views": min(settings.min_views, len(mass))})
-    nodes_of = linked_nodes(S, mass, contributions.view, settings, threads)
+    rows_of_levels = [contributions.rows_of(level) for level in LEVELS]
     identity = np.full(len(contributions), NONE, np.int64)
-    identity[rows] = nodes_of(level, rows).of_mask
+    of_levels = linked_nodes(S, mass, contributions.view, rows_of_levels, settings, threads)
+    for rows, nodes in zip(rows_of_levels, of_levels, strict=True):
+        identity[rows] = nodes.of_mask
     return identity
 
 
@@ -104,8 +103,9 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     """
     contributions, latents = inputs.contributions, inputs.latents
     views, features = labelled_views(inputs, settings.pixel_step), inputs.no_features()
+    identities = mask_identities(contributions, inputs.threads)
     for level in LEVELS:
-        identity = mask_identities(contributions, level, inputs.threads)
+        identity = np.where(contributions.level == int(level), identities, NONE)
         has = identity != NONE
         if not has.any():
             continue

@@ -7,6 +7,7 @@ tree only scores each node's crops. The clip stage embeds the best crops, whose 
 """
 
 import logging
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from hilsplat.contributions.rows import Contributions
 from hilsplat.segment.digests import require_same_masks
 from hilsplat.semantic_tree.export import readable_nodes
 from hilsplat.semantic_tree.nodes import (
-    NodesOf,
+    LevelNodes,
     linked_nodes,
     mask_fits,
     nearest_gaussians,
@@ -83,14 +84,14 @@ def build_tree(
     settings: SemanticTreeSettings,
     threads: int,
     join_wholes: bool,
-    nodes_of: NodesOf | None,
+    of_levels: Iterable[LevelNodes] | None,
 ) -> SemanticTree:
     """Link masks into nodes, compute the nodes' Gaussians, parents and boxes, and score their crops.
 
     Args:
         threads: number of threads; it does not affect the result.
         join_wholes: join regions that touch in 3D, for segmenters that detect only colour regions.
-        nodes_of: function that finds the nodes of a level; None to link masks.
+        of_levels: nodes of each level, to use instead of linked masks.
     """
     S, mass, means = contributions.matrix("S"), contributions.mass(), contributions.means()
     view = contributions.view
@@ -101,11 +102,10 @@ def build_tree(
     cluster_of_mask = np.full(len(contributions), NONE, np.int64)
     node_of_gaussian = np.full((S.shape[1], len(LEVELS)), NONE, np.int32)
     membership = np.zeros((S.shape[1], len(LEVELS)), np.float32)
-    nearest = None if nodes_of else nearest_gaussians(means, threads)
-    find = nodes_of or linked_nodes(S, mass, view, settings, threads)
-    for each in LEVELS:
-        rows = contributions.rows_of(each)
-        found = find(each, rows)
+    nearest = None if of_levels else nearest_gaussians(means, threads)
+    rows_of_levels = [contributions.rows_of(each) for each in LEVELS]
+    of_levels = of_levels or linked_nodes(S, mass, view, rows_of_levels, settings, threads)
+    for each, rows, found in zip(LEVELS, rows_of_levels, of_levels, strict=True):
         if join_wholes and each is Level.WHOLE:
             whole = joined_regions(found.of_gaussian, len(found.quality), means, mass, settings.whole_side)
             found = found.joined(whole)
@@ -172,11 +172,11 @@ def run_semantic_tree(
     out: Path,
     settings: SemanticTreeSettings,
     threads: int = 1,
-    nodes_of: NodesOf | None = None,
+    of_levels: Iterable[LevelNodes] | None = None,
 ) -> None:
     """Write the 3D semantic tree of a scene: `tree.npz`, the human-readable `tree.json`, and `index.json`.
 
-    `nodes_of` is as in `build_tree`.
+    `of_levels` is as in `build_tree`.
 
     Raises:
         MisalignedArtifactError: the contributions were computed from different masks.
@@ -188,7 +188,7 @@ def run_semantic_tree(
     require_same_masks(contributions_folder, masks_folder)
     with stage_log("semantic tree", scene) as counts:
         join_wholes = read_index(masks_folder, "segmenter")["segmenter"] == "graph"
-        tree = build_tree(contributions, settings, threads, join_wholes, nodes_of)
+        tree = build_tree(contributions, settings, threads, join_wholes, of_levels)
         per_level = {level.label: len(tree.nodes_of(level)) for level in LEVELS}
         orphans = {
             level.label: int((tree.parent[tree.nodes_of(level)] == NONE).sum()) for level in LEVELS[1:]

@@ -70,12 +70,12 @@ def mask_evidence(
     own = everywhere[np.arange(num), view]
     seen = np.where(everywhere < min_covisible * own[:, None], 0.0, everywhere)
     pairs = (*rows, weighted, *by_column, view, seen, everywhere)
-    parts = over_edges(_shared_pairs, edges, threads, *pairs)
-    counts, indices, sums = (np.concatenate(each) for each in zip(*parts, strict=True))
+    parts = [list(each) for each in zip(*over_edges(_shared_pairs, edges, threads, *pairs), strict=True)]
+    # Each list is freed once it is concatenated, because two copies of all pairs would need much memory.
+    counts, indices, inter, union = (np.concatenate(parts.pop(0)) for _ in range(4))
     indptr = np.concatenate(([0], np.cumsum(counts)))
-    both = sums.T.copy()
-    intersection, union = (sp.csr_matrix((each, indices, indptr), shape=(num, num)) for each in both)
-    return Evidence(intersection, union, seen, view)
+    both = (sp.csr_matrix((values, indices, indptr), shape=(num, num)) for values in (inter, union))
+    return Evidence(*both, seen, view)
 
 
 @compiled
@@ -92,7 +92,7 @@ def _seen_sizes(begin, end, indptr, indices, sizes, visible, out):
 def _shared_pairs(
     begin, end, indptr, indices, weighted, col_indptr, col_rows, col_shares, view, seen, everywhere
 ):
-    """Return the pairs a < b that share Gaussians: number per row, b, and intersection and union (E x 2)."""
+    """Return the pairs a < b that share Gaussians: number per row, b, intersections and unions."""
     num = len(indptr) - 1
     touched_by = np.full(num, -1, np.int64)
     sums = np.zeros(num)
@@ -127,4 +127,4 @@ def _shared_pairs(
             out_sums[done, 1] = everywhere[a, view[b]] + everywhere[b, view[a]] - sums[b]
             counts[a - begin] += 1
             done += 1
-    return counts, out[:done].copy(), out_sums[:done].copy()
+    return counts, out[:done].copy(), out_sums[:done, 0].copy(), out_sums[:done, 1].copy()

@@ -1,14 +1,15 @@
 """Nodes: masks linked across views, the Gaussians and parent of each node, and the masks that show it."""
 
-from collections.abc import Callable
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt8
 
-from hilsplat.base.levels import LEVELS, NONE, Level
-from hilsplat.semantic_tree.evidence import mask_evidence
+from hilsplat.base.levels import LEVELS, NONE
+from hilsplat.semantic_tree.evidence import Evidence, mask_evidence
 from hilsplat.semantic_tree.linkage import pooled_linkage
 from hilsplat.settings import SemanticTreeSettings
 
@@ -63,39 +64,39 @@ class LevelNodes:
         )
 
 
-NodesOf = Callable[[Level, Int64[np.ndarray, " m"]], LevelNodes]
-"""Function that returns the nodes of a level, given the level and the rows of its masks."""
-
-
 def linked_nodes(
     S: sp.csr_matrix,
     mass: Float32[np.ndarray, "V N"],
     view_of_mask: Int32[np.ndarray, " M"],
+    rows_of_levels: Sequence[Int64[np.ndarray, "_"]],
     settings: SemanticTreeSettings,
     threads: int,
-) -> NodesOf:
-    """Return the function that links the masks of a level into nodes and assigns Gaussians to them.
+) -> Iterator[LevelNodes]:
+    """Link the masks of each level (rows of `S`) into nodes, and assign Gaussians to them.
 
     A cluster whose Gaussians all belong to other clusters, such as a duplicate, would select no Gaussians. A
     cluster therefore becomes a node only if it is the best fit of at least `min_views` masks.
 
-    `S` and `mass`, the visible mass of each Gaussian in each view, are in px.
+    Linking takes one thread; with several, the next levels are prepared at the same time. `S` and `mass`,
+    the visible mass of each Gaussian in each view, are in px.
     """
     visible = mass > MIN_VISIBLE_PX
     total_mass = mass.sum(axis=0, dtype=np.float64)
     importance = np.einsum("vn,vn->n", mass, visible, dtype=np.float64) / np.maximum(visible.sum(axis=0), 1)
 
-    def nodes_of(_: Level, rows: Int64[np.ndarray, " m"]) -> LevelNodes:
+    def evidence(rows: Int64[np.ndarray, " m"]) -> Evidence:
         weights, view = S[rows], view_of_mask[rows]
         place = view[_row_of(weights)], weights.indices
         shares = weights.astype(np.float64)
         shares.data /= np.where(visible[place], mass[place], np.inf)
         shares.eliminate_zeros()
-        del place
-        evidence = mask_evidence(shares, importance, visible, view, MIN_COVISIBLE, threads)
-        del shares
-        cluster, quality = pooled_linkage(evidence, settings.link_threshold)
-        del evidence
+        del weights, place
+        return mask_evidence(shares, importance, visible, view, MIN_COVISIBLE, threads)
+
+    def nodes(
+        rows: Int64[np.ndarray, " m"], cluster: Int64[np.ndarray, " m"], quality: Float64[np.ndarray, " k"]
+    ) -> LevelNodes:
+        weights, view = S[rows], view_of_mask[rows]
         pairs = np.unique(np.stack([cluster, view.astype(np.int64)], axis=1), axis=0)
         kept = np.flatnonzero(np.bincount(pairs[:, 0], minlength=len(quality)) >= settings.min_views)
 
@@ -116,7 +117,14 @@ def linked_nodes(
         of_mask = renumber[of_cluster[cluster]].astype(np.int64)
         return LevelNodes(of_mask, renumber[node], share, quality[kept[renumber[:-1] != NONE]])
 
-    return nodes_of
+    with ThreadPoolExecutor(1, "linkage") as linker:
+        linked: list[Future] = []
+        for rows in rows_of_levels:
+            linked.append(linker.submit(pooled_linkage, evidence(rows), settings.link_threshold))
+            if threads == 1:
+                wait(linked)
+        for rows, clusters in zip(rows_of_levels, linked, strict=True):
+            yield nodes(rows, *clusters.result())
 
 
 def _row_of(matrix: sp.csr_matrix) -> Int64[np.ndarray, " E"]:

@@ -8,7 +8,6 @@ import scipy.sparse as sp
 
 from hilsplat.base.artifacts import read_index, read_json, read_npy, sha256_of_path, write_index, write_npy
 from hilsplat.base.errors import MisalignedArtifactError
-from hilsplat.base.levels import Level
 from hilsplat.semantic_tree import nodes
 from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.semantic_tree.nodes import (
@@ -72,7 +71,7 @@ def test_a_duplicate_cluster_is_not_a_node():
     view = np.array([0, 1, 2, 3, 0, 1, 2], np.int32)
     mass, rows = np.ones((4, 10), np.float32), np.arange(7)
 
-    found = linked_nodes(weights, mass, view, SemanticTreeSettings(), 1)(Level.WHOLE, rows)
+    (found,) = linked_nodes(weights, mass, view, [rows], SemanticTreeSettings(), 1)
     assert found.of_mask.tolist() == [0, 0, 0, 0, -1, -1, -1]
     assert found.of_gaussian.tolist() == [0] * 10
     assert found.membership == pytest.approx(np.where(np.arange(10) == 3, 0.5, 1.0))
@@ -80,7 +79,7 @@ def test_a_duplicate_cluster_is_not_a_node():
 
     whole[:2, :4] = 0  # now it wins all four, and is a node
     weights = sp.csr_matrix(np.concatenate([whole, double]).astype(np.float32))
-    found = linked_nodes(weights, mass, view, SemanticTreeSettings(), 1)(Level.WHOLE, rows)
+    (found,) = linked_nodes(weights, mass, view, [rows], SemanticTreeSettings(), 1)
     assert found.of_gaussian.tolist() == [1] * 4 + [0] * 6
 
 
