@@ -74,8 +74,10 @@ def mask_evidence(
     # Each list is freed once it is concatenated, because two copies of all pairs would need much memory.
     counts, indices, inter, union = (np.concatenate(parts.pop(0)) for _ in range(4))
     indptr = np.concatenate(([0], np.cumsum(counts)))
-    both = (sp.csr_matrix((values, indices, indptr), shape=(num, num)) for values in (inter, union))
-    return Evidence(*both, seen, view)
+    intersections, unions = (
+        sp.csr_matrix((values, indices, indptr), shape=(num, num)) for values in (inter, union)
+    )
+    return Evidence(intersections, unions, seen, view)
 
 
 @compiled
