@@ -55,7 +55,7 @@ def test_view(benchmark, model, image, tmp_path):
     def view() -> tuple[int, int]:
         candidates = decode_candidates(image, model, SETTINGS)
         write_npz(tmp_path / "cache.npz", **vars(candidates))
-        return len(candidates), finish(candidates, model, tmp_path)
+        return len(candidates.head), finish(candidates, model, tmp_path)
 
     benchmark.extra_info |= {"case": VIEW, "count": 1, "of": "views"}
     number, kept = benchmark(view)

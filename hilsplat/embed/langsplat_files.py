@@ -167,7 +167,6 @@ def read_clip(scene_folder: Path, files: Path, out: Path, settings: ClipSettings
             model_variant=settings.variant,
             model_sha256=model.digest,
             background="langsplat",
-            context=0.0,
         )
         counts.update(views=len(index), dim=model.width)
 

@@ -185,8 +185,7 @@ def _install(found: Prepared) -> str:
     if choice.exported:
         with work_folder(found.target) as temporary:
             made = temporary / found.target.name
-            with explain_full_disk(made):
-                versions = export_networks(found.staging, made)
+            versions = export_networks(found.staging, made)
             text = _place(found, made, exported=versions)
         shutil.rmtree(found.staging)
         return text
@@ -202,12 +201,11 @@ def _install(found: Prepared) -> str:
 def _fetch(listing: Listing, file: HubFile, staging: Path) -> Path:
     """Fetch a file or its missing part; delete the file and raise an error if its digest is wrong."""
     target = staging / file.path
-    with explain_full_disk(target):
-        if file.cached is None:
-            _download(listing, file, staging)
-        else:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file.cached, target)
+    if file.cached is None:
+        _download(listing, file, staging)
+    else:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file.cached, target)
     found, size = file.digest_of(target), target.stat().st_size
     if found != file.digest:
         target.unlink()
@@ -229,20 +227,18 @@ def _download(listing: Listing, file: HubFile, staging: Path) -> None:
             huggingface_hub.hf_hub_download(
                 listing.repository, file.path, revision=listing.revision, local_dir=staging
             )
+            return
         except CUT as error:
             if wait_s is None:
                 raise
             logger.info("%s: the connection was lost (%s); retrying", file.path, type(error).__name__)
             time.sleep(wait_s)
-        else:
-            return
 
 
 def _place(found: Prepared, made: Path, **more: Any) -> str:
     """Check a complete folder, write `origin.json` into it, and rename it to the target."""
     if whole := whole_clip(made):
-        with explain_full_disk(made):
-            split_clip(made)
+        split_clip(made)
         whole.unlink()
     text = check_model(made).replace(str(made), str(found.target))
     files = [path for path in sorted(made.rglob("*")) if path.is_file() and path.name != ORIGIN]
@@ -267,10 +263,11 @@ def _place(found: Prepared, made: Path, **more: Any) -> str:
 
 @contextmanager
 def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
-    """Convert errors from the network and the hub into a `DownloadError` with a fix."""
+    """Convert errors from the network, the hub and a full disk into errors with a fix."""
     place = f"{constants.ENDPOINT}/{requested.repository}"
     try:
-        yield
+        with explain_full_disk(models / requested.name):
+            yield
     except (requests.RequestException, *OUT_OF_REACH) as error:
         answered = error.__cause__ if isinstance(error, LocalEntryNotFoundError) else error
         if isinstance(answered, requests.HTTPError) and answered.response is not None:

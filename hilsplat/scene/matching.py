@@ -17,6 +17,7 @@ import onnxruntime
 from jaxtyping import Float64, Int8, Int32, UInt8, UInt32
 
 from hilsplat.base.compiled import compiled
+from hilsplat.models.network import one_thread_session
 from hilsplat.scene.colmap import pycolmap
 
 MAX_ANGLE = 0.7
@@ -152,11 +153,7 @@ def _integer_products() -> onnxruntime.InferenceSession | None:
         [helper.make_tensor("zero", TensorProto.INT8, [], [-128])],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    session = onnxruntime.InferenceSession(
-        model.SerializeToString(), options, providers=["CPUExecutionProvider"]
-    )
+    session = one_thread_session(model.SerializeToString(), ["CPUExecutionProvider"])
     rows = np.full((_BLOCK, _CHANNELS), 255, np.uint8)
     columns = np.repeat(np.array([[-128, 127]], np.int8), _CHANNELS, axis=0)
     found = session.run(None, {"rows": rows, "columns": columns})[0]

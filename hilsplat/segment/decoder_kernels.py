@@ -198,31 +198,13 @@ def pixel_weights(s, scaled, offset, offset0, u, v, top, top0, sums, sums0, widt
 
 @compiled
 @no_type_check
-def weighted_sums(sums, sums0, width, w, scaled, values, values0, e_t, factors, heads, tokens, pixels, depth):
-    """Add a block to the sums over pixels of weighted values (H, P, depth) and factors `e_t` (P, factors).
-
-    Args:
-        sums: (H * T, width): values, factors, and the columns of `pixel_weights`.
-        w, scaled: weights (H * T, P); `w` multiplies the factors, and `scaled` the values.
-    """
+def weighted_sums(sums, sums0, width, weights, values, values0, heads, tokens, pixels, depth):
+    """Add a block to the sums over pixels (H * T, width) of values (H, P, depth) by weights (H * T, P)."""
     for h in range(heads):
         multiply(
-            sums, sums0 + h * tokens * width, width, scaled, h * tokens * pixels, pixels,
+            sums, sums0 + h * tokens * width, width, weights, h * tokens * pixels, pixels,
             values, values0 + h * pixels * depth, depth, tokens, pixels, depth, False,
         )  # fmt: skip
-    if factors:
-        multiply(
-            sums, sums0 + depth, width, w, 0, pixels, e_t, 0, factors, heads * tokens, pixels, factors, False
-        )
-
-
-@compiled
-@no_type_check
-def pixels_first(e, e_t, rows, padded, pixels):
-    """Transpose factors (rows, P), with zeros in the padding columns."""
-    for r in range(0, padded, WIDTH):
-        for p in range(0, pixels, WIDTH):
-            transpose(e, r * pixels + p, pixels, e_t, p * padded + r, padded)
 
 
 @compiled
@@ -252,7 +234,7 @@ def read_image(sizes, rows, keys, values, top, sums):
                 s, scaled, none, 0, ones, zeros, top, i * all_rows, sums, at, width, all_rows, pixels
             )
             weighted_sums(
-                sums, at, width, s, s, values, b * heads * pixels * depth, s, 0, heads, tokens, pixels, depth
+                sums, at, width, s, values, b * heads * pixels * depth, heads, tokens, pixels, depth
             )
 
 
@@ -290,7 +272,7 @@ def read_by_factors(sizes, b, i, image, prompt, u, v, factors, padded, e, e_t, k
         u, v: scales of the pixels (P), as in `pixel_weights`.
         e: factors (padded, P); only the first `factors` rows are used.
         e_t, k, s, scaled: buffers for transposed factors, keys, scores and weights; overwritten.
-        top, sums: as in `pixel_weights`.
+        top, sums: as in `pixel_weights`; a row of `sums` begins with the sums of values, then of factors.
     """
     _, _, heads, tokens, dim, pixels, depth = sizes
     all_rows, base = heads * tokens, b * heads * dim * pixels
@@ -302,11 +284,13 @@ def read_by_factors(sizes, b, i, image, prompt, u, v, factors, padded, e, e_t, k
     pixel_weights(
         s, scaled, prompt.offset, 2 * i * all_rows, u, v, top, i * all_rows, sums, at, width, all_rows, pixels
     )
-    pixels_first(e, e_t, factors, padded, pixels)
     weighted_sums(
-        sums, at, width, s, scaled, image.values, b * heads * pixels * depth, e_t, padded,
-        heads, tokens, pixels, depth,
-    )  # fmt: skip
+        sums, at, width, scaled, image.values, b * heads * pixels * depth, heads, tokens, pixels, depth
+    )
+    for r in range(0, padded, WIDTH):
+        for c in range(0, pixels, WIDTH):
+            transpose(e, r * pixels + c, pixels, e_t, c * padded + r, padded)
+    multiply(sums, at + depth, width, s, 0, pixels, e_t, 0, padded, all_rows, pixels, padded, False)
 
 
 @compiled

@@ -68,9 +68,6 @@ class Candidates:
     stability: Float32[np.ndarray, " K"]  # `sam.read_logits` or `sam.full_stability`
     crop: UInt8[np.ndarray, " K"]  # row of the view's crop boxes
 
-    def __len__(self) -> int:
-        return len(self.head)
-
     @staticmethod
     def concatenate(parts: "list[Candidates]") -> "Candidates":
         """Concatenate the rows of all parts (at least one)."""

@@ -161,9 +161,8 @@ def _region_areas(row, start, stop, value, of, parent, area):
     number = len(row)
     previous = 0  # first segment of the row above
     first = 0  # first segment of this row
-    for k in range(number):
-        parent[k] = k
-        area[k] = 0
+    parent[:] = np.arange(number)
+    area[:] = 0
     for k in range(number):
         if k > 0 and row[k] != row[k - 1]:
             previous, first = first, k
@@ -201,9 +200,7 @@ def cleaned_runs(runs, offsets, width, min_area):
     changed = np.zeros(number, np.bool_)
     for k in range(number):
         mine = runs[offsets[k] : offsets[k + 1]]
-        size = np.int64(0)
-        for place in range(len(mine)):
-            size += mine[place]
+        size = np.int64(mine.sum())
         most = len(mine) + size // width + 2
         row, start, stop = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
         value = np.empty(most, np.bool_)
@@ -227,10 +224,7 @@ def cleaned_runs(runs, offsets, width, min_area):
                 filled[segment] = True
                 changed[k] = True
         _region_areas(row, start, stop, filled, True, parent, area)
-        largest = 0
-        for segment in range(segments):
-            if area[segment] > area[largest]:
-                largest = segment
+        largest = area.argmax()
         last, now = np.int64(0), False
         for segment in range(segments):
             keep = filled[segment]

@@ -1,5 +1,6 @@
 """Pictures of masks, for inspecting the output of a segmenter."""
 
+import itertools
 from pathlib import Path
 
 import cv2
@@ -92,15 +93,12 @@ def tree_picture(
     step_x, step_y = 2 * THUMB_PX, THUMB_PX + 6
     columns = max(map(height, shown), default=1)
     canvas = np.full((max(1, MAX_LEAVES - left) * step_y + 6, columns * step_x, 3), 255, np.uint8)
-    palette = row_colours(len(masks))
+    palette, tops = row_colours(len(masks)), itertools.count(6, step_y)
 
-    def draw(row: int, depth: int, top: int) -> int:
-        """Draw a subtree whose first leaf is in row `top`; return the top of its root's crop, px."""
-        below, at = [], top
-        for child in children.get(row, []):
-            below.append(draw(child, depth + 1, at))
-            at += leaves(child)
-        y = round(sum(below) / len(below)) if below else 6 + top * step_y
+    def draw(row: int, depth: int) -> int:
+        """Draw a subtree, each leaf below the last; return the top of its root's crop, px."""
+        below = [draw(child, depth + 1) for child in children.get(row, [])]
+        y = round(sum(below) / len(below)) if below else next(tops)
         x = 6 + depth * step_x
         for end in below:
             start = (x + THUMB_PX, y + THUMB_PX // 2)
@@ -111,10 +109,8 @@ def tree_picture(
         cv2.rectangle(canvas, (x, y), (x + THUMB_PX, y + THUMB_PX), colour, 2)
         return y
 
-    top = 0
     for root in shown:
-        draw(root, 0, top)
-        top += leaves(root)
+        draw(root, 0)
     return canvas
 
 

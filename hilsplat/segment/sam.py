@@ -274,7 +274,7 @@ class SamModel:
         """Decode prompts that may have been previewed, at full resolution."""
         if "points" in prompts:
             return self.decode(encoded, prompts["points"])
-        assert self.factored is not None and encoded.terms is not None
+        assert self.factored and encoded.terms
         return prompts["iou"], self.factored.logits(encoded.terms, prompts)
 
 

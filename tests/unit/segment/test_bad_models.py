@@ -14,49 +14,27 @@ from hilsplat.models.network import Network, require_one_space
 from hilsplat.segment.sam import SamModel
 from tests.unit.segment.handmade import save_network
 
-ENCODER, CONFIG, PREPROCESSOR = "onnx/vision_encoder.onnx", "config.json", "preprocessor_config.json"
 LFS_POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 2548000000\n"
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "words"),
-    [
-        (ENCODER, b"", r"cannot be opened(.|\n)*a file of 0 bytes"),
-        (ENCODER, b"half of a network", r"vision_encoder.onnx cannot be opened(.|\n)*fetch a complete copy"),
-        (ENCODER, LFS_POINTER, r"Git LFS pointer(.|\n)*git lfs pull"),
-        (CONFIG, b"{", r"no readable config.json(.|\n)*model_type"),
-        (CONFIG, b"[]", r"a different kind of model(.|\n)*model_type"),
-        (CONFIG, b'{"model_type": 3}', r"a different kind of model(.|\n)*model_type"),
-        (CONFIG, b'{"model_type": "sam3"}', r"SAM 2 or 2.1 \(sam2\)(.|\n)*sam3(.|\n)*use SAM 2.1"),
-        (CONFIG, b'{"model_type": "blip"}', r"SAM 2 or 2.1 \(sam2\)(.|\n)*blip(.|\n)*docs/models.md"),
-    ],
-)
-def test_damaged_or_unsupported_files_are_refused(own_sam, name, content, words):
-    (own_sam / name).write_bytes(content)
-    with pytest.raises(ModelError, match=words):
-        SamModel.load(own_sam)
+def encoder(content: bytes) -> Callable[[Path], object]:
+    return lambda folder: (folder / "onnx/vision_encoder.onnx").write_bytes(content)
 
 
-@pytest.mark.parametrize(
-    ("name", "entry", "words"),
-    [
-        (PREPROCESSOR, {"do_normalize": False}, "disables do_normalize"),
-        (PREPROCESSOR, {"image_std": [0, 1, 1]}, "image_std is invalid"),
-        (PREPROCESSOR, {"image_std": "x"}, "image_std is invalid"),
-        (PREPROCESSOR, {"image_mean": [1e999, 0, 0]}, "image_mean is invalid"),
-        (CONFIG, {"mask_generation": {"stability_min": 3}}, "config.json: mask_generation is invalid"),
-        (CONFIG, {"mask_generation": {"segmenter": "graph"}}, "config.json: mask_generation is invalid"),
-        (CONFIG, {"mask_generation": [1]}, "config.json: mask_generation is invalid"),
-    ],
-)
-def test_configuration_that_cannot_be_used_is_refused(own_sam, name, entry, words):
-    (own_sam / name).write_text(json.dumps(json.loads((own_sam / name).read_text()) | entry))
-    with pytest.raises(ModelError, match=words):
-        SamModel.load(own_sam)
+def config(content: str) -> Callable[[Path], object]:
+    return lambda folder: (folder / "config.json").write_text(content)
+
+
+def thresholds(own: object) -> Callable[[Path], object]:
+    return config(json.dumps({"model_type": "sam", "mask_generation": own}))
+
+
+def preprocessor(entry: dict) -> Callable[[Path], object]:
+    return lambda folder: (folder / "preprocessor_config.json").write_text(json.dumps(entry))
 
 
 def as_variant(folder: Path) -> None:
-    (folder / ENCODER).rename(folder / "onnx" / "vision_encoder_quantized.onnx")
+    (folder / "onnx/vision_encoder.onnx").rename(folder / "onnx/vision_encoder_quantized.onnx")
 
 
 def as_torch(folder: Path) -> None:
@@ -70,9 +48,24 @@ def as_torch(folder: Path) -> None:
         (shutil.rmtree, r"is missing(.|\n)*masks.segmenter: graph, which needs no model"),
         (as_variant, r"lacks onnx/vision_encoder.onnx(.|\n)*vision_encoder_quantized.onnx"),
         (as_torch, r"PyTorch weights(.|\n)*hilsplat models get(.|\n)*docs/models.md"),
+        (encoder(b""), r"cannot be opened(.|\n)*a file of 0 bytes"),
+        (encoder(b"half of a network"), r"encoder.onnx cannot be opened(.|\n)*fetch a complete copy"),
+        (encoder(LFS_POINTER), r"Git LFS pointer(.|\n)*git lfs pull"),
+        (config("{"), r"no readable config.json(.|\n)*model_type"),
+        (config("[]"), r"a different kind of model(.|\n)*model_type"),
+        (config('{"model_type": 3}'), r"a different kind of model(.|\n)*model_type"),
+        (config('{"model_type": "sam3"}'), r"SAM 2 or 2.1 \(sam2\)(.|\n)*sam3(.|\n)*use SAM 2.1"),
+        (config('{"model_type": "blip"}'), r"SAM 2 or 2.1 \(sam2\)(.|\n)*blip(.|\n)*docs/models.md"),
+        (thresholds({"stability_min": 3}), "config.json: mask_generation is invalid"),
+        (thresholds({"segmenter": "graph"}), "config.json: mask_generation is invalid"),
+        (thresholds([1]), "config.json: mask_generation is invalid"),
+        (preprocessor({"do_normalize": False}), "disables do_normalize"),
+        (preprocessor({"image_std": [0, 1, 1]}), "image_std is invalid"),
+        (preprocessor({"image_std": "x"}), "image_std is invalid"),
+        (preprocessor({"image_mean": [1e999, 0, 0]}), "image_mean is invalid"),
     ],
 )
-def test_missing_networks_are_refused(own_sam, change: Callable[[Path], None], words):
+def test_incomplete_damaged_and_unsupported_folders_are_refused(own_sam, change, words):
     change(own_sam)
     with pytest.raises(ModelError, match=words):
         SamModel.load(own_sam)

@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 
 from hilsplat.embed.model_check import check_model
-from hilsplat.segment.sam import REAL_SAM, Frame, SamModel, Thresholds, positive_boxes, read_logits
+from hilsplat.segment.sam import REAL_SAM, Frame, SamModel, Thresholds, read_logits
 from hilsplat.settings import MasksSettings
 from models.training.export import OWN_THRESHOLDS
-
-SQUARE = Frame((4, 4), (4, 4), (4, 4))
 
 
 def test_longest_edge_is_kept_and_halves_round_up(disc_sam):
@@ -41,18 +39,12 @@ def test_points_are_scaled_to_the_resized_image(disc_sam):
     assert logits[0, 2].max() == pytest.approx(10 - 2**0.5)
 
 
-def test_logits_are_rounded_to_eighths_and_clipped():
-    logits = np.array([0.0, 0.06, 0.07, -0.3, 99.0, -99.0, 0.1875, 0.3125], dtype=np.float32)
-    steps, _, _ = read_logits(logits.reshape(1, 1, 8), 1.0, SQUARE)
-    # 0.1875 is 1.5 steps and 0.3125 is 2.5 steps: both go to the even one
-    assert steps[0, 0].tolist() == [0, 0, 1, -2, 127, -127, 2, 2]
-
-
-def test_boxes_of_positive_logits_by_hand():
-    logits = np.full((2, 4, 6), -1, np.float32)
-    logits[0, 1, 2] = logits[0, 2, 4] = 1
-    expected = [[2, 1, 5, 3], [0, 0, 0, 0]]
-    assert read_logits(logits, 1.0, SQUARE)[2].tolist() == positive_boxes(logits / 100).tolist() == expected
+def test_logits_are_rounded_to_eighths_and_clipped_and_the_positive_ones_have_boxes():
+    logits = np.full((2, 2, 6), -99, np.float32)
+    logits[0] = [[0, 0.06, 0.07, -0.3, 99, -99], [-1, -1, -1, 0.1875, -1, -1]]
+    steps, _, boxes = read_logits(logits, 1.0, Frame((4, 4), (4, 4), (4, 4)))
+    assert steps[0].tolist() == [[0, 0, 1, -2, 127, -127], [-8, -8, -8, 2, -8, -8]]  # 1.5 steps: the even one
+    assert boxes.tolist() == [[2, 0, 5, 2], [0, 0, 0, 0]]
 
 
 def test_thresholds_are_the_settings_else_the_models_else_langsplats(own_sam, project):
