@@ -156,9 +156,7 @@ class RunSettings(StageSettings):
         (), "scenes to run, from any group, such as table-1 or synthetic/table-1; empty: all in `groups`"
     )
     # The report shows the data root without escaping < and >, so these are not allowed.
-    data_root: str = knob(
-        "", "folder of the published data sets; empty: their scenes are skipped", pattern="^[^<>]*$"
-    )
+    data_root: str = knob("", "folder of published data sets; empty: no published scenes", pattern="^[^<>]*$")
     main_variants: tuple[str, ...] = knob(("default",), "variants in the main tables")
     ablation_variants: tuple[str, ...] = knob((), "variants in the paper's ablation table")
     component_variants: tuple[str, ...] = knob((), "variants in the components table, our own ablation")

@@ -49,7 +49,11 @@ def _takes(annotation: Any, kind: type) -> bool:
 Share = Annotated[float, Field(ge=0, le=1)]
 Granularity = Annotated[float, Field(gt=0, lt=2)]
 Size = Annotated[int, Field(ge=1, le=1000)]
+Suffix = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]*$")]
 Auto = Literal["auto"]
+Device = Literal["auto", "cpu", "cuda"]
+
+DEVICE = "rasteriser; auto: cuda if torch finds a device and gsplat is installed, else cpu"
 
 
 class WorldSettings(Section):
@@ -78,9 +82,7 @@ class PosesSettings(Section):
     matcher: Literal["auto", "exhaustive", "sequential"] = knob(
         "auto", "pairs of views to match; auto: exhaustive up to 200 views, else sequential", origin="COLMAP"
     )
-    mapper: Literal["incremental", "global"] = knob(
-        "incremental", "structure-from-motion algorithm", origin="COLMAP"
-    )
+    mapper: Literal["incremental", "global"] = knob("incremental", "structure from motion", origin="COLMAP")
     max_features: int = knob(4096, "SIFT features per image", ge=100, le=32768, origin="COLMAP: 8192")
     min_registered_share: float = knob(
         0.7, "minimum share of the views in the largest model; below it, poses fail", unit="share", gt=0, le=1
@@ -141,9 +143,7 @@ class GaussiansSettings(Section):
         origin="OpenGaussian on ScanNet: frozen",
     )
     checkpoint_every: int = knob(1000, "steps between checkpoints", ge=1)
-    device: Literal["auto", "cpu", "cuda"] = knob(
-        "auto", "rasteriser; auto: cuda if torch finds a device and gsplat is installed, else cpu"
-    )
+    device: Device = knob("auto", DEVICE)
 
 
 class MasksSettings(Section):
@@ -156,23 +156,14 @@ class MasksSettings(Section):
         "the faults set in perturb",
     )
     model: str = knob(
-        "models/sam-tiny",
-        "SAM folder (Hugging Face ONNX export); auto: the best pretrained SAM, else models/sam-tiny",
+        "models/sam-tiny", "SAM folder (Hugging Face ONNX); auto: best pretrained SAM, else sam-tiny"
     )
-    variant: str = knob(
-        "",
-        "suffix of the network files, such as fp16 for vision_encoder_fp16.onnx",
-        pattern=r"^[A-Za-z0-9_.-]*$",
-    )
+    variant: Suffix = knob("", "suffix of the network files, such as fp16 for vision_encoder_fp16.onnx")
     precision: Literal["auto", "fp32", "int8"] = knob(
-        "auto",
-        "encoder precision; auto: int8 on a CPU if it agrees with fp32 on the scene; embedded models: fp32",
+        "auto", "auto: int8 on a CPU if it agrees with fp32 on the scene; embedded models: fp32"
     )
     key_views: float = knob(
-        1.0,
-        "share of the training views to segment; below 1: those that together show the most Gaussians",
-        gt=0,
-        le=1,
+        1.0, "share of training views to segment; below 1: together they show the most Gaussians", gt=0, le=1
     )
     prompts: Literal["grid", "guided"] = knob(
         "grid",
@@ -232,8 +223,7 @@ class MasksSettings(Section):
     )
     nms_inner: Share = knob(0.5, "threshold for suppressing inner masks", origin="LangSplat")
     graph_scales: tuple[float, float, float] = knob(
-        (0.12, 0.04, 0.015),
-        "graph: minimum segment size of whole, part and subpart, as a share of the image side",
+        (0.12, 0.04, 0.015), "graph: minimum segment size at each level, as a share of the image side"
     )
 
 
@@ -242,7 +232,7 @@ class PerturbSettings(Section):
 
     The defaults approximate a good SAM on a clean image of about 256 px: slightly more consistent across
     views than the embedded model (`hilsplat world inconsistency`). With all faults at 0, masks equal the
-    ground truth. Scenes have few wholes, so the effect of systematic faults varies: average over seeds.
+    ground truth. Systematic faults are drawn once per scene, which has few wholes, so average over seeds.
     """
 
     seed: int = knob(0, "seed of the faults; independent of the run's seed", ge=0)
@@ -258,16 +248,10 @@ class PerturbSettings(Section):
         (0.01, 0.04, 0.1), "probability that a mask is missing: whole, part, subpart"
     )
     wrong_level: Share = knob(0.02, "probability that a mask is one level off")
-    systematic_merge: Share = knob(
-        0.02, "probability per node, drawn once per scene, of the same wrong merge in most views"
-    )
-    systematic_missing: Share = knob(
-        0.02, "probability that a node has no mask in most views (drawn once per scene)"
-    )
+    systematic_merge: Share = knob(0.02, "probability per node of the same wrong merge in most views")
+    systematic_missing: Share = knob(0.02, "probability that a node has no mask in most views")
     systematic_share: Share = knob(0.9, "probability that a systematic fault occurs in a view")
-    score_noise: Share = knob(
-        0.05, "standard deviation of predicted IoU and stability about their true values"
-    )
+    score_noise: Share = knob(0.05, "standard deviation of predicted IoU and stability about the truth")
 
 
 class CoverageTreeSettings(Section):
@@ -287,8 +271,7 @@ class ClipSettings(Section):
     """CLIP vectors of masks and nodes."""
 
     precision: Literal["auto", "fp32", "int8"] = knob(
-        "auto",
-        "encoder precision; auto: int8 on a CPU if it agrees with fp32 on crops; embedded models: fp32",
+        "auto", "auto: int8 on a CPU if it agrees with fp32 on crops; embedded models: fp32"
     )
     crops: Literal["auto", "nodes", "masks"] = knob(
         "auto",
@@ -298,14 +281,9 @@ class ClipSettings(Section):
     crops_per_node: int = knob(5, "nodes: maximum number of crops averaged per node", ge=1, le=32)
 
     model: str = knob(
-        "models/clip-tiny",
-        "CLIP folder (Hugging Face ONNX export); auto: the best pretrained CLIP, else models/clip-tiny",
+        "models/clip-tiny", "CLIP folder (Hugging Face ONNX); auto: best pretrained CLIP, else clip-tiny"
     )
-    variant: str = knob(
-        "",
-        "suffix of the network files, such as fp16 for vision_model_fp16.onnx",
-        pattern=r"^[A-Za-z0-9_.-]*$",
-    )
+    variant: Suffix = knob("", "suffix of the network files, such as fp16 for vision_model_fp16.onnx")
     crop: Literal["box", "langsplat"] = knob(
         "box",
         "box: a mask's entire box, area filter; langsplat: no last row and column, bilinear filter",
@@ -326,9 +304,7 @@ class ContributionsSettings(Section):
         "gram: store pairs of Gaussians; weights: store pixel weights of all views; auto: the one with fewer "
         "non-zeros; none: neither, which suffices for a semantic tree without a field",
     )
-    device: Literal["auto", "cpu", "cuda"] = knob(
-        "auto", "rasteriser; auto: cuda if torch finds a device and gsplat is installed, else cpu"
-    )
+    device: Device = knob("auto", DEVICE)
 
 
 class SemanticTreeSettings(Section):
@@ -364,9 +340,7 @@ class AutoencoderSettings(Section):
     )
     latent: int = knob(16, "size d of a latent", ge=1, le=64, origin="paper, LangSplat: 3")
     targets: Literal["node", "mask"] = knob(
-        "node",
-        "vector that represents a mask; node: that of its best-fitting node; mask: its own",
-        origin="paper: mask",
+        "node", "vector of a mask; node: that of its best-fitting node; mask: its own", origin="paper: mask"
     )
     epochs: int = knob(100, "network: passes over all vectors", ge=1, origin="LangSplat: 100")
     min_steps: int = knob(2000, "network: minimum number of steps, regardless of the number of vectors", ge=1)
@@ -374,9 +348,7 @@ class AutoencoderSettings(Section):
     learning_rate: float = knob(
         2e-3, "network: initial Adam step size; cosine decay", gt=0, origin="LangSplat: 7e-4"
     )
-    cosine_weight: float = knob(
-        1e-3, "network: weight of 1 - cosine in the loss", ge=0, origin="LangSplat: 1e-3"
-    )
+    cosine_weight: float = knob(1e-3, "network: loss weight of 1 - cosine", ge=0, origin="LangSplat: 1e-3")
 
     @property
     def is_random(self) -> bool:
@@ -419,9 +391,7 @@ class FieldSettings(Section):
     iterations: int = knob(30_000, "steps of the literal trainer, each on one view", ge=1, origin="paper")
     rate: float = knob(0.0025, "Adam step size of the literal trainer", gt=0, origin="LangSplat")
     language: Literal["squared", "l1"] = knob(
-        "squared",
-        "loss of the latent regression; l1 (LangSplat's) needs the literal trainer",
-        origin="LangSplat: l1",
+        "squared", "loss of the latent regression; l1 needs trainer: literal", origin="LangSplat: l1"
     )
     min_labelled_share: float = knob(
         0.3,
@@ -526,9 +496,7 @@ class EvaluateSettings(Section):
         ge=0,
         le=1,
     )
-    ancestors: float = knob(
-        0.2, "share of the ancestors' mean margin added to a node's margin for ranking", ge=0
-    )
+    ancestors: float = knob(0.2, "share of the ancestors' mean margin added to a node's margin", ge=0)
     min_region_px: int = knob(60, "minimum area of scored regions", unit="px", ge=1)
     methods: tuple[Literal["tree", "tree-path", "field"], ...] = knob(
         ("tree", "tree-path", "field"), "methods that answer queries; each has its own table rows"

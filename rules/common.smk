@@ -4,6 +4,7 @@
 # run first, and fields, scores and pictures run after all of them. Gaussians precede masks because users can
 # view them. After the vectors, the longest chain runs first: trained code, baseline field, our fields, scores.
 import gc
+import json
 from pathlib import Path
 
 from snakemake.exceptions import WorkflowError

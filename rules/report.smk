@@ -133,7 +133,7 @@ rule comparison:
         runtime=RESOURCES.minutes("comparison"),
     params:
         folder=lambda wildcards, input: str(Path(input.gaussians).parent),
-        variants=PLAN.main_variants(),
+        variants=json.dumps(PLAN.run.main_variants),
         names=PLAN.names,
         settings=PLAN.settings("figures"),
         evaluate=PLAN.settings("evaluate"),

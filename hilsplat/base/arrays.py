@@ -69,11 +69,7 @@ def made(
     path: Path,
     limits: Limits | None = None,
 ) -> Made:
-    """Create a dataclass instance from a file's arrays and additional fields, `more`.
-
-    Raises:
-        ArtifactError: a different version of hilsplat wrote the file, or an array does not match its field.
-    """
+    """Create a dataclass instance from a file's arrays and other fields; raise ArtifactError on mismatch."""
     expected = {field.name for field in fields(maker) if field.init}  # type: ignore[arg-type]
     if {*arrays, *more} != expected:
         raise ArtifactError(

@@ -339,11 +339,7 @@ SEALED = (".json", ".npy", ".npz", ".png", ".safetensors")
 
 
 def read_index(folder: Path, *entries: str) -> dict[str, Any]:
-    """Read a folder's index.
-
-    Raises:
-        ArtifactError: the folder is incomplete, or the index was changed or lacks one of the entries.
-    """
+    """Read a folder's index; raise ArtifactError if it is missing, changed or lacks one of the entries."""
     index = copy.deepcopy(_index(Path(folder)))
     if missing := [entry for entry in entries if entry not in index]:
         raise ArtifactError(
@@ -411,10 +407,7 @@ class ViewCache:
     """Cache of a stage's finished views as .npz files, which a rerun uses if the stage was killed.
 
     Keys must cover all inputs of the result: the settings, and the digests of the image, model and code.
-
-    Args:
-        folder: cache folder, such as `results/.cache/masks`.
-        compressed: whether to compress entries; floating-point numbers shrink too little to benefit.
+    Entries are not `compressed` if they are floating-point numbers, which shrink too little to benefit.
     """
 
     def __init__(self, folder: Path, *, compressed: bool = True) -> None:

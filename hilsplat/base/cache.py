@@ -34,22 +34,16 @@ def size_table(folder: Path) -> str:
 def prune_cache(
     folder: Path, stages: list[str], *, days: float | None = None, max_mib: float | None = None
 ) -> tuple[int, float]:
-    """Delete unfinished files of killed jobs, then cache entries, least recently used first.
+    """Delete unfinished files and old cache entries; return the number of entries and their size in MiB.
 
     Args:
         stages: caches to prune; if empty, the view caches, and also the checkpoints if `days` is set.
         days: delete entries not used for this many days.
-        max_mib: then delete entries until the rest is at most this size. No limits: delete nothing.
-
-    Returns:
-        Number of deleted entries, and their size in MiB.
+        max_mib: then delete the least recently used until the rest is at most this size.
     """
     known = (*VIEW_CACHES, CHECKPOINTS)
     if unknown := sorted(set(stages) - set(known)):
-        raise HilsplatError(
-            f"unknown cache: {', '.join(unknown)}",
-            expected=f"one of {', '.join(known)}",
-        )
+        raise HilsplatError(f"unknown cache: {', '.join(unknown)}", expected=f"one of {', '.join(known)}")
     # The cache is in the results folder, where killed jobs leave unfinished files beside their outputs.
     remove_leftovers(folder.parent if Path(folder).name == ".cache" else folder)
     chosen = set(stages or (VIEW_CACHES if days is None else known))

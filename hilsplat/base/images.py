@@ -16,8 +16,6 @@ from hilsplat.base.errors import ImageError
 
 logger = logging.getLogger(__name__)
 
-DEEP_MAX = 65535  # largest value of a 16-bit channel; 257 of its steps equal one 8-bit step
-
 
 def open_image(path: Path) -> Image.Image:
     """Open an image with Pillow, which reads HEIF (.heic) through pillow-heif.
@@ -28,7 +26,9 @@ def open_image(path: Path) -> Image.Image:
     Raises:
         ImageError: the header specifies more pixels than a photograph can have.
     """
-    _register_heif()
+    import pillow_heif
+
+    pillow_heif.register_heif_opener()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
@@ -39,13 +39,6 @@ def open_image(path: Path) -> Image.Image:
             expected=f"at most {2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} megapixels",
             fix="shrink or remove it",
         ) from error
-
-
-@functools.cache
-def _register_heif() -> None:
-    import pillow_heif
-
-    pillow_heif.register_heif_opener()
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
@@ -66,11 +59,11 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
             upright = ImageOps.exif_transpose(image)
             if upright.mode.startswith("I"):  # Pillow would clip values above 255
                 values = np.asarray(upright).astype(np.int64)
-                if values.min() < 0 or values.max() > DEEP_MAX:
+                if values.min() < 0 or values.max() > np.iinfo(np.uint16).max:
                     raise ValueError(
                         f"its grey values, {values.min()} to {values.max()}, do not fit into 16 bits"
                     )
-                upright = Image.fromarray(((values + 128) // 257).astype(np.uint8))
+                upright = Image.fromarray(((values + 128) // 257).astype(np.uint8))  # 257: 65535 / 255
             if upright.mode == "F":
                 raise ValueError("its pixels are floating-point numbers of unknown range")
             return np.asarray(_to_srgb(upright, path))

@@ -57,9 +57,7 @@ class _LanesModel(models.PrimitiveModel):
 
 
 @lower_cast(types.Float, LanesType)
-def _all_equal(
-    context: Any, builder: ir.IRBuilder, scalar_type: Any, kind: Any, scalar: ir.Value
-) -> ir.Value:
+def _all_equal(context: Any, builder: Any, scalar_type: Any, kind: Any, scalar: ir.Value) -> ir.Value:
     return splat(builder, context.cast(builder, scalar, scalar_type, kind.dtype))
 
 
@@ -104,7 +102,7 @@ def _pointer(
 
 
 def _load(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-    place = _pointer(context, builder, sig.args[0], *args, sig.return_type)
+    place = _pointer(context, builder, sig.args[0], args[0], args[1], sig.return_type)
     return builder.load(place, align=sig.args[0].dtype.bitwidth // 8)
 
 
@@ -209,13 +207,9 @@ def exp2_negative(builder, value):
     return builder.fmul(result, builder.bitcast(bits, _VECTOR))
 
 
-def _fit_exp2() -> tuple[float, ...]:
-    """Return the coefficients, constant first, of the polynomial for 2**f on [-1, 0]."""
-    fit = np.polynomial.chebyshev.Chebyshev.interpolate(np.exp2, 6, domain=[-1, 0])
-    return tuple(float(np.float32(c)) for c in fit.convert(kind=np.polynomial.Polynomial).coef)
-
-
-_EXP2 = _fit_exp2()
+_fit = np.polynomial.chebyshev.Chebyshev.interpolate(np.exp2, 6, domain=[-1, 0])
+_EXP2 = [float(np.float32(c)) for c in _fit.convert(kind=np.polynomial.Polynomial).coef]
+"""Coefficients, constant first, of the polynomial for 2**f on [-1, 0]."""
 
 
 def _select(condition: str, doc: str) -> Any:
@@ -346,13 +340,9 @@ def store_sums(typingctx, array, index, vectors):
         order = [owner.index(k) if k < count else 0 for k in range(WIDTH)]
         total = builder.shuffle_vector(total, nothing, ir.Constant(_INTS, order))
         pointer = _pointer(context, builder, sig.args[0], args[0], args[1], LANES)
-        bit = ir.IntType(1)
-        mask = ir.Constant(
-            ir.VectorType(bit, WIDTH), [ir.Constant(bit, int(k < count)) for k in range(WIDTH)]
-        )
-        kind = ir.FunctionType(
-            ir.VoidType(), [_VECTOR, _VECTOR.as_pointer(), _INT, ir.VectorType(bit, WIDTH)]
-        )
+        bits = ir.VectorType(ir.IntType(1), WIDTH)
+        mask = ir.Constant(bits, [ir.Constant(bits.element, int(k < count)) for k in range(WIDTH)])
+        kind = ir.FunctionType(ir.VoidType(), [_VECTOR, _VECTOR.as_pointer(), _INT, bits])
         write = cgutils.get_or_insert_function(builder.module, kind, _MASKED_STORE)
         builder.call(write, [total, pointer, ir.Constant(_INT, 4), mask])
         return context.get_dummy_value()

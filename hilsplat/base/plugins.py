@@ -18,10 +18,7 @@ class Plugins(Mapping[str, Part], Generic[Part]):
     """Components by name, imported on first access.
 
     The code identity (`base.identity`) does not follow the entries. A stage that uses one component depends
-    only on that one, and adds the component's import path to the roots of its digest.
-
-    Attributes:
-        places: name -> "module:constant".
+    only on that one, and adds the component's import path in `places` to the roots of its digest.
     """
 
     def __init__(self, places: Mapping[str, str]) -> None:

@@ -100,13 +100,7 @@ def write_provenance(
     plugins: Sequence[str] = (),
     device: str | None = None,
 ) -> None:
-    """Write an artifact's provenance record: command, settings, inputs, software, and digests of outputs.
-
-    Args:
-        beside: other outputs.
-        plugins: import paths of the readers or baselines that the stage used.
-        device: device to which the setting `device` resolves, if the stage has this setting.
-    """
+    """Write an artifact's provenance record: command, settings, inputs, software, and digests of outputs."""
     folder = Path(artifact).parent
     write_json(
         provenance_path(artifact),
@@ -233,11 +227,7 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
 
 
 def require_own_picture(path: Path, beside: Path | None = None) -> None:
-    """Check a picture's name, and that writing it and `beside` would not replace files from other programs.
-
-    Raises:
-        ArtifactError: the name does not end in .png, or a file exists that hilsplat did not draw.
-    """
+    """Raise ArtifactError if a path is not a .png, or if it or `beside` is a file of other programs."""
     if path.suffix.lower() != ".png":
         raise ArtifactError(f"output {path} is not a PNG file", expected="a name that ends in .png")
     if _is_something(path) and not _is_own_picture(path):

@@ -72,9 +72,7 @@ def world_masks(
     scene: SceneWithMasks,
     variant: MeasuredMasks = "default",
     results: Results = Path("results"),
-    out: Annotated[
-        Path | None, typer.Option(help="PNG to write, with CSV and PDF beside it; default: beside the masks")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="PNG, CSV and PDF; default: beside the masks")] = None,
 ) -> None:
     """Compare masks with ground-truth regions at each level, and draw the errors."""
     folder = results / scene
@@ -116,9 +114,7 @@ def models_get(
         ),
     ] = None,
     revision: Annotated[str | None, typer.Option(help="branch, tag or commit of the repository")] = None,
-    variant: Annotated[
-        str, typer.Option(help="network precision: quantized, fp16, int8, ...; default: full precision")
-    ] = "",
+    variant: Annotated[str, typer.Option(help="precision: quantized, fp16, int8, ...; default: full")] = "",
     out: Annotated[
         Path | None, typer.Option(help="models folder; default: HILSPLAT_MODELS, or the user's data folder")
     ] = None,
@@ -242,8 +238,7 @@ def datasets_export(
 def datasets_fits(
     scene: Annotated[str, typer.Argument(help="scene with a tree in the results folder, as dataset/scene")],
     labels: Annotated[
-        str | None,
-        typer.Option(help="labels with levels, such as hi_lerf/figurines; default: your own labels"),
+        str | None, typer.Option(help="labels with levels, such as hi_lerf/figurines; default: your own")
     ] = None,
     variant: Annotated[str, typer.Option(help="variant whose masks and tree are measured")] = "default",
     results: Results = Path("results"),
@@ -257,12 +252,8 @@ def datasets_fits(
     folder = results / scene
     name, semantic_tree = labels or f"annotated/{scene}", folder / variant / "semantic_tree"
     target = semantic_tree.with_name("label_fits.csv")
-    inputs = {
-        "scene": folder / "scene",
-        "gaussians": folder / "gaussians.ply",
-        "masks": folder / variant / "masks",
-        "semantic_tree": semantic_tree,
-    }
+    inputs = {"scene": folder / "scene", "gaussians": folder / "gaussians.ply"}
+    inputs |= {"masks": folder / variant / "masks", "semantic_tree": semantic_tree}
     from hilsplat.datasets.registry import readers_of
 
     with stage("label_fits", target, inputs=inputs, plugins=readers_of([name])) as run:

@@ -55,11 +55,8 @@ def options(
             raise HilsplatError(
                 f"--log {log} exists and is not a .log file", fix="choose a new file, or a .log file"
             )
-        try:
-            log.parent.mkdir(parents=True, exist_ok=True)
-            file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
-        except OSError as error:
-            raise system_error(error) or error from None
+        log.parent.mkdir(parents=True, exist_ok=True)
+        file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
             os.dup2(file, stream.fileno())  # also redirects libraries that print to the file descriptor

@@ -24,15 +24,10 @@ def init(folder: Annotated[Path, typer.Argument(help="folder of the project")] =
 def run_command(
     targets: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="TARGET",
-            help="scenes (photos/desk or desk), rules (tables) or files; default: everything",
-            show_default=False,
-        ),
+        typer.Argument(metavar="TARGET", help="scenes (photos/desk or desk), tables or files; default: all"),
     ] = None,
     config: Annotated[
-        list[Path] | None,
-        typer.Option(help="configuration file that overrides config/config.yaml; may be repeated"),
+        list[Path] | None, typer.Option(help="file that overrides config/config.yaml; may be repeated")
     ] = None,
 ) -> None:
     """Run the workflow for everything in the configuration, or only for given scenes, tables or files.
@@ -57,8 +52,7 @@ def new(
         Path | None, typer.Option(help="3DGS PLY; none: fit Gaussians; default: use any 3DGS output found")
     ] = None,
     features: Annotated[
-        Path | None,
-        typer.Option(help="LangSplat's features; none: use SAM and CLIP; default: use any features found"),
+        Path | None, typer.Option(help="LangSplat's features; none: use SAM and CLIP; default: use any found")
     ] = None,
     labels: Annotated[
         Path | None, typer.Option(help="LERF-OVS labels for scoring; none: no labels; default: use any found")

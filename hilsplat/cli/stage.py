@@ -34,9 +34,7 @@ app.add_typer(cache_app, name="cache")
 
 PathIn = Annotated[Path, typer.Option(help="input artifact", show_default=False)]
 PathOut = Annotated[Path, typer.Option(help="output; written atomically", show_default=False)]
-Settings = Annotated[
-    str, typer.Option(help="settings of the stage, as JSON; omitted keys keep their defaults")
-]
+Settings = Annotated[str, typer.Option(help="settings as JSON; omitted keys keep their defaults")]
 Threads = Annotated[
     int,
     typer.Option(
@@ -49,10 +47,7 @@ MOST_THREADS = max(16, os.cpu_count() or 1)
 """Maximum number of threads; more would only cost start-up time and memory."""
 
 Memory = Annotated[
-    float | None,
-    typer.Option(
-        min=1, help="memory for views in parallel, in MiB; default: all free memory; does not affect results"
-    ),
+    float | None, typer.Option(min=1, help="memory for views in parallel, in MiB; default: all free memory")
 ]
 Seed = Annotated[int, typer.Option(min=0, max=2_000_000_000, help="random seed")]
 Cache = Annotated[Path, typer.Option(help="cache folder of finished views, for resuming")]
@@ -90,7 +85,6 @@ def stage(
     """Yield a stage's function; a call is logged, locked, checked for disk space and recorded in provenance.
 
     Args:
-        out: output; its provenance is written next to it.
         settings: the section that the stage uses, or several sections by name. If a single section has a
             setting `device`, provenance records the device that `auto` resolves to.
         seed: None if the stage is deterministic.

@@ -62,8 +62,7 @@ def gaussians(
     settings: Settings = "{}",
     existing: Annotated[Path | None, typer.Option(help="3DGS PLY, in the source's coordinates")] = None,
     dataparser: Annotated[
-        Path | None,
-        typer.Option(help="dataparser_transforms.json, if the PLY is in nerfstudio's coordinates"),
+        Path | None, typer.Option(help="dataparser_transforms.json, for a PLY in nerfstudio's coordinates")
     ] = None,
     transforms: Annotated[Path | None, typer.Option(help="transforms.json, for --dataparser")] = None,
     cache: Cache = DEFAULT_CACHE,
@@ -340,9 +339,7 @@ def evaluate(
     dataset: Annotated[str, typer.Option(help="data set to record in the scores")],
     name: Annotated[str, typer.Option(help="scene to record in the scores")],
     truth: Truth = None,
-    labels: Annotated[
-        list[str] | None, typer.Option(help="labels of published data sets, such as lerf_ovs/figurines")
-    ] = None,
+    labels: Annotated[list[str] | None, typer.Option(help="labels, such as lerf_ovs/figurines")] = None,
     data_root: DataRoot = Path(),
     kind: Kind = "",
     variant: Annotated[str, typer.Option(help="variant to record in the scores")] = "default",
@@ -371,9 +368,7 @@ def evaluate_files(
     labels: Annotated[str, typer.Option(help="labels of a data set, such as lerf_ovs/figurines")] = "",
     data_root: DataRoot = Path(),
     truth: Truth = None,
-    scene: Annotated[
-        Path | None, typer.Option(help="posed scene that lists the test views, for a synthetic scene")
-    ] = None,
+    scene: Annotated[Path | None, typer.Option(help="synthetic scene that lists the test views")] = None,
     kind: Kind = "",
     dataset: Annotated[str, typer.Option(help="data set to record for a synthetic scene")] = "synthetic",
     name: Annotated[str, typer.Option(help="name to record for a synthetic scene")] = "",

@@ -4,29 +4,22 @@ import gc
 import glob
 import json
 from dataclasses import asdict
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.cli.stage import DataRoot, Results, Threads, app
 
-SceneName = Annotated[
-    str, typer.Argument(help="scene in the results folder, such as desk or photos/desk, or its path")
-]
+SceneName = Annotated[str, typer.Argument(help="scene in results/, such as desk or photos/desk, or its path")]
 
 
 @app.command()
 def query(
     scene: SceneName,
-    text: Annotated[
-        str, typer.Argument(help="what to look for; 'bear > head > nose' finds the noses on bears' heads")
-    ],
-    level: Annotated[
-        str, typer.Option(help="level of the answers, or of a path's last text: auto, whole, part, subpart")
-    ] = "auto",
+    text: Annotated[str, typer.Argument(help="what to look for; 'bear > nose' finds the noses of bears")],
+    level: Annotated[str, typer.Option(help="level of the answers: auto, whole, part, subpart")] = "auto",
     variant: Annotated[str, typer.Option(help="variant to query")] = "default",
     results: Results = Path("results"),
     views: Annotated[int, typer.Option(min=1, max=8, help="number of views in the panel")] = 3,
@@ -37,9 +30,7 @@ def query(
     threshold: Annotated[
         float | None, typer.Option(help="minimum score of an answer, 0 to 1; default: near the best score")
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="folder for the files; default: queries/TEXT in the scene's folder")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="folder for files; default: queries/TEXT")] = None,
     threads: Threads = 2,
 ) -> None:
     """Find the objects or parts that match a text in a finished scene.
@@ -126,29 +117,18 @@ def settings(
     typer.echo(json.dumps(config_schema(), indent=1) if schema else knob_table())
 
 
-class Form(StrEnum):
-    """Export formats of a scene."""
-
-    TREE = "tree"
-    PLY = "ply"
-    COLMAP = "colmap"
-    NERFSTUDIO = "nerfstudio"
-    LANGSPLAT = "langsplat"
-    LABELS = "labels"
-
-
 @app.command()
 def export(
     scene: SceneName,
     form: Annotated[
-        Form,
+        Literal["tree", "ply", "colmap", "nerfstudio", "langsplat", "labels"],
         typer.Option(
             "--as",
             help="tree: nodes as JSON, picture and PLY; ply: a 3DGS PLY; colmap: images and sparse/0; "
             "nerfstudio: images and transforms.json; langsplat: colmap plus PLY and language_features; "
             "labels: the scene's annotations in LERF-OVS format",
         ),
-    ] = Form.TREE,
+    ] = "tree",
     variant: Annotated[str, typer.Option(help="variant, for tree and langsplat")] = "default",
     results: Results = Path("results"),
     data_root: DataRoot = Path(),
@@ -164,14 +144,13 @@ def export(
     folder = scene_folder(scene, results)
     if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ArtifactError(f"--out {out} exists", fix="choose a new folder, or remove this one first")
-    name = form.value if variant == "default" else f"{form.value}-{variant}"
-    out = out or folder / "export" / name
-    if form is Form.TREE:
+    out = out or folder / "export" / (form if variant == "default" else f"{form}-{variant}")
+    if form == "tree":
         from hilsplat.query.tree_picture import export_tree
 
         typer.echo(export_tree(folder, variant, out, threads))
         return
-    if form is Form.PLY:
+    if form == "ply":
         from hilsplat.splat.coordinates import write_source_ply
 
         ply = out / "point_cloud.ply"
@@ -181,11 +160,11 @@ def export(
 
     opened = Scene.load(folder / "scene")
     views = len(opened.cameras)
-    if form is Form.LABELS:
+    if form == "labels":
         from hilsplat.annotate.exchange import export_labels
 
         views, what = export_labels(opened, folder, data_root, out), "labels"
-    elif form is Form.LANGSPLAT:
+    elif form == "langsplat":
         from hilsplat.embed.langsplat_export import export_langsplat
         from hilsplat.scene.finished import FinishedScene
 
@@ -196,8 +175,8 @@ def export(
         from hilsplat.scene.exporting import write_colmap, write_nerfstudio
 
         write, what = {
-            Form.COLMAP: (write_colmap, "images and sparse/0"),
-            Form.NERFSTUDIO: (write_nerfstudio, "images, transforms.json and points.ply"),
+            "colmap": (write_colmap, "images and sparse/0"),
+            "nerfstudio": (write_nerfstudio, "images, transforms.json and points.ply"),
         }[form]
         write(opened, out)
     typer.echo(f"wrote {what} of {views} views to {out}")

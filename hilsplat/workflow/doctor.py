@@ -14,6 +14,7 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
 from hilsplat.base.artifacts import existing_folder
+from hilsplat.base.definitions import PACKAGE
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.provenance import version_of
 from hilsplat.configuration import merged_config
@@ -21,8 +22,6 @@ from hilsplat.models.memory import machine_mib
 from hilsplat.models.store import RECOMMENDED, broken_models, present_models, user_models
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.resources import JobResources
-
-PACKAGE = "hilsplat"
 
 RULES = ("poses", "gaussians", "masks", "contributions", "semantic_tree", "clip", "field", "figures")
 """Rules whose memory and disk requirements are compared with the machine's capacity."""
@@ -165,20 +164,16 @@ def space() -> Iterator[Finding]:
     problem = "" if free > needed else text
     yield verdict("disk", problem, text, "free up space, or set results to a folder on another disk")
     most, rule, scene = memory
-    text = (
-        f"{machine_mib() / 1024:.1f} GiB; the largest job, {rule} of {scene}, needs about {most / 1024:.1f}"
-    )
-    problem = "" if machine_mib() > most else text
+    own = machine_mib()
+    text = f"{own / 1024:.1f} GiB; the largest job, {rule} of {scene}, needs about {most / 1024:.1f}"
+    problem = "" if own > most else text
     yield verdict("memory", problem, text, "lower poses.max_side_px or gaussians.max_gaussians")
 
 
 def writing() -> Iterator[Finding]:
     kernels_folder = Path(__file__).resolve().parents[1] / "__pycache__"
-    for what, folder in (
-        ("working folder", Path.cwd()),
-        ("models", user_models()),
-        ("compiled kernels", kernels_folder),
-    ):
+    folders = {"working folder": Path.cwd(), "models": user_models(), "compiled kernels": kernels_folder}
+    for what, folder in folders.items():
         existing = existing_folder(folder)
         if os.access(existing, os.W_OK):
             yield Finding("writing", "ok", f"{what}: {folder}")

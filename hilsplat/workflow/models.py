@@ -38,10 +38,9 @@ def check_device(stages: StageSettings, where: str) -> None:
 def _require_model(folder: Path, kind: str, variant: str) -> None:
     from hilsplat.models.folder import open_model_folder  # onnxruntime is slow to import
 
-    released = any(folder.name == release.name for release in RELEASES)
-    open_model_folder(
-        folder, kind, variant=variant, fix=f"fetch it: hilsplat models get {folder.name}" if released else ""
-    )
+    is_released = any(folder.name == release.name for release in RELEASES)
+    fix = f"fetch it: hilsplat models get {folder.name}" if is_released else ""
+    open_model_folder(folder, kind, variant=variant, fix=fix)
 
 
 def describe_models(stages: StageSettings, features: Path | None = None) -> str:

@@ -337,9 +337,6 @@ class Plan:
     def baseline(self, job: VariantJob) -> tuple[str, ...]:
         return (METHODS.places[self.stages(job).method.name],)
 
-    def main_variants(self) -> str:
-        return json.dumps(self.run.main_variants)
-
     def names(self, _: object) -> str:
         """Return each variant's name in tables and figures, as JSON; Snakemake would expand plain text."""
         return inert(json.dumps(dict(self.run.labels)))

@@ -107,9 +107,8 @@ class Estimates:
             jobs = [self._estimate(rule, row) for row in rows]
             self._means[rule] = sum(jobs) / len(jobs) if jobs else START_S
         key = rule if rule in self._estimated else ""
-        return self._means[rule] * (
-            self._measured[key] / self._estimated[key] if key in self._estimated else 1.0
-        )
+        scale = self._measured[key] / self._estimated[key] if key in self._estimated else 1.0
+        return self._means[rule] * scale
 
     def _estimate(self, rule: str, job: Job) -> float:
         return self.resources.core_seconds(rule, job) if self.resources else START_S
@@ -193,10 +192,7 @@ class RunProgress:
         return max(estimates.seconds(job.rule) / job.threads - elapsed, 0.1 * elapsed)
 
     def _hint(self, job: RunningJob) -> list[str]:
-        """Return a line when a scene is ready to query, with the query commands once per run.
-
-        If key views already made the scene ready, the line for all photographs is shorter.
-        """
+        """Return a line when a scene is ready to query, with the query commands once per run."""
         variant = job.wildcards.get("variant")
         needed = {"clip": "semantic_tree", "semantic_tree": "clip"}.get(job.rule)
         if needed is None or job.log is None or variant not in ("default", KEY_VIEWS):

@@ -113,15 +113,12 @@ def start_project(folder: Path) -> list[Path]:
 
 
 def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str]) -> int:
-    """Run the workflow in the working folder.
+    """Run the workflow in the working folder, and return Snakemake's exit status.
 
     Args:
         targets: scenes (`photos/desk`, `desk`), rules (`tables`) or files; empty for everything.
         configs: files that override config/config.yaml, in order.
         options: passed to Snakemake unchanged.
-
-    Returns:
-        Snakemake's exit status.
 
     Raises:
         HilsplatError: another run is in progress in this folder, or the configuration is invalid.

@@ -92,9 +92,7 @@ class SceneData:
 
     def poses_option(self, job: Job) -> str:
         row = self.row(job)
-        if row.world:
-            return "--render"
-        return f"--no-render {options_of({'poses': row.poses})}".rstrip()
+        return "--render" if row.world else options_of({"poses": row.poses})
 
     def require_no_braces(self, row: SceneRow) -> None:
         """Raise SettingsError for file names with braces, which Snakemake interprets as wildcards."""
