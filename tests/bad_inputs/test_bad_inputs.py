@@ -213,7 +213,6 @@ ROWS = {
         nothing, ("coverage-tree", "--masks", str(MASKS), "--out", "n" * 260), "too long for this file system"
     ),
     # ---- numbers and JSON on the command line
-    "a seed beyond 64 bits": row(nothing, (*POSES, "--seed", str(10**30)), "--seed"),
     "settings that are no JSON": row(nothing, (*COVERAGE, "--settings", "{"), "coverage_tree", "JSON"),
     "names that are no JSON": row(
         nothing,

@@ -16,7 +16,7 @@ ODD_TEXTS = (
 @st.composite
 def byte_damages(draw) -> tuple[str, float, int]:
     """Draw a kind of damage, a position as a share of the file's length, and a number."""
-    kind = draw(st.sampled_from(["flip", "cut", "zero", "more", "repeat", "empty"]))
+    kind = draw(st.sampled_from(["flip", "cut", "zero", "more", "repeat"]))
     return kind, draw(st.floats(0, 1, exclude_max=True)), draw(st.integers(0, 255))
 
 
@@ -32,8 +32,6 @@ def damaged_bytes(content: bytes, damage: tuple[str, float, int]) -> bytes:
         return content + bytes([number]) * 16
     if kind == "repeat":
         return content[:place] + content[max(0, place - 8) : place] + content[place:]
-    if kind == "empty":
-        return b""
     changed = bytearray(content)
     changed[place] ^= 1 << number % 8
     return bytes(changed)

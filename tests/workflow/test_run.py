@@ -68,12 +68,6 @@ def times_of(project: Project) -> dict[str, int]:
     return {str(path): path.stat().st_mtime_ns for path in files if path.is_file()}
 
 
-def test_a_variant_has_only_the_artifacts_that_it_changes(finished: Project) -> None:
-    folder = finished.root / SCENE / "paper"
-    artifacts = {path.name for path in folder.iterdir() if path.name in (*FOLDERS, "field.safetensors")}
-    assert artifacts == {"autoencoder", "field.safetensors"}
-
-
 def test_every_artifact_has_provenance(finished: Project) -> None:
     for name in (*FOLDERS, "field.safetensors", "scores.csv"):
         path = finished.root / SCENE / "default" / f"{name}.provenance.json"

@@ -229,7 +229,7 @@ def test_each_photograph_is_an_input_and_hidden_files_are_not(tmp_path):
     found = plan(tmp_path, groups=["photos"])
     files = found.data.image_files(Job("photos", "desk"))
     assert [Path(file).name for file in files] == ["0.jpg", "1.jpg"]
-    assert found.data.poses_option(Job("photos", "desk")) == "--no-render"
+    assert found.data.poses_option(Job("photos", "desk")) == ""
     assert found.data.image_files(Job()) == "results/synthetic/one/world/images"
     assert found.data.poses_option(Job()) == "--render"
 
