@@ -3,8 +3,7 @@
 1. Every Gaussian learns 32 numbers: wholes use the first 16, parts the first 24, and subparts all. Pixels are
    attracted to their mask's prototype and repelled from others. Pixels that share a finer mask must agree
    in the coarser prefix; pixels that a coarser mask separates must differ in the finer prefix.
-2. Mask prototypes from all views are clustered by density: each cluster is an object, and a Gaussian belongs
-   to the nearest object.
+2. Mask prototypes from all views are clustered by density to objects; a Gaussian joins the nearest object.
 3. The CLIP vectors of an object's masks are clustered; the silhouette determines the number of descriptors,
    up to 20. A descriptor's weight is its cosine with the object's average.
 
@@ -54,11 +53,7 @@ def unit_slices(features: Float[Tensor, "n 32"]) -> Float[Tensor, "n 32"]:
 def masks_of_pixels(labels: Int32[np.ndarray, "p 3"]) -> list[Bool[np.ndarray, "p _"]]:
     """Return the pixels of each level's usable masks: large enough, and not a duplicate of a finer mask."""
     least = max(MIN_SHARE * len(labels), 1)
-    every = []
-    for label in labels.T:
-        kinds = np.unique(label[label >= 0])
-        every.append(label[:, None] == kinds[None])
-    found = []
+    every, found = [label[:, None] == np.unique(label[label >= 0]) for label in labels.T], []
     for index, inside in enumerate(every):
         keep = large = inside.sum(axis=0) > least
         for finer in every[index + 1 :]:

@@ -4,8 +4,7 @@
    a gate that depends on the scale: two pixels can be grouped at a large scale and separate at a small scale.
 2. At a scale, two pixels belong together if they share a mask up to that scale, or if the smallest mask
    above that scale is the same for both.
-3. Features gated at the median scale of each level's masks are clustered; a cluster is assigned the CLIP
-   vectors of the masks that fit it.
+3. Features gated at the median scale of a level's masks are clustered; clusters get fitting CLIP vectors.
 
 Source: Cen et al., Segment Any 3D Gaussians, AAAI 2025; Jumpat/SegAnyGAussians `get_scale.py`,
 `train_contrastive_feature.py`; scales and their quantiles from GARField (Kim et al., CVPR 2024,
@@ -64,8 +63,7 @@ def together(
 ) -> Bool[np.ndarray, "p p"]:
     """Return whether two pixels share a mask at or below the scale, or the smallest mask above the scale.
 
-    `labels` contains each pixel's mask at each level (-1: none), and `scales` contains the masks' scales;
-    each mask has only one level.
+    `labels` contains each pixel's mask at each level (-1: none; a mask has one level), `scales` its scale.
     """
     above = (labels >= 0) & (scales > scale)
     smallest = np.where(above, scales, np.inf).argmin(axis=1)
@@ -115,10 +113,9 @@ def affinity_loss(
 def neighbour_mean(means: Float32[np.ndarray, "N 3"]) -> sp.csr_matrix:
     """Return the matrix that averages over each Gaussian and its nearest neighbours, 16 in total."""
     near = nearest(means, NEIGHBOURS)
-    count = near.shape[1]
-    rows = np.repeat(np.arange(len(means)), count)
+    num, count = near.shape
     data = np.full(near.size, 1 / count, np.float32)
-    return sp.csr_matrix((data, (rows, near.ravel())), shape=(len(means), len(means)))
+    return sp.csr_matrix((data, (np.repeat(np.arange(num), count), near.ravel())), shape=(num, num))
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:

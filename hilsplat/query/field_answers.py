@@ -11,7 +11,7 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.contributions.compositing import rendered_latents
-from hilsplat.field.code import Code, LanguageField
+from hilsplat.field.code import Code, LanguageField, LinearCode
 from hilsplat.query.relevancy import LatentRelevancy
 from hilsplat.query.scene_views import SceneViews
 from hilsplat.semantic_tree.nodes import node_means
@@ -64,7 +64,7 @@ class FieldScene(SceneViews):
         answer = self._latent_relevancy
         shown, vectors = self.latents(view), self.text_vectors(texts)
         placed = None
-        if answer.is_linear or not exact:
+        if isinstance(self.autoencoder, LinearCode) or not exact:
             placed = self._views.get(("placed", view), lambda: [answer.prepare(each) for _, each in shown])
         height, width = self.camera(view).size_hw
         maps = np.zeros((len(texts), len(LEVELS), height * width), np.float32)

@@ -20,8 +20,7 @@ class Doubt:
 
     Attributes:
         level: the level that was searched, if a node at any level matches the text; otherwise None.
-        chance: share of words for absent objects whose best score is at least as high; None if the doubt has
-            a different cause.
+        chance: share of words for absent objects that score at least as high; None for a different doubt.
         unknown: words of the text that are not in the model's vocabulary.
     """
 
@@ -31,7 +30,6 @@ class Doubt:
     unknown: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        """Return the doubt as a sentence."""
         kind = "node" if self.level is None else self.level.label
         if self.unknown:
             words = ", ".join(map(repr, self.unknown))
@@ -49,14 +47,12 @@ class Hit:
     Attributes:
         node: row of the semantic tree.
         score: relevancy of the node and, with a lower weight, of its ancestors, in (0, 1). Answers are sorted
-            by score; at 0.5, the query fits no better than a generic word. For route "like", the score is the
-            cosine with a node or picture.
+            by score; at 0.5, the query fits no better than a generic word. For route "like": a cosine.
         box: lower and upper corner of the axis-aligned box.
         oriented_box: the box along the node's own axes.
         best_views: up to three training views in which the node is largest.
         route: as in `NodeHits`, or "like".
-        doubts: texts of the query that may match nothing; if the first text of a path is doubtful, all
-            answers are doubtful.
+        doubts: texts of the query that may match nothing; all answers to the query have the same doubts.
         name: the user's name for the node, otherwise its vocabulary name; empty if no name fits.
     """
 
@@ -91,7 +87,7 @@ def doubts_of(found: NodeHits) -> tuple[Doubt, ...]:
     doubts = []
     for each in found.texts:
         likely = each.chance is not None and each.chance > LIKELY_CHANCE
-        if each.unknown or each.is_doubtful or likely:
+        if each.unknown or each.margin <= 0 or likely:
             level = each.level if each.anywhere > 0 else None
             doubts.append(Doubt(each.text, level, each.chance if likely else None, each.unknown))
     return tuple(doubts)

@@ -235,11 +235,9 @@ class LanguageScene(FieldScene):
 
     def hits_of(self, found: NodeHits, limit: int) -> list[Hit]:
         """Return up to `limit` of the best nodes as answers."""
-        doubts, hits = doubts_of(found), []
-        for node, value in zip(found.ids[:limit].tolist(), found.values[:limit], strict=True):
-            score = relevancy_of_margins(np.array([value]), self.settings.relevancy_scale)[0]
-            hits.append(self._hit(node, float(score), found.route, doubts))
-        return hits
+        doubts, nodes = doubts_of(found), found.ids[:limit].tolist()
+        scores = relevancy_of_margins(found.values[:limit], self.settings.relevancy_scale).tolist()
+        return [self._hit(*of, found.route, doubts) for of in zip(nodes, scores, strict=True)]
 
     def _hit(self, node: int, score: float, route: str, doubts: tuple[Doubt, ...]) -> Hit:
         area = self.tree.view_area_px[node]

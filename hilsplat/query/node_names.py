@@ -45,8 +45,6 @@ FEWEST_ABSENT = 100
 """Minimum number of known words for absent objects. If there are fewer, they are replaced by the vocabulary
 words that are not the nearest word of any node. If these are too few as well, chance is not estimated."""
 
-THINGS, PARTS, SURFACES = range(3)
-
 VOCABULARY = "vocabulary.txt"
 """Vocabulary file in a model's folder; models without this file use the one in this package."""
 
@@ -97,14 +95,6 @@ class Vocabulary:
         return Vocabulary(**{section: tuple(texts) for section, texts in found.items()})
 
 
-def vocabulary_file(setting: str, model: Path) -> Path:
-    """Return a setting's vocabulary file; `auto` means the model's file if it exists, else the package's."""
-    if setting != AUTO:
-        return Path(setting)
-    own = Path(model) / VOCABULARY
-    return own if own.is_file() else COMMON
-
-
 @dataclass(frozen=True)
 class NodeNaming:
     """Vocabulary names of the nodes of a tree.
@@ -130,7 +120,7 @@ class NodeNaming:
             return None
         index = read_index(folder, "tree_sha256", "clip_sha256", "nodes")
         made_for = index["tree_sha256"], index["clip_sha256"]
-        if made_for != (tree_digest(semantic_tree), _clip_digest(clip_folder)):
+        if made_for != (tree_digest(semantic_tree), sha256_of_file(clip_folder / INDEX)):
             return None
         rows = read_json(sealed(folder, "names.json"))
         try:
@@ -170,7 +160,9 @@ def run_names(
     """
     tree = SemanticTree.load(semantic_tree, clip_folder)
     model = open_clip_of(clip_folder, evaluate.template)
-    path = vocabulary_file(settings.vocabulary, model.model.folder)
+    own = model.model.folder / VOCABULARY
+    automatic = own if own.is_file() else COMMON
+    path = automatic if settings.vocabulary == AUTO else Path(settings.vocabulary)
     vocabulary = Vocabulary.read(path)
     absent = vocabulary.absent or Vocabulary.read(COMMON).absent
     with stage_log("names", Path(out).parent.parent.name) as counts, atomic_folder(out) as folder:
@@ -194,7 +186,7 @@ def run_names(
             folder,
             {},
             tree_sha256=tree_digest(semantic_tree),
-            clip_sha256=_clip_digest(clip_folder),
+            clip_sha256=sha256_of_file(clip_folder / INDEX),
             vocabulary=path.name,
             vocabulary_sha256=sha256_of_file(path),
             nodes=len(tree),
@@ -228,15 +220,14 @@ def named(
         margin: the nodes' cosine margins for the vocabulary's things, parts and surfaces, in this order.
 
     Returns:
-        for each node, its `name`, whether that name is a `surface`, and, as `candidates`, the nearest texts
-        with their margins, best first.
+        for each node, its `name`, whether it is a `surface`, and the nearest texts, best first, with margins.
     """
-    groups = (vocabulary.things, vocabulary.parts, vocabulary.surfaces)
-    words = [word for group in groups for word in group]
-    kinds = np.repeat([THINGS, PARTS, SURFACES], [len(group) for group in groups])
+    groups = {"thing": vocabulary.things, "part": vocabulary.parts, "surface": vocabulary.surfaces}
+    words = [word for group in groups.values() for word in group]
+    kinds = np.array([kind for kind, group in groups.items() for _ in group])
     rows: list[dict[str, Any]] = []
     for node, level in enumerate(tree.level.tolist()):
-        may = np.flatnonzero(kinds != (PARTS if level == Level.WHOLE else SURFACES))
+        may = np.flatnonzero(kinds != ("part" if level == Level.WHOLE else "surface"))
         own = margin[node, may]
         order = np.argsort(-own, kind="stable")[:CANDIDATES]
         best = own.max(initial=0.0)
@@ -244,7 +235,7 @@ def named(
         rows.append(
             {
                 "name": words[may[order[0]]] if fits else "",
-                "surface": bool(fits and kinds[may[order[0]]] == SURFACES),
+                "surface": bool(fits and kinds[may[order[0]]] == "surface"),
                 "candidates": [[words[may[row]], round(float(own[row]), 4)] for row in order],
             }
         )
@@ -254,7 +245,3 @@ def named(
             if parent != NONE and rows[node]["name"] == rows[parent]["name"]:
                 rows[node]["name"] = ""
     return rows
-
-
-def _clip_digest(clip_folder: Path) -> str:
-    return sha256_of_file(Path(clip_folder) / INDEX)

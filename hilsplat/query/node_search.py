@@ -34,7 +34,8 @@ class TextAnswer:
     """The best match of one text of a query.
 
     Attributes:
-        margin: cosine margin of the best node that competed at `level`; -inf if no node competed.
+        margin: cosine margin of the best node that competed at `level`; -inf if no node competed. If it is
+            not positive, the node is no closer to the text than to a canonical phrase.
         anywhere: cosine margin of the best node of any level.
         chance: share of words for absent objects whose best margin is at least as high; None if unknown.
         unknown: words of the text that are not in the model's vocabulary.
@@ -46,11 +47,6 @@ class TextAnswer:
     anywhere: float
     chance: float | None = None
     unknown: tuple[str, ...] = ()
-
-    @property
-    def is_doubtful(self) -> bool:
-        """Whether the best node is no closer to the text than to a canonical phrase."""
-        return self.margin <= 0
 
 
 @dataclass(frozen=True)
@@ -91,6 +87,18 @@ def search(
 ) -> NodeHits:
     """Find the nodes that answer a text, or the last text of a path such as ("bear", "head", "nose").
 
+    Nodes that answer a path match its last text and are part of nodes that match the earlier texts. Every
+    text has its own level. All nodes at the last text's level compete, each together with its ancestors. If a
+    cushion matches "bear" slightly better than the bear does, the bear still wins, because its head and nose
+    match. A node that is not part of a plausible answer to the first text (`PLAUSIBLE`) does not compete,
+    unless no node is part of one.
+
+    If a path has fewer texts than there are levels, its levels are ambiguous: the handle of a mug may be a
+    part or a subpart, and the head of ("head", "nose") is not a whole. All combinations of levels are
+    therefore searched. Combinations whose best answer has an ancestor for every text are preferred; among
+    these, the largest sum of margins wins. Ancestors need not be shown; they compete with nodes that are
+    shown or have a shown descendant.
+
     Args:
         margin: cosine margin of every node for each text.
         vectors: unit vectors of every node, which determine which nodes look alike.
@@ -98,7 +106,7 @@ def search(
             level's values, or by `ALIKE_REACH` times that distance if they look like the best.
         ancestors: fraction of the ancestors' mean margin that is added to a node's own margin; ignored for a
             path of several texts, which itself specifies the ancestors.
-        level: level of the last text; None lets `automatic_level` or `_search_path` choose it.
+        level: level of the last text; None chooses it automatically.
         shown: which nodes are allowed as answers; None allows all.
 
     Raises:
@@ -106,17 +114,32 @@ def search(
     """
     margin = margin.astype(np.float64)
     anywhere = (margin if shown is None else margin[:, shown]).max(axis=1, initial=-np.inf).tolist()
-    if len(path) != 1:
-        return _search_path(tree, margin, anywhere, vectors, path, threshold, level, shown)
-    (own,) = margin
-    level = automatic_level(tree, own, shown) if level is None else level
-    nodes = tree.nodes_of(level)
-    may = nodes if shown is None else nodes[shown[nodes]]
-    value = own + ancestors * ancestor_margins(tree, own)
-    spread = np.ptp(value[nodes]) if len(nodes) else 0.0
-    chosen = _near_best(value, may, vectors, (1 - threshold) * spread)
-    best = own[may].max(initial=-np.inf)
-    return NodeHits(chosen, value[chosen], "flat", (TextAnswer(path[0], level, float(best), *anywhere),))
+    if len(path) == 1:
+        (own,) = margin
+        level = automatic_level(tree, own, shown) if level is None else level
+        nodes = tree.nodes_of(level)
+        may = nodes if shown is None else nodes[shown[nodes]]
+        value = own + ancestors * ancestor_margins(tree, own)
+        spread = np.ptp(value[nodes]) if len(nodes) else 0.0
+        chosen = _near_best(value, may, vectors, (1 - threshold) * spread)
+        best = own[may].max(initial=-np.inf)
+        return NodeHits(chosen, value[chosen], "flat", (TextAnswer(path[0], level, float(best), *anywhere),))
+    ways = [way for way in combinations(LEVELS, len(path)) if level in (None, way[-1])]
+    if not ways:
+        levels = LEVELS if level is None else LEVELS[: level.index + 1]
+        raise SettingsError(
+            f"the path {' > '.join(path)!r} cannot be searched"
+            + ("" if level is None else f" at level {level.label}"),
+            expected=f"1 to {len(levels)} texts, coarse to fine: {' > '.join(each.label for each in levels)}",
+            found=f"{len(path)}",
+            fix="name the object, then its part, then a part of that part",
+        )
+    containing, found = tree.ancestors(), []
+    for way in ways:
+        complete, total, margins, hits = _search_way(tree, margin, containing, vectors, way, threshold, shown)
+        texts = tuple(map(TextAnswer, path, way, margins, anywhere))
+        found.append((complete, total, replace(hits, texts=texts)))
+    return max(found, key=lambda each: each[:2])[2]
 
 
 def _near_best(
@@ -167,47 +190,6 @@ def automatic_level(
     if not len(levels):
         return Level.WHOLE
     return Level(int(levels[own == own.max()].min()))
-
-
-def _search_path(
-    tree: SemanticTree,
-    margin: Float64[np.ndarray, "T n"],
-    anywhere: list[float],
-    vectors: Float32[np.ndarray, "n C"],
-    path: tuple[str, ...],
-    threshold: float,
-    level: Level | None,
-    shown: Bool[np.ndarray, " n"] | None,
-) -> NodeHits:
-    """Find nodes that match the last text and are part of nodes that match the earlier texts.
-
-    Every text has its own level. All nodes at the last text's level compete, each together with its
-    ancestors. If a cushion matches "bear" slightly better than the bear does, the bear still wins, because
-    its head and nose match. A node that is not part of a plausible answer to the first text (`PLAUSIBLE`)
-    does not compete, unless no node is part of one.
-
-    If a path has fewer texts than there are levels, its levels are ambiguous: the handle of a mug may be a
-    part or a subpart, and the head of ("head", "nose") is not a whole. All combinations of levels are
-    therefore searched. Combinations whose best answer has an ancestor for every text are preferred; among
-    these, the largest sum of margins wins. Ancestors need not be shown; they compete with nodes that are
-    shown or have a shown descendant.
-    """
-    ways = [way for way in combinations(LEVELS, len(path)) if level in (None, way[-1])]
-    if not ways:
-        levels = LEVELS if level is None else LEVELS[: level.index + 1]
-        raise SettingsError(
-            f"the path {' > '.join(path)!r} cannot be searched"
-            + ("" if level is None else f" at level {level.label}"),
-            expected=f"1 to {len(levels)} texts, coarse to fine: {' > '.join(each.label for each in levels)}",
-            found=f"{len(path)}",
-            fix="name the object, then its part, then a part of that part",
-        )
-    ancestors, found = tree.ancestors(), []
-    for way in ways:
-        complete, total, margins, hits = _search_way(tree, margin, ancestors, vectors, way, threshold, shown)
-        texts = tuple(map(TextAnswer, path, way, margins, anywhere))
-        found.append((complete, total, replace(hits, texts=texts)))
-    return max(found, key=lambda each: each[:2])[2]
 
 
 def _search_way(

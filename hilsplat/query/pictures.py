@@ -36,18 +36,14 @@ def grey(image: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
     return np.repeat(luminance[..., None], 3, axis=2)
 
 
-def outline(mask: Bool[np.ndarray, "H W"], width_px: int) -> Bool[np.ndarray, "H W"]:
-    """Return the pixels of a line along the inner border of a mask."""
+def outline(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Return a line along the inner border of a mask that is visible at any image size."""
     import cv2
 
+    width_px = max(1, round(max(mask.shape) / 256))
     kernel = np.ones((2 * width_px + 1, 2 * width_px + 1), np.uint8)
     inner = cv2.erode(mask.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=(1.0,))
     return mask & (inner == 0)
-
-
-def line_px(image: UInt8[np.ndarray, "H W 3"]) -> int:
-    """Return an outline width that is visible at any image size."""
-    return max(1, round(max(image.shape[:2]) / 256))
 
 
 def paint_answer(
@@ -62,9 +58,9 @@ def paint_answer(
         painted = np.where(
             answer[..., None], 0.4 * image + 0.6 * np.array(ANSWER_RGB), 0.25 * image + 0.4 * grey(image)
         )
-        painted[outline(answer, line_px(image))] = ANSWER_RGB
+        painted[outline(answer)] = ANSWER_RGB
     if truth is not None:
-        painted[outline(truth, line_px(image))] = TRUTH_RGB
+        painted[outline(truth)] = TRUTH_RGB
     return painted.clip(0, 255).astype(np.uint8)
 
 
@@ -80,11 +76,8 @@ def paint_relevancy(
 def show(axes: Axes, picture: UInt8[np.ndarray, "H W 3"], title: str = "", bold: bool = False) -> None:
     """Show a picture without ticks."""
     axes.imshow(picture, interpolation="nearest" if max(picture.shape[:2]) < 300 else "antialiased")
-    axes.set_xticks([])
-    axes.set_yticks([])
-    for spine in axes.spines.values():
-        spine.set_linewidth(2.0 if bold else 0.5)
-        spine.set_color("#ff7a00" if bold else "#888888")
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set(linewidth=2.0 if bold else 0.5, color="#ff7a00" if bold else "#888888")
     # Titles contain queries and user-given names, in which a dollar sign must not start a formula.
     axes.set_title(title, fontsize=8, pad=3, fontweight="bold" if bold else "normal", parse_math=False)
 
@@ -104,8 +97,7 @@ def show_from_above(
     flat, flat_cameras = means @ rotation.T, centres @ rotation.T
     low, high = np.percentile(flat[:, :2], (1, 99), axis=0)
     low, high = np.minimum(low, flat_cameras[:, :2].min(0)), np.maximum(high, flat_cameras[:, :2].max(0))
-    colours = np.clip(0.5 + SH_CONSTANT * gaussians.sh[:, 0], 0, 1)
-    colours = 0.5 * colours + 0.45
+    colours = 0.5 * np.clip(0.5 + SH_CONSTANT * gaussians.sh[:, 0], 0, 1) + 0.45
     visible = np.flatnonzero((gaussians.opacities > 0.3) & ~selected)
     shown = visible[:: max(1, len(visible) // MAX_POINTS)]
     shown = shown[np.argsort(flat[shown, 2], kind="stable")]
@@ -113,11 +105,8 @@ def show_from_above(
     axes.scatter(flat[selected, 0], flat[selected, 1], s=4, color="#ff7a00", linewidths=0)
     axes.scatter(flat_cameras[:, 0], flat_cameras[:, 1], s=10, color="#333333", marker="^", linewidths=0)
     margin = 0.05 * (high - low).max()
-    axes.set_xlim(low[0] - margin, high[0] + margin)
-    axes.set_ylim(low[1] - margin, high[1] + margin)
-    axes.set_aspect("equal")
-    axes.set_xticks([])
-    axes.set_yticks([])
+    (left, bottom), (right, top) = low - margin, high + margin
+    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
     axes.set_title(title, fontsize=8, pad=3, parse_math=False)
 
 

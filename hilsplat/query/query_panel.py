@@ -46,8 +46,7 @@ def query_panel(
 ) -> None:
     """Draw each view's photograph, answer and relevancy at three levels, and the scene from above.
 
-    `note` is appended to the title; doubts are written below the title. With answerer "field", the field's
-    relevancy is drawn.
+    `note` is appended to the title, and doubts are written below. The relevancy is that of `answerer`.
     """
     last = path_of(text)[-1]
     found = f"{counted(len(hits.ids), 'node')} at level {hits.level.label}"
@@ -103,10 +102,9 @@ class _Page:
         self, text: str, x: float, y: float, *, size: float = 8.0, bold: bool = False, rotation: float = 0.0
     ) -> None:
         """Write text centred at (x, y)."""
-        place = (x / self.width_px, 1 - y / self.height_px)
-        written = self.figure.text(*place, text, ha="center", va="center", size=size, rotation=rotation)
-        written.set_parse_math(False)
-        written.set_fontweight("bold" if bold else "normal")
+        at, weight = (x / self.width_px, 1 - y / self.height_px), "bold" if bold else "normal"
+        written = self.figure.text(*at, text, ha="center", va="center", parse_math=False)
+        written.set(size=size, weight=weight, rotation=rotation)
 
     def show(
         self, picture: UInt8[np.ndarray, "H W 3"], title: str, left: int, top: int, row_px: int, bold: bool

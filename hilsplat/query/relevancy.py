@@ -1,16 +1,9 @@
 """Similarity of embeddings and texts: cosine margins, and LERF's relevancy, computed from these margins.
 
-`LatentRelevancy` computes relevancy for every pixel of a view from its rendered latents:
-
-- Linear code (PCA): the length of a decoded latent and its nearest canonical phrase do not depend on the
-  text, so they are computed once per view. A text then needs d products per pixel, without decoding.
-- Network: every pixel of a view is decoded once. The decoded vectors are close to a subspace of few
-  directions (about 65 of 128, or 105 of 512). Each vector is stored as its 16-bit coordinates in this
-  subspace, together with its cosine with the nearest canonical phrase, computed from the full vector. A text
-  then needs one product per pixel and direction.
-
-Both forms are stored channel by channel, so that the compiler can process eight or sixteen pixels at once.
-Memory bandwidth is the bottleneck: three levels of a 986 x 728 view at d = 16 take 138 MB.
+`LatentRelevancy` computes relevancy for every pixel of a view from its rendered latents. A linear code needs
+no decoding; with a network, every pixel is decoded once per view (docs/field.md). Both forms are stored
+channel by channel, so that the compiler can process eight or sixteen pixels at once. Memory bandwidth is the
+bottleneck: three levels of a 986 x 728 view at d = 16 take 138 MB.
 """
 
 from collections.abc import Callable
@@ -94,33 +87,20 @@ def relevancy(
 
 
 @dataclass(frozen=True)
-class LinearView:
-    """Latents of a view, prepared for look-ups.
+class PreparedView:
+    """Latents or decoded vectors of a view, prepared for look-ups.
 
     Attributes:
-        channels: latents, one row per channel.
-        length: length of each decoded vector before normalisation.
+        channels: latents (linear code), or coordinates along directions, in units of 1 / `STEPS` (network).
         generic: cosine with the nearest canonical phrase.
+        length: length of each decoded vector before normalisation; empty with a network, whose are 1.
+        directions: orthonormal rows; None with a linear code.
     """
 
-    channels: Float32[np.ndarray, "D P"]
-    length: Float32[np.ndarray, " P"]
+    channels: Float32[np.ndarray, "D P"] | Int16[np.ndarray, "R P"]
     generic: Float32[np.ndarray, " P"]
-
-
-@dataclass(frozen=True)
-class ProjectedView:
-    """Decoded vectors of a view, prepared for look-ups.
-
-    Attributes:
-        coordinates: along each direction, in units of 1 / `STEPS`.
-        directions: orthonormal rows.
-        generic: cosine with the nearest canonical phrase.
-    """
-
-    coordinates: Int16[np.ndarray, "R P"]
-    directions: Float32[np.ndarray, "R C"]
-    generic: Float32[np.ndarray, " P"]
+    length: Float32[np.ndarray, " L"]
+    directions: Float32[np.ndarray, "R C"] | None = None
 
 
 class LatentRelevancy:
@@ -130,8 +110,6 @@ class LatentRelevancy:
         self, code: Code, canonical: Float32[np.ndarray, "K C"], scale: float, threads: int = 1
     ) -> None:
         self._code, self._canonical, self._scale, self._threads = code, canonical, scale, threads
-        self.is_linear = isinstance(code, LinearCode)
-        """Whether `fast` equals `exact` up to rounding; otherwise they differ by at most `ERROR`."""
 
     def exact(
         self, latents: Float32[np.ndarray, "P D"], texts: Float32[np.ndarray, "T C"]
@@ -146,15 +124,20 @@ class LatentRelevancy:
         self._in_parts(decode, len(latents), CHUNK_ROWS)
         return out
 
-    def prepare(self, latents: Float32[np.ndarray, "P D"]) -> LinearView | ProjectedView:
+    def prepare(self, latents: Float32[np.ndarray, "P D"]) -> PreparedView:
         """Compute everything about the latents of a view that does not depend on the text."""
-        if isinstance(self._code, LinearCode):
-            return self._prepare_linear(self._code, latents)
-        return self._prepare_projected(latents)
+        if not isinstance(self._code, LinearCode):
+            return self._prepare_projected(latents)
+        import cv2
 
-    def fast(
-        self, view: LinearView | ProjectedView, texts: Float32[np.ndarray, "T C"]
-    ) -> Float32[np.ndarray, "T P"]:
+        offsets, slopes, mean_square, cross = self._code.cosine_terms(self._canonical)
+        # Ten times as fast as numpy's transposition, but cv2 rejects arrays without rows.
+        channels = cv2.transpose(latents) if len(latents) else latents.T
+        length, generic = (np.empty(len(latents), np.float32) for _ in range(2))
+        lengths_and_generic(channels, cross, np.float32(mean_square), offsets, slopes, length, generic)
+        return PreparedView(channels, generic, length)
+
+    def fast(self, view: PreparedView, texts: Float32[np.ndarray, "T C"]) -> Float32[np.ndarray, "T P"]:
         """Compute the relevancy at each pixel of a prepared view from a few products.
 
         Each text's weights are computed separately, so that results do not depend on the other texts.
@@ -162,35 +145,23 @@ class LatentRelevancy:
         out = np.empty((len(texts), len(view.generic)), np.float32)
         if not len(texts):
             return out
-        if isinstance(view, LinearView):
+        if view.directions is None:
             assert isinstance(self._code, LinearCode)  # `prepare` made the view
-            channels, length = view.channels, view.length
             terms = [self._code.cosine_terms(text[None])[:2] for text in texts]
             offsets, slopes = (np.concatenate(each).astype(np.float32) for each in zip(*terms, strict=True))
         else:
-            channels, length = view.coordinates, np.zeros(0, np.float32)
             offsets = np.zeros(len(texts), np.float32)
             slopes = np.stack([view.directions @ text / STEPS for text in texts]).astype(np.float32)
         scale = np.float32(self._scale)
 
         def look_up(span: slice) -> None:
-            first, part = span.start, out[:, span]
-            texts_relevancy(channels, length, view.generic, first, offsets, slopes, scale, part)
+            of_view = view.channels, view.length, view.generic, span.start
+            texts_relevancy(*of_view, offsets, slopes, scale, out[:, span])
 
         self._in_parts(look_up, len(view.generic), ROWS_AT_A_TIME)
         return out
 
-    def _prepare_linear(self, code: LinearCode, latents: Float32[np.ndarray, "P D"]) -> LinearView:
-        import cv2
-
-        offsets, slopes, mean_square, cross = code.cosine_terms(self._canonical)
-        # Ten times as fast as numpy's transposition, but cv2 rejects arrays without rows.
-        channels = cv2.transpose(latents) if len(latents) else latents.T
-        length, generic = (np.empty(len(latents), np.float32) for _ in range(2))
-        lengths_and_generic(channels, cross, np.float32(mean_square), offsets, slopes, length, generic)
-        return LinearView(channels, length, generic)
-
-    def _prepare_projected(self, latents: Float32[np.ndarray, "P D"]) -> ProjectedView:
+    def _prepare_projected(self, latents: Float32[np.ndarray, "P D"]) -> PreparedView:
         """Decode all pixels, and add directions until no pixel's loss exceeds `lost_for_error`.
 
         The first directions are computed from a sample. While some pixels lose too much, such as those of a
@@ -208,7 +179,7 @@ class LatentRelevancy:
             coordinates.resize((len(directions), len(latents)), refcheck=False)
             coordinates[:, missed], generic[missed], lost = self._decode(latents[missed], directions)
             missed = missed[lost > may_lose]
-        return ProjectedView(coordinates, directions, generic)
+        return PreparedView(coordinates, generic, np.zeros(0, np.float32), directions)
 
     def _directions(
         self, latents: Float32[np.ndarray, "P D"], among: Float64[np.ndarray, "A C"]

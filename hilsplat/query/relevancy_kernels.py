@@ -5,8 +5,7 @@ import numpy as np
 from hilsplat.base.compiled import compiled
 
 BLOCK = 2048
-"""Number of pixels processed at once: their sums fit in the L1 cache, and each channel's block is long enough
-to be prefetched."""
+"""Number of pixels processed at once: sums fit in the L1 cache, and blocks are long enough to prefetch."""
 
 
 @compiled

@@ -1,8 +1,8 @@
 """Nodes and pixels shown by a scene's views; artifacts are opened once, and results are cached per view."""
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -26,17 +26,10 @@ Nodes = Sequence[int] | Int64[np.ndarray, " n"]
 
 
 class Opened:
-    """Artifacts by path, each opened and hashed once, because a scene's variants share most artifacts."""
+    """Artifacts of a scene's variants, which share most; `get(how, *of)` opens or hashes each only once."""
 
     def __init__(self) -> None:
-        self._kept: dict[tuple[Hashable, ...], Any] = {}
-
-    def get(self, how: Callable[..., Any], path: Path, *more: Hashable) -> Any:
-        """Return `how(path, *more)`, computed on the first call."""
-        key = (how, Path(path).resolve(), *more)
-        if key not in self._kept:
-            self._kept[key] = how(path, *more)
-        return self._kept[key]
+        self.get: Callable[..., Any] = cache(lambda how, *of: how(*of))
 
 
 class ViewStore:

@@ -62,9 +62,9 @@ def touching(
     nearest = cKDTree(means).query(means, k=np.arange(1, near + 1))[1] if near else np.zeros((0, 0), np.int64)
     first, second = np.repeat(region, near), region[nearest.ravel()]
     apart = first != second
-    rows = np.concatenate([first[apart], second[apart]])
-    columns = np.concatenate([second[apart], first[apart]])
-    return sp.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(num_regions, num_regions))
+    pairs = np.ones(apart.sum()), (first[apart], second[apart])
+    counts = sp.csr_matrix(pairs, shape=(num_regions, num_regions))
+    return counts + counts.T
 
 
 def joined(touch: sp.csr_matrix, shares: Float64[np.ndarray, "T V"], most: float) -> Int64[np.ndarray, " T"]:

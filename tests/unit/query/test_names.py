@@ -127,7 +127,7 @@ def test_a_damaged_file_is_refused_and_kept(desk, content):
     assert (desk / FILE).read_text() == text
 
 
-def test_nodes_similar_to_a_node_or_a_picture_are_ranked_by_cosine(desk):
+def test_nodes_similar_to_a_node_are_ranked_by_cosine(desk):
     scene = hilsplat.open(desk)
     found = nodes_by_text(scene)
     likes = scene.like_node(found["mug > handle"])
@@ -136,8 +136,5 @@ def test_nodes_similar_to_a_node_or_a_picture_are_ranked_by_cosine(desk):
     cosines = scene.tree.clip @ scene.tree.clip[found["mug > handle"]]
     assert [hit.score for hit in likes] == sorted((float(cosines[hit.node]) for hit in likes), reverse=True)
     assert {hit.level for hit in likes} == {hilsplat.Level.PART} and len(scene.like_node(0, limit=0)) == 0
-    blue = np.zeros((7, 3, 3), np.uint8)
-    blue[..., 2] = 250
-    assert scene.like_picture(blue, limit=1)[0].node == found["book"]
     with pytest.raises(SettingsError, match="node 99 does not exist"):
         scene.like_node(99)

@@ -14,7 +14,7 @@ from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.embed.clip import open_clip_of
 from hilsplat.query.answer import answer
 from hilsplat.query.names import write_names
-from hilsplat.query.node_names import COMMON, NodeNaming, Vocabulary, named, run_names, vocabulary_file
+from hilsplat.query.node_names import COMMON, NodeNaming, Vocabulary, named, run_names
 from hilsplat.query.relevancy import margins
 from hilsplat.settings import EvaluateSettings, QuerySettings
 from tests.unit.artifact_changes import change_index
@@ -56,7 +56,6 @@ def test_absent_words_of_the_common_vocabulary_are_not_among_its_names():
     common = Vocabulary.read(COMMON)
     assert len(common.things) > 1000 and len(common.parts) > 300 and len(common.absent) >= 300
     assert not {*common.absent} & {*common.things, *common.parts, *common.surfaces} - {"tank"}
-    assert vocabulary_file("auto", Path("nowhere")) == COMMON
 
 
 def test_a_name_must_stand_out_and_differ_from_the_name_of_the_parent():

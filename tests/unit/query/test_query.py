@@ -235,10 +235,12 @@ def bear_without(root, *missing):
     return folder
 
 
-def test_a_scene_opens_with_the_settings_of_its_evaluation_or_panel(tmp_path):
+def test_a_scene_opens_with_the_settings_of_its_evaluation_or_panel(tmp_path, caplog):
     folder = bear_without(tmp_path)
     scores, panel = folder / "default/scores.csv", tmp_path / "results/figures/photos/bear/panel.png"
     assert FinishedScene.locate(folder).evaluate_settings() == EvaluateSettings()
+    assert "using the defaults" in caplog.text
+    caplog.clear()
     panel.parent.mkdir(parents=True)  # a scene without labels has a panel only
     write_record(panel, settings={"figures": {}, "evaluate": {"template": "a photo of a {}"}})
     assert FinishedScene.locate(folder).evaluate_settings().template == "a photo of a {}"
@@ -246,6 +248,7 @@ def test_a_scene_opens_with_the_settings_of_its_evaluation_or_panel(tmp_path):
     write_record(scores, settings={"canonical": ["thing"], "node_select": 0.9, "a knob of old": 1})
     found = FinishedScene.locate(folder).evaluate_settings()
     assert (found.canonical, found.node_select) == (("thing",), 0.9)
+    assert "using the defaults" not in caplog.text
 
 
 def test_a_variant_uses_the_field_recorded_in_its_scores(tmp_path):
@@ -343,6 +346,7 @@ def test_hits_describe_a_node_and_its_place(scene):
     assert hit.box[0][0] <= hit.centroid[0] <= hit.box[1][0]
     (hit,) = scene.query("A top left", "subpart")
     assert hit.gaussians.tolist() == np.flatnonzero(region_mask(5)).tolist()
+    assert np.array_equal(hit.mask("004.png"), np.roll(region_mask(5), 4, axis=1))
     # 2 columns and 4 rows of Gaussians one unit apart, in a plane
     assert hit.oriented_box.size == pytest.approx((2.88, 1, 0), abs=0.15)
 
@@ -392,25 +396,20 @@ def thin(scene) -> LanguageScene:
 
 def test_cosines_at_pixels_are_those_of_decoded_latents_and_of_nodes(thin):
     texts, pixels = ["B", "A top"], np.arange(0, HEIGHT * WIDTH, 7)
-    vectors = thin.text_vectors(texts)
-    shares = thin.view_weights("000.png").toarray()
+    vectors, shares = thin.text_vectors(texts), thin.view_weights("000.png").toarray()[pixels]
+    by_field, by_node = (of(texts, "000.png", pixels) for of in (thin.field_cosine, thin.node_cosine))
     for level in LEVELS:
         features = thin.language.features[:, level.index]
-        mass = shares @ (features != 0).any(axis=1)
-        node = thin.tree.node_of_gaussian[:, level.index]
-        by_node = (vectors @ thin.tree.clip.T)[:, thin.tree.nodes_of(level)].min(axis=1, keepdims=True)
-        of_gaussian = np.where(node >= 0, vectors @ thin.tree.clip[node].T, by_node)
-        for row, pixel in enumerate(pixels):
-            answered = mass[pixel] > 0.5
-            latent = (shares[pixel] @ features / mass[pixel])[None].astype(np.float32) if answered else None
-            expected = (vectors @ thin.autoencoder.decode_array(latent)[0]) if answered else -np.inf
-            found = thin.field_cosine(texts, "000.png", pixels)[:, level.index, row]
-            assert found == pytest.approx(np.broadcast_to(expected, 2), abs=1e-5)
-            covered = shares[pixel].any()
-            expected = of_gaussian @ shares[pixel] if covered else np.full(2, -np.inf)
-            found = thin.node_cosine(texts, "000.png", pixels)[:, level.index, row]
-            assert found == pytest.approx(expected, abs=1e-5)
-    assert np.isinf(thin.node_cosine(texts, "000.png", pixels)[:, :, 0]).all()
+        mass = shares @ (features != 0).any(axis=1).astype(np.float32)
+        latents = shares @ features / np.maximum(mass, 0.5)[:, None]
+        expected = np.where(mass > 0.5, vectors @ thin.autoencoder.decode_array(latents).T, -np.inf)
+        assert by_field[:, level.index] == pytest.approx(expected, abs=1e-5)
+        node, cosines = thin.tree.node_of_gaussian[:, level.index], vectors @ thin.tree.clip.T
+        lowest = cosines[:, thin.tree.nodes_of(level)].min(axis=1, keepdims=True)
+        expected = np.where(node >= 0, cosines[:, node], lowest) @ shares.T
+        expected = np.where(shares.any(axis=1), expected, -np.inf)
+        assert by_node[:, level.index] == pytest.approx(expected, abs=1e-5)
+    assert np.isinf(by_node[:, :, 0]).all()
 
 
 def test_uncovered_pixels_get_the_lowest_relevancy(thin):

@@ -35,7 +35,7 @@ def test_answer_is_filled_and_truth_outlined():
 
 def test_outline_runs_inside_the_mask_but_not_along_the_image_border():
     mask = box((0, 6), (2, 6), (6, 6))
-    assert np.argwhere(outline(mask, 1)).tolist() == [[row, 2] for row in range(6)]
+    assert np.argwhere(outline(mask)).tolist() == [[row, 2] for row in range(6)]
 
 
 def rows_of(block_world, **settings):
