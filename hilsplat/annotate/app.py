@@ -5,7 +5,6 @@ All geometry is computed here, with the polygon filling used in evaluation; the 
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
@@ -115,25 +114,21 @@ class OpenedScene(ShownScene):
     def __init__(self, folder: Path, labels: Path, variant: str, threads: int) -> None:
         super().__init__()
         self.folder, self.labels, self.variant, self.threads = folder, labels, variant, threads
-        self.photographs = folder / "scene"
-        if not (self.photographs / "index.json").is_file():
+        scene = folder / "scene"
+        if not (scene / "index.json").is_file():
             raise ArtifactError(
-                f"{folder} has no photographs to annotate yet: {self.photographs} is missing",
+                f"{folder} has no photographs to annotate yet: {scene} is missing",
                 expected="a run's results/<dataset>/<scene>, or a copy of it",
-                fix=f"hilsplat run {self.photographs}",
+                fix=f"hilsplat run {scene}",
             )
         proposing = (folder / variant / "masks", folder / variant / "semantic_tree")
-        self.note((self.photographs, folder / "gaussians.ply", *proposing))
-        self.scene = Scene.load(self.photographs)
+        self.note((scene, folder / "gaussians.ply", *proposing))
+        self.scene, self.photographs = Scene.load(scene), (scene,)
         self.proposals = Proposals(self.scene, folder, variant, threads)
         self.clicks = Clicks(self.scene, folder / variant / "masks")
 
     def opened_again(self) -> "OpenedScene":
         return OpenedScene(self.folder, self.labels, self.variant, self.threads)
-
-    def same_photographs(self) -> AbstractContextManager[None]:
-        """Guard reads and annotations of photographs; other parts may change."""
-        return self.unchanged(self.photographs)
 
     def described(self) -> dict[str, Any]:
         """Describe the photographs and available proposals."""
@@ -190,7 +185,9 @@ class Annotator:
             size_hw = opened.scene.cameras[view].size_hw
             labels = cut_to_parents(asked.labels, size_hw)
             path = label_path(opened.labels, view)
-            with opened.same_photographs():  # otherwise labels could be saved for other photographs
+            with opened.unchanged(
+                *opened.photographs
+            ):  # otherwise labels could be saved for other photographs
                 saved = write_labels(path, view, size_hw, labels, version_sent(request))
             return {"version": saved, "labels": [label.model_dump() for label in labels]}
 
@@ -233,7 +230,7 @@ def _at(opened: OpenedScene, asked: At) -> list[dict[str, Any]]:
 
 
 def _segment(opened: OpenedScene, asked: Segment) -> list[dict[str, Any]]:
-    with opened.same_photographs():
+    with opened.unchanged(*opened.photographs):
         view = view_name(opened.scene, asked.view)
         return [vars(found) for found in opened.clicks.outlines(view, asked.clicks, asked.box)]
 

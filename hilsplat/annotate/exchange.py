@@ -32,7 +32,7 @@ OURS = {"level", "parent", "origin"}
 def exported(kind: Kind, known: Mapping[str, Sequence[Label]], cameras: Cameras) -> bytes:
     """Return all annotations as a ZIP with one file per view or, for COCO, as one JSON file."""
     if kind == "coco":
-        return _json(_coco(known, cameras)).encode()
+        return json.dumps(_coco(known, cameras), ensure_ascii=False).encode()
     write = {"hilsplat": as_file, "isat": _isat, "labelme": _labelme}[kind]
     held = io.BytesIO()
     with zipfile.ZipFile(held, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -110,7 +110,7 @@ def _isat(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
                 "note": "",
             }
             objects.append({**described, **label.model_dump(include=OURS)})
-    return _json({"info": info, "objects": objects})
+    return json.dumps({"info": info, "objects": objects}, ensure_ascii=False)
 
 
 def _labelme(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
@@ -120,7 +120,7 @@ def _labelme(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> st
         about = {"group_id": label.id, "shape_type": "polygon", "flags": {}, **own}
         shapes += [{"label": label.text, "points": ring, **about} for ring in label.polygons]
     image = {"imagePath": view, "imageData": None, "imageHeight": size_hw[0], "imageWidth": size_hw[1]}
-    return _json({"version": "5.5.0", "flags": {}, "shapes": shapes, **image})
+    return json.dumps({"version": "5.5.0", "flags": {}, "shapes": shapes, **image}, ensure_ascii=False)
 
 
 def _coco(known: Mapping[str, Sequence[Label]], cameras: Cameras) -> dict[str, Any]:
@@ -140,18 +140,13 @@ def _coco(known: Mapping[str, Sequence[Label]], cameras: Cameras) -> dict[str, A
     return content
 
 
-def _json(value: object) -> str:
-    return json.dumps(value, ensure_ascii=False)
-
-
 # -- import ---------------------------------------------------------------------------------------
 
 
 def imported(name: str, text: str, cameras: Cameras) -> dict[str, list[Label]]:
     """Return the annotations in a file, which may have any of the four formats, by view.
 
-    Objects are numbered from 1 unless the file contains ids. The file's name identifies the photograph if the
-    content does not.
+    Objects are numbered from 1 unless the file has ids. Without a photograph's name, the file's name counts.
 
     Raises:
         SceneError: the format is unknown, or the file does not fit the scene.

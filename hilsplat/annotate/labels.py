@@ -81,8 +81,7 @@ def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[La
     """Cut every child to its parent, coarse to fine, so that subparts also stay inside their wholes.
 
     Raises:
-        SettingsError: an id is used twice, a parent is missing or not one level up, or an object has no pixel
-            inside the image and its parent.
+        SettingsError: an id occurs twice, a parent is missing or not one level up, or a cut object is empty.
     """
     twice = [number for number, count in Counter(label.id for label in labels).items() if count > 1]
     if twice:

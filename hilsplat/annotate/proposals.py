@@ -1,7 +1,6 @@
 """Outlines that the user can accept or correct: from nodes, masks, labels in other views, or SAM clicks.
 
-A proposal becomes an annotation only when the user accepts it, because ground truth copied from a prediction
-would measure nothing.
+The user must accept a proposal: ground truth copied from a prediction would measure nothing.
 """
 
 from collections.abc import Mapping, Sequence
@@ -122,8 +121,7 @@ class Proposals:
         """Transfer objects annotated in other views to this view via Gaussians, parents before children.
 
         A Gaussian belongs to an object if more than half of its weight in the object's annotated views is
-        inside the object's regions. Gaussians not visible in these views are ignored. Children are cut to
-        their parents in this view.
+        inside the object's regions. Gaussians not visible there are ignored. Children are cut to parents.
 
         Args:
             known: annotations by view; unaccepted proposals are ignored.

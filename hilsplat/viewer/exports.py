@@ -16,14 +16,13 @@ from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.export import write_selection_ply
-from hilsplat.splat.flyaround import closed_path, encoded_film, open_path
+from hilsplat.splat.flyaround import FRAMES_PER_S, closed_path, encoded_film, open_path
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.rasterise.cpu import blend_forward, project_gaussians
 from hilsplat.viewer.frames import Paint, painted
 from hilsplat.viewer.wire import Film, Group
 from hilsplat.web.coco import coco_content, coco_region
 
-FRAMES_PER_S = 24
 STEP = {"mp4": 1, "gif": 2}
 """Frame step of each format. GIFs use every second frame; with all frames, they are far larger than MP4s."""
 CROP_PX = 160

@@ -15,7 +15,7 @@ from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.rasterise.blend import MAX_ALPHA, MIN_TRANSMITTANCE
 from hilsplat.splat.rasterise.cpu import blend_forward, project_gaussians
 from hilsplat.splat.rasterise.project import MIN_ALPHA
-from hilsplat.viewer.wire import Style
+from hilsplat.viewer.wire import Style, rows_of
 
 GREY = np.array([0.299, 0.587, 0.114], np.float32)
 TINT = np.float32(0.35)
@@ -52,8 +52,8 @@ class Paint:
         if style.ramp:
             assert relevancy is not None
             share = np.full(len(relevancy), 0.8, np.float32)
-            return Paint(style.colours()[relevancy].astype(np.float32) / 255, share, "plain")
-        table = style.rgba(num_nodes).astype(np.float32) / 255
+            return Paint(rows_of(style.ramp, 3, 256)[relevancy].astype(np.float32) / 255, share, "plain")
+        table = rows_of(style.table, 4, num_nodes + 1).astype(np.float32) / 255
         found = np.zeros((len(node_of_gaussian), 4), np.float32)
         for level in range(3):  # coarse to fine, so that finer levels override coarser ones
             if style.use[level]:
@@ -93,8 +93,7 @@ def weights_at(
 ) -> tuple[Int64[np.ndarray, " g"], Float64[np.ndarray, " g"]]:
     """Return one pixel's Gaussians, nearest first, and their blending weights, like a row of `pixel_weights`.
 
-    The whole view is projected, because the Jacobian depends on the picture's borders, but only this pixel
-    is blended.
+    The whole view is projected, because the Jacobian depends on its borders; only this pixel is blended.
     """
     view = project_gaussians(gaussians, camera, 0, threads)
     first_x, last_x, first_y, last_y = view.box.T

@@ -45,6 +45,7 @@ def description() -> dict[str, Any]:
     paths: dict[str, Any] = {}
     for method, path, summary, sent, given in SENT:
         names = [part.strip("{}") for part in path.split("/") if part.startswith("{")]
+        kinds = {name: "string" if name == "variant" else "integer" for name in names}
         content = {"schema": schema_of(Answer)} if path in ANSWERS else {}
         body = {}
         if sent:
@@ -52,13 +53,8 @@ def description() -> dict[str, Any]:
         paths.setdefault(path, {})[method] = {
             "summary": summary,
             "parameters": [
-                {
-                    "name": name,
-                    "in": "path",
-                    "required": True,
-                    "schema": {"type": "string" if name == "variant" else "integer"},
-                }
-                for name in names
+                {"name": name, "in": "path", "required": True, "schema": {"type": kind}}
+                for name, kind in kinds.items()
             ],
             **body,
             "responses": {

@@ -139,8 +139,7 @@ class FoundNode(TypedDict):
 class Answer(TypedDict):
     """Answers to a text, or nodes that look like a node or a picture.
 
-    `relevancy` has one value per node, `total` counts all answers, `hits` lists the best answers, and `route`
-    is as in `hilsplat.Hit`.
+    `relevancy` has one value per node, `hits` are the best of `total` answers; `route` is as in `Hit`.
     """
 
     text: str

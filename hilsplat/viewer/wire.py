@@ -51,8 +51,7 @@ class Style(Message):
         table: base64 of RGBA bytes: row 0 for Gaussians without a node, row n + 1 for node n.
         use: whether each level is used; the finest used level with an alpha above 0 sets the colour.
         mode: style of Gaussians whose alpha is 0.
-        ramp: base64 of 256 RGB colours; if given, Gaussians are coloured by the field's relevancy to `text`
-            at `level` instead.
+        ramp: base64 of 256 RGB colours; if given, colours show the field's relevancy to `text` at `level`.
     """
 
     table: Annotated[str, Field(max_length=400_000)] = ""
@@ -68,16 +67,9 @@ class Style(Message):
             raise ValueError("colouring by relevancy requires a text, but the text is empty")
         return self
 
-    def rgba(self, num_nodes: int) -> UInt8[np.ndarray, "T1 4"]:
-        """Return the table; an empty table leaves every Gaussian unchanged."""
-        return _rows(self.table, 4, num_nodes + 1)
 
-    def colours(self) -> UInt8[np.ndarray, "256 3"]:
-        """Return the ramp's colours."""
-        return _rows(self.ramp, 3, 256)
-
-
-def _rows(text: str, width: int, count: int) -> np.ndarray:
+def rows_of(text: str, width: int, count: int) -> UInt8[np.ndarray, "count width"]:
+    """Return the rows of bytes that a style contains as base64; an empty text gives zeros."""
     if not text:
         return np.zeros((count, width), np.uint8)
     try:

@@ -2,8 +2,7 @@
 
 Loopback alone is no protection: other users of the machine can reach it, and so can any web page open in the
 same browser. Every request therefore needs a cookie that only the printed address sets, and a Host that
-names this machine (against DNS rebinding). Requests with a body also need the page's own Origin and a content
-type that no form can send.
+names this machine (against DNS rebinding). Requests with a body also need the page's Origin and JSON's type.
 """
 
 import hmac

@@ -8,7 +8,7 @@ import asyncio
 import secrets
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -34,6 +34,8 @@ class ShownScene:
     """
 
     scene: Scene
+    photographs: tuple[Path, ...] = ()
+    """Parts that must not change while photographs are read; empty means all parts."""
 
     def __init__(self) -> None:
         self.state = secrets.token_hex(4)
@@ -65,10 +67,6 @@ class ShownScene:
                 f"{', '.join(changed)} of {self.scene.name} changed on disk since the page was loaded",
                 fix="reload the page",
             )
-
-    def same_photographs(self) -> AbstractContextManager[None]:
-        """Guard reads of photographs, like `unchanged`."""
-        return self.unchanged()
 
     def news(self) -> dict[str, Any]:
         """Describe what changed since the page was loaded."""
@@ -187,12 +185,12 @@ class SceneThread(Generic[Shown]):
 def _photo(shown: ShownScene, of: Mapping[str, Any]) -> Response:
     path = shown.scene.image_path(view_name(shown.scene, of["number"]))
     kind = "image/png" if path.suffix.lower() == ".png" else "image/jpeg"
-    with shown.same_photographs():
+    with shown.unchanged(*shown.photographs):
         return plain(path.read_bytes(), kind, cached=True)
 
 
 def _thumb(shown: ShownScene, of: Mapping[str, Any]) -> Response:
     view = view_name(shown.scene, of["number"])
-    with shown.same_photographs():
+    with shown.unchanged(*shown.photographs):
         small = resize_to_fit(shown.scene.image(view), THUMB_PX)
     return plain(encoded(small), "image/jpeg", cached=True)
