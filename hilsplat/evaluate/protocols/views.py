@@ -52,9 +52,9 @@ def label_of(card: cards.ProtocolCard, method: str, settings: EvaluateSettings) 
     rule = rule_of(settings)
     words: list[str] = []
     if method == "field":
-        words += rule.departures(RelevancyRule())
+        words += rule.departures()
     else:  # nodes are selected without thresholds; localization and diagnostics still use smoothed maps
-        words += RelevancyRule(rule.filter_px, rule.mix).departures(RelevancyRule())
+        words += RelevancyRule(rule.filter_px, rule.mix).departures()
         if settings.node_select != cards.NODE_SELECT:
             words.append(f"node share {settings.node_select:g}")
         if method == "tree" and settings.ancestors != cards.ANCESTORS:

@@ -156,6 +156,8 @@ def test_labels_of_a_data_set_take_grey_where_the_protocol_does(data_set, tmp_pa
     ious = {row.protocol: row.value for row in frame[frame["metric"] == "iou"].itertuples()}
     assert ious["3d-ovs/langsplat-v2@3 (masks of files)"] == 1
     assert ious["3d-ovs/langsplat@2 (masks of files)"] == 0.5
+    shares = numbers(frame, "lerf/opengaussian", {"acc_25", "acc_50"})
+    assert shares == {("cup", "", "acc_25"): 1, ("cup", "", "acc_50"): 0}  # 0.5 is not above 0.5
     # an eighth has rows 4 and 12: the label has neither, and row 4 is in the mask
     assert ious["3d-ovs/argmax@3 (masks of files)"] == 0
     assert set(frame["scene"]) == {"s"}

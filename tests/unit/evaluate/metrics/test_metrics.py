@@ -99,14 +99,6 @@ def test_the_mean_in_the_mask_chooses_the_higher_mean_not_the_higher_value():
     np.testing.assert_array_equal(mask, relevancy[0] > 0)
 
 
-def test_rule_names_what_departs_from_langsplat():
-    assert RelevancyRule().departures(RelevancyRule()) == ()
-    rule = RelevancyRule(filter_px=20, mix=False, threshold=0.5, threshold_on="raw", majority=False)
-    expected = ("filter 20", "no mix", "threshold 0.5", "raw", "no majority")
-    assert rule.departures(RelevancyRule()) == expected
-    assert RelevancyRule().departures(RelevancyRule(filter_px=20)) == ("filter scaled",)
-
-
 def test_majority_inside_the_image_includes_the_last_row_and_column():
     mask = box((4, 8), (4, 8), (8, 8))
     # turned by 180 degrees this is the same square at the other corner, and so is the smoothed mask
@@ -172,13 +164,6 @@ def test_one_wide_erosion_equals_many_small_ones():
     np.testing.assert_array_equal(boundary(mask, 4), mask & (repeated == 0))
 
 
-def test_best_threshold_finds_the_best_cut_and_keeps_ties_together():
-    score = np.array([[0.9, 0.8, 0.8], [0.1, 0.5, 0.0]])
-    truth = np.array([[1, 1, 0], [0, 1, 0]], dtype=bool)
-    # cuts: {.9} 1/3; {.9 .8 .8} 2/4; and .5: 3/4; and .1: 3/5; all: 3/6
-    assert best_threshold_iou(score, truth) == pytest.approx(3 / 4)
-
-
 @settings(max_examples=30, deadline=None)
 @given(
     hnp.arrays(np.float32, (4, 5), elements=st.sampled_from([0.0, 0.25, 0.5, 0.75, 1.0])),
@@ -226,18 +211,6 @@ def test_mask_hit_is_stricter_than_box_hit():
 
 
 # --- hierarchical consistency ---------------------------------------------------------------------
-
-
-def test_children_of_a_parent_share_its_weight():
-    left, right = box((0, 10), (0, 5)), box((0, 10), (5, 10))
-    inside = Family(left, (box((0, 2), (0, 2)),), left)
-    outside = Family(right, tuple(box((row, row + 2), (0, 2)) for row in (2, 4, 6)), right)
-    assert hierarchical_consistency([[inside, outside]]) == 0.5
-
-
-def test_perfect_nesting_in_a_view_without_subparts_scores_half():
-    whole = box((0, 10), (0, 10))
-    assert hierarchical_consistency([[Family(whole, (box((0, 2), (0, 2)),), whole)], []]) == 0.5
 
 
 def test_whole_image_fools_all_readings_but_the_anchored_one():

@@ -93,6 +93,7 @@ def test_the_documentation_lists_every_protocol_with_its_public_function():
 
 
 CHANGED = {"filter_px": 20, "threshold_on": "raw", "node_select": 0.7, "relevancy_scale": 5}
+RULE = {"mix": False, "relevancy_threshold": 0.5, "majority": False, "level_rule": "mean_in_mask"}
 
 
 @pytest.mark.parametrize(
@@ -101,6 +102,7 @@ CHANGED = {"filter_px": 20, "threshold_on": "raw", "node_select": 0.7, "relevanc
         (LERF_LANGSPLAT, "field", {}, ""),
         (TREE_NODES, "tree", {}, ""),
         (LERF_LANGSPLAT, "field", CHANGED, " (filter 20, raw, relevancy scale 5)"),
+        (LERF_LANGSPLAT, "field", RULE, " (no mix, threshold 0.5, no majority, mean_in_mask)"),
         (TREE_NODES, "tree", {"ancestors": 0}, " (ancestors 0)"),
         # nodes are not thresholded, so the scale of the threshold doesn't affect them
         (LEVEL_GIVEN, "tree", CHANGED, " (filter 20, node share 0.7, relevancy scale 5)"),

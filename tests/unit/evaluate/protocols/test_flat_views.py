@@ -11,7 +11,6 @@ from hilsplat.base.levels import Level
 from hilsplat.datasets.images.ovs3d import FOREGROUND
 from hilsplat.datasets.labelled import mask_region
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
-from hilsplat.evaluate.protocols.answers import mask_rows
 from hilsplat.evaluate.protocols.cards import LERF_MASK, OVS_ARGMAX, OVS_LANGSPLAT_V2, OVS_NODES, card_of
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
@@ -129,14 +128,6 @@ def test_a_tree_answers_with_its_own_nodes_and_a_field_with_its_mask_or_not_at_a
     assert {row.protocol for row in tree + field} == {f"{card.full_name} (wholes)"}
 
 
-def test_rows_of_a_mask_have_the_metrics_of_the_protocol():
-    cup, metrics = query("cup", (0, 16)), ("iou", "acc_25", "acc_50")
-    rows = mask_rows("m", cup, "p", region((0, 8)), metrics=metrics)
-    assert [(row.level, row.metric, row.value) for row in rows] == [
-        ("whole", metric, value) for metric, value in zip(metrics, (0.5, 1, 0), strict=True)
-    ]
-
-
 RULE = OVS_LANGSPLAT_V2.rule
 
 
@@ -191,13 +182,6 @@ def test_masks_are_those_of_the_released_rule(seed):
     united = blobs(rng, (24, 31)) if seed % 2 else None
     mask = relevancy_mask(SmoothedRelevancy.of(maps, RULE), None, RULE, united)
     np.testing.assert_array_equal(mask, by_the_released_rule(maps, united))
-
-
-def test_an_empty_mask_wins_the_level():
-    maps = np.full((3, 40, 40), 0.1, np.float32)
-    maps[Level.WHOLE.index, :20] = 0.9
-    maps[Level.PART.index, 20, 20] = 0.9  # one pixel, which the majority filter removes
-    assert not relevancy_mask(SmoothedRelevancy.of(maps, RULE), None, RULE).any()
 
 
 @pytest.mark.parametrize(

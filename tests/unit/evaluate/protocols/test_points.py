@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilsplat.base.errors import ArtifactError, SceneError
+from hilsplat.base.errors import SceneError
 from hilsplat.datasets.classes import (
     LABELLINGS,
     SCANNET200,
@@ -193,5 +193,3 @@ def test_stand_ins_and_data_sets_name_protocols_that_exist():
         assert bool(asked.points) == (dataset.labels == "points" and bool(dataset.protocols))
     with pytest.raises(SceneError, match="one of tabletop, room, street"):
         ExtraProtocols.of_world("table")
-    with pytest.raises(ArtifactError, match="there is no protocol 'lerf/langsplatt'"):
-        card_of("lerf/langsplatt")

@@ -3,12 +3,10 @@
 import csv
 import subprocess
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hilsplat.base.artifacts import write_index
 from hilsplat.base.errors import ArtifactError
 from hilsplat.configuration import RunSettings
 from hilsplat.datasets.classes import SCANNET200_INSTANCES
@@ -18,7 +16,6 @@ from hilsplat.evaluate.tables.build import TABLES, published_values, run_table
 from hilsplat.evaluate.tables.formats import latex_text
 from hilsplat.evaluate.tables.point_tables import bootstrap_mean
 from hilsplat.evaluate.tables.rows import Block, Cell, Row, read_published
-from hilsplat.segment.origin import masks_label
 from tests.conftest import PROJECT
 from tests.unit.evaluate.builders import score
 
@@ -96,14 +93,6 @@ def test_hierarchy_means_go_over_pairs_then_scenes_then_levels(tmp_path):
     assert "not comparable with reported" in forms[".md"]
 
 
-def test_rows_of_a_published_data_set_are_measured_rows(tmp_path):
-    scores = [score("iou", 0.5, dataset="lerf", protocol="lerf/langsplat@2", method="field", level="")]
-    rows, forms = built(tmp_path, "lerf", scores)
-    assert measured(rows, "hilsplat (field)")["kind"] == "measured"
-    assert "## Measured on lerf" in forms[".md"]
-    assert "synthetic" not in forms[".md"]
-
-
 def test_lerf_table_has_a_column_per_scene_and_the_mean_of_scenes(tmp_path):
     rows, _ = built(tmp_path, "lerf", labels={"default": "ours"})
     row = measured(rows, method="ours (tree)", protocol="lerf/tree-nodes@5")
@@ -111,13 +100,14 @@ def test_lerf_table_has_a_column_per_scene_and_the_mean_of_scenes(tmp_path):
     assert cells(row, "one mBIoU", "Average mBIoU", "Average localization") == ["25.00", "25.00", "50.00"]
 
 
-def test_lerf_mask_means_go_over_texts_and_not_over_pairs(tmp_path):
-    protocol = "lerf-mask/gaussian-grouping@1 (wholes)"
+def test_lerf_mask_means_go_over_texts_and_rows_of_a_published_data_set_are_measured_rows(tmp_path):
     values = ("apple", "a", 0.8), ("apple", "b", 0.6), ("egg", "a", 0.3)
-    of_mask = {"protocol": protocol, "level": ""}
+    of_mask = {"dataset": "lerf_mask", "protocol": "lerf-mask/gaussian-grouping@1", "level": ""}
     scores = [score("iou", value, query=query, view=view, **of_mask) for query, view, value in values]
-    rows, _ = built(tmp_path, "lerf", scores)
-    assert measured(rows, protocol=protocol)["Average mIoU"] == "50.00"  # pairs would give 56.67
+    rows, forms = built(tmp_path, "lerf", scores)
+    row = measured(rows)
+    assert cells(row, "kind", "Average mIoU") == ["measured", "50.00"]  # pairs would give 56.67
+    assert "## Measured on lerf_mask" in forms[".md"] and "synthetic" not in forms[".md"]
 
 
 def test_ablation_rows_take_localization_from_the_flat_protocol(tmp_path):
@@ -256,11 +246,9 @@ def test_replica_shows_scenes_and_their_mean(tmp_path):
 def test_waymo_pools_the_counts_of_all_scenes(tmp_path):
     first = class_scores("waymo/segmentation", 1 / 2, 2, scene="street-1", query="car")
     second = class_scores("waymo/segmentation", 8 / 8, 8, scene="street-2", query="car")
-    scores = [replace(row, dataset="synthetic-streets") for row in (*first, *second)]
-    row = measured(built(tmp_path, "waymo", scores)[0])
+    row = measured(built(tmp_path, "waymo", [*first, *second])[0])
     # (1 + 8) / (2 + 8) for cars, and 21 absent classes that count 1
-    assert row["mIoU, present classes"] == "90.00"
-    assert row["mIoU"] == f"{100 * (21 + 0.9) / 22:.2f}"
+    assert cells(row, "mIoU, present classes", "mIoU") == ["90.00", f"{100 * (21 + 0.9) / 22:.2f}"]
 
 
 def test_intervals_widen_with_fewer_scenes_and_names():
@@ -356,15 +344,6 @@ def test_a_row_with_true_masks_is_marked_and_not_ranked(tmp_path):
     assert " 90.0 " in stand_in and "**90.0**" not in stand_in
 
 
-@pytest.mark.parametrize(
-    ("entries", "expected"),
-    [({}, "sam-tiny"), ({"model": None}, "sam"), ({"label": TRUE_MASKS}, TRUE_MASKS)],
-)
-def test_masks_are_named_after_the_model_the_segmenter_or_their_label(tmp_path, entries, expected):
-    write_index(tmp_path, {}, **{"segmenter": "sam", "model": "models/sam-tiny", **entries})
-    assert masks_label(tmp_path) == expected
-
-
 # --- the paper's values -----------------------------------------------------------------------------
 
 
@@ -406,9 +385,3 @@ def test_printed_averages_add_up_or_carry_a_note(name, average, parts):
         printed, *of_parts = map(float, values)
         adds_up = abs(sum(of_parts) / len(of_parts) - printed) < 0.0502  # half of the last printed digit
         assert adds_up or "average to" in cells[average]["note"]
-
-
-def test_swapped_ap_columns_carry_a_note():
-    entries = read_published(PUBLISHED / "scannet.csv")
-    notes = [e["note"] for e in entries if e["method"] == "Hi-LSplat" and "AP@" in e["column"]]
-    assert all("exchanged" in note for note in notes)
