@@ -1,21 +1,16 @@
-"""Nothing in a street collides, views overlap for structure from motion, and lidar points are on surfaces."""
-
-import itertools
+"""Objects of a street are in their places, views overlap, and lidar points are on surfaces."""
 
 import cv2
 import numpy as np
 import pytest
 
-from hilsplat.base.artifacts import read_npz
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.settings import WorldSettings
 from hilsplat.world import lidar
 from hilsplat.world.lidar import ABOVE_CAMERA_M, BEAMS, INCLINATION_DEG, MAX_RANGE_M, scan_street
 from hilsplat.world.render import label_view, render_view
 from hilsplat.world.scenes.kinds import build_scene, scene_cameras
 from hilsplat.world.scenes.scene import WorldScene
-from hilsplat.world.scenes.street import FRONT, KERB, LANE, LANE_Y, MAX_STEP, SWEEP_DEG, WALK_Z, part_boxes
-from hilsplat.world.stage import run_world
+from hilsplat.world.scenes.street import FRONT, KERB, LANE, LANE_Y, MAX_STEP, SWEEP_DEG, WALK_Z
 from hilsplat.world.truth import true_depth
 from hilsplat.world.views import square_camera
 
@@ -39,16 +34,6 @@ def things(scene: WorldScene) -> dict[int, np.ndarray]:
     """Corners of all wholes but the surroundings, by id."""
     ids = sorted(set(np.unique(scene.node_ids[:, 0]).tolist()) - scene.background)
     return {node: scene.triangles[scene.node_ids[:, 0] == node].reshape(-1, 3) for node in ids}
-
-
-def test_boxes_of_parts_of_different_objects_do_not_intersect(street):
-    boxes = {}
-    for node in things(street):
-        own = street.node_ids[:, 0] == node
-        boxes[node] = part_boxes(street.triangles[own].astype(np.float64), street.node_ids[own, 1])
-    for (low_a, high_a), (low_b, high_b) in itertools.combinations(boxes.values(), 2):
-        apart = (low_a[:, None] > high_b) | (high_a[:, None] < low_b)
-        assert apart.any(axis=2).all()  # apart along some axis, for every pair of parts
 
 
 def test_vehicles_are_on_the_road_and_pedestrians_on_the_sidewalk(street):
@@ -114,10 +99,15 @@ def test_beams_below_the_horizon_measure_the_flat_road(street, centres, monkeypa
     assert np.median(np.abs(scan.range_m - height / sine)[on_road]) < 1e-3
 
 
-def test_points_are_at_the_measured_range_and_noise_has_the_stated_deviation(street, centres, monkeypatch):
+def test_noise_has_the_stated_deviation_and_a_share_of_returns_is_dropped(street, centres, monkeypatch):
     scan = scan_street(street, centres)
     monkeypatch.setattr(lidar, "RANGE_NOISE_M", 0.0)
     exact = scan_street(street, centres)
+    monkeypatch.setattr(lidar, "LOST_SHARE", 0.0)
+    full = scan_street(street, centres)
+    assert len(scan.points) / len(full.points) == pytest.approx(0.95, abs=0.01)
+    texts = {street.nodes[node].text for node in np.unique(full.node_ids[:, 0])}
+    assert "sky" not in texts and {"road", "sidewalk", "building"} <= texts
     assert scan.origins == pytest.approx(centres[[0, 10, 20, 29, 39]] + [0, 0, ABOVE_CAMERA_M])
     away = np.linalg.norm(scan.points - scan.origins[scan.pose_index], axis=1)
     assert away == pytest.approx(scan.range_m, abs=1e-4)
@@ -125,15 +115,6 @@ def test_points_are_at_the_measured_range_and_noise_has_the_stated_deviation(str
     error = (scan.range_m - exact.range_m).astype(np.float64)
     assert error.std() == pytest.approx(0.015, rel=0.1) and abs(error.mean()) < 0.001
     assert scan.range_m.max() < MAX_RANGE_M + 0.1
-
-
-def test_the_sky_gives_no_return_and_a_share_of_returns_is_dropped(street, centres, monkeypatch):
-    some = scan_street(street, centres)
-    monkeypatch.setattr(lidar, "LOST_SHARE", 0.0)
-    full = scan_street(street, centres)
-    texts = {street.nodes[node].text for node in np.unique(full.node_ids[:, 0])}
-    assert "sky" not in texts and {"road", "sidewalk", "building"} <= texts
-    assert len(some.points) / len(full.points) == pytest.approx(0.95, abs=0.01)
 
 
 def test_visible_points_have_the_label_of_their_pixel(street, cameras, centres):
@@ -158,13 +139,3 @@ def test_visible_points_have_the_label_of_their_pixel(street, cameras, centres):
             # scanner beside a bus hits the posts between its windows, which the camera cannot show.
             least = 0.97 if level == Level.SUBPART else 0.995
             assert (image[row, column] == ids[:, level.index])[within].mean() > least
-
-
-def test_the_truth_folder_of_a_street_contains_the_scan_of_its_views(tmp_path):
-    settings = WorldSettings(views=3, image_px=48, objects=3, samples=1)
-    run_world("world:street:100", settings, tmp_path, threads=1)
-    scene = build_scene("street", 100, 3)
-    cameras = scene_cameras(scene, 3, 48, settings.arc_deg)
-    scan = vars(scan_street(scene, np.stack([cameras[name].centre for name in cameras.names])))
-    assert set(scan) == {"points", "node_ids", "pose_index", "range_m", "beam", "origins"}
-    np.testing.assert_equal(read_npz(tmp_path / "truth" / "lidar.npz"), scan)
