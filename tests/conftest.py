@@ -2,6 +2,7 @@
 
 import logging
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -50,6 +51,18 @@ def desk_project(tmp_path_factory) -> Path:
     from tests.unit.finished_desk import build_finished_desk
 
     return build_finished_desk(tmp_path_factory.mktemp("project"))
+
+
+@pytest.fixture(scope="session")
+def desk(desk_project) -> Path:
+    """The folder of the finished scene in `desk_project`."""
+    return desk_project / "results/photos/desk"
+
+
+@pytest.fixture
+def own_desk(desk_project, tmp_path) -> Path:
+    """A copy of the finished scene, in a copy of its project, to change."""
+    return shutil.copytree(desk_project, tmp_path / "project") / "results/photos/desk"
 
 
 @pytest.fixture(autouse=True)

@@ -3,10 +3,11 @@
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,6 @@ from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import save_ply
 from tests.conftest import PROJECT
 from tests.unit.evaluate.builders import cameras_of
-from tests.unit.finished_desk import SCENE
 
 HOW = "apt-get install chromium libgl1-mesa-dri libegl1; pip install -e '.[browser-tests]'"
 ARGUMENTS = ["--use-angle=gl-egl", "--ignore-gpu-blocklist", "--no-sandbox", "--disable-dev-shm-usage"]
@@ -46,7 +46,7 @@ def browser():
 
 @contextmanager
 def serving(folder: Path, *words: str) -> Iterator[str]:
-    """Address of the page of a scene, served by `hilsplat view` or another command."""
+    """Address of the page of a scene, served by `hilsplat view` or another command, which Ctrl-C must end."""
     code = "from hilsplat.cli.main import main; main()"
     command = [sys.executable, "-u", "-c", code, *(words or ("view",)), str(folder), "--no-browser"]
     environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
@@ -55,19 +55,7 @@ def serving(folder: Path, *words: str) -> Iterator[str]:
             line = server.stdout.readline()
             yield re.search(r"http://127\.0\.0\.1:\d+/\?token=\S+", line).group()
         finally:
-            server.terminate()
-
-
-@pytest.fixture(scope="session")
-def desk(desk_project) -> Path:
-    """The folder of a finished scene."""
-    return desk_project / SCENE
-
-
-@pytest.fixture
-def own_desk(desk_project, tmp_path) -> Path:
-    """A copy of the desk, to change."""
-    return shutil.copytree(desk_project, tmp_path / "project") / SCENE
+            server.send_signal(signal.SIGINT)
 
 
 @pytest.fixture
@@ -149,6 +137,25 @@ def opened(browser) -> Iterator[Callable]:
         context.close()
     wrong = [said for said in wrong if not any(each in said for each in open_page.expected)]
     assert not wrong, wrong
+
+
+@pytest.fixture
+def served(opened) -> Iterator[Callable]:
+    """A function that serves a scene and opens its page, which is closed before its server: it polls it."""
+    with ExitStack() as stack:
+
+        def serve_and_open(folder: Path, *words: str, painter: str = "gl", **more):
+            page = opened(stack.enter_context(serving(folder, *words)), painter, **more)
+            stack.callback(page.close)
+            return page
+
+        yield serve_and_open
+
+
+@pytest.fixture
+def annotating(served, tmp_path) -> Callable:
+    """A function that opens the annotation page of a scene, whose files are in `tmp_path`."""
+    return lambda folder, **more: served(folder, "annotate", "--data-root", str(tmp_path), **more)
 
 
 def drawn(page, act: Callable[[], object]) -> None:

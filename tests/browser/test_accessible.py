@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.browser.conftest import answers, ask, phone_fits, serving
+from tests.browser.conftest import answers, ask, phone_fits
 
 SERIOUS = ("serious", "critical")
 
@@ -39,15 +39,13 @@ def test_the_viewer_has_no_serious_violation_in_the_colours_of_the_user(
 
 
 @pytest.mark.parametrize("scheme", ["dark", "light"])
-def test_the_annotator_has_no_serious_violation(opened, desk, tmp_path, scheme):
+def test_the_annotator_has_no_serious_violation(annotating, desk, scheme):
     label = {"id": 1, "level": 1, "parent": None, "text": "mug", "origin": "proposed"}
     label["polygons"] = [[[1, 1], [15, 1], [15, 20], [1, 20]]]
-    with serving(desk, "annotate", "--data-root", str(tmp_path)) as address:
-        page = opened(address, color_scheme=scheme)
-        page.evaluate("(label) => hilsplat.store.change([[0, [label]]])", label)
-        page.locator("#save summary").click()
-        assert violations(page) == []
-        page.close()
+    page = annotating(desk, color_scheme=scheme)
+    page.evaluate("(label) => hilsplat.store.change([[0, [label]]])", label)
+    page.locator("#save summary").click()
+    assert violations(page) == []
 
 
 def test_the_chosen_level_is_visible_in_forced_colours(opened, desk_address):

@@ -1,7 +1,6 @@
 """The annotation page in a real browser; elements are found by role and label."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 from hilsplat.annotate.labels import Label, label_path, read_labels, write_labels
 from hilsplat.datasets.registry import open_labelled
 from hilsplat.web.file_changes import version_of
-from tests.browser.conftest import phone_fits, serving
+from tests.browser.conftest import phone_fits
 from tests.conftest import PROJECT
 from tests.unit.artifact_changes import change_index, write_again
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, WIDTH
@@ -19,11 +18,8 @@ SIZE = (HEIGHT, WIDTH + NUM_VIEWS)
 
 
 @pytest.fixture
-def page(opened, desk, tmp_path) -> Iterator:
-    with serving(desk, "annotate", "--data-root", str(tmp_path)) as address:
-        page = opened(address)
-        yield page
-        page.close()  # before its server ends, because the page polls it
+def page(annotating, desk):
+    return annotating(desk)
 
 
 def saved(page) -> None:
@@ -269,47 +265,43 @@ def test_corners_of_the_chosen_outline_are_moved_added_and_removed(page, tmp_pat
     assert kept(tmp_path)[0].mask(SIZE)[19, 21]
 
 
-def test_sam_outlines_clicked_things(opened, own_desk, tmp_path):
+def test_sam_outlines_clicked_things(annotating, own_desk, tmp_path):
     change_index(own_desk / "default/masks", segmenter="sam", model=str(PROJECT / "models/sam-tiny"))
-    with serving(own_desk, "annotate", "--data-root", str(tmp_path)) as address:
-        page = opened(address)
-        page.locator("#view").press("s")
-        page.mouse.click(*place(page, 28, 20))
-        page.get_by_text("Press Enter to accept this outline").wait_for()
-        assert page.locator("#drawing .inside").count() == 1
-        assert page.locator("#drawing .offer").count() == 1
-        page.keyboard.down("Alt")
-        page.mouse.click(*place(page, 4, 20))
-        page.keyboard.up("Alt")
-        page.locator("#drawing .outside").wait_for(state="attached")
-        page.get_by_text("Press Enter to accept this outline").wait_for()
-        saved(page)
-        page.locator("#view").press("Enter")
-        saved(page)
-        (found,) = kept(tmp_path)
-        assert found.origin == "proposed" and found.mask(SIZE)[20, 28] and not found.mask(SIZE)[20, 4]
-        page.locator("#view").press("s")
-        drag(page, (1, 2), (14, 21))  # a box
-        page.get_by_text("Press Enter to accept this outline").wait_for()
-        page.keyboard.press("Escape")
-        page.locator("#drawing .offer").wait_for(state="detached")
-        page.close()
+    page = annotating(own_desk)
+    page.locator("#view").press("s")
+    page.mouse.click(*place(page, 28, 20))
+    page.get_by_text("Press Enter to accept this outline").wait_for()
+    assert page.locator("#drawing .inside").count() == 1
+    assert page.locator("#drawing .offer").count() == 1
+    page.keyboard.down("Alt")
+    page.mouse.click(*place(page, 4, 20))
+    page.keyboard.up("Alt")
+    page.locator("#drawing .outside").wait_for(state="attached")
+    page.get_by_text("Press Enter to accept this outline").wait_for()
+    saved(page)
+    page.locator("#view").press("Enter")
+    saved(page)
+    (found,) = kept(tmp_path)
+    assert found.origin == "proposed" and found.mask(SIZE)[20, 28] and not found.mask(SIZE)[20, 4]
+    page.locator("#view").press("s")
+    drag(page, (1, 2), (14, 21))  # a box
+    page.get_by_text("Press Enter to accept this outline").wait_for()
+    page.keyboard.press("Escape")
+    page.locator("#drawing .offer").wait_for(state="detached")
 
 
 def test_the_page_fits_a_phone_and_has_no_tool_for_a_missing_sam(page):
     assert phone_fits(page) and not page.locator("#segment-label").is_visible()
 
 
-def test_a_rewritten_scene_is_reported(opened, own_desk, tmp_path):
-    with serving(own_desk, "annotate", "--data-root", str(tmp_path)) as address:
-        page = opened(address)
-        assert not page.get_by_role("alert").is_visible()
-        write_again(own_desk / "default/semantic_tree")
-        page.get_by_role("alert").get_by_text("The scene has changed (semantic_tree).").wait_for()
-        name(page, "rim")  # the photographs are the same
-        polygon(page, (1, 1), (15, 1), (15, 5), (1, 5))
-        assert [label.text for label in kept(tmp_path)] == ["rim"]
-        page.get_by_role("button", name="Reload").click()
-        page.get_by_role("alert").wait_for(state="hidden")
-        page.get_by_role("treeitem", name="rim, whole").wait_for()
-        page.close()
+def test_a_rewritten_scene_is_reported(annotating, own_desk, tmp_path):
+    page = annotating(own_desk)
+    assert not page.get_by_role("alert").is_visible()
+    write_again(own_desk / "default/semantic_tree")
+    page.get_by_role("alert").get_by_text("The scene has changed (semantic_tree).").wait_for()
+    name(page, "rim")  # the photographs are the same
+    polygon(page, (1, 1), (15, 1), (15, 5), (1, 5))
+    assert [label.text for label in kept(tmp_path)] == ["rim"]
+    page.get_by_role("button", name="Reload").click()
+    page.get_by_role("alert").wait_for(state="hidden")
+    page.get_by_role("treeitem", name="rim, whole").wait_for()

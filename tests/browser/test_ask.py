@@ -21,7 +21,6 @@ from tests.browser.conftest import (
     on_page,
     pixels,
     save,
-    serving,
     wire_camera,
 )
 from tests.unit.artifact_changes import change_index
@@ -183,11 +182,13 @@ def test_an_address_opens_the_same_view_with_the_same_queries(opened, desk_addre
     np.testing.assert_allclose(found["K"], expected["K"], rtol=1e-3)
 
 
-def test_films_show_progress_and_gifs_have_the_chosen_size(opened, desk_address, tmp_path):
-    page = opened(desk_address)
+def test_films_show_progress_and_gifs_and_pictures_have_the_chosen_size(opened, desk_address, tmp_path):
+    page = opened(desk_address, "server")
     page.locator("#save summary").click()
     page.get_by_label("Longer side of the GIF").select_option("240")
+    page.get_by_label("Longer side of the picture").select_option("1280")
     page.locator("#save summary").click()
+    assert max(Image.open(save(page, "Picture, PNG", tmp_path / "picture.png")).size) == 1280
     gif = Image.open(save(page, "Film, GIF", tmp_path / "flight.gif"))
     assert max(gif.size) == 240 and gif.n_frames > 10
     page.get_by_role("progressbar", name="Film").wait_for(state="hidden")
@@ -226,28 +227,26 @@ def test_an_exported_page_opens_from_a_file_with_its_answers(opened, browser, de
     context.close()
 
 
-def test_a_rewritten_scene_is_reported_and_reloaded_without_the_old_choice(opened, own_desk):
+def test_a_rewritten_scene_is_reported_and_reloaded_without_the_old_choice(opened, served, own_desk):
     opened.expected.append("409")  # the browser reports what was refused
-    with serving(own_desk) as address:
-        page = opened(address, "server")
-        page.locator("#view").focus()
-        ask(page, "mug > handle")
-        answers(page).first.click()
-        page.locator("#overlay path.chosen").first.wait_for(state="attached")
-        page.wait_for_timeout(800)  # until the address holds the choice
-        assert "node=" in page.url and not page.get_by_role("alert").is_visible()
-        tree = own_desk / "default/semantic_tree"
-        with np.load(tree / "tree.npz") as held:
-            arrays = {**held, "quality": held["quality"] * 0.5}
-        with atomic_folder(tree) as new:
-            shutil.copytree(tree, new, dirs_exist_ok=True)
-            np.savez(new / "tree.npz", **arrays)
-            change_index(new)
-        page.get_by_role("alert").get_by_text("The scene has changed (semantic_tree)").wait_for()
-        page.locator("#overlay path.chosen").first.wait_for(state="attached")  # as it was
-        page.get_by_role("button", name="Reload").click()
-        page.get_by_role("alert").wait_for(state="hidden")
-        answers(page).first.wait_for()  # the question is asked again
-        assert page.locator("#text").input_value() == "mug > handle"
-        assert not page.locator("#overlay path.chosen").count()
-        page.close()  # before its server ends: it asks for changes
+    page = served(own_desk, painter="server")
+    page.locator("#view").focus()
+    ask(page, "mug > handle")
+    answers(page).first.click()
+    page.locator("#overlay path.chosen").first.wait_for(state="attached")
+    page.wait_for_timeout(800)  # until the address holds the choice
+    assert "node=" in page.url and not page.get_by_role("alert").is_visible()
+    tree = own_desk / "default/semantic_tree"
+    with np.load(tree / "tree.npz") as held:
+        arrays = {**held, "quality": held["quality"] * 0.5}
+    with atomic_folder(tree) as new:
+        shutil.copytree(tree, new, dirs_exist_ok=True)
+        np.savez(new / "tree.npz", **arrays)
+        change_index(new)
+    page.get_by_role("alert").get_by_text("The scene has changed (semantic_tree)").wait_for()
+    page.locator("#overlay path.chosen").first.wait_for(state="attached")  # as it was
+    page.get_by_role("button", name="Reload").click()
+    page.get_by_role("alert").wait_for(state="hidden")
+    answers(page).first.wait_for()  # the question is asked again
+    assert page.locator("#text").input_value() == "mug > handle"
+    assert not page.locator("#overlay path.chosen").count()

@@ -4,9 +4,8 @@ import json
 import re
 
 import av
-from PIL import Image
 
-from tests.browser.conftest import HEIGHT, answers, ask, ask_and_wait, chips, drawn, keep, pixels, save
+from tests.browser.conftest import answers, ask, ask_and_wait, chips, drawn, keep, pixels, save
 
 
 def greenish(page) -> float:
@@ -95,12 +94,3 @@ def test_a_film_follows_the_path_of_the_user(opened, desk_address, tmp_path):
     page.locator("#path").select_option("around")
     page.get_by_role("button", name="Clear").click()
     assert page.locator("#path").input_value() == "around"
-
-
-def test_a_picture_is_saved_at_the_chosen_size(opened, desk_address, tmp_path):
-    page = opened(desk_address, "server")
-    page.locator("#save summary").click()
-    page.get_by_label("Longer side of the picture").select_option("1280")
-    page.locator("#save summary").click()
-    picture = Image.open(save(page, "Picture, PNG", tmp_path / "picture.png"))
-    assert max(picture.size) == 1280 and min(picture.size) > HEIGHT

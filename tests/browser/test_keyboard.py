@@ -2,7 +2,6 @@
 
 from hilsplat.annotate.labels import label_path, read_labels
 from hilsplat.base.artifacts import read_json
-from tests.browser.conftest import serving
 from tests.browser.test_annotate import SIZE
 
 MOST_STEPS = 80
@@ -22,14 +21,8 @@ def press(page, *keys: str) -> None:
         page.keyboard.press(key)
 
 
-def test_querying_choosing_naming_and_saving_in_the_viewer(opened, own_desk, tmp_path):
-    with serving(own_desk) as address:
-        page = opened(address)
-        query_choose_name_and_save(page, own_desk, tmp_path)
-        page.close()
-
-
-def query_choose_name_and_save(page, desk, tmp_path) -> None:
+def test_querying_choosing_naming_and_saving_in_the_viewer(served, own_desk, tmp_path):
+    page = served(own_desk)
     page.keyboard.type("o ? [")  # the text box has the focus: these keys do not act
     assert page.locator("#text").input_value() == "o ? [" and not page.get_by_role("dialog").is_visible()
     press(page, "Control+a")
@@ -46,7 +39,7 @@ def query_choose_name_and_save(page, desk, tmp_path) -> None:
     press(page, "Enter")
     page.get_by_text("Named “Souvenir <b”").wait_for()
     mug = page.locator("#overlay path.chosen").get_attribute("data-node")
-    (names,) = read_json(desk / "names.json")["trees"].values()
+    (names,) = read_json(own_desk / "names.json")["trees"].values()
     assert names == {mug: "Souvenir <b"}
     tab_to(page, "#text")
     press(page, "Control+a")
@@ -65,20 +58,18 @@ def query_choose_name_and_save(page, desk, tmp_path) -> None:
     page.get_by_text("The name was removed.").wait_for()
 
 
-def test_naming_drawing_and_saving_in_the_annotator(opened, desk, tmp_path):
-    with serving(desk, "annotate", "--data-root", str(tmp_path)) as address:
-        page = opened(address)
-        tab_to(page, "#text")
-        page.keyboard.type("mug")
-        press(page, "Enter")
-        tab_to(page, "#view")
-        for corner in ("Shift+ArrowLeft", "Shift+ArrowRight", "Shift+ArrowDown"):
-            press(page, *(["p"] if corner.endswith("Left") else []), corner, "Space")
-        press(page, "Enter")
-        tab_to(page, "[role=treeitem]")
-        press(page, "Enter")
-        page.locator("body[data-saved=true]").wait_for()
-        path = label_path(tmp_path / "annotated/photos/desk", "000.png")
-        (label,) = read_labels(path, SIZE)
-        assert label.text == "mug"
-        page.close()
+def test_naming_drawing_and_saving_in_the_annotator(annotating, desk, tmp_path):
+    page = annotating(desk)
+    tab_to(page, "#text")
+    page.keyboard.type("mug")
+    press(page, "Enter")
+    tab_to(page, "#view")
+    for corner in ("Shift+ArrowLeft", "Shift+ArrowRight", "Shift+ArrowDown"):
+        press(page, *(["p"] if corner.endswith("Left") else []), corner, "Space")
+    press(page, "Enter")
+    tab_to(page, "[role=treeitem]")
+    press(page, "Enter")
+    page.locator("body[data-saved=true]").wait_for()
+    path = label_path(tmp_path / "annotated/photos/desk", "000.png")
+    (label,) = read_labels(path, SIZE)
+    assert label.text == "mug"

@@ -5,7 +5,7 @@ import re
 import numpy as np
 
 from hilsplat.base.images import write_png
-from tests.browser.conftest import answers, ask, ask_and_wait, choose_row, wire_camera
+from tests.browser.conftest import answers, ask, choose_row, wire_camera
 
 
 def painted_nodes(page) -> set[int]:
@@ -58,14 +58,3 @@ def test_the_first_five_similar_nodes_are_painted(opened, desk_address, scene, t
     shown = f"import('/static/styles.js').then((own) => own.shownHits({answer}))"
     assert page.evaluate(shown.replace("ROUTE", "'like'")) == [9, 8, 7, 6, 5]
     assert len(page.evaluate(shown.replace("ROUTE", "'tree'"))) == 7
-
-
-def test_the_current_photograph_is_marked_even_if_it_shows_the_answer(opened, desk_address, scene):
-    page = opened(desk_address, "server", color_scheme="dark")
-    ask_and_wait(page, "mug > handle")
-    best = scene.views.index(scene.query("mug > handle")[0].best_views[0])
-    page.locator("#views button").nth(best).click()
-    button = page.locator("#views button[aria-selected=true].shows")
-    button.wait_for()
-    marks = "[getComputedStyle(each).borderTopColor, getComputedStyle(each, '::before').borderTopColor]"
-    assert button.evaluate(f"(each) => {marks}") == ["rgb(255, 138, 31)", "rgb(255, 255, 255)"]

@@ -7,12 +7,11 @@ import pytest
 from hilsplat.annotate.proposals import Clicks
 from hilsplat.base.artifacts import write_index
 from hilsplat.base.errors import SettingsError
-from hilsplat.base.images import write_png
 from hilsplat.base.levels import Level
 from hilsplat.datasets.images.isat import fill_polygons
-from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from tests.conftest import PROJECT
+from tests.unit.segment.handmade import save_scene
 
 SIZE = (192, 192)
 LEFT, RIGHT = ((60, 90), (26, 30)), ((140, 110), (24, 34))
@@ -32,17 +31,12 @@ def iou(found: np.ndarray, expected: np.ndarray) -> float:
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory) -> Scene:
     """A photograph of two discs on a grey table."""
-    folder = tmp_path_factory.mktemp("results") / "photos/discs/scene"
+    folder = tmp_path_factory.mktemp("scene")
     pixels = np.full((*SIZE, 3), 120.0) + np.random.default_rng(0).normal(0, 6, (*SIZE, 1))
     for each in (LEFT, RIGHT):
         pixels[disc(*each)] = (215, 60, 40)
-    write_png(folder / "images/000.png", np.clip(pixels, 0, 255).astype(np.uint8))
-    camera = np.eye(4)[None], np.diag([200.0, 200, 1])[None], np.array([SIZE], np.int32)
-    points, split = np.zeros((0, 3), np.float32), {"000.png": "train"}
-    cameras = Cameras(("000.png",), *camera)
-    made = Scene(folder, "photos/discs", "metre", cameras, split, points, points.astype(np.uint8), np.eye(4))
-    made.save()
-    return made
+    pixels = np.clip(pixels, 0, 255).astype(np.uint8)
+    return Scene.load(save_scene(folder, {"000.png": pixels}, K=np.diag([200.0, 200, 1])))
 
 
 @pytest.fixture(scope="module")

@@ -3,17 +3,11 @@
 import numpy as np
 import pytest
 
-from hilsplat.annotate.labels import (
-    Label,
-    cut_to_parents,
-    read_labels,
-    traced,
-    write_labels,
-)
+from hilsplat.annotate.labels import Label, cut_to_parents, read_labels, traced, write_labels
 from hilsplat.base.errors import SceneError, SettingsError
 from hilsplat.datasets.images.hi import regions_of
 from hilsplat.datasets.images.isat import read_isat
-from hilsplat.web.file_changes import NO_FILE, StaleFileError, version_of
+from hilsplat.web.file_changes import NO_FILE, version_of
 
 SIZE = (30, 40)
 
@@ -87,18 +81,7 @@ def test_a_written_file_is_read_back_and_scored_without_proposals(tmp_path):
     first = path.read_bytes()
     write_labels(path, "DSC_1.png", SIZE, given[::-1], version)
     assert path.read_bytes() == first  # the order of drawing does not matter
-
-
-def test_a_file_changed_by_another_program_is_not_replaced(tmp_path):
-    path = tmp_path / "DSC_1.json"
-    mine = write_labels(path, "DSC_1.png", SIZE, [label(1, 1, None, box(0, 0, 4, 4))], NO_FILE)
-    theirs = write_labels(path, "DSC_1.png", SIZE, [label(1, 1, None, box(0, 0, 5, 5))], mine)
-    kept = path.read_bytes()
-    for old in (mine, NO_FILE, ""):
-        with pytest.raises(StaleFileError, match="reload"):
-            write_labels(path, "DSC_1.png", SIZE, [], old)
-    assert path.read_bytes() == kept
-    assert write_labels(path, "DSC_1.png", SIZE, [], theirs) == NO_FILE and not path.exists()
+    assert write_labels(path, "DSC_1.png", SIZE, [], version) == NO_FILE and not path.exists()
 
 
 def test_a_file_of_another_size_is_refused(tmp_path):

@@ -14,19 +14,13 @@ from hilsplat.datasets.registry import open_labelled
 from hilsplat.segment.masks import HierarchicalMasks
 from tests.unit.annotate.test_clicks import iou
 from tests.unit.artifact_changes import write_again
-from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, region_mask
+from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, WIDTH, region_mask
 from tests.unit.viewer.conftest import ADDRESS, TOKEN, browser_of
 
 SIZE = (HEIGHT, WIDTH + NUM_VIEWS)
 MUG = {"id": 1, "level": 1, "text": "mug", "polygons": [[[1, 1], [12, 1], [12, 20], [1, 20]]]}
 HANDLE = {"id": 2, "level": 2, "parent": 1, "text": "handle"}
 HANDLE["polygons"] = [[[8, 4], [30, 4], [30, 9], [8, 9]]]
-
-
-@pytest.fixture
-def desk(desk_project) -> Path:
-    """The folder of a finished scene."""
-    return desk_project / SCENE
 
 
 @pytest.fixture
@@ -185,19 +179,13 @@ def test_a_scene_without_poses_is_refused(tmp_path):
 # -- a scene that is rebuilt ------------------------------------------------------------------------
 
 
-@pytest.fixture
-def copied(desk, tmp_path) -> Path:
-    """A copy of the scene, to change."""
-    return shutil.copytree(desk, tmp_path / "results/photos/desk")
-
-
-def test_a_rewritten_tree_is_reported_and_not_used_until_a_reload(copied, labels):
-    client = opened(copied, labels)
+def test_a_rewritten_tree_is_reported_and_not_used_until_a_reload(own_desk, labels):
+    client = opened(own_desk, labels)
     of = {"of": client.get("/api/scene").json()["of"]}
     assert client.get("/api/changes").json() == {**of, "changed": []}
     pixel = {"view": 0, "x": 6, "y": 6}
     assert client.post("/api/at", json=pixel, params=of).status_code == 200
-    write_again(copied / "default/semantic_tree")
+    write_again(own_desk / "default/semantic_tree")
     assert client.get("/api/changes").json() == {**of, "changed": ["semantic_tree"]}
     for path, sent in (("at", pixel), ("carry", {"ids": [1], "view": 1})):
         refused = client.post(f"/api/{path}", json=sent, params=of)
@@ -212,9 +200,9 @@ def test_a_rewritten_tree_is_reported_and_not_used_until_a_reload(copied, labels
         assert client.get(f"/api/{path}", params={"of": again}).status_code == 200
 
 
-def test_labels_of_rewritten_photographs_are_not_saved(copied, labels):
-    client = opened(copied, labels)
-    write_again(copied / "scene")
+def test_labels_of_rewritten_photographs_are_not_saved(own_desk, labels):
+    client = opened(own_desk, labels)
+    write_again(own_desk / "scene")
     assert put(client, 0, [MUG], "none").status_code == 409
     assert client.get("/api/photo/0").status_code == 409
     assert not labels.exists() or not list(labels.glob("*.json"))

@@ -20,7 +20,6 @@ from plyfile import PlyData
 from pycocotools import mask as coco_masks
 from starlette.requests import Request
 
-from hilsplat.base.artifacts import read_json
 from hilsplat.base.errors import ArtifactError
 from hilsplat.query.names import FILE
 from hilsplat.splat.ply import load_ply
@@ -64,17 +63,17 @@ def test_requests_match_their_openapi_description(client):
         "/api/field": {"text": "mug"},
     }
     for path, methods in described["paths"].items():
-        for method, of in methods.items():
-            asked = path.format(variant="default", number=0, node=0)
-            body = bodies.get(path) if method == "post" else None
-            if method == "get" or body is not None:
-                given = client.request(method, asked, json=body)
-                (kind,) = of["responses"]["200"]["content"]
-                found = given.headers["content-type"].replace("png", "jpeg")  # as the photograph is
-                assert (given.status_code, found) == (200, kind)
-            if body is not None:
-                sent = of["requestBody"]["content"]["application/json"]["schema"]
-                jsonschema.validate(body, {**sent, "components": described["components"]})
+        ((method, of),) = methods.items()
+        body = bodies.get(path)
+        if method == "post" and body is None:
+            continue
+        given = client.request(method, path.format(variant="default", number=0, node=0), json=body)
+        (kind,) = of["responses"]["200"]["content"]
+        found = given.headers["content-type"].replace("png", "jpeg")  # as the photograph is
+        assert (given.status_code, found) == (200, kind)
+        if body is not None:
+            sent = of["requestBody"]["content"]["application/json"]["schema"]
+            jsonschema.validate(body, {**sent, "components": described["components"]})
     schema = {"$ref": "#/components/schemas/Answer", "components": described["components"]}
     answer = client.post("/api/query", json={"text": "mug > handle"}).json()
     jsonschema.validate(answer, schema)
@@ -87,12 +86,6 @@ def test_a_photograph_and_a_level_restrict_the_answers(client, scene):
     found = ask(client, "mug", level="part", view=view)["hits"]
     assert [hit["node"] for hit in found] == [hit.node for hit in hits]
     assert client.post("/api/query", json={"text": "mug", "view": 99}).status_code == 422
-
-
-@pytest.mark.parametrize("text", ["", " ", "mug >", "x" * 201, "a > b > c > d"])
-def test_invalid_texts_are_refused(client, text):
-    sent = client.post("/api/query", json={"text": text})
-    assert sent.status_code in (400, 422) and sent.json()["error"]
 
 
 def test_nodes_similar_to_a_node_or_a_picture(client, scene):
@@ -124,7 +117,6 @@ def test_field_relevancy_of_every_gaussian(client, scene, shown):
 
 
 def test_names_are_stored_and_matched_and_need_the_last_version(client, scene, desk_project):
-    names_file = desk_project / SCENE / FILE
     outline = client.get("/api/variant/default").json()
     (book,) = ask(client, "book", level="whole")["hits"]
     node = book["node"]
@@ -141,43 +133,32 @@ def test_names_are_stored_and_matched_and_need_the_last_version(client, scene, d
     found = ask(client, "ATLAS <B")
     assert [hit["node"] for hit in found["hits"]] == [node] and found["hits"][0]["name"] == "atlas <b"
     assert client.get("/api/variant/default").json()["nodes"][node]["name"] == "atlas <b"
-    assert list(read_json(names_file)["trees"].values()) == [{str(node): "atlas <b"}]
     assert put("", kept.json()["version"]).json()["names"] == {}
-    names_file.unlink()
+    (desk_project / SCENE / FILE).unlink()
 
 
-def test_a_saved_selection_has_the_gaussians_of_the_nodes(client, scene, shown, tmp_path):
-    nodes = [hit["node"] for hit in ask(client, "mug > handle")["hits"]]
-    sent = {"groups": [{"name": "mug > handle", "nodes": nodes}]}
+def test_a_saved_selection_has_the_gaussians_boxes_and_labels_of_its_groups(client, scene, shown, tmp_path):
+    (mug,), (handle,) = scene.query("mug", "whole"), scene.query("mug > handle")
+    groups = [{"name": "mug > hëndle", "nodes": [handle.node]}, {"name": "mug", "nodes": [mug.node]}]
+    sent = {"groups": groups}
     (tmp_path / "selection.ply").write_bytes(client.post("/api/export/ply", json=sent).content)
-    saved = load_ply(tmp_path / "selection.ply")
-    rows = scene.gaussians_of(nodes)
+    saved, rows = load_ply(tmp_path / "selection.ply"), scene.gaussians_of([mug.node, handle.node])
     np.testing.assert_array_equal(saved.means, shown.gaussians.means[rows])
     np.testing.assert_array_equal(saved.sh, shown.gaussians.sh[rows])
-    (box,) = client.post("/api/export/boxes", json=sent).json()["boxes"]
-    (hit,) = scene.query("mug > handle")
-    np.testing.assert_allclose(box["corners"], hit.oriented_box.corners(), atol=1e-4)
+    labelled = PlyData.read(tmp_path / "selection.ply")
+    assert labelled.comments == ["label 1: mug > h\\xebndle", "label 2: mug"]
+    # the handle belongs to both: it is labelled as the smaller
+    expected = np.where(np.isin(rows, scene.gaussians_of([handle.node])), 1, 2)
+    np.testing.assert_array_equal(labelled["vertex"]["label"], expected)
+    boxes = client.post("/api/export/boxes", json=sent).json()["boxes"]
+    found = [(box["group"], box["node"]) for box in boxes]
+    assert found == [("mug > hëndle", handle.node), ("mug", mug.node)]
+    np.testing.assert_allclose(boxes[0]["corners"], handle.oriented_box.corners(), atol=1e-4)
     compressed = decoded(client.post("/api/export/spz", json=sent).content)
     assert sorted(compressed.means[:, 0]) == pytest.approx(sorted(saved.means[:, 0]), abs=1e-3)
     for kind in ("ply", "spz", "boxes", "masks"):
         missing = {"groups": [{"name": "", "nodes": [99]}]}
         assert client.post(f"/api/export/{kind}", json=missing).status_code == 422
-
-
-def test_answers_to_several_queries_are_saved_with_their_labels(client, scene, tmp_path):
-    (mug,), (handle,) = scene.query("mug", "whole"), scene.query("mug > handle")
-    groups = [{"name": "mug > hëndle", "nodes": [handle.node]}, {"name": "mug", "nodes": [mug.node]}]
-    sent = {"groups": groups}
-    (tmp_path / "selection.ply").write_bytes(client.post("/api/export/ply", json=sent).content)
-    saved = PlyData.read(tmp_path / "selection.ply")
-    assert saved.comments == ["label 1: mug > h\\xebndle", "label 2: mug"]
-    # the handle belongs to both: it is labelled as the smaller
-    rows = scene.gaussians_of([mug.node, handle.node])
-    expected = np.where(np.isin(rows, scene.gaussians_of([handle.node])), 1, 2)
-    np.testing.assert_array_equal(saved["vertex"]["label"], expected)
-    boxes = client.post("/api/export/boxes", json=sent).json()["boxes"]
-    found = [(box["group"], box["node"]) for box in boxes]
-    assert found == [("mug > hëndle", handle.node), ("mug", mug.node)]
 
 
 def test_saved_masks_are_those_of_the_hits_in_every_view_and_of_every_group(client, scene):
@@ -223,15 +204,11 @@ def test_queries_run_between_the_steps_of_a_file(shown):
     assert order == ["step 0", "click", "step 1", "step 2"]
 
 
-def frames_of(film: bytes) -> list[np.ndarray]:
-    with av.open(io.BytesIO(film)) as opened:
-        return [frame.to_ndarray(format="rgb24").astype(float) for frame in opened.decode(video=0)]
-
-
 def test_a_film_follows_a_path(client, shown, camera):
     views = [wire_camera(camera), {**wire_camera(camera), "cam_from_world": np.eye(4).tolist()}]
     progress, data = in_steps(client, "film", frames=5, side_px=64, path=views)
-    frames = frames_of(data)
+    with av.open(io.BytesIO(data)) as film:
+        frames = [frame.to_ndarray(format="rgb24").astype(float) for frame in film.decode(video=0)]
     assert progress == [(made, 5) for made in range(6)] and len(frames) == 5
     assert frames[0].shape == (36, 64, 3) and frames[0].std() > 20
     still = painted(shown.gaussians, camera.scaled((36, 64))).astype(float)
@@ -316,7 +293,7 @@ def test_gaussians_are_sent_once(client, shown):
     assert again.status_code == 304 and not again.content
 
 
-def test_an_exported_page_contains_everything_it_needs(client, shown):
+def test_an_exported_page_sends_no_requests_and_escapes_texts(client, shown):
     evil = "mug </script><script>alert(1)</script>".replace(">", "")
     kept = {"text": "mug > handle", "level": "part", "threshold": 0.3}
     progress, data = in_steps(client, "page", kept=[kept], last={"text": evil}, start="v3")
@@ -325,17 +302,11 @@ def test_an_exported_page_contains_everything_it_needs(client, shown):
     page = data.decode()
     assert not re.search(r"""(src|href)=["'](?!data:)""", page) and "http://127" not in page
     held = dict(re.findall(r'<script type="text/plain" id="(\w+)">(.*?)</script>', page, re.S))
-    assert set(held) == {"data", "sorter", "splats", "nodes"}
     assert len(decoded(base64.b64decode(held["splats"]))) == len(shown.gaussians)
     data = json.loads(held["data"])
     assert [answer["text"] for answer in data["answers"]] == ["mug > handle", evil]
     assert data["asked"] == [kept, {"text": evil, "level": "auto"}] and data["kept"] == 1
     assert len(data["photos"]) == len(data["scene"]["views"]) and data["opening"] == "v3"
-    imports = json.loads(re.search(r'<script type="importmap">(.*?)</script>', page, re.S)[1])["imports"]
-    for name, address in imports.items():
-        script = base64.b64decode(address.partition(",")[2]).decode()
-        for used in re.findall(r'from "([^"]+)"', script):
-            assert used in imports, (name, used)
 
 
 def test_gaussians_are_shown_during_a_run_before_queries_work(desk_project, tmp_path):

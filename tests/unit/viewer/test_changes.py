@@ -13,21 +13,13 @@ from hilsplat.splat.ply import load_ply, save_ply
 from hilsplat.viewer import exports
 from hilsplat.viewer.viewer_scene import ViewerScene
 from tests.unit.artifact_changes import write_again
-from tests.unit.finished_desk import SCENE
 from tests.unit.viewer.conftest import browsing
 
 
 @pytest.fixture
-def desk(desk_project, tmp_path) -> Path:
-    """A copy of the finished desk, to change."""
-    shutil.copytree(desk_project, tmp_path / "project")
-    return tmp_path / "project" / SCENE
-
-
-@pytest.fixture
-def page(desk) -> Iterator[TestClient]:
+def page(own_desk) -> Iterator[TestClient]:
     """A page that was loaded and has queried the scene."""
-    with browsing(ViewerScene(desk)) as client:
+    with browsing(ViewerScene(own_desk)) as client:
         client.state = load(client)
         assert ask(client).status_code == 200
         yield client
@@ -45,29 +37,29 @@ PARTS = ("scene", "gaussians.ply", "default/semantic_tree", "default/field.safet
 
 
 @pytest.mark.parametrize("part", PARTS)
-def test_a_rewritten_part_is_reported_until_a_reload(page, desk, part):
+def test_a_rewritten_part_is_reported_until_a_reload(page, own_desk, part):
     assert page.get("/api/changes").json() == {"of": page.state, "changed": [], "variants": ["default"]}
-    write_again(desk / part)
+    write_again(own_desk / part)
     assert page.get("/api/changes").json()["changed"] == [Path(part).name]
     again = load(page)
     assert again != page.state and ask(page, again).status_code == 200
     assert page.get("/api/changes").json() == {"of": again, "changed": [], "variants": ["default"]}
 
 
-def test_opened_parts_can_still_be_queried(page, desk):
+def test_opened_parts_can_still_be_queried(page, own_desk):
     before = ask(page).json()["hits"]
-    (desk / "gaussians.ply").unlink()
+    (own_desk / "gaussians.ply").unlink()
     assert page.get("/api/changes").json()["changed"] == ["gaussians.ply"]
     assert ask(page).json()["hits"] == before
     assert page.get("/api/scene").status_code == 422  # it cannot be opened again: what was opened stays
     assert ask(page).json()["hits"] == before
 
 
-def test_rebuilt_parts_are_not_read_together_with_opened_ones(page, desk):
+def test_rebuilt_parts_are_not_read_together_with_opened_ones(page, own_desk):
     """Rows of the old tree in a new PLY, names of the old tree for a new one, a tree of other Gaussians."""
-    gaussians = load_ply(desk / "gaussians.ply")
+    gaussians = load_ply(own_desk / "gaussians.ply")
     handle = page.post("/api/query", json={"text": "handle"}).json()["hits"][0]["node"]
-    save_ply(desk / "gaussians.ply", replace(gaussians, means=gaussians.means[::-1].copy()))
+    save_ply(own_desk / "gaussians.ply", replace(gaussians, means=gaussians.means[::-1].copy()))
     names = {"variant": "default", "names": {str(handle): "grip"}}
     refused: tuple[Callable, ...] = (
         lambda: page.post("/api/export/ply", json={"groups": [{"name": "handle", "nodes": [handle]}]}),
@@ -81,14 +73,14 @@ def test_rebuilt_parts_are_not_read_together_with_opened_ones(page, desk):
         answer = send()
         assert answer.status_code == 409, answer.request.url
         assert "gaussians.ply of photos/desk changed on disk" in answer.json()["error"]
-    assert not (desk / "names.json").exists()
+    assert not (own_desk / "names.json").exists()
 
 
-def test_an_export_of_a_page_fails_if_the_scene_changes_meanwhile(page, desk, monkeypatch):
+def test_an_export_of_a_page_fails_if_the_scene_changes_meanwhile(page, own_desk, monkeypatch):
     draw = exports.crop
 
     def crop(*of):
-        write_again(desk / "default/semantic_tree")
+        write_again(own_desk / "default/semantic_tree")
         return draw(*of)
 
     monkeypatch.setattr(exports, "crop", crop)
@@ -97,23 +89,23 @@ def test_an_export_of_a_page_fails_if_the_scene_changes_meanwhile(page, desk, mo
     assert len(lines) == 2 and "semantic_tree of photos/desk changed on disk" in lines[1]
 
 
-def test_a_later_variant_is_not_opened_together_with_old_parts(page, desk):
-    shutil.copytree(desk / "default", desk / "second")
+def test_a_later_variant_is_not_opened_together_with_old_parts(page, own_desk):
+    shutil.copytree(own_desk / "default", own_desk / "second")
     assert page.get("/api/changes").json()["variants"] == ["default", "second"]
-    write_again(desk / "gaussians.ply")
+    write_again(own_desk / "gaussians.ply")
     answer = page.post("/api/query", json={"text": "mug", "variant": "second"})
     assert answer.status_code == 409
     asked = {"text": "mug", "variant": "second"}
     assert page.post("/api/query", json=asked, params={"of": load(page)}).status_code == 200
 
 
-def test_names_are_saved_although_the_field_of_another_variant_cannot_be_read(page, desk):
-    shutil.copytree(desk / "default", desk / "second")
-    for part in (*(desk / "second").glob("field.safetensors*"), *(desk / "second").glob("scores.csv*")):
+def test_names_are_saved_although_the_field_of_another_variant_cannot_be_read(page, own_desk):
+    second = shutil.copytree(own_desk / "default", own_desk / "second")
+    for part in (*second.glob("field.safetensors*"), *second.glob("scores.csv*")):
         part.unlink()
     asked = {"text": "mug", "variant": "second", "answerer": "field"}
     assert "no language field yet" in page.post("/api/query", json=asked).json()["error"]
-    (desk / "second/field.safetensors").write_bytes(b"unreadable")
+    (second / "field.safetensors").write_bytes(b"unreadable")
     handle = ask(page).json()["hits"][0]["node"]
     body = {"variant": "default", "names": {str(handle): "grip"}}
     answer = page.put("/api/names", json=body, headers={"if-match": '"none"'})
@@ -123,8 +115,8 @@ def test_names_are_saved_although_the_field_of_another_variant_cannot_be_read(pa
     assert page.put("/api/names", json=body, headers={"if-match": f'"{version}"'}).status_code == 200
 
 
-def test_a_page_gets_no_data_of_a_later_state(page, desk):
-    write_again(desk / "default/semantic_tree")
+def test_a_page_gets_no_data_of_a_later_state(page, own_desk):
+    write_again(own_desk / "default/semantic_tree")
     again = load(page)  # another tab
     camera = {"cam_from_world": np.eye(4).tolist(), "K": np.eye(3).tolist(), "size_hw": [4, 4]}
     for path, sent in (("query", {"text": "mug"}), ("frame", {"camera": camera}), ("export/film", {})):
