@@ -68,11 +68,6 @@ class PhotoReport:
         """Number of readable photographs, including identical copies."""
         return sum(self.sizes.values())
 
-    @property
-    def num_distinct(self) -> int:
-        """Number of readable photographs, counting identical copies once."""
-        return self.num_readable - sum(len(names) - 1 for names in self.duplicates)
-
     def __str__(self) -> str:
         lines = [*self.notes, f"{self.num_readable} photographs in {self.folder}"]
         for (height, width), count in sorted(self.sizes.items(), key=lambda item: (-item[1], item[0])):
@@ -190,9 +185,7 @@ def add_scene(
         extra = _trained(folder, {"poses": poses, "gaussians": gaussians, "features": features})
         notes = [*made, *_notes(folder, extra)]
         annotated = root / "annotated" / PHOTOS / name
-        files = _labels(folder, labels)
-        if annotated.exists():
-            files = []
+        files = [] if annotated.exists() else _labels(folder, labels)
         if files:
             notes.append(f"labels for {len(files)} photographs, used for evaluation: {files[0].parent}")
         report = replace(inspect_photos(folder, poses), notes=tuple(notes))
@@ -227,7 +220,6 @@ def _trained(folder: Path, named: dict[str, Path | None]) -> dict[str, Path]:
 
 
 def _notes(folder: Path, extra: dict[str, Path]) -> list[str]:
-    """Return notes about the files used in addition to the photographs."""
     known = find_known_poses(folder, extra.get("poses"))
     notes = [f"poses: {', '.join(map(str, known.files)) if known else 'structure from motion'}"]
     notes += [f"{what}: {path}" for what, path in extra.items() if what != "poses"]
@@ -250,15 +242,15 @@ def _labels(folder: Path, named: Path | None) -> list[Path]:
 
 
 def _check(report: PhotoReport, have_poses: bool) -> None:
-    """Raise SceneError if photographs are unreadable or too few."""
     if report.unreadable:
         raise SceneError(
             f"{len(report.unreadable)} photographs in {report.folder} cannot be read",
             found="; ".join(f"{file}: {reason}" for file, reason in report.unreadable),
             fix="remove them from the folder or replace them with intact copies, then try again",
         )
-    if report.num_distinct < MIN_PHOTOS and not have_poses:
-        found = [f"{report.num_distinct} distinct readable photographs"]
+    num_distinct = report.num_readable - sum(len(names) - 1 for names in report.duplicates)
+    if num_distinct < MIN_PHOTOS and not have_poses:
+        found = [f"{num_distinct} distinct readable photographs"]
         found += [f"{count} {suffix} files skipped" for suffix, count in sorted(report.passed_over.items())]
         raise SceneError(
             f"{report.folder} has too few photographs",
@@ -269,7 +261,6 @@ def _check(report: PhotoReport, have_poses: bool) -> None:
 
 
 def _append(sheet: Path, name: str, photos: Path, extra: dict[str, Path]) -> None:
-    """Append the row of a scene to the sheet, and add missing columns."""
     root = project_root(sheet)
     places = {
         what: path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)

@@ -58,6 +58,9 @@ FOCALS = (0.6, 0.75, 0.9, 1.1, 1.35, 1.7, 2.2, 3.0)
 
 NAMED = 5
 
+Features = tuple[Float32[np.ndarray, "_ 2"], Float32[np.ndarray, "_ 128"]]
+"""SIFT positions in px and RootSIFT descriptors."""
+
 
 @dataclass(frozen=True)
 class CheckedPhoto:
@@ -170,10 +173,7 @@ def blur(grey: UInt8[np.ndarray, "h w"]) -> float:
     return max(shares)
 
 
-def _features(
-    grey: UInt8[np.ndarray, "h w"],
-) -> tuple[Float32[np.ndarray, "n 2"], Float32[np.ndarray, "n 128"]]:
-    """Compute SIFT positions in px and RootSIFT descriptors."""
+def _features(grey: UInt8[np.ndarray, "h w"]) -> Features:
     points, descriptors = cv2.SIFT.create(NUM_FEATURES).detectAndCompute(grey, None)
     if descriptors is None:
         return np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32)
@@ -181,11 +181,7 @@ def _features(
     return xy, np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
 
 
-def pair_motion(
-    one: tuple[Float32[np.ndarray, "n 2"], Float32[np.ndarray, "n 128"]],
-    other: tuple[Float32[np.ndarray, "m 2"], Float32[np.ndarray, "m 128"]],
-    size_hw: tuple[int, int],
-) -> tuple[float, float] | None:
+def pair_motion(one: Features, other: Features, size_hw: tuple[int, int]) -> tuple[float, float] | None:
     """Measure the motion between two pictures, or return None if too few matches fit an epipolar geometry.
 
     Return the displacement of the verified matches (90th percentile, as a share of the diagonal) and the
@@ -196,11 +192,11 @@ def pair_motion(
     if min(len(one[0]), len(other[0])) < MIN_MATCHES:
         return None
     nearest: dict[int, cv2.DMatch] = {}
-    for pair in cv2.BFMatcher().knnMatch(one[1], other[1], k=2):
-        if len(pair) == 2 and pair[0].distance < RATIO * pair[1].distance:
-            rival = nearest.get(pair[0].trainIdx)
-            if rival is None or pair[0].distance < rival.distance:
-                nearest[pair[0].trainIdx] = pair[0]
+    for first, second in cv2.BFMatcher().knnMatch(one[1], other[1], k=2):
+        if first.distance < RATIO * second.distance:
+            rival = nearest.get(first.trainIdx)
+            if rival is None or first.distance < rival.distance:
+                nearest[first.trainIdx] = first
     if len(nearest) < MIN_MATCHES:
         return None
     matches = list(nearest.values())

@@ -34,7 +34,6 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tu
     Raises:
         SceneError: the source cannot be used, or the target exists and was made from different files.
     """
-    source = Path(source)
     if not source.exists():
         raise SceneError(
             f"{source} is missing", fix="pass a folder of photographs, a video, or a zip of photographs"
@@ -119,7 +118,6 @@ def _is_wanted(name: PurePosixPath) -> bool:
 
 
 def _check_entries(archive: Path, entries: list[zipfile.ZipInfo]) -> None:
-    """Raise SceneError if the archive is too large, or has an unsafe, encrypted or repeated entry."""
     fix = "unpack it yourself with a program that you trust, inspect the files, and pass the folder"
     total_gib = sum(entry.file_size for entry in entries) / 2**30
     if len(entries) > MAX_FILES or total_gib > MAX_TOTAL_GIB:

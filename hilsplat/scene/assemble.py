@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float64, UInt8
+from jaxtyping import Float64
 
 from hilsplat.base.artifacts import atomic_folder, write_json
 from hilsplat.base.images import read_image, write_png
 from hilsplat.scene.cameras import Cameras
-from hilsplat.scene.colmap import pycolmap
+from hilsplat.scene.colmap import Points, pycolmap
 from hilsplat.scene.scene import Scene
 
 MIN_VIEWS_FOR_TEST = 8
@@ -30,6 +30,10 @@ class PosedView:
     image: Path
     camera: pycolmap.Camera
     cam_from_source: Float64[np.ndarray, "4 4"]
+
+
+Posed = tuple[list[PosedView], Points, dict[str, str], dict[str, Any]]
+"""Views and sparse points in source coordinates, the split ("train" or "test") by view, and the report."""
 
 
 def undistort(view: PosedView, folder: Path) -> PosedView:
@@ -128,30 +132,18 @@ def split_views(names: Sequence[str], test_every: int) -> dict[str, str]:
     }
 
 
-def write_scene(
-    out: Path,
-    name: str,
-    unit: str,
-    views: Sequence[PosedView],
-    points_xyz: Float[np.ndarray, "P 3"],
-    points_rgb: UInt8[np.ndarray, "P 3"],
-    split: Mapping[str, str],
-    report: dict[str, Any],
-    *,
-    turn: bool,
-    lost: Path | None = None,
-) -> None:
+def write_scene(out: Path, name: str, unit: str, posed: Posed, *, turn: bool, lost: Path) -> None:
     """Write the scene artifact with its registration report, atomically.
 
     Args:
         unit: "metre" keeps the source's scale; for any other unit, the scale is normalised.
-        report: registration report; this function adds each view's split, size and focal length.
+        posed: its report gets each view's split, size and focal length.
         turn: rotate the scene so that +z is up.
-        lost: picture of the unregistered photographs, appended to the camera plot.
+        lost: picture of the unregistered photographs; if it exists, it is appended to the camera plot.
     """
+    views, (points, colours), split, report = posed
     views = sorted(views, key=lambda view: view.view)
     source_poses = np.stack([view.cam_from_source for view in views])
-    points = np.asarray(points_xyz, dtype=np.float64).reshape(-1, 3)
     scene_from_source = normalising_similarity(source_poses, points, metric=unit == "metre", turn=turn)
     points = points @ scene_from_source[:3, :3].T + scene_from_source[:3, 3]
     with atomic_folder(out) as folder:
@@ -162,18 +154,16 @@ def write_scene(
             K=np.stack([view.camera.calibration_matrix() for view in pinhole]),
             size_hw=np.array([(view.camera.height, view.camera.width) for view in pinhole], dtype=np.int32),
         )
-        of_view = {view: split[view] for view in cameras.names}
         xyz = points.astype(np.float32)
-        scene = Scene(folder, name, unit, cameras, of_view, xyz, points_rgb, scene_from_source)
-        for camera_row, view in enumerate(cameras.names):
-            entry = report["views"][view]
-            entry["split"] = scene.split[view]
-            entry["size_hw_px"] = [int(n) for n in cameras.size_hw[camera_row]]
-            entry["focal_px"] = round(float(cameras.K[camera_row, 0, 0]), 3)
+        scene = Scene(folder, name, unit, cameras, split, xyz, colours, scene_from_source)
+        for view, size_hw, K in zip(cameras.names, cameras.size_hw.tolist(), cameras.K, strict=True):
+            own = {"split": split[view], "size_hw_px": size_hw, "focal_px": round(float(K[0, 0]), 3)}
+            report["views"][view] |= own
         write_json(folder / "registration.json", report)
         plot_registration(folder / "registration.png", scene, report)
-        if lost is not None:
-            stack_pictures(folder / "registration.png", lost)
+        if lost.exists():
+            pictures = [read_image(folder / "registration.png"), read_image(lost)]  # of the same width
+            write_png(folder / "registration.png", np.concatenate(pictures))
         scene.save()
 
 
@@ -219,13 +209,3 @@ def plot_registration(path: Path, scene: Scene, report: Mapping[str, Any]) -> No
     )
     # Date and library version are omitted, so that the same scene produces the same bytes.
     figure.savefig(path, format="png", dpi=100, metadata={"Software": None})
-
-
-def stack_pictures(upper: Path, lower: Path) -> None:
-    """Append the picture `lower` below `upper`, in place, padding the narrower one with white."""
-    pictures = [read_image(path) for path in (upper, lower)]
-    width = max(picture.shape[1] for picture in pictures)
-    stacked = np.full((sum(map(len, pictures)), width, 3), 255, np.uint8)
-    stacked[: len(pictures[0]), : pictures[0].shape[1]] = pictures[0]
-    stacked[len(pictures[0]) :, : pictures[1].shape[1]] = pictures[1]
-    write_png(upper, stacked)

@@ -11,7 +11,10 @@ from PIL import Image
 # isort: split
 import pycolmap
 
-__all__ = ["Image", "camera_of", "pose_matrix", "pycolmap", "reprojection_errors", "sparse_points"]
+__all__ = ["Image", "Points", "camera_of", "pose_matrix", "pycolmap", "reprojection_errors", "sparse_points"]
+
+Points = tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]
+"""Positions and colours."""
 
 
 def pose_matrix(pose: pycolmap.Rigid3d) -> Float64[np.ndarray, "4 4"]:
@@ -20,14 +23,12 @@ def pose_matrix(pose: pycolmap.Rigid3d) -> Float64[np.ndarray, "4 4"]:
 
 
 def camera_of(image: pycolmap.Image) -> pycolmap.Camera:
-    """Return the camera of an image that is part of a model."""
+    """Return a copy of the camera of an image in a model: the original becomes invalid with the model."""
     assert image.camera is not None  # only images outside a model have no camera
-    return image.camera
+    return pycolmap.Camera(image.camera.todict())
 
 
-def sparse_points(
-    model: pycolmap.Reconstruction,
-) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
+def sparse_points(model: pycolmap.Reconstruction) -> Points:
     """Return the sparse points and colours of a model, sorted by point id."""
     points = [model.points3D[point_id] for point_id in sorted(model.points3D)]
     xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)

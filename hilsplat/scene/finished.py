@@ -61,7 +61,6 @@ class FinishedScene:
         Raises:
             ArtifactError: the folder, the variant or a part is missing.
         """
-        folder = Path(folder)
         require_scene_folder(folder)
         finished = finished_variants(folder)
         if finished and not (folder / variant).exists():
@@ -112,10 +111,7 @@ class FinishedScene:
             found = record.settings.get("evaluate", {})
         else:
             found = {}
-            logger.warning(
-                "%s: neither scores nor a panel record the query settings; using the defaults",
-                self.folder,
-            )
+            logger.warning("%s: no scores or panel record the query settings; using defaults", self.folder)
         known = {name: value for name, value in found.items() if name in EvaluateSettings.model_fields}
         try:
             return EvaluateSettings(**known)

@@ -11,12 +11,6 @@ from hilsplat.base.files import list_images
 TRAINED = ("output", "outputs", "exports", "language_features")
 """Folders that 3DGS, nerfstudio and LangSplat write beside photographs."""
 
-MODELS = ("sparse/0", "sparse")
-"""Possible folders of a COLMAP model, in order of preference."""
-
-TRANSFORMS = ("transforms.json", "transforms_train.json")
-"""Pose files of nerfstudio and other programs, in order of preference."""
-
 POSES_BOUNDS = "poses_bounds.npy"
 """Pose file of LLFF."""
 
@@ -132,10 +126,10 @@ def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | No
         return None
     if named is not None:
         return _named_poses(folder, named)
-    for place in MODELS:
+    for place in ("sparse/0", "sparse"):
         if _is_model(folder / place):
             return KnownPoses(folder, "colmap", (folder / place,))
-    for name in TRANSFORMS:
+    for name in ("transforms.json", "transforms_train.json"):
         if (folder / name).is_file():
             files = [folder / name]
             if name == "transforms_train.json" and (folder / "transforms_test.json").is_file():

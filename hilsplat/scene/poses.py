@@ -14,7 +14,7 @@ from hilsplat.base.files import list_images
 from hilsplat.base.images import read_image, resize_to_fit
 from hilsplat.base.processes import in_own_process
 from hilsplat.base.progress import stage_log
-from hilsplat.scene.assemble import PosedView, split_views, write_scene
+from hilsplat.scene.assemble import Posed, PosedView, split_views, write_scene
 from hilsplat.scene.colmap import camera_of, pose_matrix, pycolmap, reprojection_errors, sparse_points
 from hilsplat.scene.features import (
     MIN_INLIERS,
@@ -90,10 +90,23 @@ def run_poses(
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)  # by default, COLMAP logs each step
     with stage_log("poses", name) as counts, work_folder(out) as work:
         known = find_known_poses(images, named) if images.is_dir() else None
-        if known is None:
-            report = _reconstruct(images, out, work, name, is_render, settings, seed, threads)
-        else:
-            report = import_poses(known, out, work, name, unit, settings, seed, threads)
+        lost, kept = work / LOST_PICTURE, out.with_name(LOST_PICTURE)
+        kept.unlink(missing_ok=True)  # from an earlier run
+        try:
+            if known is None:
+                unit = "arbitrary"
+                posed = _reconstruct(images, work, name, is_render, settings, seed, threads)
+            else:
+                posed = import_poses(known, work, name, settings, seed, threads)
+        except RegistrationError as error:
+            if lost.exists():
+                shutil.copyfile(lost, kept)
+                error.add_line("picture", f"{kept} shows the unregistered photographs and where they belong")
+            raise
+        report = posed[3]
+        for warning in report["warnings"]:
+            logger.warning("%s: %s", name, warning)
+        write_scene(out, name, unit, posed, turn=known is None, lost=lost)
         counts["views"] = f"{report['registered']} of {report['images']}"
         counts["points"] = report["points"]
         if report["mean_reprojection_error_px"] is not None:
@@ -101,16 +114,9 @@ def run_poses(
 
 
 def _reconstruct(
-    images: Path,
-    out: Path,
-    work: Path,
-    name: str,
-    is_render: bool,
-    settings: PosesSettings,
-    seed: int,
-    threads: int,
-) -> dict[str, Any]:
-    """Run structure from motion on a folder of photographs, and return the registration report."""
+    images: Path, work: Path, name: str, is_render: bool, settings: PosesSettings, seed: int, threads: int
+) -> Posed:
+    """Run structure from motion on a folder of photographs."""
     if not images.is_dir():
         raise SceneError(
             f"image folder {images} of {name} is missing", fix="correct the scene's source in the scene sheet"
@@ -133,29 +139,18 @@ def _reconstruct(
     shared = verified_matches(database)
     logger.info("%s: %s mapping", name, settings.mapper)
     models = map_views(database, work / "images", work / "models", settings.mapper, seed)
-    model = models[0] if models else None
     report = registration_report(work_images, count_matches(database, shared), models)
     name_neighbours(shared, report["views"])
     how = f"structure from motion, {settings.mapper} mapper, {matcher} matching, {camera_model}"
     report = {"scene": name, "poses": how, "seed": seed, **report}
-    lost = plot_lost(work / LOST_PICTURE, work / "images", report)
-    kept = out.with_name(LOST_PICTURE)
-    kept.unlink(missing_ok=True)  # from an earlier run
-    try:
-        check_registration(images, name, report, settings)
-    except RegistrationError as error:
-        if lost is not None:
-            shutil.copyfile(lost, kept)
-            error.add_line("picture", f"{kept} shows the unregistered photographs and where they belong")
-        raise
-    assert model is not None
-    views = []
+    plot_lost(work / LOST_PICTURE, work / "images", report)
+    check_registration(images, name, report, settings)
+    model, views = models[0], []
     for image in (model.images[image_id] for image_id in model.reg_image_ids()):
         pose, file = pose_matrix(image.cam_from_world()), work / "images" / image.name
         views.append(PosedView(image.name, file, camera_of(image), pose))
     split = split_views([view.view for view in views], settings.test_every)
-    write_scene(out, name, "arbitrary", views, *sparse_points(model), split, report, turn=True, lost=lost)
-    return report
+    return views, sparse_points(model), split, report
 
 
 def map_views(
@@ -179,7 +174,6 @@ def map_views(
 
 
 def _global_options(seed: int) -> pycolmap.GlobalPipelineOptions:
-    """Return the options of COLMAP's global mapper: one thread and fixed seeds."""
     options = pycolmap.GlobalPipelineOptions()
     mapper = options.mapper
     options.num_threads = mapper.num_threads = 1
@@ -204,11 +198,8 @@ def registration_report(
     views: dict[str, Any] = {}
     for image in images:
         is_registered = image.view in errors
-        entry: dict[str, Any] = {
-            "file": image.source.name,
-            "registered": is_registered,
-            **matches[image.view],
-        }
+        entry: dict[str, Any] = {"file": image.source.name, "registered": is_registered}
+        entry |= matches[image.view]
         if is_registered:
             px = errors[image.view]
             entry["observations"] = len(px)
@@ -271,7 +262,7 @@ def _why_not(view: str, entry: Mapping[str, Any], members: Sequence[set[str]]) -
 
 
 def check_registration(images: Path, name: str, report: Mapping[str, Any], settings: PosesSettings) -> None:
-    """Refuse a reconstruction with too few views; otherwise log its warnings."""
+    """Refuse a reconstruction with too few views; otherwise log the unregistered ones."""
     total, registered = report["images"], report["registered"]
     lost = [entry for entry in report["views"].values() if not entry["registered"]]
     listing = "".join(f"\n            {entry['file']}: {entry['why_not']}" for entry in lost)
@@ -295,8 +286,6 @@ def check_registration(images: Path, name: str, report: Mapping[str, Any], setti
             fix=f"{advice}; to continue with {registered} views, set poses.min_registered_share to "
             f"{np.floor(share * 100) / 100:.2f} or less",
         )
-    for warning in report["warnings"]:
-        logger.warning("%s: %s", name, warning)
     for entry in lost:
         logger.warning("%s: %s is not registered: %s", name, entry["file"], entry["why_not"])
 
@@ -313,11 +302,11 @@ def name_neighbours(shared: Mapping[str, Mapping[str, int]], views: Mapping[str,
         entry["belongs_near"] = [{"view": other, "matches": count} for count, other in near[:NEIGHBOURS]]
 
 
-def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> Path | None:
-    """Draw unregistered photographs with their registered neighbours; return None if all are registered."""
+def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> None:
+    """Draw unregistered photographs, if any, with their registered neighbours."""
     lost = [(view, entry) for view, entry in report["views"].items() if not entry["registered"]]
     if not lost:
-        return None
+        return
     from matplotlib.figure import Figure
 
     shown = lost[:MAX_ROWS]
@@ -338,4 +327,3 @@ def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> Path | Non
         if not near:
             row[1].text(0, 0.5, "no verified match with a registered photograph", fontsize=8)
     figure.savefig(path, format="png", dpi=100, metadata={"Software": None})
-    return path

@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from hilsplat.base.artifacts import read_index, read_npz, sealed, write_index, write_npz
-from hilsplat.base.errors import SceneError
 from hilsplat.base.images import read_image
 from hilsplat.scene.cameras import Cameras
 
@@ -42,17 +41,8 @@ class Scene:
         return self.folder / "images" / view
 
     def image(self, view: str) -> UInt8[np.ndarray, "H W 3"]:
-        """Read a view's undistorted image, and check its size against the camera."""
-        pixels = read_image(sealed(self.folder, f"images/{view}"))
-        expected = self.cameras[view].size_hw
-        if pixels.shape[:2] != expected:
-            raise SceneError(
-                f"the image of view {view} in {self.name} does not match its camera",
-                expected=f"{expected[0]} x {expected[1]} (height x width)",
-                found=f"{pixels.shape[0]} x {pixels.shape[1]}",
-                fix="run the poses stage again",
-            )
-        return pixels
+        """Read a view's undistorted image."""
+        return read_image(sealed(self.folder, f"images/{view}"))
 
     def save(self) -> None:
         """Write cameras, points and finally the index to `folder`, which must already contain the images."""
@@ -73,7 +63,6 @@ class Scene:
     @staticmethod
     def load(folder: Path) -> "Scene":
         """Read a scene folder written by the poses stage."""
-        folder = Path(folder)
         index = read_index(folder, "name", "unit")
         points = read_npz(sealed(folder, "points.npz"), "xyz", "rgb", "scene_from_source")
         return Scene(

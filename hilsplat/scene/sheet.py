@@ -188,7 +188,6 @@ def content_lines(path: Path) -> list[tuple[int, str]]:
 
 
 def _check_header(path: Path, line: int, header: list[str]) -> None:
-    """Refuse missing, unknown or repeated columns."""
     missing = [column for column in COLUMNS if column not in header]
     unknown = [column for column in header if column not in (*COLUMNS, *OPTIONAL_COLUMNS)]
     repeated = [column for column, count in Counter(header).items() if count > 1]

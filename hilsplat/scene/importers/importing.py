@@ -1,47 +1,34 @@
 """Creation of a scene from images with known poses."""
 
-import logging
 import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import UInt8
 
 from hilsplat.base.errors import ImageError, RegistrationError, SceneError
 from hilsplat.base.files import list_images
 from hilsplat.base.images import open_image, read_image, resize_to_fit, write_png
 from hilsplat.base.processes import in_own_process
 from hilsplat.base.progress import track
-from hilsplat.scene.assemble import PosedView, split_views, undistort, write_scene
-from hilsplat.scene.colmap import pycolmap, sparse_points
+from hilsplat.scene.assemble import Posed, PosedView, split_views, undistort
+from hilsplat.scene.colmap import Points, pycolmap, sparse_points
 from hilsplat.scene.features import EXIF_ORIENTATION, find_matches, incremental_options
 from hilsplat.scene.importers.known_views import KnownView, read_source
 from hilsplat.scene.layouts import KnownPoses
 from hilsplat.scene.view_names import view_names
 from hilsplat.settings import PosesSettings
 
-logger = logging.getLogger(__name__)
-
 ASPECT_TOLERANCE = 0.01
 """Relative tolerance of an image's aspect ratio: a scaled copy is accepted, a different crop is not."""
 
-TRAIN_FOLDER = "images_train"
-"""Folder of training views, beside `images`, in Gaussian Grouping's data (LERF-Mask)."""
-
 
 def import_poses(
-    known: KnownPoses,
-    out: Path,
-    work: Path,
-    name: str,
-    unit: str,
-    settings: PosesSettings,
-    seed: int,
-    threads: int,
-) -> dict[str, Any]:
-    """Write the Scene artifact for a folder with known poses, and return the registration report.
+    known: KnownPoses, work: Path, name: str, settings: PosesSettings, seed: int, threads: int
+) -> Posed:
+    """Read a folder with known poses.
 
     Images are matched to poses by name; the report lists poses without an image and images without a pose.
     Pixels are used as stored, because COLMAP ignores the EXIF orientation. The source's axes are kept.
@@ -81,8 +68,6 @@ def import_poses(
     unposed = [path for path in others if path not in used]
     if unposed:
         warnings.append(f"{len(unposed)} images have no pose and are skipped")
-    for warning in warnings:
-        logger.warning("%s: %s", name, warning)
     entries: dict[str, Any] = {}
     for posed, file, view in zip(present, files, views, strict=True):
         entries[view.view] = {"file": file.name, "registered": True, **posed.report}
@@ -113,14 +98,13 @@ def import_poses(
         "views": entries,
     }
     names = [view.view for view in views]
-    trained = {path.stem for path in (known.root / TRAIN_FOLDER).glob("*")}
+    trained = {path.stem for path in (known.root / "images_train").glob("*")}  # of Gaussian Grouping's data
     held_out = [view.is_test or (bool(trained) and Path(view.name).stem not in trained) for view in present]
     if any(held_out):  # the source has its own split
         split = {view: "test" if is_test else "train" for view, is_test in zip(names, held_out, strict=True)}
     else:
         split = split_views(names, settings.test_every)
-    write_scene(out, name, unit, views, *points, split, report, turn=False)
-    return report
+    return views, points, split, report
 
 
 def _with_pixels(view: KnownView, file: Path, view_name: str, folder: Path, max_side_px: int) -> PosedView:
@@ -131,9 +115,7 @@ def _with_pixels(view: KnownView, file: Path, view_name: str, folder: Path, max_
     if view.border_px:
         pixels = _without_border(pixels, camera, view.border_px)
     pixels = resize_to_fit(pixels, max_side_px)
-    height, width = pixels.shape[:2]
-    if (camera.width, camera.height) != (width, height):
-        camera.rescale(width, height)
+    camera.rescale(pixels.shape[1], pixels.shape[0])
     write_png(folder / view_name, pixels)
     return PosedView(view_name, folder / view_name, camera, view.cam_from_source)
 
@@ -172,7 +154,7 @@ def _read_as_described(path: Path, camera: pycolmap.Camera) -> UInt8[np.ndarray,
 
 def triangulate(
     views: Sequence[PosedView], work: Path, settings: PosesSettings, seed: int, threads: int
-) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
+) -> Points:
     """Match features of pinhole views, and triangulate sparse points from their known poses."""
     if len(views) < 2:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)

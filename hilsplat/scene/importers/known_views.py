@@ -20,13 +20,10 @@ from hilsplat.base.files import IMAGE_SUFFIXES, list_images
 from hilsplat.base.images import open_image
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.cameras import MAX_SIDE_PX
-from hilsplat.scene.colmap import camera_of, pose_matrix, pycolmap, reprojection_errors, sparse_points
+from hilsplat.scene.colmap import Points, camera_of, pose_matrix, pycolmap, reprojection_errors, sparse_points
 from hilsplat.scene.importers.model_files import require_whole_files
 from hilsplat.scene.layouts import KnownPoses, read_json_object
 from hilsplat.scene.posed_images import OPENGL_TO_OPENCV, rigid_pose
-
-Points = tuple[np.ndarray, np.ndarray]
-"""Positions and colours."""
 
 AGAIN = "export it again"
 
@@ -113,7 +110,7 @@ def read_colmap(known: KnownPoses) -> tuple[list[KnownView], Points]:
         views, errors = [], reprojection_errors(model)
         images = (model.images[image_id] for image_id in model.reg_image_ids())
         for image in sorted(images, key=lambda image: image.name):
-            file, camera = _find_image(known.root, image.name), pycolmap.Camera(camera_of(image).todict())
+            file, camera = _find_image(known.root, image.name), camera_of(image)
             pose, px = pose_matrix(image.cam_from_world()), errors[image.name]
             mean = round(float(px.mean()), 4) if len(px) else None
             report = {"observations": len(px), "reprojection_error_px": mean}

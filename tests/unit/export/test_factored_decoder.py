@@ -35,17 +35,6 @@ def test_scores_logits_and_previews_agree(model, photograph):
     np.testing.assert_array_equal(model.factored.logits(encoded.terms, some), logits[3:20:4])
 
 
-def test_candidates_are_those_of_the_network(model, photograph):
-    settings = MasksSettings(points_per_side=6, predicted_iou_min=0, stability_min=0.1, box_nms_iou=1)
-    factored = decode_candidates(photograph, model, settings)
-    model.factored = None
-    plain = decode_candidates(photograph, model, settings)
-    assert len(factored.head) == len(plain.head) > 20
-    np.testing.assert_allclose(factored.predicted_iou, plain.predicted_iou, atol=TOLERANCE)
-    same = [np.array_equal(one, other) for one, other in zip(windows(factored), windows(plain), strict=True)]
-    assert np.mean(same) > 0.9  # a logit within 1e-5 of a rounding step may fall to the other side
-
-
 def test_previewed_candidates_are_a_subset(model, photograph):
     settings = {"points_per_side": 6, "predicted_iou_min": 0, "stability_min": 0.1}
     some = decode_candidates(photograph, model, MasksSettings(**settings))  # previews first
@@ -69,8 +58,8 @@ def test_a_decoder_that_differs_runs_in_onnxruntime(sam_parts, monkeypatch, capl
     assert "runs in onnxruntime (slower): the factored decoder differs by" in caplog.text
 
 
-@pytest.mark.parametrize("change", ["names", "half"])
-def test_an_unusual_graph_is_an_error_with_the_reason(sam_parts, tmp_path, change):
+@pytest.mark.parametrize(("change", "reason"), [("names", "has no node"), ("half", "s weights are float16")])
+def test_an_unusual_graph_is_an_error_with_the_reason(sam_parts, tmp_path, change, reason):
     graph = onnx.load(str(next(sam_parts[-1].rglob("*mask_decoder.onnx"))))
     if change == "names":
         for number, node in enumerate(graph.graph.node):
@@ -78,14 +67,9 @@ def test_an_unusual_graph_is_an_error_with_the_reason(sam_parts, tmp_path, chang
     else:
         for each in graph.graph.initializer:
             if each.data_type == onnx.TensorProto.FLOAT:
-                each.CopyFrom(
-                    onnx.numpy_helper.from_array(
-                        onnx.numpy_helper.to_array(each).astype(np.float16), each.name
-                    )
-                )
+                halved = onnx.numpy_helper.to_array(each).astype(np.float16)
+                each.CopyFrom(onnx.numpy_helper.from_array(halved, each.name))
     path = tmp_path / "decoder.onnx"
     onnx.save(graph, str(path))
-    with pytest.raises(
-        ModelError, match=r"decoder.onnx cannot be factored: it(s weights are float16| has no node)"
-    ):
+    with pytest.raises(ModelError, match=f"decoder.onnx cannot be factored: it ?{reason}"):
         FactoredDecoder(DecoderGraph(path))

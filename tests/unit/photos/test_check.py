@@ -15,8 +15,8 @@ SIZE = 360
 def moving(tmp_path_factory):
     """Twelve pictures of a textured corner by a camera on an arc of 44 degrees."""
     folder = tmp_path_factory.mktemp("moving") / "views"
-    plane_views(folder, views=12, size=SIZE, step_deg=4)
-    return [np.asarray(Image.open(folder / f"{number}.png").convert("L")) for number in range(12)]
+    names = plane_views(folder, views=12, size=SIZE, step_deg=4).names
+    return [np.asarray(Image.open(folder / name).convert("L")) for name in names]
 
 
 def turning(picture, steps_deg):

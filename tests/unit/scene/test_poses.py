@@ -6,17 +6,18 @@ from pathlib import Path
 import numpy as np
 import pillow_heif
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
 from hilsplat.base.errors import ImageError, RegistrationError, SceneError
-from hilsplat.base.images import read_image, resize_to_fit
+from hilsplat.base.images import read_image
 from hilsplat.scene.features import EXIF_ORIENTATION, WorkImage, exif_focal_px, lenses_of, prepare_images
-from hilsplat.scene.poses import MAX_ROWS, check_registration, name_neighbours, plot_lost, run_poses
+from hilsplat.scene.posed_images import PosedImage, write_posed_images
+from hilsplat.scene.poses import check_registration, name_neighbours, plot_lost, run_poses
 from hilsplat.scene.scene import Scene
 from hilsplat.scene.view_names import view_name, view_names
 from hilsplat.settings import PosesSettings
-from tests.unit.splat.three_gaussians_world import looking_at_the_origin
+from hilsplat.world.views import numbered_cameras
 
 
 def pose_photos(folder, out, **settings):
@@ -32,19 +33,17 @@ def write_noise(folder, count, size_hw=(48, 48), suffix=".png"):
 
 
 def plane_views(folder, views=5, size=160, step_deg=9):
-    """Renders of a textured corner (the planes x = 0 and y = 0) by a pinhole camera on an arc.
-
-    Returns the camera centres, and a transforms.json content with the true poses.
-    """
+    """Render a textured corner (the planes x = 0 and y = 0) from an arc, and return the cameras."""
     folder.mkdir()
     noise = np.random.default_rng(1).random((2, 64, 64, 3)).repeat(4, axis=1).repeat(4, axis=2)
-    centres, frames, focal = [], [], 1.2 * size
-    for number in range(views):
-        angle = np.radians(45 + step_deg * (number - (views - 1) / 2))
-        centre = np.array([4 * np.cos(angle), 4 * np.sin(angle), 1.0 + 0.2 * (number % 2)])
-        rotation = looking_at_the_origin(centre)[:3, :3]
-        y, x = np.mgrid[:size, :size] + 0.5
-        rays = np.stack([(x - size / 2) / focal, (y - size / 2) / focal, np.ones_like(x)], axis=-1) @ rotation
+    angles = np.radians(45 + step_deg * (np.arange(views) - (views - 1) / 2))
+    centres = np.column_stack([4 * np.cos(angles), 4 * np.sin(angles), 1 + 0.2 * (np.arange(views) % 2)])
+    cameras = numbered_cameras([(centre, np.zeros(3)) for centre in centres], size, fov_deg=45)
+    y, x = np.mgrid[:size, :size] + 0.5
+    for name, centre in zip(cameras.names, centres, strict=True):
+        camera = cameras[name]
+        rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(camera.K).T
+        rays = rays @ camera.cam_from_world[:3, :3]
         image = np.zeros((size, size, 3))
         nearest = np.full((size, size), np.inf)
         for wall in (0, 1):  # the planes x = 0 and y = 0, seen from x, y > 0
@@ -55,12 +54,8 @@ def plane_views(folder, views=5, size=160, step_deg=9):
             texel = noise[wall][v.astype(int).clip(0, 255), u.astype(int).clip(0, 255)]
             image[inside] = texel[inside]
             nearest[inside] = depth[inside]
-        Image.fromarray((image * 255).astype(np.uint8)).save(folder / f"{number}.png")
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation.T * [1, -1, -1], centre  # OpenGL axes
-        frames.append({"file_path": f"{number}.png", "transform_matrix": pose.tolist()})
-        centres.append(centre)
-    return np.array(centres), {"fl_x": focal, "w": size, "h": size, "frames": frames}
+        Image.fromarray((image * 255).astype(np.uint8)).save(folder / name)
+    return cameras
 
 
 def test_too_few_or_damaged_photographs_are_refused_with_all_names(tmp_path):
@@ -76,46 +71,23 @@ def test_too_few_or_damaged_photographs_are_refused_with_all_names(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]  # no scene, no work folder
 
 
-def test_work_images_are_the_photographs_upright_and_shrunk(tmp_path):
-    pixels = np.random.default_rng(0).integers(0, 256, (20, 30, 3), dtype=np.uint8)
-    turned = Image.Exif()
-    turned[EXIF_ORIENTATION] = 6
-    picture, folder = Image.fromarray(pixels), tmp_path / "photos"
-    folder.mkdir()
-    picture.save(folder / "turned.png", exif=turned)
-    picture.convert("L").save(folder / "grey.tif")
-    Image.fromarray(np.concatenate([pixels, pixels])).save(folder / "tall.png")
-    sources = sorted(folder.iterdir())
-    images = prepare_images(sources, tmp_path / "work", 30)
-    for source, image in zip(sources, images, strict=True):
-        expected = resize_to_fit(read_image(source), 30)
-        np.testing.assert_array_equal(read_image(tmp_path / "work" / image.view), expected)
-        with Image.open(tmp_path / "work" / image.view) as written:  # COLMAP turns nothing
-            assert (written.mode, written.size) == ("RGB", expected.shape[1::-1])
-            assert not written.getexif()
-
-
-def test_noise_registers_nowhere_and_every_photograph_has_its_reason(tmp_path):
-    words = r"no camera pose(.|\n)*0\.png: (too few matches|no features)"
-    with pytest.raises(RegistrationError, match=words):
-        pose_photos(write_noise(tmp_path / "photos", 3), tmp_path / "scene")
-    assert not (tmp_path / "scene").exists()
-
-
 def test_renders_are_posed_with_unchanged_pixels_and_reruns_are_identical(tmp_path):
-    true_centres, _ = plane_views(tmp_path / "renders")
+    cameras = plane_views(tmp_path / "renders")
     renders, first = tmp_path / "renders", tmp_path / "first"
     for out, threads in ((first, 1), (tmp_path / "second", 2)):
         run_poses(renders, out, "world/corner", "metre", True, PosesSettings(), 0, threads)
     scene = Scene.load(first)
-    assert scene.views("train") == [f"{number}.png" for number in range(5)]  # too few for a test view
+    assert tuple(scene.views("train")) == cameras.names  # too few for a test view
     assert scene.unit == "arbitrary"  # structure from motion cannot recover the metric scale
-    np.testing.assert_array_equal(scene.image("2.png"), read_image(tmp_path / "renders" / "2.png"))
-    centres = np.array([scene.cameras[view].centre for view in scene.views()])
-    # ratios of distances do not depend on the similarity that SfM leaves undetermined
-    found = np.linalg.norm(centres[1:] - centres[0], axis=1)
-    true = np.linalg.norm(true_centres[1:] - true_centres[0], axis=1)
-    np.testing.assert_allclose(found / found[-1], true / true[-1], rtol=0.05)
+    np.testing.assert_array_equal(scene.image("002.png"), read_image(renders / "002.png"))
+
+    def relative_distances(cameras):
+        """Do not depend on the similarity that SfM leaves undetermined."""
+        centres = np.array([cameras[view].centre for view in cameras.names])
+        distances = np.linalg.norm(centres[1:] - centres[0], axis=1)
+        return distances / distances[-1]
+
+    np.testing.assert_allclose(relative_distances(scene.cameras), relative_distances(cameras), rtol=0.05)
     report = json.loads((first / "registration.json").read_text())
     assert (report["images"], report["registered"], report["models"]) == (5, 5, [5])
     assert report["mean_reprojection_error_px"] < 1
@@ -124,9 +96,12 @@ def test_renders_are_posed_with_unchanged_pixels_and_reruns_are_identical(tmp_pa
 
 
 def test_points_are_triangulated_from_known_poses(tmp_path):
-    _, transforms = plane_views(tmp_path / "renders", views=3)
-    (tmp_path / "renders" / "transforms.json").write_text(json.dumps(transforms))
-    run_poses(tmp_path / "renders", tmp_path / "scene", "world/corner", "metre", True, PosesSettings(), 0, 1)
+    renders = tmp_path / "renders"
+    cameras = plane_views(renders, views=3)
+    posed = [cameras[name] for name in cameras.names]
+    images = [PosedImage(c.name, renders / c.name, c.cam_from_world, c.K, c.size_hw) for c in posed]
+    write_posed_images(tmp_path / "known", images)
+    run_poses(tmp_path / "known", tmp_path / "scene", "world/corner", "metre", True, PosesSettings(), 0, 1)
     scene = Scene.load(tmp_path / "scene")
     source_from_scene = np.linalg.inv(scene.scene_from_source)
     points = scene.points_xyz @ source_from_scene[:3, :3].T + source_from_scene[:3, 3]
@@ -197,22 +172,13 @@ def test_lost_views_belong_near_the_registered_ones_with_most_shared_matches():
 
 
 def test_the_picture_has_a_row_for_each_lost_view(tmp_path):
-    write_noise(tmp_path / "images", MAX_ROWS + 3)
-
-    def height_with(lost):
-        entry = {"file": "a.jpg", "why_not": "too few matches: none"}
-        near = [{"view": "14.png", "matches": 20}]
-        views = {
-            f"{number}.png": {**entry, "registered": number >= lost, "belongs_near": near[: number % 2]}
-            for number in range(MAX_ROWS + 3)
-        }
-        report, path = {"images": MAX_ROWS + 3, "views": views}, tmp_path / f"{lost}.png"
-        assert plot_lost(path, tmp_path / "images", report) == (path if lost else None)
-        return Image.open(path).size[1] if lost else 0
-
-    assert height_with(0) == 0
-    assert height_with(3) == height_with(1) + 2 * 210  # 2.1 inches each, 100 dots per inch
-    assert height_with(MAX_ROWS + 2) == height_with(MAX_ROWS)
+    write_noise(tmp_path, 3)
+    lost = {"registered": False, "file": "a.jpg", "why_not": "too few matches: none"}
+    near = [{"view": "2.png", "matches": 20}]
+    views = {"0.png": {**lost, "belongs_near": near}, "1.png": {**lost, "belongs_near": []}}
+    report = {"images": 3, "views": {**views, "2.png": {"registered": True}}}
+    plot_lost(tmp_path / "lost.png", tmp_path, report)
+    assert Image.open(tmp_path / "lost.png").size == (1200, 120 + 2 * 210)
 
 
 def test_an_unrelated_photograph_is_shown_in_the_report(tmp_path):
@@ -234,18 +200,11 @@ def test_an_unrelated_photograph_is_shown_in_the_report(tmp_path):
     assert not (tmp_path / "not_registered.png").exists()
 
 
-SIZE = (400, 300)  # diagonal 500 px
-
-
-def photograph(path, size=SIZE, orientation=None, **tags):
-    """A photograph with EXIF tags: focal_35, focal, resolution (px per unit), unit, stored (width, px)."""
-    numbers = {"focal_35": 0xA405, "focal": 0x920A, "resolution": 0xA20E, "unit": 0xA210, "stored": 0xA002}
+def photograph(path, size=(400, 300), orientation=1, **tags):
+    """A photograph, by default with a diagonal of 500 px, with tags in its EXIF block."""
     exif = Image.Exif()
-    if orientation:
-        exif[0x0112] = orientation
-    ifd = exif.get_ifd(0x8769)
-    for name, value in tags.items():
-        ifd[numbers[name]] = value
+    exif[EXIF_ORIENTATION] = orientation
+    exif.get_ifd(ExifTags.IFD.Exif).update({ExifTags.Base[name]: value for name, value in tags.items()})
     pillow_heif.register_heif_opener()
     Image.new("RGB", size, (90, 120, 30)).save(path, exif=exif.tobytes())
     return path
@@ -253,33 +212,31 @@ def photograph(path, size=SIZE, orientation=None, **tags):
 
 @pytest.mark.parametrize("suffix", [".jpg", ".heic", ".avif", ".webp", ".png", ".tif"])
 def test_the_35_mm_equivalent_is_read_from_every_format(tmp_path, suffix):
-    path = photograph(tmp_path / f"a{suffix}", focal_35=26)
+    path = photograph(tmp_path / f"a{suffix}", FocalLengthIn35mmFilm=26)
     # 26 mm on a diagonal of 43.27 mm are 26 / 43.27 of the picture's diagonal
     assert exif_focal_px(path, (300, 400)) == pytest.approx(500 * 26 / 43.2666)
 
 
 def test_the_focal_length_scales_with_a_shrunk_and_rotated_picture(tmp_path):
-    path = photograph(tmp_path / "a.heic", size=(800, 600), orientation=6, focal_35=26)
+    path = photograph(tmp_path / "a.heic", (800, 600), orientation=6, FocalLengthIn35mmFilm=26)
     (image,) = prepare_images([path], tmp_path / "work", max_side_px=400)
-    assert image.size_hw == (400, 300)
+    assert image.size_hw == (400, 300) == read_image(tmp_path / "work/a.png").shape[:2]
     assert image.focal_px == pytest.approx(500 * 26 / 43.2666)
 
 
-@pytest.mark.parametrize(("unit", "resolution"), [(2, 2540.0), (3, 1000.0), (4, 100.0), (None, 2540.0)])
+@pytest.mark.parametrize(("unit", "resolution"), [(2, 2540), (3, 1000), (4, 100), (0, 2540)])
 def test_without_an_equivalent_the_sensor_resolution_is_used(tmp_path, unit, resolution):
     """100 px per mm: a lens of 5 mm is 500 px, in half the picture 250, in a tenth-size copy 50."""
-    tags = {"focal": IFDRational(5), "resolution": IFDRational(int(resolution))}
-    if unit:
-        tags["unit"] = unit
-    path = photograph(tmp_path / "a.jpg", stored=400, **tags)
+    tags = {"FocalLength": IFDRational(5), "FocalPlaneXResolution": IFDRational(resolution)}
+    tags["FocalPlaneResolutionUnit"] = unit
+    path = photograph(tmp_path / "a.jpg", ExifImageWidth=400, **tags)
     assert exif_focal_px(path, (300, 400)) == pytest.approx(500)
     assert exif_focal_px(path, (150, 200)) == pytest.approx(250)
-    shrunk = photograph(tmp_path / "a.jpg", stored=4000, **tags)
+    shrunk = photograph(tmp_path / "a.jpg", ExifImageWidth=4000, **tags)
     assert exif_focal_px(shrunk, (300, 400)) == pytest.approx(50)
 
 
-@pytest.mark.parametrize(
-    "tags", [{}, {"focal": IFDRational(5)}, {"focal_35": 0}, {"focal": IFDRational(1, 0)}]
-)
-def test_without_usable_tags_there_is_no_focal_length(tmp_path, tags):
-    assert exif_focal_px(photograph(tmp_path / "a.jpg", **tags), (300, 400)) is None
+@pytest.mark.parametrize("focal", [IFDRational(5), IFDRational(1, 0)])
+def test_without_usable_tags_there_is_no_focal_length(tmp_path, focal):
+    path = photograph(tmp_path / "a.jpg", FocalLength=focal, FocalLengthIn35mmFilm=0)
+    assert exif_focal_px(path, (300, 400)) is None

@@ -25,13 +25,6 @@ def write_sheet(folder, *rows, columns=COLUMNS[:5]):
     return sheet
 
 
-def test_rows_are_read_in_order_and_comments_are_skipped(tmp_path):
-    write_noise(tmp_path / "desk", 3)
-    first, second = read_sheet(write_sheet(tmp_path, ("# a comment",), WORLD, DESK))
-    assert (first.name, first.world, first.folder) == ("world/a", ("tabletop", 1), None)
-    assert (second.name, second.world, second.folder) == ("photos/desk", None, tmp_path / "desk")
-
-
 def test_named_scenes_are_chosen_alone_and_from_any_group(tmp_path):
     places = ("a one benchmark", "a two benchmark", "a three development", "b two development")
     rows = read_sheet(
@@ -100,12 +93,14 @@ def test_repeated_names_and_wrong_columns_are_refused(tmp_path, rows, columns, m
         read_sheet(write_sheet(tmp_path, *rows, columns=columns))
 
 
-def test_optional_columns_may_be_empty_or_missing_and_paths_start_at_the_project(tmp_path):
+def test_comments_are_skipped_optional_columns_may_be_missing_and_paths_start_at_the_project(tmp_path):
     write_noise(tmp_path / "desk", 3)
     (tmp_path / "theirs.ply").write_bytes(b"ply\nformat ...")
     cells = [("theirs.ply", "-"), ("-", ""), ("", ""), ()]
     rows = [("photos", f"desk{row}", *DESK[2:], *more) for row, more in enumerate(cells)]
-    found = read_sheet(write_sheet(tmp_path, *rows, columns=COLUMNS[:7]))
+    world, *found = read_sheet(write_sheet(tmp_path, ("# a comment",), WORLD, *rows, columns=COLUMNS[:7]))
+    assert (world.name, world.world, world.folder) == ("world/a", ("tabletop", 1), None)
+    assert {row.folder for row in found} == {tmp_path / "desk"}
     assert [row.gaussians for row in found] == [tmp_path / "theirs.ply", None, None, None]
     assert {row.features for row in found} == {None}
 
@@ -219,7 +214,7 @@ def test_inspection_finds_damaged_turned_and_copied_photographs(tmp_path):
     report = inspect_photos(tmp_path)  # the folder above images/ works too
     assert report.folder == folder
     assert report.sizes == {(30, 40): 4, (40, 30): 1}  # height, width
-    assert (report.num_readable, report.num_distinct, report.num_rotated) == (5, 4, 1)
+    assert (report.num_readable, report.num_rotated) == (5, 1)
     assert report.duplicates == (("1.jpg", "copy.jpg"),)
     unreadable = dict(report.unreadable)
     assert list(unreadable) == ["empty.jpg", "text.png", "truncated.jpg"]
