@@ -30,7 +30,6 @@ class Dataset:
         name: key in the registry, and name in table rows and paths.
         title: name as written in papers.
         labels: "images" for labelled pixels, "points" for labelled mesh vertices or lidar points.
-        folder: the data set's folder below `data_root`; all other paths are relative to it.
         scenes: scenes in the paper's tables.
         terms: the user's obligations under the licence, in one sentence.
         layout: the expected file tree, as user-facing text.
@@ -38,12 +37,12 @@ class Dataset:
         open: function that reads a scene from the data set's folder into a `LabelledScene` or `PointScene`.
         protocols: keys in `evaluate.protocols.cards`, in addition to the protocols for all image labels.
         label_places: function that returns glob patterns for a scene's labels, which only evaluation reads.
+        folder: the data set's folder below `data_root`, if it differs from the name.
     """
 
     name: str
     title: str
     labels: Literal["images", "points"]
-    folder: str
     scenes: tuple[str, ...]
     licence: str
     terms: str
@@ -53,6 +52,11 @@ class Dataset:
     open: Callable[[Path, str], Any]
     protocols: tuple[str, ...] = ()
     label_places: Callable[[str], tuple[str, ...]] = lambda scene: ()
+    folder: str = ""
+
+    def root(self, data_root: Path | str) -> Path:
+        """Return the data set's folder, to which all its paths are relative."""
+        return Path(data_root).expanduser() / (self.folder or self.name)
 
     def check(self, root: Path, scene: str) -> SceneReport:
         """Read a whole scene and report what was found."""
@@ -70,13 +74,13 @@ class Dataset:
 
     def locate(self, data_root: Path) -> Path:
         """Return the data set's folder; raise SceneError if it isn't directly below `data_root`."""
-        data_root = Path(data_root).expanduser()
-        root = data_root / self.folder
+        root = self.root(data_root)
+        data_root = root.parent
         if self._has_begun(root):
             return root
         fixes = dict.fromkeys(_folders(root), f"move its contents to {root}")
-        fixes[data_root] = f"rename it to {self.folder} if necessary, and set data_root to its parent folder"
-        fixes |= {deeper / self.folder: f"set data_root to {deeper}" for deeper in _folders(data_root)}
+        fixes[data_root] = f"rename it to {root.name} if necessary, and set data_root to its parent folder"
+        fixes |= {deeper / root.name: f"set data_root to {deeper}" for deeper in _folders(data_root)}
         for place, fix in fixes.items():
             if self._has_begun(place):
                 raise SceneError(f"{self.title} is in the wrong place", expected=root, found=place, fix=fix)

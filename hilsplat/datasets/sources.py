@@ -8,7 +8,6 @@ from collections.abc import Collection
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.registry import DATASETS, dataset_of, open_labels
 from hilsplat.scene.sheet import DATA_PREFIX
 
@@ -54,7 +53,7 @@ def unlisted(sources: Collection[str], groups: Collection[str], data_root: str) 
     found = [
         f"{dataset.name}/{scene}"
         for dataset in (open_ended if data_root else ())
-        for scene in dataset.found(_folder(dataset, data_root))
+        for scene in dataset.found(dataset.root(data_root))
     ]
     return [name for name in found if DATA_PREFIX + name not in sources]
 
@@ -73,20 +72,16 @@ def label_sets(source: str, data_root: str, row: str) -> tuple[str, ...]:
     found = (f"{name}/{scene}", *own)
     if name in LABELS_ON:
         other = dataset_of(LABELS_ON[name])
-        if not other.missing(_folder(other, data_root), scene):
+        if not other.missing(other.root(data_root), scene):
             found = (*found, f"{other.name}/{scene}")
     return found
-
-
-def _folder(dataset: Dataset, data_root: str) -> Path:
-    return Path(data_root).expanduser() / dataset.folder
 
 
 def label_files(labels: str, data_root: str) -> tuple[Path, ...]:
     """Return the sorted files of `data set/scene` that only evaluation reads; edits rerun only evaluation."""
     name, _, scene = labels.partition("/")
     dataset = dataset_of(name)
-    root = _folder(dataset, data_root)
+    root = dataset.root(data_root)
     files = {path for pattern in dataset.label_places(scene) for path in root.glob(pattern) if path.is_file()}
     return tuple(sorted(files))
 
@@ -97,7 +92,7 @@ def image_files(source: str, data_root: str) -> tuple[Path, ...]:
     dataset = dataset_of(name)
     files: set[Path] = set()
     for required in dataset.required(scene):
-        path = _folder(dataset, data_root) / required
+        path = dataset.root(data_root) / required
         files |= set(path.rglob("*")) if path.is_dir() else {path}
     labels = label_files(f"{name}/{scene}", data_root)
     return tuple(sorted(file for file in files.difference(labels) if file.is_file()))

@@ -100,10 +100,9 @@ def by_id(labels: IsatFile) -> dict[int, IsatObject]:
     for row, thing in enumerate(labels.objects):
         where = f"{labels.path}, object {row} ({thing.category})"
         level = thing.keys.get("level")
-        is_group = "id" not in thing.keys
-        number = thing.keys.get("group" if is_group else "id")
+        number = thing.keys.get("id", thing.keys.get("group"))
         same = objects.get(number) if isinstance(number, int) else None
-        is_piece = same is not None and is_group and same.category == thing.category
+        is_piece = same is not None and "id" not in thing.keys and same.category == thing.category
         if type(number) is not int or (same is not None and not is_piece):
             raise SceneError(
                 f"{where}: invalid id",
@@ -174,7 +173,6 @@ def _dataset(name: str, title: str, frame: str) -> Dataset:
         name=name,
         title=title,
         labels="images",
-        folder=name,
         scenes=tuple(FRAMES[name]),
         licence="labels unpublished; images under their data set's licence",
         terms="Write your own labels in our format; the terms of the images apply.",
@@ -207,7 +205,6 @@ ANNOTATED = Annotated(
     name="annotated",
     title="your annotations",
     labels="images",
-    folder="annotated",
     scenes=(),
     licence="your choice; the photographs keep their licence",
     terms="Draw annotations with: hilsplat annotate SCENE",

@@ -82,7 +82,6 @@ DATASET = Dataset(
     name="lerf_mask",
     title="LERF-Mask",
     labels="images",
-    folder="lerf_mask",
     scenes=("figurines", "ramen", "teatime"),
     licence="none stated for images and masks (the authors' code: Apache-2.0)",
     terms="For research use only; do not redistribute.",

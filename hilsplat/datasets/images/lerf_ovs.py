@@ -74,7 +74,6 @@ DATASET = Dataset(
     name="lerf_ovs",
     title="LERF-OVS",
     labels="images",
-    folder="lerf_ovs",
     scenes=("figurines", "ramen", "teatime", "waldo_kitchen"),
     licence="none stated for images and labels",
     terms="For research use only; do not redistribute.",

@@ -102,7 +102,6 @@ DATASET = Dataset(
     name="3d_ovs",
     title="3D-OVS",
     labels="images",
-    folder="3d_ovs",
     scenes=tuple(FRAMES["3d_ovs"]),
     licence="none stated for images and masks (the authors' code: MIT)",
     terms="For research use only; do not redistribute.",

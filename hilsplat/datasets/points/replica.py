@@ -184,7 +184,6 @@ DATASET = Dataset(
     name="replica",
     title="Replica",
     labels="points",
-    folder="replica",
     scenes=(*(f"office_{number}" for number in range(5)), *(f"room_{number}" for number in range(3))),
     licence="Replica Research Terms",
     terms="Non-commercial research and education only; do not redistribute the data.",

@@ -218,7 +218,6 @@ DATASET = Dataset(
     name="scannet",
     title="ScanNet v2",
     labels="points",
-    folder="scannet",
     # The ten scans of OpenGaussian's table. All but the last are in the training split.
     scenes=tuple(f"scene{number:04d}_00" for number in (0, 62, 70, 97, 140, 200, 347, 400, 590, 645)),
     licence="code MIT; data under the ScanNet Terms of Use",
@@ -254,6 +253,6 @@ DATASET = Dataset(
     label_places=lambda scan: (LABEL_TABLE, *_label_files(scan)),
 )
 
-SCANNET200_DATASET = replace(DATASET, name="scannet200", title="ScanNet200")
+SCANNET200_DATASET = replace(DATASET, name="scannet200", title="ScanNet200", folder="scannet")
 """The same scans and files with different labels. The paper does not state whether it scored these ten scans
 with 200 classes, or the benchmark's 312 validation scans (ScanNet's `Tasks/Benchmark/scannetv2_val.txt`)."""

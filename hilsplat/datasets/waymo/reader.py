@@ -19,8 +19,6 @@ from hilsplat.datasets.waymo.frames import frame_points, joined_points, shot_ima
 SPLITS = ("validation", "training")
 """Splits searched for a segment. Labels of the testing split are not public."""
 LABELS = "lidar_segmentation"
-RECORD = "individual_files_{split}_segment-{segment}_with_camera_labels.tfrecord"
-"""Name of a segment's file in release 1; the prefix up to `segment-` may be missing."""
 
 
 def find_parquet(root: Path, segment: str) -> Path | None:
@@ -31,15 +29,10 @@ def find_parquet(root: Path, segment: str) -> Path | None:
     return None
 
 
-def find_record(root: Path, segment: str) -> Path | None:
-    """Return a segment's release 1 file, from `root` or the folder of a split, or None if it has none."""
-    for split in SPLITS:
-        whole = RECORD.format(split=split, segment=segment)
-        for name in (whole, whole.removeprefix(f"individual_files_{split}_")):
-            for folder in (root / split, root):
-                if (folder / name).is_file():
-                    return folder / name
-    return None
+def record_files(root: Path) -> dict[str, Path]:
+    """Return the release 1 files in `root` and the folders of its splits by segment."""
+    files = (*root.glob("*.tfrecord"), *root.glob("*/*.tfrecord"))
+    return {path.stem.split("segment-")[-1].removesuffix("_with_camera_labels"): path for path in files}
 
 
 def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
@@ -50,7 +43,7 @@ def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
     Raises:
         SceneError: the segment is missing or damaged, or has no labelled frame.
     """
-    split, record = find_parquet(root, segment), find_record(root, segment)
+    split, record = find_parquet(root, segment), record_files(root).get(segment)
     if split is not None:
         poses = parquet.vehicle_poses(split, segment)
         if not poses:
@@ -96,16 +89,12 @@ class Segments(Dataset):
 
     def found(self, root: Path) -> tuple[str, ...]:
         """Return the labelled segments below the folder."""
-        found = set()
-        for split in SPLITS:
-            found |= {path.stem for path in (root / split).glob("lidar_segmentation/*.parquet")}
-        for path in (*root.glob("*.tfrecord"), *root.glob("*/*.tfrecord")):
-            found.add(path.stem.split("segment-")[-1].removesuffix("_with_camera_labels"))
-        return tuple(sorted(found))
+        files = [path for split in SPLITS for path in (root / split).glob(f"{LABELS}/*.parquet")]
+        return tuple(sorted({*(path.stem for path in files), *record_files(root)}))
 
     def missing(self, root: Path, scene: str) -> tuple[str, ...]:
         """Return the missing paths of a segment; empty if it has a file from release 1."""
-        if find_record(root, scene) is not None:
+        if scene in record_files(root):
             return ()
         split = find_parquet(root, scene) or root / SPLITS[0]
         paths = [parquet.component_path(split, tag, scene) for tag in parquet.COMPONENTS]
@@ -116,7 +105,6 @@ DATASET = Segments(
     name="waymo",
     title="Waymo Open Dataset, 3D semantic segmentation",
     labels="points",
-    folder="waymo",
     scenes=(),
     licence="code Apache-2.0; data under the Waymo Dataset License Agreement for Non-Commercial Use",
     terms="Non-commercial use after registration; do not redistribute the data.",

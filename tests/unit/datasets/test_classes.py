@@ -6,6 +6,7 @@ import pytest
 
 from hilsplat.datasets.classes import (
     CLASSES,
+    LABELLINGS,
     NYU40,
     REPLICA_48,
     REPLICA_51,
@@ -21,20 +22,18 @@ from hilsplat.datasets.classes import (
 )
 from tests.conftest import PROJECT
 
-SIZES = (
-    *((SCANNET_19, 19), (SCANNET_15, 15), (SCANNET_10, 10), (SCANNET200, 200), (SCANNET200_INSTANCES, 198)),
-    *((REPLICA_51, 51), (REPLICA_48, 48), (WAYMO_22, 22)),
-)
+SETS = [classes for sets in LABELLINGS.values() for classes in sets]
 
 
-@pytest.mark.parametrize(("classes", "size"), SIZES, ids=[classes.name for classes, _ in SIZES])
-def test_ids_and_texts_are_unique(classes, size):
-    assert size == len(classes) == len(classes.texts) == len(set(classes.ids)) == len(set(classes.texts))
+@pytest.mark.parametrize("classes", SETS, ids=[classes.name for classes in SETS])
+def test_ids_and_texts_are_unique(classes):
+    assert len(classes) == len(classes.texts) == len(set(classes.ids)) == len(set(classes.texts))
     assert min(classes.ids) > 0
     assert all(text == text.strip() and "-" not in text for text in classes.texts)
 
 
 def test_subsets_lack_the_classes_that_their_sources_exclude():
+    assert list(map(len, SETS)) == [19, 15, 10, 200, 198, 51, 48, 22]
     assert set(SCANNET_10.ids) < set(SCANNET_15.ids) < set(SCANNET_19.ids)
     ten = ("wall", "floor", "bed", "chair", "sofa", "table", "door", "window", "bookshelf", "toilet")
     assert SCANNET_10.texts == ten

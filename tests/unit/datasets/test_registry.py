@@ -28,11 +28,27 @@ from tests.conftest import PROJECT
 from tests.unit.datasets.writers.labelled import write_lerf_ovs
 
 
+def touch(*paths: Path) -> None:
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"x")
+
+
 @pytest.fixture
-def data_root(tmp_path, true_world):
-    """One scene of LERF-OVS, `figurines`."""
-    write_lerf_ovs(true_world, tmp_path / "data" / "lerf_ovs", "figurines", ["001.png"])
-    return tmp_path / "data"
+def root(tmp_path) -> Path:
+    """One scene of LERF-OVS and Hi-LERF, and one of 3D-OVS; their files are not readable."""
+    root = tmp_path / "data"
+    touch(
+        root / "lerf_ovs/figurines/images/frame_00041.jpg",
+        root / "lerf_ovs/figurines/sparse/0/cameras.bin",
+        root / "lerf_ovs/label/figurines/frame_00041.json",
+        root / "hi_lerf/label/figurines/frame_00041.json",
+        root / "3d_ovs/bed/images/00.jpg",
+        root / "3d_ovs/bed/sparse/0/cameras.bin",
+        root / "3d_ovs/bed/segmentations/classes.txt",
+        root / "3d_ovs/bed/segmentations/00/banana.png",
+    )
+    return root
 
 
 def test_published_lists_have_the_published_counts():
@@ -52,16 +68,15 @@ def test_published_lists_have_the_published_counts():
         ("lerf_ovs", "data/lerf_ovs", "wrong place.*fix       rename it to lerf_ovs if necessary, and set"),
         ("lerf_ovs", ".", "wrong place.*set data_root to .*/data$"),
         ("lerf_ovs", "deep", "wrong place.*found     .*deep/lerf_ovs/LERF-OVS\n.*move its contents to"),
-        ("lerf_mask", "data", r"does not contain LERF-Mask\n.*\n.*lerf_ovs"),
-        ("hi_lerf", "data", "does not contain Hi-LERF"),  # although its images, those of LERF-OVS, exist
+        ("lerf_mask", "data", r"does not contain LERF-Mask\n.*\n.*3d_ovs, hi_lerf, lerf_ovs"),
+        ("hi_3dovs", "data", "does not contain Hi-3DOVS"),  # although its images, those of 3D-OVS, exist
     ],
 )
-def test_a_wrong_data_root_is_detected(data_root, dataset, place, message):
-    (data_root / "hi_lerf").mkdir()
+def test_a_wrong_data_root_is_detected(root, dataset, place, message):
     if place == "deep":
-        shutil.copytree(data_root / "lerf_ovs", data_root.parent / "deep/lerf_ovs/LERF-OVS")
+        shutil.copytree(root / "lerf_ovs", root.parent / "deep/lerf_ovs/LERF-OVS")
     with pytest.raises(SceneError, match=f"(?s){message}"):
-        DATASETS[dataset].locate(data_root.parent / place)
+        DATASETS[dataset].locate(root.parent / place)
 
 
 def run(*words):
@@ -70,9 +85,9 @@ def run(*words):
     return result.exit_code, result.output
 
 
-def test_the_command_lists_data_sets_and_their_scenes(data_root):
+def test_the_command_lists_data_sets_and_their_scenes(root):
     assert "found" not in run("list")[1]
-    code, output = run("list", "--data-root", data_root)
+    code, output = run("list", "--data-root", root)
     assert code == 0
     for name, dataset in DATASETS.items():
         assert dataset.name == name and all(map(dataset.required, dataset.scenes))
@@ -80,43 +95,22 @@ def test_the_command_lists_data_sets_and_their_scenes(data_root):
         assert f"{name}: {dataset.title}, labels on {dataset.labels}" in output
         for text in (dataset.licence, dataset.terms, dataset.citation, dataset.layout.splitlines()[0]):
             assert text.strip() and text in output
-    assert f"found     figurines (in {data_root / 'lerf_ovs'})" in output
+    assert f"found     figurines (in {root / 'lerf_ovs'})" in output
     assert "missing   ramen: ramen/images, ramen/sparse, label/ramen" in output
 
 
-def test_the_command_checks_scenes_and_reports_one_that_cannot_be_read(data_root):
-    code, output = run("check", "lerf_ovs", "--data-root", data_root)
+def test_the_command_checks_scenes_and_reports_one_that_cannot_be_read(tmp_path, true_world):
+    write_lerf_ovs(true_world, tmp_path / "lerf_ovs", "figurines", ["001.png"])
+    code, output = run("check", "lerf_ovs", "--data-root", tmp_path)
     assert code == 0
     assert "lerf_ovs: missing: ramen, teatime, waldo_kitchen" in output
-    (data_root / "lerf_ovs" / "ramen" / "images").mkdir(parents=True)
-    code, output = run("check", "lerf_ovs", "--data-root", data_root)
+    (tmp_path / "lerf_ovs" / "ramen" / "images").mkdir(parents=True)
+    code, output = run("check", "lerf_ovs", "--data-root", tmp_path)
     assert code == 1
     assert "lerf_ovs/ramen: cannot be read\n  scene ramen of LERF-OVS is incomplete" in output
     assert "also ramen/sparse, label/ramen" in output
     assert "lerf_ovs/figurines: images: 4, labelled views: 1, regions: 5" in output
     assert "warning   published frames that have no label: frame_00041" in output
-
-
-def touch(*paths: Path) -> None:
-    for path in paths:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(b"x")
-
-
-@pytest.fixture
-def root(tmp_path) -> Path:
-    """One scene of LERF-OVS and Hi-LERF, and one of 3D-OVS; their files are not readable."""
-    touch(
-        tmp_path / "lerf_ovs/figurines/images/frame_00041.jpg",
-        tmp_path / "lerf_ovs/figurines/sparse/0/cameras.bin",
-        tmp_path / "lerf_ovs/label/figurines/frame_00041.json",
-        tmp_path / "hi_lerf/label/figurines/frame_00041.json",
-        tmp_path / "3d_ovs/bed/images/00.jpg",
-        tmp_path / "3d_ovs/bed/sparse/0/cameras.bin",
-        tmp_path / "3d_ovs/bed/segmentations/classes.txt",
-        tmp_path / "3d_ovs/bed/segmentations/00/banana.png",
-    )
-    return tmp_path
 
 
 def test_a_source_that_cannot_be_used_has_a_reason_in_one_line(root):

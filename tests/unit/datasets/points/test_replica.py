@@ -50,8 +50,7 @@ def make_frames(root: Path, count: int) -> None:
 @pytest.fixture
 def root(tmp_path) -> Path:
     (tmp_path / MESH).parent.mkdir(parents=True)
-    places = {axis: XYZ[:, column] for column, axis in enumerate("xyz")}
-    write_ply(tmp_path / MESH, places, QUADS, {"object_id": OBJECT})
+    write_ply(tmp_path / MESH, XYZ, QUADS, object_id=OBJECT)
     info([-2, 20, 93, -1])(tmp_path)
     make_frames(tmp_path, 3)
     poses(3)(tmp_path)

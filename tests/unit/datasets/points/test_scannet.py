@@ -119,8 +119,7 @@ def moved(name: str, target: str):
 
 def mesh_of(xyz: np.ndarray):
     """Return a change that replaces the unlabelled mesh."""
-    columns = {axis: xyz[:, column] for column, axis in enumerate("xyz")}
-    return lambda folder: write_ply(folder / f"{SCAN}_vh_clean_2.ply", columns, FACES, {})
+    return lambda folder: write_ply(folder / f"{SCAN}_vh_clean_2.ply", xyz, FACES)
 
 
 def truncate_labels(folder: Path) -> None:

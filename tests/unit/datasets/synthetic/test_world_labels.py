@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 
 from hilsplat.base.artifacts import read_npz
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.points import replica, scannet
+from hilsplat.datasets.points import replica
 from hilsplat.datasets.registry import open_labels
 from hilsplat.datasets.sources import export_images
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
@@ -29,19 +29,20 @@ IDENTITY = np.eye(4)
 SETTINGS = WorldSettings(views=3, image_px=48, samples=1, objects=2)
 
 
-def make_world(kind, folder):
-    run_world(f"world:{kind}:100", SETTINGS, folder / "world", threads=1)
-    return folder / "world"
-
-
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
-    return make_world("room", tmp_path_factory.mktemp("room"))
+    return make_world("room", tmp_path_factory)
 
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
-    return make_world("street", tmp_path_factory.mktemp("street"))
+    return make_world("street", tmp_path_factory)
+
+
+def make_world(kind, tmp_path_factory):
+    folder = tmp_path_factory.mktemp(kind)
+    run_world(f"world:{kind}:100", SETTINGS, folder, threads=1)
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -68,14 +69,14 @@ def classes_of(mesh, seen=slice(None)):
     return {labelling: of_text[mesh.whole[seen]] for labelling, of_text in ids.items()}
 
 
-def test_room_as_scannet_reads_back_equal(room, data_root):
-    scene, mesh = scannet.open_scan(data_root / "scannet", "scene0000_00"), LabelledMesh(room)
-    np.testing.assert_array_equal(scene.truth["nyu40"].xyz, mesh.xyz)
-    np.testing.assert_array_equal(scene.truth["nyu40"].instance_id, mesh.whole + 1)
-    for labelling, points in scene.truth.items():
-        np.testing.assert_array_equal(points.class_id, classes_of(mesh)[labelling])
-    assert {1, 2, 8, 22} <= set(scene.truth["nyu40"].class_id.tolist())  # wall, floor, door, ceiling
-    same_images(scene.images, posed_images(room))
+def test_a_room_as_scannet_or_replica_reads_back_equal(room, data_root, tmp_path):
+    write_room_as_replica(room, tmp_path, "room_0")
+    mesh = LabelledMesh(room)
+    for scene in (open_labels("scannet/scene0000_00", data_root), replica.open_scene(tmp_path, "room_0")):
+        for labelling, points in scene.truth.items():
+            np.testing.assert_array_equal(points.xyz, mesh.xyz)
+            np.testing.assert_array_equal(points.class_id, classes_of(mesh)[labelling])
+        same_images(scene.images, posed_images(room))
 
 
 def test_gaussians_frozen_at_the_vertices_of_a_scan_are_its_points(data_root, tmp_path):
@@ -89,18 +90,6 @@ def test_gaussians_frozen_at_the_vertices_of_a_scan_are_its_points(data_root, tm
     truth = open_labels("scannet/scene0000_00", data_root).truth["nyu40"]
     places = truth.xyz @ scene.scene_from_source[:3, :3].T + scene.scene_from_source[:3, 3]
     np.testing.assert_allclose(gaussians.means, places, atol=1e-5)
-
-
-def test_room_as_replica_reads_back_equal(room, tmp_path):
-    write_room_as_replica(room, tmp_path, "room_0")
-    scene, mesh = replica.open_scene(tmp_path, "room_0"), LabelledMesh(room)
-    truth, expected = scene.truth["replica"], classes_of(mesh)["replica"]
-    np.testing.assert_array_equal(truth.xyz, mesh.xyz)
-    np.testing.assert_array_equal(truth.class_id, expected)
-    # objects count from 1 in the file, instances are the object's number + 1, none without a class
-    np.testing.assert_array_equal(truth.instance_id, np.where(expected > 0, mesh.whole + 2, 0))
-    assert {93, 40, 37, 31} <= set(truth.class_id.tolist())  # wall, floor, door, ceiling
-    same_images(scene.images, posed_images(room))
 
 
 def test_street_as_waymo_reads_back_equal(street, tmp_path):

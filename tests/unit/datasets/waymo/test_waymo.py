@@ -22,12 +22,12 @@ from hilsplat.datasets.waymo.frames import (
     rotation_of,
     shot_image,
 )
-from hilsplat.datasets.waymo.reader import RECORD, open_segment
-from hilsplat.datasets.waymo.records import MESSAGES, matrix, message_classes
-from tests.conftest import PROJECT
+from hilsplat.datasets.waymo.reader import open_segment
+from hilsplat.datasets.waymo.records import MESSAGES, matrix
 from tests.unit.datasets.writers.points import write_segment
 
 SEGMENT = "1_2_000_3_000"
+RECORD = f"segment-{SEGMENT}_with_camera_labels.tfrecord"
 SQRT2 = np.sqrt(2.0)
 
 
@@ -38,7 +38,8 @@ def turned(degrees: float, x: float = 0.0) -> np.ndarray:
     return pose
 
 
-FRONT = WaymoCamera("FRONT", np.array([2000.0, 2000, 960, 640, 1, 2, 3, 4, 5]), np.eye(4), (1280, 1920))
+STILL, VEHICLE, LIDAR = np.eye(4), turned(90, x=20000.0), turned(30)
+FRONT = WaymoCamera("FRONT", np.array([2000.0, 2000, 960, 640, 1, 2, 3, 4, 5]), STILL, (1280, 1920))
 SIDE = replace(FRONT, name="SIDE_LEFT", vehicle_from_cam=turned(90), size_hw=(886, 1920))
 
 
@@ -50,16 +51,12 @@ def one_return(ranges, classes, instances=0) -> LidarReturn:
     return LidarReturn(image, labels[None])
 
 
-def make_frame(
-    time: int = 1000, vehicle: np.ndarray | None = None, lidar: np.ndarray | None = None
-) -> LidarFrame:
+def make_frame(time: int = 1000, vehicle: np.ndarray = STILL, lidar: np.ndarray = STILL) -> LidarFrame:
     """Four columns, range 2 all around; the second return has two hits, one of them unlabelled."""
-    vehicle = np.eye(4) if vehicle is None else vehicle
     yaw = np.arctan2(vehicle[1, 0], vehicle[0, 0])
     pose = np.tile(np.float32([0, 0, yaw, *vehicle[:3, 3]]), (1, 4, 1))
     first = one_return([2, 2, 2, 2], [1, 14, 15, 18], [7, 0, 0, 0])
     second = one_return([-1, 4, 0, 6], [22, 10, 22, 0], [0, 9, 0, 0])
-    lidar = np.eye(4) if lidar is None else lidar
     return LidarFrame(time, vehicle, lidar, np.zeros(1), pose, (first, second))
 
 
@@ -98,7 +95,7 @@ def test_rotation_is_yaw_after_pitch_after_roll():
 def test_opencv_axes_yield_the_same_pixel():
     """K is unchanged, because 0 is the left edge of the first pixel in Waymo, as here."""
     vehicle = turned(40, x=7.0)
-    image = shot_image(CameraShot(1000, SIDE, b"", vehicle), np.eye(4))
+    image = shot_image(CameraShot(1000, SIDE, b"", vehicle), STILL)
     x, y, z, _ = image.cam_from_world @ vehicle @ turned(90) @ [10, 1, -0.5, 1]
     np.testing.assert_allclose([x, y, z], [-1, 0.5, 10], atol=1e-12)
     np.testing.assert_allclose((image.K @ [x, y, z])[:2] / z, [760, 740])
@@ -106,7 +103,7 @@ def test_opencv_axes_yield_the_same_pixel():
 
 
 def test_each_return_has_its_own_mask_and_channel_one_is_the_class():
-    points = frame_points(make_frame(), np.eye(4))
+    points = frame_points(make_frame(), STILL)
     assert points.class_id.tolist() == [1, 14, 15, 18, 10, 0]
     assert points.instance_id.tolist() == [7, 0, 0, 0, 9, 0]
     np.testing.assert_allclose(points.xyz[4], [2 * SQRT2, 2 * SQRT2, 0])  # range 4 in column 1
@@ -129,19 +126,17 @@ def test_pixel_poses_move_points_into_the_world():
 
 @pytest.fixture
 def root(tmp_path):
-    vehicle = turned(90, x=20000.0)
-    frames = [make_frame(1000, vehicle, turned(30)), make_frame(3000, vehicle, turned(30))]
-    write_segment(tmp_path / "waymo" / "validation", SEGMENT, frames, make_shots(vehicle))
+    frames = [make_frame(time, VEHICLE, LIDAR) for time in (1000, 3000)]
+    write_segment(tmp_path / "waymo" / "validation", SEGMENT, frames, make_shots(VEHICLE))
     return tmp_path / "waymo"
 
 
 def test_a_written_segment_reads_back_in_the_frame_of_its_first_vehicle(root):
     scene = open_segment(root, SEGMENT)
     truth = scene.truth["waymo"]
-    one = frame_points(make_frame(), np.eye(4))
+    one = frame_points(make_frame(), STILL)
     np.testing.assert_allclose(truth.xyz, np.tile(one.xyz, (2, 1)), atol=2e-3)  # pixel poses are float32
-    assert truth.class_id.tolist() == one.class_id.tolist() * 2
-    assert truth.instance_id.tolist() == one.instance_id.tolist() * 2
+    np.testing.assert_array_equal(truth.class_id, np.tile(one.class_id, 2))
     names = [image.name for image in scene.images]
     assert names[:3] == ["1000_FRONT.jpg", "1000_SIDE_LEFT.jpg", "2000_FRONT.jpg"]
     assert scene.images[2].image == b"jpeg 2000" and scene.images[1].size_hw == (886, 1920)
@@ -192,28 +187,28 @@ def compressed(image: np.ndarray) -> bytes:
     return zlib.compress(message.SerializeToString())
 
 
+def transform(pose: np.ndarray) -> dict:
+    return {"transform": pose.ravel()}
+
+
 def encoded(frame: LidarFrame, shots: list[CameraShot], labelled: bool = True) -> bytes:
-    message = MESSAGES["Frame"](timestamp_micros=frame.timestamp_micros)
-    message.pose.transform.extend(frame.world_from_vehicle.ravel())
-    for number, name in ((4, "SIDE_LEFT"), (1, "FRONT")):
-        lens = next(shot.camera for shot in shots if shot.camera.name == name)
-        added = message.context.camera_calibrations.add(
-            name=number, intrinsic=lens.intrinsic, width=lens.size_hw[1], height=lens.size_hw[0]
-        )
-        added.extrinsic.transform.extend(lens.vehicle_from_cam.ravel())
-    message.context.laser_calibrations.add(name=2)
-    laser = message.context.laser_calibrations.add(
-        name=1, beam_inclination_min=-0.1, beam_inclination_max=0.1
-    )  # one beam in the middle: 0
-    laser.extrinsic.transform.extend(frame.vehicle_from_lidar.ravel())
-    for shot in shots:
+    """The record of a frame, with its cameras in reverse and a second lidar that is not read."""
+    pose = transform(frame.world_from_vehicle)
+    message = MESSAGES["Frame"](timestamp_micros=frame.timestamp_micros, pose=pose)
+    lenses, lidars = message.context.camera_calibrations, message.context.laser_calibrations
+    for shot in reversed(shots):
         if shot.timestamp_micros == frame.timestamp_micros:
-            image = message.images.add(name=1 if shot.camera.name == "FRONT" else 4, image=shot.encoded)
-            image.pose.transform.extend(shot.world_from_vehicle.ravel())
+            lens, name = shot.camera, 1 if shot.camera.name == "FRONT" else 4
+            message.images.add(name=name, image=shot.encoded, pose=transform(shot.world_from_vehicle))
+            size = dict(zip(("height", "width"), lens.size_hw, strict=True))
+            place = transform(lens.vehicle_from_cam)
+            lenses.add(name=name, intrinsic=lens.intrinsic, extrinsic=place, **size)
+    lidars.add(name=2)
+    beams = {"beam_inclination_min": -0.1, "beam_inclination_max": 0.1}  # one beam in the middle: 0
+    lidars.add(name=1, extrinsic=transform(frame.vehicle_from_lidar), **beams)
     message.lasers.add(name=2)
     top = message.lasers.add(name=1)
-    for name, part in zip(("ri_return1", "ri_return2"), frame.returns, strict=True):
-        target = getattr(top, name)
+    for target, part in zip((top.ri_return1, top.ri_return2), frame.returns, strict=True):
         target.range_image_compressed = compressed(part.image)
         if labelled:
             target.segmentation_label_compressed = compressed(part.labels)
@@ -237,12 +232,10 @@ def test_a_matrix_by_hand():
 
 
 def test_both_releases_give_the_same_scene(root, tmp_path):
-    vehicle = turned(90, x=20000.0)
-    shots = make_shots(vehicle)
-    frames = [make_frame(time, vehicle, turned(30)) for time in (1000, 2000, 3000)]
+    shots = make_shots(VEHICLE)
+    frames = [make_frame(time, VEHICLE, LIDAR) for time in (1000, 2000, 3000)]
     records = [encoded(frame, shots, labelled=frame.timestamp_micros != 2000) for frame in frames]
-    name = RECORD.format(split="validation", segment=SEGMENT)
-    write_records(tmp_path / "old" / name, records)
+    write_records(tmp_path / "old" / f"individual_files_validation_{RECORD}", records)
     old, new = open_segment(tmp_path / "old", SEGMENT), open_segment(root, SEGMENT)
     for field in ("xyz", "class_id", "instance_id"):
         np.testing.assert_array_equal(getattr(old.truth["waymo"], field), getattr(new.truth["waymo"], field))
@@ -251,15 +244,12 @@ def test_both_releases_give_the_same_scene(root, tmp_path):
         assert first.image == second.image and first.size_hw == second.size_hw
         np.testing.assert_array_equal(first.cam_from_world, second.cam_from_world)
     assert DATASETS["waymo"].found(tmp_path / "old") == (SEGMENT,)
-    short = name.removeprefix("individual_files_validation_")  # also in the folder of its split
-    write_records(tmp_path / "other" / "validation" / short, records)
+    write_records(tmp_path / "other" / "validation" / RECORD, records)
     assert len(open_segment(tmp_path / "other", SEGMENT).images) == 6
 
 
 def test_a_record_that_is_cut_off_or_unlabelled_is_refused(tmp_path):
-    shots = make_shots(np.eye(4))
-    record = encoded(make_frame(), shots, labelled=False)
-    path = write_records(tmp_path / RECORD.format(split="validation", segment=SEGMENT), [record])
+    path = write_records(tmp_path / RECORD, [encoded(make_frame(), make_shots(STILL), labelled=False)])
     whole, damaged = path.read_bytes(), write_records(tmp_path / "damaged", [b"\x0b"]).read_bytes()
     for content, message in (
         (whole, "no frames with labels for the top lidar"),
@@ -271,24 +261,3 @@ def test_a_record_that_is_cut_off_or_unlabelled_is_refused(tmp_path):
         path.write_bytes(content)
         with pytest.raises(SceneError, match=f"(?s){message}"):
             open_segment(tmp_path, SEGMENT)
-
-
-def test_published_label_file_holds_all_classes():
-    """The file of Waymo's metrics tool: frames and lasers are fields 1, labels field 6 of a return."""
-    path = PROJECT.parent / "shared/reference/samples/waymo/fake_segmentation_groundtruths.bin"
-    if not path.is_file():
-        pytest.skip("Waymo's test files are not beside the checkout (shared/reference/samples/waymo)")
-    kinds = message_classes("""
-RangeImage: optional bytes segmentation_label_compressed 6
-Laser: required RangeImage ri_return1 2, required RangeImage ri_return2 3
-SegmentationFrame: required Laser segmentation_labels 1, required int64 timestamp_micros 3
-SegmentationFrameList: repeated SegmentationFrame frames 1""")
-    frames = kinds["SegmentationFrameList"].FromString(path.read_bytes()).frames
-    assert [frame.timestamp_micros for frame in frames] == [0, 1000000, 2000000] * 2
-    labels = [
-        matrix(image.segmentation_label_compressed, np.int32)
-        for frame in frames
-        for image in (frame.segmentation_labels.ri_return1, frame.segmentation_labels.ri_return2)
-    ]
-    assert len(labels) == 12 and all(image.size == 50 * 1000 for image in labels)
-    assert set(np.unique(np.concatenate([image.ravel() for image in labels]))) >= set(range(1, 23))

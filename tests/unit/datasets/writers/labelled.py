@@ -128,13 +128,10 @@ def write_lerf_mask(
             _write_mask(place / f"{text}.png", world.mask(view, nodes))
 
 
-def write_3d_ovs(world: TrueWorld, root: Path, scene: str, views: Sequence[str], sparse: bool = True) -> None:
-    """Write `root/<scene>`: classes are the wholes in any segmented view; other views get empty masks.
-
-    With `sparse`, a COLMAP model is written beside `poses_bounds.npy`.
-    """
+def write_3d_ovs(world: TrueWorld, root: Path, scene: str, views: Sequence[str]) -> None:
+    """Write `root/<scene>`: classes are the wholes in any segmented view; other views get empty masks."""
     folder = root / scene
-    stems = _write_images(world, folder, OVS_STEMS, sparse)
+    stems = _write_images(world, folder, OVS_STEMS)
     shown = {view: world.nodes(view, Level.WHOLE) for view in views}
     classes = sorted({text for texts in shown.values() for text in texts})
     for view, texts in shown.items():
@@ -167,17 +164,15 @@ def write_hi(
         _write_labels(world, root / "label" / scene, view, names[view], objects)
 
 
-def _write_images(
-    world: TrueWorld, folder: Path, pattern: tuple[str, int], sparse: bool = True
-) -> Mapping[str, str]:
+def _write_images(world: TrueWorld, folder: Path, pattern: tuple[str, int]) -> Mapping[str, str]:
+    """Write images and a COLMAP model; return the stems of the files by view."""
     form, first = pattern
     stems = {view: form.format(row) for row, view in enumerate(world.cameras.names, start=first)}
     for view, stem in stems.items():
         write_jpeg(folder / "images" / f"{stem}.jpg", read_image(world.images / view))
-    if sparse:
-        cameras = [world.cameras[view] for view in stems]
-        names = [f"{stem}.jpg" for stem in stems.values()]
-        write_sparse(folder / "sparse" / "0", cameras, names, world.points_xyz)
+    cameras = [world.cameras[view] for view in stems]
+    names = [f"{stem}.jpg" for stem in stems.values()]
+    write_sparse(folder / "sparse" / "0", cameras, names, world.points_xyz)
     return stems
 
 

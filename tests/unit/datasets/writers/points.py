@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as parquet
 from jaxtyping import Float, Float32, Int32
+from numpy.lib.recfunctions import append_fields
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
@@ -40,26 +41,25 @@ from hilsplat.world.lidar import AZIMUTH_STEPS, BEAMS, INCLINATION_DEG
 
 
 def write_ply(
-    path: Path, vertices: Mapping[str, np.ndarray], faces: np.ndarray, of_faces: Mapping[str, np.ndarray]
+    path: Path,
+    xyz: Float32[np.ndarray, "P 3"],
+    faces: Int32[np.ndarray, "F C"],
+    label: np.ndarray | None = None,
+    object_id: np.ndarray | None = None,
 ) -> None:
-    """Write a binary mesh: columns of vertices, corners of faces, columns of faces."""
-    rows = np.rec.fromarrays([*vertices.values()], names=[*vertices])
-    corners = ("vertex_indices", "i4", faces.shape[1:])
-    polygons = np.empty(len(faces), [corners, *((name, column.dtype) for name, column in of_faces.items())])
-    for name, column in {"vertex_indices": faces, **of_faces}.items():
-        polygons[name] = column
-    elements = [PlyElement.describe(rows, "vertex"), PlyElement.describe(polygons, "face")]
+    """Write a binary mesh with the labels of vertices or the objects of faces."""
+    vertices = np.rec.fromarrays(xyz.T, names="x, y, z")
+    corners = np.rec.fromarrays([faces], dtype=[("vertex_indices", "i4", faces.shape[1:])])
+    if label is not None:
+        vertices = append_fields(vertices, "label", label, usemask=False)
+    if object_id is not None:
+        corners = append_fields(corners, "object_id", object_id, usemask=False)
+    elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(corners, "face")]
     PlyData(elements, byte_order="<").write(path)
 
 
 SEGMENT_STEP = 7
 """Step between segment ids, which are not contiguous in real scans either."""
-
-
-def _grey_vertices(xyz: Float32[np.ndarray, "P 3"]) -> dict[str, np.ndarray]:
-    """Return the columns x, y, z and colours of vertices."""
-    places = {axis: xyz[:, column] for column, axis in enumerate("xyz")}
-    return places | dict.fromkeys(("red", "green", "blue", "alpha"), np.full(len(xyz), 128, dtype=np.uint8))
 
 
 def write_label_table(root: Path, categories: Mapping[str, tuple[int, int]]) -> None:
@@ -97,11 +97,10 @@ def write_scan(
     np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", K)
     height, width = images[0].size_hw
     write_text(folder / f"{scan}.txt", f"colorHeight = {height}\ncolorWidth = {width}\nsceneType = Office\n")
-    vertices = _grey_vertices(xyz)
-    write_ply(folder / f"{scan}_vh_clean_2.ply", vertices, faces, {})
+    write_ply(folder / f"{scan}_vh_clean_2.ply", xyz, faces)
     of_object = np.array([categories[name][1] for name in objects] + [0], dtype=np.uint16)
     labels = of_object[object_of_vertex]  # -1, none, is the last
-    write_ply(folder / f"{scan}_vh_clean_2.labels.ply", {**vertices, "label": labels}, faces, {})
+    write_ply(folder / f"{scan}_vh_clean_2.labels.ply", xyz, faces, labels)
     # Two segments per object, on either side of its middle.
     segment = np.zeros(len(xyz), dtype=np.int64)
     groups = []
@@ -139,7 +138,7 @@ def write_semantic_mesh(
     labels = [NO_OBJECT, *(number or UNDEFINED for number in classes)]
     names = [{"id": number, "name": name} for number, name in REPLICA_NAMES.items()]
     habitat.mkdir(parents=True)
-    write_ply(habitat / "mesh_semantic.ply", _grey_vertices(xyz), quads, {"object_id": of_face})
+    write_ply(habitat / "mesh_semantic.ply", xyz, quads, object_id=of_face)
     write_json(habitat / "info_semantic.json", {"classes": names, "id_to_label": labels})
 
 
@@ -186,8 +185,19 @@ def write_segment(
         images = [[getattr(each, part) for each in frame.returns] for frame in frames]
         write(tag, [_cells(component, *pair) for pair in zip(frames, images, strict=True)])
     write("lidar_pose", [_cells("LiDARPoseComponent", frame, [frame.pixel_pose]) for frame in frames])
-    camera_of = {shot.camera.name: shot.camera for shot in reversed(shots)}
-    write("camera_calibration", [_calibration(camera) for camera in camera_of.values()])
+    base = "[CameraCalibrationComponent]"
+    cameras = {shot.camera.name: shot.camera for shot in reversed(shots)}
+    calibrations = [
+        {
+            CAMERA: CAMERAS.index(camera.name) + 1,
+            **{f"{base}.intrinsic.{name}": v for name, v in zip(INTRINSIC, camera.intrinsic, strict=True)},
+            f"{base}.extrinsic.transform": camera.vehicle_from_cam.ravel(),
+            f"{base}.width": camera.size_hw[1],
+            f"{base}.height": camera.size_hw[0],
+        }
+        for camera in cameras.values()
+    ]
+    write("camera_calibration", calibrations)
     write(
         "camera_image",
         [
@@ -211,19 +221,6 @@ def _cells(component: str, frame: LidarFrame, images: Sequence[np.ndarray]) -> d
         row[f"{name}.values"] = None if image is None else image.ravel()
         row[f"{name}.shape"] = None if image is None else np.array(image.shape, dtype=np.int32)
     return row
-
-
-def _calibration(camera: WaymoCamera) -> dict[str, Any]:
-    base = "[CameraCalibrationComponent]"
-    height, width = camera.size_hw
-    lens = {f"{base}.intrinsic.{name}": float(v) for name, v in zip(INTRINSIC, camera.intrinsic, strict=True)}
-    return {
-        CAMERA: CAMERAS.index(camera.name) + 1,
-        **lens,
-        f"{base}.extrinsic.transform": camera.vehicle_from_cam.ravel(),
-        f"{base}.width": width,
-        f"{base}.height": height,
-    }
 
 
 def _write_component(split: Path, segment: str, tag: str, rows: Sequence[Mapping[str, Any]]) -> None:
