@@ -79,13 +79,8 @@ def test_a_crop_equals_that_of_the_pipeline():
     segmented = int(np.flatnonzero(crops.rough)[0])
     for row in (exact, segmented):
         assert np.array_equal(crops.cut(row), expected)
-    kept = crops.cut(exact, "keep")
-    assert np.array_equal(kept, square_crop(views.images[0], half, "keep", 0.0, CROP_PX))
-    roughened = crops.cut(exact, rng=np.random.default_rng(0))
-    assert roughened.shape == expected.shape
-    assert not np.array_equal(roughened, expected)
-    only = list_segmented(views, [drawn_masks((2, half))])
-    assert np.array_equal(only.cut(0), expected)
+    assert not np.array_equal(crops.cut(exact, rng=np.random.default_rng(0)), expected)  # roughened
+    assert np.array_equal(list_segmented(views, [drawn_masks((2, half))]).cut(0), expected)
 
 
 def test_levels_are_drawn_equally_often():

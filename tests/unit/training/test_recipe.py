@@ -7,7 +7,7 @@ from hilsplat.base.artifacts import read_json
 from hilsplat.base.errors import SceneError, SettingsError
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
 from models.training.card import RECORD, digests
-from models.training.render import MIXTURE, kind_of_seed, phrases_of, scene_of_seed, training_seeds
+from models.training.render import phrases_of, scene_of_seed, training_seeds
 from models.training.settings import TrainingSettings
 from models.training.train import train_models
 
@@ -28,13 +28,6 @@ def test_a_part_may_be_named_without_its_object():
     whole, part = phrases_of(nodes)
     assert whole.phrases == ("bear", "teddy")
     assert part.phrases == ("bear head", "head of the bear", "head of the teddy", "head")
-
-
-def test_kinds_of_scenes_have_their_shares():
-    kinds = [kind_of_seed(seed)[0] for seed in range(1_000_000, 1_000_600)]
-    for kind, (share, _, _) in MIXTURE.items():
-        # three standard deviations of 600 draws are 0.06
-        assert kinds.count(kind) / 600 == pytest.approx(share, abs=0.06)
 
 
 def test_an_unknown_stage_of_training_is_refused(tmp_path):

@@ -158,15 +158,3 @@ def test_packets_have_the_hits_of_single_rays(count):
     is_far = np.arange(count) % 2 == 1  # of every second hit, the reach falls short
     reach = (hits.distance * np.where(is_far, 0.999, 1.001)).astype(np.float32)
     np.testing.assert_array_equal(RayCaster(triangles).blocked(origins, directions, reach), met & ~is_far)
-
-
-def test_hits_of_a_triangle_match_values_worked_by_hand():
-    caster = RayCaster(np.array([[[0, 0, 2], [4, 0, 2], [0, 8, 2]]], np.float32))
-    ways = np.array([[1, 1, 2], [0.5, 2, 1], [-1, 1, 2]], np.float32)  # the second ends halfway to its hit
-    hits = caster.nearest(np.zeros((1, 3), np.float32), ways)
-    assert hits.triangle.tolist() == [0, 0, -1]
-    assert hits.distance.tolist() == pytest.approx([1, 2, np.inf])
-    assert hits.u[:2].tolist() == pytest.approx([1 / 4, 1 / 4])
-    assert hits.v[:2].tolist() == pytest.approx([1 / 8, 1 / 2])
-    reach = np.array([0.9, 2.1, 9], np.float32)
-    assert caster.blocked(np.zeros((1, 3), np.float32), ways, reach).tolist() == [False, True, False]
