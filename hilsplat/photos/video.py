@@ -86,7 +86,6 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
     """
     notes: list[str] = []
     candidates: list[Frame] = []
-    decoded_videos = []
     for position, video in enumerate(videos):
         decoding = Decoding()
         candidates += _candidates(video, position, CANDIDATES_PER_FRAME * count, decoding)
@@ -96,15 +95,6 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
                 found=f"{decoding.num_damaged} damaged packets, {video.stat().st_size} bytes",
                 fix="play it to see whether it is intact; copy it again, or convert it to H.264 in an .mp4",
             )
-        decoded_videos.append(
-            {
-                "file": video.name,
-                "sha256": sha256_of_file(video),
-                "seconds": round(decoding.decoded_s, 3),
-                "frames": decoding.num_frames,
-                "damaged": decoding.num_damaged,
-            }
-        )
         if decoding.num_damaged:
             notes.append(f"{video.name}: {decoding.num_damaged} damaged packets or frames were skipped")
         if decoding.stated_s is not None and decoding.decoded_s < 0.9 * decoding.stated_s - 1:
@@ -120,7 +110,7 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
         names = {frame.number: name for name, frame in named.items() if frame.video == position}
         _write_frames(video, names, folder)
     origin = {
-        "videos": decoded_videos,
+        "videos": [{"file": video.name, "sha256": sha256_of_file(video)} for video in videos],
         "settings": {"frames": count, "min_step": MIN_STEP, "jpeg_quality": JPEG_QUALITY},
         "frames": {
             name: {
@@ -130,7 +120,6 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
             }
             for name, frame in named.items()
         },
-        "notes": notes,
     }
     write_json(folder / "origin.json", origin)
     return notes
