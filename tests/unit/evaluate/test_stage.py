@@ -23,15 +23,12 @@ def test_only_test_views_are_scored_and_evaluating_twice_gives_the_same_bytes(op
     assert set(scores["method"]) == {"field", "tree", "tree-path", "truth"}
     opened.evaluate(tmp_path / "two.csv")
     assert (tmp_path / "scores.csv").read_bytes() == (tmp_path / "two.csv").read_bytes()
+    assert len(opened.evaluate(tmp_path / "none.csv", truth=None)) == 0  # no annotations
 
 
 def test_queries_of_every_method_are_timed(block_world):
     seconds = time_queries(block_world.answers, "001.png", ["bear", "chest"], EvaluateSettings())
     assert list(seconds) == ["field", "tree"] and min(seconds.values()) > 0
-
-
-def test_a_scene_without_annotations_gives_only_a_header(opened, tmp_path):
-    assert len(opened.evaluate(tmp_path / "scores.csv", truth=None)) == 0
 
 
 def test_the_panel_is_written_with_the_pictures_of_poses_and_fit_beside_it(opened, tmp_path):
@@ -83,12 +80,9 @@ def test_labels_give_the_scores_of_the_same_annotations_and_flat_ones_those_of_l
     assert held_out.reset_index(drop=True).equals(of_lerf.reset_index(drop=True))
 
 
-def test_labelled_views_without_pose_are_named(block_world, rows):
+def test_labelled_views_without_pose_and_labels_of_another_shape_are_refused(block_world, rows):
     with pytest.raises(SceneError, match=r"have no pose: 007\.png\n"):
         rows(labelled(block_world, views=("001.png", "007.png")))
-
-
-def test_labels_of_another_shape_than_the_view_are_refused(rows):
     wide = region_of(np.ones((64, 80), bool), "bear")
     scene = LabelledScene("lerf_ovs", "blocks", {}, None, {"001.png": (wide,)})
     with pytest.raises(SceneError, match=r"label of view 001.png does not match"):

@@ -25,16 +25,16 @@ from tests.unit.evaluate.builders import box, cameras_of, masks_of
 HEIGHT, WIDTH, FOCAL = 6, 10, 8.0
 
 
-def camera(name: str, x: float) -> Camera:
-    """Looks along +z from (x, 0, 0)."""
+def pose_at(x):
+    """Camera pose that looks along +z from (x, 0, 0)."""
     pose = np.eye(4)
     pose[0, 3] = -x
-    K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-    return Camera(name, pose, K, (HEIGHT, WIDTH))
+    return pose
 
 
+K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
 # A wall at depth 4: a step of 1 to the right moves it by 8 * 1 / 4 = 2 px to the left.
-A, B = camera("a", 0.0), camera("b", 1.0)
+A, B = (Camera("", pose_at(x), K, (HEIGHT, WIDTH)) for x in (0, 1))
 WALL = np.full((HEIGHT, WIDTH), 4.0, np.float32)
 
 
@@ -51,7 +51,7 @@ def test_points_of_a_wall_move_by_its_disparity():
 
 def test_a_slanted_wall_keeps_its_points():
     # depth 4 + x: seen in both views, a plane; its inverse depth is linear in the image
-    def depth(step: float) -> np.ndarray:
+    def depth(step):
         slope = (np.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL
         return np.tile((4 + step) / (1 - slope), (HEIGHT, 1)).astype(np.float32)
 
@@ -63,23 +63,20 @@ def test_a_slanted_wall_keeps_its_points():
     assert np.array_equal(pixel_b % WIDTH, expected)
 
 
-def test_hidden_points_are_not_shared():
+def test_hidden_points_the_sky_and_surfaces_behind_the_camera_are_not_shared():
     # in B something nearer (depth 2) covers columns 3 to 5 and hides the wall there
     hidden = WALL.copy()
     hidden[:, 3:6] = 2.0
     _, pixel_b = shared_points(A, WALL, B, hidden)
     # A's pixels are projected to pixel centres, where no neighbour counts
     assert set(pixel_b % WIDTH) == {0, 1, 2, 6, 7}
-
-
-def test_the_sky_and_surfaces_behind_the_camera_are_not_shared():
     sky = np.full((HEIGHT, WIDTH), np.inf, np.float32)
-    back = Camera("back", np.diag([-1.0, 1.0, -1.0, 1.0]), A.K, A.size_hw)
+    back = Camera("back", np.diag([-1.0, 1.0, -1.0, 1.0]), K, A.size_hw)
     for views in ((A, sky, B, WALL), (A, WALL, B, sky), (A, WALL, back, WALL)):
         assert len(shared_points(*views)[0]) == 0
 
 
-def columns(left: int, right: int) -> np.ndarray:
+def columns(left, right):
     return box((0, HEIGHT), (left, right), (HEIGHT, WIDTH))
 
 
@@ -125,24 +122,23 @@ def test_very_small_masks_are_not_compared_and_smaller_ones_are_painted_last():
 
 
 def test_neighbours_are_the_nearest_cameras():
-    cameras = cameras_of([camera("", x).cam_from_world for x in (0.0, 1.0, 3.0)], A.K, A.size_hw)
+    cameras = cameras_of([pose_at(x) for x in (0, 1, 3)], K, A.size_hw)
     first, second, third = cameras.names
     assert neighbours(cameras, cameras.names, 1) == [(first, second), (second, first), (third, second)]
     assert len(neighbours(cameras, cameras.names, 5)) == 6
 
 
 def test_means_ignore_undefined_values():
-    nan = float("nan")
-    mean = mean_agreement([Agreement(2, 0.5, 0.1, nan), Agreement(0, nan, 0.3, 0.4)])
-    assert mean == Agreement(2, 0.5, 0.2, 0.4)
+    parts = [Agreement(2, 0.5, 0.1, np.nan), Agreement(0, np.nan, 0.3, 0.4)]
+    assert mean_agreement(parts) == Agreement(2, 0.5, 0.2, 0.4)
 
 
 @pytest.fixture
 def world(tmp_path):
     """Truth folder and exact masks of the wall in two views; its nodes are a left and a right half."""
     truth, size_hw = tmp_path / "truth", (12, 20)
-    K = np.array([[16.0, 0, 10], [0, 16.0, 6], [0, 0, 1]])  # a step of 1 to the right: 4 px to the left
-    cameras = cameras_of([A.cam_from_world, B.cam_from_world], K, size_hw)
+    # with twice the pixels, a step of 1 to the right moves the wall by 4 px to the left
+    cameras = cameras_of([pose_at(0), pose_at(1)], np.diag([2, 2, 1]) @ K, size_hw)
     truth.mkdir()
     cameras.save(truth / "cameras.npz")
     corners = [(-9, -9, 4), (9, -9, 4), (9, 9, 4), (-9, 9, 4)]

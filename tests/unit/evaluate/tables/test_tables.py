@@ -5,15 +5,18 @@ import subprocess
 import sys
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from hilsplat.base.errors import ArtifactError
 from hilsplat.configuration import RunSettings
 from hilsplat.datasets.classes import SCANNET200_INSTANCES
 from hilsplat.evaluate.metrics.instances import match_instances
+from hilsplat.evaluate.protocols.cards import INSTANCES, LERF_MASK, OVS_ARGMAX
 from hilsplat.evaluate.scores import write_instances, write_scores
 from hilsplat.evaluate.tables.build import TABLES, published_values, run_table
 from hilsplat.evaluate.tables.formats import latex_text
+from hilsplat.evaluate.tables.measured import table_value
 from hilsplat.evaluate.tables.point_tables import bootstrap_mean
 from hilsplat.evaluate.tables.rows import Block, Cell, Row, read_published
 from tests.conftest import PROJECT
@@ -100,9 +103,11 @@ def test_lerf_table_has_a_column_per_scene_and_the_mean_of_scenes(tmp_path):
     assert cells(row, "one mBIoU", "Average mBIoU", "Average localization") == ["25.00", "25.00", "50.00"]
 
 
-def test_lerf_mask_means_go_over_texts_and_rows_of_a_published_data_set_are_measured_rows(tmp_path):
+@pytest.mark.parametrize("departures", ["", " (filter 20)"])
+def test_lerf_mask_means_go_over_texts_and_rows_of_a_published_data_set_are_measured(tmp_path, departures):
     values = ("apple", "a", 0.8), ("apple", "b", 0.6), ("egg", "a", 0.3)
-    of_mask = {"dataset": "lerf_mask", "protocol": "lerf-mask/gaussian-grouping@1", "level": ""}
+    protocol = f"lerf-mask/gaussian-grouping@1{departures}"
+    of_mask = {"dataset": "lerf_mask", "protocol": protocol, "level": ""}
     scores = [score("iou", value, query=query, view=view, **of_mask) for query, view, value in values]
     rows, forms = built(tmp_path, "lerf", scores)
     row = measured(rows)
@@ -119,18 +124,29 @@ def test_ablation_rows_take_localization_from_the_flat_protocol(tmp_path):
 
 
 def test_ablation_rows_are_compared_with_the_default_field_scene_by_scene(tmp_path):
-    values = {"default": (0.4, 0.8), "d-8": (0.5, 0.7), "d-8.seed1": (0.7, 0.9), "paper": (0.3, None)}
+    values = {
+        ("one", "whole"): {"default": 0.4, "d-8": 0.5, "d-8.seed1": 0.7, "paper": 0.2},
+        ("one", "part"): {"default": 0.2, "d-8": 0.3},
+        ("two", "whole"): {"default": 0.8, "d-8": 0.7, "d-8.seed1": 0.9},
+    }
     scores = [
-        score("iou", value, variant=variant, method="field", scene=scene)
-        for variant, of_scenes in values.items()
-        for scene, value in zip(("one", "two"), of_scenes, strict=True)
-        if value is not None
+        score("iou", value, variant=variant, method="field", scene=scene, level=level)
+        for (scene, level), of_variants in values.items()
+        for variant, value in of_variants.items()
     ]
     rows, forms = built(tmp_path, "ablation", scores)
     differences = {row["method"]: row["against default field"] for row in rows if row["kind"] != "reported"}
-    # scene one: (0.5 + 0.7) / 2 - 0.4 = 0.2; scene two: (0.7 + 0.9) / 2 - 0.8 = 0
-    assert differences == {"hilsplat (field)": "", "d-8": "10.00 ± 10.00", "paper": "-10.00"}
-    assert "+10.0 ± 10.0" in forms[".md"]
+    # levels, then seeds. Scene one: (0.4 + 0.7) / 2 - 0.3 = 0.25; scene two: (0.7 + 0.9) / 2 - 0.8 = 0
+    assert differences == {"hilsplat (field)": "", "d-8": "12.50 ± 12.50", "paper": "-10.00"}
+    assert "+12.5 ± 12.5" in forms[".md"]
+
+
+def test_averaging_orders_are_not_mixed_and_pooled_protocols_have_no_number_per_scene():
+    pairs, classes, pooled = (card.full_name for card in (OVS_ARGMAX, LERF_MASK, INSTANCES))
+    for protocols, message in (((pairs, classes), "several averaging orders"), ((pooled,), "pooled")):
+        frame = pd.DataFrame({"protocol": protocols, "metric": "iou", "scene": "one", "value": 0.5})
+        with pytest.raises(AssertionError, match=message):
+            table_value(frame, "iou")
 
 
 @pytest.mark.parametrize("name", ["hierarchy", "lerf", "ablation"])
