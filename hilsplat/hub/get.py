@@ -114,7 +114,11 @@ def get_models(
             else:
                 prepared.append(_prepare(requested, listing, target, variant))
     if prepared:
-        _require_space(prepared, models)
+        fetched = sum(each.num_bytes(missing=True) for each in prepared)
+        made = sum(each.num_bytes() * (EXPORT_FACTOR - 1) for each in prepared if each.choice.exported)
+        free = shutil.disk_usage(models).free
+        logger.info("%.1f MB to download; %.1f GB free on the disk of %s", fetched / 1e6, free / 1e9, models)
+        require_free_space(models, (fetched + made + SPARE_BYTES) / 2**20)
     for found in prepared:
         with explain_refusals(found.requested, models), output_lock(found.target):
             texts.append(_install(found))
@@ -166,15 +170,6 @@ def _prepare(requested: ModelRequest, listing: Listing, target: Path, variant: s
     if choice.exported:
         require_exporter(requested.repository)
     return found
-
-
-def _require_space(prepared: Sequence[Prepared], models: Path) -> None:
-    """Log the size of the download and the free space, and refuse a download that does not fit."""
-    fetched = sum(each.num_bytes(missing=True) for each in prepared)
-    made = sum(each.num_bytes() * (EXPORT_FACTOR - 1) for each in prepared if each.choice.exported)
-    free = shutil.disk_usage(models).free
-    logger.info("%.1f MB to download; %.1f GB free on the disk of %s", fetched / 1e6, free / 1e9, models)
-    require_free_space(models, (fetched + made + SPARE_BYTES) / 2**20)
 
 
 def _install(found: Prepared) -> str:

@@ -159,8 +159,7 @@ def _row_loop(
 
 def whole_clip(folder: Path) -> Path | None:
     """Return the path of a folder's network with both halves, or None."""
-    places = (folder / WHOLE, folder / "onnx" / WHOLE)
-    return next((place for place in places if place.is_file()), None)
+    return next((place for place in (folder / WHOLE, folder / "onnx" / WHOLE) if place.is_file()), None)
 
 
 def split_clip(folder: Path) -> list[Path]:

@@ -92,7 +92,6 @@ class DecoderGraph:
         return Linear(np.ascontiguousarray(weight.T), bias)
 
     def attention(self, module: str) -> Attention:
-        """Return an attention block."""
         out = "out" if self._find(f"{module}/out_proj/MatMul") is not None else "o"  # SAM, SAM 2
         return Attention(*(self.linear(f"{module}/{part}_proj") for part in ("q", "k", "v", out)))
 
@@ -105,7 +104,6 @@ class DecoderGraph:
         return [self.linear(f"{module}/{name}") for name in found]
 
     def norm(self, module: str) -> Norm:
-        """Return a layer norm."""
         node = self._find(f"{module}/LayerNormalization")
         eps = [each.f for each in node.attribute if each.name == "epsilon"] if node is not None else []
         scale, shift = (self.parameter(f"{module}/{name}") for name in ("weight", "bias"))

@@ -376,7 +376,7 @@ def read_logits(
     for row, each in enumerate(logits):  # one by one, in the processor's cache
         steps[row] = np.clip(np.rint(each / np.float32(LOGIT_STEP)), -127, 127)
         seen = steps[row, :height, :width]
-        stability[row] = np.count_nonzero(seen > upper) / max(1, np.count_nonzero(seen > lower))
+        stability[row] = np.count_nonzero(seen > upper) / max(1, int(np.count_nonzero(seen > lower)))
     return steps, stability, positive_boxes(steps)
 
 

@@ -54,8 +54,6 @@ def test_the_settings_determine_the_pixels_of_a_crop(colour_clip):
     image[:5, :5] = (0, 255, 0)
     image[:4, :4] = (255, 0, 0)
     assert model.embed_masks(image, pack([mask]), ClipSettings(crop="langsplat")).tolist() == [[1, 0, 0]]
-    (box,) = model.embed_masks(image, pack([mask]))
-    np.testing.assert_allclose(box, np.array([16, 9, 0]) / np.hypot(16, 9), atol=1e-2)
 
 
 def test_vectors_do_not_depend_on_the_batch(colour_clip):
@@ -108,20 +106,9 @@ def red_scene(tmp_path) -> tuple[Path, Path]:
     return save_scene(tmp_path / "scene", dict.fromkeys(names, image)), tmp_path / "masks"
 
 
-def test_finished_views_are_reused(red_scene, colour_clip, tmp_path, monkeypatch):
-    scene, masks = red_scene
-    settings = ClipSettings(model=str(colour_clip))
-    run_clip(scene, masks, None, tmp_path / "first", tmp_path / "cache", settings, threads=2)
-    np.testing.assert_array_equal(read_npy(tmp_path / "first" / "0.png.npy"), [[1, 0, 0], [0, 1, 0]])
-    assert read_index(tmp_path / "first")["dim"] == 3
-    assert digests_in(tmp_path / "first") == digests_in(masks)
-
-    monkeypatch.setattr(Network, "__call__", pytest.fail)
-    run_clip(scene, masks, None, tmp_path / "second", tmp_path / "cache", settings, threads=1)
-    assert sha256_of_path(tmp_path / "first") == sha256_of_path(tmp_path / "second")
-
-
-def test_only_the_best_crops_of_each_node_are_embedded_and_never_twice(red_scene, colour_clip, tmp_path):
+def test_only_the_best_crops_of_each_node_are_embedded_and_never_twice(
+    red_scene, colour_clip, tmp_path, monkeypatch
+):
     scene, masks = red_scene
     tree = tmp_path / "semantic_tree"
     # Two views of two masks: the first masks show node 0, better in the second view; no node has the others.
@@ -137,8 +124,13 @@ def test_only_the_best_crops_of_each_node_are_embedded_and_never_twice(red_scene
     with patch.object(ClipModel, "embed_crops", autospec=True, side_effect=embed) as embedded:
         run_clip(scene, masks, None, tmp_path / "all", cache, settings, threads=1)
     assert [len(call.args[1]) for call in embedded.call_args_list] == [1]  # both views have the same crops
-    run_clip(scene, masks, None, tmp_path / "fresh", tmp_path / "other", settings, threads=1)
-    assert sha256_of_path(tmp_path / "all") == sha256_of_path(tmp_path / "fresh")
+    assert read_npy(tmp_path / "all" / "0.png.npy").tolist() == [[1, 0, 0], [0, 1, 0]]
+    assert read_index(tmp_path / "all")["dim"] == 3
+    assert digests_in(tmp_path / "all") == digests_in(masks)
+    run_clip(scene, masks, None, tmp_path / "fresh", tmp_path / "other", settings, threads=2)
+    monkeypatch.setattr(Network, "__call__", pytest.fail)
+    run_clip(scene, masks, None, tmp_path / "again", cache, settings, threads=1)
+    assert len({sha256_of_path(tmp_path / name) for name in ("all", "fresh", "again")}) == 1
 
 
 def test_a_tree_without_nodes_chooses_every_mask(tmp_path):

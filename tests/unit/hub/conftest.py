@@ -4,31 +4,20 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import huggingface_hub
-import numpy as np
 import onnx
 import pytest
 from huggingface_hub import file_download
 from huggingface_hub.utils import reset_sessions
-from onnx import numpy_helper
 
 from hilsplat.hub import get
 from tests.loopback_hub import LoopbackHub, loopback_hub
 from tests.unit.export.conftest import clip_parts, transformers
 from tests.unit.finished_desk import write_colour_clip
-from tests.unit.segment.conftest import write_disc_sam
+from tests.unit.segment.handmade import write_disc_sam
 
 __all__ = ["clip_parts", "transformers"]
 
 SAM, CLIP = "Xenova/sam-vit-base", "Xenova/clip-vit-base-patch16"
-PADDING_BYTES = 600_000
-
-
-def pad(network: Path) -> None:
-    """Enlarge a network's file by a constant that the network does not use."""
-    model = onnx.load(network)
-    noise = np.random.default_rng(0).integers(0, 255, PADDING_BYTES, dtype=np.uint8)
-    model.graph.initializer.append(numpy_helper.from_array(noise, "unused"))
-    network.write_bytes(model.SerializeToString())
 
 
 @pytest.fixture(scope="session")
@@ -36,18 +25,16 @@ def repositories(tmp_path_factory) -> dict[str, Path]:
     """Repositories of the two models, with a card and a second set of networks."""
     folder = tmp_path_factory.mktemp("hub")
     sam = write_disc_sam(folder / "sam")
-    pad(sam / "onnx/vision_encoder.onnx")
+    encoder = onnx.load(sam / "onnx/vision_encoder.onnx")
+    encoder.doc_string = "padding" * 90_000
+    onnx.save(encoder, sam / "onnx/vision_encoder.onnx")
     for name in ("vision_encoder", "prompt_encoder_mask_decoder"):
         content = (sam / f"onnx/{name}.onnx").read_bytes()
         (sam / f"onnx/{name}_quantized.onnx").write_bytes(content)
     (sam / "README.md").write_text("card")
-    clip = folder / "clip"
-    write_colour_clip(clip)
-    (clip / "onnx").mkdir()
-    for network in clip.glob("*.onnx"):
-        network.rename(clip / "onnx" / network.name)
-    (clip / "onnx/model.onnx").write_bytes(b"both halves, which are not needed")
-    return {SAM: sam, CLIP: clip}
+    write_colour_clip(folder / "clip")
+    (folder / "clip/model.onnx").write_bytes(b"both halves, which are not needed")
+    return {SAM: sam, CLIP: folder / "clip"}
 
 
 def point_at(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from hilsplat.base.errors import ModelError
-from hilsplat.models.folder import external_weights, open_model_folder, variants_of
+from hilsplat.models.folder import external_weights, open_model_folder
 from hilsplat.models.onnx_graph import split_clip
 from hilsplat.segment.sam import SamModel
 from tests.conftest import PROJECT
@@ -31,17 +31,14 @@ def test_the_digest_covers_external_weights_in_a_file_of_any_name(sam, location)
     model, weights = open_model_folder(sam), sam / "onnx" / location
     assert weights in model.files
     before = model.digest
-    changed = bytearray(weights.read_bytes())
-    changed[1000] ^= 1
-    weights.write_bytes(changed)
+    weights.write_bytes(bytes(weights.stat().st_size))
     assert open_model_folder(sam).digest != before
 
 
 def test_external_weights_of_constants_are_found(tmp_path):
-    value = numpy_helper.from_array(np.ones(99, np.float32))
-    constant = helper.make_node("Constant", [], ["y"], value=value)
-    output = helper.make_tensor_value_info("y", TensorProto.FLOAT, [99])
     path = tmp_path / "constant.onnx"
+    constant = helper.make_node("Constant", [], ["y"], value=numpy_helper.from_array(np.ones(99, np.float32)))
+    output = helper.make_tensor_value_info("y", TensorProto.FLOAT, [99])
     onnx.save(helper.make_model(helper.make_graph([constant], "constant", [], [output])), path)
     move_weights(path, "elsewhere")
     assert external_weights(path, tmp_path) == [tmp_path / "elsewhere"]
@@ -59,51 +56,35 @@ def test_missing_weights_and_links_to_weights_outside_the_folder_are_refused(sam
         open_model_folder(sam)
 
 
-def test_a_variant_is_chosen_by_its_ending(sam):
-    plain = open_model_folder(sam).digest
-    for path in (sam / "onnx").glob("*.onnx"):
-        path.rename(path.with_name(f"{path.stem}_fp16.onnx"))
+def test_a_variant_is_chosen_by_its_ending_which_all_networks_must_have(sam):
+    plain, encoder = open_model_folder(sam).digest, sam / "onnx/vision_encoder.onnx"
+    shutil.copy(encoder, encoder.with_name("vision_encoder_q4.onnx"))
+    for path in (encoder, sam / "onnx/prompt_encoder_mask_decoder.onnx"):
+        shutil.copy(path, path.with_name(f"{path.stem}_fp16.onnx"))
+    with pytest.raises(ModelError, match=r"lacks onnx/prompt_encoder_mask_decoder_q4.onnx(.|\n)*'', 'fp16'"):
+        open_model_folder(sam, variant="q4")
+    model = SamModel.load(sam, "fp16")
+    assert model.encoder.path.name == "vision_encoder_fp16.onnx" and model.digest != plain
+    encoder.unlink()
     with pytest.raises(ModelError, match=r"have suffixes: set masks.variant to one of 'fp16'"):
         SamModel.load(sam)
-    model = SamModel.load(sam, "fp16")
-    assert model.encoder.path.name == "vision_encoder_fp16.onnx"
-    assert model.digest != plain
 
 
-def test_variants_are_those_that_all_networks_have(sam):
-    for ending in ("q4", "int8"):
-        shutil.copy(sam / "onnx/vision_encoder.onnx", sam / f"onnx/vision_encoder_{ending}.onnx")
-    decoder = sam / "onnx/prompt_encoder_mask_decoder.onnx"
-    shutil.copy(decoder, decoder.with_name("prompt_encoder_mask_decoder_int8.onnx"))
-    assert variants_of(sam, "sam") == ["", "int8"]
-    with pytest.raises(ModelError, match=r"lacks onnx/prompt_encoder_mask_decoder_q4.onnx(.|\n)*'', 'int8'"):
-        open_model_folder(sam, variant="q4")
-
-
-def write_whole_clip(folder, external: bool) -> None:
-    """A `model.onnx` whose halves scale their inputs by different weights."""
+def test_halves_compute_the_same_as_the_whole_and_splitting_reads_no_weights(tmp_path, monkeypatch):
     text = """whole (float[1,64] pixel_values, float[1,64] input_ids, float[1,64] attention_mask)
     => (float[1,64] image_embeds, float[1,64] text_embeds) {
         image_embeds = Mul (pixel_values, more)
         words = Mul (input_ids, less)
         text_embeds = Mul (words, attention_mask)
     }"""
-    numbers = np.arange(64, dtype=np.float32)
+    numbers, folder = np.arange(64, dtype=np.float32), tmp_path / "clip"
     save_network(folder / "model.onnx", text, more=numbers, less=-numbers)
-    if external:
-        move_weights(folder / "model.onnx", "model.onnx_data")
-
-
-@pytest.mark.parametrize("external", [False, True])
-def test_halves_compute_the_same_as_the_whole_and_splitting_reads_no_weights(tmp_path, external, monkeypatch):
-    write_whole_clip(tmp_path / "clip", external)
-    if external:  # above 2 GiB they do not fit into the graph
-        monkeypatch.setattr(onnx, "load_external_data_for_model", pytest.fail)
-    vision, text = split_clip(tmp_path / "clip")
+    move_weights(folder / "model.onnx", "model.onnx_data")
+    monkeypatch.setattr(onnx, "load_external_data_for_model", pytest.fail)  # above 2 GiB, no graph holds them
+    vision, text = split_clip(folder)
     ones = np.ones((1, 64), np.float32)
     run = onnxruntime.InferenceSession
-    np.testing.assert_array_equal(run(vision).run(None, {"pixel_values": ones})[0][0], np.arange(64))
+    np.testing.assert_array_equal(run(vision).run(None, {"pixel_values": ones})[0][0], numbers)
     fed = {"input_ids": ones, "attention_mask": ones}
-    np.testing.assert_array_equal(run(text).run(None, fed)[0][0], -np.arange(64))
-    expected = [tmp_path / "clip/model.onnx_data"] if external else []
-    assert external_weights(vision, tmp_path / "clip") == expected
+    np.testing.assert_array_equal(run(text).run(None, fed)[0][0], -numbers)
+    assert external_weights(vision, folder) == [folder / "model.onnx_data"]

@@ -43,10 +43,6 @@ def test_the_estimate_for_clip_vit_b_16_agrees_with_the_measurement(tmp_path):
     assert needs.view_mib == pytest.approx(521, rel=0.25)
 
 
-def test_free_memory_is_part_of_the_machine():
-    assert 0 < available_mib() <= machine_mib()
-
-
 GIB, UNLIMITED = 2**30, 9223372036854771712
 V1, V2 = "9:cpuset:/\n4:cpu,memory:/a/b\n0::/\n", "0::/a/b\n"
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from hilsplat.configuration import with_models
-from hilsplat.models.store import EMBEDDED, model_path, present_models, read_model, real_model
+from hilsplat.models.store import model_path, present_models, read_model, real_model
 from hilsplat.settings import ClipSettings, FieldSettings, MasksSettings
 
 AUTO = MasksSettings(segmenter="auto", model="auto")
@@ -26,10 +26,6 @@ def models(tmp_path, monkeypatch) -> Path:
     write_model(Path("models/sam-tiny"), "sam", embedded=True)
     write_model(Path("models/clip-tiny"), "clip", embedded=True)
     return Path("models")
-
-
-def test_embedded_models_are_recognised(project):
-    assert all(read_model(project / folder).embedded for folder in EMBEDDED.values())
 
 
 def test_without_a_pretrained_model_photographs_use_the_graph_segmenter_and_the_embedded_clip(models):

@@ -88,45 +88,8 @@ def move_weights(path: Path, location: str) -> None:
     """Move a network's weights and constants to a separate file."""
     model = onnx.load(path)
     path.unlink()
-    options = {"size_threshold": 64, "convert_attribute": True}
+    options = {"size_threshold": 128, "convert_attribute": True}
     onnx.save(model, path, save_as_external_data=True, location=location, **options)
-
-
-def _write_disc_decoder(path: Path, every: slice, cell_px: float) -> None:
-    """Write the decoder of `write_disc_sam`; masks contain only the rows and columns in `every`."""
-    centres = ((np.arange(LOW, dtype=np.float32) + 0.5) * FRAME / LOW)[every]
-    low = len(centres)
-    x, y = np.meshgrid(centres, centres)
-    to_middle_of_cell = """
-        in_cells = Div (input_points, cell)
-        corner = Floor (in_cells)
-        middle = Add (corner, half)
-        centre = Mul (middle, cell)
-    """
-    save_network(
-        path,
-        f"""discs (
-            float[1,P,1,2] input_points, int64[1,P,1] input_labels,
-            float[1,3,{LOW},{LOW}] image_embeddings, float[1,3,{LOW},{LOW}] image_positional_embeddings
-        ) => (float[1,P,3] iou_scores, float[1,P,3,{low},{low}] pred_masks) {{
-            {to_middle_of_cell if cell_px else "centre = Identity (input_points)"}
-            offset = Sub (centre, grid)
-            distance = ReduceL2 <axes = [3]> (offset)
-            apart = Transpose <perm = [0, 1, 3, 2]> (distance)
-            logits = Sub (radii, apart)
-            pred_masks = Reshape (logits, shape)
-            peak = ReduceMax <axes = [3], keepdims = 0> (logits)
-            nothing = Mul (peak, zero)
-            iou_scores = Add (nothing, scores)
-        }}""",
-        cell=np.array([cell_px], np.float32),
-        half=np.array([0.5], np.float32),
-        grid=np.stack([x.reshape(-1), y.reshape(-1)], axis=1)[None, None],
-        radii=np.array(RADII, np.float32)[None, None, :, None],
-        shape=np.array([1, -1, 3, low, low]),
-        zero=np.zeros(1, np.float32),
-        scores=np.array(SCORES, np.float32),
-    )
 
 
 def write_disc_sam(folder: Path, cell_px: float = 0) -> Path:
@@ -143,9 +106,41 @@ def write_disc_sam(folder: Path, cell_px: float = 0) -> Path:
             image_positional_embeddings = Identity (image_embeddings)
         }}""",
     )
+    to_middle_of_cell = """
+        in_cells = Div (input_points, cell)
+        corner = Floor (in_cells)
+        middle = Add (corner, half)
+        centre = Mul (middle, cell)
+    """
     networks = {DECODER: slice(None), PREVIEW: slice(None, None, 2)} if cell_px else {DECODER: slice(None)}
-    for name, every in networks.items():
-        _write_disc_decoder(folder / "onnx" / f"{name}.onnx", every, cell_px)
+    for name, every in networks.items():  # rows and columns of the masks
+        centres = ((np.arange(LOW, dtype=np.float32) + 0.5) * FRAME / LOW)[every]
+        low = len(centres)
+        x, y = np.meshgrid(centres, centres)
+        save_network(
+            folder / "onnx" / f"{name}.onnx",
+            f"""discs (
+                float[1,P,1,2] input_points, int64[1,P,1] input_labels,
+                {features} image_embeddings, {features} image_positional_embeddings
+            ) => (float[1,P,3] iou_scores, float[1,P,3,{low},{low}] pred_masks) {{
+                {to_middle_of_cell if cell_px else "centre = Identity (input_points)"}
+                offset = Sub (centre, grid)
+                distance = ReduceL2 <axes = [3]> (offset)
+                apart = Transpose <perm = [0, 1, 3, 2]> (distance)
+                logits = Sub (radii, apart)
+                pred_masks = Reshape (logits, shape)
+                peak = ReduceMax <axes = [3], keepdims = 0> (logits)
+                nothing = Mul (peak, zero)
+                iou_scores = Add (nothing, scores)
+            }}""",
+            cell=np.array([cell_px], np.float32),
+            half=np.array([0.5], np.float32),
+            grid=np.stack([x.reshape(-1), y.reshape(-1)], axis=1)[None, None],
+            radii=np.array(RADII, np.float32)[None, None, :, None],
+            shape=np.array([1, -1, 3, low, low]),
+            zero=np.zeros(1, np.float32),
+            scores=np.array(SCORES, np.float32),
+        )
     own = {"predicted_iou_min": 0.35, "stability_min": 0.5, "nms_score": 0.0, "points_per_batch": 64}
     (folder / "config.json").write_text(json.dumps({"model_type": "sam", "mask_generation": own}))
     sizes = {"size": {"longest_edge": FRAME}, "pad_size": {"height": FRAME, "width": FRAME}}

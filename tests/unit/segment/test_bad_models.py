@@ -14,27 +14,15 @@ from hilsplat.models.network import Network, require_one_space
 from hilsplat.segment.sam import SamModel
 from tests.unit.segment.handmade import save_network
 
+ENCODER, CONFIG, PREPROCESSOR = "onnx/vision_encoder.onnx", "config.json", "preprocessor_config.json"
+SAM = {"model_type": "sam"}
 LFS_POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 2548000000\n"
 
 
-def encoder(content: bytes) -> Callable[[Path], object]:
-    return lambda folder: (folder / "onnx/vision_encoder.onnx").write_bytes(content)
-
-
-def config(content: str) -> Callable[[Path], object]:
-    return lambda folder: (folder / "config.json").write_text(content)
-
-
-def thresholds(own: object) -> Callable[[Path], object]:
-    return config(json.dumps({"model_type": "sam", "mask_generation": own}))
-
-
-def preprocessor(entry: dict) -> Callable[[Path], object]:
-    return lambda folder: (folder / "preprocessor_config.json").write_text(json.dumps(entry))
-
-
-def as_variant(folder: Path) -> None:
-    (folder / "onnx/vision_encoder.onnx").rename(folder / "onnx/vision_encoder_quantized.onnx")
+def written(name: str, content: object) -> Callable[[Path], object]:
+    """Return a function that replaces a file of a folder by these bytes or this JSON value."""
+    data = content if isinstance(content, bytes) else json.dumps(content).encode()
+    return lambda folder: (folder / name).write_bytes(data)
 
 
 def as_torch(folder: Path) -> None:
@@ -46,23 +34,23 @@ def as_torch(folder: Path) -> None:
     ("change", "words"),
     [
         (shutil.rmtree, r"is missing(.|\n)*masks.segmenter: graph, which needs no model"),
-        (as_variant, r"lacks onnx/vision_encoder.onnx(.|\n)*vision_encoder_quantized.onnx"),
+        (lambda folder: (folder / ENCODER).unlink(), "lacks onnx/vision_encoder.onnx"),
         (as_torch, r"PyTorch weights(.|\n)*hilsplat models get(.|\n)*docs/models.md"),
-        (encoder(b""), r"cannot be opened(.|\n)*a file of 0 bytes"),
-        (encoder(b"half of a network"), r"encoder.onnx cannot be opened(.|\n)*fetch a complete copy"),
-        (encoder(LFS_POINTER), r"Git LFS pointer(.|\n)*git lfs pull"),
-        (config("{"), r"no readable config.json(.|\n)*model_type"),
-        (config("[]"), r"a different kind of model(.|\n)*model_type"),
-        (config('{"model_type": 3}'), r"a different kind of model(.|\n)*model_type"),
-        (config('{"model_type": "sam3"}'), r"SAM 2 or 2.1 \(sam2\)(.|\n)*sam3(.|\n)*use SAM 2.1"),
-        (config('{"model_type": "blip"}'), r"SAM 2 or 2.1 \(sam2\)(.|\n)*blip(.|\n)*docs/models.md"),
-        (thresholds({"stability_min": 3}), "config.json: mask_generation is invalid"),
-        (thresholds({"segmenter": "graph"}), "config.json: mask_generation is invalid"),
-        (thresholds([1]), "config.json: mask_generation is invalid"),
-        (preprocessor({"do_normalize": False}), "disables do_normalize"),
-        (preprocessor({"image_std": [0, 1, 1]}), "image_std is invalid"),
-        (preprocessor({"image_std": "x"}), "image_std is invalid"),
-        (preprocessor({"image_mean": [1e999, 0, 0]}), "image_mean is invalid"),
+        (written(ENCODER, b""), r"cannot be opened(.|\n)*a file of 0 bytes"),
+        (written(ENCODER, b"half"), r"encoder.onnx cannot be opened(.|\n)*fetch a complete copy"),
+        (written(ENCODER, LFS_POINTER), r"Git LFS pointer(.|\n)*git lfs pull"),
+        (written(CONFIG, b"{"), r"no readable config.json(.|\n)*model_type"),
+        (written(CONFIG, []), r"a different kind of model(.|\n)*model_type"),
+        (written(CONFIG, {"model_type": 3}), r"a different kind of model(.|\n)*model_type"),
+        (written(CONFIG, {"model_type": "sam3"}), r"SAM 2 or 2.1 \(sam2\)(.|\n)*sam3(.|\n)*use SAM 2.1"),
+        (written(CONFIG, {"model_type": "blip"}), r"SAM 2 or 2.1 \(sam2\)(.|\n)*blip(.|\n)*docs/models.md"),
+        (written(CONFIG, SAM | {"mask_generation": {"stability_min": 3}}), "mask_generation is invalid"),
+        (written(CONFIG, SAM | {"mask_generation": {"segmenter": "graph"}}), "mask_generation is invalid"),
+        (written(CONFIG, SAM | {"mask_generation": [1]}), "mask_generation is invalid"),
+        (written(PREPROCESSOR, {"do_normalize": False}), "disables do_normalize"),
+        (written(PREPROCESSOR, {"image_std": [0, 1, 1]}), "image_std is invalid"),
+        (written(PREPROCESSOR, {"image_std": "x"}), "image_std is invalid"),
+        (written(PREPROCESSOR, {"image_mean": [1e999, 0, 0]}), "image_mean is invalid"),
     ],
 )
 def test_incomplete_damaged_and_unsupported_folders_are_refused(own_sam, change, words):

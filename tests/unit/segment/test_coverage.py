@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from hilsplat.base.levels import NONE
-from hilsplat.segment.coverage import coverage_parents, coverage_tree, depths, with_tree_levels
+from hilsplat.segment.coverage import coverage_parents, coverage_tree, with_tree_levels
 from tests.unit.segment.handmade import pack
 
 shapes = st.tuples(st.integers(1, 8), st.just(3), st.just(4))
@@ -20,8 +20,7 @@ def rows(*texts: str) -> np.ndarray:
 
 
 def parents_of(masks: np.ndarray, theta: float, level: list[int]) -> list[int]:
-    pixels = masks.reshape(len(masks), -1).astype(np.int64)
-    return coverage_parents(pixels @ pixels.T, np.array(level, np.uint8), theta).tolist()
+    return coverage_parents(pack(masks).overlaps_px(), np.array(level, np.uint8), theta).tolist()
 
 
 def parents_by_loop(masks: np.ndarray, theta: float, level: np.ndarray) -> list[int]:
@@ -71,24 +70,13 @@ def test_both_shares_are_compared_with_theta(theta, expected):
 
 
 @given(nonempty_masks, st.floats(0.51, 0.99), st.data())
-def test_parents_form_a_forest_of_growing_masks(masks, theta, data):
+def test_the_tree_equals_a_loop_over_pairs(masks, theta, data):
     level = data.draw(hnp.arrays(np.uint8, len(masks), elements=st.integers(1, 3)))
-    parents = np.array(parents_of(masks, theta, level.tolist()), np.int32)
-    area_px = masks.sum(axis=(1, 2))
-    children = np.flatnonzero(parents != NONE)
-    assert (area_px[parents[children]] > area_px[children]).all()
-    assert (level[parents[children]] < level[children]).all()
-    depth = depths(parents)
-    assert (depth[children] == depth[parents[children]] + 1).all()
-    assert (depth[parents == NONE] == 1).all()
-
-
-@given(nonempty_masks, st.data())
-def test_the_tree_of_run_lengths_equals_a_loop_over_pairs(masks, data):
-    level = data.draw(hnp.arrays(np.uint8, len(masks), elements=st.integers(1, 3)))
-    parent, depth = coverage_tree(pack(masks, level), theta=0.8)
-    assert parent.tolist() == parents_by_loop(masks, 0.8, level)
-    np.testing.assert_array_equal(depth, depths(parent))
+    parent, depth = coverage_tree(pack(masks, level), theta)
+    assert parent.tolist() == parents_by_loop(masks, theta, level)
+    children = np.flatnonzero(parent != NONE)
+    assert (depth[children] == depth[parent[children]] + 1).all()
+    assert (depth[parent == NONE] == 1).all()
 
 
 def test_levels_by_the_tree_are_depths_for_masks_of_any_head_and_depend_on_theta():

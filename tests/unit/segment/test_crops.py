@@ -40,10 +40,7 @@ def published(image: np.ndarray, mask: np.ndarray, size: int) -> np.ndarray:
     black = np.where(mask[..., None], image, np.uint8(0))[y : y + h, x : x + w]
     side = max(w, h)
     square = np.zeros((side, side, 3), np.uint8)
-    if h > w:
-        square[:, (h - w) // 2 : (h - w) // 2 + w] = black
-    else:
-        square[(w - h) // 2 : (w - h) // 2 + h] = black
+    square[(side - h) // 2 : (side - h) // 2 + h, (side - w) // 2 : (side - w) // 2 + w] = black
     return cv2.resize(square, (size, size))
 
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from benchmarks.canned_sam import CannedSam, NetworkClock
+from benchmarks.memory import status_mib
 from hilsplat.base.levels import Level
 from hilsplat.segment.coverage import coverage_tree
 from hilsplat.segment.generate import (
@@ -81,10 +82,7 @@ def test_crops_by_hand():
 def test_crops_find_finer_masks_and_truncated_ones_are_dropped(model):
     image = np.zeros((128, 128, 3), dtype=np.uint8)
     settings = changed(crop_layers=1, nms_inner=0.0)
-    candidates = decode_candidates(image, model, settings)
-    assert set(candidates.crop.tolist()) == {0, 1, 2, 3, 4}
-    masks = masks_from_candidates(candidates, (128, 128), model, settings)
-    plain = generate(model, SETTINGS, image)
+    masks, plain = generate(model, settings, image), generate(model, SETTINGS, image)
     # whole image: 12 px of radius 3 at 128 px; crops of 86 px: 8 px
     smallest = masks.area_px[masks.rows_of(Level.SUBPART)].min()
     assert smallest < 0.6 * plain.area_px[plain.rows_of(Level.SUBPART)].min()
@@ -131,16 +129,6 @@ def test_a_view_may_have_no_masks(model):
     none = generate(model, changed(min_area_px=5000), IMAGE)
     assert (len(none), none.size_hw) == (0, (32, 32))
     assert [len(each) for each in coverage_tree(none, theta=0.9)] == [0, 0]
-
-
-def test_of_two_predicted_ious_above_1_the_higher_wins(model):
-    y, x = np.mgrid[:16, :16]
-    radii = np.array([5.2, 4.8], np.float32)[:, None, None]  # clipped to 1, the larger disc would win
-    discs = np.repeat((radii - np.hypot(x - 7.5, y - 7.5))[:, None], 3, axis=1).astype(np.float32)
-    scores = np.repeat(np.array([[1.02], [1.06]], np.float32), 3, axis=1)
-    kept = keep_candidates(scores, discs, model.frame((32, 32)), 0, SETTINGS, NOTHING_DROPPED)
-    masks = masks_from_candidates(kept, (32, 32), model, SETTINGS)
-    assert masks.predicted_iou.tolist() == [np.float32(1.06)] * 3
 
 
 @pytest.mark.parametrize(
@@ -194,11 +182,6 @@ def test_prompts_with_a_mask_that_repeats_no_better_one_are_kept():
 
 def test_one_prompt_is_kept_if_the_preview_is_empty():
     assert prompts_of(Previewed([[0.05] * 3] * 3, [[(8, 3)] * 3] * 3)) == [0]
-
-
-def status_mib(name: str) -> float:
-    (line,) = [line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(name)]
-    return int(line.split()[1]) / 1024
 
 
 @pytest.mark.skipif(not CLEAR.exists(), reason="only Linux can reset the peak of memory (/proc)")

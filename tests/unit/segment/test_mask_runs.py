@@ -8,6 +8,7 @@ from hypothesis.extra import numpy as hnp
 
 from hilsplat.base.errors import EmptyMaskError
 from hilsplat.base.levels import Level
+from hilsplat.segment.kernels import BAND_WORDS
 from hilsplat.segment.masks import HierarchicalMasks, encode_runs, runs_of_labels
 from tests.unit.segment.handmade import pack
 
@@ -35,11 +36,11 @@ def test_pixels_overlaps_areas_and_boxes_are_those_of_dense_masks(dense):
 def test_overlaps_of_many_masks_are_counted_band_by_band_and_word_by_word():
     generator = np.random.default_rng(0)
     y, x = np.mgrid[:150, :200]
-    circles = generator.uniform((0, 0, 2), (150, 200, 80), (180, 3))
+    circles = generator.uniform((0, 0, 2), (150, 200, 80), (250, 3))
     discs = [np.hypot(y - cy, x - cx) < radius for cy, cx, radius in circles]
     dense = np.stack([np.ones((150, 200), bool), *(disc for disc in discs if disc.any())])
     dense[1::3] &= generator.random(dense[1::3].shape) > 0.2
-    assert len(dense) * 4 * 150 > 2**16  # more than one band of the packed masks, and more than one word
+    assert len(dense) * 4 * 150 > BAND_WORDS  # more than one band of the packed masks, and more than one word
     flat = dense.reshape(len(dense), -1).astype(np.float64)
     np.testing.assert_array_equal(pack(dense).overlaps_px(), flat @ flat.T)
 
@@ -76,11 +77,6 @@ def test_no_masks_at_all_is_a_valid_view():
     assert none.dense().shape == (0, 3, 4)
     assert (none.label_map(Level.WHOLE) == -1).all()
     assert none.overlaps_px().shape == (0, 0)
-
-
-def test_label_map_paints_small_masks_over_large_ones():
-    small, large = [[0, 1, 0]], [[1, 1, 1]]
-    assert pack(np.array([small, large], dtype=bool)).label_map(Level.WHOLE).tolist() == [[1, 0, 1]]
 
 
 def test_empty_mask_is_refused():

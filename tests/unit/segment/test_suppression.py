@@ -22,11 +22,6 @@ nonempty_masks = hnp.arrays(bool, shapes).filter(lambda masks: masks.any(axis=(1
 scores_of = st.sampled_from([0.1, 0.25, 0.5, 0.75, 1.0])
 
 
-def overlaps(masks: np.ndarray) -> np.ndarray:
-    flat = masks.reshape(len(masks), -1).astype(np.int64)
-    return flat @ flat.T
-
-
 def test_box_iou_by_hand():
     a = np.array([[0, 0, 4, 4]])
     b = np.array([[0, 0, 4, 4], [2, 0, 6, 4], [4, 0, 8, 4]])
@@ -74,7 +69,7 @@ def test_a_contained_mask_is_dropped_even_with_the_better_score():
     masks = np.array([[[1, 1, 1, 1, 1]], [[1, 1, 0, 0, 0]]], dtype=bool)
     score = np.array([0.2, 0.9])
     for inner, expected in ((0.5, [True, False]), (0.0, [True, True])):  # 0 keeps nesting inside a level
-        keep = keep_best_masks(overlaps(masks), score, iou_max=0.8, score_min=0.0, inner=inner)
+        keep = keep_best_masks(pack(masks).overlaps_px(), score, iou_max=0.8, score_min=0.0, inner=inner)
         assert keep.tolist() == expected
 
 
@@ -87,7 +82,9 @@ def test_a_contained_mask_is_dropped_even_with_the_better_score():
 )
 def test_kept_masks_equal_langsplats(masks, data, iou_max, score_min, inner):
     score = np.array(data.draw(st.lists(scores_of, min_size=len(masks), max_size=len(masks))))
-    keep = keep_best_masks(overlaps(masks), score, iou_max=iou_max, score_min=score_min, inner=inner)
+    keep = keep_best_masks(
+        pack(masks).overlaps_px(), score, iou_max=iou_max, score_min=score_min, inner=inner
+    )
     expected = official.suppress(masks, score, MasksSettings(nms_iou=iou_max, nms_inner=inner), score_min)
     assert np.flatnonzero(keep).tolist() == expected
 
