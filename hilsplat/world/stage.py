@@ -10,7 +10,7 @@ import numpy as np
 from hilsplat.base.artifacts import atomic_folder, require_free_space, write_index, write_json, write_npz
 from hilsplat.base.errors import SceneError
 from hilsplat.base.images import write_png
-from hilsplat.base.levels import LEVELS
+from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.processes import in_processes
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.synthetic.hierarchy import write_hierarchy
@@ -20,7 +20,7 @@ from hilsplat.world.objects.catalogue import GENERATOR_VERSION
 from hilsplat.world.render import render_and_label
 from hilsplat.world.scenes.kinds import KINDS, build_scene, scene_cameras
 from hilsplat.world.seeds import TRAINING_SEEDS, split_of_seed
-from hilsplat.world.truth import annotated_nodes, smallest_areas, write_mesh
+from hilsplat.world.truth import MIN_SUBPART_AREA, annotated_nodes, write_mesh
 
 logger = logging.getLogger(__name__)
 
@@ -69,7 +69,8 @@ def run_world(source: str, settings: WorldSettings, out: Path, threads: int) -> 
         scene = _scene(kind, seed, settings.objects)
         cameras = scene_cameras(scene, settings.views, settings.image_px, settings.arc_deg)
         require_free_space(out, needed_mib=5 + settings.views * settings.image_px**2 * 4 / 2**20)
-        smallest = smallest_areas(settings.image_px, settings.min_area_px)
+        smallest: dict[Level, float | int] = dict.fromkeys(LEVELS, settings.min_area_px)
+        smallest[Level.SUBPART] = MIN_SUBPART_AREA * settings.image_px**2
         labels, annotated = {}, {}
         size = {"height": settings.image_px, "width": settings.image_px}
         with atomic_folder(out / "images") as folder:

@@ -22,12 +22,6 @@ HIDDEN_BY = 2e-3
 """A point is hidden if a surface is nearer to the camera by at least this fraction of the distance."""
 
 
-def smallest_areas(image_px: int, min_area_px: int) -> dict[Level, float | int]:
-    """Return the minimum area, in px, of an annotated query in a view, by level."""
-    smallest_subpart = MIN_SUBPART_AREA * image_px**2
-    return {Level.WHOLE: min_area_px, Level.PART: min_area_px, Level.SUBPART: smallest_subpart}
-
-
 def annotated_nodes(
     labels: Int32[np.ndarray, "3 H W"],
     nodes: tuple[AnnotatedNode, ...],
@@ -120,8 +114,6 @@ def views_of_points(
             x, y = (camera.K[a, a] * local[:, a] / local[:, 2] + camera.K[a, 2] for a in range(2))
         height, width = camera.size_hw
         rows = np.flatnonzero((local[:, 2] > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height))
-        if not len(rows):
-            continue
         centre = camera.centre.astype(np.float32)
         ways = points[rows] - centre
         distance = np.linalg.norm(ways, axis=1).astype(np.float32)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hilsplat.world.objects import belongings, furniture, household, kitchen, street, toys
+from hilsplat.world.objects import furniture, household, kitchen, street, toys
 from hilsplat.world.objects.builder import Builder, ObjectModel
 
 GENERATOR_VERSION = 2
@@ -46,14 +46,14 @@ CLASSES: dict[str, dict[str, tuple[str, Callable[[Builder], None]]]] = {
         "camera": ("photo camera, compact camera", household.camera),
         "toaster": ("bread toaster", household.toaster),
         "headphones": ("headset, earphones", household.headphones),
-        "backpack": ("rucksack, school bag", belongings.backpack),
-        "boot": ("winter boot, ankle boot", belongings.boot),
-        "lantern": ("oil lantern, storm lantern", belongings.lantern),
-        "treasure chest": ("pirate chest, money chest", belongings.chest),
-        "cactus": ("saguaro, potted cactus", belongings.cactus),
-        "windmill": ("mill, toy windmill", belongings.windmill),
-        "birdhouse": ("nesting box, bird house", belongings.birdhouse),
-        "watering can": ("garden can, sprinkling can", belongings.watering_can),
+        "backpack": ("rucksack, school bag", household.backpack),
+        "boot": ("winter boot, ankle boot", household.boot),
+        "lantern": ("oil lantern, storm lantern", household.lantern),
+        "treasure chest": ("pirate chest, money chest", household.chest),
+        "cactus": ("saguaro, potted cactus", household.cactus),
+        "windmill": ("mill, toy windmill", household.windmill),
+        "birdhouse": ("nesting box, bird house", household.birdhouse),
+        "watering can": ("garden can, sprinkling can", household.watering_can),
     },
     "room": {  # furniture and fixtures in metres; the lamp is a floor lamp
         "bed": ("sleeping bed", furniture.bed),

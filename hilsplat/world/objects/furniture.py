@@ -79,15 +79,14 @@ def sofa(b: Builder) -> None:
     shape = box((depth - 0.02, inner + 0.02, seat_z - 0.09), (0, 0, (seat_z + 0.09) / 2), 0.02)
     seat = b.part("seat, base", cloth, shape)
     front = depth / 2 - 0.01
-    for i in range(seats):
-        y = (i - (seats - 1) / 2) * inner / seats
+    middles = [(i - (seats - 1) / 2) * inner / seats for i in range(seats)]
+    for y in middles:
         shape = box((depth - 0.24, inner / seats - 0.012, 0.16), (0.12, y, seat_z + 0.075), 0.045)
         seat.subpart("cushion, seat cushion", cushion, shape)
     shape = box((0.18, width - 2 * arm_w + 0.02, top - 0.09), (-depth / 2 + 0.09, 0, (top + 0.09) / 2), 0.04)
     back = b.part("back, backrest", cloth, shape)
     back_paint = b.paint("cloth")
-    for i in range(seats):
-        y = (i - (seats - 1) / 2) * inner / seats
+    for y in middles:
         size = (0.15, inner / seats - 0.03, top - seat_z - 0.15)
         shape = box(size, (-depth / 2 + 0.25, y, (top + seat_z) / 2 + 0.1), 0.06)
         back.subpart("back cushion, back pad", back_paint, shape)

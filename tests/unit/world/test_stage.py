@@ -18,7 +18,7 @@ from hilsplat.world.pictures import show_world, tree_lines
 from hilsplat.world.render import label_view
 from hilsplat.world.scenes.kinds import build_scene
 from hilsplat.world.stage import parse_source, run_world
-from hilsplat.world.truth import annotated_nodes, smallest_areas
+from hilsplat.world.truth import annotated_nodes
 from tests.conftest import PROJECT
 
 SETTINGS = WorldSettings(views=3, image_px=64, arc_deg=30, objects=3, samples=1)
@@ -72,11 +72,6 @@ def test_instances_of_a_text_are_annotated_together_or_not_at_all():
     smallest = {Level.WHOLE: 10, Level.PART: 10, Level.SUBPART: 10}
     # The legs have 11 px between them, the seat 6, and the table is background.
     assert annotated_nodes(labels, nodes, {4}, smallest) == (0, 1, 2)
-
-
-def test_the_minimum_area_of_subparts_scales_with_the_view():
-    assert smallest_areas(384, 60) == {Level.WHOLE: 60, Level.PART: 60, Level.SUBPART: 100}
-    assert smallest_areas(192, 60)[Level.SUBPART] == pytest.approx(25)
 
 
 def test_malformed_sources_and_training_seeds_are_refused():
