@@ -10,8 +10,8 @@ from jaxtyping import Float32, Float64, UInt8, UInt16
 PQ, HLG = 16, 18
 """Transfer characteristics of HDR video (ITU-T H.273): SMPTE ST 2084 and ARIB STD-B67."""
 
-UNSPECIFIED, BT709, BT601, BT2020 = 2, 1, 5, 9
-"""Colour matrices and primaries (ITU-T H.273)."""
+UNSPECIFIED, BT709, BT601 = 2, 1, 5
+"""Colour matrices (ITU-T H.273)."""
 
 WHITE_NITS = 203.0
 """Luminance of reference white in HDR video (ITU-R BT.2408)."""

@@ -89,7 +89,7 @@ class LanguageScene(FieldScene):
         parts = found.parts
         scene = LanguageScene.from_parts(parts, found.evaluate_settings(), threads=threads, opened=opened)
         names = read_names(found.folder, parts.semantic_tree)
-        naming = NodeNaming.load(found.naming, parts.semantic_tree, parts.clip)
+        naming = NodeNaming.load(parts.clip.parent / "names", parts.semantic_tree, parts.clip)
         return replace(scene, names=names, naming=naming, finished=found)
 
     @staticmethod

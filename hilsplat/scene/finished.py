@@ -93,11 +93,6 @@ class FinishedScene:
                 raise _unfinished(folder, path)
         return FinishedScene(folder, variant, parts)
 
-    @property
-    def naming(self) -> Path:
-        """Folder of node names, beside the CLIP vectors used to compute them; it may not exist."""
-        return self.parts.clip.parent / "names"
-
     def evaluate_settings(self) -> EvaluateSettings:
         """Return the query settings of the run that made the scene, from the provenance of its scores.
 
@@ -111,7 +106,7 @@ class FinishedScene:
             found = record.settings.get("evaluate", {})
         else:
             found = {}
-            logger.warning("%s: no scores or panel record the query settings; using defaults", self.folder)
+            logger.warning("%s: no scores or panel record the settings; using the defaults", self.folder)
         known = {name: value for name, value in found.items() if name in EvaluateSettings.model_fields}
         try:
             return EvaluateSettings(**known)
