@@ -1,7 +1,8 @@
-"""Picture of a scene's semantic tree: a crop per node, parents above their children."""
+"""Crops of nodes, and a picture of the semantic tree with a crop per node, parents above their children."""
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
@@ -10,8 +11,10 @@ from hilsplat.base.artifacts import atomic_folder, write_json
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.query.language_scene import LanguageScene
+from hilsplat.scene.cameras import Camera
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.semantic_tree.export import readable_nodes, write_tree_ply
+from hilsplat.splat.rasterise.cpu import blend_forward, project_gaussians
 
 CELL_PX = 84
 GAP_PX = 6
@@ -26,7 +29,11 @@ ROW_PX = CELL_PX + LABEL_PX + 2 * GAP_PX
 COLUMNS = 18
 """Maximum number of leaves in a row of the picture; wholes are placed side by side until the row is full."""
 
-BACKGROUND = 250
+BACKGROUND = 250.0
+CROP_MARGIN = 0.15
+LEAST_ALPHA = 0.1
+"""Minimum alpha assumed in deciding whether a crop's pixel shows the node; enlarged Gaussians leave gaps."""
+
 LINE = (150, 150, 150)
 TEXT = (40, 40, 40)
 TEXT_PX = 12
@@ -97,7 +104,7 @@ def tree_picture(scene: LanguageScene) -> UInt8[np.ndarray, "H W 3"]:
             (level.label, MARGIN_PX // 2, top + level.index * ROW_PX + CELL_PX // 2) for level in LEVELS
         ]
     for node, x, y in placed:
-        canvas[y : y + CELL_PX, x : x + CELL_PX] = _crop(scene, node)
+        canvas[y : y + CELL_PX, x : x + CELL_PX] = crop(scene, node, CELL_PX, 0.35, BACKGROUND)
         name, middle, line = scene.own_name_of(node) or "?", x + CELL_PX // 2, LABEL_PX // 2
         labels += [(name, middle, y + CELL_PX + line // 2), (str(node), middle, y + CELL_PX + line * 3 // 2)]
     return _labelled(canvas, labels)
@@ -120,23 +127,57 @@ def _labelled(
     return np.asarray(picture)
 
 
-def _crop(scene: LanguageScene, node: int) -> UInt8[np.ndarray, "84 84 3"]:
-    """Return a square crop of the view in which a node is largest, with everything else dimmed."""
-    import cv2
+def crop(
+    scene: LanguageScene, node: int, side_px: int = 160, dimmed: float = 0.2, ground: float = 110.0
+) -> UInt8[np.ndarray, "S S 3"]:
+    """Return a square crop of the photograph in which a node is largest.
 
-    view = scene.tree.view_names[int(scene.tree.view_area_px[node].argmax())]
-    image = scene.image(view)
-    mask = scene.node_masks(view, [node])
-    if not mask.any():
-        return np.full((CELL_PX, CELL_PX, 3), 225, np.uint8)
-    ys, xs = np.nonzero(mask)
-    side = max(np.ptp(ys), np.ptp(xs)) * 1.15 + 4
-    centre_y, centre_x = (ys.min() + ys.max()) / 2, (xs.min() + xs.max()) / 2
-    shown = np.where(mask[..., None], image, (0.35 * image + 0.65 * BACKGROUND)).astype(np.uint8)
-    scale = CELL_PX / side
-    shift = np.array(
-        [[scale, 0, CELL_PX / 2 - scale * centre_x], [0, scale, CELL_PX / 2 - scale * centre_y]], np.float32
-    )
-    return cv2.warpAffine(
-        shown, shift, (CELL_PX, CELL_PX), flags=cv2.INTER_AREA, borderValue=(BACKGROUND,) * 3
-    )
+    To find the node's pixels, only the square is rendered, with a camera whose image is that square. Other
+    pixels are blended with the grey value `ground` and have the weight `dimmed`.
+    """
+    tree = scene.tree
+    view = tree.view_names[int(tree.view_area_px[node].argmax())]
+    camera, photograph = scene.scene.cameras[view], scene.image(view)
+    rows = scene.gaussians_of([node])
+    x, y, side = _square_around(scene.gaussians.means[rows], camera)
+    shift = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]])
+    scale = np.diag([side_px / side, side_px / side, 1.0])
+    inside = Camera("crop", camera.cam_from_world, scale @ shift @ camera.K, (side_px, side_px))
+    member = np.zeros((len(scene.gaussians), 1), np.float32)
+    member[rows] = 1
+    drawn = project_gaussians(scene.gaussians, inside, 0, scene.threads)
+    shares, alpha = blend_forward(drawn, member, scene.threads)
+    is_node = shares[..., 0] > 0.5 * np.maximum(alpha, LEAST_ALPHA)
+    pixels = resampled(photograph, x, y, side, side_px, ground)
+    around = pixels * dimmed + (1 - dimmed) * ground
+    return np.where(is_node[..., None], pixels, around.astype(np.uint8))
+
+
+def resampled(
+    image: UInt8[np.ndarray, "H W 3"], x: float, y: float, side: float, side_px: int, ground: float
+) -> np.ndarray:
+    """Resample the square (x, y, side) of an image to `side_px` px; pixels outside the image are `ground`."""
+    shrink = max(1.0, side / side_px)  # warping does not average areas, so shrink first
+    if shrink > 1:
+        image = cv2.resize(image, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
+    scale = side_px * shrink / side
+    # Pixel centres are at 0.5 here, but at 0 in OpenCV.
+    move = np.array([[scale, 0, -scale * x / shrink], [0, scale, -scale * y / shrink]])
+    move[:, 2] += 0.5 * scale - 0.5
+    return cv2.warpAffine(image, move, (side_px, side_px), flags=cv2.INTER_LINEAR, borderValue=(ground,) * 3)
+
+
+def _square_around(points: np.ndarray, camera: Camera) -> tuple[float, float, float]:
+    """Return the left edge, top edge and side length, px, of a square around most of the points."""
+    local = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    local = local[local[:, 2] > 0.01]
+    height, width = camera.size_hw
+    if not len(local):
+        return 0.0, 0.0, float(max(height, width))
+    places = local @ camera.K.T
+    xy = places[:, :2] / places[:, 2:]
+    low, high = np.percentile(xy, (3, 97), axis=0)
+    low, high = np.clip(low, 0, (width, height)), np.clip(high, 0, (width, height))
+    side = float((high - low).max()) * (1 + 2 * CROP_MARGIN) + 4
+    x, y = ((low + high) / 2 - side / 2).tolist()
+    return x, y, side

@@ -17,8 +17,9 @@ from starlette.routing import Route
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.query.names import write_names
+from hilsplat.query.tree_picture import crop
 from hilsplat.scene.finished import FinishedScene
-from hilsplat.viewer import exports, payload, wire
+from hilsplat.viewer import payload, wire
 from hilsplat.viewer.frames import painted, pick
 from hilsplat.viewer.openapi import description
 from hilsplat.viewer.saved_files import SavedFiles
@@ -99,7 +100,7 @@ def _crop(shown: ViewerScene, of: Mapping[str, Any]) -> Response:
     scene = shown.answering(of["variant"])
     node = scene.existing_node(of["node"])
     with shown.unchanged():
-        return plain(encoded(exports.crop(scene, node, shown.threads)), "image/jpeg", cached=True)
+        return plain(encoded(crop(scene, node)), "image/jpeg", cached=True)
 
 
 def _query(shown: ViewerScene, asked: wire.Query) -> payload.Answer:

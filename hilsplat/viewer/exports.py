@@ -1,4 +1,4 @@
-"""Content of exported files (Gaussians, masks of all views, films), and crops of nodes."""
+"""Content of exported files (Gaussians, masks of all views, films)."""
 
 import io
 import json
@@ -7,9 +7,8 @@ from collections.abc import Generator, Iterable, Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import cv2
 import numpy as np
-from jaxtyping import Int32, Int64, UInt8
+from jaxtyping import Int32, Int64
 from PIL import Image
 
 from hilsplat.query.language_scene import LanguageScene
@@ -18,19 +17,12 @@ from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.export import write_selection_ply
 from hilsplat.splat.flyaround import FRAMES_PER_S, closed_path, encoded_film, open_path
 from hilsplat.splat.gaussians import Gaussians
-from hilsplat.splat.rasterise.cpu import blend_forward, project_gaussians
 from hilsplat.viewer.frames import Paint, painted
 from hilsplat.viewer.wire import Film, Group
 from hilsplat.web.coco import coco_content, coco_region
 
 STEP = {"mp4": 1, "gif": 2}
 """Frame step of each format. GIFs use every second frame; with all frames, they are far larger than MP4s."""
-CROP_PX = 160
-CROP_MARGIN = 0.15
-LEAST_ALPHA = 0.1
-"""Minimum alpha assumed in deciding whether a crop's pixel shows the node; enlarged Gaussians leave gaps."""
-DIMMED, GROUND = 0.2, 110.0
-"""Weight of a crop's photograph outside the node, and the grey value that it is blended with."""
 
 Steps = Generator[tuple[int, int], None, bytes]
 """Generator that creates a file: it yields (steps done, total), starting at 0, and returns the file."""
@@ -88,57 +80,6 @@ def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
             yield number + 1, len(scene.views)
         archive.writestr("coco.json", json.dumps(coco, ensure_ascii=False))
     return held.getvalue()
-
-
-def crop(scene: LanguageScene, node: int, threads: int = 1) -> UInt8[np.ndarray, "S S 3"]:
-    """Return a square crop of the photograph in which a node is largest, with the rest dimmed towards grey.
-
-    To find the node's pixels, only the square is rendered, with a camera whose image is that square.
-    """
-    tree = scene.tree
-    view = tree.view_names[int(tree.view_area_px[node].argmax())]
-    camera, photograph = scene.scene.cameras[view], scene.image(view)
-    rows = scene.gaussians_of([node])
-    x, y, side = _square_around(scene.gaussians.means[rows], camera)
-    shift = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]])
-    scale = np.diag([CROP_PX / side, CROP_PX / side, 1.0])
-    inside = Camera("crop", camera.cam_from_world, scale @ shift @ camera.K, (CROP_PX, CROP_PX))
-    member = np.zeros((len(scene.gaussians), 1), np.float32)
-    member[rows] = 1
-    drawn = project_gaussians(scene.gaussians, inside, 0, threads)
-    shares, alpha = blend_forward(drawn, member, threads)
-    is_node = shares[..., 0] > 0.5 * np.maximum(alpha, LEAST_ALPHA)
-    pixels = resampled(photograph, x, y, side)
-    around = pixels * DIMMED + (1 - DIMMED) * GROUND
-    return np.where(is_node[..., None], pixels, around.astype(np.uint8))
-
-
-def resampled(image: UInt8[np.ndarray, "H W 3"], x: float, y: float, side: float) -> np.ndarray:
-    """Resample the square (x, y, side) of an image to `CROP_PX` px; pixels outside the image are black."""
-    shrink = max(1.0, side / CROP_PX)  # warping does not average areas, so shrink first
-    if shrink > 1:
-        image = cv2.resize(image, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
-    scale = CROP_PX * shrink / side
-    # Pixel centres are at 0.5 here, but at 0 in OpenCV.
-    move = np.array([[scale, 0, -scale * x / shrink], [0, scale, -scale * y / shrink]])
-    move[:, 2] += 0.5 * scale - 0.5
-    return cv2.warpAffine(image, move, (CROP_PX, CROP_PX), flags=cv2.INTER_LINEAR)
-
-
-def _square_around(points: np.ndarray, camera: Camera) -> tuple[float, float, float]:
-    """Return the left edge, top edge and side length, px, of a square around most of the points."""
-    local = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
-    local = local[local[:, 2] > 0.01]
-    height, width = camera.size_hw
-    if not len(local):
-        return 0.0, 0.0, float(max(height, width))
-    places = local @ camera.K.T
-    xy = places[:, :2] / places[:, 2:]
-    low, high = np.percentile(xy, (3, 97), axis=0)
-    low, high = np.clip(low, 0, (width, height)), np.clip(high, 0, (width, height))
-    side = float((high - low).max()) * (1 + 2 * CROP_MARGIN) + 4
-    x, y = ((low + high) / 2 - side / 2).tolist()
-    return x, y, side
 
 
 def flight(asked: Film, scene: Scene) -> list[Camera]:

@@ -9,6 +9,7 @@ import re
 from typing import Any
 
 from hilsplat.base.images import resize_to_fit
+from hilsplat.query.tree_picture import crop
 from hilsplat.viewer import exports, payload
 from hilsplat.viewer.viewer_scene import ViewerScene
 from hilsplat.viewer.wire import Page
@@ -52,7 +53,7 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
     yield 0, len(nodes)
     for made, node in enumerate(nodes):
         with shown.unchanged():
-            described["crops"][node] = _text(encoded(exports.crop(scene, node, shown.threads)))
+            described["crops"][node] = _text(encoded(crop(scene, node)))
         yield made + 1, len(nodes)
     # Data URLs have no relative paths, so the scripts import each other by name.
     scripts = {

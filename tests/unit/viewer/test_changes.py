@@ -10,7 +10,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from hilsplat.splat.ply import load_ply, save_ply
-from hilsplat.viewer import exports
+from hilsplat.viewer import html_page
 from hilsplat.viewer.viewer_scene import ViewerScene
 from tests.unit.artifact_changes import write_again
 from tests.unit.viewer.conftest import browsing
@@ -77,13 +77,13 @@ def test_rebuilt_parts_are_not_read_together_with_opened_ones(page, own_desk):
 
 
 def test_an_export_of_a_page_fails_if_the_scene_changes_meanwhile(page, own_desk, monkeypatch):
-    draw = exports.crop
+    draw = html_page.crop
 
     def crop(*of):
         write_again(own_desk / "default/semantic_tree")
         return draw(*of)
 
-    monkeypatch.setattr(exports, "crop", crop)
+    monkeypatch.setattr(html_page, "crop", crop)
     lines = page.post("/api/export/page", json={}).text.splitlines()
     assert lines[0].startswith('{"made":0')
     assert len(lines) == 2 and "semantic_tree of photos/desk changed on disk" in lines[1]
