@@ -74,20 +74,15 @@ def test_saved_labels_are_cut_to_their_parents_versioned_and_a_data_set(client, 
     np.testing.assert_array_equal(scene.views["002.png"][1].mask(), child)
 
 
+HALVES = [[[0.5, 1], [2, 2], [3, 1]]]
+
+
 @pytest.mark.parametrize(
-    ("change", "status"),
-    [
-        ({"level": 4}, 400),
-        ({"text": "x" * 201}, 400),
-        ({"polygons": [[[0.5, 1], [2, 2], [3, 1]]]}, 400),
-        ({"path": "/etc/passwd"}, 400),
-        ({"parent": 7}, 422),
-        ({"polygons": [[[900, 900], [910, 900], [910, 910]]]}, 422),
-    ],
+    "change", [{"level": 4}, {"text": "x" * 201}, {"polygons": HALVES}, {"path": "/etc/passwd"}]
 )
-def test_invalid_labels_are_refused(client, labels, change, status):
+def test_invalid_labels_are_refused(client, labels, change):
     sent = put(client, 0, [{**MUG, **change}], "none")
-    assert sent.status_code == status and sent.json()["error"] and not labels.exists()
+    assert sent.status_code == 400 and sent.json()["error"] and not labels.exists()
 
 
 # -- shapes -----------------------------------------------------------------------------------------

@@ -11,10 +11,10 @@ from hilsplat.base.levels import Level
 from hilsplat.query.hits import doubts_of
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.node_search import search
-from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import EvaluateSettings
+from tests.unit.evaluate.builders import cameras_of
 from tests.unit.evaluate.plain_tree import plain_tree
 from tests.unit.query.test_query import near
 from tests.unit.round_gaussians import round_gaussians
@@ -59,11 +59,10 @@ def three_mugs() -> LanguageScene:
         return np.eye(6, dtype=np.float32)[[axes.get(text, 1) for text in texts]]
 
     settings = EvaluateSettings(relevancy_scale=100)
-    camera = Cameras(("000.png",), np.eye(4)[None], np.eye(3)[None], np.array([[2, 2]], np.int32))
-    nothing = np.zeros((0, 3), np.float32)
+    cameras, nothing = cameras_of(np.eye(4)[None], np.eye(3), (2, 2)), np.zeros((0, 3), np.float32)
     split, colours = {"000.png": "train"}, nothing.astype(np.uint8)
     return LanguageScene(
-        Scene(Path(), "toy/mugs", "metre", camera, split, nothing, colours, np.eye(4)),
+        Scene(Path(), "toy/mugs", "metre", cameras, split, nothing, colours, np.eye(4)),
         round_gaussians(np.zeros((1, 3))),
         replace(tree, clip=vectors),
         lambda view: sp.csr_matrix((4, 1), dtype=np.float32),

@@ -52,11 +52,8 @@ def camera(shown):
 
 
 def wire_camera(camera) -> dict:
-    return {
-        "cam_from_world": camera.cam_from_world.tolist(),
-        "K": camera.K.tolist(),
-        "size_hw": list(camera.size_hw),
-    }
+    pose, size_hw = camera.cam_from_world.tolist(), list(camera.size_hw)
+    return {"cam_from_world": pose, "K": camera.K.tolist(), "size_hw": size_hw}
 
 
 def in_steps(client, kind: str, **sent) -> tuple[list[tuple[int, int]], bytes]:
