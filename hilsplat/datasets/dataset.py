@@ -11,12 +11,7 @@ from hilsplat.base.errors import SceneError
 
 @dataclass(frozen=True)
 class SceneReport:
-    """Result of checking one scene.
-
-    Attributes:
-        facts: counts of what was read, such as {"labelled views": 4, "texts": 21}.
-        warnings: one sentence for each item that was reinterpreted or could not be used.
-    """
+    """Counts of what was read in a scene, and a sentence for each item that was reinterpreted or not used."""
 
     facts: dict[str, object]
     warnings: tuple[str, ...] = ()

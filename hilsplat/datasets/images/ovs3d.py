@@ -63,17 +63,16 @@ def read_classes(path: Path) -> tuple[str, ...]:
     """Return the prompts of `classes.txt`: stripped, without empty lines, sorted (capitals first)."""
     try:
         lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise SceneError(f"{path} cannot be read: {error}", fix="unpack segmentations again") from error
-    prompts = sorted(line for line in lines if line)
-    twice = sorted({prompt for prompt in prompts if prompts.count(prompt) > 1})
-    if not prompts or twice:
+        prompts = sorted(line for line in lines if line)
+        twice = sorted({prompt for prompt in prompts if prompts.count(prompt) > 1})
+        if not prompts or twice:
+            raise ValueError(f"duplicates: {', '.join(twice)}" if twice else "no classes")
+    except (OSError, ValueError) as error:
         raise SceneError(
-            f"{path} is not a valid list of classes",
+            f"{path} is not a valid list of classes: {error}",
             expected="one class per line, without duplicates",
-            found=f"duplicates: {', '.join(twice)}" if twice else "no classes",
             fix="unpack segmentations again",
-        )
+        ) from error
     return tuple(prompts)
 
 

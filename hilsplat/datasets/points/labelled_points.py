@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Float, Float32, Float64, Int32
 from plyfile import PlyData, PlyParseError
 
 from hilsplat.base.errors import SceneError
@@ -84,24 +84,16 @@ def read_json_object(path: Path, keys: tuple[str, ...]) -> dict:
     return content
 
 
-def read_numbers(path: Path, columns: int) -> np.ndarray:
-    """Read a text file of numbers, `columns` per line (inf and nan are allowed)."""
+def read_matrices(path: Path, columns: int) -> Float64[np.ndarray, "M 4 4"]:
+    """Read a text file: lines of 16 numbers, or one matrix as 4 lines of 4 (inf and nan are allowed)."""
     try:
         rows = np.loadtxt(require_file(path), comments=None, encoding="utf-8", ndmin=2)
-        if rows.shape[1] != columns:
-            raise ValueError(f"{rows.shape[1]} columns")
+        if rows.shape[1] != columns or (columns == 4 and len(rows) != 4):
+            raise ValueError(f"{rows.shape[0]} lines of {rows.shape[1]} numbers")
     except ValueError as error:
-        expected = f"{columns} numbers per line"
+        expected = f"{columns} numbers per line" + (", 4 lines" if columns == 4 else "")
         raise SceneError(f"{path} cannot be read: {error}", expected=expected, fix=UNPACK_AGAIN) from error
-    return rows
-
-
-def read_matrix(path: Path) -> np.ndarray:
-    """Read a 4 x 4 matrix from text."""
-    matrix = read_numbers(path, 4)
-    if len(matrix) != 4:
-        raise SceneError(f"{path} is not a matrix", expected="4 lines", found=len(matrix), fix=UNPACK_AGAIN)
-    return matrix
+    return rows.reshape(-1, 4, 4)
 
 
 class PlyMesh:

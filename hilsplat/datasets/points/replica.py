@@ -28,7 +28,7 @@ from hilsplat.datasets.points.labelled_points import (
     PlyMesh,
     PointScene,
     read_json_object,
-    read_numbers,
+    read_matrices,
 )
 from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage, rigid_pose
 
@@ -81,7 +81,7 @@ def read_images(root: Path, scene: str) -> tuple[tuple[PosedImage, ...], tuple[s
     """
     folder, (pose_file, image_folder, prefix) = find_sequence(root, scene)
     path = folder / pose_file
-    poses = read_numbers(path, 16).reshape(-1, 4, 4)
+    poses = read_matrices(path, 16)
     frames = sorted(
         (int(image.stem.removeprefix(prefix)), image)
         for image in list_images(folder / image_folder)

@@ -25,7 +25,7 @@ from hilsplat.datasets.points.labelled_points import (
     PlyMesh,
     PointScene,
     read_json_object,
-    read_matrix,
+    read_matrices,
     require_file,
 )
 from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage, rigid_pose
@@ -84,7 +84,7 @@ def read_images(folder: Path, scan: str) -> tuple[tuple[PosedImage, ...], tuple[
     Also return a warning for each reason that frames were skipped.
     """
     frames = sorted((_frame_number(path), path) for path in list_images(folder / "color"))
-    K = read_matrix(folder / "intrinsic" / "intrinsic_color.txt")[:3, :3] + HALF_PIXEL
+    K = read_matrices(folder / "intrinsic" / "intrinsic_color.txt", 4)[0, :3, :3] + HALF_PIXEL
     lost, without, images = [], [], []
     described = folder / f"{scan}.txt"
     info = dict(re.findall("(.*) = (.*)", described.read_text("utf-8"))) if described.is_file() else {}
@@ -97,7 +97,7 @@ def read_images(folder: Path, scan: str) -> tuple[tuple[PosedImage, ...], tuple[
         if not pose.is_file():
             without.append(number)
             continue
-        world_from_cam = read_matrix(pose)
+        world_from_cam = read_matrices(pose, 4)[0]
         if not np.isfinite(world_from_cam).all():
             lost.append(number)
             continue

@@ -5,7 +5,6 @@ the vehicle at the segment's first frame, because positions in the files (kilome
 for float32.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,10 +22,8 @@ LABELS = "lidar_segmentation"
 
 def find_parquet(root: Path, segment: str) -> Path | None:
     """Return the folder of the split that contains a segment's release 2 files, or None."""
-    for split in SPLITS:
-        if parquet.component_path(root / split, LABELS, segment).is_file():
-            return root / split
-    return None
+    splits = (root / split for split in SPLITS)
+    return next((s for s in splits if parquet.component_path(s, LABELS, segment).is_file()), None)
 
 
 def record_files(root: Path) -> dict[str, Path]:
@@ -79,7 +76,6 @@ def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
     return PointScene(segment, images, {"waymo": joined_points(points)}, warnings)
 
 
-@dataclass(frozen=True)
 class Segments(Dataset):
     """A data set whose scenes are the segments on disk, because the paper names none."""
 

@@ -136,6 +136,8 @@ def test_all_labels_on_a_scenes_images_score_it_and_only_evaluation_reads_them(r
     both = ("lerf_ovs/figurines", "hi_lerf/figurines")
     assert label_sets("data:lerf_ovs/figurines", str(root), "lerf/figurines") == both
     assert label_sets("data:3d_ovs/bed", str(root), "3d_ovs/bed") == ("3d_ovs/bed",)
+    touch(root / "hi_3dovs/label/bed/00.json")
+    assert label_sets("data:3d_ovs/bed", str(root), "3d_ovs/bed") == ("3d_ovs/bed", "hi_3dovs/bed")
     assert label_sets("data:lerf_ovs/ramen", str(root), "lerf/ramen") == ()
     label, masks = root / "lerf_ovs/label/figurines/frame_00041.json", root / "3d_ovs/bed/segmentations"
     assert label_files("lerf_ovs/figurines", str(root)) == (label,)

@@ -9,14 +9,14 @@ import pytest
 from hilsplat.base.errors import SceneError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import Level
-from hilsplat.datasets.images.hi import ANNOTATED, HI_3DOVS, HI_LERF
+from hilsplat.datasets.images.hi import ANNOTATED, HI_LERF
 from hilsplat.datasets.images.isat import fill_polygons, read_isat, trace_polygons
 from hilsplat.datasets.images.lerf_ovs import open_scene
 from hilsplat.datasets.published import PAIRS, PROMPTS
 from hilsplat.datasets.registry import open_labelled
 from hilsplat.datasets.sources import label_files, label_sets
 from tests.conftest import PROJECT
-from tests.unit.datasets.writers.labelled import LERF_STEMS, OVS_STEMS, write_hi, write_lerf_ovs
+from tests.unit.datasets.writers.labelled import LERF_STEMS, write_hi, write_lerf_ovs
 
 SQUARE = [[2.0, 3.0], [5.0, 3.0], [5.0, 6.0], [2.0, 6.0]]
 LABELLED = (("001.png", "frame_00002.png"), ("003.png", "frame_00004.png"))
@@ -209,14 +209,6 @@ def test_a_world_written_as_hi_lerf_is_read_back_equal(true_world, hi):
             rows, columns = np.nonzero(region.mask())
             assert region.boxes().tolist() == [[columns.min(), rows.min(), columns.max(), rows.max()]]
     assert not any("parent" in line for line in scene.warnings)
-
-
-def test_hi_3dovs_uses_the_images_of_3d_ovs(tmp_path, true_world):
-    write_hi(true_world, tmp_path / "hi_3dovs", tmp_path / "3d_ovs", "bed", ["001.png"], OVS_STEMS)
-    scene = HI_3DOVS.open(tmp_path / "hi_3dovs", "bed")
-    assert scene.images["01.png"] == tmp_path / "3d_ovs" / "bed" / "images" / "01.jpg"
-    assert HI_3DOVS.check(tmp_path / "hi_3dovs", "bed").facts["posed views"] == 4
-    assert "published frames that have no label: 06.png, 11.png, 20.png, 28.png, 36.png" in scene.warnings
 
 
 def test_frames_without_image_or_label_are_reported(hi):

@@ -105,7 +105,7 @@ def test_a_sequence_of_nice_slam_is_preferred_and_has_its_own_lens(root, tmp_pat
         (poses(1), "1 lines, 3 images; the first frame without a line is 1"),
         (
             lambda root: (root / SEQUENCE / "traj_w_c.txt").write_text("1 0 0 0\n"),
-            "cannot be read: 4 columns\n  expected  16 numbers per line",
+            "cannot be read: 1 lines of 4 numbers\n  expected  16 numbers per line",
         ),
         (
             lambda root: (root / SEQUENCE).rename(root / "00"),

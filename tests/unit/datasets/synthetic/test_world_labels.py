@@ -9,8 +9,7 @@ from hilsplat.base.errors import SceneError
 from hilsplat.datasets.points import replica
 from hilsplat.datasets.registry import open_labels
 from hilsplat.datasets.sources import export_images
-from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
-from hilsplat.datasets.synthetic.world_labels import labelled_points, replica_id, scannet_ids, waymo_labels
+from hilsplat.datasets.synthetic.world_labels import labelled_points
 from hilsplat.datasets.waymo import reader as waymo
 from hilsplat.scene.poses import run_poses
 from hilsplat.scene.scene import Scene
@@ -62,21 +61,18 @@ def same_images(read, true, read_from_true=IDENTITY):
             assert image.image.read_bytes() == view.image.read_bytes()
 
 
-def classes_of(mesh, seen=slice(None)):
-    """Expected class ids of vertices, by labelling."""
-    fine, broad = np.array([scannet_ids(text) for text in mesh.texts]).T
-    ids = {"scannet200": fine, "nyu40": broad, "replica": np.array([replica_id(text) for text in mesh.texts])}
-    return {labelling: of_text[mesh.whole[seen]] for labelling, of_text in ids.items()}
-
-
-def test_a_room_as_scannet_or_replica_reads_back_equal(room, data_root, tmp_path):
+def test_a_room_reads_back_equal_and_is_labelled_where_a_camera_sees_it(room, data_root, tmp_path):
     write_room_as_replica(room, tmp_path, "room_0")
-    mesh = LabelledMesh(room)
+    mesh, known = LabelledMesh(room), labelled_points(room, "room")
+    seen = mesh.column("vertex", "views") > 0
+    assert 0 < seen.sum() < len(seen)
     for scene in (open_labels("scannet/scene0000_00", data_root), replica.open_scene(tmp_path, "room_0")):
         for labelling, points in scene.truth.items():
             np.testing.assert_array_equal(points.xyz, mesh.xyz)
-            np.testing.assert_array_equal(points.class_id, classes_of(mesh)[labelling])
+            np.testing.assert_array_equal(points.xyz[seen], known[labelling].xyz)
+            np.testing.assert_array_equal(points.class_id[seen], known[labelling].class_id)
         same_images(scene.images, posed_images(room))
+    assert known["nyu40"].xyz is known["replica"].xyz  # one search for neighbours serves all labellings
 
 
 def test_gaussians_frozen_at_the_vertices_of_a_scan_are_its_points(data_root, tmp_path):
@@ -92,41 +88,21 @@ def test_gaussians_frozen_at_the_vertices_of_a_scan_are_its_points(data_root, tm
     np.testing.assert_allclose(gaussians.means, places, atol=1e-5)
 
 
-def test_street_as_waymo_reads_back_equal(street, tmp_path):
+def test_a_street_reads_back_equal_and_a_table_has_no_labelled_points(street, tmp_path):
     write_street_as_waymo(street, tmp_path / "validation", "drive")
     scene = waymo.open_segment(tmp_path, "drive")
-    truth, scan = scene.truth["waymo"], read_npz(street / "truth" / "lidar.npz")
-    nodes = HierarchyAnnotations.load(street / "truth").nodes
-    assert len(truth) == len(scan["points"])
+    truth, known = scene.truth["waymo"], labelled_points(street, "street")["waymo"]
+    assert len(truth) == len(known)
     # The segment's frame is that of the vehicle below its first scan, which heads along x.
-    shift = scan["origins"][0] - np.array([1.4, 0.0, 2.2])
+    shift = read_npz(street / "truth" / "lidar.npz")["origins"][0] - np.array([1.4, 0.0, 2.2])
     # Both are the same points in different orders, up to float32 rounding.
-    distance, row = cKDTree(truth.xyz + shift).query(scan["points"])
+    distance, row = cKDTree(truth.xyz + shift).query(known.xyz)
     assert distance.max() < 2e-4
-    labels = waymo_labels(scan["node_ids"], [node.text for node in nodes])
     # Points of two objects can coincide only where the objects touch.
-    assert (truth.class_id[row] == labels[:, 1]).mean() > 0.9999
-    assert (np.bincount(truth.class_id, minlength=23) == np.bincount(labels[:, 1], minlength=23)).all()
+    assert (truth.class_id[row] == known.class_id).mean() > 0.9999
+    assert (np.bincount(truth.class_id, minlength=23) == np.bincount(known.class_id, minlength=23)).all()
     segment_from_world = np.eye(4)
     segment_from_world[:3, 3] = -shift
     same_images(scene.images, posed_images(street), segment_from_world)
-
-
-def test_a_room_is_labelled_where_a_camera_sees_it(room):
-    mesh, found = LabelledMesh(room), labelled_points(room, "room")
-    seen = mesh.column("vertex", "views") > 0
-    assert 0 < seen.sum() < len(seen)
-    np.testing.assert_array_equal(found["nyu40"].xyz, mesh.xyz[seen])
-    for labelling, expected in classes_of(mesh, seen).items():
-        np.testing.assert_array_equal(found[labelling].class_id, expected)
-    assert found["nyu40"].xyz is found["replica"].xyz  # one search for neighbours serves all labellings
-
-
-def test_a_street_is_labelled_at_its_lidar_returns_and_a_table_nowhere(street):
-    scan = read_npz(street / "truth" / "lidar.npz")
-    points = labelled_points(street, "street")["waymo"]
-    texts = [node.text for node in HierarchyAnnotations.load(street / "truth").nodes]
-    np.testing.assert_array_equal(points.class_id, waymo_labels(scan["node_ids"], texts)[:, 1])
-    np.testing.assert_allclose(points.xyz, scan["points"])
     with pytest.raises(SceneError, match="expected  room or street"):
         labelled_points(street, "tabletop")
