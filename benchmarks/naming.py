@@ -18,7 +18,7 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.tables import markdown_table
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.evaluate.diagnostics.tree_truth import measure_tree, true_votes
-from hilsplat.query.node_names import Vocabulary, vocabulary_file
+from hilsplat.query.node_names import Vocabulary
 
 ABSENT = 200  # maximum number of queries for absent texts, spread over the vocabulary
 
@@ -70,7 +70,7 @@ def measure(folder: Path, levels: dict[Level, Naming], missed: Counts) -> None:
             if name:
                 counts.right.add(name in texts)
             counts.doubted.add(bool(scene.query(truth.nodes[partner].text)[0].doubts))
-    known = Vocabulary.read(vocabulary_file("auto", Path("models/clip-tiny")))
+    known = Vocabulary.read(Path("models/clip-tiny/vocabulary.txt"))
     here = {text for node in truth.nodes for text in (node.text, *node.synonyms)}
     absent = [text for text in (*known.things, *known.parts) if text not in here]
     for text in absent[:: -(-len(absent) // ABSENT)]:
