@@ -6,13 +6,12 @@ import scipy.sparse as sp
 
 from hilsplat.base.artifacts import read_index, write_index
 from hilsplat.base.levels import Level
-from hilsplat.contributions.stage import run_contributions
 from hilsplat.semantic_tree import wholes
 from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.semantic_tree.nodes import LevelNodes
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.semantic_tree.wholes import joined, joined_regions, touching
-from hilsplat.settings import ContributionsSettings, SemanticTreeSettings
+from hilsplat.settings import SemanticTreeSettings
 
 
 def on_a_line(*x: float) -> np.ndarray:
@@ -119,16 +118,12 @@ def test_joined_nodes_keep_their_masks_gaussians_and_mean_quality():
 @pytest.mark.parametrize(
     ("segmenter", "most", "wholes"), [("graph", 1.1, 1), ("graph", 0.9, 2), ("sam", 1.1, 2)]
 )
-def test_only_wholes_of_the_graph_segmenter_are_joined(two_boxes, segmenter, most, wholes):
+def test_only_wholes_of_the_graph_segmenter_are_joined(two_boxes_contributions, segmenter, most, wholes):
     # boxes A and B fill every view together and touch only each other: the pair costs 1
-    write_index(two_boxes.masks, read_index(two_boxes.masks)["views"], segmenter=segmenter)
-    folder = two_boxes.folder
-    settings = ContributionsSettings()
-    run_contributions(
-        two_boxes.scene, two_boxes.ply, two_boxes.masks, folder / "c", folder / "cache", settings, 1
-    )
-    run_semantic_tree(folder / "c", two_boxes.masks, folder / "t", SemanticTreeSettings(whole_side=most))
-    tree = SemanticTree.load(folder / "t")
+    world, contributions = two_boxes_contributions
+    write_index(world.masks, read_index(world.masks)["views"], segmenter=segmenter)
+    run_semantic_tree(contributions, world.masks, world.folder / "t", SemanticTreeSettings(whole_side=most))
+    tree = SemanticTree.load(world.folder / "t")
     assert [len(tree.nodes_of(level)) for level in Level] == [wholes, 3, 2]
     if wholes == 1:
         assert (tree.node_of_gaussian[:, 0] == 0).all()
