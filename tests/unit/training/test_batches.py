@@ -3,14 +3,7 @@
 import numpy as np
 import pytest
 
-from models.training.batches import (
-    CropStage,
-    class_rows,
-    compared_pixels,
-    draw_batch,
-    draw_level_prompts,
-    region_edges,
-)
+from models.training.batches import compared_pixels, draw_level_prompts, region_edges
 from models.training.data import cut_window, nested_targets, region_centres
 from tests.unit.training.drawn import drawn_views
 
@@ -48,22 +41,6 @@ def test_edges_are_on_both_sides_of_a_border():
     blocks = np.full((1, 2, 4, 1), 0)
     blocks[0, :, 2:] = 1
     assert region_edges(blocks)[0].tolist() == [[0, 1, 1, 0]] * 2
-
-
-def test_a_batch_compares_a_prompt_with_the_region_around_it():
-    views = drawn_views(3, 64)
-    _, classes = class_rows(views)
-    batch = draw_batch(views, classes, CropStage(1.0, 64, 4, 6, 256), np.random.default_rng(0))
-    assert batch.truth.shape == (4, 6, 3, 256)
-    assert batch.edges.shape == (4, 3, 32, 32)
-    # where the compared pixel nearest to a prompt is in a region, it is in the prompted one
-    y, x = np.divmod(batch.places.numpy(), 32)
-    away = (x * 2 + 1 - batch.points[:, :, 0, 0, None].numpy()) ** 2
-    away += (y * 2 + 1 - batch.points[:, :, 0, 1, None].numpy()) ** 2
-    near = away.argmin(axis=-1)
-    for window, prompt in np.argwhere(batch.known[:, :, 2].numpy() > 0):
-        if away[window, prompt, near[window, prompt]] <= 1:
-            assert batch.truth[window, prompt, 2, near[window, prompt]] > 0
 
 
 def test_a_missing_subpart_is_its_part_and_a_missing_part_its_whole():

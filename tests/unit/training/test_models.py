@@ -1,12 +1,11 @@
 """The committed small models: files, training seeds and quality as in their cards."""
 
 import numpy as np
-import onnxruntime
 import pytest
-from tokenizers import Tokenizer
 
 from hilsplat.base.artifacts import read_json
 from hilsplat.base.levels import LEVELS
+from hilsplat.embed.clip import ClipModel
 from hilsplat.segment.sam import SamModel, enlarged
 from hilsplat.world.objects.catalogue import GENERATOR_VERSION
 from hilsplat.world.render import label_view, render_view
@@ -14,7 +13,7 @@ from hilsplat.world.seeds import TRAINING_SEEDS
 from models.training.cameras import training_camera
 from models.training.card import CARD, RECORD, digests
 from models.training.crops import list_crops
-from models.training.data import LabelledViews, normalised
+from models.training.data import LabelledViews
 from models.training.measure_sam import draw_regions
 from models.training.render import phrases_of, scene_of_seed
 from models.training.sam import FRAME_PX, HEADS
@@ -79,18 +78,10 @@ def test_the_committed_segmenter_is_as_good_as_its_card_says(unseen):
 
 def test_the_committed_clip_is_as_good_as_its_card_says(unseen):
     folder = MODELS / "clip-tiny"
-    options = {"providers": ["CPUExecutionProvider"]}
-    vision = onnxruntime.InferenceSession(str(folder / "onnx" / "vision_model.onnx"), **options)
-    text = onnxruntime.InferenceSession(str(folder / "onnx" / "text_model.onnx"), **options)
-    tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))
-    crops = list_crops(unseen)
+    model, crops = ClipModel.load(folder), list_crops(unseen)
     texts = sorted({phrases[0] for phrases in crops.phrase_sets})
-    rows = tokenizer.encode_batch(texts)
-    feeds = {"input_ids": [row.ids for row in rows], "attention_mask": [row.attention_mask for row in rows]}
-    (expected,) = text.run(None, {name: np.array(values, np.int64) for name, values in feeds.items()})
-    cut = np.stack([crops.cut(row) for row in range(len(crops))])
-    (found,) = vision.run(None, {"pixel_values": normalised(cut)})
-    best = (found @ expected.T).argmax(axis=1)
+    found = model.embed_crops(np.stack([crops.cut(row) for row in range(len(crops))]))
+    best = (found @ model.embed_texts(texts).T).argmax(axis=1)
     true_texts = [crops.phrase_sets[caption][0] for caption in crops.caption]
     right = np.array([texts[row] == true_text for row, true_text in zip(best, true_texts, strict=True)])
     card = read_json(folder / RECORD)["metrics"]["black"]["exact"]

@@ -1,4 +1,4 @@
-"""The recipe of both small models: scenes, phrases, and a training of two steps each."""
+"""The recipe of both small models: scenes, cameras, phrases, and a training of two steps each."""
 
 import numpy as np
 import pytest
@@ -6,6 +6,9 @@ import pytest
 from hilsplat.base.artifacts import read_json
 from hilsplat.base.errors import SceneError, SettingsError
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
+from hilsplat.world.render import label_view
+from hilsplat.world.scenes.kinds import KINDS, build_scene
+from models.training.cameras import training_camera
 from models.training.card import RECORD, digests
 from models.training.render import phrases_of, scene_of_seed, training_seeds
 from models.training.settings import TrainingSettings
@@ -18,6 +21,18 @@ def test_no_scene_is_both_trained_and_measured_on():
     trained, measured = training_seeds(5, 3)
     assert trained == [1_000_000, 1_000_001, 1_000_002, 1_000_003, 1_000_004]
     assert measured == [1_999_997, 1_999_998, 1_999_999]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_training_cameras_show_several_objects_and_half_are_close_ups(kind):
+    scene, rng = build_scene(kind, 100, 7), np.random.default_rng(0)
+    close = 0
+    for _ in range(40):
+        whole, part, _ = label_view(scene, training_camera(scene, rng, 32))
+        # From inside a wall or an object, everything belongs to it.
+        assert len(np.unique(whole)) > 1 and len(np.unique(part)) > 2
+        close += np.isin(whole[10:22, 10:22], list(scene.background), invert=True).mean() > 0.3
+    assert close >= 15
 
 
 def test_a_part_may_be_named_without_its_object():

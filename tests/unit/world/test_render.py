@@ -14,7 +14,7 @@ from hilsplat.world.render import label_view, render_and_label, render_view
 from hilsplat.world.scenes.kinds import build_scene, scene_cameras
 from hilsplat.world.scenes.scene import Style
 from hilsplat.world.shapes import box, joined, sphere
-from hilsplat.world.textures import fractal_noise, grains, hash01
+from hilsplat.world.textures import fractal_noise, grains
 from hilsplat.world.truth import true_depth
 from hilsplat.world.views import square_camera
 from tests.unit.world.scenes import scene_of
@@ -81,18 +81,6 @@ def test_the_floor_below_a_slab_is_in_shadow():
     columns, rows = projected(camera, np.array([[0.0, 0.0, 0.0], [0.0, 0.8, 0.0]])).astype(int)
     under, beside = render_view(scene, camera, 3)[rows, columns].mean(axis=1)
     assert under < 0.75 * beside
-
-
-def test_the_hash_of_a_cell_equals_a_reference_in_python_integers():
-    def reference(*cell):
-        factors = (0x27D4EB2D, 0x165667B1, 0x1B873593, 0x2545F491)
-        h = sum(a * b for a, b in zip(cell, factors, strict=True)) % 2**32
-        h = (h ^ h >> 15) * 0x2C1B3C6D % 2**32
-        h = (h ^ h >> 12) * 0x297A2D39 % 2**32
-        return (h ^ h >> 15) / 2**32
-
-    cells = np.random.default_rng(0).integers(-5000, 5000, (200, 4)) * [1, 1, 1, 0] + [0, 0, 0, 203]
-    assert [hash01(*cell) for cell in cells] == [reference(*cell) for cell in cells.tolist()]
 
 
 def test_vectorised_grain_is_bit_identical_to_fractal_noise():
