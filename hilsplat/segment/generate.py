@@ -256,7 +256,7 @@ def edge_windows(
     windows = np.clip(boxes[rows] + reach, 0, np.array([width, height, width, height], np.int32))
     square = np.ones((2 * BAND_PX + 1, 2 * BAND_PX + 1), np.uint8)
     parts = [np.zeros(0, logits.dtype)]
-    for row, (x0, y0, x1, y1) in zip(rows, windows, strict=True):
+    for row, (x0, y0, x1, y1) in zip(rows.tolist(), windows.tolist(), strict=True):
         window = logits[row, y0:y1, x0:x1].copy()
         inside = (window > 0).view(np.uint8)
         window[cv2.dilate(inside, square) == 0] = -127

@@ -374,7 +374,7 @@ def read_logits(
     upper, lower = math.floor(offset / LOGIT_STEP), math.floor(-offset / LOGIT_STEP)
     steps, stability = np.empty(logits.shape, np.int8), np.empty(len(logits), np.float32)
     for row, each in enumerate(logits):  # one by one, in the processor's cache
-        steps[row] = np.clip(np.rint(each / np.float32(LOGIT_STEP)), -127, 127)
+        steps[row] = np.rint(each / np.float32(LOGIT_STEP)).clip(-127, 127)
         seen = steps[row, :height, :width]
         stability[row] = np.count_nonzero(seen > upper) / max(1, int(np.count_nonzero(seen > lower)))
     return steps, stability, positive_boxes(steps)

@@ -106,9 +106,7 @@ def red_scene(tmp_path) -> tuple[Path, Path]:
     return save_scene(tmp_path / "scene", dict.fromkeys(names, image)), tmp_path / "masks"
 
 
-def test_only_the_best_crops_of_each_node_are_embedded_and_never_twice(
-    red_scene, colour_clip, tmp_path, monkeypatch
-):
+def test_only_the_best_crops_of_each_node_are_embedded_and_never_twice(red_scene, colour_clip, tmp_path):
     scene, masks = red_scene
     tree = tmp_path / "semantic_tree"
     # Two views of two masks: the first masks show node 0, better in the second view; no node has the others.
@@ -128,8 +126,8 @@ def test_only_the_best_crops_of_each_node_are_embedded_and_never_twice(
     assert read_index(tmp_path / "all")["dim"] == 3
     assert digests_in(tmp_path / "all") == digests_in(masks)
     run_clip(scene, masks, None, tmp_path / "fresh", tmp_path / "other", settings, threads=2)
-    monkeypatch.setattr(Network, "__call__", pytest.fail)
-    run_clip(scene, masks, None, tmp_path / "again", cache, settings, threads=1)
+    with patch.object(Network, "__call__", pytest.fail):
+        run_clip(scene, masks, None, tmp_path / "again", cache, settings, threads=1)
     assert len({sha256_of_path(tmp_path / name) for name in ("all", "fresh", "again")}) == 1
 
 
@@ -181,19 +179,14 @@ def test_masks_of_another_scene_are_refused(red_scene, colour_clip, tmp_path):
         run_clip(scene, masks, None, tmp_path / "out", tmp_path / "cache", settings, threads=1)
 
 
-def test_the_clip_of_an_artifact_is_found_with_its_variant(red_scene, colour_clip, tmp_path):
+def test_queries_open_the_recorded_variant_without_its_image_network(red_scene, colour_clip, tmp_path):
     scene, masks = red_scene
     for name in ("vision_model", "text_model"):
         (colour_clip / f"{name}.onnx").rename(colour_clip / f"{name}_fp16.onnx")
     settings = ClipSettings(model=str(colour_clip), variant="fp16")
     run_clip(scene, masks, None, tmp_path / "vectors", tmp_path / "cache", settings, threads=1)
-    assert open_clip_of(tmp_path / "vectors").text.path.name == "text_model_fp16.onnx"
-
-
-def test_queries_do_not_open_the_image_network(colour_clip, tmp_path):
-    model = ClipModel.load(colour_clip)
-    write_index(tmp_path / "vectors", {}, model=str(colour_clip), model_sha256=model.digest)
-    opened = open_clip_of(tmp_path / "vectors")
+    opened, model = open_clip_of(tmp_path / "vectors"), ClipModel.load(colour_clip, "fp16")
+    assert opened.text.path.name == "text_model_fp16.onnx"
     assert opened.width == model.width == len(opened.embed_texts(["mug"])[0])
     assert "vision" not in vars(opened)
     picture = np.zeros((6, 6, 3), np.uint8)
