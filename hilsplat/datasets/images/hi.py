@@ -5,7 +5,6 @@ three more keys per object: `id`, unique in the file; `level`, 1 whole, 2 part, 
 id of an object one level up, or null. `segmentation` may be a list of polygons. `hilsplat annotate` writes
 this format for your own scenes (data set `annotated`) and adds `origin`: drawn, edited, accepted or proposed.
 
-A frame without an image or a label, an invalid parent, or a child outside its parent causes a warning.
 Missing files, invalid ids and levels, and unusable label files raise SceneError.
 """
 
