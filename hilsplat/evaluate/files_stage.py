@@ -139,12 +139,9 @@ def _mask_rows(
     for view, truth in truths.items():
         masks = found[view]
         _check(view, masks, truth, texts)
-        if "" in levels:
-            for row in _flat_rows(masks, truth, extra):
-                yield view, row
-        if levels - {""}:
-            for row in _level_rows(masks, truth):
-                yield view, row
+        flat = _flat_rows(masks, truth, extra) if "" in levels else ()
+        levelled = _level_rows(masks, truth) if levels - {""} else ()
+        yield from ((view, row) for row in (*flat, *levelled))
 
 
 def _check(view: str, masks: Masks, truth: ViewTruth, texts: Mapping[str, set[str]]) -> None:

@@ -15,7 +15,7 @@ def scores(plan: Plan, table: str, name: str = "scores.csv") -> list[str]:
     """Return a table's score files, or the files `name` beside them; sweeps use `sweep_scenes`, if set."""
     kind = TABLES[table]
     rows = [row for row in labelled(plan) if data_of(row) in kind.data]
-    if kind.is_sweep and plan.run.sweep_scenes:
+    if kind.variants != "main_variants" and plan.run.sweep_scenes:
         rows = [row for row in rows if row.scene in plan.run.sweep_scenes]
     return [
         plan.path(row, variant, name)

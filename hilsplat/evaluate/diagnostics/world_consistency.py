@@ -53,17 +53,12 @@ class Agreement:
     """Agreement between the masks of one level in two views A and B, or the mean over pairs of views."""
 
     masks: int  # number of masks of A compared, over all pairs
-
+    # mean over the masks of A of their highest IoU with any mask of B, in shared points; nan if A has no mask
     best_iou: float
-    """Highest IoU of a mask of A with any mask of B, in shared points (0 if B has no mask), averaged over the
-    masks of A; 1 is perfect, nan if A has no mask."""
-
+    # share of all pairs of shared points that are in the same mask in one view only (1 minus the Rand index)
     disagreement: float
-    """Share of all pairs of shared points that are in the same mask in one view only (1 minus the Rand
-    index); 0 is perfect. The value is always small if most pairs are in different masks in both views."""
-
+    # the same share among pairs that share a mask in at least one view (a Jaccard distance); nan if none
     joined_disagreement: float
-    """The same share among pairs that share a mask in at least one view (a Jaccard distance); nan if none."""
 
 
 def shared_points(

@@ -41,8 +41,7 @@ pooled: counts of all scenes are summed first, so each scene is weighted by its 
 class ProtocolCard:
     """One protocol."""
 
-    name: str  # `benchmark/variant`
-    version: int  # incremented when a change below affects the numbers
+    full_name: str  # `benchmark/variant@version`; a change below that affects the numbers needs a new version
     metrics: tuple[str, ...]
     averaging: Averaging
     selection: str  # how a prediction is chosen (threshold, level), in words
@@ -58,8 +57,8 @@ class ProtocolCard:
     public: str = ""
 
     @property
-    def full_name(self) -> str:
-        return f"{self.name}@{self.version}"
+    def name(self) -> str:
+        return self.full_name.partition("@")[0]
 
     def labelled(self, departures: Iterable[str] = ()) -> str:
         """Return the name used in rows: the full name and any non-default settings."""
@@ -82,8 +81,7 @@ OURS = "none: ours"
 LANGSPLAT_V2 = "LangSplatV2, as in its copy xuexutao/Lang_GS"
 
 LERF_LANGSPLAT = ProtocolCard(
-    "lerf/langsplat",
-    2,
+    "lerf/langsplat@2",
     MASK + LOCALIZATION,
     "pairs",
     "min-max relevancy above 0.7 after a mean filter of 30 px at a height of 730, scaled; level of the "
@@ -93,8 +91,7 @@ LERF_LANGSPLAT = ProtocolCard(
     public="minghanqin/LangSplat@26ed214 eval/evaluate_iou_loc.py:activate_stream",
 )
 TREE_NODES = ProtocolCard(
-    "lerf/tree-nodes",
-    5,
+    "lerf/tree-nodes@5",
     MASK + LOCALIZATION,
     "pairs",
     "3D nodes visible in the view whose cosine margin (plus a fifth of their ancestors' mean) is below the "
@@ -103,8 +100,7 @@ TREE_NODES = ProtocolCard(
     OURS,
 )
 LEVEL_GIVEN = ProtocolCard(
-    "hierarchy/level-given",
-    5,
+    "hierarchy/level-given@5",
     (*MASK, *LOCALIZATION, "best_threshold_iou", *CONSISTENCY),
     "levels",
     "as lerf/langsplat for maps and lerf/tree-nodes for nodes, at the level of the annotation",
@@ -112,8 +108,7 @@ LEVEL_GIVEN = ProtocolCard(
     RelevancyRule(),
 )
 LEVEL_AUTO = ProtocolCard(
-    "hierarchy/level-auto",
-    6,
+    "hierarchy/level-auto@6",
     (*MASK, *LOCALIZATION, *CONSISTENCY),
     "levels",
     "as lerf/langsplat for maps and lerf/tree-nodes for nodes, level chosen by the method",
@@ -121,8 +116,7 @@ LEVEL_AUTO = ProtocolCard(
     RelevancyRule(),
 )
 PATH = ProtocolCard(
-    "hierarchy/path",
-    3,
+    "hierarchy/path@3",
     (*MASK, *LOCALIZATION, *CONSISTENCY),
     "levels",
     "3D nodes, visible in the view, that match the chain of texts from the whole down, each with its "
@@ -130,27 +124,24 @@ PATH = ProtocolCard(
     OURS,
 )
 SCENE_WIDE = ProtocolCard(
-    "hierarchy/scene-wide",
-    2,
+    "hierarchy/scene-wide@2",
     (*MASK, *CONSISTENCY),
     "levels",
     "like hierarchy/level-given, but all nodes of the scene compete: one answer for all views",
     OURS,
 )
 ANNOTATIONS = ProtocolCard(
-    "hierarchy/annotations", 1, CONSISTENCY, "views", "the annotations, to score perfect masks", OURS
+    "hierarchy/annotations@1", CONSISTENCY, "views", "the annotations, to score perfect masks", OURS
 )
 VIEW_CONSISTENCY = ProtocolCard(
-    "world/view-consistency",
-    2,
+    "world/view-consistency@2",
     ("view_consistency",),
     "levels",
     "like hierarchy/level-given, in a view and its nearest neighbour; IoU over points visible in both",
     f"{OURS}; exact geometry of the synthetic world",
 )
 LERF_OPENGAUSSIAN = ProtocolCard(
-    "lerf/opengaussian",
-    1,
+    "lerf/opengaussian@1",
     ("iou", "acc_25", "acc_50"),
     "pairs",
     "Gaussians selected in 3D by cosine, rendered, silhouette above 0.7; not the task of lerf/langsplat",
@@ -158,8 +149,7 @@ LERF_OPENGAUSSIAN = ProtocolCard(
     public="yanmin-wu/OpenGaussian@b70dcc6 scripts/compute_lerf_iou.py",
 )
 LERF_MASK = ProtocolCard(
-    "lerf-mask/gaussian-grouping",
-    1,
+    "lerf-mask/gaussian-grouping@1",
     MASK,
     "classes",
     "the method's own masks, one per prompt",
@@ -168,22 +158,20 @@ LERF_MASK = ProtocolCard(
 )
 LERF_MASK_SKIPPING = replace(
     LERF_MASK,
-    name="lerf-mask/gaussian-grouping-skipping",
+    full_name="lerf-mask/gaussian-grouping-skipping@1",
     source="Gaussian Grouping, except that missing predictions are skipped and two empty masks count as 0 "
     "(there, NaN)",
     missing="left out",
 )
 OVS_NODES = ProtocolCard(
-    "3d-ovs/tree-nodes",
-    1,
+    "3d-ovs/tree-nodes@1",
     MASK,
     "pairs",
     "as lerf/tree-nodes: a tree answers with nodes, to which rules for maps do not apply",
     OURS,
 )
 OVS_ARGMAX = ProtocolCard(
-    "3d-ovs/argmax",
-    3,
+    "3d-ovs/argmax@3",
     ("iou", "pixel_accuracy"),
     "pairs",
     f"{ARGMAX} and over the levels, at an eighth of the image's size",
@@ -192,8 +180,7 @@ OVS_ARGMAX = ProtocolCard(
     public="Kunhao-Liu/3D-OVS@80e512c renderer.py:evaluation_segmentation_test",
 )
 INSTANCES = ProtocolCard(
-    "scannet200/instances",
-    1,
+    "scannet200/instances@1",
     ("ap", "ap50", "ap25", "ap_head", "ap_common", "ap_tail"),
     "pooled",
     "predicted instances with class and confidence; those with fewer than 100 points are ignored",
@@ -203,8 +190,7 @@ INSTANCES = ProtocolCard(
     public="OpenMask3D/openmask3d@6488748 openmask3d/evaluation/eval_semantic_instance.py:evaluate_matches",
 )
 OVS_LANGSPLAT_V2 = ProtocolCard(
-    "3d-ovs/langsplat-v2",
-    3,
+    "3d-ovs/langsplat-v2@3",
     MASK,
     "pairs",
     "min-max of the smoothed relevancy above 0.625, 7 x 7 majority; whole or part, by the highest mean in "
@@ -229,7 +215,9 @@ def _maps(
     name: str, source: str, selection: str, metrics: tuple[str, ...], public: str = "", **rule
 ) -> ProtocolCard:
     """Return a protocol that differs from LangSplat's protocol only in its map rule."""
-    return ProtocolCard(name, 2, metrics, "pairs", selection, source, RelevancyRule(**rule), public=public)
+    return ProtocolCard(
+        f"{name}@2", metrics, "pairs", selection, source, RelevancyRule(**rule), public=public
+    )
 
 
 def _points(
@@ -241,7 +229,7 @@ def _points(
     public: str = "",
 ) -> ProtocolCard:
     """Return a protocol that scores points."""
-    return ProtocolCard(name, 1, metrics, averaging, ARGMAX, source, classes=classes, public=public)
+    return ProtocolCard(f"{name}@1", metrics, averaging, ARGMAX, source, classes=classes, public=public)
 
 
 CARDS: tuple[ProtocolCard, ...] = (

@@ -126,9 +126,8 @@ def argmax_rows(
         return
     ordered = sorted(queries, key=lambda query: query.text)
     size_hw, truth = ordered[0].truth.shape, np.stack([query.eighth for query in ordered])
-    rows, columns = kept_by_pillow(size_hw, truth.shape[1:])
     compared = truth.any(axis=0) if is_stand_in else np.full(truth.shape[1:], True)
-    pixels = (rows[:, None] * size_hw[1] + columns)[compared]
+    pixels = kept_by_pillow(size_hw, truth.shape[1:])[compared]
     if not len(pixels):
         return
     protocol = OVS_ARGMAX.labelled([*(["labelled pixels"] if is_stand_in else []), *words])

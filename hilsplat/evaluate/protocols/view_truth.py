@@ -1,9 +1,10 @@
 """Ground truth of one view: its scored queries and their regions, loaded on demand."""
 
 import logging
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -106,7 +107,7 @@ class ViewTruth:
             if level is not None and not mask.any():
                 continue
             grey = region.mask(size_hw, any_grey=True) if region.any_grey else mask
-            small = region.pixels()[np.ix_(*kept_by_pillow(region.size_hw, small_hw))]
+            small = region.pixels().reshape(-1)[kept_by_pillow(region.size_hw, small_hw)]
             single.append(Query(region.text, level, (path,), mask, region.boxes(size_hw), small, grey))
             if level is not None and len(path) == int(level):
                 by_path[path] = by_path[path] | mask if path in by_path else mask
@@ -162,16 +163,11 @@ def _merged(queries: Iterable[Query], by_level: bool) -> tuple[Query, ...]:
     return tuple(merged)
 
 
-def kept_by_pillow(
-    old_hw: tuple[int, int], new_hw: tuple[int, int]
-) -> tuple[Int64[np.ndarray, " h"], Int64[np.ndarray, " w"]]:
-    """Return the rows and columns that Pillow's nearest-neighbour resizing keeps, as in 3D-OVS."""
-
-    def kept(old: int, new: int) -> Int64[np.ndarray, " n"]:
-        line = Image.fromarray(np.arange(old, dtype=np.int32)[None])
-        return np.asarray(line.resize((new, 1), Image.Resampling.NEAREST))[0].astype(np.int64)
-
-    return kept(old_hw[0], new_hw[0]), kept(old_hw[1], new_hw[1])
+@cache
+def kept_by_pillow(old_hw: tuple[int, int], new_hw: tuple[int, int]) -> Int64[np.ndarray, "h w"]:
+    """Return the pixels (row * width + column) kept by Pillow's nearest-neighbour resizing, as in 3D-OVS."""
+    pixels = Image.fromarray(np.arange(math.prod(old_hw), dtype=np.int32).reshape(old_hw))
+    return np.asarray(pixels.resize(new_hw[::-1], Image.Resampling.NEAREST)).astype(np.int64)
 
 
 def truths_of(

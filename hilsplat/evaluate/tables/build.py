@@ -28,18 +28,14 @@ LEVELLED = ("tabletop", "lerf_ovs", "3d_ovs")
 class TableKind:
     """One table: its builder, the kinds of scenes and data sets that it covers, and its variants.
 
-    `variants` is the configuration key that lists the variants; `shows_costs` adds job and query times.
+    `variants` is the configuration key that lists the variants. Tables of other variants than `main_variants`
+    are measured only on the scenes in `sweep_scenes`. `shows_costs` adds job and query times.
     """
 
     build: Callable[[Sources], Table]
     data: tuple[str, ...]
     variants: str = "main_variants"
     shows_costs: bool = False
-
-    @property
-    def is_sweep(self) -> bool:
-        """Whether the table is measured only on the scenes in `sweep_scenes`."""
-        return self.variants != "main_variants"
 
 
 TABLES: dict[str, TableKind] = {

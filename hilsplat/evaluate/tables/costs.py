@@ -166,14 +166,10 @@ def read_benchmark(path: Path, results: Path) -> list[Job]:
             raise ArtifactError(
                 f"{path} is not a valid benchmark file: {error}", fix="run its stage again"
             ) from error
-        cpu_s, peak_mib = _number(record.get("cpu_time")), _number(record.get("max_rss"))
-        jobs.append(Job(path.stem, dataset, scene, variant, elapsed_s, cpu_s, peak_mib))
+        sampled = (record.get("cpu_time"), record.get("max_rss"))  # "-" or null if Snakemake could not sample
+        numbers = (float(value) if isinstance(value, int | float) else 0.0 for value in sampled)
+        jobs.append(Job(path.stem, dataset, scene, variant, elapsed_s, *numbers))
     return jobs
-
-
-def _number(value: object) -> float:
-    """Return a sampled value, or 0 for "-" or null, which Snakemake writes if it could not sample."""
-    return float(value) if isinstance(value, int | float) else 0.0
 
 
 def cost_table(sources: Sources, seconds: bool = False) -> Table:

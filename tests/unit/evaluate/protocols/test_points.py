@@ -145,7 +145,7 @@ def test_a_node_is_an_instance_of_its_best_class_also_after_a_file(block_world, 
 def test_rows_name_the_mode_and_are_moved_into_the_frame_of_the_scene(block_world, monkeypatch):
     monkeypatch.setitem(LABELLINGS, "drawn", (CLASSES,))
     card = type(card_of("replica/per-scene"))(
-        "drawn/points", 1, ("miou_present",), "scenes", "argmax", "drawn", classes="blocks"
+        "drawn/points@1", ("miou_present",), "scenes", "argmax", "drawn", classes="blocks"
     )
     points, _ = points_of(block_world)
     moved = LabelledPoints(points.xyz / 2 - 1, points.class_id, points.instance_id)
