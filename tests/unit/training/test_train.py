@@ -8,7 +8,7 @@ from models.training import sam_loss
 from models.training.batches import CropStage
 from models.training.clip import contrastive_loss
 from models.training.crops import list_crops
-from models.training.loop import Budget, Tuning, learning_rate
+from models.training.loop import Budget, Tuning
 from models.training.measure_clip import measure_clip, measure_queries
 from models.training.measure_sam import measure_everything
 from models.training.sam_loss import segmentation_loss
@@ -65,13 +65,6 @@ def test_a_budget_in_minutes_schedules_the_decay_from_the_speed():
     assert budget.decay_steps(1000, 100.0) == 100
     with pytest.raises(ValueError, match="minutes or steps"):
         Budget()
-
-
-def test_learning_rate_rises_stays_and_falls():
-    assert learning_rate(0, 1.0, 10) == pytest.approx(0.1)
-    assert learning_rate(500, 1.0, 10) == 1.0
-    assert learning_rate(500, 1.0, 10, 400, 200) == pytest.approx(0.5)
-    assert learning_rate(600, 1.0, 10, 400, 200) == pytest.approx(0.01)
 
 
 def test_segmentation_loss_is_near_zero_for_the_ground_truth_and_ignores_unknown_heads():

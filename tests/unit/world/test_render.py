@@ -13,7 +13,7 @@ from hilsplat.world.rays import RayCaster
 from hilsplat.world.render import label_view, render_and_label, render_view
 from hilsplat.world.scenes.kinds import build_scene, scene_cameras
 from hilsplat.world.scenes.scene import Style
-from hilsplat.world.shapes import box, joined, sphere
+from hilsplat.world.shapes import box, joined
 from hilsplat.world.textures import fractal_noise, grains
 from hilsplat.world.truth import true_depth
 from hilsplat.world.views import square_camera
@@ -43,14 +43,6 @@ def projected(camera: Camera, points: np.ndarray) -> np.ndarray:
     """Columns and rows at which points appear, px."""
     seen = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     return ((seen @ camera.K.T)[:, :2] / seen[:, 2:]).T
-
-
-def test_image_axes_are_x_right_and_y_down():
-    # From +x, looking at the origin, +y is to the right and +z is up.
-    for index, place in enumerate([(0.0, 0.4, 0.0), (0.0, 0.0, 0.4)]):
-        camera = camera_at((3.0, 0, 0))
-        rows, columns = np.nonzero(label_view(scene_of(sphere(0.1, place)), camera)[0] == 0)
-        assert (columns.mean() > 40, rows.mean() < 24) == (index == 0, index == 1)
 
 
 def test_a_surface_point_has_one_colour_in_all_views():
@@ -117,7 +109,6 @@ def test_ring_cameras_alternate_in_elevation_and_an_arc_is_centred_on_the_front(
     # Jitter moves each by at most 1 degree.
     assert np.degrees(np.diff(azimuth)) == pytest.approx(9.0, abs=2.1)
     assert (np.diff(centres[:, 2]) * np.tile([1, -1], 20)[:39] > 0).all()
-    assert np.linalg.det(cameras.cam_from_world[:, :3, :3]) == pytest.approx(1.0)
     cameras = scene_cameras(scene, 12, 128, 100.0)
     for name, end in (("000.png", -50), ("011.png", 50)):
         x, y, _ = cameras[name].centre
