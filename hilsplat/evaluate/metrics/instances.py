@@ -92,8 +92,8 @@ def match_instances(
             scored, missed = _matches(overlap > threshold, large, ignored > threshold, confidence)
             misses[class_index, overlap_index] = missed
             entries += [(class_index, overlap_index, *each) for each in scored]
-    columns = np.array(entries, dtype="i8, i8, f8, ?")
-    return InstanceMatches(*(columns[f"f{number}"] for number in range(4)), misses, has_truth)
+    found = np.array(entries, dtype="i8, i8, f8, ?")
+    return InstanceMatches(found["f0"], found["f1"], found["f2"], found["f3"], misses, has_truth)
 
 
 def _matches(

@@ -7,7 +7,7 @@ a card that affects its numbers requires a new version; a test checks this.
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import Level
@@ -70,7 +70,7 @@ MASK = ("iou", "boundary_iou")
 LOCALIZATION = ("localization_box", "localization_mask")
 CONSISTENCY = ("hc_containment", "hc_literal", "hc_anchored")
 PER_CLASS = ("class_iou", "class_accuracy")
-MEAN_LEVEL = {"mix": False, "majority": False, "level_rule": "mean_in_mask"}
+MEAN_LEVEL: dict[str, Any] = {"mix": False, "majority": False, "level_rule": "mean_in_mask"}
 """Map rule of LangSplat's text on 3D-OVS, except for the threshold."""
 
 OPENGAUSSIAN = "yanmin-wu/OpenGaussian@b70dcc6 scripts/eval_scannet.py"
