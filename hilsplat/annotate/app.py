@@ -185,9 +185,8 @@ class Annotator:
             size_hw = opened.scene.cameras[view].size_hw
             labels = cut_to_parents(asked.labels, size_hw)
             path = label_path(opened.labels, view)
-            with opened.unchanged(
-                *opened.photographs
-            ):  # otherwise labels could be saved for other photographs
+            # Otherwise, labels could be saved for other photographs.
+            with opened.unchanged(*opened.photographs):
                 saved = write_labels(path, view, size_hw, labels, version_sent(request))
             return {"version": saved, "labels": [label.model_dump() for label in labels]}
 
