@@ -90,7 +90,7 @@ def labelled_points(world: Path, kind: str) -> dict[str, LabelledPoints]:
         raise SceneError(
             f"a {kind!r} world has no labelled points", expected="room or street", fix="score its images"
         )
-    mesh = PlyMesh(world / "truth" / "mesh.ply", 3)
+    mesh = PlyMesh(world / "truth" / "mesh.ply", 3, fix="rerun the world stage")
     seen = mesh.column("vertex", "views") > 0
     whole = mesh.column("vertex", "whole").astype(np.int32)[seen]
     xyz = mesh.xyz[seen].astype(np.float64)
