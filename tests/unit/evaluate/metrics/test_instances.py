@@ -125,13 +125,6 @@ def test_small_instances_and_predictions_and_other_classes_do_not_count():
     assert precisions(scan, min_points=4).tolist() == [[0.0] * 10]
 
 
-def test_scans_share_one_curve():
-    good = scan_of([(A, 4)], [(0, 4, 0.9)])
-    missed = scan_of([(A, 4), (VOID, 4)], [])
-    # one match, one miss: P = 1, 1 and R = 1/2, 0: 1/4 + 1/4
-    assert precisions(good, missed)[0, 0] == pytest.approx(0.5)
-
-
 def test_masks_of_other_points_are_refused():
     with pytest.raises(MisalignedArtifactError, match=r"expected  3 points\n  found     4"):
         match_instances(np.zeros(3, int), np.ones((1, 4), bool), np.array([CLASS]), np.ones(1), (CLASS,))

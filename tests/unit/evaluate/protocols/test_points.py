@@ -41,7 +41,8 @@ def test_rows_of_the_worked_example():
     rows = list(measure_points(OPENGAUSSIAN, "tree", TRUTH, PREDICTION, SCANNET_19, "frozen"))
     assert {row.protocol for row in rows} == {"scannet/opengaussian-19@1 (points: frozen)"}
     ious = {row.query: row.value for row in rows if row.metric == "class_iou"}
-    # the first four of the 19 classes; the bed is only predicted
+    # the first four of the 19 classes; the bed is only predicted. The wall has 2 hits, 4 true and 3 predicted
+    # points, without the prediction on ignored truth: 2 / (4 + 3 - 2)
     assert ious == pytest.approx({"wall": 2 / 5, "floor": 2 / 3, "cabinet": 1 / 2, "bed": 0})
     assert [row.n for row in rows if row.metric == "class_iou"] == [5, 3, 2, 1]
     accuracies = {row.query: (row.value, row.n) for row in rows if row.metric == "class_accuracy"}

