@@ -88,10 +88,8 @@ def nodes_of_view(tree: SemanticTree, weights: sp.csr_matrix) -> dict[Level, np.
 def masks_of_view(path: Path) -> dict[Level, Bool[np.ndarray, "M P"]]:
     """Load the masks of a view by level; a level may have no masks."""
     masks = HierarchicalMasks.load(path)
-    rows = {level: masks.rows_of(level) for level in LEVELS}
-    return {
-        level: masks.dense(own).reshape(len(own), math.prod(masks.size_hw)) for level, own in rows.items()
-    }
+    pixels = math.prod(masks.size_hw)
+    return {level: masks.dense(masks.rows_of(level)).reshape(-1, pixels) for level in LEVELS}
 
 
 def run_label_fits(

@@ -230,9 +230,7 @@ def consistency_rows(
         return
     families = [
         [
-            hierarchy.Family(
-                mask_of(parent), tuple(mask_of(child) for child in children), truth.regions[parent]
-            )
+            hierarchy.Family(mask_of(parent), tuple(map(mask_of, children)), truth.regions[parent])
             for parent, children in transition
         ]
         for transition in transitions
