@@ -68,7 +68,7 @@ def linked_nodes(
     S: sp.csr_matrix,
     mass: Float32[np.ndarray, "V N"],
     view_of_mask: Int32[np.ndarray, " M"],
-    rows_of_levels: Sequence[Int64[np.ndarray, "_"]],
+    rows_of_levels: Sequence[Int64[np.ndarray, " _"]],
     settings: SemanticTreeSettings,
     threads: int,
 ) -> Iterator[LevelNodes]:
