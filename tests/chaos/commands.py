@@ -6,20 +6,26 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import httpx2
+
+from hilsplat.annotate.labels import label_path, read_labels
 from tests.bad_inputs.conftest import snapshot
 from tests.conftest import PROJECT
-from tests.unit.finished_desk import SCENE, build_finished_desk
+from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, build_finished_desk
 
 COMMANDS = {
     "new": ("new", "chair", "photos.zip"),
     "query": ("query", "photos/desk", "mug", "--out", "answers"),
     "export": ("export", "photos/desk", "--out", "exported"),
 }
+SIZE = (HEIGHT, WIDTH + NUM_VIEWS)
+POLYGON = [[1, 1], [15, 1], [15, 20], [1, 20]]
 
 
 def prepare(root: Path) -> Path:
@@ -91,4 +97,48 @@ def kill_commands(root: Path, kills: int, chance: random.Random) -> list[str]:
             problems += kill_command(copy, name, whole_s, expected, chance)
             shutil.rmtree(copy)
         print(f"{kills} kills of {name}, which takes {whole_s:.1f} s", flush=True)
+    for number in range(kills):
+        copy = root / f"annotate-{number}"
+        shutil.copytree(project, copy)
+        problems += kill_annotator(copy, chance)
+        shutil.rmtree(copy)
+    print(f"{kills} kills of annotate", flush=True)
     return problems
+
+
+def kill_annotator(project: Path, chance: random.Random) -> Iterator[str]:
+    """Kill the annotation server while it saves a series of changes.
+
+    Yields:
+        Problems that need manual intervention: a confirmed change that is missing, or a damaged file.
+    """
+    server = started(project, "annotate", "photos/desk", "--no-browser", "--port", "0")
+    address = next(word for line in server.stdout for word in line.split() if word.startswith("http://127"))
+    confirmed = [-1]
+    threading.Thread(target=save_changes, args=(address, confirmed), daemon=True).start()
+    time.sleep(chance.uniform(0.2, 3))
+    os.killpg(server.pid, signal.SIGKILL)
+    server.wait()
+    last = confirmed[0]
+    path = label_path(project / "annotated/photos/desk", "000.png")
+    texts = [label.text for label in read_labels(path, SIZE)] if path.is_file() else []
+    if last >= 0 and texts not in ([f"change {last}"], [f"change {last + 1}"]):
+        yield f"annotate: after a kill {path.name} holds {texts}, and change {last} was confirmed"
+
+
+def save_changes(address: str, confirmed: list[int]) -> None:
+    """Replace the annotations of the first photograph until the server has ended."""
+    base = address.partition("/?")[0]
+    with httpx2.Client(base_url=base, headers={"origin": base, "sec-fetch-site": "same-origin"}) as client:
+        client.get(address)
+        version = "none"
+        while True:
+            label = {"id": 1, "level": 1, "text": f"change {confirmed[0] + 1}", "polygons": [POLYGON]}
+            try:
+                answer = client.put(
+                    "/api/labels/0", json={"labels": [label]}, headers={"if-match": f'"{version}"'}
+                )
+            except httpx2.HTTPError:
+                return
+            version = answer.json()["version"]
+            confirmed[0] += 1

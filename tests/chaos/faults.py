@@ -139,6 +139,13 @@ class Run:
         if ended.returncode:
             self.problems.append(f"no clean-up in another process namespace: {ended.stderr}")
 
+    def run_twice(self, chance: random.Random) -> None:
+        """Start a second run in the same project, which must refuse without disturbing the first."""
+        second = self.project.run(*COMMAND, check=False)
+        said = second.stdout + second.stderr
+        if self.is_running() and (second.returncode == 0 or "another hilsplat run" not in said):
+            self.problems.append(f"a second run was not refused:\n{said}")
+
 
 def mounted(folder: Path, *options: str) -> bool:
     """Mount a folder with these options; return False if this user may not, or if the disk is in use."""
@@ -179,4 +186,5 @@ FAULTS = (
     Fault("fill the disk", Run.fill_the_disk, kills=False, needs_disk=True, ends_run=False),
     Fault("make results read-only", Run.lock_the_disk, kills=False, needs_disk=True, ends_run=False),
     Fault("clean up on another machine", Run.clean_up_elsewhere, kills=False, may_fail=False, ends_run=False),
+    Fault("start a second run", Run.run_twice, kills=False, may_fail=False, ends_run=False),
 )
