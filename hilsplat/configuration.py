@@ -20,7 +20,7 @@ from hilsplat.settings import LARGEST, Section, knob
 CONFIG = Path("config/config.yaml")
 """The project's configuration; files given with `--configfile` override it."""
 
-LONGEST_SHOWN = 120  # maximum characters of a value in a message
+LONGEST_SHOWN = 120  # maximum number of characters of a value in a message
 
 
 class StageSettings(Section):

@@ -10,8 +10,8 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-# The summation order of linear algebra libraries depends on the number of threads. Stages use several cores
-# through numba or our own pools, whose results do not depend on that number.
+# The summation order of linear algebra libraries depends on the number of threads. Stages therefore run on
+# several cores through numba or our own pools, where the number of cores does not affect results.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_name] = "1"
 

@@ -121,7 +121,7 @@ def train_literally(
     seed: int,
     threads: int,
 ) -> tuple[Float32[np.ndarray, "N 3 D"], dict[str, object]]:
-    """Run Adam from the field's start, one random view per step; each is used once before any is repeated.
+    """Run Adam from the field's start, one random view per step; all are used once before any is repeated.
 
     Returns:
         the features, and a report with the loss curve and every term of the objective before and after.

@@ -208,7 +208,7 @@ def _fetch(listing: Listing, file: HubFile, staging: Path) -> Path:
             f"{file.path} of {listing.repository} does not have the digest that the hub reports",
             expected=f"digest {file.digest}, {file.size} bytes",
             found=f"digest {found}, {size} bytes; the file was deleted",
-            fix="run the command again; if the error persists, a proxy or mirror changes the file",
+            fix="run the command again; if the error persists, a proxy or mirror probably modifies the file",
         )
     return target
 

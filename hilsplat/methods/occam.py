@@ -32,7 +32,7 @@ def centre_pixels(means: Float[np.ndarray, "N 3"], camera: Camera) -> Int64[np.n
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
-    """Lift all levels; Gaussians whose centre is in no mask of any view get zeros."""
+    """Lift all levels; Gaussians whose centre is not inside a mask in any view get zeros."""
     contributions, latents, sums = inputs.contributions, inputs.latents, inputs.no_features()
     means = contributions.means().astype(np.float64)
     total = np.zeros(sums.shape[:2], np.float32)

@@ -76,7 +76,7 @@ def require_same_masks(folder: Path, other: Path) -> list[str]:
     """
     found, expected = digests_in(folder), digests_in(other)
     what = f"{folder} and {other} refer to different masks"
-    fix = f"rerun the stage that writes {folder}; if the error persists, also the one for {other}"
+    fix = f"rerun the stage that writes {folder}; if the error persists, also that of {other}"
     for view in {**expected, **found}:
         _require_same(view, expected.get(view), found.get(view), what, fix)
     return list(expected)

@@ -69,7 +69,7 @@ class Style(Message):
 
 
 def rows_of(text: str, width: int, count: int) -> UInt8[np.ndarray, "count width"]:
-    """Return the rows of bytes that a style contains as base64; an empty text gives zeros."""
+    """Return the rows of bytes stored in a style as base64; an empty string gives zeros."""
     if not text:
         return np.zeros((count, width), np.uint8)
     try:

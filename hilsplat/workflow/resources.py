@@ -68,7 +68,7 @@ MASKS, NODES = 230, 400
 
 UNTRAINED = ("lifted", "occam", "dr_splat")  # baselines without training
 
-UNKNOWN_MP = 0.5  # megapixels of a view if no image header can be read before the run
+UNKNOWN_MP = 0.5  # megapixels assumed per view if no image header can be read before the run
 
 
 class Size(NamedTuple):

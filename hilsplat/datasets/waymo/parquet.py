@@ -178,7 +178,7 @@ def camera_shots(split: Path, segment: str, every: int = 1) -> Iterator[CameraSh
     strange = sorted({row[CAMERA] for row in rows} - set(known))
     if strange:
         raise SceneError(
-            f"segment {segment} has images from cameras without a calibration",
+            f"segment {segment} has images from uncalibrated cameras",
             expected=", ".join(map(str, sorted(known))),
             found=", ".join(map(str, strange)),
             fix="download camera_image and camera_calibration from the same release",

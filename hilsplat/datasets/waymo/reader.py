@@ -72,7 +72,7 @@ def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
     images = tuple(shot_image(shot, segment_from_world) for shot in shots)
     warnings: tuple[str, ...] = ()
     if any(image.distortion[4] for image in images):
-        warnings = ("the lenses have a k3 coefficient, which poses cannot import; undistort the images",)
+        warnings = ("lenses have k3 distortion, which the poses stage cannot import; undistort the images",)
     return PointScene(segment, images, {"waymo": joined_points(points)}, warnings)
 
 

@@ -129,7 +129,7 @@ def lerf_table(sources: Sources) -> Table:
 
 
 def ovs_table(sources: Sources) -> Table:
-    """Build the table of segmentation per scene (paper: 3D-OVS), by LangSplat's thresholds and by argmax."""
+    """Build the per-scene segmentation table (paper: 3D-OVS), with LangSplat's thresholds and with argmax."""
 
     def columns_of(of_data: "pd.DataFrame") -> list[str]:
         scenes = sorted(set(of_data["scene"]))

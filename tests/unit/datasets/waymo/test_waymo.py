@@ -147,7 +147,7 @@ def test_a_written_segment_reads_back_in_the_frame_of_its_first_vehicle(root):
     assert dataset.locate(root.parent) == root and dataset.found(root) == (SEGMENT,)
     assert dataset.missing(root, SEGMENT) == ()
     assert dataset.check(root, SEGMENT).facts["posed images"] == 2  # of every tenth frame
-    assert scene.warnings[0].startswith("the lenses have a k3 coefficient")
+    assert scene.warnings[0].startswith("lenses have k3 distortion")
     (root / "validation" / "vehicle_pose" / f"{SEGMENT}.parquet").unlink()
     assert dataset.missing(root, SEGMENT) == (f"validation/vehicle_pose/{SEGMENT}.parquet",)
 
