@@ -14,6 +14,7 @@ from hilsplat.base.errors import MisalignedArtifactError, SettingsError
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.quadratic import StackedWeights
 from hilsplat.contributions.view_matrices import painted_indicator
+from hilsplat.field import solver
 from hilsplat.field.autoencoder import run_autoencoder
 from hilsplat.field.code import LanguageField
 from hilsplat.field.contrast import Contrast, ViewRelations, compared, distinct
@@ -151,6 +152,21 @@ def test_the_first_step_of_lbfgs_starts_at_the_conjugate_gradient_and_lowers_the
     assert after < before
     without = settings.model_copy(update={"weight_instance": 0.0, "weight_part": 0.0})
     assert "after_lbfgs" not in solve_field(toy.problem, toy.contrast(without))[1]
+
+
+def test_lbfgs_gets_the_conjugate_gradient_and_the_curvature_of_the_quadratic_part(monkeypatch):
+    toy, first_steps = Toy((1.0, 0.3, 0.1)), []
+
+    def unchanged(objective, start, steps, first_step):
+        first_steps.append(first_step)
+        return start
+
+    monkeypatch.setattr(solver, "lbfgs", unchanged)
+    settings = FieldSettings(weight_instance=0.5, weight_part=0.1, cg_steps=3, lbfgs_steps=1)
+    features, _ = solve_field(toy.problem, toy.contrast(settings))
+    shown = toy.problem.mass > 0
+    assert features[shown] == pytest.approx(conjugate_gradient(toy.problem, 3)[shown], rel=1e-5, abs=1e-7)
+    assert first_steps == [pytest.approx(toy.problem.total_pixels / (2 * 1.4))]
 
 
 @pytest.mark.parametrize("length", range(9))
