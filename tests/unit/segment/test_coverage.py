@@ -63,6 +63,7 @@ def test_parents_by_hand(texts, level, expected):
         (0.9, [NONE, NONE]),  # 9 of the last mask's 10 px are in the first: 0.9 > 0.9 is false
         (0.85, [NONE, 0]),  # 9 of the first mask's 13 px are in the last: 0.69 < 0.85
         (0.65, [NONE, NONE]),  # 0.69 > 0.65: too much of the first mask is in the last
+        (9 / 13, [NONE, NONE]),  # exactly theta of the first mask is too much
     ],
 )
 def test_both_shares_are_compared_with_theta(theta, expected):
