@@ -30,7 +30,9 @@ def query(
     threshold: Annotated[
         float | None, typer.Option(help="minimum score of an answer, 0 to 1; default: near the best score")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="folder for files; default: queries/TEXT")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="folder; default: queries/TEXT in the scene's folder")
+    ] = None,
     threads: Threads = 2,
 ) -> None:
     """Find the objects or parts that match a text in a finished scene.
