@@ -35,6 +35,8 @@ def test_box_iou_by_hand():
         ([[0, 0, 10, 10], [0, 0, 10, 9], [20, 20, 30, 30]], [0.5, 0.9, 0.1], 0.7, [1, 2]),
         # a dropped box drops no other: 0-1 and 1-2 overlap by 0.6, 0-2 by a third
         ([[0, 0, 8, 1], [2, 0, 10, 1], [4, 0, 12, 1]], [0.9, 0.8, 0.7], 0.5, [0, 2]),
+        # at the same score and area, the box further left is kept
+        ([[1, 0, 11, 10], [0, 0, 10, 10]], [0.5, 0.5], 0.7, [1]),
     ],
 )
 def test_boxes_are_dropped_by_better_ones_that_are_kept(boxes, score, iou_max, kept):
