@@ -288,6 +288,7 @@ def test_a_second_writer_is_refused(tmp_path: Path) -> None:
 
 def test_digest_of_parts_depends_on_their_boundaries() -> None:
     assert artifacts.sha256_of_bytes(b"ab", b"c") != artifacts.sha256_of_bytes(b"a", b"bc")
+    assert artifacts.sha256_of_json({"a": 1, "b": 2}) == artifacts.sha256_of_json({"b": 2, "a": 1})
 
 
 def test_folder_digest_follows_names_and_bytes(tmp_path: Path) -> None:
