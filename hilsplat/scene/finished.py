@@ -51,7 +51,7 @@ class FinishedScene:
 
     @staticmethod
     def locate(folder: Path, variant: str = "default") -> "FinishedScene":
-        """Find the artifacts of a variant, all of which are in the scene folder.
+        """Find the artifacts of a variant, which must all be in the scene folder.
 
         Input paths are read from provenance; without it, each is expected beside the artifact made from it. A
         variant without a field uses the field recorded in the provenance of its scores. During a run, the

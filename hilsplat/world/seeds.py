@@ -4,7 +4,7 @@ TRAINING_SEEDS = range(1_000_000, 2_000_000)
 """Scenes on which the small embedded models are trained."""
 
 SPLITS = {"training": TRAINING_SEEDS, "development": range(100, 200), "benchmark": range(200, 300)}
-"""Training, choosing settings, and reporting results use different scenes."""
+"""Scenes for training, for choosing settings, and for reported results; no scene has two of these uses."""
 
 
 def split_of_seed(seed: int) -> str:

@@ -48,5 +48,5 @@ def numbered_cameras(sights: Sequence[Sight], image_px: int, fov_deg: float | in
 
 
 def square_camera(sight: Sight, image_px: int, fov_deg: float | int) -> Camera:
-    """Return the one camera of `numbered_cameras`."""
+    """Return an upright camera with a square image; a sight is its centre and the point that it looks at."""
     return numbered_cameras([sight], image_px, fov_deg)["000.png"]
