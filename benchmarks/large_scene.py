@@ -23,6 +23,7 @@ import numpy as np
 from benchmarks.memory import status_mib
 from hilsplat.base.artifacts import atomic_folder, write_index, write_npy
 from hilsplat.base.levels import LEVELS
+from hilsplat.base.processes import keep_freed_memory
 from hilsplat.base.progress import track
 from hilsplat.base.tables import markdown_table
 from hilsplat.contributions.stage import run_contributions
@@ -205,6 +206,7 @@ def main() -> None:
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     if given.stage:
+        keep_freed_memory()  # as all commands do
         begun = time.perf_counter()
         stages(given.out, given.threads, given.device)[given.stage]()
         print(f"{time.perf_counter() - begun:.1f} {status_mib('VmHWM'):.0f}")

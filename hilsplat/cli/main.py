@@ -18,7 +18,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 import typer  # noqa: E402
 
 from hilsplat.base.errors import HilsplatError, require_working_directory, system_error  # noqa: E402
-from hilsplat.base.processes import end_with_workflow  # noqa: E402
+from hilsplat.base.processes import end_with_workflow, keep_freed_memory  # noqa: E402
 from hilsplat.cli.stage import app, start_logging  # noqa: E402
 
 # `hilsplat --help` lists the commands in this order.
@@ -30,6 +30,7 @@ from hilsplat.cli import scene_commands, stage_commands, user_commands, group_co
 def main() -> None:
     """Run the command; for errors that the user can fix, print a message without a traceback."""
     end_with_workflow()
+    keep_freed_memory()
     try:
         require_working_directory()
         app()

@@ -9,6 +9,7 @@ import numpy as np
 from hilsplat.base.compiled import compiled
 
 BETA1, BETA2 = 0.9, 0.999  # decay rates of the moments, as in torch
+LEAST_MOMENT = np.float32(1e-36)  # smaller moments are set to 0
 
 View = TypeVar("View")
 
@@ -49,6 +50,9 @@ def _step(values, gradient, first, second, rate, scale, eps):
     """Take one step in place; `rate` is divided by 1 - beta1^t, and `scale` is 1 / sqrt(1 - beta2^t)."""
     for k in range(len(values)):
         g = gradient[k]
-        first[k] = np.float32(BETA1) * first[k] + np.float32(1 - BETA1) * g
-        second[k] = np.float32(BETA2) * second[k] + np.float32(1 - BETA2) * g * g
+        m = np.float32(BETA1) * first[k] + np.float32(1 - BETA1) * g
+        v = np.float32(BETA2) * second[k] + np.float32(1 - BETA2) * g * g
+        # Processors are a hundred times slower with subnormal numbers, which moments of unused units reach.
+        first[k] = m if abs(m) > LEAST_MOMENT else np.float32(0)
+        second[k] = v if v > LEAST_MOMENT else np.float32(0)
         values[k] -= rate * first[k] / (np.sqrt(second[k]) * scale + eps)
