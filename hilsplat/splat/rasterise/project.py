@@ -160,6 +160,34 @@ def _read(table, width, first, count, rows, columns, column):
 
 
 @compiled(inline="always")
+def _read_narrow(means, log_scales, quats, first, count, rows, columns):
+    """Transpose the narrow tables to the first ten columns (see `_read`), in one block instead of three."""
+    for lane in range(count):
+        at, i = lane * LANES, first + lane
+        for k in range(3):
+            rows[at + k] = means[3 * i + k]
+            rows[at + 3 + k] = log_scales[3 * i + k]
+        for k in range(4):
+            rows[at + 6 + k] = quats[4 * i + k]
+    transpose(rows, 0, LANES, columns, 0, LANES)
+
+
+@compiled(inline="always")
+def _write_narrow(columns, rows, grads, first, count):
+    """Transpose the first 13 columns back to rows of the narrow gradients (see `project_backward`)."""
+    transpose(columns, 0, LANES, rows, 0, LANES)
+    for lane in range(count):
+        at, i = lane * LANES, first + lane
+        for k in range(3):
+            grads[0][3 * i + k] = rows[at + k]
+            grads[1][3 * i + k] = rows[at + 3 + k]
+        for k in range(4):
+            grads[2][4 * i + k] = rows[at + 6 + k]
+        grads[4][i] = rows[at + 10]
+        grads[5][2 * i], grads[5][2 * i + 1] = rows[at + 11], rows[at + 12]
+
+
+@compiled(inline="always")
 def _write(columns, column, width, rows, table, first, count, last):
     """Transpose columns back to rows of a table, for rows below `last` (see `_read`).
 
@@ -253,10 +281,9 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
     for group in range(begin, end):
         first = group * LANES
         count = min(LANES, len(means) - first)
-        _read(tables[0], 3, first, count, rows, columns, 0)
-        _read(tables[1], 3, first, count, rows, columns, 3)
-        _read(tables[2], 4, first, count, rows, columns, 6)
-        _read(opacity_logits, 1, first, count, rows, columns, 10)
+        _read_narrow(tables[0], tables[1], tables[2], first, count, rows, columns)
+        for lane in range(count):
+            columns[10 * LANES + lane] = opacity_logits[first + lane]
         _read(tables[3], numbers, first, count, rows, columns, SH_COLUMN)
         finite = zero  # becomes NaN if a parameter is not finite
         for k in range(SH_COLUMN + numbers):
@@ -383,9 +410,7 @@ def project_backward(begin, end, num_bases, tables, degree, camera, geometry, su
     for group in range(begin, end):
         first = group * LANES
         count = min(LANES, num_gaussians - first)
-        _read(tables[0], 3, first, count, rows, columns, 0)
-        _read(tables[1], 3, first, count, rows, columns, 3)
-        _read(tables[2], 4, first, count, rows, columns, 6)
+        _read_narrow(tables[0], tables[1], tables[2], first, count, rows, columns)
         _read(tables[3], numbers, first, count, rows, columns, SH_COLUMN)
         transpose(flat_geometry, first * GEOMETRY, GEOMETRY, columns, 64 * LANES, LANES)
         transpose(flat_sums, first * sums.shape[1], sums.shape[1], columns, 80 * LANES, LANES)
@@ -476,9 +501,5 @@ def project_backward(begin, end, num_bases, tables, degree, camera, geometry, su
         store(columns, 2 * LANES, narrow(wz))
         for k in range(SH_COLUMN + numbers):
             store(columns, k * LANES, keep_gt(drawn, zero, load(columns, k * LANES)))
-        _write(columns, 0, 3, rows, grads[0], first, count, last)
-        _write(columns, 3, 3, rows, grads[1], first, count, last)
-        _write(columns, 6, 4, rows, grads[2], first, count, last)
-        _write(columns, 10, 1, rows, grads[4], first, count, last)
-        _write(columns, 11, 2, rows, grads[5], first, count, last)
+        _write_narrow(columns, rows, grads, first, count)
         _write(columns, SH_COLUMN, numbers, rows, grads[3], first, count, last)
