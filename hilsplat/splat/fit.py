@@ -60,6 +60,7 @@ class FitState:
         arrays = {f"{table}_{name}": getattr(self.adam, table)[name] for table in TABLES for name in FIELDS}
         write_npz(
             path,
+            compressed=False,  # compression would take longer than a hundred steps
             steps=np.array(self.adam.steps),
             order=np.array(self.order, dtype=np.int64),
             generator=np.array(json.dumps(self.generator.bit_generator.state)),

@@ -42,6 +42,9 @@ LOOPS = {
 }
 """Rule -> the loop (`base.progress.track`) that takes almost all of the rule's time."""
 
+STARTED = 0.1
+"""Share of a loop from which its speed predicts the rest; before, start-up and compilation dominate."""
+
 
 @dataclass(frozen=True)
 class RunningJob:
@@ -185,9 +188,9 @@ class RunProgress:
         return max([spread, *(left for left, _ in running)])
 
     def _left(self, job: RunningJob) -> float:
-        """Return a running job's remaining seconds, from the job's progress if it has reported any."""
+        """Return a running job's remaining seconds, from its progress once it is past `STARTED`."""
         elapsed, progress = self.clock() - job.start_s, job.progress()
-        if progress is not None and progress[1] and progress[0] == LOOPS.get(job.rule):
+        if progress and progress[1] > STARTED * progress[2] and progress[0] == LOOPS.get(job.rule):
             return elapsed * (progress[2] / progress[1] - 1)
         return max(estimates.seconds(job.rule) / job.threads - elapsed, 0.1 * elapsed)
 

@@ -170,6 +170,8 @@ def test_the_progress_in_a_log_is_shown_and_counts(screen, run, clock, tmp_path)
     log_lines(log, (20, "hilsplat.base.progress", "photographs read: 3 of 4"))
     assert run.line().endswith("photos/desk gaussians: photographs read 3 of 4")
     assert run.seconds_left() == pytest.approx(60), "only the main loop counts"
+    log_lines(log, (20, "hilsplat.base.progress", "fit steps: 1 of 100"))
+    assert run.seconds_left() == pytest.approx(60), "so far, most of the time was compilation"
     log_lines(log, (20, "hilsplat.base.progress", "fit steps: 1 of 4"))
     assert run.line().endswith("photos/desk gaussians 1 of 4")
     assert run.seconds_left() == pytest.approx(1800)
