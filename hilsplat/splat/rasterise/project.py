@@ -24,6 +24,7 @@ from hilsplat.base.lanes import (
     larger,
     load,
     narrow,
+    prefetch,
     root,
     smaller,
     store,
@@ -139,6 +140,13 @@ def _sh_pull(x, y, z, degree, w):
         gz = gz + _C31 * x * y * w10 + _C35 * (xx - yy) * w14 - 8.0 * _C32 * z * (y * w11 + x * w13)
         gz = gz + _C33 * (6.0 * zz - 3.0 * xx - 3.0 * yy) * w12
     return gx, gy, gz
+
+
+@compiled(inline="always")
+def _fetch(table, width, first):
+    """Start loading 16 rows of a table into the cache, to be read or written there."""
+    for k in range(width):
+        prefetch(table, first * width + k * LANES)
 
 
 @compiled(inline="always")
@@ -411,6 +419,10 @@ def project_backward(begin, end, num_bases, tables, degree, camera, geometry, su
         first = group * LANES
         count = min(LANES, num_gaussians - first)
         _read_narrow(tables[0], tables[1], tables[2], first, count, rows, columns)
+        _fetch(tables[3], numbers, first + LANES)
+        _fetch(grads[3], numbers, first + LANES)
+        _fetch(flat_geometry, GEOMETRY, first + LANES)
+        _fetch(flat_sums, sums.shape[1], first + LANES)
         _read(tables[3], numbers, first, count, rows, columns, SH_COLUMN)
         transpose(flat_geometry, first * GEOMETRY, GEOMETRY, columns, 64 * LANES, LANES)
         transpose(flat_sums, first * sums.shape[1], sums.shape[1], columns, 80 * LANES, LANES)
