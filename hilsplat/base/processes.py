@@ -61,16 +61,16 @@ def end_with_workflow() -> None:
 
 
 def keep_freed_memory() -> None:
-    """Let glibc keep freed memory for later arrays instead of returning it to the system.
+    """Let glibc keep up to 128 MiB of freed memory for later arrays instead of returning it to the system.
 
     Otherwise, the system clears new pages for most arrays of a step, which takes up to a fifth of a step of
-    a fit. Arrays above 64 MiB are still returned at once, so that large scenes take no more memory.
+    a fit. Arrays above 32 MiB are still returned at once, so that large scenes take no more memory.
     """
     if sys.platform == "linux":
         with suppress(AttributeError):  # another C library
             set_option = ctypes.CDLL(None).mallopt
-            set_option(M_MMAP_THRESHOLD, 64 << 20)
-            set_option(M_TRIM_THRESHOLD, 256 << 20)
+            set_option(M_MMAP_THRESHOLD, 32 << 20)
+            set_option(M_TRIM_THRESHOLD, 128 << 20)
 
 
 UNFINISHED = re.compile(r"\.writing-(?P<host>[0-9a-f]{8})-.*", re.DOTALL)
