@@ -127,7 +127,7 @@ def export_clip(out: Path) -> None:
     from optimum.exporters.onnx import main_export
     from transformers.models.clip.tokenization_clip import bytes_to_unicode
 
-    from hilsplat.models.onnx_graph import split_whole
+    from hilsplat.models.onnx_graph import split_clip
 
     torch.manual_seed(0)
     torch_folder = out / "torch"
@@ -148,7 +148,8 @@ def export_clip(out: Path) -> None:
     model.save_pretrained(torch_folder)
     transformers.CLIPProcessor(transformers.CLIPImageProcessor(), tokenizer).save_pretrained(torch_folder)
     main_export(str(torch_folder), output=out, task="feature-extraction", do_validation=False)
-    split_whole(out)
+    split_clip(out)
+    (out / "model.onnx").unlink()
 
 
 def export(name: str, out: Path) -> None:
