@@ -5,6 +5,7 @@ import time
 import numpy as np
 from PIL import Image
 
+from hilsplat.models.network import Network
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.sam import Encoded, SamModel
 
@@ -75,7 +76,7 @@ class CannedSam(SamModel):
         """Return the number of prompts, at most the limit."""
         return min(limit, prompts)
 
-    def encode(self, image: np.ndarray) -> Encoded:
+    def encode(self, image: np.ndarray, encoder: Network | None = None) -> Encoded:
         """Prepare the image without encoding it."""
         _, frame = self.prepare(image)
         return Encoded({}, frame)

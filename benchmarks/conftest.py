@@ -115,7 +115,7 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
 GOALS: pytest.StashKey[list] = pytest.StashKey()
 
 
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[Any]) -> None:
     """Collect the goals of the selected modules."""
     modules = dict.fromkeys(item.module for item in items)
     config.stash[GOALS] = [goal for module in modules for goal in getattr(module, "GOALS", [])]

@@ -17,6 +17,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -96,7 +97,8 @@ def ring_of_cameras(number: int, size_hw: tuple[int, int]) -> Cameras:
     focal = 0.9 * size_hw[1]
     K = np.array([[focal, 0, size_hw[1] / 2], [0, focal, size_hw[0] / 2], [0, 0, 1]])
     names = tuple(f"{index:04d}.png" for index in range(number))
-    return Cameras(names, poses, np.tile(K, (number, 1, 1)), np.tile(np.int32(size_hw), (number, 1)))
+    sizes = np.tile(np.array(size_hw, np.int32), (number, 1))
+    return Cameras(names, poses, np.tile(K, (number, 1, 1)), sizes)
 
 
 def make(out: Path, number: int, views: int, size_hw: tuple[int, int], masks: int, threads: int) -> None:
@@ -152,7 +154,7 @@ def front_gaussian(weights) -> np.ndarray:
     return front
 
 
-def stages(out: Path, threads: int, device: str) -> dict[str, Callable[[], None]]:
+def stages(out: Path, threads: int, device: Literal["cpu", "cuda"]) -> dict[str, Callable[[], None]]:
     """Return the stages to time; `device` applies to contributions."""
     code = AutoencoderSettings(code="pca", latent=16)
     return {
@@ -223,8 +225,8 @@ def main() -> None:
         seconds, peak = done.stdout.split()[-2:]
         rows.append((stage, seconds, peak))
         print(*rows[-1], flush=True)
-    seconds = sum(float(row[1]) for row in rows)
-    rows.append(("all", f"{seconds:.1f}", max((row[2] for row in rows), key=float)))
+    total = sum(float(row[1]) for row in rows)
+    rows.append(("all", f"{total:.1f}", max((row[2] for row in rows), key=float)))
     table = markdown_table(("stage", "s", "peak MiB"), rows, 1)
     (given.out / "times.md").write_text(table + "\n")
     times = {stage: [float(seconds), float(peak)] for stage, seconds, peak in rows}

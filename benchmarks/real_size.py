@@ -198,7 +198,7 @@ def measure(step: str, models: Path, photograph: Path, points: int) -> dict[str,
     else:
         model, settings = SamModel.load(models), MasksSettings(points_per_side=points)
         encode = model.encode
-        model.encode = lambda image: clocked("encode", lambda: encode(image))  # type: ignore[method-assign]
+        model.encode = lambda image: clocked("encode", lambda: encode(image))  # type: ignore
         clocked("view", lambda: decode_candidates(image, model, settings))
     return found | {"peak_mib": status_mib("VmHWM")}
 
@@ -215,9 +215,9 @@ def compare_decoders(models: Path, photograph: Path, points: int) -> dict[str, f
     from hilsplat.segment.sam import SamModel, ask_network, in_input, point_grid
 
     model, rounds, many = SamModel.load(models), 8, 64
-    assert model.factored is not None
     image = resize_to_fit(read_image(photograph), MAX_SIDE_PX)
     encoded = model.encode(image)
+    assert model.factored is not None and encoded.terms is not None
     at = in_input(point_grid(points) * (image.shape[1], image.shape[0]), encoded.frame)
     at = at[np.random.default_rng(0).permutation(len(at))[:many]]
     found: dict[str, list[float]] = {"plain_ms": [], "preview_ms": [], "masks_ms": []}

@@ -74,7 +74,8 @@ def rehearse(folder: Path, photographs: Path, options: list[str], cores: int) ->
     plain = {**os.environ, "PYTHONPATH": str(PROJECT)}
     subprocess.run([*command, "models", "check"], cwd=folder, env=plain, check=True)
     subprocess.run([*command, "new", name, str(photographs)], cwd=folder, env=environment, check=True)
-    begin, found = time.monotonic(), {}
+    begin = time.monotonic()
+    found: dict[str, float] = {}
     run = [*command, "run", SCENE, *options, "--", "--cores", str(cores)]
     with subprocess.Popen(
         run, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True

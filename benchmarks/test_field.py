@@ -7,6 +7,7 @@ before the timing, because the time to embed a text depends on the model.
 
 import time
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.quadratic import StackedWeights
 from hilsplat.field.autoencoder import train_autoencoder
-from hilsplat.field.code import LanguageField, LinearCode
+from hilsplat.field.code import Code, LanguageField, LinearCode
 from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Cameras
@@ -61,6 +62,7 @@ def open_scene(code_name: str, threads: int = 1) -> LanguageScene:
         first += down * across
     kinds = rng.normal(size=(40, CHANNELS))
     clip = unit(kinds[rng.integers(0, 40, first)] + 0.5 * rng.normal(size=(first, CHANNELS)))
+    code: Code
     if code_name == "pca":
         code = LinearCode.fit(clip, 16)
     else:
@@ -92,7 +94,7 @@ def open_scene(code_name: str, threads: int = 1) -> LanguageScene:
     cameras = Cameras((VIEW,), np.eye(4)[None], camera.K[None], np.array([SIZE_HW], np.int32))
     nothing = np.zeros((0, 3), np.float32)
     scene = Scene(
-        None, "made/up", "metre", cameras, {VIEW: "train"}, nothing, nothing.astype(np.uint8), np.eye(4)
+        Path(), "made/up", "metre", cameras, {VIEW: "train"}, nothing, nothing.astype(np.uint8), np.eye(4)
     )
     weights = pixel_weights(gaussians, camera, min_weight=1 / 255)
 

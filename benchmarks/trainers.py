@@ -44,7 +44,7 @@ EMPTY = ("ablation", "component", "theta", "omega", "pruning")
 def configuration(scene: str, iterations: int, seeds: int) -> dict[str, Any]:
     """Return the configuration: a variant per trainer; `fast-60` is the solver with many more steps."""
     literal = {"trainer": "literal", "rate": 0.001}
-    more = ({}, {"cg_steps": 60, "lbfgs_steps": 20}, literal)
+    more: tuple[dict[str, Any], ...] = ({}, {"cg_steps": 60, "lbfgs_steps": 20}, literal)
     trainers = dict(zip(TRAINERS, more, strict=True))
     return {
         "groups": ["benchmark", "development", "ci"],

@@ -16,7 +16,7 @@ from hilsplat.base.artifacts import (
     sha256_of_path,
     write_index,
     write_json,
-    write_npz,
+    write_stored_npz,
 )
 from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.base.identity import code_digest
@@ -58,9 +58,8 @@ class FitState:
     def save(self, path: Path) -> None:
         """Write a checkpoint."""
         arrays = {f"{table}_{name}": getattr(self.adam, table)[name] for table in TABLES for name in FIELDS}
-        write_npz(
+        write_stored_npz(  # compression would take longer than a hundred steps
             path,
-            compressed=False,  # compression would take longer than a hundred steps
             steps=np.array(self.adam.steps),
             order=np.array(self.order, dtype=np.int64),
             generator=np.array(json.dumps(self.generator.bit_generator.state)),
