@@ -52,7 +52,7 @@ def _step(values, gradient, first, second, rate, scale, eps):
         g = gradient[k]
         m = np.float32(BETA1) * first[k] + np.float32(1 - BETA1) * g
         v = np.float32(BETA2) * second[k] + np.float32(1 - BETA2) * g * g
-        # Processors are a hundred times slower with subnormal numbers, which moments of unused units reach.
+        # Processors are many times slower with subnormal numbers, which moments of unused units reach.
         first[k] = m if abs(m) > LEAST_MOMENT else np.float32(0)
         second[k] = v if v > LEAST_MOMENT else np.float32(0)
         values[k] -= rate * first[k] / (np.sqrt(second[k]) * scale + eps)

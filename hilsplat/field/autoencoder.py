@@ -205,14 +205,14 @@ def _backward(
     """Compute the gradients of the layers' parameters, and return the gradient of their inputs."""
     for layer, (values, scaled, spread) in zip(layers[::-1], passed[::-1], strict=True):
         np.matmul(slope.T, values, out=gradients[f"{layer.name}.weight"])
-        np.add.reduce(slope, axis=0, out=gradients[f"{layer.name}.bias"])  # without the checks of np.sum
+        np.sum(slope, axis=0, out=gradients[f"{layer.name}.bias"])
         slope = slope @ parameters[f"{layer.name}.weight"]
         if layer.relu:
             slope *= values > 0
         if layer.norm:
             of_weight, of_bias = (gradients[f"{layer.norm}.{name}"] for name in ("weight", "bias"))
-            np.add.reduce(slope * scaled, axis=0, out=of_weight)
-            np.add.reduce(slope, axis=0, out=of_bias)
+            np.sum(slope * scaled, axis=0, out=of_weight)
+            np.sum(slope, axis=0, out=of_bias)
             common = np.float32(1 / len(slope)) * (of_bias + scaled * of_weight)
             slope = parameters[f"{layer.norm}.weight"] * spread * (slope - common)
     return slope
@@ -220,15 +220,15 @@ def _backward(
 
 def _slope_before_unit(values: np.ndarray, slope: np.ndarray) -> np.ndarray:
     """Convert the gradient with respect to the output of `unit_rows` to that with respect to its input."""
-    length = np.sqrt(np.add.reduce(np.square(values), axis=1, keepdims=True))
+    length = np.sqrt(np.square(values).sum(axis=1, keepdims=True))
     units = values / length
-    return (slope - units * np.add.reduce(units * slope, axis=1, keepdims=True)) / length
+    return (slope - units * (units * slope).sum(axis=1, keepdims=True)) / length
 
 
 def _normalised(values: np.ndarray, weight: np.ndarray, bias: np.ndarray) -> Passed:
     """Apply BatchNorm (batch statistics) and ReLU; return normalised inputs, 1 / deviation and outputs."""
     share = np.float32(1 / len(values))
-    centred = values - np.add.reduce(share * values, axis=0)
-    spread = 1 / np.sqrt(np.add.reduce(share * np.square(centred), axis=0) + np.float32(NORM_EPS))
+    centred = values - (share * values).sum(axis=0)
+    spread = 1 / np.sqrt((share * np.square(centred)).sum(axis=0) + np.float32(NORM_EPS))
     scaled = centred * spread
     return scaled, spread, np.maximum(scaled * weight + bias, 0)

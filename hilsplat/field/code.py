@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -160,7 +160,6 @@ class Layer(NamedTuple):
     outputs: int
 
 
-@cache
 def layers_of(channels: int, latent: int) -> tuple[list[Layer], list[Layer]]:
     """Return the layers of the encoder and the decoder; no layer is wider than the vectors."""
     inner, outer = ([min(width, channels) for width in sizes] for sizes in (ENCODER_WIDTHS, DECODER_WIDTHS))

@@ -150,8 +150,8 @@ def _fetch(table, width, first):
 
 
 @compiled(inline="always")
-def _read(table, width, first, count, rows, columns, column):
-    """Transpose rows first..first + count of a flat table to columns of 16 lanes.
+def _read(table, width, first, count, rows, columns):
+    """Transpose harmonics of Gaussians first..first + count to columns of 16 lanes from SH_COLUMN.
 
     Lanes beyond `count` and columns beyond `width` contain arbitrary numbers.
     """
@@ -159,12 +159,12 @@ def _read(table, width, first, count, rows, columns, column):
     if (first + LANES - 1) * width + blocks * LANES <= len(table):
         for block in range(blocks):
             at = first * width + block * LANES
-            transpose(table, at, width, columns, (column + block * LANES) * LANES, LANES)
+            transpose(table, at, width, columns, (SH_COLUMN + block * LANES) * LANES, LANES)
     else:  # a vector load would read past the end of the table
         for k in range(count * width):
             rows[k] = table[first * width + k]
         for block in range(blocks):
-            transpose(rows, block * LANES, width, columns, (column + block * LANES) * LANES, LANES)
+            transpose(rows, block * LANES, width, columns, (SH_COLUMN + block * LANES) * LANES, LANES)
 
 
 @compiled(inline="always")
@@ -196,7 +196,7 @@ def _write_narrow(columns, rows, grads, first, count):
 
 
 @compiled(inline="always")
-def _write(columns, column, width, rows, table, first, count, last):
+def _write(columns, width, rows, table, first, count, last):
     """Transpose columns back to rows of a table, for rows below `last` (see `_read`).
 
     The last block of a row overlaps the next row, whose first block is written after it.
@@ -205,10 +205,10 @@ def _write(columns, column, width, rows, table, first, count, last):
     if (first + LANES - 1) * width + blocks * LANES <= last * width:
         for block in range(blocks - 1, -1, -1):
             at = first * width + block * LANES
-            transpose(columns, (column + block * LANES) * LANES, LANES, table, at, width)
+            transpose(columns, (SH_COLUMN + block * LANES) * LANES, LANES, table, at, width)
     else:
         for block in range(blocks - 1, -1, -1):
-            transpose(columns, (column + block * LANES) * LANES, LANES, rows, block * LANES, width)
+            transpose(columns, (SH_COLUMN + block * LANES) * LANES, LANES, rows, block * LANES, width)
         for k in range(count * width):
             table[first * width + k] = rows[k]
 
@@ -292,7 +292,7 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
         _read_narrow(tables[0], tables[1], tables[2], first, count, rows, columns)
         for lane in range(count):
             columns[10 * LANES + lane] = opacity_logits[first + lane]
-        _read(tables[3], numbers, first, count, rows, columns, SH_COLUMN)
+        _read(tables[3], numbers, first, count, rows, columns)
         finite = zero  # becomes NaN if a parameter is not finite
         for k in range(SH_COLUMN + numbers):
             if k < 11 or k >= SH_COLUMN:
@@ -423,7 +423,7 @@ def project_backward(begin, end, num_bases, tables, degree, camera, geometry, su
         _fetch(grads[3], numbers, first + LANES)
         _fetch(flat_geometry, GEOMETRY, first + LANES)
         _fetch(flat_sums, sums.shape[1], first + LANES)
-        _read(tables[3], numbers, first, count, rows, columns, SH_COLUMN)
+        _read(tables[3], numbers, first, count, rows, columns)
         transpose(flat_geometry, first * GEOMETRY, GEOMETRY, columns, 64 * LANES, LANES)
         transpose(flat_sums, first * sums.shape[1], sums.shape[1], columns, 80 * LANES, LANES)
         drawn = load(columns, 71 * LANES)
@@ -514,4 +514,4 @@ def project_backward(begin, end, num_bases, tables, degree, camera, geometry, su
         for k in range(SH_COLUMN + numbers):
             store(columns, k * LANES, keep_gt(drawn, zero, load(columns, k * LANES)))
         _write_narrow(columns, rows, grads, first, count)
-        _write(columns, SH_COLUMN, numbers, rows, grads[3], first, count, last)
+        _write(columns, numbers, rows, grads[3], first, count, last)
