@@ -178,7 +178,7 @@ def measure(step: str, models: Path, photograph: Path, points: int) -> dict[str,
     from hilsplat.models.network import Network
     from hilsplat.segment.generate import decode_candidates
     from hilsplat.segment.graph import segment_graph
-    from hilsplat.segment.sam import SamModel
+    from hilsplat.segment.sam import Encoded, SamModel
     from hilsplat.settings import ClipSettings, MasksSettings
 
     image = resize_to_fit(read_image(photograph), MAX_SIDE_PX)
@@ -198,7 +198,11 @@ def measure(step: str, models: Path, photograph: Path, points: int) -> dict[str,
     else:
         model, settings = SamModel.load(models), MasksSettings(points_per_side=points)
         encode = model.encode
-        model.encode = lambda image: clocked("encode", lambda: encode(image))  # type: ignore
+
+        def clocked_encode(image: np.ndarray, encoder: Network | None = None) -> Encoded:
+            return clocked("encode", lambda: encode(image, encoder))
+
+        model.encode = clocked_encode  # type: ignore[method-assign]
         clocked("view", lambda: decode_candidates(image, model, settings))
     return found | {"peak_mib": status_mib("VmHWM")}
 

@@ -169,7 +169,7 @@ def _read(table, width, first, count, rows, columns):
 
 @compiled(inline="always")
 def _read_narrow(means, log_scales, quats, first, count, rows, columns):
-    """Transpose the narrow tables to the first ten columns (see `_read`), in one block instead of three."""
+    """Transpose means, log scales and quaternions together to the first ten columns (see `_read`)."""
     for lane in range(count):
         at, i = lane * LANES, first + lane
         for k in range(3):
@@ -197,7 +197,7 @@ def _write_narrow(columns, rows, grads, first, count):
 
 @compiled(inline="always")
 def _write(columns, width, rows, table, first, count, last):
-    """Transpose columns back to rows of a table, for rows below `last` (see `_read`).
+    """Transpose columns of harmonics back to rows of a table, for rows below `last` (see `_read`).
 
     The last block of a row overlaps the next row, whose first block is written after it.
     """
