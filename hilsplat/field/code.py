@@ -1,6 +1,6 @@
 """The scene's code, which maps CLIP vectors to a few numbers and back, and the language field of codes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -8,25 +8,19 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, Int64
+from jaxtyping import Float, Float32
 
 from hilsplat.base.arrays import made, read_tensors, write_tensors
 from hilsplat.base.artifacts import read_npz, remake, sealed
-from hilsplat.base.compiled import compiled
 from hilsplat.base.errors import ArtifactError
-from hilsplat.base.lane_products import MOST_ROWS, WIDE_COLUMNS, rows_of_products
 from hilsplat.contributions.rows import Contributions
+from hilsplat.field.decoder import PackedLayers
 from hilsplat.segment.digests import require_same_masks
 
 CHUNK_ROWS = 4096  # rows decoded at once: 4096 vectors of 128 numbers (2 MiB) fit in the processor's cache
 ENCODER_WIDTHS = (256, 128, 64, 32)
 DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
 NORM_EPS = 1e-5  # epsilon added to the variances of BatchNorm, as in torch
-
-ROWS = 2 * WIDE_COLUMNS  # rows processed together; for each such block, weights are read from L2 once
-UNITS = MOST_ROWS  # outputs of a layer that are summed together; layers are padded to a multiple of this
-
-_add_products = rows_of_products(UNITS)
 
 
 class LinearCode:
@@ -77,77 +71,6 @@ class LinearCode:
         """Write a .safetensors file; identical codes produce identical bytes."""
         arrays = {"mean": self.mean, "basis": self.basis}
         write_tensors(path, arrays, code="pca", channels=self.channels, latent=self.latent)
-
-
-class PackedLayers(NamedTuple):
-    """Dense layers with ReLUs between them, in the memory layout that the compiled loop needs.
-
-    The values fit in the L1 cache. Rows are SIMD lanes, and as many outputs are summed together as fit in
-    the registers. The summation order in a row does not depend on other rows.
-    """
-
-    widths: Int64[np.ndarray, " L_plus_1"]  # number of inputs, then number of each layer's outputs
-    weights: Float32[np.ndarray, " W"]
-    biases: Float32[np.ndarray, " V"]
-
-    @staticmethod
-    def of(layers: Sequence[tuple[np.ndarray, np.ndarray]]) -> "PackedLayers":
-        """Pack weights (outputs, inputs) and biases (outputs) of each layer."""
-        widths = [layers[0][0].shape[1], *(len(bias) for _, bias in layers)]
-        weights, biases = [], []
-        for weight, bias in layers:
-            missing = -len(bias) % UNITS
-            weights.append(np.pad(weight, ((0, missing), (0, 0))).reshape(-1))
-            biases.append(np.pad(bias, (0, missing)))
-        flat_weights, flat_biases = (np.concatenate(each).astype(np.float32) for each in (weights, biases))
-        return PackedLayers(np.array(widths), flat_weights, flat_biases)
-
-    def through(self, rows: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B C"]:
-        """Return the outputs of the last layer, scaled to unit length."""
-        out = np.empty((len(rows), self.widths[-1]), np.float32)
-        _through(np.ascontiguousarray(rows, np.float32), *self, out)
-        return out
-
-
-@compiled
-def _through(rows, widths, weights, biases, out):
-    widest = (widths.max() + UNITS - 1) // UNITS * UNITS
-    values, following = np.zeros(widest * ROWS, np.float32), np.zeros(widest * ROWS, np.float32)
-    lengths = np.empty(ROWS, np.float32)
-    for begin in range(0, len(rows), ROWS):
-        count = min(ROWS, len(rows) - begin)
-        for channel in range(widths[0]):
-            for row in range(count):
-                values[channel * ROWS + row] = rows[begin + row, channel]
-        weight, bias = 0, 0
-        for layer in range(len(widths) - 1):
-            inputs, outputs = widths[layer], (widths[layer + 1] + UNITS - 1) // UNITS * UNITS
-            for unit in range(outputs):
-                following[unit * ROWS : (unit + 1) * ROWS] = biases[bias + unit]
-            for unit in range(0, outputs, UNITS):
-                for lane in range(0, ROWS, WIDE_COLUMNS):
-                    to = unit * ROWS + lane
-                    _add_products(
-                        following, to, ROWS, weights, weight, inputs, values, lane, ROWS, inputs, False, True
-                    )
-                weight += UNITS * inputs
-            if layer < len(widths) - 2:
-                for place in range(outputs * ROWS):
-                    following[place] = max(following[place], np.float32(0))
-            bias += outputs
-            values, following = following, values
-        lengths[:] = 0
-        for channel in range(widths[-1]):
-            for row in range(ROWS):
-                lengths[row] += values[channel * ROWS + row] ** 2
-        for row in range(ROWS):
-            lengths[row] = max(np.sqrt(lengths[row]), np.float32(1e-12))
-        for channel in range(widths[-1]):
-            for row in range(ROWS):
-                values[channel * ROWS + row] /= lengths[row]
-        for row in range(count):
-            for channel in range(widths[-1]):
-                out[begin + row, channel] = values[channel * ROWS + row]
 
 
 class Layer(NamedTuple):

@@ -250,6 +250,20 @@ class Plan:
             return []
         return [self.shared("clip", "clip")(of_variant(job, KEY_VIEWS))]
 
+    def cached_masks(self, job: VariantJob) -> list[str]:
+        """Return an input of `masks` that only orders jobs: vectors of the same masks with other levels.
+
+        The job then finds its masks in the cache, and `clip` their vectors; otherwise, both would be computed
+        by several jobs at the same time.
+        """
+        stages = self.stages(job)
+        by_head = stages.masks.model_copy(update={"levels": "head", "theta": None})
+        stage = "clip" if stages.clip.crops == "masks" else "masks"
+        for name in self.run.every_variant() if stages.masks != by_head else ():
+            if self.stages(of_variant(job, name)).masks == by_head:
+                return [self.shared(stage, stage)(of_variant(job, name))]
+        return []
+
     def masks_truth(self, job: VariantJob) -> list[str]:
         """Return the input of `masks`: the diagnostic's ground-truth labels; SettingsError if none exist."""
         if self.masks_stage(job) != "truth_masks":

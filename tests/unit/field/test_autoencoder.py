@@ -19,12 +19,12 @@ from hilsplat.field.autoencoder import (
 )
 from hilsplat.field.code import (
     Autoencoder,
-    PackedLayers,
     autoencoder_file,
     load_code,
     load_latents,
     unit_rows,
 )
+from hilsplat.field.decoder import PackedLayers
 from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import AutoencoderSettings, SemanticTreeSettings
@@ -105,7 +105,7 @@ def test_a_trained_network_equals_torch_with_the_statistics_of_all_vectors():
     assert model.decode_array(model.encode_array(vectors)) == pytest.approx(expected, abs=1e-5)
 
 
-@pytest.mark.parametrize(("rows", "widths"), [(1, (3, 1)), (130, (2, 5, 16, 7)), (64, (16, 64))])
+@pytest.mark.parametrize(("rows", "widths"), [(1, (3, 1)), (100, (2, 5, 16, 7)), (64, (16, 64))])
 def test_compiled_layers_equal_matrix_products_with_relu(rows, widths):
     random = np.random.default_rng(0)
     layers = [
@@ -120,6 +120,20 @@ def test_compiled_layers_equal_matrix_products_with_relu(rows, widths):
     packed = PackedLayers.of(layers)
     assert packed.through(given) == pytest.approx(expected, abs=2e-6)
     assert np.array_equal(packed.through(given)[rows // 2 :], packed.through(given[rows // 2 :]))
+
+
+@pytest.mark.parametrize("latent", [1, 2, 3])
+def test_pieces_decode_what_the_network_decodes(latent):
+    random, code = np.random.default_rng(0), Autoencoder.drawn(40, latent, np.random.RandomState(0))
+    centres = random.normal(size=(12, latent)).astype(np.float32)
+    near = random.normal(scale=1e-3, size=(1500, latent)).astype(np.float32)
+    latents = np.concatenate([centres[random.integers(0, 12, 1500)] + near, near * 1e3])
+    one_by_one = np.concatenate([code.decode_array(latents[row : row + 1]) for row in range(len(latents))])
+    decoded = code.decode_array(latents)
+    assert decoded == pytest.approx(one_by_one, abs=1e-6)
+    by_network = (decoded == one_by_one).all(axis=1)  # pieces round differently
+    assert by_network.any()
+    assert by_network[:1500].mean() < 0.1
 
 
 def test_missing_files_and_weights_are_reported(tmp_path):
