@@ -44,10 +44,11 @@ def margins(
     compared by margins because relevancies saturate. All vectors have unit length.
     """
     found = np.empty((len(texts), len(embeddings)), np.float32)
+    every = np.concatenate([texts, canonical])  # one product takes less time than two
     for start in range(0, len(embeddings), ROWS_AT_A_TIME):
-        part = embeddings[start : start + ROWS_AT_A_TIME]
-        generic = (part @ canonical.T).max(axis=1)
-        found[:, start : start + ROWS_AT_A_TIME] = (part @ texts.T - generic[:, None]).T
+        cosines = every @ embeddings[start : start + ROWS_AT_A_TIME].T
+        generic = cosines[len(texts) :].max(axis=0)
+        found[:, start : start + ROWS_AT_A_TIME] = cosines[: len(texts)] - generic
     return found
 
 

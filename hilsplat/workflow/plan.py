@@ -251,16 +251,16 @@ class Plan:
         return [self.shared("clip", "clip")(of_variant(job, KEY_VIEWS))]
 
     def cached_masks(self, job: VariantJob) -> list[str]:
-        """Return an input of `masks` that only orders jobs: vectors of the same masks with other levels.
+        """Return an input of `masks` that only orders jobs: the same masks with other levels, or their vectors.
 
-        The job then finds its masks in the cache, and `clip` their vectors; otherwise, both would be computed
-        by several jobs at the same time.
+        The job then finds its masks in the cache; otherwise, several jobs would compute them at once.
         """
-        stages = self.stages(job)
-        by_head = stages.masks.model_copy(update={"levels": "head", "theta": None})
-        stage = "clip" if stages.clip.crops == "masks" else "masks"
-        for name in self.run.every_variant() if stages.masks != by_head else ():
-            if self.stages(of_variant(job, name)).masks == by_head:
+        own = self.stages(job).masks
+        by_head = own.model_copy(update={"levels": "head", "theta": None})
+        for name in self.run.every_variant() if own != by_head else ():
+            other = self.stages(of_variant(job, name))
+            if other.masks == by_head:
+                stage = "clip" if other.clip.crops == "masks" else "masks"  # crops of nodes need more stages
                 return [self.shared(stage, stage)(of_variant(job, name))]
         return []
 

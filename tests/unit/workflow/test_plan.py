@@ -134,9 +134,10 @@ def test_levels_by_the_tree_take_the_theta_of_the_tree(tmp_path):
     for name, theta in (("default", None), ("theta", None), ("levels", 0.7)):
         assert json.loads(found.settings("masks")(Job(variant=name)))["theta"] == theta
     assert found.shared_variant("masks", Job(variant="levels")) == "levels"
-    cached = found.cached_masks(Job(variant="levels"))  # masks with other levels
-    assert cached == ["results/synthetic/one/default/clip"]
-    assert found.cached_masks(Job()) == []
+    assert found.cached_masks(Job(variant="levels")) == ["results/synthetic/one/default/masks"]
+    every = plan(tmp_path, variants={**VARIANTS, "levels": by_tree}, clip={"crops": "masks"})
+    assert every.cached_masks(Job(variant="levels")) == ["results/synthetic/one/default/clip"]
+    assert every.cached_masks(Job(variant="theta")) == every.cached_masks(Job()) == []
 
 
 def test_inputs_of_the_literal_trainer_and_of_a_field_that_continues_langsplats(tmp_path):
