@@ -107,6 +107,11 @@ class ClipModel:
         """Length of a vector."""
         return self.text.fixed_axis(self.words, 1) or self.embed_texts(["object"]).shape[1]
 
+    def about(self, settings: ClipSettings) -> dict[str, Any]:
+        """Return the entries that identify the model in an artifact's index."""
+        named = {"model": settings.model, "model_variant": settings.variant}
+        return {"dim": self.width, **named, "model_sha256": self.digest}
+
     def require_width(self, numbers: int, what: str) -> None:
         """Raise a MisalignedArtifactError unless an artifact's vectors have this model's width."""
         if self.width != numbers:

@@ -158,16 +158,7 @@ def read_clip(scene_folder: Path, files: Path, out: Path, settings: ClipSettings
         for view, (masks, vectors) in found.items():
             write_npy(folder / f"{view}.npy", vectors)
             index[view] = {MASKS_SHA256: digest_of(masks), "masks": len(vectors)}
-        write_index(
-            folder,
-            index,
-            scene=scene.name,
-            dim=model.width,
-            model=settings.model,
-            model_variant=settings.variant,
-            model_sha256=model.digest,
-            background="langsplat",
-        )
+        write_index(folder, index, scene=scene.name, **model.about(settings), background="langsplat")
         counts.update(views=len(index), dim=model.width)
 
 

@@ -129,17 +129,8 @@ def run_clip(
             write_npy(folder / f"{view}.npy", vectors)
             crops = int(vectors.any(axis=1).sum())
             index[view] = {MASKS_SHA256: digests[view], "masks": len(vectors), "crops": crops}
-        write_index(
-            folder,
-            index,
-            scene=scene.name,
-            dim=model.width,
-            model=settings.model,
-            model_variant=settings.variant,
-            model_sha256=model.digest,
-            precision=model.precision,
-            background=settings.background,
-        )
+        more = {"precision": model.precision, "background": settings.background}
+        write_index(folder, index, scene=scene.name, **model.about(settings), **more)
         totals = {name: sum(entry[name] for entry in index.values()) for name in ("masks", "crops")}
         counts.update(views=len(views), **totals, dim=model.width, from_cache=view_cache.hits)
 

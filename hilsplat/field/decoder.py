@@ -29,18 +29,10 @@ from hilsplat.base.lanes import (
 
 ROWS = 4 * WIDTH  # rows processed together; for each such block, weights are read from L2 once
 UNITS = MOST_ROWS  # outputs of a layer that are summed together; layers are padded to a multiple of this
-
-MOST_LATENT = 3
-"""Longest latents that are decoded by pieces; longer ones have many more pieces."""
-
-TERMS = MOST_LATENT + 1
-"""Terms of an affine function of a latent: its value and its derivatives at the anchor."""
-
-PIECES = WIDTH
-"""Number of pieces that are computed together: their terms take `ROWS` lanes."""
-
-WORTHWHILE = 2 * ROWS
-"""Fewest rows that `PIECES` pieces must contain: the network decodes about this many in the same time."""
+LATENT = 3  # longest latents that are decoded by pieces; longer ones have many more pieces
+TERMS = LATENT + 1  # terms of an affine function: its value at the anchor, and its derivatives
+PIECES = ROWS // TERMS  # pieces that are computed together
+WORTHWHILE = 2 * ROWS  # rows that the network decodes in the time that `PIECES` pieces take
 
 _add_products = rows_of_products(UNITS)
 
@@ -48,8 +40,8 @@ _add_products = rows_of_products(UNITS)
 class PackedLayers(NamedTuple):
     """Dense layers with ReLUs between them, in the memory layout that the compiled loops need.
 
-    The values fit in the L1 cache. Rows are SIMD lanes, and as many outputs are summed together as fit in
-    the registers.
+    The values of `ROWS` rows fit in the L2 cache. Rows are SIMD lanes, and as many outputs are summed
+    together as fit in the registers.
     """
 
     widths: Int64[np.ndarray, " L_plus_1"]  # number of inputs, then number of each layer's outputs
@@ -69,10 +61,7 @@ class PackedLayers(NamedTuple):
         return PackedLayers(np.array(widths), flat_weights, flat_biases)
 
     def through(self, rows: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B C"]:
-        """Return the outputs of the last layer, scaled to unit length.
-
-        The result of a row depends on the other rows only by rounding (about 1e-7).
-        """
+        """Return the last layer's outputs, scaled to unit length; other rows affect only the rounding."""
         out = np.empty((len(rows), self.widths[-1]), np.float32)
         _through(np.ascontiguousarray(rows, np.float32), *self, out)
         return out
@@ -80,19 +69,23 @@ class PackedLayers(NamedTuple):
 
 @compiled
 def _through(rows, widths, weights, biases, out):
-    widest = _padded(widths.max())
+    widest, wide = _padded(widths.max(), WIDTH), _padded(widths[-1], WIDTH)
     values, following = np.zeros(widest * ROWS, np.float32), np.zeros(widest * ROWS, np.float32)
-    layers = (widths, weights, biases)
-    left = np.arange(len(rows))
-    if widths[0] <= MOST_LATENT and len(widths) > 2 and len(rows) > WORTHWHILE:
+    no_planes, block = np.empty(0, np.float32), np.empty(WIDTH * wide, np.float32)
+    layers, left = (widths, weights, biases), np.arange(len(rows))
+    if widths[0] <= LATENT and len(widths) > 2:
         left = _decode_pieces(rows, layers, values, following, out)
-    no_planes = np.empty(0, np.float32)
     for begin in range(0, len(left), ROWS):
         some = left[begin : begin + ROWS]
-        for place, row in enumerate(some):
-            for channel in range(widths[0]):
+        for channel in range(widths[0]):
+            for place, row in enumerate(some):
                 values[channel * ROWS + place] = rows[row, channel]
-        _write_rows(_outputs(layers, values, following, no_planes), some, out)
+        found = _outputs(layers, values, following, no_planes)
+        for first in range(0, len(some), WIDTH):
+            for channel in range(0, wide, WIDTH):
+                transpose(found, channel * ROWS + first, ROWS, block, channel, wide)
+            for place, row in enumerate(some[first : first + WIDTH]):
+                _write_unit(block[place * wide : (place + 1) * wide], out[row])
 
 
 @compiled
@@ -106,7 +99,7 @@ def _outputs(layers, values, following, planes):
     widths, weights, biases = layers
     weight, bias, plane = 0, 0, 0
     for layer in range(len(widths) - 1):
-        inputs, outputs = widths[layer], (widths[layer + 1] + UNITS - 1) // UNITS * UNITS
+        inputs, outputs = widths[layer], _padded(widths[layer + 1], UNITS)
         for unit in range(outputs):
             following[unit * ROWS : (unit + 1) * ROWS] = biases[bias + unit]
             if len(planes):  # derivatives have no bias
@@ -139,114 +132,78 @@ def _outputs(layers, values, following, planes):
 def _decode_pieces(rows, layers, values, following, out):
     """Decode the rows of common pieces, and return the indices of the other rows.
 
-    Anchors are rows that are evenly spaced among those not yet decoded, so they are likely to be in large
-    pieces. The search ends when the last pieces contain fewer than `WORTHWHILE` rows.
+    Anchors are evenly spaced among the rows not yet decoded, so they are likely to be in large pieces. The
+    search ends when the last pieces contain fewer than `WORTHWHILE` rows.
     """
-    widths = layers[0]
-    latent, hidden = widths[0], len(layers[2]) - (widths[-1] + UNITS - 1) // UNITS * UNITS
-    planes = np.empty(hidden * ROWS, np.float32)
-    left = np.arange(len(rows))
-    step = len(rows) + WIDTH
-    points = np.zeros(MOST_LATENT * step, np.float32)
-    members = np.empty(len(rows), np.int64)
-    caught = WORTHWHILE
+    widths, step, left = layers[0], len(rows) + WIDTH, np.arange(len(rows))
+    planes = np.empty((len(layers[2]) - _padded(widths[-1], UNITS)) * ROWS, np.float32)
+    points, caught = np.zeros(LATENT * step, np.float32), WORTHWHILE
     while caught >= WORTHWHILE and len(left) > WORTHWHILE:
-        for place, row in enumerate(left):
-            for channel in range(latent):
+        for channel in range(widths[0]):
+            for place, row in enumerate(left):
                 points[channel * step + place] = rows[row, channel]
         anchors = (2 * np.arange(PIECES) + 1) * len(left) // (2 * PIECES)
-        values[: latent * ROWS] = 0
-        for piece in range(PIECES):
-            for channel in range(latent):
-                values[channel * ROWS + piece] = rows[left[anchors[piece]], channel]
+        values[: widths[0] * ROWS] = 0
+        for piece, anchor in enumerate(anchors):
+            for channel in range(widths[0]):
+                values[channel * ROWS + piece] = points[channel * step + anchor]
                 values[channel * ROWS + (channel + 1) * PIECES + piece] = 1
         outputs = _outputs(layers, values, following, planes)
         taken = np.zeros(len(left), np.bool_)
-        caught = 0
-        for piece in range(PIECES):
-            if not taken[anchors[piece]]:
-                found = _members(planes, piece, points, anchors[piece], taken, members)
-                _write_affine(outputs, piece, points, anchors[piece], members[:found], left, out)
-                caught += found
+        for piece, anchor in enumerate(anchors):
+            if not taken[anchor]:
+                _decode_piece(_terms(planes, piece), _terms(outputs, piece), points, anchor, taken, left, out)
+        caught = taken.sum()
         left = left[~taken]
     return left
 
 
+@compiled
+def _terms(values, piece):
+    """Return the terms of one piece, term by term."""
+    units = len(values) // ROWS
+    terms = np.empty(TERMS * units, np.float32)
+    for term in range(TERMS):
+        for unit in range(units):
+            terms[term * units + unit] = values[unit * ROWS + term * PIECES + piece]
+    return terms
+
+
 @compiled(forceinline=True)
-def _value(own, unit, x, y, z):
-    """Return a unit's affine function at 16 points."""
-    one, other = load_same(own, unit + 1) * x, load_same(own, unit + 3) * z
-    return load_same(own, unit) + one + (load_same(own, unit + 2) * y + other)
+def _height(terms, units, unit, x, y, z):
+    """Return a hidden unit's affine function at 16 points."""
+    one, other = load_same(terms, units + unit) * x, load_same(terms, 2 * units + unit) * y
+    return load_same(terms, unit) + one + (other + load_same(terms, 3 * units + unit) * z)
 
 
 @compiled
-def _members(planes, piece, points, anchor, taken, members):
-    """Mark the points in a piece as taken, write their indices to `members`, and return their number."""
-    own, step = _of_piece(planes, piece), len(points) // MOST_LATENT
-    last = len(own) - UNITS * TERMS
+def _decode_piece(planes, outputs, points, anchor, taken, left, out):
+    """Decode the points in a piece that are not yet taken, and mark them as taken."""
+    step, units, wide = len(points) // LATENT, len(planes) // TERMS, len(outputs) // TERMS
     x0, y0, z0 = points[anchor], points[step + anchor], points[2 * step + anchor]
-    found = 0
+    row = np.empty(wide, np.float32)
     for begin in range(0, len(taken), WIDTH):
         x, y = load(points, begin) - x0, load(points, step + begin) - y0
         z = load(points, 2 * step + begin) - z0
         lowest = lower = lanes(np.float32(1))
-        inside, at = 1, last
+        inside, at = 1, units - UNITS
         # The last units are tested first, because most other points are outside of one of them.
         while inside and at >= 0:
-            for unit in range(at, at + UNITS * TERMS, 2 * TERMS):  # two minima, so that neither has to wait
-                lowest = smaller(lowest, _value(own, unit, x, y, z))
-                lower = smaller(lower, _value(own, unit + TERMS, x, y, z))
+            for unit in range(at, at + UNITS, 2):  # two minima, so that neither has to wait
+                lowest = smaller(lowest, _height(planes, units, unit, x, y, z))
+                lower = smaller(lower, _height(planes, units, unit + 1, x, y, z))
             inside = bits_ge(smaller(lowest, lower), lanes(np.float32(0)))
-            at -= UNITS * TERMS
-        if inside:
-            for lane in range(min(WIDTH, len(taken) - begin)):
-                if (inside >> lane) & 1 and not taken[begin + lane]:
-                    taken[begin + lane] = True
-                    members[found] = begin + lane
-                    found += 1
-    return found
-
-
-@compiled
-def _of_piece(values, piece):
-    """Return the terms of one piece, unit by unit."""
-    own = np.empty(len(values) // ROWS * TERMS, np.float32)
-    for unit in range(len(values) // ROWS):
-        for term in range(TERMS):
-            own[unit * TERMS + term] = values[unit * ROWS + term * PIECES + piece]
-    return own
-
-
-@compiled
-def _write_affine(outputs, piece, points, anchor, members, left, out):
-    """Decode the members of a piece."""
-    channels, step = out.shape[1], len(points) // MOST_LATENT
-    wide = _padded(channels)
-    terms, row = np.zeros(TERMS * wide, np.float32), np.empty(wide, np.float32)
-    for term in range(TERMS):
-        for channel in range(channels):
-            terms[term * wide + channel] = outputs[channel * ROWS + term * PIECES + piece]
-    for point in members:
-        x = lanes(points[point] - points[anchor])
-        y = lanes(points[step + point] - points[step + anchor])
-        z = lanes(points[2 * step + point] - points[2 * step + anchor])
-        for at in range(0, wide, WIDTH):
-            value = load(terms, at) + load(terms, wide + at) * x
-            value = value + load(terms, 2 * wide + at) * y + load(terms, 3 * wide + at) * z
-            store(row, at, value)
-        _write_unit(row, out[left[point]])
-
-
-@compiled
-def _write_rows(values, rows, out):
-    """Scale outputs in lanes to unit length, and write each lane to its row of `out`."""
-    wide = _padded(out.shape[1])
-    block = np.empty(WIDTH * wide, np.float32)
-    for begin in range(0, len(rows), WIDTH):
-        for channel in range(0, wide, WIDTH):
-            transpose(values, channel * ROWS + begin, ROWS, block, channel, wide)
-        for lane, row in enumerate(rows[begin : begin + WIDTH]):
-            _write_unit(block[lane * wide : (lane + 1) * wide], out[row])
+            at -= UNITS
+        for point in range(begin, min(begin + WIDTH, len(taken)) if inside else begin):
+            if (inside >> (point - begin)) & 1 and not taken[point]:
+                taken[point] = True
+                x, y = lanes(points[point] - x0), lanes(points[step + point] - y0)
+                z = lanes(points[2 * step + point] - z0)
+                for at in range(0, wide, WIDTH):
+                    value = load(outputs, at) + load(outputs, wide + at) * x
+                    rest = load(outputs, 2 * wide + at) * y + load(outputs, 3 * wide + at) * z
+                    store(row, at, value + rest)
+                _write_unit(row, out[left[point]])
 
 
 @compiled
@@ -263,5 +220,5 @@ def _write_unit(row, out):
 
 
 @compiled
-def _padded(channels):
-    return (channels + WIDTH - 1) // WIDTH * WIDTH
+def _padded(count, multiple):
+    return (count + multiple - 1) // multiple * multiple

@@ -251,7 +251,7 @@ class Plan:
         return [self.shared("clip", "clip")(of_variant(job, KEY_VIEWS))]
 
     def cached_masks(self, job: VariantJob) -> list[str]:
-        """Return an input of `masks` that only orders jobs: the same masks with other levels, or their vectors.
+        """Return an input of `masks` that only orders jobs: the same masks by head, or their vectors.
 
         The job then finds its masks in the cache; otherwise, several jobs would compute them at once.
         """
