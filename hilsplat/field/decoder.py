@@ -1,9 +1,9 @@
 """Decoding of latents by a network of dense layers and ReLUs, in compiled loops.
 
-Such a network is affine between the kinks of its ReLUs. Pixels of an object have similar latents, so nine
-tenths of a view's pixels lie in a few hundred of these affine pieces. A piece is given by the network's value
-and derivatives at one latent, its anchor. It contains all latents for which every hidden unit has the sign
-that it has at the anchor, and decodes them exactly in a tenth of the network's time.
+Such a network is affine where no ReLU changes sign. Pixels of an object have similar latents, so most pixels
+of a view share a few hundred of these affine pieces. A piece is given by the network's value and derivatives
+at one latent, its anchor. It contains all latents for which every hidden unit has the sign that it has at the
+anchor, and decodes them exactly in a tenth of the network's time.
 """
 
 from collections.abc import Sequence
