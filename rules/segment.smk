@@ -6,8 +6,6 @@ rule masks:
         gaussians=PLAN.key_gaussians,  # empty, except for key views and guided prompts
         key_masks=lambda wildcards: PLAN.key_parts(wildcards, "masks"),
         key_tree=lambda wildcards: PLAN.key_parts(wildcards, "semantic_tree"),
-        first=ancient(PLAN.first_answer),  # not read, like the next input; both only order the jobs
-        cached=ancient(PLAN.cached_masks),
         features=PLAN.data.features,  # empty, except for LangSplat's masks
     output:
         masks=directory("<results>/{dataset}/{scene}/{variant}/masks"),
@@ -15,7 +13,7 @@ rule masks:
         "<results>/{dataset}/{scene}/{variant}/logs/masks.log",
     benchmark:
         "<results>/{dataset}/{scene}/{variant}/benchmarks/masks.jsonl"
-    priority: 30
+    priority: PLAN.masks_priority
     conda:
         ENVIRONMENT
     threads: RESOURCES.threads

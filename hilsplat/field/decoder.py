@@ -69,7 +69,7 @@ class PackedLayers(NamedTuple):
 
 @compiled
 def _through(rows, widths, weights, biases, out):
-    widest, wide = _padded(widths.max(), WIDTH), _padded(widths[-1], WIDTH)
+    widest, wide = _padded(widths.max() + UNITS, WIDTH), _padded(widths[-1], WIDTH)
     values, following = np.zeros(widest * ROWS, np.float32), np.zeros(widest * ROWS, np.float32)
     no_planes, block = np.empty(0, np.float32), np.empty(WIDTH * wide, np.float32)
     layers, left = (widths, weights, biases), np.arange(len(rows))

@@ -239,30 +239,22 @@ class Plan:
         is_guided = self.masks_stage(job) == "guided_masks"
         return [self.shared(stage, stage)(of_variant(job, KEY_VIEWS))] if is_guided else []
 
-    def first_answer(self, job: VariantJob) -> list[str]:
-        """Return an input of `masks` that only orders jobs, so that key views are embedded first."""
+    def first_answer(self, job: VariantJob) -> bool:
+        """Return whether key views answer queries before all photographs have masks."""
         row, masks = self.row(job), self.stages(job).masks
         of_photographs = job.variant == "default" and row.group == PHOTOS and not row.features
         if not of_photographs or KEY_VIEWS not in self.run.variants:
-            return []
+            return False
         model = read_model(Path(masks.model)) if masks.segmenter == "sam" else None
-        if model is None or model.embedded or len(self.data.image_files(job)) < LEAST_PHOTOGRAPHS:
-            return []
-        return [self.shared("clip", "clip")(of_variant(job, KEY_VIEWS))]
+        return model is not None and not model.embedded and len(self.data.image_files(job)) >= LEAST_PHOTOGRAPHS
 
-    def cached_masks(self, job: VariantJob) -> list[str]:
-        """Return an input of `masks` that only orders jobs: the same masks by head, or their vectors.
+    def masks_priority(self, job: VariantJob) -> int:
+        """Return the priority of `masks`: lower if key views come first, or if cached masks get other levels.
 
-        The job then finds its masks in the cache; otherwise, several jobs would compute them at once.
+        Ordering by an `ancient` input would be stricter, but then Snakemake 9.27 overlooks that later stages
+        have changed.
         """
-        own = self.stages(job).masks
-        by_head = own.model_copy(update={"levels": "head", "theta": None})
-        for name in self.run.every_variant() if own != by_head else ():
-            other = self.stages(of_variant(job, name))
-            if other.masks == by_head:
-                stage = "clip" if other.clip.crops == "masks" else "masks"  # crops of nodes need more stages
-                return [self.shared(stage, stage)(of_variant(job, name))]
-        return []
+        return 20 if self.first_answer(job) or self.stages(job).masks.levels == "tree" else 30
 
     def masks_truth(self, job: VariantJob) -> list[str]:
         """Return the input of `masks`: the diagnostic's ground-truth labels; SettingsError if none exist."""

@@ -134,10 +134,7 @@ def test_levels_by_the_tree_take_the_theta_of_the_tree(tmp_path):
     for name, theta in (("default", None), ("theta", None), ("levels", 0.7)):
         assert json.loads(found.settings("masks")(Job(variant=name)))["theta"] == theta
     assert found.shared_variant("masks", Job(variant="levels")) == "levels"
-    assert found.cached_masks(Job(variant="levels")) == ["results/synthetic/one/default/masks"]
-    every = plan(tmp_path, variants={**VARIANTS, "levels": by_tree}, clip={"crops": "masks"})
-    assert every.cached_masks(Job(variant="levels")) == ["results/synthetic/one/default/clip"]
-    assert every.cached_masks(Job(variant="theta")) == every.cached_masks(Job()) == []
+    assert found.masks_priority(Job(variant="levels")) < found.masks_priority(Job())  # cached by then
 
 
 def test_inputs_of_the_literal_trainer_and_of_a_field_that_continues_langsplats(tmp_path):
@@ -208,11 +205,12 @@ def test_key_views_are_embedded_before_a_full_size_sam_segments_the_others(tmp_p
     config = {"groups": ["photos", "benchmark"], "variants": variants, "main_variants": ["default"]}
     found = plan(tmp_path, **config)
     desk, key, one = Job("photos", "desk"), Job("photos", "desk", "key-views"), Job()
-    assert found.first_answer(desk) == []  # sam-tiny takes seconds
+    assert not found.first_answer(desk)  # sam-tiny takes seconds
 
     monkeypatch.setattr("hilsplat.workflow.plan.read_model", lambda folder: SimpleNamespace(embedded=False))
-    assert found.first_answer(desk) == ["results/photos/desk/key-views/clip"]
-    assert found.first_answer(key) == found.first_answer(one) == []
+    assert found.first_answer(desk)
+    assert not found.first_answer(key) and not found.first_answer(one)
+    assert found.masks_priority(desk) < found.masks_priority(key)
     assert found.masks_stage(key) == "key_masks" and found.masks_stage(desk) == "masks"
     assert found.key_gaussians(key) == ["results/photos/desk/gaussians.ply"]
     assert found.key_gaussians(desk) == []
@@ -223,7 +221,7 @@ def test_key_views_are_embedded_before_a_full_size_sam_segments_the_others(tmp_p
     assert guided.key_parts(desk, "masks") == ["results/photos/desk/key-views/masks"]
     assert guided.key_parts(desk, "semantic_tree") == ["results/photos/desk/key-views/semantic_tree"]
     assert guided.key_parts(one, "masks") == found.key_parts(desk, "masks") == []
-    assert plan(tmp_path, **(config | {"variants": {}})).first_answer(desk) == []
+    assert not plan(tmp_path, **(config | {"variants": {}})).first_answer(desk)
 
 
 def test_each_photograph_is_an_input_and_hidden_files_are_not(tmp_path):
