@@ -7,8 +7,10 @@ from hilsplat.datasets.registry import DATASETS
 from hilsplat.datasets.sources import published
 from hilsplat.evaluate.scores import score_summary
 from hilsplat.evaluate.tables.build import TABLES
+from hilsplat.scene.finished import KEY_VIEWS
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.workflow.plan import Plan, some
+from hilsplat.workflow.scene_data import of_variant
 
 
 def scores(plan: Plan, table: str, name: str = "scores.csv") -> list[str]:
@@ -74,7 +76,7 @@ def tables(plan: Plan) -> list[str]:
 
 
 def default(plan: Plan) -> list[str]:
-    """Return the pictures of all scenes, the scores of scenes that you annotated, and tables and plots.
+    """Return pictures of all scenes, first answers, scores of scenes that you annotated, tables and plots.
 
     Tables and plots need a benchmark scene in the run. A run of photographs would otherwise replace a
     benchmark's tables with tables of reported rows only.
@@ -84,9 +86,11 @@ def default(plan: Plan) -> list[str]:
         for name in ("theta", "omega")
         if getattr(plan.run, TABLES[name].variants)
     ]
+    early = [row for row in plan.scenes if plan.first_answer(of_variant(row, "default"))]
+    answers = [plan.shared("clip", "clip")(of_variant(row, KEY_VIEWS)) for row in early]
     scores = [path for row in annotated(plan) for path in own_scores(plan, row).values()]
     has_tables = len(labelled(plan)) > len(annotated(plan))
-    return [*figures(plan), *scores, *(tables(plan) + plots if has_tables else [])]
+    return [*figures(plan), *answers, *scores, *(tables(plan) + plots if has_tables else [])]
 
 
 def own_scores(plan: Plan, row: SceneRow) -> dict[str, str]:
