@@ -246,7 +246,8 @@ class Plan:
         if not of_photographs or KEY_VIEWS not in self.run.variants:
             return False
         model = read_model(Path(masks.model)) if masks.segmenter == "sam" else None
-        return model is not None and not model.embedded and len(self.data.image_files(job)) >= LEAST_PHOTOGRAPHS
+        is_slow = model is not None and not model.embedded
+        return is_slow and len(self.data.image_files(job)) >= LEAST_PHOTOGRAPHS
 
     def masks_priority(self, job: VariantJob) -> int:
         """Return the priority of `masks`: lower if key views come first, or if cached masks get other levels.

@@ -211,6 +211,7 @@ def test_key_views_are_embedded_before_a_full_size_sam_segments_the_others(tmp_p
     assert found.first_answer(desk)
     assert not found.first_answer(key) and not found.first_answer(one)
     assert found.masks_priority(desk) < found.masks_priority(key)
+    assert "results/photos/desk/key-views/clip" in targets.default(found)
     assert found.masks_stage(key) == "key_masks" and found.masks_stage(desk) == "masks"
     assert found.key_gaussians(key) == ["results/photos/desk/gaussians.ply"]
     assert found.key_gaussians(desk) == []
