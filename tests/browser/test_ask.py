@@ -155,7 +155,7 @@ def test_two_answerers_are_shown_side_by_side(opened, desk_address):
     ask_and_wait(page, "mug")
     drawn(page, lambda: page.get_by_label("Beside").select_option("default|field"))
     right = page.get_by_role("list", name="On the right, by default, field: 1 of 1 are on the left too")
-    assert right.get_by_role("button").count() == 1
+    right.get_by_role("button").wait_for()  # exactly one
     page.locator("#overlay .split").wait_for(state="attached")
     page.wait_for_timeout(1500)
     picture = pixels(page)
