@@ -153,6 +153,13 @@ def test_query_on_the_field(benchmark, code):
     assert benchmark(lambda: scene.field_relevancy(["mug handle"], VIEW, exact=False)).max() > 0
 
 
+@pytest.mark.benchmark(timer=time.process_time, min_rounds=3, max_time=1.5)
+def test_relevancy_that_decodes_every_pixel(benchmark):
+    scene, count = open_scene("network"), 3 * SIZE_HW[0] * SIZE_HW[1]
+    benchmark.extra_info |= {"case": "exact relevancy, 986x728: network, d=3", "count": count, "of": "px"}
+    assert benchmark(lambda: scene.field_relevancy(["mug handle"], VIEW)).max() > 0
+
+
 @pytest.mark.benchmark(min_rounds=5, max_time=1.5)
 @pytest.mark.parametrize("code", ["network", "pca"])
 def test_query_on_the_field_by_two_threads(benchmark, code):

@@ -76,7 +76,7 @@ def tables(plan: Plan) -> list[str]:
 
 
 def default(plan: Plan) -> list[str]:
-    """Return pictures of all scenes, first answers, scores of scenes that you annotated, tables and plots.
+    """Return all pictures, vectors of key views, scores of annotated scenes, tables and plots.
 
     Tables and plots need a benchmark scene in the run. A run of photographs would otherwise replace a
     benchmark's tables with tables of reported rows only.

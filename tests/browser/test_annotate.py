@@ -295,7 +295,7 @@ def test_the_page_fits_a_phone_and_has_no_tool_for_a_missing_sam(page):
 
 
 def test_a_rewritten_scene_is_reported(opened, annotating, own_desk, tmp_path):
-    opened.expected.append("409")  # the browser reports requests that were refused meanwhile
+    opened.expected.append("409")  # the browser reports what was refused
     page = annotating(own_desk)
     assert not page.get_by_role("alert").is_visible()
     write_again(own_desk / "default/semantic_tree")

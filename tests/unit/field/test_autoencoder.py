@@ -105,7 +105,7 @@ def test_a_trained_network_equals_torch_with_the_statistics_of_all_vectors():
     assert model.decode_array(model.encode_array(vectors)) == pytest.approx(expected, abs=1e-5)
 
 
-@pytest.mark.parametrize(("rows", "widths"), [(1, (3, 1)), (100, (2, 5, 16, 7)), (64, (16, 64))])
+@pytest.mark.parametrize(("rows", "widths"), [(1, (3, 1)), (130, (4, 5, 16, 7)), (64, (16, 64))])
 def test_compiled_layers_equal_matrix_products_with_relu(rows, widths):
     random = np.random.default_rng(0)
     layers = [
