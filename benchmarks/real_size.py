@@ -59,62 +59,18 @@ def export_sam(size: str, out: Path) -> None:
 
 
 def export_sam2(out: Path) -> None:
-    """Export a SAM 2.1 small with random weights in the layout of the published ONNX exports."""
+    """Export a SAM 2.1 small with random weights and the signature of the published files."""
     import torch
-    import transformers
 
-    torch.manual_seed(0)
-    backbone = transformers.Sam2HieraDetConfig(
-        blocks_per_stage=[1, 2, 11, 2],
-        global_attention_blocks=[7, 10, 13],
-        window_positional_embedding_background_size=[7, 7],
-    )
-    model = transformers.Sam2Model(transformers.Sam2Config(transformers.Sam2VisionConfig(backbone))).eval()
+    from tests.published_models.exports import export_sam2, full_sam2
+
+    kind = full_sam2()
+    model = kind.model()
     with torch.no_grad():
         for parameter in model.parameters():
             if not parameter.any():
                 parameter.normal_(0, 0.02)
-    names = [f"image_embeddings.{level}" for level in range(3)]
-    pixels = torch.zeros(1, 3, 1024, 1024)
-
-    class Part(torch.nn.Module):
-        def __init__(self, decode: bool) -> None:
-            super().__init__()
-            self.model, self.decode = model, decode
-
-        def forward(self, *inputs):
-            if not self.decode:
-                return tuple(self.model.get_image_embeddings(*inputs))
-            points, labels, boxes, *features = inputs
-            found = self.model(input_points=points, input_labels=labels, image_embeddings=features)
-            return found.iou_scores + boxes.sum(), found.pred_masks
-
-    out.mkdir(parents=True, exist_ok=True)
-    prompts = {1: "prompts", 2: "points"}
-    prompted = {
-        "input_points": torch.full((1, 3, 2, 2), 32.0),
-        "input_labels": torch.ones((1, 3, 2), dtype=torch.int64),
-        "input_boxes": torch.zeros(1, 0, 4),
-        **dict(zip(names, model.get_image_embeddings(pixels), strict=True)),
-    }
-    dynamic = {"input_points": prompts, "input_labels": prompts, "input_boxes": {1: "boxes"}}
-    for network, inputs, outputs, axes in (
-        ("vision_encoder", {"pixel_values": pixels}, names, {}),
-        ("prompt_encoder_mask_decoder", prompted, ["iou_scores", "pred_masks"], dynamic),
-    ):
-        torch.onnx.export(
-            Part(len(inputs) > 1),
-            tuple(inputs.values()),
-            str(out / f"{network}.onnx"),
-            input_names=list(inputs),
-            output_names=outputs,
-            dynamic_axes=axes,
-            opset_version=18,
-            dynamo=False,
-        )
-    model.config.save_pretrained(out)
-    square = {"size": {"height": 1024, "width": 1024}, "pad_size": None, "resample": 2}
-    (out / "preprocessor_config.json").write_text(json.dumps(square))
+    export_sam2(kind, model, out)
 
 
 def export_clip(out: Path) -> None:
@@ -210,13 +166,14 @@ def measure(step: str, models: Path, photograph: Path, points: int) -> dict[str,
 def compare_decoders(models: Path, photograph: Path, points: int) -> dict[str, float]:
     """Measure processor milliseconds per prompt of the plain and the factored decoder, in alternating rounds.
 
-    The plain network decodes 64 prompts in calls of 8. The factored decoder previews and decodes all of them;
+    The plain network decodes 64 prompts in calls of 8, or of 1 if each prompt needs its own copy of the image
+    features. The factored decoder previews and decodes all of them;
     `mean_ms` includes only the share `KEPT` of the decoding. A random SAM predicts no confident mask, so the
     preview rule itself is not run. The masks of both are compared by pixel: `unequal_px` of `mask_px` differ,
     and no absolute logit there exceeds `tie`. Random logits are close to 0; those of a trained SAM are steep.
     """
     from hilsplat.base.images import read_image, resize_to_fit
-    from hilsplat.segment.sam import SamModel, ask_network, in_input, point_grid
+    from hilsplat.segment.sam import SamModel, in_input, point_grid
 
     model, rounds, many = SamModel.load(models), 8, 64
     image = resize_to_fit(read_image(photograph), MAX_SIDE_PX)
@@ -224,11 +181,12 @@ def compare_decoders(models: Path, photograph: Path, points: int) -> dict[str, f
     assert model.factored is not None and encoded.terms is not None
     at = in_input(point_grid(points) * (image.shape[1], image.shape[0]), encoded.frame)
     at = at[np.random.default_rng(0).permutation(len(at))[:many]]
+    step = model.decoder.prompts_per_call or 8
     found: dict[str, list[float]] = {"plain_ms": [], "preview_ms": [], "masks_ms": []}
     apart = {"iou": 0.0, "logits": 0.0}
     for _ in range(rounds):
         clock = time.process_time()
-        plain = [ask_network(model.decoder, encoded.features, at[k : k + 8, None]) for k in range(0, many, 8)]
+        plain = [model.decoder(encoded.features, at[k : k + step, None]) for k in range(0, many, step)]
         found["plain_ms"].append(time.process_time() - clock)
         clock = time.process_time()
         calls = [model.factored.decode(encoded.terms, at[k : k + 16], fine=False) for k in range(0, many, 16)]

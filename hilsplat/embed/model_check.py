@@ -34,7 +34,8 @@ def check_model(folder: Path, variant: str = "") -> str:
     lines = [f"folder     {model.folder}", f"kind       {model.layout}", f"image      {side} x {side} px"]
     opened = SamModel(model) if model.kind == "sam" else ClipModel(model)
     precisions = ["fp32", "int8"] if may_be_int8(model) else ["fp32"]
-    seconds = {precision: _measure(opened, precision) for precision in precisions}
+    measured = {precision: _measure(opened, precision) for precision in precisions}
+    seconds = {precision: each for precision, each in measured.items() if each}
     times = "; ".join(
         f"{precision}: " + ", ".join(f"{value:.4f} s per {what}" for what, value in each.items())
         for precision, each in seconds.items()
@@ -103,19 +104,25 @@ def seconds_of(folder: Path, variant: str, precision: str, cache: Path) -> Secon
     requested = "int8" if precision != "fp32" and may_be_int8(model) else "fp32"
     found = _known(cache).get(_key(folder, variant, requested))
     if found is None:
-        found = _measure(SamModel(model) if model.kind == "sam" else ClipModel(model), requested)
+        opened = SamModel(model) if model.kind == "sam" else ClipModel(model)
+        found = _measure(opened, requested) or _measure(opened, "fp32")
         _remember(folder, variant, {requested: found}, cache)
     return found
 
 
 def _measure(model: SamModel | ClipModel, precision: str) -> Seconds:
+    """Measure a model; the result is empty if it has no int8 network."""
     side, is_int8 = input_side_px(model.model), precision == "int8"
     if isinstance(model, ClipModel):
         network = int8_network(model.model, "vision_model", CACHE) if is_int8 else model.vision
+        if network is None:
+            return {}
         crops = np.zeros((model.crops_per_call or 1, side, side, 3), np.uint8)
         _, seconds = _second_call(lambda: network(**{model.pixels: model.prepare(crops)}))
         return {"crop": seconds / len(crops)}
     encoder = model.int8_encoder(CACHE) if is_int8 else model.encoder
+    if encoder is None:
+        return {}
     encoded, seconds = _second_call(lambda: model.encode(np.zeros((side, side, 3), np.uint8), encoder))
     found = {"image": seconds}
     prompts = model.prompts_per_call(1, 1)

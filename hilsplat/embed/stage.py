@@ -161,6 +161,8 @@ def _choose_precision(
         ]
     )
     quantised = int8_network(model.model, "vision_model", cache)
+    if quantised is None:
+        return
 
     def both(one: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         (found,) = quantised(**{model.pixels: model.prepare(one[None])})

@@ -6,8 +6,6 @@ so its digest identifies the model.
 """
 
 import math
-import mmap
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +15,7 @@ from hilsplat.base.artifacts import read_json, sha256_of_file, sha256_of_json
 from hilsplat.base.errors import ArtifactError, ModelError
 from hilsplat.models.layouts import LAYOUTS, OTHER_TYPES, SECTIONS, SUPPORTED, TORCH_SUFFIXES, layout_of
 from hilsplat.models.network import Network
-from hilsplat.models.onnx_graph import whole_clip
+from hilsplat.models.onnx_graph import Graph, has_external_weights, location_of, tensors_of, whole_clip
 from hilsplat.models.store import model_path
 
 OTHER_FOLDER = "choose a folder in a layout listed in docs/models.md"
@@ -53,9 +51,9 @@ class ModelFolder:
         files = [(path.relative_to(self.folder).as_posix(), sha256_of_file(path)) for path in self.files]
         return sha256_of_json(files)
 
-    def network(self, name: str, graph: bytes | None = None, provider: str | None = None) -> Network:
+    def network(self, name: str, changed: Graph | Path | None = None, provider: str | None = None) -> Network:
         """Open one of the model's networks and check its inputs and outputs (see `Network`)."""
-        return Network(self.networks[name], LAYOUTS[self.layout].usable[name], graph, provider)
+        return Network(self.networks[name], LAYOUTS[self.layout].usable[name], changed, provider)
 
 
 def open_model_folder(
@@ -90,7 +88,7 @@ def open_model_folder(
     if missing:
         raise _incomplete(folder, name, missing, variant, alternative)
     preprocessing = _preprocessing_of(folder / layout.preprocessing)
-    weights = [path for network in networks.values() for path in external_weights(network, folder)]
+    weights = [path for network in networks.values() for path in external_weights(network)]
     described = [folder / file for file in (*layout.described, *layout.beside) if (folder / file).is_file()]
     files = tuple(sorted({*described, *networks.values(), *weights}))
     return ModelFolder(folder, name, config, preprocessing, networks, files)
@@ -189,29 +187,24 @@ def _preprocessing_of(path: Path) -> dict[str, Any]:
     return found
 
 
-def external_weights(network: Path, folder: Path) -> list[Path]:
+def external_weights(network: Path) -> list[Path]:
     """Return the external weight files named in a network's graph, without reading the weights.
 
-    A ModelError is raised if such a file is missing or outside the model folder.
+    A ModelError is raised if such a file is missing, or named by a path that leads out of the folder.
     """
-    if not network.stat().st_size:
-        return []  # opening the network reports the problem
-    with network.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        if content.find(b"location") < 0:  # key of every tensor stored outside the graph
-            return []
+    if not has_external_weights(network):
+        return []
     import onnx
     from google.protobuf.message import DecodeError
-    from onnx.external_data_helper import ExternalDataInfo, uses_external_data
 
     try:
         graph = onnx.load(str(network), load_external_data=False).graph
     except DecodeError:
         return []  # a damaged copy: opening the network reports it
-    named = {ExternalDataInfo(tensor).location for tensor in _tensors(graph) if uses_external_data(tensor)}
     found = []
-    for name in sorted(named):
+    for name in sorted({place for tensor in tensors_of(graph) if (place := location_of(tensor)) is not None}):
         path = network.parent / name
-        if not path.is_file() or not path.resolve().is_relative_to(folder.resolve()):
+        if Path(name).is_absolute() or ".." in Path(name).parts or not path.is_file():
             raise ModelError(
                 f"network {network} cannot be opened: its weights are missing",
                 expected=f"the file {name} beside it",
@@ -220,16 +213,6 @@ def external_weights(network: Path, folder: Path) -> list[Path]:
             )
         found.append(path)
     return found
-
-
-def _tensors(graph: Any) -> Iterator[Any]:
-    """Yield all weights and constants of a graph and its subgraphs."""
-    yield from graph.initializer
-    for node in graph.node:
-        for attribute in node.attribute:
-            yield from (attribute.t, *attribute.tensors)
-            for inner in (attribute.g, *attribute.graphs):
-                yield from _tensors(inner)
 
 
 def side_px(size: Any, default: int) -> int:

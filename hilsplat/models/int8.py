@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from hilsplat.base.artifacts import ViewCache, atomic_path, sha256_of_bytes, sha256_of_file, sha256_of_json
+from hilsplat.base.artifacts import ViewCache, atomic_path, sha256_of_json
+from hilsplat.models.fast_paths import or_as_exported
 from hilsplat.models.folder import ModelFolder
-from hilsplat.models.network import Network, execution_providers
-from hilsplat.models.onnx_graph import needed_names
+from hilsplat.models.network import CPU, Network, execution_providers
+from hilsplat.models.onnx_graph import Graph, needed_names
 
 logger = logging.getLogger(__name__)
 
@@ -36,7 +37,7 @@ CHECKED_CROPS, CHECKED_VIEWS, CHECKED_GRID = 16, 2, 5
 
 def may_be_int8(model: ModelFolder) -> bool:
     """Return whether int8 can save time: on a CPU, for models other than those of the synthetic world."""
-    return execution_providers()[0] == "CPUExecutionProvider" and not model.config.get("world_only")
+    return execution_providers()[0] == CPU and not model.config.get("world_only")
 
 
 def considers_int8(precision: str, model: ModelFolder) -> bool:
@@ -48,32 +49,38 @@ def considers_int8(precision: str, model: ModelFolder) -> bool:
 
 
 def int8_network(
-    model: ModelFolder, name: str, cache: Path, graph: bytes | None = None, exact: Sequence[str] = ()
-) -> Network:
+    model: ModelFolder, name: str, cache: Path, graph: Graph | None = None, exact: Sequence[str] = ()
+) -> Network | None:
     """Open the int8 version of a model's network, which `hilsplat models get` or the first use computes.
 
-    The int8 version is stored beside the model folder, in `.int8`, named by a digest of its source.
+    The int8 version is stored beside the model folder, in `.int8`, named by a digest of its source. If it
+    cannot be computed, a warning is logged and None is returned.
 
     Args:
         cache: folder to use instead if the model's parent folder is read-only.
-        graph: a modified graph to use instead of the network's file.
+        graph: a modified network to use instead of the network's file.
         exact: outputs that stay in float32, such as sines of large arguments.
     """
-    source = sha256_of_file(model.networks[name]) if graph is None else sha256_of_bytes(graph)
-    beside = model.folder.parent  # a new file in the model folder could change its digest
-    folder = beside if os.access(beside, os.W_OK) else cache
-    path = folder / ".int8" / f"{sha256_of_json([source, RECIPE, list(exact)])}.onnx"
-    if not path.is_file():
-        logger.info("quantising %s of %s, which takes a few seconds; the result is kept", name, model.folder)
-        _quantise(model.networks[name] if graph is None else graph, path, exact)
-    return model.network(name, graph=path.read_bytes())
+
+    def prepare() -> Network:
+        source = graph or Graph.read(model.networks[name])
+        beside = model.folder.parent  # a new file in the model folder could change its digest
+        folder = beside if os.access(beside, os.W_OK) else cache
+        path = folder / ".int8" / f"{sha256_of_json([source.digest, RECIPE, list(exact)])}.onnx"
+        if not path.is_file():
+            logger.info(
+                "quantising %s of %s, which takes a few seconds; the result is kept", name, model.folder
+            )
+            _quantise(source, path, exact)
+        return model.network(name, path)
+
+    return or_as_exported(model.networks[name], "each image takes about twice as long", prepare)
 
 
-def _quantise(network: Path | bytes, out: Path, exact: Sequence[str]) -> None:
-    import onnx
+def _quantise(source: Graph, out: Path, exact: Sequence[str]) -> None:
     from onnxruntime.quantization import QuantType, quantize_dynamic
 
-    graph = onnx.load_from_string(network) if isinstance(network, bytes) else onnx.load(str(network))
+    graph = source.complete()
     logging.disable(logging.WARNING)  # onnxruntime logs a line for each layer that stays in float32
     try:
         with atomic_path(out) as temporary:

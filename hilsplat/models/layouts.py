@@ -40,9 +40,9 @@ class Layout:
         return ("config.json", self.preprocessing, *([self.tokenizer] if self.tokenizer else []))
 
 
-_ANY2, _ANY3, _ANY4 = (None,) * 2, (None,) * 3, (None,) * 4
+_ANY2, _ANY4 = (None,) * 2, (None,) * 4
 _IMAGE: Axes = (None, 3, None, None)
-_POINTS: dict[str, Axes] = {"input_points": (None, None, None, 2), "input_labels": _ANY3}
+_POINTS: dict[str, Axes] = {"input_points": (None, None, None, 2)}
 _MASKS: dict[str, Axes] = {"iou_scores": (None, None, 3), "pred_masks": (None, None, 3, None, None)}
 
 DECODER = "prompt_encoder_mask_decoder"
@@ -55,12 +55,13 @@ def _places(name: str) -> tuple[str, ...]:
     return name, f"onnx/{name}"
 
 
-def _segmenter(features: Sequence[str], optional: tuple[str, ...] = ()) -> Layout:
+def _segmenter(features: Sequence[str]) -> Layout:
     """Return the layout of a SAM model whose encoder passes the named features to its decoder."""
     encoded = dict.fromkeys(features, _ANY4)
     encoder = NetworkSpec({"pixel_values": _IMAGE}, encoded, (), _places("vision_encoder"))
     decoder, preview = (
-        NetworkSpec(_POINTS | encoded, _MASKS, optional, _places(name)) for name in (DECODER, PREVIEW)
+        NetworkSpec(_POINTS | encoded, _MASKS, ("input_labels", "input_boxes"), _places(name))
+        for name in (DECODER, PREVIEW)
     )
     return Layout("sam", {"vision_encoder": encoder, DECODER: decoder}, {PREVIEW: preview})
 
@@ -83,7 +84,7 @@ def _image_and_text(image: str, text: str, optional: tuple[str, ...] = ()) -> La
 
 LAYOUTS: dict[str, Layout] = {
     "sam": _segmenter(("image_embeddings", "image_positional_embeddings")),
-    "sam2": _segmenter(tuple(f"image_embeddings.{level}" for level in range(3)), ("input_boxes",)),
+    "sam2": _segmenter(tuple(f"image_embeddings.{level}" for level in range(3))),
     "clip": _image_and_text("image_embeds", "text_embeds", ("attention_mask",)),
     "siglip": _image_and_text("pooler_output", "pooler_output"),
     "open_clip": Layout(

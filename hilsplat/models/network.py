@@ -1,8 +1,10 @@
 """Open, check and run a network of a model folder."""
 
+import ctypes
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ import onnxruntime
 
 from hilsplat.base.errors import ModelError
 from hilsplat.models.layouts import Axes, NetworkSpec
+from hilsplat.models.onnx_graph import Graph, has_external_weights
 
 logger = logging.getLogger(__name__)
 
@@ -27,21 +30,67 @@ DTYPES = {
 }
 
 
-def execution_providers() -> list[str]:
-    """Return the available onnxruntime execution providers in order of preference: CUDA, then CPU."""
-    available = onnxruntime.get_available_providers()
-    return [name for name in ("CUDAExecutionProvider", "CPUExecutionProvider") if name in available]
+CPU, CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
 
 
-def one_thread_session(network: bytes | str, providers: list[str]) -> onnxruntime.InferenceSession:
-    """Open a network (its graph or path) that runs in one thread per call.
+def execution_providers() -> tuple[str, ...]:
+    """Return the onnxruntime execution providers that work, in order of preference: CUDA, then CPU."""
+    return (CPU,) if cuda_provider_problem() else (CUDA, CPU)
+
+
+@cache
+def cuda_provider_problem() -> str | None:
+    """Return why onnxruntime cannot use CUDA here, or None if a session runs on it.
+
+    The list of available providers contains what onnxruntime was built with. Without a driver, CUDA or cuDNN,
+    sessions run on the CPU. If onnxruntime was built with CUDA, the problem is logged as a warning.
+    """
+    if CUDA not in onnxruntime.get_available_providers():
+        return "onnxruntime is built without CUDA"
+    try:
+        onnxruntime.preload_dlls()  # CUDA and cuDNN as installed with torch
+        session = one_thread_session(_identity(), (CUDA, CPU))
+        session.run(None, {"x": np.zeros(1, np.float32)})
+        problem = None if session.get_providers()[0] == CUDA else _missing_library()
+    except Exception as error:  # onnxruntime's errors share no public base class
+        problem = str(error).splitlines()[0]
+    if problem:
+        logger.warning("onnxruntime runs on the CPU, because CUDA cannot be used: %s", problem)
+    return problem
+
+
+def _identity() -> Graph:
+    from onnx.parser import parse_model
+
+    text = (
+        """<ir_version: 8, opset_import: ["" : 17]> same (float[1] x) => (float[1] y) { y = Identity (x) }"""
+    )
+    return Graph(parse_model(text), {})
+
+
+def _missing_library() -> str:
+    """Return why the library of onnxruntime's CUDA provider cannot be loaded."""
+    library = Path(onnxruntime.__file__).parent / "capi/libonnxruntime_providers_cuda.so"
+    try:
+        ctypes.CDLL(str(library))
+    except OSError as error:
+        return str(error)
+    return "its session fell back to the CPU"
+
+
+def one_thread_session(network: Graph | Path, providers: Sequence[str]) -> onnxruntime.InferenceSession:
+    """Open a network that runs in one thread per call; the weights of a `Graph` must outlive the session.
 
     Stages are faster if they process several views at once; results don't depend on the number of threads.
     """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 3
-    return onnxruntime.InferenceSession(network, options, providers=providers)
+    if isinstance(network, Path):
+        return onnxruntime.InferenceSession(str(network), options, providers=list(providers))
+    values = [onnxruntime.OrtValue.ortvalue_from_numpy(value) for value in network.weights.values()]
+    options.add_external_initializers(list(network.weights), values)
+    return onnxruntime.InferenceSession(network.serialized(), options, providers=list(providers))
 
 
 class Network:
@@ -50,7 +99,7 @@ class Network:
     Each call runs in one thread (`one_thread_session`), and several threads may call a network.
 
     Args:
-        graph: a modified graph to use instead of the file (`onnx_graph`).
+        changed: a changed network, or its file, to use instead of `path`.
         provider: the only execution provider to use, or None for the first that works.
 
     Raises:
@@ -58,7 +107,11 @@ class Network:
     """
 
     def __init__(
-        self, path: Path, spec: NetworkSpec, graph: bytes | None = None, provider: str | None = None
+        self,
+        path: Path,
+        spec: NetworkSpec,
+        changed: Graph | Path | None = None,
+        provider: str | None = None,
     ) -> None:
         self.path = path
         if path.stat().st_size < POINTER_BYTES and path.read_bytes().startswith(b"version https://git-lfs"):
@@ -68,8 +121,11 @@ class Network:
                 fix="fetch the file itself: git lfs pull, or download it from the model's page",
             )
         try:
-            providers = [provider] if provider else execution_providers()
-            self.session = one_thread_session(graph or str(path), providers)
+            source = changed or path
+            if isinstance(source, Path) and has_external_weights(source):
+                source = Graph.read(source)  # onnxruntime alone refuses some links to weights
+            self._weights = source.weights if isinstance(source, Graph) else {}  # the session reads them
+            self.session = one_thread_session(source, [provider] if provider else execution_providers())
         except Exception as error:  # onnxruntime's errors share no public base class
             raise ModelError(
                 f"network {path} cannot be opened: {error}",
@@ -86,7 +142,7 @@ class Network:
         self._check("inputs", spec.inputs, self.inputs, spec.optional)
         self._check("outputs", spec.outputs, self.outputs, tuple(self.outputs))
         self.providers = self.session.get_providers()
-        logger.info("network %s runs on %s", path.name, self.providers[0])
+        logger.debug("network %s runs on %s", path.name, self.providers[0])
 
     def _check(
         self, what: str, expected: Mapping[str, Axes], found: dict[str, Any], optional: tuple[str, ...]

@@ -1,15 +1,18 @@
-"""Changes to ONNX graphs: extraction of parts, row-wise global attention, and splitting of CLIP models.
+"""Read and change ONNX graphs: parts, row-wise attention, prompts without boxes, halves of CLIP models.
 
 `model.onnx`, as exported by optimum from CLIP or SigLIP, accepts an image and a text together. The image
 vectors depend only on the image and the text vectors only on the text, so each half is a subgraph.
 """
 
 import copy
-from collections.abc import Iterable, Sequence
+import mmap
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from hilsplat.base.artifacts import atomic_path
+import numpy as np
+
+from hilsplat.base.artifacts import atomic_path, sha256_of_bytes, sha256_of_json
 from hilsplat.base.errors import ModelError
 
 WHOLE = "model.onnx"
@@ -23,8 +26,126 @@ OPTIONAL = {"attention_mask"}
 """Inputs that a network may lack; SigLIP's text network reads the padding instead."""
 
 
-def reduced(model: Any, outputs: Sequence[str]) -> bytes:
-    """Reduce a model to the nodes that compute the given values, its new outputs, and return its bytes."""
+class Graph:
+    """An ONNX network in memory; its external weights stay in their files, mapped into memory.
+
+    Unlike the onnx package, this class accepts links to weights in other folders, as in the hub's cache.
+
+    Attributes:
+        model: the network as an `onnx.ModelProto`, without the external weights.
+        weights: external weights by name.
+    """
+
+    def __init__(self, model: Any, weights: dict[str, np.ndarray]) -> None:
+        self.model = model
+        self.weights = weights
+
+    @staticmethod
+    def read(path: Path) -> "Graph":
+        """Read a network; raise a ModelError if it or its external weights are damaged."""
+        import onnx
+        from google.protobuf.message import DecodeError
+
+        try:
+            model = onnx.load(str(path), load_external_data=False)
+        except DecodeError as error:
+            problem = f"network {path} cannot be opened: {error}"
+            raise ModelError(problem, fix="fetch or export it again") from error
+        weights = {}
+        for tensor in tensors_of(model.graph):
+            if (place := location_of(tensor)) is None:
+                continue
+            content = _mapped(path, tensor, place)
+            if tensor.name in {each.name for each in model.graph.initializer}:
+                weights[tensor.name] = content
+            else:  # a constant of a node, which onnxruntime can't receive separately
+                _inline(tensor, content)
+        return Graph(model, weights)
+
+    def serialized(self) -> bytes:
+        """Return the network without its external weights, as bytes."""
+        return bytes(self.model.SerializeToString())
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the network and its weights."""
+        weights = [(name, sha256_of_bytes(value.tobytes())) for name, value in self.weights.items()]
+        return sha256_of_json([sha256_of_bytes(self.serialized()), weights])
+
+    @property
+    def num_bytes(self) -> int:
+        """Size of the network and its weights."""
+        return self.model.ByteSize() + sum(value.nbytes for value in self.weights.values())
+
+    def complete(self) -> Any:
+        """Return a copy of the network that contains its external weights (at most 2 GiB)."""
+        model = copy.deepcopy(self.model)
+        for tensor in model.graph.initializer:
+            if tensor.name in self.weights:
+                _inline(tensor, self.weights[tensor.name])
+        return model
+
+    def reduced(self, outputs: Sequence[str]) -> "Graph":
+        """Return the nodes that compute the given values, which become the outputs."""
+        model = reduced(copy.deepcopy(self.model), outputs)
+        kept = {each.name for each in model.graph.initializer}
+        return Graph(model, {name: value for name, value in self.weights.items() if name in kept})
+
+
+def location_of(tensor: Any) -> str | None:
+    """Return the name of the file with a tensor's values, or None if the network contains them."""
+    from onnx.external_data_helper import ExternalDataInfo, uses_external_data
+
+    return ExternalDataInfo(tensor).location if uses_external_data(tensor) else None
+
+
+def has_external_weights(path: Path) -> bool:
+    """Return whether a network may refer to other files, without reading its weights."""
+    if not path.stat().st_size:
+        return False
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        return content.find(b"location") >= 0  # key of every tensor stored outside the graph
+
+
+def tensors_of(graph: Any) -> Iterator[Any]:
+    """Yield all weights and constants of a graph and its subgraphs."""
+    yield from graph.initializer
+    for node in graph.node:
+        for attribute in node.attribute:
+            yield from (attribute.t, *attribute.tensors)
+            for inner in (attribute.g, *attribute.graphs):
+                yield from tensors_of(inner)
+
+
+def _mapped(network: Path, tensor: Any, location: str) -> np.ndarray:
+    """Map the values of an external tensor into memory."""
+    import onnx
+    from onnx.external_data_helper import ExternalDataInfo
+
+    info, dtype = ExternalDataInfo(tensor), onnx.helper.tensor_dtype_to_np_dtype(tensor.data_type)
+    start, size = info.offset or 0, int(np.prod(tensor.dims)) * dtype.itemsize
+    path = network.parent / location
+    if path.stat().st_size < start + size:
+        raise ModelError(
+            f"network {network} cannot be opened: its weights file {location} is too short",
+            expected=f"at least {start + size} bytes",
+            found=f"{path.stat().st_size} bytes",
+            fix="fetch a complete copy",
+        )
+    return np.memmap(path, dtype, "r", start, tuple(tensor.dims)) if size else np.zeros(tensor.dims, dtype)
+
+
+def _inline(tensor: Any, content: np.ndarray) -> None:
+    """Store the values of an external tensor in the network."""
+    import onnx
+
+    tensor.raw_data = content.tobytes()
+    tensor.data_location = onnx.TensorProto.DEFAULT
+    del tensor.external_data[:]
+
+
+def reduced(model: Any, outputs: Sequence[str]) -> Any:
+    """Reduce a model in place to the nodes that compute the given values, its new outputs, and return it."""
     import onnx
 
     graph = model.graph
@@ -43,7 +164,7 @@ def reduced(model: Any, outputs: Sequence[str]) -> bytes:
         target = getattr(graph, field)
         del target[:]
         target.extend(values)
-    return bytes(model.SerializeToString())
+    return model
 
 
 def needed_names(graph: Any, outputs: Sequence[str]) -> set[str]:
@@ -64,10 +185,53 @@ def _inputs(node: Any) -> list[str]:
     return [*node.input, *(name for graph in inner for part in graph.node for name in _inputs(part))]
 
 
-def with_rowwise_attention(path: Path, layers: Iterable[int], heads: int, side: int) -> bytes | None:
-    """Return the graph of SAM's encoder with global attention computed for one row of patches at a time.
+def without_joined(graph: Graph, name: str, other: str) -> Graph | None:
+    """Return a network that no longer concatenates values of the input `name` with values of `other`.
 
-    The result is None if a layer has an unexpected form, or weights are external or 16-bit.
+    Other uses of the input, such as its length, remain. The result is None if no such operator exists.
+
+    Published SAM 2 decoders join the tokens of boxes to those of points. Without boxes, onnxruntime 1.31
+    joins tokens that were never computed, so results change from call to call.
+    """
+    model = copy.deepcopy(graph.model)
+    by_name, by_other = (computed_from(graph, each) for each in (name, other))
+    found = False
+    for node in model.graph.node:
+        rest = [each for each in node.input if each not in by_name]
+        if node.op_type == "Concat" and 0 < len(rest) < len(node.input) and by_other.intersection(rest):
+            del node.input[:]
+            node.input.extend(rest)
+            found = True
+    return Graph(model, graph.weights).reduced([each.name for each in model.graph.output]) if found else None
+
+
+def computed_from(graph: Graph, name: str) -> set[str]:
+    """Return a value's name and those of all values computed from its numbers, not only from its shape."""
+    found, before = {name}, 0
+    while len(found) > before:  # converters to float16 append nodes in any order
+        before = len(found)
+        for node in graph.model.graph.node:
+            if node.op_type != "Shape" and found.intersection(_inputs(node)):
+                found.update(node.output)
+    return found
+
+
+def reads_through(graph: Graph, name: str, operators: Iterable[str]) -> bool:
+    """Return whether an input is passed to one of these operators, directly or after a cast."""
+    waiting = [name]
+    while waiting:
+        value = waiting.pop()
+        for node in graph.model.graph.node:
+            if value in node.input:
+                if node.op_type in operators:
+                    return True
+                if node.op_type in ("Cast", "Identity"):
+                    waiting += node.output
+    return False
+
+
+def with_rowwise_attention(path: Path, layers: Iterable[int], heads: int, side: int) -> Graph:
+    """Return the graph of SAM's encoder with global attention computed for one row of patches at a time.
 
     As exported, such a layer writes the weights of all pairs of patches (800 MB) and reads them four times.
     The weights of one row fit into the processor's cache. onnxruntime loops over rows (operator Scan);
@@ -77,24 +241,24 @@ def with_rowwise_attention(path: Path, layers: Iterable[int], heads: int, side: 
         path: the `.onnx` file of a ViT encoder exported from transformers.
         layers: layers with global attention.
         side: patches per side of the image.
+
+    Raises:
+        ModelError: a layer has an unexpected form, or weights are 16-bit.
     """
     import onnx
 
-    model = onnx.load(str(path), load_external_data=False)
-    graph = model.graph
-    if any(
-        each.data_location == onnx.TensorProto.EXTERNAL or each.data_type == onnx.TensorProto.FLOAT16
-        for each in graph.initializer
-    ):
-        return None
+    read = Graph.read(path)
+    graph = read.model.graph
+    if any(each.data_type == onnx.TensorProto.FLOAT16 for each in graph.initializer):
+        raise ModelError("its weights are float16")
     makers = {name: node for node in graph.node for name in node.output}
     for layer in layers:
         ending = f"/layers.{layer}/attn/Softmax"
         found = [node for node in graph.node if node.name.endswith(ending)]
         sums = _scores(found[0], makers) if len(found) == 1 else None
-        readers = [node for node in graph.node if found and found[0].output[0] in node.input]
+        readers = _readers(graph, found[0].output[0]) if found else []
         if sums is None or len(readers) != 1 or readers[0].op_type != "MatMul":
-            return None
+            raise ModelError(f"layer {layer} has no global attention in the form of transformers")
         (queries, keys), positions = sums
         values, output = readers[0].input[1], readers[0].output[0]
         nodes = _row_loop(f"rowwise_{layer}_", queries, keys, values, positions, output, heads, side)
@@ -102,7 +266,17 @@ def with_rowwise_attention(path: Path, layers: Iterable[int], heads: int, side: 
         graph.node.remove(readers[0])
         for offset, node in enumerate(nodes):
             graph.node.insert(place + offset, node)
-    return reduced(model, [each.name for each in graph.output])
+    reduced(read.model, [each.name for each in graph.output])
+    return read
+
+
+def _readers(graph: Any, value: str) -> list[Any]:
+    """Return the nodes that read a value, in place of casts their readers."""
+    found = []
+    for node in graph.node:
+        if value in node.input:
+            found += _readers(graph, node.output[0]) if node.op_type == "Cast" else [node]
+    return found
 
 
 def _scores(softmax: Any, makers: dict[str, Any]) -> tuple[list[str], list[str]] | None:
@@ -196,6 +370,6 @@ def split_clip(folder: Path) -> list[Path]:
     for name, (_, output) in HALVES.items():
         path = whole.with_name(f"{name}.onnx")
         with atomic_path(path) as temporary:
-            temporary.write_bytes(reduced(copy.deepcopy(model), [output]))
+            temporary.write_bytes(reduced(copy.deepcopy(model), [output]).SerializeToString())
         written.append(path)
     return written

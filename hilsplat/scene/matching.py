@@ -18,6 +18,7 @@ from jaxtyping import Float64, Int8, Int32, UInt8, UInt32
 
 from hilsplat.base.compiled import compiled
 from hilsplat.models.network import one_thread_session
+from hilsplat.models.onnx_graph import Graph
 from hilsplat.scene.colmap import pycolmap
 
 MAX_ANGLE = 0.7
@@ -153,7 +154,7 @@ def _integer_products() -> onnxruntime.InferenceSession | None:
         [helper.make_tensor("zero", TensorProto.INT8, [], [-128])],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
-    session = one_thread_session(model.SerializeToString(), ["CPUExecutionProvider"])
+    session = one_thread_session(Graph(model, {}), ["CPUExecutionProvider"])
     rows = np.full((_BLOCK, _CHANNELS), 255, np.uint8)
     columns = np.repeat(np.array([[-128, 127]], np.int8), _CHANNELS, axis=0)
     found = session.run(None, {"rows": rows, "columns": columns})[0]

@@ -1,9 +1,7 @@
 """Read the mask decoder of an ONNX export: weights by module, and subgraphs."""
 
-import copy
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,11 +9,8 @@ from jaxtyping import Float32
 
 from hilsplat.base.errors import ModelError
 from hilsplat.base.lanes import WIDTH
-from hilsplat.models.onnx_graph import reduced
+from hilsplat.models.onnx_graph import Graph
 from hilsplat.segment import decoder_kernels as kernels
-
-EPS = 1e-6
-"""Epsilon of layer norms that the export splits into basic operators; the default of transformers."""
 
 
 @dataclass(frozen=True)
@@ -68,28 +63,29 @@ class Attention:
 class DecoderGraph:
     """Graph of a decoder exported from transformers; its nodes are named after the modules.
 
+    Weights are found by the nodes that use them, because exporters rename weights and merge equal ones.
+
     Raises:
         ModelError: if the graph lacks expected nodes, or weights are not float32.
     """
 
-    def __init__(self, path: Path) -> None:
-        import onnx
-
-        self.path = path
-        self.model = onnx.load(str(path))
-        graph = self.model.graph
-        self._initializers = {each.name: each for each in graph.initializer}
-        self._nodes = {node.name: node for node in graph.node}
-        self._aliases = {node.output[0]: node.input[0] for node in graph.node if node.op_type == "Identity"}
+    def __init__(self, graph: Graph) -> None:
+        self._graph = graph
+        model = graph.model.graph
+        self._initializers = {each.name: each for each in model.initializer}
+        self._nodes = {node.name: node for node in model.node}
+        self._makers = {name: node for node in model.node for name in node.output}
+        self._readers = {name: node for node in model.node for name in node.input}
 
     def linear(self, module: str) -> Linear:
         """Return a linear layer from the constants of its MatMul and Add nodes."""
-        product, total = self._node(f"{module}/MatMul"), self._node(f"{module}/Add")
-        (bias,) = [value for name in total.input if (value := self._constant(name)) is not None]
-        weight = self._constant(product.input[1])
-        if weight is None:
-            raise self._unusual(f"{module} has no constant weights")
-        return Linear(np.ascontiguousarray(weight.T), bias)
+        product = self._node(f"{module}/MatMul")
+        total = self._readers.get(product.output[0])
+        weight = self._constants(product)
+        bias = self._constants(total) if total is not None and total.op_type == "Add" else []
+        if len(weight) != 1 or len(bias) != 1:
+            raise _unusual(f"{module} has no constant weights")
+        return Linear(np.ascontiguousarray(weight[0].T), bias[0])
 
     def attention(self, module: str) -> Attention:
         out = "out" if self._find(f"{module}/out_proj/MatMul") is not None else "o"  # SAM, SAM 2
@@ -100,32 +96,36 @@ class DecoderGraph:
         names = ["proj_in", *(f"layers.{number}" for number in range(8)), "proj_out", "lin1", "lin2"]
         found = [name for name in names if self._find(f"{module}/{name}/MatMul") is not None]
         if not found:
-            raise self._unusual(f"it has no layers in {module}")
+            raise _unusual(f"it has no layers in {module}")
         return [self.linear(f"{module}/{name}") for name in found]
 
     def norm(self, module: str) -> Norm:
+        """Return a layer norm, which is one node since opset 17, or several nodes."""
         node = self._find(f"{module}/LayerNormalization")
-        eps = [each.f for each in node.attribute if each.name == "epsilon"] if node is not None else []
-        scale, shift = (self.parameter(f"{module}/{name}") for name in ("weight", "bias"))
-        return Norm(scale, shift, eps[0] if eps else EPS)
+        if node is not None:
+            (eps,) = [each.f for each in node.attribute if each.name == "epsilon"]
+            values = [*self._constants(node), np.array(eps)]
+        else:
+            nodes = [self._node(f"{module}/{name}") for name in ("Mul", "Add_1", "Add")]
+            values = [value for each in nodes for value in self._constants(each)]
+        if len(values) != 3 or np.size(values[2]) != 1:
+            raise _unusual(f"{module} has no constant weights")
+        return Norm(values[0].reshape(-1), values[1].reshape(-1), values[2].item())
 
-    def parameter(self, name: str) -> Float32[np.ndarray, "..."]:
-        """Return a parameter that the export left unchanged; `name` is its path with slashes."""
-        ending = name.replace("/", ".")
-        found = [each for each in [*self._initializers, *self._aliases] if each.endswith(ending)]
-        value = self._constant(found[0]) if found else None
-        if value is None:
-            raise self._unusual(f"it has no parameter {ending}")
-        return value
+    def upscaling(self, module: str) -> tuple[Float32[np.ndarray, "i o 2 2"], Float32[np.ndarray, " o"]]:
+        """Return weights and bias of a transposed convolution."""
+        values = self._constants(self._node(f"{module}/ConvTranspose"))
+        if len(values) != 2:
+            raise _unusual(f"{module} has no constant weights")
+        return values[0], values[1]
 
     def has(self, module: str, operator: str) -> bool:
         """Return whether a module has a node of the given operator type."""
         return any(f"{module}/" in name and node.op_type == operator for name, node in self._nodes.items())
 
-    def until(self, *modules: str) -> bytes:
-        """Return the serialised subgraph whose outputs are the inputs of the given modules."""
-        ends = [self._node(f"{module}/MatMul").input[0] for module in modules]
-        return reduced(copy.deepcopy(self.model), ends)
+    def until(self, *modules: str) -> Graph:
+        """Return the subgraph whose outputs are the inputs of the given modules."""
+        return self._graph.reduced([self._node(f"{module}/MatMul").input[0] for module in modules])
 
     def _find(self, ending: str) -> Any:
         matches = [node for name, node in self._nodes.items() if name.endswith(f"/{ending}")]
@@ -133,19 +133,33 @@ class DecoderGraph:
 
     def _node(self, ending: str) -> Any:
         if (node := self._find(ending)) is None:
-            raise self._unusual(f"it has no node {ending}")
+            raise _unusual(f"it has no node {ending}")
         return node
 
+    def _constants(self, node: Any) -> list[np.ndarray]:
+        """Return the constant inputs of a node, in order."""
+        return [value for name in node.input if (value := self._constant(name)) is not None]
+
     def _constant(self, name: str) -> np.ndarray | None:
+        """Return a weight, or None for a value that depends on an input; axes of length 1 may be missing."""
         from onnx import numpy_helper
 
-        found = self._initializers.get(self._aliases.get(name, name))
-        if found is None:
+        maker = self._makers.get(name)
+        while maker is not None and maker.op_type in ("Identity", "Unsqueeze"):
+            name = maker.input[0]
+            maker = self._makers.get(name)
+        if name in self._graph.weights:
+            value: np.ndarray = self._graph.weights[name]
+        elif name in self._initializers:
+            value = numpy_helper.to_array(self._initializers[name])
+        elif maker is not None and maker.op_type == "Constant" and maker.attribute[0].name == "value":
+            value = numpy_helper.to_array(maker.attribute[0].t)
+        else:
             return None
-        value = numpy_helper.to_array(found)
         if value.dtype != np.float32:
-            raise self._unusual(f"its weights are {value.dtype}")
-        return value
+            raise _unusual(f"its weights are {value.dtype}")
+        return np.asarray(value)
 
-    def _unusual(self, why: str) -> ModelError:
-        return ModelError(f"{self.path.name} cannot be factored: {why}")
+
+def _unusual(why: str) -> ModelError:
+    return ModelError(f"the decoder cannot be factored: {why}")

@@ -30,7 +30,9 @@ from jaxtyping import Float, Float32, Float64
 from hilsplat.base.errors import ModelError
 from hilsplat.base.lanes import WIDTH
 from hilsplat.models.network import one_thread_session
+from hilsplat.models.onnx_graph import Graph
 from hilsplat.segment import decoder_kernels as kernels
+from hilsplat.segment.decoder_network import DecoderNetwork
 from hilsplat.segment.decoder_weights import DecoderGraph, Linear
 
 LOG2_E = np.float32(1 / np.log(2))  # converts scores to base 2
@@ -116,7 +118,9 @@ Kept = Mapping[str, np.ndarray]
 class FactoredDecoder:
     """Factored mask decoder of a SAM or SAM 2 model; raises a ModelError for any other architecture."""
 
-    def __init__(self, graph: DecoderGraph, heads: int = HEADS_PER_ATTENTION) -> None:
+    def __init__(self, network: DecoderNetwork, heads: int = HEADS_PER_ATTENTION) -> None:
+        graph = DecoderGraph(network.graph)
+        self._network = network
         self.heads = heads
         base = "mask_decoder/transformer"
         layers = [f"{base}/layers.{number}" for number in (0, 1)]
@@ -134,20 +138,15 @@ class FactoredDecoder:
         ]
         # inputs of these modules: the prompt tokens; the image features without and with positions
         tokens, image_side = ["self_attn/q_proj"], [f"cross_attn_token_to_image/{part}_proj" for part in "vk"]
+        self._graphs = [
+            graph.until(*(f"{layers[0]}/{each}" for each in ends)) for ends in (tokens, image_side)
+        ]
+        _relax_shapes(self._graphs[0])
         self._tokens, self._image_side = (
-            one_thread_session(
-                graph.until(*(f"{layers[0]}/{each}" for each in ends)), ["CPUExecutionProvider"]
-            )
-            for ends in (tokens, image_side)
+            one_thread_session(each, ["CPUExecutionProvider"]) for each in self._graphs
         )
         self.inner = len(self._reads[0].q.bias)
-        # tokens depend only on the shapes of the features
-        self._blank = {
-            each.name: np.zeros([side if isinstance(side, int) else 1 for side in each.shape], np.float32)
-            for each in self._tokens.get_inputs()
-            if not each.name.startswith("input_")
-        }
-        one, other = (_run(self._tokens, self._blank, np.full((1, 2), place))[0] for place in (0.0, 9.0))
+        one, other = (self._token_rows(np.full((1, 2), place)) for place in (0.0, 9.0))
         same = (one == other).all(axis=-1).reshape(-1)
         self._iou_token = int(np.argmin(same)) - 5  # SAM 2 has a token for the object score before it
         self.dim = self.inner // heads
@@ -156,7 +155,7 @@ class FactoredDecoder:
     def _fold(self, graph: DecoderGraph, layers: list[str]) -> None:
         """Multiply consecutive weight matrices, in float64."""
         norms = [graph.norm(f"{layer}/layer_norm4") for layer in layers]
-        self._eps = self._upscale_eps = norms[0].eps
+        self._eps = norms[0].eps
         (g1, b1), (g2, b2) = ((wide(norm.scale), wide(norm.shift)) for norm in norms)
         # output projections of values (inner, channels): before and after the next layer norm
         out0, out1 = (centred(wide(each.out.weight).T, 1) for each in self._updates)
@@ -175,17 +174,19 @@ class FactoredDecoder:
         self._low_read2 = single(wide(read2.k.weight) @ finer.T)
         self._values2 = single(finer @ read2.v.weight.T)
         # rows are (dy, dx, channel) and centred, so that the mean in the upscaling's layer norm is 0
-        weight = wide(graph.parameter("mask_decoder/upscale_conv1/weight"))
-        bias = np.tile(centred(wide(graph.parameter("mask_decoder/upscale_conv1/bias"))), 4)
+        weight, bias = map(wide, graph.upscaling("mask_decoder/upscale_conv1"))
+        bias = np.tile(centred(bias), 4)
         upscale = centred(weight.transpose(2, 3, 1, 0), 2).reshape(-1, len(weight))
         self._upscale, self._factor_masks = single(upscale), single(finer @ upscale.T)
-        second = graph.parameter("mask_decoder/upscale_conv2/weight")
+        second, second_bias = graph.upscaling("mask_decoder/upscale_conv2")
+        norm = graph.norm("mask_decoder/upscale_layer_norm")
+        self._upscale_eps = norm.eps
         self._upscaling = Upscaling(
-            norm_scale=graph.parameter("mask_decoder/upscale_layer_norm/weight"),
-            norm_shift=graph.parameter("mask_decoder/upscale_layer_norm/bias"),
+            norm_scale=norm.scale,
+            norm_shift=norm.shift,
             fixed=single(upscale @ b2 + bias),
             second=np.ascontiguousarray(second.transpose(2, 3, 1, 0)).reshape(-1),
-            bias=graph.parameter("mask_decoder/upscale_conv2/bias"),
+            bias=second_bias,
         )
 
     def image(self, features: Mapping[str, np.ndarray]) -> ImageTerms:
@@ -193,7 +194,7 @@ class FactoredDecoder:
 
         A ModelError is raised if the image embedding cannot be divided into blocks.
         """
-        sides = _run(self._image_side, features, np.zeros((1, 2)))
+        sides = self._run(self._image_side, features, np.zeros((1, 2)))
         x, with_positions = (wide(side.reshape(side.shape[-2:]).T) for side in sides)  # (channels, pixels)
         pe = with_positions - x
         side = features.get("image_embeddings", features.get("image_embeddings.2"))
@@ -268,8 +269,7 @@ class FactoredDecoder:
         Points are inside the object, in px of the network's input. With `fine`, all 4 x 4 logits of each
         pixel of the embedding are computed, otherwise only the first logit.
         """
-        pe = _run(self._tokens, self._blank, points_xy)[0]
-        pe = pe.reshape(len(points_xy), *pe.shape[-2:])
+        pe = self._token_rows(points_xy)
         number, tokens, channels = pe.shape
         sizes, factors = self._sizes(image, number, tokens), self.heads * (tokens - 1)
         pixels = image.grid_hw[0] * image.grid_hw[1]
@@ -384,6 +384,26 @@ class FactoredDecoder:
         )  # fmt: skip
         return out
 
+    def _token_rows(self, points_xy: Float[np.ndarray, "P 2"]) -> Float32[np.ndarray, "P T C"]:
+        """Return the tokens of each prompt before the first layer."""
+        blank = {
+            each.name: np.zeros((1, 1, 1, 1), np.float32)
+            for each in self._tokens.get_inputs()
+            if each.name.startswith("image_")
+        }
+        (found,) = self._run(self._tokens, blank, points_xy)
+        return found.reshape(len(points_xy), *found.shape[-2:])
+
+    def _run(
+        self,
+        session: onnxruntime.InferenceSession,
+        features: Mapping[str, np.ndarray],
+        points_xy: Float[np.ndarray, "P 2"],
+    ) -> list[np.ndarray]:
+        """Run a subgraph of the decoder for prompts of one point."""
+        feeds = self._network.feeds(features, points_xy[:, None])
+        return session.run(None, {each.name: feeds[each.name] for each in session.get_inputs()})
+
     def _sizes(self, image: ImageTerms, number: int, tokens: int) -> tuple[int, ...]:
         """Return the sizes that `decoder_kernels.read_image` documents."""
         pixels = image.grid_hw[0] * image.grid_hw[1]
@@ -451,19 +471,12 @@ class PixelSums:
         return found / total
 
 
-def _run(
-    session: onnxruntime.InferenceSession,
-    features: Mapping[str, np.ndarray],
-    points: Float[np.ndarray, "P 2"],
-) -> list[np.ndarray]:
-    """Run a subgraph of the decoder."""
-    feeds = {
-        "input_points": points[None, :, None].astype(np.float32),
-        "input_labels": np.ones((1, len(points), 1), np.int64),
-        "input_boxes": np.zeros((1, 0, 4), np.float32),
-        **features,
-    }
-    return session.run(None, {each.name: feeds[each.name] for each in session.get_inputs()})
+def _relax_shapes(graph: Graph) -> None:
+    """Remove the declared shapes of the image features, of which the tokens use only the number of images."""
+    for each in graph.model.graph.input:
+        if each.name.startswith("image_"):
+            for side in each.type.tensor_type.shape.dim:
+                side.Clear()
 
 
 def _layers(layers: list[Linear], x: np.ndarray) -> np.ndarray:

@@ -21,12 +21,14 @@ from hilsplat.base.artifacts import sha256_of_bytes
 from hilsplat.base.errors import ModelError
 from hilsplat.base.levels import Level
 from hilsplat.base.processes import in_order
+from hilsplat.models.fast_paths import or_as_exported
 from hilsplat.models.folder import ModelFolder, open_model_folder, side_px
 from hilsplat.models.int8 import CHECKED_GRID, agreement_of_masks, considers_int8, int8_network, use_int8
 from hilsplat.models.layouts import DECODER, PREVIEW
-from hilsplat.models.network import Network, execution_providers
-from hilsplat.models.onnx_graph import with_rowwise_attention
-from hilsplat.segment.decoder_weights import DecoderGraph
+from hilsplat.models.network import CPU, Network, execution_providers
+from hilsplat.models.onnx_graph import Graph, with_rowwise_attention
+from hilsplat.models.repeatable import require_repeatable_once
+from hilsplat.segment.decoder_network import DecoderNetwork
 from hilsplat.segment.factored_decoder import HEADS_PER_ATTENTION, PROMPTS, FactoredDecoder, ImageTerms
 from hilsplat.segment.kernels import areas_and_boxes, upscaled_runs
 from hilsplat.settings import MasksSettings
@@ -96,7 +98,7 @@ class SamModel:
     precision: str = "fp32"  # precision of the encoder: "fp32" or "int8"
     own: Thresholds = REAL_SAM
     stretches: bool = False  # images are stretched to a square (SAM 2), not padded (SAM)
-    previewer: Network | None = None  # the decoder at half the resolution (`layouts.PREVIEW`)
+    previewer: DecoderNetwork | None = None  # the decoder at half the resolution (`layouts.PREVIEW`)
     factored: FactoredDecoder | None = None  # the much faster decoder, if the graph can be factored
     as_exported: bool = True  # the encoder or decoder runs as exported, which takes more memory
 
@@ -106,10 +108,10 @@ class SamModel:
         self.stretches = model.layout == "sam2"
         self.digest = model.digest
         self._graph = graph = self._rowwise_encoder()
-        self.encoder = model.network("vision_encoder", graph=graph)
-        self.decoder = model.network(DECODER)
+        self.encoder = model.network("vision_encoder", graph)
+        self.decoder = DecoderNetwork(model, DECODER)
         if PREVIEW in model.networks:
-            self.previewer = model.network(PREVIEW)
+            self.previewer = DecoderNetwork(model, PREVIEW)
         preprocessing = model.preprocessing
         self.longest_edge = side_px(preprocessing.get("size"), 1024)
         padded_px = side_px(preprocessing.get("pad_size"), self.longest_edge)
@@ -119,8 +121,10 @@ class SamModel:
         self.mean = np.array(preprocessing.get("image_mean", (0.485, 0.456, 0.406)), dtype=np.float32)
         self.std = np.array(preprocessing.get("image_std", (0.229, 0.224, 0.225)), dtype=np.float32)
         self.rescale = np.float32(preprocessing.get("rescale_factor", 1 / 255))
-        if self.previewer is None and self.decoder.providers[0] == "CPUExecutionProvider":
-            self.factored = self._factor()
+        features = self._require_repeatable()
+        if self.previewer is None and self.decoder.network.providers[0] == CPU:
+            cost = "each prompt takes about 6 times as long"
+            self.factored = or_as_exported(model.networks[DECODER], cost, lambda: self._factor(features))
         self.as_exported = self.factored is None or (graph is None and not self.stretches)
 
     def choose_precision(
@@ -130,6 +134,8 @@ class SamModel:
         if not considers_int8(precision, self.model):
             return
         quantised = self.int8_encoder(cache)
+        if quantised is None:
+            return
         grid = point_grid(CHECKED_GRID)
         batch = self.prompts_per_call(self.own.points_per_batch, len(grid))
 
@@ -151,41 +157,48 @@ class SamModel:
         if use_int8(precision, "SAM's encoder", cache, inputs, measure):
             self.encoder, self.precision = quantised, "int8"
 
-    def int8_encoder(self, cache: Path) -> Network:
+    def int8_encoder(self, cache: Path) -> Network | None:
         """Open the int8 version of the encoder (`models.int8.int8_network`)."""
         exact = [name for name in self.encoder.outputs if name == "image_positional_embeddings"]
         return int8_network(self.model, "vision_encoder", cache, self._graph, exact)
 
-    def _rowwise_encoder(self) -> bytes | None:
+    def _rowwise_encoder(self) -> Graph | None:
         """Return a ViT's graph with row-wise global attention; None for other encoders or on a GPU."""
-        vision = self.model.config.get("vision_config")
-        on_cpu = execution_providers()[0] == "CPUExecutionProvider"
-        if self.stretches or not isinstance(vision, dict) or not on_cpu:
+        vision, path = self.model.config.get("vision_config"), self.model.networks["vision_encoder"]
+        if self.stretches or not isinstance(vision, dict) or execution_providers()[0] != CPU:
             return None
-        graph = with_rowwise_attention(
-            self.model.networks["vision_encoder"],
-            vision.get("global_attn_indexes", (2, 5, 8, 11)),
-            vision.get("num_attention_heads", 12),
-            vision.get("image_size", 1024) // vision.get("patch_size", 16),
-        )
-        if graph is None:
-            logger.info("the encoder of %s runs as exported, which takes more memory", self.model.folder)
-        return graph
+        layers = vision.get("global_attn_indexes", (2, 5, 8, 11))
+        heads = vision.get("num_attention_heads", 12)
+        side = vision.get("image_size", 1024) // vision.get("patch_size", 16)
+        cost = "each image takes about 5 times as much memory"
+        return or_as_exported(path, cost, lambda: with_rowwise_attention(path, layers, heads, side))
 
-    def _factor(self) -> FactoredDecoder | None:
-        """Return the factored decoder, checked against the network; None if factoring or the check fails."""
+    def _require_repeatable(self) -> dict[str, np.ndarray]:
+        """Raise a ModelError if results for the same input differ; return random image features."""
+        rng = np.random.default_rng(0)
+        pixels = rng.standard_normal((1, 3, *self.padded_hw), np.float32)
+        require_repeatable_once(self.model, self.encoder, {"pixel_values": pixels})
+        shapes = {
+            name: tuple(network.fixed_axis(name, axis) or 0 for axis in (1, 2, 3))
+            for network in (self.encoder, self.decoder.network)
+            for name in self.encoder.spec.outputs
+        }
+        if all(map(all, shapes.values())):
+            features = {name: rng.standard_normal((1, *shape), np.float32) for name, shape in shapes.items()}
+        else:  # neither network declares its shapes
+            found = self.encoder(pixel_values=pixels)
+            features = dict(zip(self.encoder.spec.outputs, found, strict=True))
+        for decoder in filter(None, (self.decoder, self.previewer)):
+            decoder.require_repeatable(features, self.padded_hw[0])
+        return features
+
+    def _factor(self, features: Mapping[str, np.ndarray]) -> FactoredDecoder:
+        """Return the factored decoder; raise an exception if factoring or the comparison fails."""
         described = self.model.config.get("mask_decoder_config", {})
-        heads = described.get("num_attention_heads", HEADS_PER_ATTENTION)
-        on_runtime = f"the decoder of {self.model.folder} runs in onnxruntime"
-        try:
-            factored = FactoredDecoder(DecoderGraph(self.model.networks[DECODER]), heads)
-            difference = largest_difference(factored, self.decoder, self.padded_hw[0])
-        except ModelError as error:
-            logger.info("%s: %s", on_runtime, error)
-            return None
-        if difference > AGREEMENT:
-            logger.warning("%s (slower): the factored decoder differs by %.2g", on_runtime, difference)
-            return None
+        factored = FactoredDecoder(self.decoder, described.get("num_attention_heads", HEADS_PER_ATTENTION))
+        difference = largest_difference(factored, self.decoder, features, self.padded_hw[0])
+        if not difference <= AGREEMENT:
+            raise ModelError(f"the factored decoder differs by {difference:.2g}")
         return factored
 
     @staticmethod
@@ -232,7 +245,7 @@ class SamModel:
         """Return the number of prompts per call: the decoder's fixed number, else min(limit, prompts)."""
         if self.factored:
             return PROMPTS
-        return self.decoder.fixed_axis("input_points", 1) or min(limit, prompts)
+        return self.decoder.prompts_per_call or min(limit, prompts)
 
     def decode(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "P 2"]
@@ -242,14 +255,14 @@ class SamModel:
         if self.factored and encoded.terms:
             iou, logits, _ = self.factored.decode(encoded.terms, points, fine=True)
             return iou, logits
-        return ask_network(self.decoder, encoded.features, points[:, None])
+        return self.decoder(encoded.features, points[:, None])
 
     def decode_clicks(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "K 2"], inside: Bool[np.ndarray, " K"]
     ) -> tuple[Float32[np.ndarray, " 3"], Float32[np.ndarray, "3 h w"]]:
         """Decode three masks of one object for several points (px) inside or outside it."""
         points = in_input(points_xy, encoded.frame)[None]
-        iou, logits = ask_network(self.decoder, encoded.features, points, inside[None].astype(np.float64))
+        iou, logits = self.decoder(encoded.features, points, inside[None])
         return iou[0], logits[0]
 
     @property
@@ -266,7 +279,7 @@ class SamModel:
             iou, logits, kept = self.factored.decode(encoded.terms, points, fine=False)
             return iou, logits, {"iou": iou, **kept}
         assert self.previewer is not None
-        return *ask_network(self.previewer, encoded.features, points[:, None]), {"points": points_xy}
+        return *self.previewer(encoded.features, points[:, None]), {"points": points_xy}
 
     def finish(
         self, encoded: Encoded, prompts: Prompts
@@ -284,25 +297,6 @@ def in_input(points_xy: Float[np.ndarray, "P 2"], frame: Frame) -> Float[np.ndar
     return points_xy * np.array([resized_w / width, resized_h / height])
 
 
-def ask_network(
-    decoder: Network,
-    features: Mapping[str, np.ndarray],
-    points_xy: Float[np.ndarray, "P K 2"],
-    labels: Float[np.ndarray, "P K"] | None = None,
-) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 h w"]]:
-    """Run a decoder on prompts of K points (px of its input); labels are 1 inside the object, 0 outside.
-
-    By default all points are inside. Returns predicted IoUs and logits.
-    """
-    scores, logits = decoder(
-        input_points=points_xy[None],
-        input_labels=np.ones((1, *points_xy.shape[:2])) if labels is None else labels[None],
-        input_boxes=np.zeros((1, 0, 4)),
-        **features,
-    )
-    return scores[0], logits[0]
-
-
 def enlarged(logits: Float32[np.ndarray, "K h w"], frame: Frame) -> Bool[np.ndarray, "K H W"]:
     """Upscale low-resolution logits as SamProcessor does, and return the masks at the image's size."""
     found = []
@@ -314,23 +308,18 @@ def enlarged(logits: Float32[np.ndarray, "K h w"], frame: Frame) -> Bool[np.ndar
     return np.stack(found)
 
 
-def largest_difference(factored: FactoredDecoder, decoder: Network, side_px: int) -> float:
-    """Return the largest difference between the factored decoder and the network on random inputs.
+def largest_difference(
+    factored: FactoredDecoder, decoder: DecoderNetwork, features: Mapping[str, np.ndarray], side_px: int
+) -> float:
+    """Return the largest difference between the factored decoder and the network for random points.
 
-    The comparison covers predicted IoUs, and logits divided by the largest logit (at least 1). A ModelError
-    is raised if the network doesn't declare the shapes of its inputs.
+    The comparison covers predicted IoUs, and logits divided by the largest logit (at least 1).
     """
-    rng = np.random.default_rng(0)
-    features = {}
-    for name in decoder.spec.inputs:
-        if name.startswith("image_"):
-            shape = [decoder.fixed_axis(name, axis) or 0 for axis in (1, 2, 3)]
-            if 0 in shape:
-                raise ModelError(f"{decoder.path.name} declares no shape for input {name}")
-            features[name] = rng.standard_normal((1, *shape), np.float32)
-    points = rng.uniform(0, side_px, (CHECKED_PROMPTS, 2))
-    iou, logits = ask_network(decoder, features, points[:, None])
-    own_iou, own_logits, _ = factored.decode(factored.image(features), points, fine=True)
+    points = np.random.default_rng(0).uniform(0, side_px, (CHECKED_PROMPTS, 1, 2))
+    step = decoder.prompts_per_call or CHECKED_PROMPTS
+    calls = [decoder(features, points[start : start + step]) for start in range(0, CHECKED_PROMPTS, step)]
+    iou, logits = (np.concatenate(each) for each in zip(*calls, strict=True))
+    own_iou, own_logits, _ = factored.decode(factored.image(features), points[:, 0], fine=True)
     off = np.abs(own_logits - logits).max() / max(1, np.abs(logits).max())
     return float(max(off, np.abs(own_iou - iou).max()))
 

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import torch
 
+from tests.published_models.exports import Call, enliven, export_sam, export_sam2, small_sam2, trace
+
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("TRANSFORMERS_VERBOSITY", "error")
 
@@ -32,21 +34,6 @@ def export(folder: Path, out: Path) -> Path:
     return out
 
 
-def enliven(model) -> None:
-    """Replace the tiny initial weights, whose outputs would hardly depend on the inputs.
-
-    SAM's positional frequencies are a buffer that transformers draws again for every model.
-    """
-    generator = torch.Generator().manual_seed(0)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            if parameter.ndim > 1:
-                parameter.normal_(0, 1.6 / parameter[0].numel() ** 0.5, generator=generator)
-        for name, buffer in model.named_buffers():
-            if name.endswith("positional_embedding"):
-                buffer.normal_(generator=generator)
-
-
 @pytest.fixture(scope="session")
 def sam_parts(transformers, tmp_path_factory):
     """A SAM for images of 64 px: transformers' model, its processor, and its exported folder."""
@@ -59,7 +46,7 @@ def sam_parts(transformers, tmp_path_factory):
         {"hidden_size": 16, **image, "mask_input_channels": 4},
         {**sizes, "iou_head_hidden_dim": 16},
     )
-    model = transformers.SamModel(config).eval()
+    model = transformers.SamModel._from_config(config, attn_implementation="eager").eval()
     enliven(model)
     images = transformers.SamImageProcessor(
         size={"longest_edge": 64},
@@ -69,9 +56,9 @@ def sam_parts(transformers, tmp_path_factory):
     )
     processor = transformers.SamProcessor(images)
     processor.target_size = 64  # the processor of a model of 1024 px is the same with 1024
-    model.save_pretrained(folder / "torch")
-    images.save_pretrained(folder / "torch")
-    return model, processor, export(folder / "torch", folder / "export")
+    export_sam(model, folder / "export")
+    images.save_pretrained(folder / "export")
+    return model, processor, folder / "export"
 
 
 @pytest.fixture(scope="session")
@@ -115,98 +102,13 @@ def photograph() -> np.ndarray:
     return np.clip(image + generator.normal(0, 8, image.shape), 0, 255).astype(np.uint8)
 
 
-def trace(module, inputs: dict, outputs: list[str], dynamic: dict, path: Path) -> None:
-    """`torch.onnx.export` by tracing, as the scripts do that made the published exports."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with warnings.catch_warnings(), torch.no_grad():
-        warnings.simplefilter("ignore")
-        torch.onnx.export(
-            module.eval(),
-            tuple(inputs.values()),
-            str(path),
-            input_names=list(inputs),
-            output_names=outputs,
-            dynamic_axes=dynamic,
-            opset_version=18,
-            dynamo=False,
-        )
-
-
-def as_module(model, function):
-    """Wrap a function of a model as a module."""
-
-    class Called(torch.nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.model = model
-
-        def forward(self, *inputs):
-            return function(*inputs)
-
-    return Called()
-
-
 @pytest.fixture(scope="session")
 def sam2_parts(transformers, tmp_path_factory):
-    """A SAM 2 for images of 64 px: transformers' model, and its folder with the names of transformers.js."""
-    folder = tmp_path_factory.mktemp("sam2")
-    backbone = transformers.Sam2HieraDetConfig(
-        hidden_size=8,
-        num_attention_heads=1,
-        image_size=[64, 64],
-        blocks_per_stage=[1, 1, 2, 1],
-        embed_dim_per_stage=[8, 16, 32, 64],
-        num_attention_heads_per_stage=[1, 2, 4, 8],
-        window_size_per_stage=[8, 4, 4, 2],
-        global_attention_blocks=[3],
-        window_positional_embedding_background_size=[4, 4],
-    )
-    vision = transformers.Sam2VisionConfig(
-        backbone_config=backbone,
-        backbone_channel_list=[64, 32, 16, 8],
-        backbone_feature_sizes=[[16, 16], [8, 8], [4, 4]],
-        fpn_hidden_size=16,
-    )
-    config = transformers.Sam2Config(
-        vision,
-        {"hidden_size": 16, "image_size": 64, "patch_size": 16, "mask_input_channels": 4},
-        {"hidden_size": 16, "mlp_dim": 32, "num_attention_heads": 2, "iou_head_hidden_dim": 16},
-    )
-    model = transformers.Sam2Model(config).eval()
+    """A SAM 2 for images of 64 px: transformers' model, and its folder with the published signature."""
+    kind, folder = small_sam2(), tmp_path_factory.mktemp("sam2")
+    model = kind.model()
     enliven(model)
-    names = [f"image_embeddings.{level}" for level in range(3)]
-    pixels = torch.zeros(1, 3, 64, 64)
-
-    def encode(pixel_values):
-        return tuple(model.get_image_embeddings(pixel_values))
-
-    def decode(points, labels, boxes, *embeddings):
-        found = model(input_points=points, input_labels=labels, image_embeddings=list(embeddings))
-        # the published decoder takes boxes too, here none
-        return found.iou_scores + boxes.sum(), found.pred_masks, found.object_score_logits
-
-    trace(as_module(model, encode), {"pixel_values": pixels}, names, {}, folder / "onnx/vision_encoder.onnx")
-    prompts = {1: "prompts", 2: "points"}
-    inputs = {
-        "input_points": torch.full((1, 3, 2, 2), 32.0),
-        "input_labels": torch.ones((1, 3, 2), dtype=torch.int64),
-        "input_boxes": torch.zeros(1, 0, 4),
-        **dict(zip(names, model.get_image_embeddings(pixels), strict=True)),
-    }
-    dynamic = {"input_points": prompts, "input_labels": prompts, "input_boxes": {1: "boxes"}}
-    outputs = ["iou_scores", "pred_masks", "object_score_logits"]
-    path = folder / "onnx/prompt_encoder_mask_decoder.onnx"
-    trace(as_module(model, decode), inputs, outputs, dynamic, path)
-    config.save_pretrained(folder)
-    preprocessing = {
-        "image_processor_type": "Sam2ImageProcessorFast",
-        "size": {"height": 64, "width": 64},
-        "image_mean": [0.485, 0.456, 0.406],
-        "image_std": [0.229, 0.224, 0.225],
-        "resample": 2,
-        "pad_size": None,
-    }
-    (folder / "preprocessor_config.json").write_text(json.dumps(preprocessing))
+    export_sam2(kind, model, folder)
     return model, folder
 
 
@@ -240,7 +142,7 @@ def siglip_parts(transformers, tmp_path_factory):
         ("vision_model", model.vision_model, {"pixel_values": torch.zeros(2, 3, 32, 32)}),
         ("text_model", model.text_model, {"input_ids": torch.ones((2, 64), dtype=torch.int64)}),
     ):
-        wrapped = as_module(part, lambda value, part=part: tuple(part(value).to_tuple()[:2]))
+        wrapped = Call(part, lambda value, part=part: tuple(part(value).to_tuple()[:2]))
         trace(wrapped, inputs, output, batch, folder / f"js/onnx/{name}.onnx")
 
     def whole(ids, pixels):
@@ -250,7 +152,7 @@ def siglip_parts(transformers, tmp_path_factory):
     inputs = {"input_ids": torch.ones((2, 64), dtype=torch.int64), "pixel_values": torch.zeros(2, 3, 32, 32)}
     vectors = ["text_embeds", "image_embeds"]
     batch = {name: {0: "batch"} for name in (*inputs, *vectors)}
-    trace(as_module(model, whole), inputs, vectors, batch, folder / "optimum/model.onnx")
+    trace(Call(model, whole), inputs, vectors, batch, folder / "optimum/model.onnx")
     return model, images, folder
 
 
@@ -259,9 +161,9 @@ def open_clip_folder(clip_parts, tmp_path_factory):
     """The CLIP of `clip_parts` in open_clip's two folders, with one picture and one text per call."""
     model, processor, exported = clip_parts
     folder = tmp_path_factory.mktemp("open_clip")
-    visual = as_module(model, lambda image: torch.nn.functional.normalize(model.get_image_features(image)))
+    visual = Call(model, lambda image: torch.nn.functional.normalize(model.get_image_features(image)))
     trace(visual, {"image": torch.zeros(1, 3, 32, 32)}, ["embedding"], {}, folder / "visual/model.onnx")
-    textual = as_module(model, lambda text: torch.nn.functional.normalize(model.get_text_features(text)))
+    textual = Call(model, lambda text: torch.nn.functional.normalize(model.get_text_features(text)))
     ids = torch.full((1, 16), model.config.text_config.eos_token_id, dtype=torch.int32)
     trace(textual, {"text": ids}, ["embedding"], {}, folder / "textual/model.onnx")
     for name in ("tokenizer.json", "tokenizer_config.json", "special_tokens_map.json"):

@@ -1,5 +1,6 @@
 """A model's files and variants, and splitting of a whole CLIP."""
 
+import os
 import shutil
 
 import numpy as np
@@ -10,12 +11,13 @@ from onnx import TensorProto, helper, numpy_helper
 
 from hilsplat.base.errors import ModelError
 from hilsplat.models.folder import external_weights, open_model_folder
-from hilsplat.models.onnx_graph import split_clip
+from hilsplat.models.onnx_graph import Graph, split_clip, tensors_of
 from hilsplat.segment.sam import SamModel
 from tests.conftest import PROJECT
 from tests.unit.segment.handmade import move_weights, save_network
 
 TINY = PROJECT / "models/sam-tiny"
+IMAGE = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
 
 
 @pytest.fixture
@@ -41,19 +43,55 @@ def test_external_weights_of_constants_are_found(tmp_path):
     output = helper.make_tensor_value_info("y", TensorProto.FLOAT, [99])
     onnx.save(helper.make_model(helper.make_graph([constant], "constant", [], [output])), path)
     move_weights(path, "elsewhere")
-    assert external_weights(path, tmp_path) == [tmp_path / "elsewhere"]
+    assert external_weights(path) == [tmp_path / "elsewhere"]
 
 
-@pytest.mark.parametrize("linked", [False, True])
-def test_missing_weights_and_links_to_weights_outside_the_folder_are_refused(sam, linked):
+@pytest.mark.parametrize("location", ["../weights.bin", "/weights.bin", "weights.bin"])
+def test_missing_weights_and_paths_that_lead_out_of_the_folder_are_refused(sam, location):
     path, weights = sam / "onnx/vision_encoder.onnx", sam / "onnx/weights.bin"
     move_weights(path, weights.name)
-    weights.rename(sam.parent / "weights.bin")
-    if linked:
-        weights.symlink_to(sam.parent / "weights.bin")
-    words = r"cannot be opened: its weights are missing(.|\n)*the file weights.bin beside it"
-    with pytest.raises(ModelError, match=words):
+    weights.rename(sam / "weights.bin")
+    graph = onnx.load(path, load_external_data=False)
+    for tensor in tensors_of(graph.graph):
+        for entry in tensor.external_data:
+            if entry.key == "location":
+                entry.value = location
+    onnx.save(graph, path)
+    with pytest.raises(ModelError, match=r"its weights are missing(.|\n)*the file .*weights.bin beside it"):
         open_model_folder(sam)
+
+
+def test_a_folder_of_links_as_in_the_cache_of_the_hub_works(sam, tmp_path):
+    path, weights = sam / "onnx/vision_encoder.onnx", sam / "onnx/weights.bin"
+    move_weights(path, weights.name)
+    expected, digest = SamModel.load(sam).encode(IMAGE).features, open_model_folder(sam).digest
+    blobs, linked = tmp_path / "blobs", tmp_path / "snapshots/model"
+    blobs.mkdir()
+    for number, file in enumerate(sorted(each for each in sam.rglob("*") if each.is_file())):
+        place = linked / file.relative_to(sam)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        file.rename(blobs / f"{number:02}")
+        place.symlink_to(os.path.relpath(blobs / f"{number:02}", place.parent))
+    model = SamModel.load(linked)
+    assert model.digest == digest
+    for name, value in model.encode(IMAGE).features.items():
+        np.testing.assert_array_equal(value, expected[name])
+
+
+def test_a_truncated_weights_file_is_refused(sam):
+    path, weights = sam / "onnx/vision_encoder.onnx", sam / "onnx/weights.bin"
+    move_weights(path, weights.name)
+    weights.write_bytes(weights.read_bytes()[:-1])
+    with pytest.raises(ModelError, match=r"its weights file weights.bin is too short(.|\n)*complete copy"):
+        SamModel.load(sam)
+
+
+def test_int8_networks_depend_on_external_weights(sam, tmp_path):
+    path, weights = sam / "onnx/vision_encoder.onnx", sam / "onnx/weights.bin"
+    move_weights(path, weights.name)
+    before = Graph.read(path).digest
+    weights.write_bytes(bytes(weights.stat().st_size))
+    assert Graph.read(path).digest != before
 
 
 def test_a_variant_is_chosen_by_its_ending_which_all_networks_must_have(sam):
@@ -87,4 +125,4 @@ def test_halves_compute_the_same_as_the_whole_and_splitting_reads_no_weights(tmp
     np.testing.assert_array_equal(run(vision).run(None, {"pixel_values": ones})[0][0], numbers)
     fed = {"input_ids": ones, "attention_mask": ones}
     np.testing.assert_array_equal(run(text).run(None, fed)[0][0], -numbers)
-    assert external_weights(vision, folder) == [folder / "model.onnx_data"]
+    assert external_weights(vision) == [folder / "model.onnx_data"]
