@@ -3,13 +3,13 @@
 import copy
 import ctypes
 import errno
-import fcntl
 import functools
 import hashlib
 import json
 import os
 import shlex
 import shutil
+import sys
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from hilsplat.base.errors import ArtifactError, DiskSpaceError, HilsplatError
+from hilsplat.base.locks import lock
 from hilsplat.base.processes import FORMER, UNFINISHED, is_unfinished, unfinished_folder
 
 ZIP64_BYTES = 2**30  # arrays above this size get an archive entry that may exceed 2 GiB
@@ -133,7 +134,7 @@ def _flush(path: Path) -> None:
         os.close(descriptor)
 
 
-_renameat2 = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+_renameat2 = ctypes.CDLL(None, use_errno=True).renameat2 if sys.platform == "linux" else None
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # from Linux's <stdio.h>, <fcntl.h> and <linux/fs.h>
 
 
@@ -463,7 +464,7 @@ def output_lock(output: Path) -> Iterator[None]:
     output.parent.mkdir(parents=True, exist_ok=True)
     with lock_path(output).open("a") as stream:
         try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(stream, wait=False)
         except BlockingIOError as error:
             raise ArtifactError(
                 f"another process is writing {output}", fix="let it finish or stop it, then run again"

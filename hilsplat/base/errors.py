@@ -1,8 +1,12 @@
 """Errors that a user can fix."""
 
 import errno
-import resource
 from pathlib import Path
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
 
 
 class HilsplatError(Exception):
@@ -26,7 +30,7 @@ class HilsplatError(Exception):
 
 def system_error(error: BaseException) -> HilsplatError | None:
     """Convert a system error that a user can fix into a `HilsplatError`; return None for any other error."""
-    is_limited = resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
+    is_limited = resource is not None and resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
     by_library = is_limited and any(words in str(error) for words in NO_MEMORY)
     if isinstance(error, MemoryError) or by_library:
         return HilsplatError(

@@ -1,7 +1,6 @@
 """Child processes that end with their parent, unfinished files, and process and thread pools."""
 
 import ctypes
-import fcntl
 import functools
 import hashlib
 import itertools
@@ -20,6 +19,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Thread
 from typing import IO, Any, TypeVar
+
+from hilsplat.base.locks import lock
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -105,7 +106,7 @@ def unfinished_folder(parent: Path) -> Iterator[Path]:
         folder.mkdir()
         with suppress(FileNotFoundError):  # a clean-up deleted the folder before it was locked
             stream = (folder / LOCK).open("ab")
-            fcntl.flock(stream, fcntl.LOCK_EX)
+            lock(stream)
             is_locked = os.fstat(stream.fileno()).st_nlink > 0
     try:
         yield folder
@@ -141,7 +142,7 @@ def remove_leftovers(folder: Path) -> list[Path]:
             path = Path(place) / name
             with suppress(BlockingIOError, FileNotFoundError, PermissionError):
                 with (path / LOCK).open("ab") as stream:  # a new folder may not contain it yet
-                    fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    lock(stream, wait=False)
                     _discard(path, stream)
                 removed.append(path)
         folders[:] = [name for name in folders if not UNFINISHED.fullmatch(name)]

@@ -5,6 +5,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,16 @@ DTYPES = {
 
 
 CPU, CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
+OVERWRITTEN = (
+    "onnxruntime-gpu was overwritten by onnxruntime; run pip uninstall onnxruntime onnxruntime-gpu, then "
+    "pip install onnxruntime-gpu"
+)
+
+if not hasattr(onnxruntime, "InferenceSession"):
+    raise ModelError(
+        "onnxruntime is incomplete; uninstalling onnxruntime-gpu removes its files, and the reverse",
+        fix="pip install --force-reinstall onnxruntime (or onnxruntime-gpu)",
+    )
 
 
 def execution_providers() -> tuple[str, ...]:
@@ -46,6 +57,9 @@ def cuda_provider_problem() -> str | None:
     sessions run on the CPU. If onnxruntime was built with CUDA, the problem is logged as a warning.
     """
     if CUDA not in onnxruntime.get_available_providers():
+        if any(metadata.distributions(name="onnxruntime-gpu")):
+            logger.warning("onnxruntime runs on the CPU: %s", OVERWRITTEN)
+            return OVERWRITTEN
         return "onnxruntime is built without CUDA"
     try:
         onnxruntime.preload_dlls()  # CUDA and cuDNN as installed with torch

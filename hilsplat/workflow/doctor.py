@@ -77,24 +77,30 @@ def libraries() -> Iterator[Finding]:
 
 
 def onnx() -> Iterator[Finding]:
-    """Check whether two builds of onnxruntime overwrite each other."""
+    """Check on which provider a session runs, and whether two builds of onnxruntime overwrite each other."""
     import onnxruntime
 
-    problem = ""
+    from hilsplat.models.network import cuda_provider_problem, execution_providers
+
+    problem, found = "", cuda_provider_problem()
+    fix = "pip uninstall onnxruntime onnxruntime-gpu, then pip install onnxruntime-gpu"
     if version_of("onnxruntime") and version_of("onnxruntime-gpu"):
         problem = "onnxruntime and onnxruntime-gpu are both installed; their files overwrite each other"
-    sound = f"{onnxruntime.__version__}: {', '.join(onnxruntime.get_available_providers())}"
-    fix = "pip uninstall onnxruntime onnxruntime-gpu, then pip install onnxruntime-gpu"
+    elif version_of("onnxruntime-gpu") and found:
+        problem = f"onnxruntime-gpu runs on the CPU: {found}"
+        fix = "install the CUDA and cuDNN versions that onnxruntime-gpu requires, or pip install onnxruntime"
+    sound = f"{onnxruntime.__version__}: sessions run on {execution_providers()[0]}"
     yield verdict("onnxruntime", problem, sound, fix)
 
 
 def cuda() -> Iterator[Finding]:
     """Check whether torch and gsplat can use CUDA, and whether their renders match the CPU's."""
-    from hilsplat.splat.rasterise.device import cuda_problem
+    from hilsplat.splat.rasterise.device import cuda_problem, forget
     from hilsplat.splat.rasterise.parity import cuda_disagreement
 
+    forget()
     if problem := cuda_problem():
-        fix = "on a machine with an NVIDIA GPU: pip install 'hilsplat[gpu]'"
+        fix = "on a machine with an NVIDIA GPU: pip install 'hilsplat[gpu]', and a CUDA toolkit (nvcc)"
         yield Finding("cuda", "note", f"{problem}: everything runs on the CPU", fix)
         return
     sound = "gsplat and the CPU agree on image, gradients and pixel weights"

@@ -1,6 +1,6 @@
 """Estimates for the user: the jobs of a dry run, and the time until photographs can be queried."""
 
-import resource
+import os
 import subprocess
 import sys
 from collections import defaultdict
@@ -73,10 +73,11 @@ class RunEstimate:
 
 def machine_scale() -> float:
     """Return the CPU time that a stage's process takes to start on this machine, relative to `START_S`."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    before = os.times()
     subprocess.run([sys.executable, "-c", "import hilsplat.cli.main, hilsplat.evaluate.stage"], check=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return (after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime) / START_S
+    after = os.times()
+    both = [times.children_user + times.children_system for times in (before, after)]
+    return (both[1] - both[0]) / START_S
 
 
 def _row(name: str, jobs: Sequence[JobEstimate], cores: int, scale: float) -> tuple[str, ...]:

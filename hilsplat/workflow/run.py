@@ -6,7 +6,6 @@ this process. Plain `snakemake --cores 2` produces the same bytes.
 
 import argparse
 import difflib
-import fcntl
 import json
 import logging
 import os
@@ -26,6 +25,7 @@ import yaml
 from hilsplat.base.artifacts import write_text
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.base.files import INSTALLED, project_path
+from hilsplat.base.locks import lock
 from hilsplat.base.processes import PARENT, remove_leftovers
 from hilsplat.configuration import CONFIG, first_unusable, merged_config, parse_run
 from hilsplat.scene.sheet import DEFAULT_SHEET, SceneRow, read_sheet
@@ -62,14 +62,14 @@ def prepare_process() -> TextIOWrapper | None:
     if os.environ.get(UNREGISTERED):
         return None
     with suppress(OSError):
-        return _locked("processes.lock", fcntl.LOCK_SH)
+        return _locked("processes.lock", shared=True)
     return None
 
 
 def mark_run() -> None:
     """Write a marker of this process's run and lock it; a killed run leaves it unlocked."""
     if not _marks:  # `hilsplat run` and the Snakefile share a process
-        stream = _locked(f"run-{secrets.token_hex(4)}", fcntl.LOCK_EX)
+        stream = _locked(f"run-{secrets.token_hex(4)}")
         stream.write(socket.gethostname())
         stream.flush()
         _marks.append(stream)
@@ -90,11 +90,11 @@ def unmark_run() -> None:
         stream.close()
 
 
-def _locked(name: str, kind: int) -> TextIOWrapper:
+def _locked(name: str, *, shared: bool = False, wait: bool = True) -> TextIOWrapper:
     STATE.mkdir(exist_ok=True)
     stream = (STATE / name).open("a", encoding="utf-8")
     try:
-        fcntl.flock(stream, kind)
+        lock(stream, shared=shared, wait=wait)
     except OSError:
         stream.close()
         raise
@@ -160,12 +160,12 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
     if _has(others, "-n", "--dry-run", "--dryrun"):
         return _start(command, plan, targets, scenes)
     try:
-        lock = _locked("run.lock", fcntl.LOCK_EX | fcntl.LOCK_NB)
+        held = _locked("run.lock", wait=False)
     except BlockingIOError as error:
         raise HilsplatError(
             f"another hilsplat run has locked {Path.cwd()}", fix="let it finish, or stop it"
         ) from error
-    with lock:
+    with held:
         _recover(command, plan.results)
         if not _has(others, *ELSEWHERE):
             cores = int(given.cores) if given.cores and given.cores.isdigit() else 0
@@ -246,7 +246,7 @@ def _recover(command: Sequence[str], results: Path) -> None:
         return
     for marker in markers:
         try:
-            _locked(marker.name, fcntl.LOCK_EX | fcntl.LOCK_NB).close()
+            _locked(marker.name, wait=False).close()
         except BlockingIOError as error:  # at its end, this run would remove the other run's locks
             raise HilsplatError(
                 f"another Snakemake process is running in {Path.cwd()}", fix="let it finish, or stop it"
@@ -256,7 +256,7 @@ def _recover(command: Sequence[str], results: Path) -> None:
         logger.warning("another machine may be running this workflow; if not, run: snakemake --unlock")
         return
     try:
-        alone = _locked("processes.lock", fcntl.LOCK_EX | fcntl.LOCK_NB)
+        alone = _locked("processes.lock", wait=False)
     except BlockingIOError:
         return
     with alone:

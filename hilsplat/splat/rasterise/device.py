@@ -1,21 +1,32 @@
 """Choice of the rendering backend: our own on the CPU, or gsplat on CUDA."""
 
+import contextlib
 import ctypes
+import io
 import logging
+import os
+from collections.abc import Callable
 from functools import cache
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Literal
 
+import platformdirs
+
+from hilsplat.base.artifacts import parse_json, sha256_of_json, write_json
 from hilsplat.base.errors import DeviceError
 
 logger = logging.getLogger(__name__)
 
 Device = Literal["cpu", "cuda"]
 
+ABSENT = ("gsplat is not installed", "no NVIDIA driver is installed", "torch ")
+"""Beginnings of the problems of machines on which CUDA is not expected to work."""
+
 
 @cache
 def cuda_problem() -> str | None:
-    """Return why the CUDA backend cannot be used here, or None if it can."""
+    """Return why the CUDA backend cannot be used here, or None if it can; never raise an exception."""
     # checked before importing torch, which takes 1.3 to 3 s
     if find_spec("gsplat") is None:
         return "gsplat is not installed"
@@ -23,22 +34,72 @@ def cuda_problem() -> str | None:
         ctypes.CDLL("libcuda.so.1")
     except OSError:
         return "no NVIDIA driver is installed"
-    import torch
-
-    if not torch.cuda.is_available():
-        return f"torch {torch.__version__} finds no CUDA device"
     try:
-        import gsplat  # noqa: F401
-    except ImportError as error:
-        return f"gsplat cannot be imported: {error}"
+        import gsplat
+        import torch
+
+        if not torch.cuda.is_available():
+            return f"torch {torch.__version__} finds no CUDA device"
+        versions = [torch.__version__, str(torch.version.cuda), gsplat.__version__]
+        key = ["kernels", *versions, os.environ.get("PATH", "")]
+        return remembered(key, _kernels_problem) or _kernels_problem()
+    except Exception as error:  # a broken installation can raise anything
+        return f"gsplat cannot be imported: {_first_line(error)}"
+
+
+def _kernels_problem() -> str | None:
+    """Load gsplat's kernels, which compiles them on first use; return why that fails, or None."""
+    logger.info("loading the CUDA kernels of gsplat, which are compiled on first use, in several minutes")
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints what is reported here
+            from gsplat.cuda import _backend
+    except Exception as error:  # compilers, linkers and torch raise several types
+        return f"the CUDA kernels of gsplat cannot be compiled: {_first_line(error)}"
+    if getattr(_backend, "_C", None) is None:
+        return "the CUDA kernels of gsplat cannot be compiled, because no CUDA toolkit (nvcc) is installed"
     return None
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
+
+
+def remembered(key: list[str], examine: Callable[[], str | None]) -> str | None:
+    """Return the result of examining this machine, which is done once for each key (names and versions).
+
+    A compilation that fails takes minutes, and each stage runs in its own process. `forget` deletes the
+    results.
+    """
+    try:
+        known = dict(parse_json(_kept().read_bytes()))
+    except (OSError, ValueError):
+        known = {}
+    entry = sha256_of_json(key)
+    if entry not in known:
+        known[entry] = examine() or ""
+        with contextlib.suppress(OSError):
+            write_json(_kept(), known)
+    return known[entry] or None
+
+
+def forget() -> None:
+    """Forget earlier results, so that `cuda_problem` and the self-test examine this machine again."""
+    with contextlib.suppress(OSError):
+        _kept().unlink(missing_ok=True)
+    cuda_problem.cache_clear()
+    choose_device.cache_clear()
+
+
+def _kept() -> Path:
+    return platformdirs.user_cache_path("hilsplat") / "cuda-self-test.json"
 
 
 @cache
 def choose_device(requested: Literal["auto", "cpu", "cuda"]) -> Device:
     """Return the device that a setting selects on this machine, and log it the first time.
 
-    `auto` uses CUDA if torch finds a device, gsplat can be imported, and a self-test agrees with the CPU.
+    `auto` uses CUDA if torch finds a device, gsplat works, and a self-test agrees with the CPU. If gsplat is
+    installed but does not work on a machine with a device, a warning names the reason.
     For `cpu`, or if gsplat or a driver is missing, torch is not imported, which would take 1.3 to 3 s.
 
     Raises:
@@ -50,12 +111,19 @@ def choose_device(requested: Literal["auto", "cpu", "cuda"]) -> Device:
             "device: cuda was requested but cannot be used",
             expected="a CUDA build of torch that finds a device, and gsplat",
             found=problem,
-            fix="pip install 'hilsplat[gpu]' on a machine with a CUDA device, or set device: auto or cpu",
+            fix="pip install 'hilsplat[gpu]' and a CUDA toolkit on a machine with a CUDA device, or set "
+            "device: auto or cpu; after a change, run `hilsplat doctor`",
         )
     if requested == "auto" and problem is None:
         from hilsplat.splat.rasterise.parity import cuda_disagreement
 
-        problem = cuda_disagreement()
+        try:
+            problem = cuda_disagreement()
+        except Exception as error:  # drivers, torch and gsplat raise several types
+            problem = f"the self-test on CUDA failed: {_first_line(error)}"
     device: Device = "cuda" if requested != "cpu" and not problem else "cpu"
-    logger.info("rasterising on %s (device: %s%s)", device, requested, f"; {problem}" if problem else "")
+    is_broken = problem is not None and not problem.startswith(ABSENT)
+    level = logging.WARNING if is_broken else logging.INFO
+    suffix = f"; {problem}" if problem else ""
+    logger.log(level, "rasterising on %s (device: %s%s)", device, requested, suffix)
     return device

@@ -1,14 +1,12 @@
 """Self-test that compares the CUDA backend with the CPU backend; its result is cached per machine."""
 
 import numpy as np
-import platformdirs
 
-from hilsplat.base.artifacts import parse_json, sha256_of_json, write_json
 from hilsplat.base.identity import code_digest
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise import api
-from hilsplat.splat.rasterise.device import Device
+from hilsplat.splat.rasterise.device import Device, remembered
 
 MAX_DIFFERENCES = {"image": 1e-3, "alpha": 1e-3, "weights": 1e-3, "gradients": 1e-2}
 """Maximum differences caused by rounding. The limit for gradients is relative and covers all Gaussians."""
@@ -19,17 +17,9 @@ def cuda_disagreement() -> str | None:
     import gsplat
     import torch
 
-    machine = [torch.__version__, gsplat.__version__, torch.cuda.get_device_name(), torch.version.cuda]
-    key = sha256_of_json([*machine, code_digest("hilsplat.splat.rasterise.cuda", api.draw)])
-    kept = platformdirs.user_cache_path("hilsplat") / "cuda-self-test.json"
-    try:
-        known = dict(parse_json(kept.read_bytes()))
-    except (OSError, ValueError):
-        known = {}
-    if key not in known:
-        known[key] = disagreement("cpu", "cuda") or ""
-        write_json(kept, known)
-    return known[key] or None
+    machine = [torch.__version__, gsplat.__version__, torch.cuda.get_device_name(), str(torch.version.cuda)]
+    key = [*machine, code_digest("hilsplat.splat.rasterise.cuda", api.draw)]
+    return remembered(key, lambda: disagreement("cpu", "cuda"))
 
 
 def disagreement(one: Device, other: Device) -> str | None:

@@ -150,7 +150,7 @@ def test_only_folders_of_unfinished_files_of_this_host_are_removed(tmp_path):
 def test_a_writer_whose_folder_is_removed_before_it_is_locked_takes_another(
     tmp_path, monkeypatch, is_lock_created
 ):
-    module, name = (processes.fcntl, "flock") if is_lock_created else (Path, "open")
+    module, name = (processes, "lock") if is_lock_created else (Path, "open")
     function = getattr(module, name)
 
     def after_a_clean_up(*arguments):

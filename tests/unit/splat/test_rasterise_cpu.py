@@ -3,6 +3,7 @@
 import logging
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import gsplat
 import numpy as np
@@ -84,6 +85,88 @@ def test_without_cuda_auto_selects_the_cpu_and_cuda_is_an_error(caplog):
     assert "finds no CUDA device" in caplog.text
     with pytest.raises(DeviceError, match=r"device: cuda was requested(?s:.*)finds no CUDA device(?s:.*)gpu"):
         choose_device("cuda")
+
+
+@pytest.fixture
+def card(monkeypatch, tmp_path):
+    """Simulate a machine with an NVIDIA card and gsplat; return a function that sets gsplat's kernels."""
+    monkeypatch.setattr(device, "find_spec", lambda name: name)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.get_device_name", lambda: "a card")
+    monkeypatch.setattr("ctypes.CDLL", lambda name: None)
+    monkeypatch.setattr("platformdirs.user_cache_path", lambda name: tmp_path)
+    gsplat = SimpleNamespace(__version__="1.5.3")
+    monkeypatch.setitem(sys.modules, "gsplat", gsplat)
+
+    def with_kernels(module: object) -> None:
+        monkeypatch.setitem(sys.modules, "gsplat.cuda", module)
+        monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", getattr(module, "_backend", None))
+        device.forget()
+
+    yield with_kernels
+    device.forget()
+
+
+class Failing:
+    """A module whose import of the kernels fails."""
+
+    def __init__(self, error: Exception) -> None:
+        self.error = error
+        self.tries = 0
+
+    @property
+    def _backend(self) -> object:
+        self.tries += 1
+        raise self.error
+
+
+def test_a_card_without_a_toolkit_selects_the_cpu_with_a_warning(card, caplog):
+    card(SimpleNamespace(_backend=SimpleNamespace(_C=None)))
+    assert choose_device("auto") == "cpu"
+    (line,) = [each.message for each in caplog.records if each.levelname == "WARNING"]
+    assert line.startswith("rasterising on cpu") and "no CUDA toolkit (nvcc) is installed" in line
+    with pytest.raises(DeviceError, match=r"nvcc(?s:.*)a CUDA toolkit on a machine"):
+        choose_device("cuda")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        RuntimeError("Error building extension 'gsplat_cuda': [1/9] nvcc"),
+        subprocess.CalledProcessError(1, "where cl"),
+        ImportError("libcudart.so.12: cannot open shared object file"),
+        RuntimeError(),
+    ],
+)
+def test_a_failing_build_of_gsplat_is_tried_once_and_selects_the_cpu(card, caplog, error):
+    kernels = Failing(error)
+    card(SimpleNamespace())
+    sys.modules["gsplat.cuda"] = kernels
+    sys.modules.pop("gsplat.cuda._backend")
+    assert choose_device("auto") == "cpu"
+    assert "the CUDA kernels of gsplat cannot be compiled: " in caplog.text
+    tries = kernels.tries
+    device.cuda_problem.cache_clear()  # as in the next stage's process
+    choose_device.cache_clear()
+    assert choose_device("auto") == "cpu" and kernels.tries == tries
+    device.forget()  # as `hilsplat doctor` does
+    assert choose_device("auto") == "cpu" and kernels.tries > tries
+
+
+def test_a_self_test_that_fails_selects_the_cpu(card, caplog):
+    card(SimpleNamespace(_backend=SimpleNamespace(_C=object())))
+    assert choose_device("auto") == "cpu"  # this gsplat cannot render
+    assert "the self-test on CUDA failed: " in caplog.text
+
+
+def test_a_broken_driver_selects_the_cpu(card, monkeypatch, caplog):
+    card(SimpleNamespace(_backend=SimpleNamespace(_C=object())))
+
+    def fail() -> bool:
+        raise RuntimeError("Unexpected error from cudaGetDeviceCount()\ndriver too old")
+
+    monkeypatch.setattr("torch.cuda.is_available", fail)
+    assert choose_device("auto") == "cpu" and "Unexpected error from cudaGetDeviceCount()" in caplog.text
 
 
 def test_the_cpu_is_selected_without_a_check_for_cuda(monkeypatch):
