@@ -8,8 +8,9 @@ import hashlib
 import json
 import re
 import threading
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -42,11 +43,19 @@ class LoopbackHub:
     replaced: dict[str, bytes] = field(default_factory=dict)  # file name -> bytes that are sent instead
     refusals: dict[str, list[Refusal]] = field(default_factory=dict)  # part of a path -> next responses
     licences: dict[str, str] = field(default_factory=dict)  # owner/name -> licence in its card
+    commits: dict[str, str] = field(default_factory=dict)  # owner/name -> commit, instead of a computed one
+    truncated: dict[str, int] = field(default_factory=dict)  # file name -> bytes that are announced and sent
+    held: dict[str, int] = field(default_factory=dict)  # part of a path -> bytes before its next answer waits
+    reached: threading.Event = field(default_factory=threading.Event)  # set while an answer waits
+    released: threading.Event = field(default_factory=threading.Event)  # lets a waiting answer go on
+    drip_s: float = 0.0  # pause after each 64 KiB of a large file
     ranged: bool = True  # False: ignore Range headers and send whole files, as some mirrors do
     asked: list[tuple[str, str, str]] = field(default_factory=list)  # method, path and Range header
 
     def commit(self, repository: str) -> str:
-        """Return a commit that depends on the files."""
+        """Return the current commit, which depends on the files unless it is given."""
+        if repository in self.commits:
+            return self.commits[repository]
         names = [f"{file}{file.stat().st_size}" for file in sorted(self.repositories[repository].rglob("*"))]
         return hashlib.sha1("".join(names).encode()).hexdigest()
 
@@ -119,7 +128,7 @@ def handler_of(hub: LoopbackHub) -> type[BaseHTTPRequestHandler]:
             if is_lfs and "authorization" in self.headers:
                 self.answer(400, b"a token reached the store of large files")
                 return
-            content = hub.replaced.get(path.name, content)
+            content = hub.replaced.get(path.name, content)[: hub.truncated.get(path.name)]
             status, start = 200, 0
             given = re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", ""))
             if given and hub.ranged:
@@ -135,10 +144,24 @@ def handler_of(hub: LoopbackHub) -> type[BaseHTTPRequestHandler]:
             self.send_header("Content-Length", str(len(body)))
             self.end_headers()
             if self.command != "HEAD":
-                self.wfile.write(body[:cut])
+                self.send(body[:cut])
             if cut is not None:
                 self.wfile.flush()
                 self.close_connection = True
+
+        def send(self, body: bytes) -> None:
+            step = 2**16 if hub.drip_s else len(body)
+            for part in [each for each in hub.held if each in self.path]:
+                first = hub.held.pop(part)
+                self.wfile.write(body[:first])
+                self.wfile.flush()
+                body = body[first:]
+                hub.reached.set()
+                hub.released.wait(60)
+            with suppress(ConnectionError):  # the client was killed
+                for start in range(0, len(body), step or 1):
+                    self.wfile.write(body[start : start + step])
+                    time.sleep(hub.drip_s)
 
         def log_message(self, format: str, *args: object) -> None:
             pass

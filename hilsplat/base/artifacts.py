@@ -134,7 +134,8 @@ def _flush(path: Path) -> None:
         os.close(descriptor)
 
 
-_renameat2 = ctypes.CDLL(None, use_errno=True).renameat2 if sys.platform == "linux" else None
+_libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
+_renameat2 = getattr(_libc, "renameat2", None)
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # from Linux's <stdio.h>, <fcntl.h> and <linux/fs.h>
 
 

@@ -113,7 +113,10 @@ def models_get(
             help="names from `hilsplat models list`, or owner/name on the hub; default: the recommended pair"
         ),
     ] = None,
-    revision: Annotated[str | None, typer.Option(help="branch, tag or commit of the repository")] = None,
+    revision: Annotated[
+        str | None,
+        typer.Option(help="branch, tag or commit; default: the pinned commit of a released model, else main"),
+    ] = None,
     variant: Annotated[str, typer.Option(help="precision: quantized, fp16, int8, ...; default: full")] = "",
     out: Annotated[
         Path | None, typer.Option(help="models folder; default: HILSPLAT_MODELS, or the user's data folder")

@@ -11,13 +11,14 @@ from hilsplat.base.artifacts import read_json, write_json
 from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.embed.clip import ClipModel
 from hilsplat.models.folder import input_side_px, open_model_folder
-from hilsplat.models.int8 import int8_network, may_be_int8
+from hilsplat.models.int8 import considers_int8, int8_network
 from hilsplat.models.network import execution_providers, require_one_space
 from hilsplat.models.store import broken_models, present_models
 from hilsplat.segment.sam import SamModel
 
 CACHE = Path("results/.cache")
 """Folder for measured timings, and for int8 networks if the models folder is read-only."""
+IMAGE_NETWORKS = {"sam": "vision_encoder", "clip": "vision_model"}
 LARGEST_PROVIDER_DIFFERENCE = 0.02
 """Maximum relative difference attributed to rounding, such as that of TF32 products on CUDA."""
 Seconds = dict[str, float]
@@ -33,7 +34,7 @@ def check_model(folder: Path, variant: str = "") -> str:
     side = input_side_px(model)
     lines = [f"folder     {model.folder}", f"kind       {model.layout}", f"image      {side} x {side} px"]
     opened = SamModel(model) if model.kind == "sam" else ClipModel(model)
-    precisions = ["fp32", "int8"] if may_be_int8(model) else ["fp32"]
+    precisions = ["fp32", "int8"] if considers_int8("auto", model, IMAGE_NETWORKS[model.kind]) else ["fp32"]
     measured = {precision: _measure(opened, precision) for precision in precisions}
     seconds = {precision: each for precision, each in measured.items() if each}
     times = "; ".join(
@@ -80,7 +81,7 @@ def provider_disagreement(folder: Path) -> str | None:
     providers = execution_providers()
     if len(providers) < 2:
         return None
-    name = "vision_encoder" if model.kind == "sam" else "vision_model"
+    name = IMAGE_NETWORKS[model.kind]
     side = input_side_px(model)
     pixels = np.random.default_rng(0).normal(size=(1, 3, side, side)).astype(np.float32)
     outputs = {
@@ -101,7 +102,7 @@ def seconds_of(folder: Path, variant: str, precision: str, cache: Path) -> Secon
     `precision` is "fp32", or "auto" or "int8", which both mean int8 where possible.
     """
     model = open_model_folder(folder, variant=variant)
-    requested = "int8" if precision != "fp32" and may_be_int8(model) else "fp32"
+    requested = "int8" if considers_int8(precision, model, IMAGE_NETWORKS[model.kind]) else "fp32"
     found = _known(cache).get(_key(folder, variant, requested))
     if found is None:
         opened = SamModel(model) if model.kind == "sam" else ClipModel(model)

@@ -146,7 +146,7 @@ def _choose_precision(
     threads: int,
 ) -> None:
     """Switch the model to int8 if the settings require it, or if int8 and float32 agree on scene crops."""
-    if not considers_int8(settings.precision, model.model):
+    if not considers_int8(settings.precision, model.model, "vision_model"):
         return
     entries = read_index(masks_folder)["views"]
     rows = chosen or {view: np.arange(entries[view]["whole"]) for view in digests}

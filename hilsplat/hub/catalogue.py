@@ -13,6 +13,8 @@ from huggingface_hub.utils.sha import git_hash
 
 from hilsplat.base.artifacts import parse_json, sha256_of_file
 from hilsplat.base.errors import DownloadError
+from hilsplat.hub.pins import pins
+from hilsplat.hub.retries import repeated
 from hilsplat.models.layouts import LAYOUTS, SUPPORTED, layout_of
 from hilsplat.models.store import RELEASES, Release
 
@@ -73,7 +75,7 @@ class HubFile:
 
     path: str
     size: int
-    digest: str  # SHA-256 of the bytes (64 digits), or git's SHA-1 of a small file (40 digits)
+    digest: str  # pinned or listed: SHA-256 (64 digits), or git's SHA-1 of a small file (40 digits)
     cached: Path | None = None  # the file in the hub's local cache, if the listing was read from the cache
 
     def digest_of(self, path: Path) -> str:
@@ -114,16 +116,19 @@ def read_listing(repository: str, revision: str | None) -> Listing:
     """Request the listing of a repository from the hub.
 
     Raises:
-        requests.RequestException: the hub is unreachable or denies access.
+        requests.RequestException: the hub is unreachable, busy or denies access.
         OfflineModeIsEnabled: HF_HUB_OFFLINE is set.
         DownloadError: the hub does not report the size and digest of a file.
     """
-    info = huggingface_hub.HfApi().model_info(repository, revision=revision, files_metadata=True)
-    files = {}
+    info = repeated(
+        f"listing of {repository}",
+        lambda: huggingface_hub.HfApi().model_info(repository, revision=revision, files_metadata=True),
+    )
+    known, files = _pinned_digests(repository, str(info.sha)), {}
     for each in info.siblings or ():
-        if each.rfilename.startswith("/") or ".." in each.rfilename.split("/"):
+        if not _is_inside(each.rfilename):
             continue  # valid repositories have no such path; the file would be written outside the folder
-        digest = each.lfs.sha256 if each.lfs else each.blob_id
+        digest = known.get(each.rfilename) or (each.lfs.sha256 if each.lfs else each.blob_id)
         if digest is None or each.size is None:
             problem = f"{constants.ENDPOINT} reports no size or digest for {each.rfilename} (?blobs=true)"
             raise DownloadError(problem, fix="unset HF_ENDPOINT, or set it to a complete mirror")
@@ -139,11 +144,23 @@ def read_cached_listing(repository: str, revision: str | None) -> Listing | None
     except LocalEntryNotFoundError:
         return None
     snapshot = Path(folder)
-    files = {}
+    known, files = _pinned_digests(repository, snapshot.name), {}
     for file in [path for path in snapshot.rglob("*") if path.is_file()]:
         path = file.relative_to(snapshot).as_posix()
-        files[path] = HubFile(path, file.stat().st_size, file.resolve().name, file)
+        files[path] = HubFile(path, file.stat().st_size, known.get(path) or file.resolve().name, file)
     return Listing(repository, snapshot.name, "", files)
+
+
+def _pinned_digests(repository: str, commit: str) -> Mapping[str, str]:
+    """Return the known SHA-256 digests of a repository's files at a commit; empty for other commits."""
+    pin = pins().get(repository)
+    return pin.sha256 if pin is not None and pin.commit == commit else {}
+
+
+def _is_inside(path: str) -> bool:
+    """Return whether a listed path stays inside the folder to which it is appended, on any system."""
+    parts = path.replace("\\", "/").split("/")
+    return ":" not in path and not {"", ".", ".."}.intersection(parts)
 
 
 def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:

@@ -8,10 +8,9 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -19,10 +18,11 @@ from typing import Any
 import huggingface_hub
 import requests
 from huggingface_hub import constants
-from huggingface_hub.errors import GatedRepoError, LocalEntryNotFoundError, RepositoryNotFoundError
+from huggingface_hub.errors import GatedRepoError, RepositoryNotFoundError
 from huggingface_hub.utils import disable_progress_bars
 
 from hilsplat.base.artifacts import (
+    FULL_DISK,
     explain_full_disk,
     output_lock,
     read_json,
@@ -44,7 +44,12 @@ from hilsplat.hub.catalogue import (
     read_listing,
     usual_files,
 )
-from hilsplat.models.onnx_graph import split_clip, whole_clip
+from hilsplat.hub.pins import pins
+from hilsplat.hub.retries import TOO_SHORT, reason_of, repeated
+from hilsplat.models.folder import ModelFolder, input_side_px, preprocessing_of
+from hilsplat.models.layouts import LAYOUTS, layout_of
+from hilsplat.models.memory import needs
+from hilsplat.models.onnx_graph import external_files, split_clip, whole_clip
 from hilsplat.models.store import RECOMMENDED, real_model, user_models
 
 logger = logging.getLogger(__name__)
@@ -52,14 +57,14 @@ logger = logging.getLogger(__name__)
 ORIGIN = "origin.json"
 """File in a model folder that records its origin."""
 KEPT = "transferred data is kept, and the transfer resumes"
-WAITS_S = (1.0, 2.0, 4.0, 8.0)
-"""Waiting times between attempts to download a file."""
-CUT = (requests.ConnectionError, requests.Timeout, requests.exceptions.ChunkedEncodingError)
-"""Errors raised by a broken connection."""
 SPARE_BYTES = 200_000_000
 """Disk space that must remain free after a transfer."""
 EXPORT_FACTOR = 4
 """Disk space for an export, as a multiple of the weights' size: weights, complete network, and its halves."""
+INT8_SHARE = 0.27
+"""Size of int8 networks, relative to float32."""
+BATCHES = {"sam": 16, "clip": 64}
+"""Prompts or crops per call for which the memory is reported."""
 NEEDED = ("optimum-onnx", "transformers", "torch")
 """Packages that an export requires."""
 INSTALL = "pip install --constraint constraints.txt --editable '.[export]'"
@@ -90,7 +95,8 @@ def get_models(
     Args:
         names: released models, or owner/name; empty for the recommended pair.
         models: parent folder of the models; None for the user's models.
-        revision: branch, tag or commit of a single model; None for the hub's default branch.
+        revision: branch, tag or commit of a single model; None for the pinned commit of a released model
+            (`pins`), or the default branch of another repository.
         variant: precision of the networks, such as "quantized" or "fp16"; empty for full precision.
 
     Raises:
@@ -146,6 +152,8 @@ def _is_present(requested: ModelRequest, target: Path, listing: Listing) -> bool
 
 def _listing(requested: ModelRequest, revision: str | None) -> Listing:
     """Return the listing from the hub or, if the hub is unreachable, from its cache on this machine."""
+    if revision is None and requested.repository in pins():
+        revision = pins()[requested.repository].commit
     try:
         return read_listing(requested.repository, revision)
     except OUT_OF_REACH:
@@ -167,9 +175,25 @@ def _prepare(requested: ModelRequest, listing: Listing, target: Path, variant: s
     size = f"{found.num_bytes() / 1e6:.1f} MB in {len(choice.files)} files"
     left = f"{found.num_bytes(missing=True) / 1e6:.1f} MB still to download"
     logger.info("%s, %s, %s; licence: %s", source, size, left, listing.licence or licence)
+    logger.info("%s: %s", requested.name, _needs(found))
     if choice.exported:
         require_exporter(requested.repository)
     return found
+
+
+def _needs(found: Prepared) -> str:
+    """Describe the disk space and memory that a model needs."""
+    config = read_json(found.staging / "config.json")
+    layout = layout_of(config)
+    assert layout is not None  # `choose_files` refuses other models
+    (file,) = found.listing.require(LAYOUTS[layout].preprocessing)
+    preprocessing = preprocessing_of(_fetch(found.listing, file, found.staging))
+    model = ModelFolder(found.staging, layout, config, preprocessing, {}, ())
+    num_bytes = found.num_bytes()
+    memory_mib = needs(layout, config, input_side_px(model), num_bytes, BATCHES[model.kind]).total_mib(1)
+    disk = f"needs up to {(1 + INT8_SHARE) * num_bytes / 1e6:.0f} MB of disk space with its int8 networks"
+    export = f"; its export needs about {3 * num_bytes / 1e9:.1f} GB" if found.choice.exported else ""
+    return f"{disk}, and about {memory_mib * 2**20 / 1e9:.1f} GB of memory on a CPU{export}"
 
 
 def _install(found: Prepared) -> str:
@@ -177,6 +201,11 @@ def _install(found: Prepared) -> str:
     listing, choice = found.listing, found.choice
     for path in track(list(choice.files), f"files of {found.requested.name}"):
         _fetch(listing, listing.files[path], found.staging)
+    if more := _further_weights(found):
+        for path in more:
+            _fetch(listing, listing.files[path], found.staging)
+        choice = replace(choice, files={**choice.files, **more})
+        found = replace(found, choice=choice)
     if choice.exported:
         with work_folder(found.target) as temporary:
             made = temporary / found.target.name
@@ -193,6 +222,17 @@ def _install(found: Prepared) -> str:
     return _place(found, found.staging)
 
 
+def _further_weights(found: Prepared) -> dict[str, str]:
+    """Return further files of the repository to which the downloaded networks refer, in any name."""
+    listed = [
+        (Path(path).parent / name).as_posix()
+        for path in found.choice.files
+        if path.endswith(".onnx")
+        for name in external_files(found.staging / path)
+    ]
+    return {path: path for path in listed if path in found.listing.files and path not in found.choice.files}
+
+
 def _fetch(listing: Listing, file: HubFile, staging: Path) -> Path:
     """Fetch a file or its missing part; delete the file and raise an error if its digest is wrong."""
     target = staging / file.path
@@ -205,7 +245,7 @@ def _fetch(listing: Listing, file: HubFile, staging: Path) -> Path:
     if found != file.digest:
         target.unlink()
         raise DownloadError(
-            f"{file.path} of {listing.repository} does not have the digest that the hub reports",
+            f"{file.path} of {listing.repository} does not have the expected digest",
             expected=f"digest {file.digest}, {file.size} bytes",
             found=f"digest {found}, {size} bytes; the file was deleted",
             fix="run the command again; if the error persists, a proxy or mirror probably modifies the file",
@@ -214,20 +254,24 @@ def _fetch(listing: Listing, file: HubFile, staging: Path) -> Path:
 
 
 def _download(listing: Listing, file: HubFile, staging: Path) -> None:
-    """Download a file with `huggingface_hub`, which resumes; retry if the connection breaks."""
+    """Download a file with `huggingface_hub`, which resumes; see `repeated` for further attempts."""
     if not sys.stderr.isatty():
         disable_progress_bars()
-    for wait_s in (*WAITS_S, None):
-        try:
-            huggingface_hub.hf_hub_download(
+    try:
+        repeated(
+            file.path,
+            lambda: huggingface_hub.hf_hub_download(
                 listing.repository, file.path, revision=listing.revision, local_dir=staging
-            )
-            return
-        except CUT as error:
-            if wait_s is None:
-                raise
-            logger.info("%s: the connection was lost (%s); retrying", file.path, type(error).__name__)
-            time.sleep(wait_s)
+            ),
+        )
+    except (RuntimeError, ValueError) as error:  # raised by hf_xet, which has no errors of its own
+        if constants.HF_HUB_DISABLE_XET or any(words in str(error) for words in FULL_DISK):
+            raise
+        raise DownloadError(
+            f"{file.path} of {listing.repository} cannot be downloaded by Xet",
+            found=str(error).splitlines()[0],
+            fix="transfer it by HTTP: unset HF_HUB_DISABLE_XET, then run the command again",
+        ) from error
 
 
 def _place(found: Prepared, made: Path, **more: Any) -> str:
@@ -264,7 +308,19 @@ def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
         with explain_full_disk(models / requested.name):
             yield
     except (requests.RequestException, *OUT_OF_REACH) as error:
-        answered = error.__cause__ if isinstance(error, LocalEntryNotFoundError) else error
+        answered = reason_of(error)
+        if isinstance(answered, requests.exceptions.SSLError):
+            raise DownloadError(
+                f"{requested.repository} cannot be downloaded: the certificate of {place} is not trusted",
+                found=_innermost(error),
+                fix="if a proxy replaces certificates, set REQUESTS_CA_BUNDLE to the file of its certificate",
+            ) from error
+        if isinstance(answered, requests.exceptions.ProxyError):
+            raise DownloadError(
+                f"{requested.repository} cannot be downloaded: the proxy does not connect to {place}",
+                found=_innermost(error),
+                fix="correct HTTPS_PROXY and HTTP_PROXY, or unset them to connect without a proxy",
+            ) from error
         if isinstance(answered, requests.HTTPError) and answered.response is not None:
             raise _refused(answered, answered.response, requested.repository, place) from error
         families = [requested.release.family] if requested.release else ["sam", "clip"]
@@ -276,6 +332,12 @@ def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
             f"{', '.join(file for family in families for file in usual_files(family))}",
         ) from error
     except OSError as error:
+        if str(error).startswith(TOO_SHORT):
+            raise DownloadError(
+                f"{requested.repository} cannot be downloaded: a file is shorter than announced",
+                found=str(error).splitlines()[0],
+                fix="run the command again; if the error persists, a proxy or mirror truncates files",
+            ) from error
         if error.filename is None:
             raise
         raise DownloadError(
@@ -303,7 +365,7 @@ def _refused(
         fix = f"see {place}; run `hf auth login`, or set HF_TOKEN to a token with access"
     elif response.status_code == requests.codes.not_found:
         problem = f"the hub does not have this revision or file of {repository} {status}"
-        fix = f"correct the name or --revision; {place} lists what exists"
+        fix = f"correct the name or --revision ({place} lists what exists); --revision main is the newest"
     else:
         problem = f"the hub failed to serve {repository} {status}"
         fix = f"run the command again later: {KEPT}"

@@ -15,7 +15,7 @@ from hilsplat.base.artifacts import read_json, sha256_of_file, sha256_of_json
 from hilsplat.base.errors import ArtifactError, ModelError
 from hilsplat.models.layouts import LAYOUTS, OTHER_TYPES, SECTIONS, SUPPORTED, TORCH_SUFFIXES, layout_of
 from hilsplat.models.network import Network
-from hilsplat.models.onnx_graph import Graph, has_external_weights, location_of, tensors_of, whole_clip
+from hilsplat.models.onnx_graph import Graph, external_files, whole_clip
 from hilsplat.models.store import model_path
 
 OTHER_FOLDER = "choose a folder in a layout listed in docs/models.md"
@@ -87,7 +87,7 @@ def open_model_folder(
     missing += [file for file in layout.described if not (folder / file).is_file()]
     if missing:
         raise _incomplete(folder, name, missing, variant, alternative)
-    preprocessing = _preprocessing_of(folder / layout.preprocessing)
+    preprocessing = preprocessing_of(folder / layout.preprocessing)
     weights = [path for network in networks.values() for path in external_weights(network)]
     described = [folder / file for file in (*layout.described, *layout.beside) if (folder / file).is_file()]
     files = tuple(sorted({*described, *networks.values(), *weights}))
@@ -156,7 +156,7 @@ def variants_of(folder: Path, layout: str) -> list[str]:
     return sorted(set.intersection(*found))
 
 
-def _preprocessing_of(path: Path) -> dict[str, Any]:
+def preprocessing_of(path: Path) -> dict[str, Any]:
     """Read the image preprocessing settings, and convert open_clip's keys.
 
     A ModelError is raised if the file is unreadable, disables a step, or has an invalid mean or deviation.
@@ -192,17 +192,8 @@ def external_weights(network: Path) -> list[Path]:
 
     A ModelError is raised if such a file is missing, or named by a path that leads out of the folder.
     """
-    if not has_external_weights(network):
-        return []
-    import onnx
-    from google.protobuf.message import DecodeError
-
-    try:
-        graph = onnx.load(str(network), load_external_data=False).graph
-    except DecodeError:
-        return []  # a damaged copy: opening the network reports it
     found = []
-    for name in sorted({place for tensor in tensors_of(graph) if (place := location_of(tensor)) is not None}):
+    for name in external_files(network):
         path = network.parent / name
         if Path(name).is_absolute() or ".." in Path(name).parts or not path.is_file():
             raise ModelError(

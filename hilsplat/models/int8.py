@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from hilsplat.base.artifacts import ViewCache, atomic_path, sha256_of_json
 from hilsplat.models.fast_paths import or_as_exported
-from hilsplat.models.folder import ModelFolder
+from hilsplat.models.folder import ModelFolder, external_weights
 from hilsplat.models.network import CPU, Network, execution_providers
 from hilsplat.models.onnx_graph import Graph, needed_names
 
@@ -31,21 +31,25 @@ LEAST = {"mask IoU": 0.98, "cosine": 0.99, "rank correlation": 0.95}
 """Minimum agreement of int8 with float32: mean IoU of masks from the same prompts, mean cosine of vectors,
 and rank correlation of `WORDS` by cosine with a crop. Two crops of one object from neighbouring views agree
 less."""
+LARGE_BYTES = 1_000_000_000
+"""Size of a network above which int8 is used only if required, because quantising takes four times as much
+memory."""
 CHECKED_CROPS, CHECKED_VIEWS, CHECKED_GRID = 16, 2, 5
 """Number of crops used to check a CLIP model; numbers of views and of prompts per side for a SAM model."""
 
 
-def may_be_int8(model: ModelFolder) -> bool:
-    """Return whether int8 can save time: on a CPU, for models other than those of the synthetic world."""
-    return execution_providers()[0] == CPU and not model.config.get("world_only")
+def considers_int8(precision: str, model: ModelFolder, name: str) -> bool:
+    """Return whether to compare a network's int8 version with float32.
 
-
-def considers_int8(precision: str, model: ModelFolder) -> bool:
-    """Return whether to compare int8 with float32; log a warning if int8 is required but unavailable."""
-    possible = may_be_int8(model)
+    `auto` ignores large networks, such as those of ViT-L and ViT-H. A warning is logged if int8 is required
+    but cannot save time: on a GPU, or for a model of the synthetic world.
+    """
+    possible = execution_providers()[0] == CPU and not model.config.get("world_only")
     if precision == "int8" and not possible:
         logger.warning("%s runs in float32: int8 requires a pretrained model on a CPU", model.folder)
-    return possible and precision != "fp32"
+    path = model.networks[name]
+    num_bytes = sum(file.stat().st_size for file in (path, *external_weights(path)))
+    return possible and (precision == "int8" or (precision == "auto" and num_bytes <= LARGE_BYTES))
 
 
 def int8_network(

@@ -2,11 +2,13 @@
 
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from hilsplat.models.folder import ModelFolder, input_side_px
+from hilsplat.models.layouts import LAYOUTS
 
 PROCESS_MIB = 1500
 """Memory of a stage without its networks: libraries, images, candidates, masks."""
@@ -25,6 +27,8 @@ previewed, plus the masks of the prompts that are kept."""
 CLIP_TOKEN_MIB = 0.03
 """Memory per patch of a crop in a CLIP model, not counting two arrays of attention weights. Measured: 521 MiB
 for 64 crops in ViT-B/16."""
+SAM_HEADS, SAM2_HEADS = 12, 4
+"""Attention heads if the configuration does not specify them (SAM 2 and EdgeTAM: of the global attention)."""
 UNKNOWN_BYTES_PER_PX = 400
 """Memory for encoding an image, per pixel, if the configuration does not describe the network (sam-tiny)."""
 
@@ -55,35 +59,50 @@ def needs_of(model: ModelFolder, batch: int, *, as_exported: bool = False) -> Ne
 
     `batch` is the number of prompts (SAM) or crops (CLIP) per call; see `SamModel` for `as_exported`.
     """
-    files = {*model.networks.values(), *(path for path in model.files if "onnx" in path.name)}
-    weights = 1.2 * sum(path.stat().st_size for path in files) / MIB
+    described = {*(model.folder / name for name in LAYOUTS[model.layout].described)}
+    weights = sum(path.stat().st_size for path in model.files if path not in described)
     side = input_side_px(model)
-    vision = model.config.get("vision_config", model.config.get("vision_cfg"))
+    return needs(model.layout, model.config, side, weights, batch, as_exported=as_exported)
+
+
+def needs(
+    layout: str,
+    config: Mapping[str, Any],
+    side: int,
+    num_bytes: int,
+    batch: int,
+    *,
+    as_exported: bool = False,
+) -> Needs:
+    """Estimate the memory of a model from its configuration, input side (px) and networks' size."""
+    kind, weights = LAYOUTS[layout].kind, 1.2 * num_bytes / MIB
+    vision = config.get("vision_config", config.get("vision_cfg"))
     if not isinstance(vision, dict):
         picture, as_exported = side * side * UNKNOWN_BYTES_PER_PX / MIB, True
-    elif model.kind == "clip":
+    elif kind == "clip":
         tokens = (side / _patch_px(vision)) ** 2
         picture = 2 * _attention_mib(vision, side) + CLIP_TOKEN_MIB * tokens
-    elif model.layout == "sam" and not as_exported:
+    elif layout == "sam" and not as_exported:
         patches = side / _patch_px(vision)
         features = patches**2 * vision.get("hidden_size", 768) * 4 / MIB
         picture = ACTIVATIONS * features + ATTENTION_COPIES * _attention_mib(vision, side) / patches
     else:
-        picture = ATTENTION_COPIES * _attention_mib(vision, side)
-    if model.kind == "clip":
+        heads = SAM2_HEADS if layout == "sam2" else SAM_HEADS
+        picture = ATTENTION_COPIES * _attention_mib(vision, side, heads)
+    if kind == "clip":
         return Needs(weights, batch * picture)
     decoder = batch * PROMPT_MIB if as_exported else FACTORED_MIB
     return Needs(weights, picture + decoder * (side / 1024) ** 2)
 
 
-def _attention_mib(vision: dict[str, Any], side_px: int) -> float:
+def _attention_mib(vision: dict[str, Any], side_px: int, default_heads: int = SAM_HEADS) -> float:
     """Return the memory of one layer's attention weights between all patches of an image, MiB.
 
-    Keys missing from the configuration get the defaults of transformers: patches of 16 px and 12 heads. In
-    SAM 2, the stage with global attention has a stride of 16 px and 4 heads.
+    Keys missing from the configuration get the defaults of transformers, such as patches of 16 px. In SAM 2,
+    the stage with global attention has a stride of 16 px.
     """
     stages = (vision.get("backbone_config") or {}).get("num_attention_heads_per_stage")
-    heads = stages[2] if stages else vision.get("num_attention_heads", 12)
+    heads = stages[2] if stages else vision.get("num_attention_heads", default_heads)
     return heads * (side_px / _patch_px(vision)) ** 4 * 4 / MIB
 
 

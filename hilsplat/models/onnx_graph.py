@@ -99,6 +99,20 @@ def location_of(tensor: Any) -> str | None:
     return ExternalDataInfo(tensor).location if uses_external_data(tensor) else None
 
 
+def external_files(path: Path) -> list[str]:
+    """Return the names of the files to which a network refers; empty for a damaged network."""
+    import onnx
+    from google.protobuf.message import DecodeError
+
+    if not has_external_weights(path):
+        return []
+    try:
+        graph = onnx.load(str(path), load_external_data=False).graph
+    except DecodeError:
+        return []  # opening the network reports it
+    return sorted({name for tensor in tensors_of(graph) if (name := location_of(tensor)) is not None})
+
+
 def has_external_weights(path: Path) -> bool:
     """Return whether a network may refer to other files, without reading its weights."""
     if not path.stat().st_size:

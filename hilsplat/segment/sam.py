@@ -131,7 +131,7 @@ class SamModel:
         self, precision: str, images: Sequence[UInt8[np.ndarray, "H W 3"]], cache: Path, threads: int = 1
     ) -> None:
         """Use int8 if `masks.precision` requires it, or if int8 and float32 masks of these images agree."""
-        if not considers_int8(precision, self.model):
+        if not considers_int8(precision, self.model, "vision_encoder"):
             return
         quantised = self.int8_encoder(cache)
         if quantised is None:

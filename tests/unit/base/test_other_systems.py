@@ -39,7 +39,8 @@ print("imported", len(sys.modules))
 """
 LIBRARIES = (
     "av, cv2, embreex.rtcore_scene, filelock, huggingface_hub.utils, matplotlib.pyplot, numba, onnxruntime, "
-    "pandas, pillow_heif, pyarrow.parquet, pycolmap, safetensors, scipy.sparse, starlette, torch, typer, uvicorn"
+    "pandas, pillow_heif, pyarrow.parquet, pycolmap, safetensors, scipy.sparse, starlette, torch, typer, "
+    "uvicorn"
 )
 """Libraries, which have their own code for Windows, are imported before Windows is simulated."""
 

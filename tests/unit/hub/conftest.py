@@ -9,7 +9,8 @@ import pytest
 from huggingface_hub import file_download
 from huggingface_hub.utils import reset_sessions
 
-from hilsplat.hub import get
+from hilsplat.hub import retries
+from hilsplat.hub.pins import pins
 from tests.loopback_hub import LoopbackHub, loopback_hub
 from tests.unit.export.conftest import clip_parts, transformers
 from tests.unit.finished_desk import write_colour_clip
@@ -51,6 +52,8 @@ def hub(repositories, monkeypatch, tmp_path) -> Iterator[LoopbackHub]:
     with loopback_hub() as served:
         served.repositories.update(repositories)
         point_at(served.endpoint, monkeypatch)
+        monkeypatch.setattr("hilsplat.hub.pins.TABLE", write_pins(tmp_path / "pins.tsv"))
+        pins.cache_clear()
         monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", False)
         monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
         monkeypatch.setattr(huggingface_hub.constants, "DOWNLOAD_CHUNK_SIZE", 2**16)
@@ -62,11 +65,19 @@ def hub(repositories, monkeypatch, tmp_path) -> Iterator[LoopbackHub]:
         reset_sessions()
         yield served
         reset_sessions()
+    pins.cache_clear()
 
 
 @pytest.fixture
 def waits(monkeypatch) -> list[float]:
     """Waiting times, in seconds, which are skipped."""
     seconds: list[float] = []
-    monkeypatch.setattr(get.time, "sleep", seconds.append)
+    monkeypatch.setattr(retries.time, "sleep", seconds.append)
     return seconds
+
+
+def write_pins(path: Path, *rows: tuple[str, str, str, str]) -> Path:
+    """Write a table of pinned commits and digests, by default an empty one."""
+    lines = [("repository", "commit", "path", "sha256"), *rows]
+    path.write_text("".join("\t".join(line) + "\n" for line in lines))
+    return path

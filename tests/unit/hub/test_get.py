@@ -3,12 +3,16 @@
 import errno
 import hashlib
 import json
+import re
 import shutil
+import time
+from email.utils import formatdate
 from pathlib import Path
 from unittest.mock import Mock
 
 import huggingface_hub
 import pytest
+import requests
 from huggingface_hub.utils import reset_sessions
 
 from hilsplat.base.artifacts import sha256_of_file
@@ -17,9 +21,11 @@ from hilsplat.embed.clip import ClipModel
 from hilsplat.embed.model_check import check_models
 from hilsplat.hub import get
 from hilsplat.hub.get import get_models
+from hilsplat.hub.pins import pins
+from hilsplat.hub.retries import retry_after_s
 from hilsplat.models.store import RELEASES, models_table, real_model
 from tests.loopback_hub import Refusal, git_sha1
-from tests.unit.hub.conftest import CLIP, SAM, point_at
+from tests.unit.hub.conftest import CLIP, SAM, point_at, write_pins
 from tests.unit.segment.handmade import move_weights
 
 ENCODER = "vision_encoder.onnx"
@@ -126,7 +132,7 @@ def test_a_failed_download_is_resumed(hub, waits):
 def test_files_with_another_digest_are_refused_and_deleted(hub, repositories):
     content = (repositories[SAM] / "onnx" / ENCODER).read_bytes()
     hub.replaced[ENCODER] = content[:-1] + bytes([content[-1] ^ 1])
-    message = rf"does not have the digest that the hub reports(.|\n)*{hashlib.sha256(content).hexdigest()}"
+    message = rf"does not have the expected digest(.|\n)*{hashlib.sha256(content).hexdigest()}"
     with pytest.raises(DownloadError, match=message):
         get_models(["sam-vit-base"])
     assert visible() == [] and not (STAGING / "onnx" / ENCODER).exists()
@@ -166,10 +172,120 @@ GATED, NO_FILE = Refusal(401, {"X-Error-Code": "GatedRepo"}), Refusal(404, {"X-E
     ],
 )
 def test_refusals_suggest_a_fix(hub, waits, where, refusal, message):
-    hub.refusals[where] = [refusal]
+    hub.refusals[where] = [refusal] * 100
     with pytest.raises(DownloadError, match=message):
         get_models(["sam-vit-base"])
-    assert waits == [] and visible() == []
+    assert visible() == []
+
+
+@pytest.mark.parametrize("where", ["/api/", f"/resolve/{'{}'}/config.json", f"/lfs/{SAM}"])
+@pytest.mark.parametrize(
+    ("refusal", "least_s"),
+    [(Refusal(429, {"Retry-After": "7"}), 7), (Refusal(429), 1), (Refusal(503), 1), (Refusal(500), 1)],
+)
+def test_busy_hubs_are_asked_again_after_the_time_that_they_state(hub, waits, where, refusal, least_s):
+    hub.refusals[where.format(hub.commit(SAM))] = [refusal, refusal]
+    assert "kind       sam" in get_models(["sam-vit-base"])
+    assert max(waits) >= least_s
+
+
+def answered(retry_after: str) -> requests.Response:
+    response = requests.Response()
+    response.headers["Retry-After"] = retry_after
+    return response
+
+
+def test_a_date_in_retry_after_is_a_time_from_now():
+    later = formatdate(time.time() + 60, usegmt=True)
+    assert 55 < retry_after_s(answered(later)) <= 60
+    assert retry_after_s(answered("soon")) == 0
+
+
+def test_a_truncated_file_is_refused_after_a_few_tries(hub, waits):
+    hub.truncated[ENCODER] = 1000
+    with pytest.raises(DownloadError, match=r"shorter than announced(.|\n)*mirror truncates files"):
+        get_models(["sam-vit-base"])
+    hub.truncated.clear()
+    assert "kind       sam" in get_models(["sam-vit-base"])
+
+
+def test_a_slow_transfer_completes(hub, repositories):
+    hub.drip_s = 0.05
+    get_models(["sam-vit-base"])
+    assert (TARGET / "onnx" / ENCODER).read_bytes() == (repositories[SAM] / "onnx" / ENCODER).read_bytes()
+
+
+def test_a_released_model_is_fetched_at_its_pinned_commit_and_with_its_digests(hub, repositories, tmp_path):
+    path, commit = f"onnx/{ENCODER}", "44dd3b8c825d2daa581102f162d0ebc23bbf4eea"
+    digest = sha256_of_file(repositories[SAM] / path)
+    write_pins(tmp_path / "pins.tsv", (SAM, commit, path, digest))
+    pins.cache_clear()
+    with pytest.raises(DownloadError, match=r"does not have this revision(.|\n)*--revision main is"):
+        get_models(["sam-vit-base"])
+    get_models(["sam-vit-base"], revision="main")
+    shutil.rmtree(TARGET)
+    hub.commits[SAM] = commit
+    get_models(["sam-vit-base"])
+    assert origin_of(TARGET)["revision"] == commit
+    shutil.rmtree(TARGET)
+    write_pins(tmp_path / "pins.tsv", (SAM, commit, path, "0" * 64))
+    pins.cache_clear()
+    message = rf"{ENCODER} of {SAM} does not have the expected digest\n  expected  digest 0{{64}}"
+    with pytest.raises(DownloadError, match=message):  # the hub lists the digest of the file that it sends
+        get_models(["sam-vit-base"])
+    assert visible() == []
+
+
+def test_the_table_of_pins_covers_every_release_with_complete_hashes():
+    found = pins.__wrapped__()
+    assert set(found) == {release.repository for release in RELEASES}
+    for pin in found.values():
+        assert re.fullmatch("[0-9a-f]{40}", pin.commit)
+        assert all(re.fullmatch("[0-9a-f]{64}", digest) for digest in pin.sha256.values())
+
+
+def test_disk_and_memory_are_reported_before_the_transfer(hub, monkeypatch, caplog):
+    caplog.set_level("INFO")
+    monkeypatch.setattr(get.shutil, "disk_usage", lambda folder: type("Usage", (), {"free": 100})())
+    with pytest.raises(DiskSpaceError):
+        get_models(["sam-vit-base"])
+    assert "needs up to 1 MB of disk space with its int8 networks, and about 1.6 GB of memory" in caplog.text
+    assert hub.ranges(ENCODER) == []
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "message"),
+    [
+        (
+            RuntimeError("Data processing error: CAS service error : x"),
+            DownloadError,
+            "unset HF_HUB_DISABLE",
+        ),
+        (ValueError("Failed to refresh token"), DownloadError, "unset HF_HUB_DISABLE"),
+        (RuntimeError("IO Error: No space left on device (os error 28)"), DiskSpaceError, "no space left"),
+    ],
+)
+def test_failures_of_xet_suggest_http(hub, monkeypatch, error, kind, message):
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_DISABLE_XET", False)
+    monkeypatch.setattr(huggingface_hub, "hf_hub_download", Mock(side_effect=error))
+    with pytest.raises(kind, match=message):
+        get_models(["sam-vit-base"])
+
+
+def test_a_proxy_that_refuses_is_named(hub, monkeypatch, waits):
+    monkeypatch.setenv("HTTP_PROXY", "http://127.0.0.1:9")
+    monkeypatch.setenv("NO_PROXY", "")
+    reset_sessions()
+    with pytest.raises(DownloadError, match=r"the proxy does not connect to http(.|\n)*correct HTTPS_PROXY"):
+        get_models(["sam-vit-base"])
+
+
+def test_an_untrusted_certificate_is_named(hub, monkeypatch, waits):
+    error = requests.exceptions.SSLError("certificate verify failed: self-signed certificate")
+    monkeypatch.setattr(huggingface_hub.HfApi, "model_info", Mock(side_effect=error))
+    with pytest.raises(DownloadError, match=r"is not trusted(.|\n)*REQUESTS_CA_BUNDLE"):
+        get_models(["sam-vit-base"])
+    assert waits == []
 
 
 @pytest.mark.parametrize(
@@ -215,6 +331,12 @@ def test_a_variant_is_installed_under_the_plain_names_and_external_weights_under
     assert {plain, f"{quantized}_data"} <= set(files) and quantized not in files
 
 
+def test_weights_in_a_file_of_any_name_are_fetched(changed):
+    move_weights(changed / "onnx/prompt_encoder_mask_decoder.onnx", "Constant_62_attr__value")
+    get_models(["some/changed"])
+    assert "onnx/Constant_62_attr__value" in files_of(Path("models/changed"))
+
+
 def test_a_folder_of_the_user_is_not_replaced(hub):
     TARGET.mkdir(parents=True)
     (TARGET / "mine.onnx").write_text("mine")
@@ -230,8 +352,9 @@ def test_a_whole_clip_is_split(hub, clip_parts):
     assert {"vision_model.onnx", "text_model.onnx"} <= set(files) and "model.onnx" not in files
 
 
-def test_a_hub_cannot_write_outside_the_model(hub, monkeypatch):
-    info, name = hub.info(SAM), f"onnx/{ENCODER}_data/../../../../escaped"
+@pytest.mark.parametrize("name", ["_data/../../../../escaped", "_data\\..\\escaped", "_data/C:/escaped"])
+def test_a_hub_cannot_write_outside_the_model(hub, monkeypatch, name):
+    info, name = hub.info(SAM), f"onnx/{ENCODER}{name}"
     info["siblings"].append({"rfilename": name, "size": 1, "blobId": git_sha1(b"x")})
     monkeypatch.setattr(hub, "info", lambda repository: info)
     get_models(["sam-vit-base"])
