@@ -22,6 +22,7 @@ from hilsplat.scene.layouts import (
     has_known_poses,
     label_files,
     langsplat_features,
+    langsplat_level,
     photo_folder,
     trained_gaussians,
 )
@@ -223,6 +224,8 @@ def _notes(folder: Path, extra: dict[str, Path]) -> list[str]:
     known = find_known_poses(folder, extra.get("poses"))
     notes = [f"poses: {', '.join(map(str, known.files)) if known else 'structure from motion'}"]
     notes += [f"{what}: {path}" for what, path in extra.items() if what != "poses"]
+    if (ply := extra.get("gaussians")) and langsplat_level(ply):
+        notes.append("the three levels of LangSplat share their geometry, so the Gaussians of one are enough")
     if (ply := extra.get("gaussians")) and (dataparser := dataparser_of(ply, folder)):
         notes.append(f"coordinates of the Gaussians: nerfstudio's, from {dataparser}")
     if skipped := [path.name for path in sorted(folder.rglob("*.pth"))[:3]]:

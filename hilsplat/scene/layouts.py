@@ -36,13 +36,31 @@ def read_json_object(path: Path, fix: str) -> dict[str, Any]:
 
 
 def trained_gaussians(folder: Path) -> Path | None:
-    """Return the PLY that 3DGS or nerfstudio wrote to a folder after the most training steps, or None."""
-    starts = ("output/*/", "output/", "")
+    """Return the PLY that 3DGS, LangSplat or nerfstudio wrote to a folder after the most steps, or None.
+
+    LangSplat's process.sh keeps 3DGS in `<scene>/<case>` and copies it to `<case>_1`, `_2` and `_3`, one for
+    each level. Of equal numbers of steps, 3DGS's own PLY is preferred, then the first level's.
+    """
+    starts = ("output/*/", "output/", "*/", "")
     patterns = [f"{start}point_cloud/iteration_*/point_cloud.ply" for start in starts]
-    found = [path for pattern in patterns for path in folder.glob(pattern)]
-    found.sort(key=lambda path: (int(path.parent.name.partition("_")[2] or 0), path.stat().st_mtime_ns))
+    found = {path for pattern in patterns for path in folder.glob(pattern)}
+
+    def rank(path: Path) -> tuple[int, int, int, str]:
+        steps = path.parent.name.partition("_")[2]
+        level = langsplat_level(path)
+        return int(steps) if steps.isdecimal() else 0, -(level or 0), path.stat().st_mtime_ns, str(path)
+
     others = [path for name in EXPORTED for path in sorted(folder.glob(name))]
-    return [*others, *found][-1] if others or found else None
+    every = [*others, *sorted(found, key=rank)]
+    return every[-1] if every else None
+
+
+def langsplat_level(ply: Path) -> int | None:
+    """Return the level (1, 2 or 3) of LangSplat for which a PLY written by its training was used, or None."""
+    model = ply.parents[2].name if len(ply.parents) > 2 else ""
+    siblings = [ply.parents[2].with_name(f"{model[:-1]}{level}") for level in (1, 2, 3)] if model else []
+    is_level = model[-2:] in ("_1", "_2", "_3") and all(path.is_dir() for path in siblings)
+    return int(model[-1]) if is_level else None
 
 
 def dataparser_of(ply: Path, source: Path) -> Path | None:

