@@ -472,7 +472,7 @@ class PixelSums:
 
 
 def _relax_shapes(graph: Graph) -> None:
-    """Remove the declared shapes of the image features, of which the tokens use only the number of images."""
+    """Remove the declared shapes of the image features; the tokens depend only on the number of images."""
     for each in graph.model.graph.input:
         if each.name.startswith("image_"):
             for side in each.type.tensor_type.shape.dim:

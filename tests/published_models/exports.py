@@ -19,7 +19,7 @@ ENCODER = "vision_encoder.onnx"
 
 
 def enliven(module: nn.Module) -> None:
-    """Replace the initial weights, whose outputs would hardly depend on the inputs.
+    """Replace the initial weights, with which the outputs would be almost constant.
 
     Norms get different scales, because exporters merge equal weights. SAM's positional frequencies are a
     buffer that transformers draws again for every model.
