@@ -108,7 +108,8 @@ def handler_of(hub: LoopbackHub) -> type[BaseHTTPRequestHandler]:
             elif revision not in (None, "main", hub.commit(repository)):
                 self.answer(404, b"", **{"X-Error-Code": "RevisionNotFound"})
             else:
-                self.answer(200, json.dumps(hub.info(repository)).encode())
+                found = hub.info(repository)
+                self.answer(200, found if isinstance(found, bytes) else json.dumps(found).encode())
 
         def file(self, repository: str, revision: str, name: str, is_lfs: bool) -> None:
             path = hub.repositories[repository] / name

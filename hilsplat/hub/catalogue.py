@@ -1,12 +1,13 @@
 """Model names, the files in hub repositories, and the choice of the files that a model needs."""
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import huggingface_hub
 import requests
-from huggingface_hub import constants
+from huggingface_hub import ModelInfo, constants
 from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError, OfflineModeIsEnabled
 from huggingface_hub.utils import validate_repo_id
 from huggingface_hub.utils.sha import git_hash
@@ -18,11 +19,16 @@ from hilsplat.hub.retries import repeated
 from hilsplat.models.layouts import LAYOUTS, SUPPORTED, layout_of
 from hilsplat.models.store import RELEASES, Release
 
+# also if huggingface_hub was imported before this package
+constants.HF_HUB_DISABLE_XET = os.environ["HF_HUB_DISABLE_XET"].upper() in constants.ENV_VARS_TRUE_VALUES
+
 WEIGHTS = ("model.safetensors", "pytorch_model.bin")
 """PyTorch weights that can be exported, in order of preference. The second is a pickle, but transformers
 doesn't run code in it (`weights_only`)."""
 SMALL_BYTES = 50_000_000
 """Text files above this size are not part of a PyTorch model's tokenizer."""
+TIMEOUT_S = 10.0
+"""Longest wait for the hub's next bytes; huggingface_hub uses the same value for files."""
 OUT_OF_REACH = (requests.ConnectionError, requests.Timeout, OfflineModeIsEnabled, LocalEntryNotFoundError)
 """Errors raised if the hub cannot be reached."""
 WHOLES = ("onnx/model", "model")
@@ -118,12 +124,23 @@ def read_listing(repository: str, revision: str | None) -> Listing:
     Raises:
         requests.RequestException: the hub is unreachable, busy or denies access.
         OfflineModeIsEnabled: HF_HUB_OFFLINE is set.
-        DownloadError: the hub does not report the size and digest of a file.
+        DownloadError: the answer is no listing, or it lacks the size or digest of a file.
     """
-    info = repeated(
-        f"listing of {repository}",
-        lambda: huggingface_hub.HfApi().model_info(repository, revision=revision, files_metadata=True),
-    )
+
+    def request() -> ModelInfo:
+        api = huggingface_hub.HfApi()
+        return api.model_info(repository, revision=revision, timeout=TIMEOUT_S, files_metadata=True)
+
+    try:
+        info = repeated(f"listing of {repository}", request)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        if isinstance(error, OSError) and not isinstance(error, requests.exceptions.JSONDecodeError):
+            raise  # a refusal of the hub
+        raise DownloadError(
+            f"{constants.ENDPOINT} sent no listing of {repository}",
+            found=f"{type(error).__name__}: {printable(error)}",
+            fix="unset HF_ENDPOINT, or set it to a complete mirror; a proxy may also have answered",
+        ) from error
     known, files = _pinned_digests(repository, str(info.sha)), {}
     for each in info.siblings or ():
         if not _is_inside(each.rfilename):
@@ -133,8 +150,13 @@ def read_listing(repository: str, revision: str | None) -> Listing:
             problem = f"{constants.ENDPOINT} reports no size or digest for {each.rfilename} (?blobs=true)"
             raise DownloadError(problem, fix="unset HF_ENDPOINT, or set it to a complete mirror")
         files[each.rfilename] = HubFile(each.rfilename, each.size, digest)
-    licence = getattr(info.card_data, "license", None) or ""
-    return Listing(repository, str(info.sha), str(licence), files)
+    licence = printable(getattr(info.card_data, "license", None) or "")
+    return Listing(repository, printable(info.sha), licence, files)
+
+
+def printable(foreign: object) -> str:
+    """Return the first 80 printable characters of a text from the hub, which may contain anything."""
+    return "".join(letter for letter in str(foreign)[:1000] if letter.isprintable())[:80]
 
 
 def read_cached_listing(repository: str, revision: str | None) -> Listing | None:
@@ -160,7 +182,7 @@ def _pinned_digests(repository: str, commit: str) -> Mapping[str, str]:
 def _is_inside(path: str) -> bool:
     """Return whether a listed path stays inside the folder to which it is appended, on any system."""
     parts = path.replace("\\", "/").split("/")
-    return ":" not in path and not {"", ".", ".."}.intersection(parts)
+    return path.isprintable() and ":" not in path and not {"", ".", ".."}.intersection(parts)
 
 
 def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:

@@ -45,7 +45,7 @@ from hilsplat.hub.catalogue import (
     usual_files,
 )
 from hilsplat.hub.pins import pins
-from hilsplat.hub.retries import TOO_SHORT, reason_of, repeated
+from hilsplat.hub.retries import WRONG_LENGTH, reason_of, repeated
 from hilsplat.models.folder import ModelFolder, input_side_px, preprocessing_of
 from hilsplat.models.layouts import LAYOUTS, layout_of
 from hilsplat.models.memory import needs
@@ -265,7 +265,11 @@ def _download(listing: Listing, file: HubFile, staging: Path) -> None:
             ),
         )
     except (RuntimeError, ValueError) as error:  # raised by hf_xet, which has no errors of its own
-        if constants.HF_HUB_DISABLE_XET or any(words in str(error) for words in FULL_DISK):
+        if (
+            constants.HF_HUB_DISABLE_XET
+            or isinstance(error, OSError)
+            or any(words in str(error) for words in FULL_DISK)
+        ):
             raise
         raise DownloadError(
             f"{file.path} of {listing.repository} cannot be downloaded by Xet",
@@ -332,9 +336,9 @@ def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
             f"{', '.join(file for family in families for file in usual_files(family))}",
         ) from error
     except OSError as error:
-        if str(error).startswith(TOO_SHORT):
+        if str(error).startswith(WRONG_LENGTH):
             raise DownloadError(
-                f"{requested.repository} cannot be downloaded: a file is shorter than announced",
+                f"{requested.repository} cannot be downloaded: a file does not have the announced length",
                 found=str(error).splitlines()[0],
                 fix="run the command again; if the error persists, a proxy or mirror truncates files",
             ) from error

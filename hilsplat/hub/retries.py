@@ -18,8 +18,8 @@ LONGEST_S = 120.0
 """Longest waiting time accepted from a `Retry-After` header."""
 BROKEN = (requests.ConnectionError, requests.Timeout, requests.exceptions.ChunkedEncodingError)
 """Errors raised by a broken connection."""
-TOO_SHORT = "Consistency check failed"
-"""Beginning of huggingface_hub's message about a file that is shorter than announced."""
+WRONG_LENGTH = "Consistency check failed"
+"""Beginning of huggingface_hub's message about a file of another length than announced."""
 
 Result = TypeVar("Result")
 
@@ -58,7 +58,7 @@ def _pause_s(error: Exception, wait_s: float) -> float | None:
             return None
         asked_s = retry_after_s(reason.response)
         return None if asked_s > LONGEST_S else max(wait_s, asked_s)
-    if isinstance(reason, BROKEN) or str(reason).startswith(TOO_SHORT):
+    if isinstance(reason, BROKEN) or str(reason).startswith(WRONG_LENGTH):
         return wait_s
     return None
 

@@ -35,13 +35,15 @@ def require_repeatable(
             )
 
 
-def require_repeatable_once(model: ModelFolder, network: Network, feeds: Mapping[str, np.ndarray]) -> None:
-    """Apply `require_repeatable` to a slow network, once for each model and version of onnxruntime.
+def require_repeatable_once(
+    model: ModelFolder, network: Network, form: str, feeds: Mapping[str, np.ndarray]
+) -> None:
+    """Apply `require_repeatable` to a form of a slow network, once for each version of onnxruntime.
 
     The result is kept in `.checked` beside the model folder, unless that place is read-only.
     """
     beside = model.folder.parent
-    key = sha256_of_json([model.digest, network.path.name, onnxruntime.__version__, network.providers])
+    key = sha256_of_json([model.digest, network.path.name, form, onnxruntime.__version__, network.providers])
     place = beside / ".checked" / key
     if not place.is_file():
         require_repeatable(network, feeds, {name: -value for name, value in feeds.items()})

@@ -31,19 +31,18 @@ class DecoderNetwork:
         self.graph = alone or self.graph
         self.network = model.network(name, alone)
         self.pads = alone is not None and not reads_through(self.graph, LABELS, ("Concat", "Pad"))
-        if self._needs_boxes():
+        if self._needs_boxes() or (self.pads and LABELS not in self.network.inputs):
             raise ModelError(
                 f"network {self.network.path} requires a box with each prompt",
-                expected="a decoder for points, with or without boxes",
+                expected=f"a decoder for points with {LABELS}, with or without boxes",
                 fix="use another model or variant (docs/models.md)",
             )
         along_first = self.network.fixed_axis(POINTS, 1) == 1 and self.network.fixed_axis(POINTS, 0) != 1
         self.axis = 0 if along_first else 1
         self.prompts_per_call = self.network.fixed_axis(POINTS, self.axis)
         if self.axis == 0 and self.network.providers[0] == CPU:
-            self.prompts_per_call = (
-                1  # 8 prompts, each with its own copy of the image, take 1.6 times as long
-            )
+            # each of 8 prompts in a call, with its own copy of the image, takes 1.6 times as long
+            self.prompts_per_call = 1
 
     def _needs_boxes(self) -> bool:
         """Return whether the network accepts only a fixed number of boxes, and its results depend on them."""

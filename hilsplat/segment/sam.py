@@ -107,8 +107,6 @@ class SamModel:
         self.own = own_thresholds(model)
         self.stretches = model.layout == "sam2"
         self.digest = model.digest
-        self._graph = graph = self._rowwise_encoder()
-        self.encoder = model.network("vision_encoder", graph)
         self.decoder = DecoderNetwork(model, DECODER)
         if PREVIEW in model.networks:
             self.previewer = DecoderNetwork(model, PREVIEW)
@@ -121,11 +119,14 @@ class SamModel:
         self.mean = np.array(preprocessing.get("image_mean", (0.485, 0.456, 0.406)), dtype=np.float32)
         self.std = np.array(preprocessing.get("image_std", (0.229, 0.224, 0.225)), dtype=np.float32)
         self.rescale = np.float32(preprocessing.get("rescale_factor", 1 / 255))
-        features = self._require_repeatable()
+        self._graph, self.encoder = self._open_encoder()
+        features = self._random_features()
+        for decoder in filter(None, (self.decoder, self.previewer)):
+            decoder.require_repeatable(features, self.padded_hw[0])
         if self.previewer is None and self.decoder.network.providers[0] == CPU:
             cost = "each prompt takes about 6 times as long"
             self.factored = or_as_exported(model.networks[DECODER], cost, lambda: self._factor(features))
-        self.as_exported = self.factored is None or (graph is None and not self.stretches)
+        self.as_exported = self.factored is None or (self._graph is None and not self.stretches)
 
     def choose_precision(
         self, precision: str, images: Sequence[UInt8[np.ndarray, "H W 3"]], cache: Path, threads: int = 1
@@ -162,35 +163,38 @@ class SamModel:
         exact = [name for name in self.encoder.outputs if name == "image_positional_embeddings"]
         return int8_network(self.model, "vision_encoder", cache, self._graph, exact)
 
-    def _rowwise_encoder(self) -> Graph | None:
-        """Return a ViT's graph with row-wise global attention; None for other encoders or on a GPU."""
+    def _open_encoder(self) -> tuple[Graph | None, Network]:
+        """Return the encoder, and its graph if a ViT's global attention is computed row by row on a CPU."""
         vision, path = self.model.config.get("vision_config"), self.model.networks["vision_encoder"]
+        pixels = np.random.default_rng(0).standard_normal((1, 3, *self.padded_hw), np.float32)
+
+        def opened(graph: Graph | None) -> tuple[Graph | None, Network]:
+            network = self.model.network("vision_encoder", graph)
+            form = "as exported" if graph is None else "row-wise"
+            require_repeatable_once(self.model, network, form, {"pixel_values": pixels})
+            return graph, network
+
         if self.stretches or not isinstance(vision, dict) or execution_providers()[0] != CPU:
-            return None
+            return opened(None)
         layers = vision.get("global_attn_indexes", (2, 5, 8, 11))
         heads = vision.get("num_attention_heads", 12)
         side = vision.get("image_size", 1024) // vision.get("patch_size", 16)
         cost = "each image takes about 5 times as much memory"
-        return or_as_exported(path, cost, lambda: with_rowwise_attention(path, layers, heads, side))
+        found = or_as_exported(path, cost, lambda: opened(with_rowwise_attention(path, layers, heads, side)))
+        return found or opened(None)
 
-    def _require_repeatable(self) -> dict[str, np.ndarray]:
-        """Raise a ModelError if results for the same input differ; return random image features."""
+    def _random_features(self) -> dict[str, np.ndarray]:
+        """Return random image features; the encoder runs only if no network declares their shapes."""
         rng = np.random.default_rng(0)
-        pixels = rng.standard_normal((1, 3, *self.padded_hw), np.float32)
-        require_repeatable_once(self.model, self.encoder, {"pixel_values": pixels})
         shapes = {
             name: tuple(network.fixed_axis(name, axis) or 0 for axis in (1, 2, 3))
             for network in (self.encoder, self.decoder.network)
             for name in self.encoder.spec.outputs
         }
         if all(map(all, shapes.values())):
-            features = {name: rng.standard_normal((1, *shape), np.float32) for name, shape in shapes.items()}
-        else:  # neither network declares its shapes
-            found = self.encoder(pixel_values=pixels)
-            features = dict(zip(self.encoder.spec.outputs, found, strict=True))
-        for decoder in filter(None, (self.decoder, self.previewer)):
-            decoder.require_repeatable(features, self.padded_hw[0])
-        return features
+            return {name: rng.standard_normal((1, *shape), np.float32) for name, shape in shapes.items()}
+        found = self.encoder(pixel_values=rng.standard_normal((1, 3, *self.padded_hw), np.float32))
+        return dict(zip(self.encoder.spec.outputs, found, strict=True))
 
     def _factor(self, features: Mapping[str, np.ndarray]) -> FactoredDecoder:
         """Return the factored decoder; raise an exception if factoring or the comparison fails."""

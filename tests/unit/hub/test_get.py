@@ -5,6 +5,7 @@ import hashlib
 import json
 import re
 import shutil
+import threading
 import time
 from email.utils import formatdate
 from pathlib import Path
@@ -19,7 +20,7 @@ from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import DiskSpaceError, DownloadError, ModelError
 from hilsplat.embed.clip import ClipModel
 from hilsplat.embed.model_check import check_models
-from hilsplat.hub import get
+from hilsplat.hub import catalogue, get
 from hilsplat.hub.get import get_models
 from hilsplat.hub.pins import pins
 from hilsplat.hub.retries import retry_after_s
@@ -203,10 +204,46 @@ def test_a_date_in_retry_after_is_a_time_from_now():
 
 def test_a_truncated_file_is_refused_after_a_few_tries(hub, waits):
     hub.truncated[ENCODER] = 1000
-    with pytest.raises(DownloadError, match=r"shorter than announced(.|\n)*mirror truncates files"):
+    with pytest.raises(DownloadError, match=r"announced length(.|\n)*mirror truncates files"):
         get_models(["sam-vit-base"])
     hub.truncated.clear()
     assert "kind       sam" in get_models(["sam-vit-base"])
+
+
+def test_a_hub_that_never_answers_is_reported(hub, monkeypatch, waits):
+    monkeypatch.setattr(catalogue, "TIMEOUT_S", 0.2)
+    monkeypatch.setattr(hub, "info", lambda repository: threading.Event().wait(1) or {})
+    with pytest.raises(DownloadError, match=r"ReadTimeout, http\S+ is unreachable"):
+        get_models(["sam-vit-base"])
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (lambda info: b"<html>sign in</html>", "JSONDecodeError"),
+        (lambda info: b"[1]", "TypeError"),
+        (lambda info: {**info, "siblings": [3]}, "AttributeError|TypeError"),
+        (lambda info: {**info, "siblings": [{"size": 3}]}, "KeyError"),
+    ],
+)
+def test_an_answer_that_is_no_listing_is_refused(hub, monkeypatch, change, found):
+    changed = change(hub.info(SAM))
+    monkeypatch.setattr(hub, "info", lambda repository: changed)
+    with pytest.raises(DownloadError, match=rf"sent no listing of {SAM}\n  found +({found})"):
+        get_models(["sam-vit-base"])
+
+
+def test_a_loop_of_redirections_is_reported(hub, waits):
+    hub.refusals["/api/"] = [Refusal(307, {"Location": f"{hub.endpoint}/api/models/{SAM}"})] * 100
+    with pytest.raises(DownloadError, match=r"cannot be downloaded: TooManyRedirects"):
+        get_models(["sam-vit-base"])
+
+
+def test_escape_sequences_of_the_hub_do_not_reach_the_terminal(hub, caplog):
+    caplog.set_level("INFO")
+    hub.licences[SAM] = "mit\x1b]0;title\x07"
+    get_models(["sam-vit-base"])
+    assert "licence: mit]0;title" in caplog.text and "\x1b" not in caplog.text
 
 
 def test_a_slow_transfer_completes(hub, repositories):
