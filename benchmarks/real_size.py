@@ -68,8 +68,8 @@ def export_sam2(out: Path) -> None:
     model = kind.model()
     with torch.no_grad():
         for parameter in model.parameters():
-            if not parameter.any():
-                parameter.normal_(0, 0.02)
+            if (parameter == parameter.flatten()[0]).all():  # onnxslim would merge equal weights
+                parameter += 0.02 * torch.randn_like(parameter)
     export_sam2(kind, model, out)
 
 

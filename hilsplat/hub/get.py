@@ -40,6 +40,7 @@ from hilsplat.hub.catalogue import (
     Listing,
     ModelRequest,
     choose_files,
+    printable,
     read_cached_listing,
     read_listing,
     usual_files,
@@ -273,7 +274,7 @@ def _download(listing: Listing, file: HubFile, staging: Path) -> None:
             raise
         raise DownloadError(
             f"{file.path} of {listing.repository} cannot be downloaded by Xet",
-            found=str(error).splitlines()[0],
+            found=printable(error),
             fix="transfer it by HTTP: unset HF_HUB_DISABLE_XET, then run the command again",
         ) from error
 
@@ -353,7 +354,7 @@ def _refused(
     error: requests.HTTPError, response: requests.Response, repository: str, place: str
 ) -> DownloadError:
     """Return the error for a response with a status other than 2xx; `place` is the repository's page."""
-    status, found = f"({response.status_code} {response.reason})", str(response.url)
+    status, found = f"({response.status_code} {printable(response.reason)})", str(response.url)
     if isinstance(error, GatedRepoError):
         problem = f"{repository} requires you to accept its terms before downloading {status}"
         fix = f"accept them at {place}, run `hf auth login` or set HF_TOKEN, and run the command again"
@@ -362,7 +363,7 @@ def _refused(
         fix = f"correct the name (hilsplat models list), or log in (`hf auth login`, HF_TOKEN) to use {place}"
     elif response.status_code == requests.codes.too_many_requests:
         problem = f"the hub refused {repository}: too many requests {status}"
-        found = f"Retry-After: {response.headers.get('Retry-After', 'not stated')}"
+        found = f"Retry-After: {printable(response.headers.get('Retry-After', 'not stated'))}"
         fix = f"run the command again later ({KEPT}); `hf auth login` or HF_TOKEN raises the limit"
     elif response.status_code in (requests.codes.unauthorized, requests.codes.forbidden):
         problem = f"the hub denies access to {repository} {status}"

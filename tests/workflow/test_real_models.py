@@ -43,7 +43,9 @@ def test_get_new_run_and_query(project: Path, plain: Project, tmp_path: Path) ->
         serve(hub, project, tmp_path / "hub")
         where = {"HF_ENDPOINT": hub.endpoint, "HF_HOME": str(tmp_path / "home")}
         hub.cuts["vision_encoder.onnx"] = [2_000_000]
-        printed = plain.hilsplat("models", "get", HF_HUB_OFFLINE="0", **where)
+        for name in RECOMMENDED:  # the pinned commits have other files
+            words = ("models", "get", name, "--revision", "main")
+            printed = plain.hilsplat(*words, HF_HUB_OFFLINE="0", **where)
         assert len(hub.ranges("vision_encoder.onnx")) == 2
     assert "photographs use sam2.1-hiera-small and clip-vit-base-patch16" in printed
     told = plain.hilsplat("new", "desk", "photographs")
