@@ -39,23 +39,24 @@ SIZES = {
 
 
 def export_sam(size: str, out: Path) -> None:
-    """Export a SAM with random weights in the layout of the Hugging Face ONNX exports."""
+    """Export a SAM with random weights and the signature of the published files."""
     import torch
     import transformers
-    from optimum.exporters.onnx import main_export
+
+    from tests.published_models.exports import DECODER, export_sam, slim
 
     torch.manual_seed(0)
     config = transformers.SamConfig(transformers.SamVisionConfig(**SIZES[size]).to_dict())
-    model = transformers.SamModel(config)
+    model = transformers.SamModel._from_config(config, attn_implementation="eager").eval()
     # Zero-initialised positions and biases would give denormal numbers in the padding of an image. Arithmetic
     # on denormal numbers takes several times as long.
     with torch.no_grad():
         for parameter in model.parameters():
-            if not parameter.any():
-                parameter.normal_(0, 0.02)
-    model.save_pretrained(out / "torch")
-    transformers.SamImageProcessor().save_pretrained(out / "torch")
-    main_export(str(out / "torch"), output=out, task="feature-extraction", do_validation=False)
+            if (parameter == parameter.flatten()[0]).all():
+                parameter.add_(torch.randn_like(parameter), alpha=0.02)
+    export_sam(model, out)
+    slim(out / DECODER)
+    transformers.SamImageProcessor().save_pretrained(out)
 
 
 def export_sam2(out: Path) -> None:
@@ -69,7 +70,7 @@ def export_sam2(out: Path) -> None:
     with torch.no_grad():
         for parameter in model.parameters():
             if (parameter == parameter.flatten()[0]).all():  # onnxslim would merge equal weights
-                parameter += 0.02 * torch.randn_like(parameter)
+                parameter.add_(torch.randn_like(parameter), alpha=0.02)
     export_sam2(kind, model, out)
 
 

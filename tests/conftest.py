@@ -71,3 +71,10 @@ def own_log() -> Iterator[None]:
     before = list(logging.getLogger().handlers)
     yield
     logging.getLogger().handlers[:] = before
+
+
+@pytest.fixture(autouse=True)
+def cache_folder_of_tests(monkeypatch, tmp_path_factory) -> None:
+    """Keep what is remembered about networks out of the user's cache folder."""
+    folder = tmp_path_factory.getbasetemp() / "user-cache"
+    monkeypatch.setattr("platformdirs.user_cache_path", lambda name: folder)

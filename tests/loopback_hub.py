@@ -48,6 +48,7 @@ class LoopbackHub:
     held: dict[str, int] = field(default_factory=dict)  # part of a path -> bytes before its next answer waits
     reached: threading.Event = field(default_factory=threading.Event)  # set while an answer waits
     released: threading.Event = field(default_factory=threading.Event)  # lets a waiting answer go on
+    is_lenient: bool = False  # answers every revision with the current commit
     drip_s: float = 0.0  # pause after each 64 KiB of a large file
     ranged: bool = True  # False: ignore Range headers and send whole files, as some mirrors do
     asked: list[tuple[str, str, str]] = field(default_factory=list)  # method, path and Range header
@@ -105,7 +106,7 @@ def handler_of(hub: LoopbackHub) -> type[BaseHTTPRequestHandler]:
         def listing(self, repository: str, revision: str | None) -> None:
             if repository not in hub.repositories:
                 self.answer(401, b"", **{"X-Error-Code": "RepoNotFound"})
-            elif revision not in (None, "main", hub.commit(repository)):
+            elif not hub.is_lenient and revision not in (None, "main", hub.commit(repository)):
                 self.answer(404, b"", **{"X-Error-Code": "RevisionNotFound"})
             else:
                 found = hub.info(repository)

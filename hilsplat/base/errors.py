@@ -46,6 +46,12 @@ def system_error(error: BaseException) -> HilsplatError | None:
     )
 
 
+def first_line(error: object) -> str:
+    """Return the first line of an error from elsewhere, without unprintable characters, or its type."""
+    lines = str(error)[:1000].strip().splitlines() or [type(error).__name__]
+    return "".join(letter for letter in lines[0] if letter.isprintable())[:200]
+
+
 def require_working_directory() -> None:
     """Raise HilsplatError if the working directory was deleted."""
     try:

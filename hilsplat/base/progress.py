@@ -32,14 +32,14 @@ def last_progress(log: Path) -> tuple[str, int, int] | None:
 
 
 def warnings_in(log: Path) -> list[str]:
-    """Return the warnings in the last `LOG_TAIL_BYTES` of a stage's log."""
-    return [found["text"].rstrip() for found in WARNING.finditer(_tail(log))]
+    """Return the warnings in a stage's log."""
+    return [found["text"].rstrip() for found in WARNING.finditer(_tail(log, sys.maxsize))]
 
 
-def _tail(log: Path) -> str:
+def _tail(log: Path, num_bytes: int = LOG_TAIL_BYTES) -> str:
     try:
         with log.open("rb") as stream:
-            stream.seek(max(0, stream.seek(0, os.SEEK_END) - LOG_TAIL_BYTES))
+            stream.seek(max(0, stream.seek(0, os.SEEK_END) - num_bytes))
             return stream.read().decode("utf-8", errors="replace")
     except OSError:  # the job has not created the log yet
         return ""

@@ -14,6 +14,7 @@ from hilsplat.base.errors import MisalignedArtifactError, ModelError
 from hilsplat.base.files import INSTALLED
 from hilsplat.models.folder import WHOLE_COPY, ModelFolder, input_side_px, open_model_folder
 from hilsplat.models.network import Network, require_one_space
+from hilsplat.models.repeatable import require_repeatable_once
 from hilsplat.models.store import MODELS, user_models
 from hilsplat.segment.crops import crop_to_square
 from hilsplat.segment.masks import HierarchicalMasks
@@ -63,6 +64,7 @@ class ClipModel:
             self.tokenizer.enable_padding(length=self.max_tokens, pad_id=self._pad_id(text_config))
         else:
             self.tokenizer.no_padding()
+        require_repeatable_once(model, self.text, "as exported", self._tokens("object, things, stuff"))
 
     @cached_property
     def vision(self) -> Network:
@@ -71,6 +73,8 @@ class ClipModel:
         (vector,) = opened.spec.outputs
         widths = opened.fixed_axis(vector, 1), self.text.fixed_axis(self.words, 1)
         require_one_space(self.model.folder, *widths)
+        crop = np.random.default_rng(0).standard_normal((1, 3, self.side_px, self.side_px), np.float32)
+        require_repeatable_once(self.model, opened, "as exported", {next(iter(opened.spec.inputs)): crop})
         return opened
 
     @property
@@ -190,13 +194,16 @@ class ClipModel:
         sentence = self.template.replace("{}", text)
         if self.siglip:  # trained on lower-case texts
             sentence = sentence.lower()
-        encoding = self.tokenizer.encode(sentence)
-        if encoding.overflowing:
+        if self.tokenizer.encode(sentence).overflowing:
             logger.warning("text truncated after %d tokens: %r", self.max_tokens, text)
-        mask = np.array([encoding.attention_mask], dtype=np.int64)
-        ids = np.array([encoding.ids], dtype=np.int64)
-        (vector,) = self.text(**{self.ids: ids, "attention_mask": mask})
+        (vector,) = self.text(**self._tokens(sentence))
         return unit(vector)[0]
+
+    def _tokens(self, sentence: str) -> dict[str, np.ndarray]:
+        """Return the text network's inputs for one sentence."""
+        encoding = self.tokenizer.encode(sentence)
+        mask, ids = (np.array([each], dtype=np.int64) for each in (encoding.attention_mask, encoding.ids))
+        return {self.ids: ids, "attention_mask": mask}
 
 
 def unit(vectors: Float32[np.ndarray, "N C"]) -> Float32[np.ndarray, "N C"]:

@@ -13,7 +13,7 @@ from huggingface_hub.utils import validate_repo_id
 from huggingface_hub.utils.sha import git_hash
 
 from hilsplat.base.artifacts import parse_json, sha256_of_file
-from hilsplat.base.errors import DownloadError
+from hilsplat.base.errors import DownloadError, first_line
 from hilsplat.hub.pins import pins
 from hilsplat.hub.retries import repeated
 from hilsplat.models.layouts import LAYOUTS, SUPPORTED, layout_of
@@ -124,7 +124,7 @@ def read_listing(repository: str, revision: str | None) -> Listing:
     Raises:
         requests.RequestException: the hub is unreachable, busy or denies access.
         OfflineModeIsEnabled: HF_HUB_OFFLINE is set.
-        DownloadError: the answer is no listing, or it lacks the size or digest of a file.
+        DownloadError: the response is not a listing, or it lacks the size or digest of a file.
     """
 
     def request() -> ModelInfo:
@@ -137,8 +137,8 @@ def read_listing(repository: str, revision: str | None) -> Listing:
         if isinstance(error, OSError) and not isinstance(error, requests.exceptions.JSONDecodeError):
             raise  # a refusal of the hub
         raise DownloadError(
-            f"{constants.ENDPOINT} sent no listing of {repository}",
-            found=f"{type(error).__name__}: {printable(error)}",
+            f"{constants.ENDPOINT} sent an invalid listing of {repository}",
+            found=f"{type(error).__name__}: {first_line(error)}",
             fix="unset HF_ENDPOINT, or set it to a complete mirror; a proxy may also have answered",
         ) from error
     known, files = _pinned_digests(repository, str(info.sha)), {}
@@ -150,13 +150,8 @@ def read_listing(repository: str, revision: str | None) -> Listing:
             problem = f"{constants.ENDPOINT} reports no size or digest for {each.rfilename} (?blobs=true)"
             raise DownloadError(problem, fix="unset HF_ENDPOINT, or set it to a complete mirror")
         files[each.rfilename] = HubFile(each.rfilename, each.size, digest)
-    licence = printable(getattr(info.card_data, "license", None) or "")
-    return Listing(repository, printable(info.sha), licence, files)
-
-
-def printable(foreign: object) -> str:
-    """Return the first 80 printable characters of a text from the hub, which may contain anything."""
-    return "".join(letter for letter in str(foreign)[:1000] if letter.isprintable())[:80]
+    licence = getattr(info.card_data, "license", None)
+    return Listing(repository, str(info.sha), first_line(licence) if licence else "", files)
 
 
 def read_cached_listing(repository: str, revision: str | None) -> Listing | None:

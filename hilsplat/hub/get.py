@@ -30,7 +30,7 @@ from hilsplat.base.artifacts import (
     work_folder,
     write_json,
 )
-from hilsplat.base.errors import DownloadError, ModelError
+from hilsplat.base.errors import DownloadError, ModelError, first_line
 from hilsplat.base.progress import track
 from hilsplat.embed.model_check import check_model
 from hilsplat.hub.catalogue import (
@@ -40,7 +40,6 @@ from hilsplat.hub.catalogue import (
     Listing,
     ModelRequest,
     choose_files,
-    printable,
     read_cached_listing,
     read_listing,
     usual_files,
@@ -48,6 +47,7 @@ from hilsplat.hub.catalogue import (
 from hilsplat.hub.pins import pins
 from hilsplat.hub.retries import WRONG_LENGTH, reason_of, repeated
 from hilsplat.models.folder import ModelFolder, input_side_px, preprocessing_of
+from hilsplat.models.int8 import LARGE_BYTES
 from hilsplat.models.layouts import LAYOUTS, layout_of
 from hilsplat.models.memory import needs
 from hilsplat.models.onnx_graph import external_files, split_clip, whole_clip
@@ -81,6 +81,7 @@ class Prepared:
     choice: Choice
     staging: Path  # folder of the download; kept after a failure, for resuming
     target: Path
+    variant: str  # suffix of the networks; empty for full precision
 
     def num_bytes(self, *, missing: bool = False) -> int:
         """Return the total size of the required files, or only of those not transferred yet."""
@@ -145,6 +146,8 @@ def _is_present(requested: ModelRequest, target: Path, listing: Listing) -> bool
             found=f"{ORIGIN} of {origin['repository']}" if origin else f"no {ORIGIN}",
             fix="rename or remove that folder, then run the command again",
         )
+    if origin and origin.get("revision") != listing.revision:
+        logger.info("%s is replaced: it has commit %s", target, origin.get("revision"))
     return origin.get("revision") == listing.revision and all(
         (target / path).is_file() and (target / path).stat().st_size == size
         for path, size in origin["holds"].items()
@@ -153,12 +156,32 @@ def _is_present(requested: ModelRequest, target: Path, listing: Listing) -> bool
 
 def _listing(requested: ModelRequest, revision: str | None) -> Listing:
     """Return the listing from the hub or, if the hub is unreachable, from its cache on this machine."""
-    if revision is None and requested.repository in pins():
-        revision = pins()[requested.repository].commit
+    repository, pin = requested.repository, pins().get(requested.repository)
+    if revision is None and pin is not None:
+        revision = pin.commit
     try:
-        return read_listing(requested.repository, revision)
-    except OUT_OF_REACH:
-        cached = read_cached_listing(requested.repository, revision)
+        listing = read_listing(repository, revision)
+        if pin is not None and revision == pin.commit != listing.revision:
+            raise DownloadError(
+                f"{constants.ENDPOINT} does not serve the pinned commit of {repository}",
+                expected=revision,
+                found=first_line(listing.revision),
+                fix="use another mirror (HF_ENDPOINT), or accept its commit: --revision main",
+            )
+        return listing
+    except OUT_OF_REACH as error:
+        cached = read_cached_listing(repository, revision)
+        if (
+            cached is None
+            and pin is not None
+            and (other := read_cached_listing(repository, None)) is not None
+        ):
+            raise DownloadError(
+                f"the hub is unreachable, and its cache has another commit of {repository}",
+                expected=revision,
+                found=other.revision,
+                fix=f"accept it: hilsplat models get {requested.name} --revision main",
+            ) from error
         if cached is None:
             raise
         logger.info("the hub is unreachable; %s is read from the local cache", requested.repository)
@@ -170,7 +193,7 @@ def _prepare(requested: ModelRequest, listing: Listing, target: Path, variant: s
     staging = target.with_name(f".{target.name}.part")
     (config,) = listing.require("config.json")
     choice = choose_files(listing, _fetch(listing, config, staging).read_bytes(), variant)
-    found = Prepared(requested, listing, choice, staging, target)
+    found = Prepared(requested, listing, choice, staging, target, variant)
     licence = requested.release.licence if requested.release else "not stated by the hub"
     source = f"{requested.name}: {requested.repository} at {listing.revision[:12]}"
     size = f"{found.num_bytes() / 1e6:.1f} MB in {len(choice.files)} files"
@@ -190,9 +213,13 @@ def _needs(found: Prepared) -> str:
     (file,) = found.listing.require(LAYOUTS[layout].preprocessing)
     preprocessing = preprocessing_of(_fetch(found.listing, file, found.staging))
     model = ModelFolder(found.staging, layout, config, preprocessing, {}, ())
-    num_bytes = found.num_bytes()
-    memory_mib = needs(layout, config, input_side_px(model), num_bytes, BATCHES[model.kind]).total_mib(1)
-    disk = f"needs up to {(1 + INT8_SHARE) * num_bytes / 1e6:.0f} MB of disk space with its int8 networks"
+    num_bytes, is_reduced = found.num_bytes(), bool(found.variant)
+    memory = needs(
+        layout, config, input_side_px(model), num_bytes, BATCHES[model.kind], as_exported=is_reduced
+    )
+    memory_mib, has_int8 = memory.total_mib(1), not is_reduced and num_bytes <= LARGE_BYTES
+    disk = f"needs {num_bytes * (1 + INT8_SHARE * has_int8) / 1e6:.0f} MB of disk space"
+    disk += " with its int8 networks" * has_int8
     export = f"; its export needs about {3 * num_bytes / 1e9:.1f} GB" if found.choice.exported else ""
     return f"{disk}, and about {memory_mib * 2**20 / 1e9:.1f} GB of memory on a CPU{export}"
 
@@ -274,7 +301,7 @@ def _download(listing: Listing, file: HubFile, staging: Path) -> None:
             raise
         raise DownloadError(
             f"{file.path} of {listing.repository} cannot be downloaded by Xet",
-            found=printable(error),
+            found=first_line(error),
             fix="transfer it by HTTP: unset HF_HUB_DISABLE_XET, then run the command again",
         ) from error
 
@@ -340,7 +367,7 @@ def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
         if str(error).startswith(WRONG_LENGTH):
             raise DownloadError(
                 f"{requested.repository} cannot be downloaded: a file does not have the announced length",
-                found=str(error).splitlines()[0],
+                found=first_line(error),
                 fix="run the command again; if the error persists, a proxy or mirror truncates files",
             ) from error
         if error.filename is None:
@@ -354,7 +381,7 @@ def _refused(
     error: requests.HTTPError, response: requests.Response, repository: str, place: str
 ) -> DownloadError:
     """Return the error for a response with a status other than 2xx; `place` is the repository's page."""
-    status, found = f"({response.status_code} {printable(response.reason)})", str(response.url)
+    status, found = f"({response.status_code} {first_line(response.reason)})", str(response.url)
     if isinstance(error, GatedRepoError):
         problem = f"{repository} requires you to accept its terms before downloading {status}"
         fix = f"accept them at {place}, run `hf auth login` or set HF_TOKEN, and run the command again"
@@ -363,7 +390,7 @@ def _refused(
         fix = f"correct the name (hilsplat models list), or log in (`hf auth login`, HF_TOKEN) to use {place}"
     elif response.status_code == requests.codes.too_many_requests:
         problem = f"the hub refused {repository}: too many requests {status}"
-        found = f"Retry-After: {printable(response.headers.get('Retry-After', 'not stated'))}"
+        found = f"Retry-After: {first_line(response.headers.get('Retry-After', 'not stated'))}"
         fix = f"run the command again later ({KEPT}); `hf auth login` or HF_TOKEN raises the limit"
     elif response.status_code in (requests.codes.unauthorized, requests.codes.forbidden):
         problem = f"the hub denies access to {repository} {status}"
@@ -381,7 +408,7 @@ def _innermost(error: BaseException) -> str:
     """Return the message of an error's root cause."""
     while (cause := error.__cause__ or error.__context__) is not None:
         error = cause
-    return str(error) or type(error).__name__
+    return first_line(error)
 
 
 def require_exporter(what: str) -> None:

@@ -10,6 +10,8 @@ from typing import TypeVar
 import requests
 from huggingface_hub.errors import LocalEntryNotFoundError, OfflineModeIsEnabled
 
+from hilsplat.base.errors import first_line
+
 logger = logging.getLogger(__name__)
 
 WAITS_S = (1.0, 2.0, 4.0, 8.0)
@@ -36,8 +38,7 @@ def repeated(what: str, request: Callable[[], Result]) -> Result:
             pause_s = _pause_s(error, wait_s)
             if pause_s is None:
                 raise
-            problem = str(reason_of(error)) or type(error).__name__
-            logger.info("%s: %s; retrying in %g s", what, problem.splitlines()[0], pause_s)
+            logger.info("%s: %s; retrying in %g s", what, first_line(reason_of(error)), pause_s)
             time.sleep(pause_s)
     return request()
 

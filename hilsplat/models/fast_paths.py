@@ -5,6 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
+from hilsplat.base.errors import first_line
+
 logger = logging.getLogger(__name__)
 
 Fast = TypeVar("Fast")
@@ -20,6 +22,5 @@ def or_as_exported(network: Path, cost: str, prepare: Callable[[], Fast]) -> Fas
     try:
         return prepare()
     except Exception as error:  # exporters write many forms of graphs, and each of them can run as exported
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        logger.warning("%s runs as exported, and %s: %s", network, cost, reason)
+        logger.warning("%s runs as exported, and %s: %s", network, cost, first_line(error))
         return None

@@ -11,9 +11,10 @@ from jaxtyping import Bool, Float
 
 from hilsplat.base.artifacts import ViewCache, atomic_path, sha256_of_json
 from hilsplat.models.fast_paths import or_as_exported
-from hilsplat.models.folder import ModelFolder, external_weights
+from hilsplat.models.folder import ModelFolder, external_weights, input_side_px
 from hilsplat.models.network import CPU, Network, execution_providers
 from hilsplat.models.onnx_graph import Graph, needed_names
+from hilsplat.models.repeatable import require_repeatable_once
 
 logger = logging.getLogger(__name__)
 
@@ -76,7 +77,11 @@ def int8_network(
                 "quantising %s of %s, which takes a few seconds; the result is kept", name, model.folder
             )
             _quantise(source, path, exact)
-        return model.network(name, path)
+        network = model.network(name, path)
+        side = input_side_px(model)
+        pixels = np.random.default_rng(0).standard_normal((1, 3, side, side), np.float32)
+        require_repeatable_once(model, network, "int8", {next(iter(network.spec.inputs)): pixels})
+        return network
 
     return or_as_exported(model.networks[name], "each image takes about twice as long", prepare)
 

@@ -1,6 +1,8 @@
 """Open, check and run a network of a model folder."""
 
+import contextlib
 import ctypes
+import io
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -12,16 +14,13 @@ from typing import Any
 import numpy as np
 import onnxruntime
 
-from hilsplat.base.errors import ModelError
+from hilsplat.base.errors import ModelError, first_line
 from hilsplat.models.layouts import Axes, NetworkSpec
-from hilsplat.models.onnx_graph import Graph, has_external_weights
+from hilsplat.models.onnx_graph import Graph, has_external_weights, refuse_pointer
 
 logger = logging.getLogger(__name__)
 
 EXPORT_AGAIN = "export the model in the layout of the Hugging Face ONNX exports"
-POINTER_BYTES = 1024
-"""Size below which a file may be a pointer from a clone without Git LFS."""
-
 DTYPES = {
     "tensor(float)": np.float32,
     "tensor(float16)": np.float16,
@@ -32,6 +31,7 @@ DTYPES = {
 
 
 CPU, CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
+SILENT, WARNINGS = 4, 2  # severities of onnxruntime's log
 OVERWRITTEN = (
     "onnxruntime-gpu was overwritten by onnxruntime; run pip uninstall onnxruntime onnxruntime-gpu, then "
     "pip install onnxruntime-gpu"
@@ -62,12 +62,16 @@ def cuda_provider_problem() -> str | None:
             return OVERWRITTEN
         return "onnxruntime is built without CUDA"
     try:
-        onnxruntime.preload_dlls()  # CUDA and cuDNN as installed with torch
+        onnxruntime.set_default_logger_severity(SILENT)  # the problem is reported below
+        with contextlib.redirect_stdout(io.StringIO()):
+            onnxruntime.preload_dlls()  # CUDA and cuDNN as installed with torch
         session = one_thread_session(_identity(), (CUDA, CPU))
         session.run(None, {"x": np.zeros(1, np.float32)})
         problem = None if session.get_providers()[0] == CUDA else _missing_library()
     except Exception as error:  # onnxruntime's errors share no public base class
-        problem = str(error).splitlines()[0]
+        problem = first_line(error)
+    finally:
+        onnxruntime.set_default_logger_severity(WARNINGS)
     if problem:
         logger.warning("onnxruntime runs on the CPU, because CUDA cannot be used: %s", problem)
     return problem
@@ -128,18 +132,15 @@ class Network:
         provider: str | None = None,
     ) -> None:
         self.path = path
-        if path.stat().st_size < POINTER_BYTES and path.read_bytes().startswith(b"version https://git-lfs"):
-            raise ModelError(
-                f"network {path} is a Git LFS pointer, not the network",
-                found=f"a text file of {path.stat().st_size} bytes",
-                fix="fetch the file itself: git lfs pull, or download it from the model's page",
-            )
+        refuse_pointer(path)
         try:
             source = changed or path
             if isinstance(source, Path) and has_external_weights(source):
                 source = Graph.read(source)  # onnxruntime alone refuses some links to weights
             self._weights = source.weights if isinstance(source, Graph) else {}  # the session reads them
             self.session = one_thread_session(source, [provider] if provider else execution_providers())
+        except ModelError:
+            raise
         except Exception as error:  # onnxruntime's errors share no public base class
             raise ModelError(
                 f"network {path} cannot be opened: {error}",

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hilsplat.base.artifacts import atomic_path, sha256_of_bytes, sha256_of_json
-from hilsplat.base.errors import ModelError
+from hilsplat.base.errors import ModelError, first_line
 
 WHOLE = "model.onnx"
 """Network with both halves, in the model folder itself or in its subfolder `onnx/`."""
@@ -22,6 +22,10 @@ HALVES = {
     "text_model": (["input_ids", "attention_mask"], "text_embeds"),
 }
 """Inputs and output of each half."""
+POINTER_BYTES = 1024
+"""Size below which a file may be a pointer from a clone without Git LFS."""
+SMALL_BYTES = 1024
+"""Size below which external values are stored in the network; constants of shapes must be there."""
 OPTIONAL = {"attention_mask"}
 """Inputs that a network may lack; SigLIP's text network reads the padding instead."""
 
@@ -46,20 +50,24 @@ class Graph:
         import onnx
         from google.protobuf.message import DecodeError
 
+        refuse_pointer(path)
         try:
             model = onnx.load(str(path), load_external_data=False)
-        except DecodeError as error:
-            problem = f"network {path} cannot be opened: {error}"
-            raise ModelError(problem, fix="fetch or export it again") from error
-        weights = {}
-        for tensor in tensors_of(model.graph):
-            if (place := location_of(tensor)) is None:
-                continue
-            content = _mapped(path, tensor, place)
-            if tensor.name in {each.name for each in model.graph.initializer}:
-                weights[tensor.name] = content
-            else:  # a constant of a node, which onnxruntime can't receive separately
-                _inline(tensor, content)
+            initializers = {each.name for each in model.graph.initializer}
+            weights = {}
+            for tensor in tensors_of(model.graph):
+                if (place := location_of(tensor)) is None:
+                    continue
+                content, dtype = _external_bytes(path, tensor, place), _native_dtype(tensor)
+                # constants of nodes and packed types cannot be passed to onnxruntime separately
+                if dtype is None or tensor.name not in initializers or content.size < SMALL_BYTES:
+                    _inline(tensor, content)
+                else:
+                    weights[tensor.name] = content.view(dtype).reshape(tuple(tensor.dims))
+        except (DecodeError, ValueError, KeyError, OSError) as error:
+            problem = f"network {path} cannot be opened: {first_line(error)}"
+            found = f"a file of {path.stat().st_size} bytes"
+            raise ModelError(problem, found=found, fix="fetch a complete copy, or export it again") from error
         return Graph(model, weights)
 
     def serialized(self) -> bytes:
@@ -71,11 +79,6 @@ class Graph:
         """SHA-256 of the network and its weights."""
         weights = [(name, sha256_of_bytes(value.tobytes())) for name, value in self.weights.items()]
         return sha256_of_json([sha256_of_bytes(self.serialized()), weights])
-
-    @property
-    def num_bytes(self) -> int:
-        """Size of the network and its weights."""
-        return self.model.ByteSize() + sum(value.nbytes for value in self.weights.values())
 
     def complete(self) -> Any:
         """Return a copy of the network that contains its external weights (at most 2 GiB)."""
@@ -131,22 +134,39 @@ def tensors_of(graph: Any) -> Iterator[Any]:
                 yield from tensors_of(inner)
 
 
-def _mapped(network: Path, tensor: Any, location: str) -> np.ndarray:
-    """Map the values of an external tensor into memory."""
-    import onnx
+def refuse_pointer(path: Path) -> None:
+    """Raise a ModelError if a network is a pointer from a clone without Git LFS."""
+    if path.stat().st_size < POINTER_BYTES and path.read_bytes().startswith(b"version https://git-lfs"):
+        raise ModelError(
+            f"network {path} is a Git LFS pointer, not the network",
+            found=f"a text file of {path.stat().st_size} bytes",
+            fix="fetch the file itself: git lfs pull, or download it from the model's page",
+        )
+
+
+def _external_bytes(network: Path, tensor: Any, location: str) -> np.ndarray:
+    """Map the bytes of an external tensor into memory."""
     from onnx.external_data_helper import ExternalDataInfo
 
-    info, dtype = ExternalDataInfo(tensor), onnx.helper.tensor_dtype_to_np_dtype(tensor.data_type)
-    start, size = info.offset or 0, int(np.prod(tensor.dims)) * dtype.itemsize
-    path = network.parent / location
-    if path.stat().st_size < start + size:
+    info, path = ExternalDataInfo(tensor), network.parent / location
+    start, available = info.offset or 0, path.stat().st_size
+    size = info.length or available - start
+    if available < start + size:
         raise ModelError(
             f"network {network} cannot be opened: its weights file {location} is too short",
             expected=f"at least {start + size} bytes",
-            found=f"{path.stat().st_size} bytes",
+            found=f"{available} bytes",
             fix="fetch a complete copy",
         )
-    return np.memmap(path, dtype, "r", start, tuple(tensor.dims)) if size else np.zeros(tensor.dims, dtype)
+    return np.memmap(path, np.uint8, "r", start, (size,)) if size else np.zeros(0, np.uint8)
+
+
+def _native_dtype(tensor: Any) -> np.dtype | None:
+    """Return a tensor's type if numpy has it, else None (such as bfloat16 and packed 4-bit integers)."""
+    import onnx
+
+    dtype = onnx.helper.tensor_dtype_to_np_dtype(tensor.data_type)
+    return dtype if dtype.kind in "fiub" and dtype.isbuiltin else None
 
 
 def _inline(tensor: Any, content: np.ndarray) -> None:
@@ -285,7 +305,7 @@ def with_rowwise_attention(path: Path, layers: Iterable[int], heads: int, side: 
 
 
 def _readers(graph: Any, value: str) -> list[Any]:
-    """Return the nodes that read a value, in place of casts their readers."""
+    """Return the nodes that read a value, directly or after casts."""
     found = []
     for node in graph.node:
         if value in node.input:

@@ -1,13 +1,12 @@
 """A check that a network returns the same results for the same input."""
 
-import os
 from collections.abc import Mapping
 
 import numpy as np
 import onnxruntime
 
-from hilsplat.base.artifacts import sha256_of_json, write_json
 from hilsplat.base.errors import ModelError
+from hilsplat.base.remembered import remembered
 from hilsplat.models.folder import ModelFolder
 from hilsplat.models.network import Network
 
@@ -20,8 +19,8 @@ def require_repeatable(
 ) -> None:
     """Raise a ModelError if a network's results for `feeds` change after a run with `other` inputs.
 
-    A network that reads memory that it never wrote often repeats its last results, so a run with other inputs
-    comes between the two.
+    Between the two runs, the network runs on `other`, because a network that reads memory that it never wrote
+    may repeat its last results.
     """
     first, _, second = network(**feeds), network(**other), network(**feeds)
     for name, before, after in zip(network.spec.outputs, first, second, strict=True):
@@ -38,14 +37,11 @@ def require_repeatable(
 def require_repeatable_once(
     model: ModelFolder, network: Network, form: str, feeds: Mapping[str, np.ndarray]
 ) -> None:
-    """Apply `require_repeatable` to a form of a slow network, once for each version of onnxruntime.
+    """Apply `require_repeatable` to a form of a slow network, once for each version of onnxruntime."""
 
-    The result is kept in `.checked` beside the model folder, unless that place is read-only.
-    """
-    beside = model.folder.parent
-    key = sha256_of_json([model.digest, network.path.name, form, onnxruntime.__version__, network.providers])
-    place = beside / ".checked" / key
-    if not place.is_file():
-        require_repeatable(network, feeds, {name: -value for name, value in feeds.items()})
-        if os.access(beside, os.W_OK):
-            write_json(place, {"model": model.folder.name, "network": network.path.name})
+    def examine() -> str:
+        require_repeatable(network, feeds, {name: np.flip(value, axis=-1) for name, value in feeds.items()})
+        return "repeatable"
+
+    key = [model.digest, network.path.name, form, onnxruntime.__version__, network.providers]
+    remembered("networks", key, examine)

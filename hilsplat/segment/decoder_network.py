@@ -31,16 +31,19 @@ class DecoderNetwork:
         self.graph = alone or self.graph
         self.network = model.network(name, alone)
         self.pads = alone is not None and not reads_through(self.graph, LABELS, ("Concat", "Pad"))
-        if self._needs_boxes() or (self.pads and LABELS not in self.network.inputs):
+        problem = "requires a box with each prompt" if self._needs_boxes() else ""
+        if self.pads and LABELS not in self.network.inputs:
+            problem = f"accepts boxes, but no {LABELS}"
+        if problem:
             raise ModelError(
-                f"network {self.network.path} requires a box with each prompt",
-                expected=f"a decoder for points with {LABELS}, with or without boxes",
+                f"network {self.network.path} {problem}",
+                expected=f"a decoder for {POINTS} and {LABELS}, with or without {BOXES}",
                 fix="use another model or variant (docs/models.md)",
             )
         along_first = self.network.fixed_axis(POINTS, 1) == 1 and self.network.fixed_axis(POINTS, 0) != 1
         self.axis = 0 if along_first else 1
         self.prompts_per_call = self.network.fixed_axis(POINTS, self.axis)
-        if self.axis == 0 and self.network.providers[0] == CPU:
+        if self.prompts_per_call is None and self.axis == 0 and self.network.providers[0] == CPU:
             # each of 8 prompts in a call, with its own copy of the image, takes 1.6 times as long
             self.prompts_per_call = 1
 

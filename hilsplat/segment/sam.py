@@ -186,9 +186,9 @@ class SamModel:
     def _random_features(self) -> dict[str, np.ndarray]:
         """Return random image features; the encoder runs only if no network declares their shapes."""
         rng = np.random.default_rng(0)
+        pair = self.encoder, self.decoder.network
         shapes = {
-            name: tuple(network.fixed_axis(name, axis) or 0 for axis in (1, 2, 3))
-            for network in (self.encoder, self.decoder.network)
+            name: tuple(max(network.fixed_axis(name, axis) or 0 for network in pair) for axis in (1, 2, 3))
             for name in self.encoder.spec.outputs
         }
         if all(map(all, shapes.values())):

@@ -87,18 +87,19 @@ def onnx() -> Iterator[Finding]:
     if version_of("onnxruntime") and version_of("onnxruntime-gpu"):
         problem = "onnxruntime and onnxruntime-gpu are both installed; their files overwrite each other"
     elif version_of("onnxruntime-gpu") and found:
-        problem = f"onnxruntime-gpu runs on the CPU: {found}"
         fix = "install the CUDA and cuDNN versions that onnxruntime-gpu requires, or pip install onnxruntime"
+        yield Finding("onnxruntime", "note", f"onnxruntime-gpu runs on the CPU: {found}", fix)
+        return
     sound = f"{onnxruntime.__version__}: sessions run on {execution_providers()[0]}"
     yield verdict("onnxruntime", problem, sound, fix)
 
 
 def cuda() -> Iterator[Finding]:
     """Check whether torch and gsplat can use CUDA, and whether their renders match the CPU's."""
-    from hilsplat.splat.rasterise.device import cuda_problem, forget
+    from hilsplat.splat.rasterise.device import cuda_problem, forget_cuda
     from hilsplat.splat.rasterise.parity import cuda_disagreement
 
-    forget()
+    forget_cuda()
     if problem := cuda_problem():
         fix = "on a machine with an NVIDIA GPU: pip install 'hilsplat[gpu]', and a CUDA toolkit (nvcc)"
         yield Finding("cuda", "note", f"{problem}: everything runs on the CPU", fix)

@@ -170,15 +170,27 @@ def test_networks_that_change_or_need_a_box_are_refused(changed, operator, words
         SamModel.load(changed(change)[0])
 
 
-def test_a_slow_encoder_is_tested_once(sam2, tmp_path, monkeypatch):
-    folder = shutil.copytree(sam2[0], tmp_path / "models/sam2")
+def test_slow_networks_are_tested_once(sam2, tmp_path, monkeypatch):
+    monkeypatch.setattr("platformdirs.user_cache_path", lambda name: tmp_path / "cache")
+    folder = shutil.copytree(sam2[0], tmp_path / "sam2")
+    ran: list[Path] = []
+    tested = repeatable.require_repeatable
+
+    def counted(network, *feeds) -> None:
+        ran.append(network.path)
+        tested(network, *feeds)
+
+    monkeypatch.setattr(repeatable, "require_repeatable", counted)
     SamModel.load(folder)
-    ran = []
-    monkeypatch.setattr(repeatable, "require_repeatable", lambda *given: ran.append(given))
-    SamModel.load(folder)
-    assert ran == [] and len(list((tmp_path / "models/.checked").iterdir())) == 1
-    (folder / "preprocessor_config.json").write_text(
-        (folder / "preprocessor_config.json").read_text().replace("0.485", "0.5")
-    )
+    assert [path.name for path in ran] == [exports.ENCODER]
     SamModel.load(folder)
     assert len(ran) == 1
+    config = folder / "preprocessor_config.json"
+    config.write_text(config.read_text().replace("0.485", "0.5"))  # another model
+    SamModel.load(folder)
+    assert len(ran) == 2
+    (tmp_path / "blocked").touch()
+    monkeypatch.setattr("platformdirs.user_cache_path", lambda name: tmp_path / "blocked")
+    SamModel.load(folder)
+    SamModel.load(folder)
+    assert len(ran) == 4

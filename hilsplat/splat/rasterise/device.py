@@ -5,21 +5,21 @@ import ctypes
 import io
 import logging
 import os
-from collections.abc import Callable
+import socket
 from functools import cache
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Literal
 
-import platformdirs
-
-from hilsplat.base.artifacts import parse_json, sha256_of_json, write_json
-from hilsplat.base.errors import DeviceError
+from hilsplat.base.errors import DeviceError, first_line
+from hilsplat.base.remembered import forget, remembered
 
 logger = logging.getLogger(__name__)
 
 Device = Literal["cpu", "cuda"]
 
+KIND = "cuda"
+"""Kind of `remembered` results about CUDA."""
+UNBUILT = "the CUDA kernels of gsplat cannot be compiled"
 ABSENT = ("gsplat is not installed", "no NVIDIA driver is installed", "torch ")
 """Beginnings of the problems of machines on which CUDA is not expected to work."""
 
@@ -41,57 +41,35 @@ def cuda_problem() -> str | None:
         if not torch.cuda.is_available():
             return f"torch {torch.__version__} finds no CUDA device"
         versions = [torch.__version__, str(torch.version.cuda), gsplat.__version__]
-        key = ["kernels", *versions, os.environ.get("PATH", "")]
-        return remembered(key, _kernels_problem) or _kernels_problem()
+        paths = [os.environ.get(name, "") for name in ("PATH", "CUDA_HOME")]
+        # a compilation that fails takes minutes, and each stage runs in its own process
+        if failure := remembered(KIND, ["build", *versions, *paths, socket.gethostname()], _build_failure):
+            return failure
+        from gsplat.cuda import _backend
+
+        if getattr(_backend, "_C", None) is None:
+            return f"{UNBUILT}, because no CUDA toolkit (nvcc) is installed"
+        return None
     except Exception as error:  # a broken installation can raise anything
-        return f"gsplat cannot be imported: {_first_line(error)}"
+        return f"gsplat cannot be imported: {first_line(error)}"
 
 
-def _kernels_problem() -> str | None:
-    """Load gsplat's kernels, which compiles them on first use; return why that fails, or None."""
+def _build_failure() -> str:
+    """Load gsplat's kernels, which compiles them on first use; return why that fails, or an empty text."""
     logger.info("loading the CUDA kernels of gsplat, which are compiled on first use, in several minutes")
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # it prints what is reported here
-            from gsplat.cuda import _backend
+            from gsplat.cuda import _backend  # noqa: F401
     except Exception as error:  # compilers, linkers and torch raise several types
-        return f"the CUDA kernels of gsplat cannot be compiled: {_first_line(error)}"
-    if getattr(_backend, "_C", None) is None:
-        return "the CUDA kernels of gsplat cannot be compiled, because no CUDA toolkit (nvcc) is installed"
-    return None
+        return f"{UNBUILT}: {first_line(error)}"
+    return ""
 
 
-def _first_line(error: Exception) -> str:
-    return str(error).splitlines()[0] if str(error) else type(error).__name__
-
-
-def remembered(key: list[str], examine: Callable[[], str | None]) -> str | None:
-    """Return the result of examining this machine, which is done once for each key (names and versions).
-
-    A compilation that fails takes minutes, and each stage runs in its own process. `forget` deletes the
-    results.
-    """
-    try:
-        known = dict(parse_json(_kept().read_bytes()))
-    except (OSError, ValueError):
-        known = {}
-    entry = sha256_of_json(key)
-    if entry not in known:
-        known[entry] = examine() or ""
-        with contextlib.suppress(OSError):
-            write_json(_kept(), known)
-    return known[entry] or None
-
-
-def forget() -> None:
+def forget_cuda() -> None:
     """Forget earlier results, so that `cuda_problem` and the self-test examine this machine again."""
-    with contextlib.suppress(OSError):
-        _kept().unlink(missing_ok=True)
+    forget(KIND)
     cuda_problem.cache_clear()
     choose_device.cache_clear()
-
-
-def _kept() -> Path:
-    return platformdirs.user_cache_path("hilsplat") / "cuda-self-test.json"
 
 
 @cache
@@ -120,10 +98,11 @@ def choose_device(requested: Literal["auto", "cpu", "cuda"]) -> Device:
         try:
             problem = cuda_disagreement()
         except Exception as error:  # drivers, torch and gsplat raise several types
-            problem = f"the self-test on CUDA failed: {_first_line(error)}"
+            problem = f"the self-test on CUDA failed: {first_line(error)}"
     device: Device = "cuda" if requested != "cpu" and not problem else "cpu"
     is_broken = problem is not None and not problem.startswith(ABSENT)
     level = logging.WARNING if is_broken else logging.INFO
-    suffix = f"; {problem}" if problem else ""
+    advice = "; after a fix, run `hilsplat doctor`" if is_broken else ""
+    suffix = f"; {problem}{advice}" if problem else ""
     logger.log(level, "rasterising on %s (device: %s%s)", device, requested, suffix)
     return device

@@ -3,10 +3,11 @@
 import numpy as np
 
 from hilsplat.base.identity import code_digest
+from hilsplat.base.remembered import remembered
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise import api
-from hilsplat.splat.rasterise.device import Device, remembered
+from hilsplat.splat.rasterise.device import KIND, Device
 
 MAX_DIFFERENCES = {"image": 1e-3, "alpha": 1e-3, "weights": 1e-3, "gradients": 1e-2}
 """Maximum differences caused by rounding. The limit for gradients is relative and covers all Gaussians."""
@@ -19,7 +20,7 @@ def cuda_disagreement() -> str | None:
 
     machine = [torch.__version__, gsplat.__version__, torch.cuda.get_device_name(), str(torch.version.cuda)]
     key = [*machine, code_digest("hilsplat.splat.rasterise.cuda", api.draw)]
-    return remembered(key, lambda: disagreement("cpu", "cuda"))
+    return remembered(KIND, ["self-test", *key], lambda: disagreement("cpu", "cuda") or "") or None
 
 
 def disagreement(one: Device, other: Device) -> str | None:

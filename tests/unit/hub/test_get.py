@@ -229,7 +229,7 @@ def test_a_hub_that_never_answers_is_reported(hub, monkeypatch, waits):
 def test_an_answer_that_is_no_listing_is_refused(hub, monkeypatch, change, found):
     changed = change(hub.info(SAM))
     monkeypatch.setattr(hub, "info", lambda repository: changed)
-    with pytest.raises(DownloadError, match=rf"sent no listing of {SAM}\n  found +({found})"):
+    with pytest.raises(DownloadError, match=rf"sent an invalid listing of {SAM}\n  found +({found})"):
         get_models(["sam-vit-base"])
 
 
@@ -273,6 +273,26 @@ def test_a_released_model_is_fetched_at_its_pinned_commit_and_with_its_digests(h
     assert visible() == []
 
 
+def test_a_mirror_with_another_commit_than_the_pinned_one_is_refused(hub, monkeypatch, tmp_path):
+    write_pins(tmp_path / "pins.tsv", (SAM, "0" * 40, "", ""))
+    pins.cache_clear()
+    monkeypatch.setattr(hub, "is_lenient", True)
+    with pytest.raises(DownloadError, match=rf"the pinned commit of {SAM}\n  expected  0{{40}}"):
+        get_models(["sam-vit-base"])
+    assert "kind       sam" in get_models(["sam-vit-base"], revision="main")
+
+
+def test_offline_a_cache_with_another_commit_than_the_pinned_one_is_named(hub, monkeypatch, tmp_path):
+    huggingface_hub.snapshot_download(CLIP, cache_dir=tmp_path / "cache")
+    write_pins(tmp_path / "pins.tsv", (CLIP, "0" * 40, "", ""))
+    pins.cache_clear()
+    set_offline(monkeypatch)
+    message = rf"another commit of {CLIP}(.|\n)*found     {hub.commit(CLIP)}(.|\n)*patch16 --revision main"
+    with pytest.raises(DownloadError, match=message):
+        get_models(["clip-vit-base-patch16"])
+    assert "kind       clip" in get_models(["clip-vit-base-patch16"], revision="main")
+
+
 def test_the_table_of_pins_covers_every_release_with_complete_hashes():
     found = pins.__wrapped__()
     assert set(found) == {release.repository for release in RELEASES}
@@ -286,7 +306,7 @@ def test_disk_and_memory_are_reported_before_the_transfer(hub, monkeypatch, capl
     monkeypatch.setattr(get.shutil, "disk_usage", lambda folder: type("Usage", (), {"free": 100})())
     with pytest.raises(DiskSpaceError):
         get_models(["sam-vit-base"])
-    assert "needs up to 1 MB of disk space with its int8 networks, and about 1.6 GB of memory" in caplog.text
+    assert "needs 1 MB of disk space with its int8 networks, and about 1.6 GB of memory" in caplog.text
     assert hub.ranges(ENCODER) == []
 
 

@@ -1,6 +1,5 @@
 """A model's files and variants, and splitting of a whole CLIP."""
 
-import os
 import shutil
 
 import numpy as np
@@ -11,9 +10,12 @@ from onnx import TensorProto, helper, numpy_helper
 
 from hilsplat.base.errors import ModelError
 from hilsplat.models.folder import external_weights, open_model_folder
+from hilsplat.models.layouts import NetworkSpec
+from hilsplat.models.network import Network
 from hilsplat.models.onnx_graph import Graph, split_clip, tensors_of
 from hilsplat.segment.sam import SamModel
 from tests.conftest import PROJECT
+from tests.published_models.exports import link
 from tests.unit.segment.handmade import move_weights, save_network
 
 TINY = PROJECT / "models/sam-tiny"
@@ -65,14 +67,7 @@ def test_a_folder_of_links_as_in_the_cache_of_the_hub_works(sam, tmp_path):
     path, weights = sam / "onnx/vision_encoder.onnx", sam / "onnx/weights.bin"
     move_weights(path, weights.name)
     expected, digest = SamModel.load(sam).encode(IMAGE).features, open_model_folder(sam).digest
-    blobs, linked = tmp_path / "blobs", tmp_path / "snapshots/model"
-    blobs.mkdir()
-    for number, file in enumerate(sorted(each for each in sam.rglob("*") if each.is_file())):
-        place = linked / file.relative_to(sam)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        file.rename(blobs / f"{number:02}")
-        place.symlink_to(os.path.relpath(blobs / f"{number:02}", place.parent))
-    model = SamModel.load(linked)
+    model = SamModel.load(link(sam, tmp_path / "hub"))
     assert model.digest == digest
     for name, value in model.encode(IMAGE).features.items():
         np.testing.assert_array_equal(value, expected[name])
@@ -84,6 +79,25 @@ def test_a_truncated_weights_file_is_refused(sam):
     weights.write_bytes(weights.read_bytes()[:-1])
     with pytest.raises(ModelError, match=r"its weights file weights.bin is too short(.|\n)*complete copy"):
         SamModel.load(sam)
+
+
+def test_external_weights_of_packed_and_other_types_are_read(tmp_path):
+    path, rng = tmp_path / "network.onnx", np.random.default_rng(0)
+    packed = helper.make_tensor("packed", TensorProto.INT4, [4000], rng.integers(-8, 8, 4000))
+    brain = helper.make_tensor("brain", TensorProto.BFLOAT16, [4000], rng.standard_normal(4000))
+    plain = numpy_helper.from_array(rng.standard_normal(4000).astype(np.float32), "plain")
+    nodes = [
+        helper.make_node("Cast", ["packed"], ["a"], to=TensorProto.FLOAT),
+        helper.make_node("Cast", ["brain"], ["b"], to=TensorProto.FLOAT),
+        helper.make_node("Sum", ["a", "b", "plain", "x"], ["y"]),
+    ]
+    values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [4000]) for name in "xy"]
+    graph = helper.make_graph(nodes, "types", values[:1], values[1:], [packed, brain, plain])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 21)], ir_version=10), path)
+    spec, x = NetworkSpec({"x": (None,)}, {"y": (None,)}), np.ones(4000, np.float32)
+    expected = Network(path, spec)(x=x)[0]
+    move_weights(path, "weights.bin")
+    np.testing.assert_array_equal(Network(path, spec)(x=x)[0], expected)
 
 
 def test_int8_networks_depend_on_external_weights(sam, tmp_path):

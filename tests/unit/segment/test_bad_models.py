@@ -15,6 +15,7 @@ from hilsplat.segment.sam import SamModel
 from tests.unit.segment.handmade import save_network
 
 ENCODER, CONFIG, PREPROCESSOR = "onnx/vision_encoder.onnx", "config.json", "preprocessor_config.json"
+DECODER = "onnx/prompt_encoder_mask_decoder.onnx"
 SAM = {"model_type": "sam"}
 LFS_POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 2548000000\n"
 
@@ -39,6 +40,8 @@ def as_torch(folder: Path) -> None:
         (written(ENCODER, b""), r"cannot be opened(.|\n)*a file of 0 bytes"),
         (written(ENCODER, b"half"), r"encoder.onnx cannot be opened(.|\n)*fetch a complete copy"),
         (written(ENCODER, LFS_POINTER), r"Git LFS pointer(.|\n)*git lfs pull"),
+        (written(DECODER, LFS_POINTER), r"Git LFS pointer(.|\n)*git lfs pull"),
+        (written(DECODER, b"half"), r"decoder.onnx cannot be opened(.|\n)*fetch a complete copy"),
         (written(CONFIG, b"{"), r"no readable config.json(.|\n)*model_type"),
         (written(CONFIG, []), r"a different kind of model(.|\n)*model_type"),
         (written(CONFIG, {"model_type": 3}), r"a different kind of model(.|\n)*model_type"),

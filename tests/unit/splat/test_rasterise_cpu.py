@@ -101,10 +101,10 @@ def card(monkeypatch, tmp_path):
     def with_kernels(module: object) -> None:
         monkeypatch.setitem(sys.modules, "gsplat.cuda", module)
         monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", getattr(module, "_backend", None))
-        device.forget()
+        device.forget_cuda()
 
     yield with_kernels
-    device.forget()
+    device.forget_cuda()
 
 
 class Failing:
@@ -149,7 +149,7 @@ def test_a_failing_build_of_gsplat_is_tried_once_and_selects_the_cpu(card, caplo
     device.cuda_problem.cache_clear()  # as in the next stage's process
     choose_device.cache_clear()
     assert choose_device("auto") == "cpu" and kernels.tries == tries
-    device.forget()  # as `hilsplat doctor` does
+    device.forget_cuda()  # as `hilsplat doctor` does
     assert choose_device("auto") == "cpu" and kernels.tries > tries
 
 

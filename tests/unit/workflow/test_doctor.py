@@ -80,7 +80,7 @@ def test_onnxruntime_gpu_replaces_onnxruntime(monkeypatch):
     [("no gsplat", None, "note"), (None, "cuda differs from cpu: image by 0.3", "fault"), (None, None, "ok")],
 )
 def test_cuda_is_optional_but_must_agree_with_the_cpu(monkeypatch, problem, apart, state):
-    monkeypatch.setattr("hilsplat.splat.rasterise.device.forget", lambda: None)
+    monkeypatch.setattr("hilsplat.splat.rasterise.device.forget_cuda", lambda: None)
     monkeypatch.setattr("hilsplat.splat.rasterise.device.cuda_problem", lambda: problem)
     monkeypatch.setattr("hilsplat.splat.rasterise.parity.cuda_disagreement", lambda: apart)
     assert [found.state for found in doctor.cuda()] == [state]
