@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 
 from hilsplat.base.errors import ArtifactError, DiskSpaceError, HilsplatError
-from hilsplat.base.locks import lock
-from hilsplat.base.processes import FORMER, UNFINISHED, is_unfinished, unfinished_folder
+from hilsplat.base.processes import FORMER, UNFINISHED, is_unfinished, lock, unfinished_folder
 
 ZIP64_BYTES = 2**30  # arrays above this size get an archive entry that may exceed 2 GiB
 

@@ -1,4 +1,4 @@
-"""Child processes that end with their parent, unfinished files, and process and thread pools."""
+"""Child processes that end with their parent, file locks, unfinished files, and process and thread pools."""
 
 import ctypes
 import functools
@@ -20,7 +20,12 @@ from pathlib import Path
 from threading import Thread
 from typing import IO, Any, TypeVar
 
-from hilsplat.base.locks import lock
+from hilsplat.base.errors import HilsplatError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -72,6 +77,23 @@ def keep_freed_memory() -> None:
             set_option = ctypes.CDLL(None).mallopt
             set_option(M_MMAP_THRESHOLD, 32 << 20)
             set_option(M_TRIM_THRESHOLD, 128 << 20)
+
+
+def lock(stream: IO[Any], *, shared: bool = False, wait: bool = True) -> None:
+    """Lock an open file until it is closed.
+
+    Raises:
+        BlockingIOError: another process has locked it, and `wait` is false.
+        HilsplatError: this operating system has no such locks.
+    """
+    if fcntl is None:
+        raise HilsplatError(
+            "hilsplat cannot lock files on this operating system",
+            expected="Linux, macOS, or Windows Subsystem for Linux",
+            fix="run hilsplat in WSL: https://learn.microsoft.com/windows/wsl",
+        )
+    kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
+    fcntl.flock(stream, kind if wait else kind | fcntl.LOCK_NB)
 
 
 UNFINISHED = re.compile(r"\.writing-(?P<host>[0-9a-f]{8})-.*", re.DOTALL)

@@ -25,8 +25,7 @@ import yaml
 from hilsplat.base.artifacts import write_text
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.base.files import INSTALLED, project_path
-from hilsplat.base.locks import lock
-from hilsplat.base.processes import PARENT, remove_leftovers
+from hilsplat.base.processes import PARENT, lock, remove_leftovers
 from hilsplat.configuration import CONFIG, first_unusable, merged_config, parse_run
 from hilsplat.scene.sheet import DEFAULT_SHEET, SceneRow, read_sheet
 from hilsplat.workflow.estimate import forecasts

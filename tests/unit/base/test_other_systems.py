@@ -27,7 +27,7 @@ for module in pkgutil.walk_packages(hilsplat.__path__, "hilsplat."):
     if module.name != "hilsplat.__main__":
         importlib.import_module(module.name)
 from hilsplat.base.errors import HilsplatError, system_error
-from hilsplat.base.locks import lock
+from hilsplat.base.processes import lock
 assert system_error(MemoryError("x")) is not None
 try:
     lock(open(os.devnull, "a"))
