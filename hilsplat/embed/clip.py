@@ -14,7 +14,7 @@ from hilsplat.base.errors import MisalignedArtifactError, ModelError
 from hilsplat.base.files import INSTALLED
 from hilsplat.models.folder import WHOLE_COPY, ModelFolder, input_side_px, open_model_folder
 from hilsplat.models.network import Network, require_one_space
-from hilsplat.models.repeatable import require_repeatable_once
+from hilsplat.models.repeatable import random_pixels, require_repeatable_once
 from hilsplat.models.store import MODELS, user_models
 from hilsplat.segment.crops import crop_to_square
 from hilsplat.segment.masks import HierarchicalMasks
@@ -73,8 +73,7 @@ class ClipModel:
         (vector,) = opened.spec.outputs
         widths = opened.fixed_axis(vector, 1), self.text.fixed_axis(self.words, 1)
         require_one_space(self.model.folder, *widths)
-        crop = np.random.default_rng(0).standard_normal((1, 3, self.side_px, self.side_px), np.float32)
-        require_repeatable_once(self.model, opened, "as exported", {next(iter(opened.spec.inputs)): crop})
+        require_repeatable_once(self.model, opened, "as exported", random_pixels(opened, self.side_px))
         return opened
 
     @property

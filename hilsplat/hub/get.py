@@ -72,6 +72,21 @@ INSTALL = "pip install --constraint constraints.txt --editable '.[export]'"
 LAST_LINES = 15  # number of lines of the exporter's output shown in an error
 
 
+BETWEEN = (
+    (
+        requests.exceptions.SSLError,
+        "no trusted certificate from",
+        "if a proxy replaces certificates, set REQUESTS_CA_BUNDLE to the file of its certificate",
+    ),
+    (
+        requests.exceptions.ProxyError,
+        "the proxy does not connect to",
+        "correct HTTPS_PROXY and HTTP_PROXY, or unset them to connect without a proxy",
+    ),
+)
+"""Errors raised by a proxy between this machine and the hub: type, problem and fix."""
+
+
 @dataclass(frozen=True)
 class Prepared:
     """A model whose required files are known."""
@@ -171,11 +186,8 @@ def _listing(requested: ModelRequest, revision: str | None) -> Listing:
         return listing
     except OUT_OF_REACH as error:
         cached = read_cached_listing(repository, revision)
-        if (
-            cached is None
-            and pin is not None
-            and (other := read_cached_listing(repository, None)) is not None
-        ):
+        other = read_cached_listing(repository, None) if cached is None and pin is not None else None
+        if other is not None:
             raise DownloadError(
                 f"the hub is unreachable, and its cache has another commit of {repository}",
                 expected=revision,
@@ -341,18 +353,10 @@ def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
             yield
     except (requests.RequestException, *OUT_OF_REACH) as error:
         answered = reason_of(error)
-        if isinstance(answered, requests.exceptions.SSLError):
-            raise DownloadError(
-                f"{requested.repository} cannot be downloaded: the certificate of {place} is not trusted",
-                found=_innermost(error),
-                fix="if a proxy replaces certificates, set REQUESTS_CA_BUNDLE to the file of its certificate",
-            ) from error
-        if isinstance(answered, requests.exceptions.ProxyError):
-            raise DownloadError(
-                f"{requested.repository} cannot be downloaded: the proxy does not connect to {place}",
-                found=_innermost(error),
-                fix="correct HTTPS_PROXY and HTTP_PROXY, or unset them to connect without a proxy",
-            ) from error
+        for kind, problem, fix in BETWEEN:
+            if isinstance(answered, kind):
+                problem = f"{requested.repository} cannot be downloaded: {problem} {place}"
+                raise DownloadError(problem, found=_innermost(error), fix=fix) from error
         if isinstance(answered, requests.HTTPError) and answered.response is not None:
             raise _refused(answered, answered.response, requested.repository, place) from error
         families = [requested.release.family] if requested.release else ["sam", "clip"]

@@ -14,7 +14,7 @@ from hilsplat.models.fast_paths import or_as_exported
 from hilsplat.models.folder import ModelFolder, external_weights, input_side_px
 from hilsplat.models.network import CPU, Network, execution_providers
 from hilsplat.models.onnx_graph import Graph, needed_names
-from hilsplat.models.repeatable import require_repeatable_once
+from hilsplat.models.repeatable import random_pixels, require_repeatable_once
 
 logger = logging.getLogger(__name__)
 
@@ -78,9 +78,7 @@ def int8_network(
             )
             _quantise(source, path, exact)
         network = model.network(name, path)
-        side = input_side_px(model)
-        pixels = np.random.default_rng(0).standard_normal((1, 3, side, side), np.float32)
-        require_repeatable_once(model, network, "int8", {next(iter(network.spec.inputs)): pixels})
+        require_repeatable_once(model, network, "int8", random_pixels(network, input_side_px(model)))
         return network
 
     return or_as_exported(model.networks[name], "each image takes about twice as long", prepare)

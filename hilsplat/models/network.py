@@ -92,7 +92,7 @@ def _missing_library() -> str:
     try:
         ctypes.CDLL(str(library))
     except OSError as error:
-        return str(error)
+        return first_line(error)
     return "its session fell back to the CPU"
 
 

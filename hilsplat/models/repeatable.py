@@ -34,6 +34,13 @@ def require_repeatable(
             )
 
 
+def random_pixels(network: Network, side_px: int) -> dict[str, np.ndarray]:
+    """Return random input for a network of images: as many (3, side, side) images as a call requires."""
+    (name,) = network.spec.inputs
+    shape = (network.fixed_axis(name, 0) or 1, 3, side_px, side_px)
+    return {name: np.random.default_rng(0).standard_normal(shape, np.float32)}
+
+
 def require_repeatable_once(
     model: ModelFolder, network: Network, form: str, feeds: Mapping[str, np.ndarray]
 ) -> None:

@@ -23,6 +23,7 @@ class DecoderNetwork:
         graph: the network without boxes.
         axis: axis of `input_points` along which prompts are passed: 1, or 0 if axis 1 has length 1.
         pads: whether calls add the padding point, because the network itself doesn't.
+        prompts_per_call: required number of prompts per call; None for any number.
     """
 
     def __init__(self, model: ModelFolder, name: str) -> None:

@@ -12,6 +12,8 @@ from hilsplat.base.lanes import WIDTH
 from hilsplat.models.onnx_graph import Graph
 from hilsplat.segment import decoder_kernels as kernels
 
+DEFAULT_EPS = 1e-5  # of ONNX's LayerNormalization
+
 
 @dataclass(frozen=True)
 class Linear:
@@ -103,8 +105,8 @@ class DecoderGraph:
         """Return a layer norm, which is one node since opset 17, or several nodes."""
         node = self._find(f"{module}/LayerNormalization")
         if node is not None:
-            (eps,) = [each.f for each in node.attribute if each.name == "epsilon"]
-            values = [*self._constants(node), np.array(eps)]
+            eps = [each.f for each in node.attribute if each.name == "epsilon"] or [DEFAULT_EPS]
+            values = [*self._constants(node), np.array(eps[0])]
         else:
             nodes = [self._node(f"{module}/{name}") for name in ("Mul", "Add_1", "Add")]
             values = [value for each in nodes for value in self._constants(each)]

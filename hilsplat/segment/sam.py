@@ -27,7 +27,7 @@ from hilsplat.models.int8 import CHECKED_GRID, agreement_of_masks, considers_int
 from hilsplat.models.layouts import DECODER, PREVIEW
 from hilsplat.models.network import CPU, Network, execution_providers
 from hilsplat.models.onnx_graph import Graph, with_rowwise_attention
-from hilsplat.models.repeatable import require_repeatable_once
+from hilsplat.models.repeatable import random_pixels, require_repeatable_once
 from hilsplat.segment.decoder_network import DecoderNetwork
 from hilsplat.segment.factored_decoder import HEADS_PER_ATTENTION, PROMPTS, FactoredDecoder, ImageTerms
 from hilsplat.segment.kernels import areas_and_boxes, upscaled_runs
@@ -166,12 +166,11 @@ class SamModel:
     def _open_encoder(self) -> tuple[Graph | None, Network]:
         """Return the encoder, and its graph if a ViT's global attention is computed row by row on a CPU."""
         vision, path = self.model.config.get("vision_config"), self.model.networks["vision_encoder"]
-        pixels = np.random.default_rng(0).standard_normal((1, 3, *self.padded_hw), np.float32)
 
         def opened(graph: Graph | None) -> tuple[Graph | None, Network]:
             network = self.model.network("vision_encoder", graph)
             form = "as exported" if graph is None else "row-wise"
-            require_repeatable_once(self.model, network, form, {"pixel_values": pixels})
+            require_repeatable_once(self.model, network, form, random_pixels(network, self.padded_hw[0]))
             return graph, network
 
         if self.stretches or not isinstance(vision, dict) or execution_providers()[0] != CPU:
@@ -193,7 +192,7 @@ class SamModel:
         }
         if all(map(all, shapes.values())):
             return {name: rng.standard_normal((1, *shape), np.float32) for name, shape in shapes.items()}
-        found = self.encoder(pixel_values=rng.standard_normal((1, 3, *self.padded_hw), np.float32))
+        found = self.encoder(**random_pixels(self.encoder, self.padded_hw[0]))
         return dict(zip(self.encoder.spec.outputs, found, strict=True))
 
     def _factor(self, features: Mapping[str, np.ndarray]) -> FactoredDecoder:

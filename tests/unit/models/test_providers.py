@@ -1,6 +1,9 @@
 """Providers are used only if a session runs on them."""
 
 import ctypes
+import os
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import onnxruntime
@@ -10,6 +13,7 @@ from hilsplat.models import network
 from hilsplat.models.network import CPU, CUDA, cuda_provider_problem, execution_providers
 from hilsplat.segment.sam import SamModel
 from hilsplat.workflow import doctor
+from tests.conftest import PROJECT
 
 
 @pytest.fixture(autouse=True)
@@ -80,3 +84,13 @@ def test_a_working_cuda_comes_first(monkeypatch):
     session = SimpleNamespace(run=lambda *given: None, get_providers=lambda: [CUDA, CPU])
     monkeypatch.setattr(network, "one_thread_session", lambda *given: session)
     assert execution_providers() == (CUDA, CPU)
+
+
+def test_an_onnxruntime_that_lost_its_files_is_named(tmp_path):
+    (tmp_path / "onnxruntime").mkdir()
+    program = "import hilsplat.models.network"
+    environment = {**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{PROJECT}"}
+    (tmp_path / "onnxruntime/__init__.py").touch()
+    words = [sys.executable, "-c", program]
+    done = subprocess.run(words, env=environment, cwd=tmp_path, capture_output=True, text=True)
+    assert "ModelError: onnxruntime is incomplete" in done.stderr and "--force-reinstall" in done.stderr
