@@ -12,8 +12,10 @@ import yaml
 from pydantic import BaseModel, ValidationError, field_validator
 
 from hilsplat import settings
+from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import SettingsError
-from hilsplat.base.files import NAME_RULE, name_problem, project_path
+from hilsplat.base.files import NAME_RULE, name_problem, project_path, regular
+from hilsplat.base.levels import path_of
 from hilsplat.models.store import AUTO, EMBEDDED, read_model, real_model
 from hilsplat.settings import LARGEST, Section, knob
 
@@ -70,9 +72,11 @@ SECTIONS: dict[str, type[Section]] = {name: type(section) for name, section in S
 def parse_section(name: str, text: str) -> Any:
     """Parse a section from JSON; raise SettingsError if a key is unknown or a value is invalid."""
     try:
-        return SECTIONS[name].model_validate_json(text or "{}")
+        return SECTIONS[name].model_validate(parse_json(text or "{}"))
     except ValidationError as error:
         raise settings_error(error, name, SECTIONS[name]) from error
+    except ValueError as error:
+        raise SettingsError(f"{name}: the settings are not valid JSON: {error}", found=text[:80]) from error
 
 
 Settings = TypeVar("Settings", bound=Section)
@@ -267,16 +271,23 @@ def parse_run(config: dict[str, Any]) -> RunSettings:
                 expected=NAME_RULE,
                 fix="rename it in the configuration",
             )
-    for name in run.variants:
-        if _parts_of(name)[0] in RESERVED:
+    taken = dict.fromkeys(RESERVED, "for files in a scene folder")
+    for name in dict.fromkeys(["default", *run.variants]):
+        # Names that differ only in case share a folder on some file systems; other seeds have own folders.
+        key = _parts_of(name)[0].casefold()
+        if key in taken:
             raise SettingsError(
-                f"variants.{name}: this name is reserved for files in a scene folder",
-                expected=f"a name other than {', '.join(sorted(RESERVED))}",
+                f"variants.{name}: this name is reserved {taken[key]}",
+                expected=f"a name other than {', '.join(sorted(taken))}, also if the case is ignored",
                 fix="rename the variant",
             )
-    for key, texts in run.queries.items():
-        if any(not text.strip() for text in texts):
-            raise SettingsError(f"queries.{key}: a query is empty", fix="remove it, or enter some text")
+        taken[key] = f"by the variant {name}"
+    for key, text in ((key, text) for key, texts in run.queries.items() for text in texts):
+        try:
+            path_of(text)
+        except SettingsError as error:
+            error.add_line("in", f"queries.{key}")
+            raise
     for variant in dict.fromkeys([*run.variant_names(), *run.variants]):
         run.stages(variant)
     for scope in run.overrides:
@@ -314,7 +325,7 @@ class _UniqueKeys(yaml.SafeLoader):
 def read_config(path: Path) -> dict[str, Any]:
     """Read a configuration file; raise SettingsError if it is missing or not a YAML mapping."""
     try:
-        found = yaml.load(Path(path).read_text(encoding="utf-8"), _UniqueKeys)
+        found = yaml.load(regular(Path(path)).read_text(encoding="utf-8"), _UniqueKeys)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""

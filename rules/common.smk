@@ -19,7 +19,7 @@ from hilsplat.workflow import targets
 from hilsplat.workflow.plan import Plan, any_of
 from hilsplat.workflow.progress import estimates
 from hilsplat.workflow.resources import JobResources
-from hilsplat.workflow.run import mark_run, prepare_process, unmark_run
+from hilsplat.workflow.run import mark_run, prepare_process, record_run, unmark_run
 
 # Planning many scenes creates millions of permanent objects; less frequent collection saves 10 % of the time.
 gc.set_threshold(200_000, 50, 100)
@@ -36,6 +36,14 @@ def own_cores():
     if cores < 1:
         raise WorkflowError("with --cores 0, no job can start; expected at least 1")
     return cores
+
+
+def mark_or_refuse():
+    """Mark this run, or refuse it if another run writes to the same results."""
+    try:
+        mark_run(PLAN.results)
+    except HilsplatError as error:
+        raise WorkflowError(str(error)) from None
 
 
 def cache_folder(wildcards, input):

@@ -9,6 +9,7 @@ import sys
 
 from snakemake_interface_logger_plugins.base import LogHandlerBase
 
+from hilsplat.base.errors import visible
 from hilsplat.workflow.estimate import RunEstimate
 from hilsplat.workflow.progress import ProgressDisplay, RunProgress, estimates
 
@@ -36,7 +37,7 @@ class LogHandler(LogHandlerBase):
             if self.display is not None:
                 self.display.show(record)
             elif text := self.format(record):
-                print(text, file=self.stream, flush=True)
+                print(visible(text), file=self.stream, flush=True)
             if self.is_dry and getattr(record, "event", None) == "job_info":
                 self._count(record)
         except Exception:

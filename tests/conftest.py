@@ -77,4 +77,4 @@ def own_log() -> Iterator[None]:
 def cache_folder_of_tests(monkeypatch, tmp_path_factory) -> None:
     """Keep what is remembered about networks out of the user's cache folder."""
     folder = tmp_path_factory.getbasetemp() / "user-cache"
-    monkeypatch.setattr("platformdirs.user_cache_path", lambda name: folder)
+    monkeypatch.setattr("platformdirs.user_cache_path", lambda *name: folder)

@@ -195,13 +195,12 @@ class Annotator:
 
 def _all_labels(opened: OpenedScene, of: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the annotations and file version of every view, in view order."""
+    names = opened.scene.cameras.names
+    versions = [version_of(label_path(opened.labels, view)) for view in names]  # before the labels are read
     known = opened.known()
     return [
-        {
-            "version": version_of(label_path(opened.labels, view)),
-            "labels": [label.model_dump() for label in known.get(view, ())],
-        }
-        for view in opened.scene.cameras.names
+        {"version": version, "labels": [label.model_dump() for label in known.get(view, ())]}
+        for view, version in zip(names, versions, strict=True)
     ]
 
 

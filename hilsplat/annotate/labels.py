@@ -17,6 +17,7 @@ from pydantic import AfterValidator, Field, ValidationError
 from hilsplat.base.artifacts import write_text
 from hilsplat.base.errors import SceneError, SettingsError
 from hilsplat.base.levels import Level
+from hilsplat.base.removal import delete
 from hilsplat.datasets.images.hi import by_id, parents_of
 from hilsplat.datasets.images.isat import IsatFile, fill_polygons, read_isat, trace_polygons
 from hilsplat.scene.cameras import Cameras
@@ -177,11 +178,11 @@ def write_labels(
     Raises:
         StaleFileError: the file changed since `version` was read.
     """
-    with replacing(path, version, f"the annotations of {view}"):
+    with replacing(path, version, f"the annotations of {view}") as path:
         if labels:
             write_text(path, as_file(view, size_hw, labels))
         else:
-            path.unlink(missing_ok=True)
+            delete(path, r".+\.json")
         return version_of(path)
 
 

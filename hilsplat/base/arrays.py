@@ -1,4 +1,4 @@
-"""Validation of an artifact's arrays against its dataclass when the artifact is opened.
+"""Validation of an artifact's arrays against its dataclass when the artifact is written and opened.
 
 Compiled loops do not check bounds, so an out-of-range offset would crash the process.
 """

@@ -1,17 +1,18 @@
 """Atomic writing, reading and hashing of artifacts; view caches; output locks."""
 
 import copy
-import ctypes
 import errno
 import functools
 import hashlib
 import json
+import logging
+import math
 import os
 import shlex
 import shutil
-import sys
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,7 +22,11 @@ from typing import Any
 import numpy as np
 
 from hilsplat.base.errors import ArtifactError, DiskSpaceError, HilsplatError
-from hilsplat.base.processes import FORMER, UNFINISHED, is_unfinished, lock, unfinished_folder
+from hilsplat.base.files import regular
+from hilsplat.base.processes import lock, unfinished_folder
+from hilsplat.base.removal import UNFINISHED, delete, is_unfinished, replace_file, replace_folder, tag
+
+logger = logging.getLogger(__name__)
 
 ZIP64_BYTES = 2**30  # arrays above this size get an archive entry that may exceed 2 GiB
 
@@ -29,8 +34,8 @@ INDEX = "index.json"  # written last in a folder artifact, so its presence means
 
 DAMAGE = (
     *(EOFError, MemoryError, NotImplementedError, OSError, SyntaxError, TokenError, ValueError),
-    *(zipfile.BadZipFile, zlib.error),
-    AttributeError,  # an .npy file instead of .npz
+    *(OverflowError, zipfile.BadZipFile, zlib.error),
+    TypeError,  # an .npy file instead of .npz
 )
 """Errors that numpy and zipfile raise on damaged files."""
 
@@ -41,15 +46,31 @@ def provenance_path(artifact: Path) -> Path:
     return artifact.parent / f"{artifact.name}.provenance.json"
 
 
+RUN = ".run.json"
+"""Hidden file in a results folder that records the options of the run that writes to it."""
+
+
+def run_command(path: Path, *options: str) -> str:
+    """Return the command that makes a results file, or all results, in the project that they belong to."""
+    path = Path(path).resolve()
+    places = [path, *path.parents]
+    results = next((place for place in places if (place / RUN).is_file()), None)
+    about = read_memo(results / RUN, dict[str, list[str]]) if results else {}
+    results = results or next((place for place in places if place.name == "results"), path.parent)
+    files = [word for name in about.get("config", ()) for word in ("--config", name)]
+    name = Path(*about.get("results", ["results"]))
+    target = [] if path == results else [str(name / path.relative_to(results))]
+    overrides = ["--", "--config", *about["overrides"]] if about.get("overrides") else []
+    return shlex.join(["hilsplat", "run", *files, *options, *target, *overrides])
+
+
 def remake(path: Path) -> str:
     """Return the command that rebuilds an artifact, given the artifact or a file in it."""
     places = [place for place in (Path(path), *Path(path).parents) if provenance_path(place).is_file()]
     if not places:
         return "rerun the stage that writes it"
     place = places[0] / "images" if places[0].name == "world" else places[0]  # its rule writes two subfolders
-    parts = place.parts  # Snakemake identifies files by their paths relative to the project
-    start = len(parts) - 1 - parts[::-1].index("results") if "results" in parts else 0
-    return f"snakemake --cores 2 --forcerun {shlex.quote(str(Path(*parts[start:])))}"
+    return run_command(place, "--verify")
 
 
 @contextmanager
@@ -65,7 +86,7 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
             with explain_full_disk(path), _keep_mode(path):
                 yield path
         except BaseException:
-            path.unlink(missing_ok=True)
+            delete(path)
             raise
         return
     with work_folder(path) as folder:
@@ -74,7 +95,7 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
             yield temporary
         if durable:
             _flush(temporary)
-        temporary.replace(path)
+        replace_file(temporary, path)
         if durable:
             _flush(path.parent)
 
@@ -102,12 +123,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
                 for name in names:
                     _flush(Path(place, name))
                 _flush(Path(place))
-        if not os.path.lexists(path):
-            temporary.rename(path)
-        elif not _exchange(temporary, path):
-            (folder / FORMER).mkdir()
-            path.rename(folder / FORMER / path.name)
-            temporary.rename(path)
+        replace_folder(temporary, path, folder)
         if durable:
             _flush(path.parent)
 
@@ -131,23 +147,6 @@ def _flush(path: Path) -> None:
             raise
     finally:
         os.close(descriptor)
-
-
-_libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
-_renameat2 = getattr(_libc, "renameat2", None)
-AT_FDCWD, RENAME_EXCHANGE = -100, 2  # from Linux's <stdio.h>, <fcntl.h> and <linux/fs.h>
-
-
-def _exchange(one: Path, other: Path) -> bool:
-    """Exchange two paths atomically; return False if the operating or file system does not support this."""
-    if _renameat2 is None:
-        return False
-    if _renameat2(AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other), RENAME_EXCHANGE) == 0:
-        return True
-    code = ctypes.get_errno()
-    if code in (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP):
-        return False
-    raise OSError(code, os.strerror(code), str(other))
 
 
 FULL_DISK = ("No space left on device", "disk is full", "Disk quota exceeded")
@@ -176,12 +175,18 @@ def explain_full_disk(path: Path) -> Iterator[None]:
         if full:
             raise DiskSpaceError(
                 f"no space left while writing {path.name} in {folder}",
-                found=f"{usage.free / 2**20:.1f} MiB free of {usage.total / 2**20:.0f} MiB on that disk",
+                found=f"{usage.free / 2**20:.1f} MiB free of {usage.total / 2**20:.0f} MiB on that disk"
+                + ", which cannot hold more files (inodes)" * _lacks_inodes(folder),
                 fix=f"free up space on the disk of {folder}, then run again; finished work is kept",
             ) from error
         if isinstance(error, OSError) and is_unfinished(Path(str(error.filename))):
             error.filename = str(path)  # a temporary name means nothing to a user
         raise
+
+
+def _lacks_inodes(folder: Path) -> bool:
+    found = os.statvfs(folder) if hasattr(os, "statvfs") else None
+    return found is not None and found.f_files > 0 and found.f_favail == 0
 
 
 def existing_folder(folder: Path) -> Path:
@@ -216,15 +221,31 @@ def write_json(path: Path, value: Any) -> None:
 def read_json(path: Path) -> Any:
     """Read JSON; raise ArtifactError if the file is missing or invalid."""
     with _readable(path, "is not valid JSON", (ValueError, OSError)):
-        return parse_json(Path(path).read_text(encoding="utf-8"))
+        return parse_json(regular(Path(path)).read_text(encoding="utf-8"))
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse JSON from outside the package; raise ValueError if it is invalid or nested too deeply."""
+    """Parse JSON from outside the package; raise ValueError if it is invalid, too deep or repeats a key."""
     try:
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=_unique)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    if len(found := dict(pairs)) < len(pairs):  # all but the last value would be ignored
+        raise ValueError(f"key {Counter(key for key, _ in pairs).most_common(1)[0][0]!r} is duplicated")
+    return found
+
+
+def read_memo(path: Path, kind: Any) -> Any:
+    """Return the JSON object in a cache file; {} if the file is missing or damaged, or is not a `kind`."""
+    from pydantic import TypeAdapter
+
+    try:
+        return TypeAdapter(kind).validate_python(parse_json(path.read_bytes()), strict=True)
+    except (OSError, ValueError):
+        return {}
 
 
 @contextmanager
@@ -263,10 +284,15 @@ def _write_zip(path: Path, arrays: dict[str, np.ndarray], method: int, *, durabl
                 np.lib.format.write_array(stream, np.ascontiguousarray(array), allow_pickle=False)
 
 
-def read_npz(path: Path, *needed: str) -> dict[str, np.ndarray]:
-    """Read an .npz file without unpickling; raise ArtifactError if it is damaged or lacks a needed array."""
+def read_npz(path: Path, *needed: str, max_gib: float = math.inf) -> dict[str, np.ndarray]:
+    """Read an .npz file without unpickling.
+
+    An ArtifactError is raised if it is damaged, lacks a needed array or, unpacked, is larger than `max_gib`.
+    """
     with _readable(path):
-        with np.load(path, allow_pickle=False) as archive:
+        with np.load(regular(Path(path)), allow_pickle=False) as archive:
+            if (gib := sum(entry.file_size for entry in archive.zip.infolist()) / 2**30) > max_gib:
+                raise ValueError(f"it unpacks to {gib:.1f} GiB, but the limit is {max_gib} GiB")
             arrays = {name: archive[name] for name in archive.files}
         if any(isinstance(array, bytes) for array in arrays.values()):  # numpy found no header
             raise ValueError("it contains data other than arrays")
@@ -288,7 +314,7 @@ def write_npy(path: Path, array: np.ndarray) -> None:
 def read_npy(path: Path) -> np.ndarray:
     """Read a numeric array from an .npy file without unpickling; raise ArtifactError for anything else."""
     with _readable(path):
-        array = np.load(path, allow_pickle=False)
+        array = np.load(regular(Path(path)), allow_pickle=False)
         if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
             raise ValueError(f"it contains {getattr(array, 'dtype', 'an archive')}, not numbers")
     return array
@@ -309,7 +335,7 @@ def sha256_of_json(value: Any) -> str:
 
 
 def sha256_of_file(path: Path) -> str:
-    with Path(path).open("rb") as stream:
+    with regular(Path(path)).open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
@@ -337,7 +363,7 @@ def write_index(folder: Path, views: Mapping[str, Any], **more: Any) -> None:
     files = sorted(path for path in folder.rglob("*") if path.suffix in SEALED)
     sums = {path.relative_to(folder).as_posix(): _crc32_of_file(path) for path in files}
     index = {**more, "views": dict(views), "crc32": sums}
-    write_json(folder / INDEX, {**index, "seal": _seal(index)})
+    write_json(folder / INDEX, {**index, "seal": seal_of(index)})
 
 
 SEALED = (".json", ".npy", ".npz", ".png", ".safetensors")
@@ -372,7 +398,7 @@ def _unsealed(path: Path, *_: int) -> dict[str, Any]:
     index = read_json(path)
     if not isinstance(index, dict) or not isinstance(index.get("views"), dict) or "seal" not in index:
         raise ArtifactError(f"{path} is not an artifact index of this version of hilsplat", fix=remake(path))
-    if index.pop("seal") != _seal(index):
+    if index.pop("seal") != seal_of(index):
         raise _changed(path)
     return index
 
@@ -396,7 +422,8 @@ def _changed(path: Path) -> ArtifactError:
     )
 
 
-def _seal(index: Mapping[str, Any]) -> int:
+def seal_of(index: Mapping[str, Any]) -> int:
+    """Return the checksum of a JSON object, which its file contains as `seal`."""
     as_read = json.loads(json.dumps(index))  # JSON has no tuples, and its keys are strings
     return zlib.crc32(json.dumps(as_read, sort_keys=True).encode())
 
@@ -450,6 +477,7 @@ class ViewCache:
         """Store an entry, replacing any existing one."""
         # A power failure may truncate entries or fill them with zeros. Checksums reveal this on reading, and
         # the entry is recomputed. A flush to disk, which takes milliseconds, is therefore unnecessary.
+        tag(self.folder)
         _write_zip(self.path(key), arrays, self._method, durable=False)
 
 
@@ -474,6 +502,25 @@ def output_lock(output: Path) -> Iterator[None]:
         stream.flush()
         yield
         stream.truncate(0)
+
+
+@contextmanager
+def changing(path: Path) -> Iterator[Path]:
+    """Wait for the lock of a file that is read, changed and written; yield the file, or where it links to."""
+    path = Path(os.path.realpath(path))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        stream = lock_path(path).open("a")
+    except OSError as error:
+        error.filename = str(path)  # the name of the lock means nothing to a user
+        raise
+    with stream:
+        try:
+            lock(stream, wait=False)
+        except BlockingIOError:
+            logger.info("waiting for another command that changes %s", path)
+            lock(stream)
+        yield path
 
 
 def lock_path(output: Path) -> Path:

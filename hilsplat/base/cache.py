@@ -1,16 +1,28 @@
-"""Cache sizes, and pruning of finished views and checkpoints."""
+"""Cache sizes, pruning of finished views and checkpoints, and remembered examinations of this machine."""
 
+import logging
+import os
+import re
+import tempfile
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
-from hilsplat.base.artifacts import visible_files
+import platformdirs
+
+from hilsplat.base.artifacts import existing_folder, sha256_of_json, visible_files, write_text
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.processes import remove_leftovers
+from hilsplat.base.removal import DIGEST, ENTRY, delete, is_tagged
+
+logger = logging.getLogger(__name__)
 
 VIEW_CACHES = ("masks", "clip", "contributions")
 """Caches of finished views: a missing entry costs time but does not change a result."""
 
 CHECKPOINTS = "gaussians"  # cache of fit checkpoints
+
 FIT_DAYS = 1.0
 """Checkpoints younger than this are kept, because fits save more often and may still be running."""
 
@@ -36,6 +48,8 @@ def prune_cache(
 ) -> tuple[int, float]:
     """Delete unfinished files and old cache entries; return the number of entries and their size in MiB.
 
+    Only files named like an entry (`ENTRY`), in a cache with our tag, are deleted.
+
     Args:
         stages: caches to prune; if empty, the view caches, and also the checkpoints if `days` is set.
         days: delete entries not used for this many days.
@@ -48,7 +62,13 @@ def prune_cache(
     remove_leftovers(folder.parent if Path(folder).name == ".cache" else folder)
     chosen = set(stages or (VIEW_CACHES if days is None else known))
     now, freed, deleted = time.time(), 0, 0
-    used = {path: path.stat() for name, files in caches(folder).items() if name in chosen for path in files}
+    used = {
+        path: path.stat()
+        for name, files in caches(folder).items()
+        if name in chosen and is_tagged(folder / name)
+        for path in files
+        if ENTRY.fullmatch(path.relative_to(folder / name).as_posix())
+    }
     oldest_first = sorted(used, key=lambda path: (used[path].st_mtime, str(path)))
     total = sum(stat.st_size for stat in used.values())
     for path in oldest_first:
@@ -56,7 +76,69 @@ def prune_cache(
         old = days is not None and idle_days >= days
         much = max_mib is not None and total - freed > max_mib * 2**20
         if (old or much) and not (path.parent.name == CHECKPOINTS and idle_days < FIT_DAYS):
-            path.unlink(missing_ok=True)
+            delete(path, re.escape(path.name))
             freed += used[path].st_size
             deleted += 1
     return deleted, freed / 2**20
+
+
+def remembered(kind: str, key: object, examine: Callable[[], str]) -> str:
+    """Return the text that an examination found, which is done once for each key.
+
+    If the user's cache folder cannot be written, each process examines again.
+
+    Args:
+        kind: name of a folder of results, which `forget` clears.
+        key: JSON value that changes if the result may change, such as versions of libraries.
+    """
+    place = _folder(kind) / sha256_of_json(key)
+    with suppress(OSError, ValueError):
+        return place.read_text(encoding="utf-8")
+    found = examine()
+    with suppress(OSError, HilsplatError):
+        write_text(place, found)
+    return found
+
+
+def forget(kind: str) -> None:
+    """Delete the results of one kind."""
+    with suppress(OSError):
+        for path in _folder(kind).iterdir():
+            if re.fullmatch(DIGEST, path.name):
+                delete(path, DIGEST)
+
+
+def use_writable_cache() -> None:
+    """Give libraries a folder for their caches in the temporary folder if the user's cannot be written.
+
+    They would fail otherwise: numba, Snakemake and Matplotlib, in containers without a home.
+    """
+    wanted = Path("~/.cache")
+    with suppress(OSError, RuntimeError):  # RuntimeError: a user without a home
+        wanted = platformdirs.user_cache_path()
+        wanted.mkdir(parents=True, exist_ok=True)
+        if os.access(wanted, os.W_OK):
+            return
+    folder = Path(tempfile.gettempdir()) / f"hilsplat-{os.getuid()}"
+    with suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+    found = folder.lstat()
+    if found.st_uid != os.getuid() or found.st_mode & 0o022:  # not ours
+        folder = Path(tempfile.mkdtemp(prefix="hilsplat-"))
+    os.environ["XDG_CACHE_HOME"] = os.environ["MPLCONFIGDIR"] = str(folder)
+    os.environ.setdefault("HOME", str(folder))
+    os.environ.setdefault("LOGNAME", str(os.getuid()))  # a user without a name
+    logger.info("%s cannot be written; caches are kept in %s", wanted, folder)
+
+
+def writable(folder: Path) -> Path:
+    """Return a cache folder, or if it cannot be written, one in the user's cache folder."""
+    if os.access(existing_folder(folder), os.W_OK):
+        return folder
+    other = _folder("views")
+    logger.info("%s cannot be written; its entries are kept in %s", folder, other)
+    return other
+
+
+def _folder(kind: str) -> Path:
+    return platformdirs.user_cache_path("hilsplat") / kind

@@ -46,6 +46,15 @@ def system_error(error: BaseException) -> HilsplatError | None:
     )
 
 
+KILLED = "probably because memory ran out"
+KILLED_FIX = "use fewer cores (hilsplat run -- --cores 1), smaller images (poses.max_side_px) or more memory"
+
+
+def visible(text: object) -> str:
+    """Escape unprintable characters except line breaks and tabs, because terminals may obey them."""
+    return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in str(text))
+
+
 def first_line(error: object) -> str:
     """Return the first line of an error from elsewhere, without unprintable characters, or its type."""
     lines = str(error)[:1000].strip().splitlines() or [type(error).__name__]

@@ -4,6 +4,8 @@ import re
 from collections.abc import Collection
 from pathlib import Path
 
+from hilsplat.base.errors import HilsplatError
+
 IMAGE_SUFFIXES = frozenset(
     {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".avif", ".heic", ".heif", ".hif"}
 )
@@ -27,6 +29,15 @@ def project_path(path: str | Path) -> Path:
     """
     installed = INSTALLED / path
     return installed if not Path(path).exists() and installed.exists() else Path(path)
+
+
+def regular(path: Path) -> Path:
+    """Return a path; raise HilsplatError for a pipe or device, because reading it could wait for ever."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise HilsplatError(
+            f"{path} is a pipe or device", expected="a file", fix="save its content as a file"
+        )
+    return path
 
 
 def list_images(folder: Path) -> list[Path]:

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from hilsplat.base import definitions
-from hilsplat.base.artifacts import atomic_path, parse_json
+from hilsplat.base.artifacts import atomic_path, read_memo
 from hilsplat.base.definitions import PACKAGE, Import, Statement, module_of, path_of
 from hilsplat.base.errors import HilsplatError
 
@@ -100,11 +100,9 @@ def is_as_imported() -> bool:
 
 
 def _known(kept: Path, state: str) -> dict[str, str]:
-    try:
-        found = parse_json(kept.read_bytes())
-        return dict(found["digests"]) if found["state"] == state else {}
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
+    found = read_memo(kept, dict[str, str | dict[str, str]])
+    digests = found.get("digests") if found.get("state") == state else None
+    return digests if isinstance(digests, dict) else {}
 
 
 def _digest_of(roots: tuple[str, ...], root: Path) -> str:

@@ -4,27 +4,38 @@ import functools
 import io
 import logging
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from PIL import Image, ImageCms, ImageOps, PngImagePlugin, UnidentifiedImageError
+from PIL import Image, ImageCms, ImageOps, PngImagePlugin
 
 from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.errors import ImageError
 
 logger = logging.getLogger(__name__)
 
+FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", "AVIF", "HEIF")
+"""Pillow's names of the formats of `IMAGE_SUFFIXES` (JPEG includes phones' MPO). All other formats are
+refused whatever the suffix: for EPS, Pillow starts Ghostscript, which runs the program in the file."""
 
-def open_image(path: Path) -> Image.Image:
+MIN_SIDE_PX, MAX_ASPECT = 16, 20  # limits on photographs; all stages were run on 16 x 16 and 320 x 16 px
+
+DAMAGE = (EOFError, MemoryError, OSError, SyntaxError, ValueError)
+"""Errors that Pillow raises on damaged files."""
+
+
+def open_image(file: Path | io.BytesIO, max_side_px: int = 2**16) -> Image.Image:
     """Open an image with Pillow, which reads HEIF (.heic) through pillow-heif.
 
     Size and EXIF data are read immediately; pixels are decoded on demand. A HEIF image is returned upright:
     its rotation is part of the format, and its EXIF orientation is reset.
 
     Raises:
-        ImageError: the header specifies more pixels than a photograph can have.
+        ImageError: the header specifies more pixels than a photograph can have, or sides above `max_side_px`.
+        OSError: the file is missing or has none of the `FORMATS`.
     """
     import pillow_heif
 
@@ -32,27 +43,40 @@ def open_image(path: Path) -> Image.Image:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            return Image.open(path)
+            image = Image.open(file, formats=FORMATS)
+        if max(image.size) > max_side_px:
+            raise Image.DecompressionBombError(f"{image.width} x {image.height} px")
     except Image.DecompressionBombError as error:
         raise ImageError(
-            f"image {path} is too large: {str(error).partition(',')[0]}",
-            expected=f"at most {2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} megapixels",
+            f"image {file} is too large: {str(error).partition(',')[0]}",
+            expected=f"at most {2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} MP, {max_side_px} px per side",
             fix="shrink or remove it",
         ) from error
+    return image
 
 
-def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
+@contextmanager
+def opened_image(path: Path, what: str = "image") -> Iterator[Image.Image]:
+    """Open an image as `open_image` does; raise ImageError if opening or the block fails on its content."""
+    try:
+        with open_image(path) as image:
+            yield image
+    except DAMAGE as error:
+        fix = "replace it with an intact copy"
+        raise ImageError(f"{what} {path} cannot be read: {error}", fix=fix) from error
+
+
+def read_image(file: Path | io.BytesIO, max_side_px: int = 2**16) -> UInt8[np.ndarray, "H W 3"]:
     """Read an image as upright sRGB.
 
     The EXIF orientation is applied. Colours with an embedded profile (Display P3 from phones, Adobe RGB) and
     CMYK are converted, alpha is dropped, grey is copied to all channels, and 16-bit values become 8-bit.
 
     Raises:
-        ImageError: the file is missing, empty, truncated or not an image.
+        ImageError: the file is missing, empty, truncated, too large (`open_image`) or not an image.
     """
-    path = Path(path)
     try:
-        with open_image(path) as image:
+        with open_image(file, max_side_px) as image:
             if (num_frames := _frames(image)) > 1:
                 raise ValueError(f"it contains {num_frames} frames of the same size, like an animation")
             image.load()
@@ -66,16 +90,27 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
                 upright = Image.fromarray(((values + 128) // 257).astype(np.uint8))  # 257: 65535 / 255
             if upright.mode == "F":
                 raise ValueError("its pixels are floating-point numbers of unknown range")
-            return np.asarray(_to_srgb(upright, path))
+            return np.asarray(_to_srgb(upright, file))
     except FileNotFoundError as error:
-        raise ImageError(f"image {path} is missing") from error
-    except (UnidentifiedImageError, EOFError, OSError, SyntaxError, ValueError, MemoryError) as error:
-        size = path.stat().st_size if path.exists() else 0
+        raise ImageError(f"image {file} is missing") from error
+    except DAMAGE as error:
+        size = file.stat().st_size if isinstance(file, Path) and file.exists() else 0
         raise ImageError(
-            f"image {path} cannot be read: {error}",
+            f"image {file} cannot be read: {error}",
             found=f"a file of {size} bytes",
             fix="remove it from the folder, or replace it with an intact copy",
         ) from error
+
+
+def require_usable_size(image: object, size_hw: tuple[int, ...], max_side_px: int = 2**16) -> None:
+    """Raise ImageError if a photograph is too narrow for later stages, now or shrunk to `max_side_px`."""
+    short, long = sorted(size_hw)
+    if long > MAX_ASPECT * short or round(short * min(1, max_side_px / max(long, 1))) < MIN_SIDE_PX:
+        raise ImageError(
+            f"image {image} is too small or too narrow: {size_hw[1]} x {size_hw[0]} px (width x height)",
+            expected=f"sides from {MIN_SIDE_PX} px, also at poses.max_side_px; aspect ratio to {MAX_ASPECT}",
+            fix="remove it, or crop it and its poses",
+        )
 
 
 def _frames(image: Image.Image) -> int:
@@ -90,7 +125,7 @@ def _frames(image: Image.Image) -> int:
     return num_frames if same else 1
 
 
-def _to_srgb(image: Image.Image, path: Path) -> Image.Image:
+def _to_srgb(image: Image.Image, file: object) -> Image.Image:
     """Convert to sRGB with the embedded profile; if it is missing or damaged, assume sRGB pixels."""
     profile = image.info.get("icc_profile")
     if profile and image.mode in ("RGB", "RGBA", "CMYK"):
@@ -100,7 +135,7 @@ def _to_srgb(image: Image.Image, path: Path) -> Image.Image:
                 colours, io.BytesIO(profile), _srgb_profile(), outputMode="RGB"
             )
         except ImageCms.PyCMSError as error:
-            logger.warning("%s is read as sRGB, because its colour profile is damaged: %s", path, error)
+            logger.warning("%s is read as sRGB, because its colour profile is damaged: %s", file, error)
         else:
             assert converted is not None  # only in-place conversion returns None
             return converted

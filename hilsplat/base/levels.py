@@ -1,6 +1,8 @@
-"""The three semantic levels and their order, coarse to fine."""
+"""The three semantic levels, coarse to fine, and queries with a text for each of several levels."""
 
 from enum import IntEnum
+
+from hilsplat.base.errors import SettingsError
 
 
 class Level(IntEnum):
@@ -26,5 +28,31 @@ class Level(IntEnum):
 
 
 LEVELS: tuple[Level, ...] = (Level.WHOLE, Level.PART, Level.SUBPART)
+
+PATH_SEPARATOR = ">"
+MAX_TEXT = 500  # maximum number of characters in a query; CLIP reads 77 tokens
+
+
+def plain_text(text: str) -> str:
+    """Return a text in lower case with single spaces, to compare it with others."""
+    return " ".join(text.split()).casefold()
+
+
+def path_of(text: str) -> tuple[str, ...]:
+    """Return the texts of a query, coarse to fine: one text, or a path such as "bear > head > nose".
+
+    SettingsError is raised if a text is empty or not UTF-8, or if the query is too long.
+    """
+    path = tuple(part.strip() for part in text.split(PATH_SEPARATOR))
+    problem = "contains an empty text" if not all(path) else "is too long" if len(text) > MAX_TEXT else ""
+    if problem := "is not UTF-8 text" if text != text.encode(errors="replace").decode() else problem:
+        raise SettingsError(
+            f"the query {problem}",
+            expected=f'up to {MAX_TEXT} characters: words, or a path such as "bear > head > nose"',
+            found=f"{text[:80]!r}, {len(text)} characters",
+            fix="enter words on both sides of each >, shorten the query, or set the terminal to UTF-8",
+        )
+    return path
+
 
 NONE = -1  # index that means "no such row": a root's parent, a pixel without a mask, an unassigned Gaussian

@@ -6,9 +6,7 @@ import hashlib
 import itertools
 import logging
 import os
-import re
 import secrets
-import shutil
 import signal
 import socket
 import sys
@@ -20,7 +18,8 @@ from pathlib import Path
 from threading import Thread
 from typing import IO, Any, TypeVar
 
-from hilsplat.base.errors import HilsplatError
+from hilsplat.base.errors import KILLED, KILLED_FIX, HilsplatError
+from hilsplat.base.removal import LOCK, UNFINISHED, delete, discard
 
 try:
     import fcntl
@@ -96,22 +95,10 @@ def lock(stream: IO[Any], *, shared: bool = False, wait: bool = True) -> None:
     fcntl.flock(stream, kind if wait else kind | fcntl.LOCK_NB)
 
 
-UNFINISHED = re.compile(r"\.writing-(?P<host>[0-9a-f]{8})-.*", re.DOTALL)
-"""Name of a folder of unfinished files; it is hidden, so digests ignore it."""
-
-LOCK = ".lock"  # file in such a folder; its writer locks it
-FORMER = ".former"  # subfolder for the version that is being replaced
-
-
 @functools.cache
 def host_token() -> str:
     """Return eight hexadecimal digits that identify this host by name; a reboot does not change the name."""
     return hashlib.sha256(socket.gethostname().encode()).hexdigest()[:8]
-
-
-def is_unfinished(path: Path) -> bool:
-    """Return whether a path is a folder of unfinished files or inside one."""
-    return any(UNFINISHED.fullmatch(part) for part in Path(path).parts)
 
 
 @contextmanager
@@ -137,23 +124,17 @@ def unfinished_folder(parent: Path) -> Iterator[Path]:
 
 
 def _discard(folder: Path, lock: IO[bytes]) -> None:
-    """Delete a folder of unfinished files after restoring any previous version that was not replaced."""
-    former = folder / FORMER
-    if former.is_dir():
-        for version in former.iterdir():
-            if not os.path.lexists(folder.parent / version.name):
-                version.rename(folder.parent / version.name)
-        former.rename(folder / "old")  # a partly deleted version must never be restored
-    shutil.rmtree(folder, ignore_errors=True)
+    discard(folder)
     lock.close()
-    shutil.rmtree(folder, ignore_errors=True)  # NFS keeps a deleted file until it is closed
+    delete(folder)  # NFS keeps a deleted file until it is closed
 
 
 def remove_leftovers(folder: Path) -> list[Path]:
     """Delete unfinished files left in a folder by dead processes on this host; return the deleted folders.
 
     Files of live processes, including those in other containers, are kept. If the folder is shared, files
-    from other hosts are also kept, because their locks may be invisible here.
+    from other hosts are also kept, because their locks may be invisible here. A folder without a lock is not
+    ours, unless it is empty.
     """
     removed = []
     for place, folders, _ in os.walk(folder):
@@ -163,7 +144,8 @@ def remove_leftovers(folder: Path) -> list[Path]:
                 continue
             path = Path(place) / name
             with suppress(BlockingIOError, FileNotFoundError, PermissionError):
-                with (path / LOCK).open("ab") as stream:  # a new folder may not contain it yet
+                is_new = not any(path.iterdir())  # its writer may be about to create the lock
+                with (path / LOCK).open("ab" if is_new else "rb+") as stream:
                     lock(stream, wait=False)
                     _discard(path, stream)
                 removed.append(path)
@@ -196,8 +178,13 @@ def in_processes(
         for item in items:
             yield work(*item)
         return
-    with _pool(min(workers, len(items)), end_with_parent, os.getpid()) as pool:
-        yield from pool.map(work, *zip(*items, strict=True), chunksize=chunk)
+    from concurrent.futures.process import BrokenProcessPool
+
+    try:
+        with _pool(min(workers, len(items)), end_with_parent, os.getpid()) as pool:
+            yield from pool.map(work, *zip(*items, strict=True), chunksize=chunk)
+    except BrokenProcessPool as error:
+        raise HilsplatError(f"a process of {work} was killed, {KILLED}", fix=KILLED_FIX) from error
 
 
 def _pool(workers: int, initializer: Callable[..., None], *given: Any) -> Any:

@@ -10,11 +10,21 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
+from hilsplat.base.errors import visible
+
 Item = TypeVar("Item")
 logger = logging.getLogger(__name__)
 
 LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 """Log format of a stage that a run starts; `last_progress` and `warnings_in` parse it."""
+
+
+class LogFormatter(logging.Formatter):  # noqa: TID251
+    """Formatter of all log records that are printed."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return visible(super().format(record))
+
 
 LOG_EVERY_S = 5.0  # seconds between progress lines if stderr is not a terminal
 

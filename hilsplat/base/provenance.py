@@ -9,19 +9,20 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from hilsplat.base.artifacts import (
     provenance_path,
     read_json,
     remake,
+    seal_of,
     sha256_of_path,
     visible_files,
     was_interrupted,
     write_json,
 )
-from hilsplat.base.errors import ArtifactError, HilsplatError
+from hilsplat.base.errors import ArtifactError, HilsplatError, ImageError
+from hilsplat.base.images import opened_image
 
 LIBRARIES = (
     *("hilsplat", "numpy", "scipy", "torch", "numba", "pycolmap", "onnxruntime"),
@@ -46,29 +47,26 @@ class Inputs:
                 )
         self._files = self._signatures()
         self.records = {name: self._record(path) for name, path in paths.items()}
+        for record in self.records.values():
+            for path, digest in record.get("files", {record["path"]: record.get("sha256")}).items():
+                require_as_written(Path(path), digest)
 
     def require_unchanged(self) -> None:
         """Raise HilsplatError if an input changed; files with the same size, time and inode are skipped."""
         now = self._signatures()
-        for name, path in self._paths.items():
-            before, after = self._files[name], now[name]
-            changed = sorted({file for file, _ in before.items() ^ after.items()})
-            if changed and self._record(path) != self.records[name]:
+        changed = sorted({file for file, _ in self._files.items() ^ now.items()})
+        for name, path in self._paths.items() if changed else ():
+            if self._record(path) != self.records[name]:
                 raise HilsplatError(
                     f"{self.stage}: input {name} changed while the stage ran: {changed[0]}",
                     expected="inputs that do not change until the stage ends",
-                    found="a new file" if changed[0] not in before else "a changed or deleted file",
+                    found="a changed or deleted file" if changed[0] in self._files else "a new file",
                     fix="run the stage again",
                 )
 
-    def _signatures(self) -> dict[str, dict[Path, tuple[int, ...]]]:
-        signatures: dict[str, dict[Path, tuple[int, ...]]] = {}
-        for name, path in self._paths.items():
-            stats = {file: file.stat() for file in files_of(path)}
-            signatures[name] = {
-                file: (stat.st_size, stat.st_mtime_ns, stat.st_ino) for file, stat in stats.items()
-            }
-        return signatures
+    def _signatures(self) -> dict[Path, tuple[int, ...]]:
+        stats = {file: file.stat() for path in self._paths.values() for file in files_of(path)}
+        return {file: (stat.st_size, stat.st_mtime_ns, stat.st_ino) for file, stat in stats.items()}
 
     @staticmethod
     def _record(path: Path | Sequence[Path]) -> dict[str, Any]:
@@ -102,27 +100,25 @@ def write_provenance(
 ) -> None:
     """Write an artifact's provenance record: command, settings, inputs, software, and digests of outputs."""
     folder = Path(artifact).parent
-    write_json(
-        provenance_path(artifact),
-        {
-            "stage": stage,
-            "artifact": Path(artifact).name,
-            "command": list(command),
-            "code": code,
-            "plugins": list(plugins),
-            "settings": dict(settings),
-            "seed": seed,
-            "device": device,
-            "inputs": inputs.records,
-            "outputs": {
-                os.path.relpath(path, folder): {"sha256": sha256_of_path(path), "bytes": sizes_of(path)}
-                for path in (artifact, *beside)
-            },
-            "python": platform.python_version(),
-            "libraries": {name: version_of(name) or "not installed" for name in LIBRARIES},
-            "git": git_commit(),
+    record = {
+        "stage": stage,
+        "artifact": Path(artifact).name,
+        "command": list(command),
+        "code": code,
+        "plugins": list(plugins),
+        "settings": dict(settings),
+        "seed": seed,
+        "device": device,
+        "inputs": inputs.records,
+        "outputs": {
+            os.path.relpath(path, folder): {"sha256": sha256_of_path(path), "bytes": sizes_of(path)}
+            for path in (artifact, *beside)
         },
-    )
+        "python": platform.python_version(),
+        "libraries": {name: version_of(name) or "not installed" for name in LIBRARIES},
+        "git": git_commit(),
+    }
+    write_json(provenance_path(artifact), {**record, "seal": seal_of(record)})
 
 
 class Written(BaseModel):
@@ -141,15 +137,24 @@ class Read(BaseModel):
 
 
 class Provenance(BaseModel):
-    """The fields of a record that are read back; `write_provenance` documents them."""
+    """A record, as `write_provenance` documents it; `seal` is its checksum, which old records lack."""
+
+    model_config = ConfigDict(extra="forbid")
 
     stage: str
+    artifact: str = ""
+    command: tuple[str, ...] = ()
     code: str
     plugins: tuple[str, ...]
     settings: dict[str, Any]
     seed: int | None
+    device: str | None = None
     inputs: dict[str, Read]
     outputs: dict[str, Written]
+    python: str = ""
+    libraries: dict[str, str] = Field(default_factory=dict)
+    git: str = ""
+    seal: int | None = None
 
 
 def read_provenance(artifact: Path) -> Provenance | None:
@@ -158,12 +163,32 @@ def read_provenance(artifact: Path) -> Provenance | None:
     if not path.is_file():
         return None
     try:
-        return Provenance.model_validate(read_json(path))
+        values = read_json(path)
+        record = Provenance.model_validate(values)
+        if record.seal is not None and values.pop("seal") != seal_of(values):
+            raise ArtifactError(f"{path} was changed after it was written", fix=remake(artifact))
+        return record
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         raise ArtifactError(
             f"{path} is damaged: {'.'.join(map(str, first['loc']))}: {first['msg']}", fix=remake(artifact)
         ) from error
+
+
+def require_as_written(path: Path, sha256: str | None) -> None:
+    """Raise ArtifactError if an artifact's digest differs from its provenance; other files are ignored."""
+    ending = provenance_path(Path()).name
+    beside = [path.parent / file.name.removesuffix(ending) for file in path.parent.glob(f"*{ending}")]
+    for artifact in [path] if path in beside else [path.parent, *beside]:  # `world` records `world/images`
+        record = read_provenance(artifact)
+        written = record.outputs.get(os.path.relpath(path, artifact.parent)) if record else None
+        if written is not None and written.sha256 != sha256:
+            raise ArtifactError(
+                f"{path} was changed after it was written",
+                expected=f"sha256 {written.sha256[:12]}, as in {provenance_path(artifact).name}",
+                found=f"sha256 {(sha256 or 'of nothing')[:12]}",
+                fix=remake(artifact),
+            )
 
 
 def sizes_of(path: Path) -> dict[str, int]:
@@ -238,9 +263,9 @@ def require_own_picture(path: Path, beside: Path | None = None) -> None:
 
 def _is_own_picture(path: Path) -> bool:
     try:
-        with Image.open(path) as image:
+        with opened_image(path) as image:
             return bool(image.info.get("Software") == SOFTWARE["Software"])
-    except (OSError, ValueError, SyntaxError):
+    except ImageError:
         return False
 
 

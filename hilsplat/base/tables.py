@@ -1,37 +1,47 @@
 """Small tables: CSV files with fixed columns, and Markdown."""
 
 import csv
-import io
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 from hilsplat.base.artifacts import write_text
 from hilsplat.base.errors import ArtifactError
+from hilsplat.base.files import regular
+
+FORMULA = r"(?='*(?![-+][\d.]+(e[-+]?\d+)?( ± [\d.]+)?\Z)[=+\-@\t\r\n](?s:.))"
+"""Beginning of a text, but not of a number, that a spreadsheet would run, perhaps after our apostrophes."""
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Write a header and rows; identical rows produce identical bytes."""
-    stream = io.StringIO()
-    csv.writer(stream, lineterminator="\n").writerows([columns, *rows])
-    write_text(path, stream.getvalue())
+    """Write a header and rows with an apostrophe before formulas; identical rows produce identical bytes."""
+    lines: list[str] = []
+    writer = csv.writer(SimpleNamespace(write=lines.append))  # its lines end in CRLF; else it quotes no CR
+    for row in (columns, *rows):
+        writer.writerow([re.sub(f"^{FORMULA}", "'", cell) if isinstance(cell, str) else cell for cell in row])
+    write_text(path, "".join(line.removesuffix("\r\n") + "\n" for line in lines))
 
 
-def read_csv(path: Path, columns: Sequence[str], fix: str) -> list[dict[str, str]]:
-    """Return the rows of a CSV file; raise ArtifactError with `fix` if it is missing or has wrong columns."""
+def read_csv(path: Path, columns: Sequence[str] | None, fix: str) -> list[dict[str, str]]:
+    """Return the rows of a file from `write_csv`; None accepts any columns.
+
+    ArtifactError, with `fix`, is raised if the file is missing or damaged, or has different columns.
+    """
     try:
-        with Path(path).open(encoding="utf-8", newline="") as stream:
-            reader = csv.DictReader(stream)
-            rows = list(reader)
+        with regular(Path(path)).open(encoding="utf-8", newline="") as stream:
+            lines = [line for line in csv.reader(stream) if line]
+        header, *rows = ([re.sub(f"^'{FORMULA}", "", cell) for cell in line] for line in lines)
+        found = [dict(zip(header, row, strict=True)) for row in rows]
     except FileNotFoundError as error:
         raise ArtifactError(f"{path} is missing", fix=fix) from error
-    if tuple(reader.fieldnames or ()) != tuple(columns):
+    except (ValueError, OSError, csv.Error) as error:
+        raise ArtifactError(f"{path} cannot be read: {error}", fix=fix) from error
+    if columns is not None and tuple(header) != tuple(columns):
         raise ArtifactError(
-            f"{path} has unexpected columns",
-            expected=", ".join(columns),
-            found=", ".join(reader.fieldnames or ()),
-            fix=fix,
+            f"{path} has unexpected columns", expected=", ".join(columns), found=", ".join(header), fix=fix
         )
-    return rows
+    return found
 
 
 def plain_markdown(text: str) -> str:

@@ -14,6 +14,7 @@ from hilsplat.cli.stage import (
     Threads,
     cache_app,
     datasets_app,
+    echo,
     models_app,
     section_of,
     stage,
@@ -49,7 +50,7 @@ def world_show(
 
     target = results / scene / "world.png"
     show_world(results / scene / "world", target)
-    typer.echo(f"wrote {target}")
+    echo(f"wrote {target}")
 
 
 @world_app.command("inconsistency")
@@ -64,7 +65,7 @@ def world_inconsistency(
     target = masks_folder.with_name("consistency.csv")
     with stage("consistency", target, inputs={"truth": truth, "masks": masks_folder}) as run:
         table = run(truth, masks_folder, target, NEIGHBOURS)
-    typer.echo(table)
+    echo(table)
 
 
 @world_app.command("masks")
@@ -81,7 +82,7 @@ def world_masks(
     inputs = {"scene": folder / "scene", "truth": truth, "masks": masks_folder}
     with stage("mask_truth", target, inputs=inputs, beside=(target.with_suffix(".csv"),)) as run:
         table = run(folder / "scene", truth, masks_folder, target)
-    typer.echo(table)
+    echo(table)
 
 
 @world_app.command("semantic-tree")
@@ -102,7 +103,7 @@ def world_tree(
     inputs = {"scene": posed, "gaussians": ply, "truth": truth, "semantic_tree": semantic_tree}
     with stage("tree_truth", target, inputs=inputs) as run:
         table = run(posed, ply, semantic_tree, truth, target, threads)
-    typer.echo(table)
+    echo(table)
 
 
 @models_app.command("get")
@@ -129,7 +130,7 @@ def models_get(
     """
     from hilsplat.hub.get import get_models
 
-    typer.echo(get_models(names or (), out, revision, variant))
+    echo(get_models(names or (), out, revision, variant))
 
 
 @models_app.command("list")
@@ -137,7 +138,7 @@ def models_list() -> None:
     """List released and installed models, with size, licence and use."""
     from hilsplat.models.store import models_table
 
-    typer.echo(models_table())
+    echo(models_table())
 
 
 @models_app.command("check")
@@ -149,7 +150,7 @@ def models_check(
     from hilsplat.embed.model_check import check_model, check_models
 
     text, num_failed = (check_model(folder, variant), 0) if folder is not None else check_models()
-    typer.echo(text)
+    echo(text)
     if num_failed:
         raise typer.Exit(1)
 
@@ -160,7 +161,7 @@ def models_split(folder: Annotated[Path, typer.Argument(help="folder of an expor
     from hilsplat.models.onnx_graph import split_clip
 
     for path in split_clip(folder):
-        typer.echo(f"wrote {path}")
+        echo(f"wrote {path}")
 
 
 @cache_app.callback()
@@ -172,7 +173,7 @@ def cache_show(
 
     context.obj = folder
     if context.invoked_subcommand is None:
-        typer.echo(size_table(folder))
+        echo(size_table(folder))
 
 
 @cache_app.command("prune")
@@ -194,7 +195,7 @@ def cache_prune(
     from hilsplat.base.cache import prune_cache, size_table
 
     number, freed_mib = prune_cache(context.obj, stage or [], days=days, max_mib=max_mib)
-    typer.echo(f"deleted {number} files, {freed_mib:.1f} MiB\n{size_table(context.obj)}")
+    echo(f"deleted {number} files, {freed_mib:.1f} MiB\n{size_table(context.obj)}")
 
 
 @datasets_app.command("list")
@@ -204,7 +205,7 @@ def datasets_list(
     """List the data sets: citation, licence, layout and, with --data-root, the scenes found."""
     from hilsplat.datasets.registry import overview
 
-    typer.echo(overview(data_root))
+    echo(overview(data_root))
 
 
 @datasets_app.command("check")
@@ -217,7 +218,7 @@ def datasets_check(
     from hilsplat.datasets.registry import check, dataset_of
 
     report, num_failed = check(dataset_of(name), data_root, scene or ())
-    typer.echo(report)
+    echo(report)
     if num_failed:
         raise typer.Exit(1)
 
@@ -261,4 +262,4 @@ def datasets_fits(
 
     with stage("label_fits", target, inputs=inputs, plugins=readers_of([name])) as run:
         table = run(folder, variant, name, data_root, target, threads)
-    typer.echo(table)
+    echo(table)

@@ -7,6 +7,7 @@ import gc
 import logging
 import os
 import sys
+import warnings
 from pathlib import Path
 from typing import Annotated
 
@@ -14,12 +15,30 @@ from typing import Annotated
 # several cores through numba or our own pools, where the number of cores does not affect results.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_name] = "1"
+os.environ["MPLBACKEND"] = "agg"
+warnings.filterwarnings("ignore", "Glyph .* missing from font")  # pictures show boxes instead of such letters
+for _name in (
+    "NUMBA_DISABLE_JIT",
+    "NUMBA_NUM_THREADS",
+    "NUMBA_OPT",
+):  # they break our loops or change results
+    os.environ.pop(_name, None)
+
+# Otherwise, a file would get the number of a stream that is closed (cron, daemons), and receive its output.
+for _number in range(3):
+    try:
+        os.set_inheritable(_number, True)
+    except OSError:
+        os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
+sys.stdout = sys.stdout or open(1, "w", closefd=False)  # noqa: SIM115
+sys.stderr = sys.stderr or open(2, "w", closefd=False)  # noqa: SIM115
 
 import typer  # noqa: E402
 
+from hilsplat.base.cache import use_writable_cache  # noqa: E402
 from hilsplat.base.errors import HilsplatError, require_working_directory, system_error  # noqa: E402
 from hilsplat.base.processes import end_with_workflow, keep_freed_memory  # noqa: E402
-from hilsplat.cli.stage import app, start_logging  # noqa: E402
+from hilsplat.cli.stage import app, echo, start_logging  # noqa: E402
 
 # `hilsplat --help` lists the commands in this order.
 # isort: off
@@ -34,13 +53,15 @@ def main() -> None:
     gc.set_threshold(5_000)  # imports create many permanent objects: a tenth less time to start
     try:
         require_working_directory()
+        start_logging()
+        use_writable_cache()
         app()
         sys.stdout.flush()
     except Exception as error:
         message = error if isinstance(error, HilsplatError) else system_error(error)
-        if message is None:
+        if message is None and sys.gettrace() is not None:  # for post-mortem debugging
             raise
-        logging.getLogger("hilsplat").error("%s", message)
+        logging.getLogger("hilsplat").error("%s", message or "unexpected error", exc_info=message is None)
         sys.exit(1)
     finally:  # otherwise, garbage-collecting numba and matplotlib objects at exit takes 0.4 s
         gc.freeze()
@@ -66,5 +87,5 @@ def options(
     if version:
         from hilsplat.base.provenance import version_of
 
-        typer.echo(f"hilsplat {version_of('hilsplat') or 'not installed'}")
+        echo(f"hilsplat {version_of('hilsplat') or 'not installed'}")
         raise typer.Exit

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from hilsplat.cli.stage import app
+from hilsplat.cli.stage import app, echo
 
 POSES_HELP = "COLMAP model or transforms.json, or its folder; none: compute poses; default: use any found"
 
@@ -17,7 +17,7 @@ def init(folder: Annotated[Path, typer.Argument(help="folder of the project")] =
     from hilsplat.workflow.run import start_project
 
     for path in start_project(folder):
-        typer.echo(f"wrote {path}")
+        echo(f"wrote {path}")
 
 
 @app.command("run")
@@ -29,6 +29,9 @@ def run_command(
     config: Annotated[
         list[Path] | None, typer.Option(help="file that overrides config/config.yaml; may be repeated")
     ] = None,
+    verify: Annotated[
+        bool, typer.Option(help="read every byte of earlier results, and rebuild what is damaged")
+    ] = False,
 ) -> None:
     """Run the workflow for everything in the configuration, or only for given scenes, tables or files.
 
@@ -38,7 +41,7 @@ def run_command(
 
     options = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else []
     names = targets or []
-    raise typer.Exit(run(names[: len(names) - len(options)], config or [], options))
+    raise typer.Exit(run(names[: len(names) - len(options)], config or [], options, every_byte=verify))
 
 
 @app.command()
@@ -63,14 +66,14 @@ def new(
     Reports what was found, what is used, and what is likely to fail.
     """
     from hilsplat.photos.add import add_scene
-    from hilsplat.scene.sheet import read_sheet
+    from hilsplat.scene.sheet import PHOTOS, read_sheet
     from hilsplat.workflow.models import models_of_photographs
 
     report = add_scene(
         sheet, name, photos, frames=frames, poses=poses, gaussians=gaussians, features=features, labels=labels
     )
     following = f"  hilsplat run {name}\n  hilsplat query {name} 'bear nose'"
-    typer.echo(f"{report}\n\nadded photos/{name} to {sheet}. Next:\n{following}")
-    features = read_sheet(sheet, checked_groups=())[-1].features
-    for line in models_of_photographs(sheet.with_name("config.yaml"), name, features):
-        typer.echo(line)
+    echo(f"{report}\n\nadded photos/{name} to {sheet}. Next:\n{following}")
+    (row,) = (row for row in read_sheet(sheet, checked_groups=()) if row.name == f"{PHOTOS}/{name}")
+    for line in models_of_photographs(sheet.with_name("config.yaml"), name, row.features):
+        echo(line)

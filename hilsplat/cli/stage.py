@@ -11,9 +11,11 @@ from typing import Annotated, Any
 import typer
 
 from hilsplat.base.artifacts import output_lock, parse_json, provenance_path, require_free_space
-from hilsplat.base.errors import HilsplatError, SettingsError, system_error
+from hilsplat.base.cache import writable
+from hilsplat.base.errors import HilsplatError, SettingsError, system_error, visible
 from hilsplat.base.plugins import load
-from hilsplat.base.progress import LOG_FORMAT
+from hilsplat.base.progress import LOG_FORMAT, LogFormatter
+from hilsplat.base.removal import delete
 from hilsplat.models.store import model_path
 from hilsplat.workflow.stages import STAGES, stage_code
 
@@ -50,7 +52,7 @@ Memory = Annotated[
     float | None, typer.Option(min=1, help="memory for views in parallel, in MiB; default: all free memory")
 ]
 Seed = Annotated[int, typer.Option(min=0, max=2_000_000_000, help="random seed")]
-Cache = Annotated[Path, typer.Option(help="cache folder of finished views, for resuming")]
+Cache = Annotated[Path, typer.Option(callback=writable, help="cache folder of finished views, for resuming")]
 Results = Annotated[Path, typer.Option(help="results folder")]
 DataRoot = Annotated[Path, typer.Option(help="folder of the data sets")]
 
@@ -64,11 +66,15 @@ def start_logging(*, timestamps: bool = False) -> None:
     root.setLevel(logging.INFO)
     root.handlers.clear()
     handler = logging.StreamHandler(sys.stderr)
-    if timestamps and not sys.stderr.isatty():
-        handler.setFormatter(logging.Formatter(LOG_FORMAT))
+    handler.setFormatter(LogFormatter(LOG_FORMAT if timestamps and not sys.stderr.isatty() else None))
     root.addHandler(handler)
     for noisy in ("matplotlib", "numba", "PIL", "fontTools", "urllib3"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
+
+
+def echo(text: object) -> None:
+    """Print to stdout; commands print nothing in any other way, because texts from files may be hostile."""
+    typer.echo(visible(text))  # noqa: TID251
 
 
 @contextmanager
@@ -113,8 +119,9 @@ def stage(
             try:
                 read.require_unchanged()
             except HilsplatError:
-                provenance_path(out).unlink(missing_ok=True)  # without provenance, the output is rebuilt
+                delete(provenance_path(out), r".+\.provenance\.json")  # so that the output is rebuilt
                 raise
+            written = [path.with_suffix(kind) for path in (out, *beside) for kind in (".pdf", ".report.json")]
             write_provenance(
                 out,
                 stage=name,
@@ -123,7 +130,7 @@ def stage(
                 settings=_recorded(settings),
                 seed=seed,
                 inputs=read,
-                beside=beside,
+                beside=(*beside, *filter(Path.exists, written)),
                 plugins=plugins,
                 device=None if device is None else choose_device(device),
             )

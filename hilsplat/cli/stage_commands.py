@@ -20,6 +20,7 @@ from hilsplat.cli.stage import (
     Settings,
     Threads,
     app,
+    echo,
     json_option,
     model_input,
     section_of,
@@ -157,7 +158,7 @@ def show_masks(
     """Draw a view's masks at three levels, and its coverage trees."""
     from hilsplat.segment.pictures import masks_overview
 
-    typer.echo(f"wrote {out}, view {masks_overview(scene, masks, out, view, coverage_tree)}")
+    echo(f"wrote {out}, view {masks_overview(scene, masks, out, view, coverage_tree)}")
 
 
 @app.command()
@@ -480,4 +481,4 @@ def efficiency(
     """Print the time of each stage, from the benchmark files of a run."""
     from hilsplat.evaluate.tables.costs import run_efficiency
 
-    typer.echo(run_efficiency(results, out))
+    echo(run_efficiency(results, out))

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import typer
 
 from hilsplat.base.errors import ArtifactError, SettingsError
-from hilsplat.cli.stage import DataRoot, Results, Threads, app
+from hilsplat.cli.stage import DataRoot, Results, Threads, app, echo
 
 SceneName = Annotated[str, typer.Argument(help="scene in results/, such as desk or photos/desk, or its path")]
 
@@ -56,7 +56,7 @@ def query(
             out=out,
             threads=threads,
         ):
-            typer.echo(found)
+            echo(found)
     finally:
         gc.enable()
 
@@ -84,7 +84,7 @@ def verify(
     from hilsplat.workflow.records import verify
 
     report, is_whole = verify(results)
-    typer.echo(report)
+    echo(report)
     if not is_whole:
         raise typer.Exit(1)
 
@@ -100,11 +100,11 @@ def doctor(
     for finding in examine():
         findings.append(asdict(finding))
         if not as_json:
-            typer.echo(f"{finding.state:<5}  {finding.check:<14} {finding.found}")
+            echo(f"{finding.state:<5}  {finding.check:<14} {finding.found}")
             if finding.fix:
-                typer.echo(f"       {'':<14} -> {finding.fix}")
+                echo(f"       {'':<14} -> {finding.fix}")
     if as_json:
-        typer.echo(json.dumps(findings, indent=1))
+        echo(json.dumps(findings, indent=1))
     if any(finding["state"] == "fault" for finding in findings):
         raise typer.Exit(1)
 
@@ -116,7 +116,7 @@ def settings(
     """Print every setting: default, choices or range, unit, origin, meaning."""
     from hilsplat.configuration import config_schema, knob_table
 
-    typer.echo(json.dumps(config_schema(), indent=1) if schema else knob_table())
+    echo(json.dumps(config_schema(), indent=1) if schema else knob_table())
 
 
 @app.command()
@@ -150,13 +150,13 @@ def export(
     if form == "tree":
         from hilsplat.query.tree_picture import export_tree
 
-        typer.echo(export_tree(folder, variant, out, threads))
+        echo(export_tree(folder, variant, out, threads))
         return
     if form == "ply":
         from hilsplat.splat.coordinates import write_source_ply
 
         ply = out / "point_cloud.ply"
-        typer.echo(f"wrote {write_source_ply(folder / 'gaussians.ply', ply)} Gaussians to {ply}")
+        echo(f"wrote {write_source_ply(folder / 'gaussians.ply', ply)} Gaussians to {ply}")
         return
     from hilsplat.scene.scene import Scene
 
@@ -181,7 +181,7 @@ def export(
             "nerfstudio": (write_nerfstudio, "images, transforms.json and points.ply"),
         }[form]
         write(opened, out)
-    typer.echo(f"wrote {what} of {views} views to {out}")
+    echo(f"wrote {what} of {views} views to {out}")
 
 
 Port = Annotated[int, typer.Option(min=0, max=65535, help="port of the page; 0: any free port")]
@@ -204,7 +204,7 @@ def view(
     from hilsplat.viewer.app import run_view
 
     folder = scene_folder(scene, results)
-    run_view(folder, variant=variant, port=port, browser=browser, threads=threads, on_ready=typer.echo)
+    run_view(folder, variant=variant, port=port, browser=browser, threads=threads, on_ready=echo)
 
 
 @app.command()
@@ -226,6 +226,4 @@ def annotate(
 
     folder = scene_folder(scene, results)
     labels = data_root / "annotated" / Scene.load(folder / "scene").name
-    run_annotate(
-        folder, labels, variant=variant, port=port, browser=browser, threads=threads, on_ready=typer.echo
-    )
+    run_annotate(folder, labels, variant=variant, port=port, browser=browser, threads=threads, on_ready=echo)

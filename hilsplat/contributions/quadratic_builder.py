@@ -1,7 +1,6 @@
 """Sum the quadratic form of frozen geometry part by part in bounded memory; choose G or W."""
 
 import logging
-import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
@@ -22,6 +21,7 @@ from hilsplat.base.artifacts import (
 )
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS
+from hilsplat.base.removal import DIGEST, delete
 from hilsplat.contributions.kernels import SUMS, add_to_block, enlarged, merge_rows, transpose
 from hilsplat.contributions.quadratic import Gram, Quadratic, StackedWeights
 
@@ -273,7 +273,7 @@ class QuadraticCheckpoint:
 
     def forget(self) -> None:
         """Delete the checkpoint of a finished pass."""
-        shutil.rmtree(self._folder, ignore_errors=True)
+        delete(self._folder, DIGEST)
 
 
 def stack_weights(parts: list[StackedWeights]) -> StackedWeights:

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import scipy.sparse as sp
 
+from hilsplat.base.arrays import require_types
 from hilsplat.base.artifacts import (
     ViewCache,
     atomic_folder,
@@ -37,6 +38,7 @@ from hilsplat.base.progress import stage_log, track
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.contributions.quadratic import Gram, StackedWeights
 from hilsplat.contributions.quadratic_builder import QuadraticBuilder, QuadraticCheckpoint
+from hilsplat.contributions.rows import Contributions
 from hilsplat.contributions.view_matrices import label_maps, labelled_rows, view_contributions
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks
@@ -210,7 +212,9 @@ def run_contributions(
             )
         np.save(folder / "means.npy", gaussians.means)
         np.save(folder / "centres.npy", np.stack([camera.centre for camera in cameras]))
-        write_npz(folder / "rows.npz", **{name: np.concatenate(values) for name, values in rows.items()})
+        arrays = {name: np.concatenate(values) for name, values in rows.items()}
+        require_types(Contributions, arrays, out / "rows.npz", {})
+        write_npz(folder / "rows.npz", **arrays)
         counts |= {"views": len(cameras), "masks": num_masks}
         nonzeros = {name: len(streams[f"{name}_data"]) for name in MATRICES}
         if settings.keep != "none":

@@ -4,8 +4,7 @@ Labels, images and poses are keyed by view name ("frame_00041.png", see `scene.v
 a label matches its image and camera even if other views are missing.
 """
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,12 +13,11 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 from jaxtyping import Bool, Int
-from PIL import Image
 
-from hilsplat.base.errors import ImageError, SceneError
+from hilsplat.base.errors import SceneError
 from hilsplat.base.files import list_images
-from hilsplat.base.images import open_image
-from hilsplat.base.levels import Level
+from hilsplat.base.images import opened_image
+from hilsplat.base.levels import Level, plain_text
 from hilsplat.datasets.dataset import SceneReport
 from hilsplat.scene.layouts import find_known_poses
 from hilsplat.scene.view_names import view_name
@@ -93,7 +91,7 @@ class LabelledScene:
         images: all image files of the scene, by view.
         poses: folder in which `find_known_poses` finds poses; None if the scene has none.
         views: labelled regions by view, in label order.
-        warnings: one sentence for each item that was reinterpreted.
+        warnings: one sentence for each item that was reinterpreted or is doubtful.
     """
 
     dataset: str
@@ -102,6 +100,14 @@ class LabelledScene:
     poses: Path | None
     views: Mapping[str, tuple[LabelledRegion, ...]]
     warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Add a warning for each text that resembles another one."""
+        first: dict[str, str] = {}
+        for text in self.prompts:
+            if (other := first.setdefault(plain_text(text), text)) != text:
+                twins = f"{other!r} and {text!r} differ only in case or spaces, but are scored separately"
+                object.__setattr__(self, "warnings", (*self.warnings, twins))
 
     @property
     def prompts(self) -> tuple[str, ...]:
@@ -176,7 +182,7 @@ def images_by_view(folder: Path) -> dict[str, Path]:
 
 def image_size_hw(path: Path) -> tuple[int, int]:
     """Read an image's height and width, as stored, from its header; raise ImageError if it is unreadable."""
-    with _opened("image", path) as image:
+    with opened_image(path) as image:
         return image.height, image.width
 
 
@@ -204,19 +210,8 @@ def mask_region(
 
 def read_mask_file(path: Path, least: int) -> Bool[np.ndarray, "H W"]:
     """Return which values in a grey mask file are at least `least`; raise ImageError if it is damaged."""
-    with _opened("mask", path) as image:
+    with opened_image(path, "mask") as image:
         return np.asarray(image.convert("L")) >= least
-
-
-@contextmanager
-def _opened(kind: str, path: Path) -> Iterator[Image.Image]:
-    try:
-        with open_image(path) as image:
-            yield image
-    except (OSError, SyntaxError) as error:  # Pillow raises SyntaxError for a damaged PNG
-        raise ImageError(
-            f"{kind} {path} cannot be read: {error}", fix="replace it with an intact copy"
-        ) from error
 
 
 def check_label_size(

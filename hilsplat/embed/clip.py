@@ -134,7 +134,7 @@ class ClipModel:
         """Return the unit vectors of square crops with side `side_px`."""
         step = self.crops_per_call or len(crops)
         pieces = np.split(self.prepare(crops), range(step, len(crops), step))
-        return unit(np.concatenate([self.vision(**{self.pixels: piece})[0] for piece in pieces]))
+        return self._unit(np.concatenate([self.vision(**{self.pixels: piece})[0] for piece in pieces]))
 
     def embed_picture(self, picture: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, " C"]:
         """Return the unit vector of a whole image, centred in a black square like mask crops."""
@@ -196,7 +196,18 @@ class ClipModel:
         if self.tokenizer.encode(sentence).overflowing:
             logger.warning("text truncated after %d tokens: %r", self.max_tokens, text)
         (vector,) = self.text(**self._tokens(sentence))
-        return unit(vector)[0]
+        return self._unit(vector)[0]
+
+    def _unit(self, vectors: Float32[np.ndarray, "N C"]) -> Float32[np.ndarray, "N C"]:
+        """Scale a network's vectors to length 1; raise ModelError if this is impossible."""
+        if not (np.isfinite(vectors).all() and vectors.any(axis=1).all()):
+            raise ModelError(
+                f"the CLIP model {self.model.folder} gives vectors without a direction",
+                expected="finite numbers that are not all 0",
+                found=f"{vectors.min()} to {vectors.max()}",
+                fix="use another variant (clip.variant), or another export of the model",
+            )
+        return unit(vectors)
 
     def _tokens(self, sentence: str) -> dict[str, np.ndarray]:
         """Return the text network's inputs for one sentence."""

@@ -66,7 +66,7 @@ def read_view(
     """
     maps_path, vectors_path = (folder / f"{stem_of(view)}_{kind}.npy" for kind in "sf")
     maps, vectors = read_npy(maps_path), read_npy(vectors_path)
-    if maps.ndim != 3 or len(maps) != len(MAPS):
+    if maps.ndim != 3 or len(maps) != len(MAPS) or not maps.size:
         shape = "an array of shape (4, height, width): default, s, m, l"
         raise ArtifactError(f"{maps_path} is not a LangSplat map", expected=shape, found=f"{maps.shape}")
     if vectors.ndim != 2 or vectors.dtype.kind != "f" or not np.isfinite(vectors).all():

@@ -3,12 +3,14 @@
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
-from hilsplat.base.artifacts import read_json, write_json
-from hilsplat.base.errors import ArtifactError, HilsplatError
+from hilsplat.base.artifacts import read_memo, write_json
+from hilsplat.base.cache import writable
+from hilsplat.base.errors import HilsplatError
 from hilsplat.embed.clip import ClipModel
 from hilsplat.models.folder import input_side_px, open_model_folder
 from hilsplat.models.int8 import considers_int8, int8_network
@@ -21,6 +23,7 @@ CACHE = Path("results/.cache")
 IMAGE_NETWORKS = {"sam": "vision_encoder", "clip": "vision_model"}
 LARGEST_PROVIDER_DIFFERENCE = 0.02
 """Maximum relative difference attributed to rounding, such as that of TF32 products on CUDA."""
+Measured = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Seconds = dict[str, float]
 """Timings (s). SAM: "image" per image; "masks" and optional "preview" per prompt. CLIP: "crop" per crop."""
 
@@ -54,11 +57,11 @@ def check_model(folder: Path, variant: str = "") -> str:
         ]
         providers = opened.encoder.providers
     else:
-        vectors = opened.embed_crops(np.zeros((1, side, side, 3), np.uint8))
+        vectors = opened.embed_crops(np.full((1, side, side, 3), 128, np.uint8))
         require_one_space(model.folder, vectors.shape[1], opened.embed_texts(["object"]).shape[1])
         lines += [f"vectors    {vectors.shape[1]} dimensions"]
         providers = opened.vision.providers
-    _remember(folder, variant, seconds, CACHE)
+    _remember(folder, variant, seconds, writable(CACHE))
     lines += [f"time       {times}", f"runs on    {', '.join(providers)}", f"digest     {model.digest}"]
     return "\n".join(lines)
 
@@ -103,11 +106,11 @@ def seconds_of(folder: Path, variant: str, precision: str, cache: Path) -> Secon
     """
     model = open_model_folder(folder, variant=variant)
     requested = "int8" if considers_int8(precision, model, IMAGE_NETWORKS[model.kind]) else "fp32"
-    found = _known(cache).get(_key(folder, variant, requested))
-    if found is None:
+    found = _known(cache).get(_key(folder, variant, requested), {})
+    if not found.keys() >= ({"crop"} if model.kind == "clip" else {"image", "masks"}):
         opened = SamModel(model) if model.kind == "sam" else ClipModel(model)
         found = _measure(opened, requested) or _measure(opened, "fp32")
-        _remember(folder, variant, {requested: found}, cache)
+        _remember(folder, variant, {requested: found}, writable(cache))
     return found
 
 
@@ -115,13 +118,13 @@ def _measure(model: SamModel | ClipModel, precision: str) -> Seconds:
     """Measure a model; the result is empty if it has no int8 network."""
     side, is_int8 = input_side_px(model.model), precision == "int8"
     if isinstance(model, ClipModel):
-        network = int8_network(model.model, "vision_model", CACHE) if is_int8 else model.vision
+        network = int8_network(model.model, "vision_model", writable(CACHE)) if is_int8 else model.vision
         if network is None:
             return {}
         crops = np.zeros((model.crops_per_call or 1, side, side, 3), np.uint8)
         _, seconds = _second_call(lambda: network(**{model.pixels: model.prepare(crops)}))
         return {"crop": seconds / len(crops)}
-    encoder = model.int8_encoder(CACHE) if is_int8 else model.encoder
+    encoder = model.int8_encoder(writable(CACHE)) if is_int8 else model.encoder
     if encoder is None:
         return {}
     encoded, seconds = _second_call(lambda: model.encode(np.zeros((side, side, 3), np.uint8), encoder))
@@ -146,10 +149,7 @@ def _key(folder: Path, variant: str, precision: str) -> str:
 
 
 def _known(cache: Path) -> dict[str, Seconds]:
-    try:
-        return read_json(cache / "model_seconds.json")
-    except ArtifactError:
-        return {}
+    return read_memo(cache / "model_seconds.json", dict[str, dict[str, Measured]])
 
 
 def _remember(folder: Path, variant: str, found: dict[str, Seconds], cache: Path) -> None:

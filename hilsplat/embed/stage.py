@@ -19,7 +19,7 @@ from hilsplat.base.artifacts import (
     write_index,
     write_npy,
 )
-from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.errors import MisalignedArtifactError, ModelError
 from hilsplat.base.identity import code_digest
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
@@ -36,6 +36,8 @@ from hilsplat.models.memory import needs_of
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks, pixel_digests, require_same_masks
 from hilsplat.settings import ClipSettings
+
+FEW_CROPS = 10  # number of crops from which equal vectors show a broken model
 
 RERUN_MASKS = "rerun the masks stage for this scene"
 
@@ -124,12 +126,19 @@ def run_clip(
 
     with stage_log("clip", scene.name) as counts, atomic_folder(out) as folder:
         index: dict[str, dict[str, Any]] = {}
+        distinct = set[bytes]()
         made = in_order(embed, views, threads)
         for view, vectors in zip(views, track(made, "CLIP of views", len(views)), strict=True):
             write_npy(folder / f"{view}.npy", vectors)
             crops = int(vectors.any(axis=1).sum())
+            distinct.update(vector.tobytes() for vector in vectors[vectors.any(axis=1)][:FEW_CROPS])
             index[view] = {MASKS_SHA256: digests[view], "masks": len(vectors), "crops": crops}
         more = {"precision": model.precision, "background": settings.background}
+        if len(distinct) == 1 and sum(entry["crops"] for entry in index.values()) >= FEW_CROPS:
+            raise ModelError(
+                f"the CLIP model {settings.model} gives the same vector for all crops of {scene.name}",
+                fix="use another variant (clip.variant), or another export of the model",
+            )
         write_index(folder, index, scene=scene.name, **model.about(settings), **more)
         totals = {name: sum(entry[name] for entry in index.values()) for name in ("masks", "crops")}
         counts.update(views=len(views), **totals, dim=model.width, from_cache=view_cache.hits)

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from hilsplat.base.artifacts import read_npz
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, SettingsError
-from hilsplat.base.images import open_image
+from hilsplat.base.images import opened_image
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import stage_log
 from hilsplat.datasets.labelled import image_size_hw
@@ -263,6 +263,7 @@ def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.nd
 
     Raises:
         ArtifactError: the view has neither a folder nor a file, or has both, or a file cannot be used.
+        ImageError: a PNG is damaged.
     """
     stem = Path(view).stem
     place, packed = folder / stem, folder / f"{stem}.npz"
@@ -274,7 +275,8 @@ def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.nd
             fix="remove one of them",
         )
     if packed.is_file():
-        return {_key(name): _as_mask(array, f"{packed}: {name}") for name, array in read_npz(packed).items()}
+        arrays = read_npz(packed, max_gib=2.0)  # 500 masks of 4 megapixels
+        return {_key(name): _as_mask(array, f"{packed}: {name}") for name, array in arrays.items()}
     if not place.is_dir():
         raise ArtifactError(
             f"view {stem} has no predictions",
@@ -348,20 +350,17 @@ def _key(name: str) -> tuple[str, str]:
 
 
 def _read_png(path: Path) -> Bool[np.ndarray, "h w"]:
-    try:
-        with open_image(path) as image:
-            grey = np.asarray(image.convert("L"))
-    except (OSError, SyntaxError) as error:
-        raise ArtifactError(f"mask {path} cannot be read: {error}", fix="save it as PNG again") from error
+    with opened_image(path, "mask") as image:
+        grey = np.asarray(image.convert("L"))
     return _as_mask(grey, str(path))
 
 
 def _as_mask(array: np.ndarray, where: str) -> Bool[np.ndarray, "h w"]:
-    if array.ndim != 2:
+    if array.ndim != 2 or array.dtype.kind not in "biuf":
         raise ArtifactError(
-            f"mask {where} is not two-dimensional",
+            f"mask {where} is not two-dimensional, or not numeric",
             expected="height x width",
-            found=" x ".join(map(str, array.shape)),
+            found=f"{' x '.join(map(str, array.shape))} {array.dtype}",
         )
     if array.dtype == bool:
         return array

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from hilsplat.base.artifacts import read_npz, remake, write_npz
 from hilsplat.base.errors import ArtifactError
-from hilsplat.base.tables import write_csv
+from hilsplat.base.tables import read_csv, write_csv
 from hilsplat.evaluate.metrics.instances import InstanceMatches
 from hilsplat.evaluate.protocols.cards import card_of
 
@@ -60,28 +60,18 @@ def read_scores(paths: Iterable[Path]) -> "pd.DataFrame":
     """Read score files into one frame.
 
     Raises:
-        ArtifactError: a file is missing or has different columns.
+        ArtifactError: a file is missing, damaged, or has different columns.
     """
     import pandas as pd
 
-    frames = []
+    rows: list[dict[str, object]] = []
     for path in paths:
+        found = read_csv(path, COLUMNS, remake(path))
         try:
-            frame = pd.read_csv(path, dtype=str, keep_default_na=False)
-        except FileNotFoundError as error:
-            raise ArtifactError(f"{path} is missing", fix=remake(path)) from error
-        except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError, OSError) as error:
+            rows += [{**row, "value": float(row["value"]), "n": int(row["n"])} for row in found]
+        except ValueError as error:
             raise ArtifactError(f"{path} cannot be read: {error}", fix=remake(path)) from error
-        if tuple(frame.columns) != COLUMNS:
-            raise ArtifactError(
-                f"{path} does not have the columns of a score file",
-                expected=", ".join(COLUMNS),
-                found=", ".join(map(str, frame.columns)),
-                fix=remake(path),
-            )
-        frames.append(frame)
-    scores = pd.concat([*frames, pd.DataFrame(columns=list(COLUMNS), dtype=str)], ignore_index=True)
-    return scores.assign(value=scores["value"].astype(float), n=scores["n"].astype(int))
+    return pd.DataFrame(rows, columns=list(COLUMNS)).astype({"value": float, "n": int})
 
 
 def write_instances(scores: Path, matches: Mapping[tuple[str, ...], InstanceMatches]) -> None:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float32
 
-from hilsplat.base.arrays import made, read_tensors, write_tensors
+from hilsplat.base.arrays import made, read_tensors, require_types, write_tensors
 from hilsplat.base.artifacts import read_npz, remake, sealed
 from hilsplat.base.errors import ArtifactError
 from hilsplat.contributions.rows import Contributions
@@ -206,6 +206,7 @@ class LanguageField:
 
     def save(self, path: Path) -> None:
         """Write `field.safetensors` atomically; identical fields produce identical bytes."""
+        require_types(LanguageField, vars(self), path, {})
         about = {"gaussians_sha256": self.gaussians_sha256, "autoencoder_sha256": self.autoencoder_sha256}
         write_tensors(path, {"features": self.features}, **about)
 

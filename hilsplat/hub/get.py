@@ -5,6 +5,7 @@ PyTorch weights are exported to ONNX networks by optimum, in a separate process 
 
 import logging
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -23,15 +24,17 @@ from huggingface_hub.utils import disable_progress_bars
 
 from hilsplat.base.artifacts import (
     FULL_DISK,
+    atomic_folder,
     explain_full_disk,
     output_lock,
     read_json,
+    read_memo,
     require_free_space,
-    work_folder,
     write_json,
 )
 from hilsplat.base.errors import DownloadError, ModelError, first_line
 from hilsplat.base.progress import track
+from hilsplat.base.removal import delete, is_tagged, tag
 from hilsplat.embed.model_check import check_model
 from hilsplat.hub.catalogue import (
     OUT_OF_REACH,
@@ -57,6 +60,8 @@ logger = logging.getLogger(__name__)
 
 ORIGIN = "origin.json"
 """File in a model folder that records its origin."""
+STAGING = ".{name}.part"
+"""Name of a download's folder, beside the model's."""
 KEPT = "transferred data is kept, and the transfer resumes"
 SPARE_BYTES = 200_000_000
 """Disk space that must remain free after a transfer."""
@@ -154,7 +159,9 @@ def _is_present(requested: ModelRequest, target: Path, listing: Listing) -> bool
 
     A folder that was not downloaded from this repository is refused.
     """
-    origin = read_json(target / ORIGIN) if (target / ORIGIN).is_file() else {}
+    origin = read_memo(target / ORIGIN, dict[str, Any])
+    if not isinstance(origin.get("holds"), dict):
+        origin = {}
     if target.exists() and origin.get("repository") != requested.repository:
         raise DownloadError(
             f"{target} already exists and was not downloaded from {requested.repository}",
@@ -202,7 +209,10 @@ def _listing(requested: ModelRequest, revision: str | None) -> Listing:
 
 def _prepare(requested: ModelRequest, listing: Listing, target: Path, variant: str) -> Prepared:
     """Choose the files to download according to the repository's config.json."""
-    staging = target.with_name(f".{target.name}.part")
+    staging = target.with_name(STAGING.format(name=target.name))
+    if staging.exists() and not is_tagged(staging):
+        raise DownloadError(f"{staging} exists, but is not a download of this version", fix="remove it first")
+    tag(staging)
     (config,) = listing.require("config.json")
     choice = choose_files(listing, _fetch(listing, config, staging).read_bytes(), variant)
     found = Prepared(requested, listing, choice, staging, target, variant)
@@ -237,7 +247,7 @@ def _needs(found: Prepared) -> str:
 
 
 def _install(found: Prepared) -> str:
-    """Download all files, prepare and check the folder next to the target, and rename it to the target."""
+    """Download all files, complete and check the model in a new folder, and replace the target by it."""
     listing, choice = found.listing, found.choice
     for path in track(list(choice.files), f"files of {found.requested.name}"):
         _fetch(listing, listing.files[path], found.staging)
@@ -246,20 +256,37 @@ def _install(found: Prepared) -> str:
             _fetch(listing, listing.files[path], found.staging)
         choice = replace(choice, files={**choice.files, **more})
         found = replace(found, choice=choice)
-    if choice.exported:
-        with work_folder(found.target) as temporary:
-            made = temporary / found.target.name
-            versions = export_networks(found.staging, made)
-            text = _place(found, made, exported=versions)
-        shutil.rmtree(found.staging)
-        return text
-    for path, place in choice.files.items():
-        (found.staging / path).replace(found.staging / place)
-    for file in [path for path in found.staging.rglob("*") if path.is_file()]:
-        if file.relative_to(found.staging).as_posix() not in choice.files.values():
-            file.unlink()  # metadata of the download, and files of another revision
-    shutil.rmtree(found.staging / ".cache", ignore_errors=True)
-    return _place(found, found.staging)
+    with atomic_folder(found.target) as made:
+        versions = {}
+        if choice.exported:
+            versions = {"exported": export_networks(found.staging, made)}
+        else:
+            for path, place in choice.files.items():
+                (made / place).parent.mkdir(parents=True, exist_ok=True)
+                try:
+                    (made / place).hardlink_to(found.staging / path)
+                except OSError:  # the file system has no hard links
+                    shutil.copyfile(found.staging / path, made / place)
+        text = _complete(found, made, **versions)
+        _keep_others(found.target, made)
+    delete(found.staging, STAGING.format(name=re.escape(found.target.name)))
+    return text
+
+
+def _keep_others(former: Path, made: Path) -> None:
+    """Copy the files that a former version did not download, such as a vocabulary, into the new version."""
+    held = {ORIGIN, *(read_json(former / ORIGIN)["holds"] if former.exists() else ())}
+    for path in former.rglob("*"):
+        place = made / path.relative_to(former)
+        if path.is_dir() or path.relative_to(former).as_posix() in held:
+            continue
+        if place.exists():
+            raise DownloadError(
+                f"{path} was not downloaded, and the new version has a file of this name",
+                fix="rename or move it, then run the command again",
+            )
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(path, place, follow_symlinks=False)
 
 
 def _further_weights(found: Prepared) -> dict[str, str]:
@@ -283,7 +310,7 @@ def _fetch(listing: Listing, file: HubFile, staging: Path) -> Path:
         shutil.copyfile(file.cached, target)
     found, size = file.digest_of(target), target.stat().st_size
     if found != file.digest:
-        target.unlink()
+        delete(target, re.escape(target.name))
         raise DownloadError(
             f"{file.path} of {listing.repository} does not have the expected digest",
             expected=f"digest {file.digest}, {file.size} bytes",
@@ -318,11 +345,11 @@ def _download(listing: Listing, file: HubFile, staging: Path) -> None:
         ) from error
 
 
-def _place(found: Prepared, made: Path, **more: Any) -> str:
-    """Check a complete folder, write `origin.json` into it, and rename it to the target."""
+def _complete(found: Prepared, made: Path, **more: Any) -> str:
+    """Check a model folder, write `origin.json` into it, and return the report."""
     if whole := whole_clip(made):
         split_clip(made)
-        whole.unlink()
+        delete(whole)
     text = check_model(made).replace(str(made), str(found.target))
     files = [path for path in sorted(made.rglob("*")) if path.is_file() and path.name != ORIGIN]
     fetched = []
@@ -338,9 +365,6 @@ def _place(found: Prepared, made: Path, **more: Any) -> str:
         "holds": {path.relative_to(made).as_posix(): path.stat().st_size for path in files},
     }
     write_json(made / ORIGIN, origin)
-    if found.target.exists():
-        shutil.rmtree(found.target)
-    made.replace(found.target)
     return text
 
 

@@ -5,11 +5,12 @@ A folder contains `config.json`, the preprocessing configuration and the network
 so its digest identifies the model.
 """
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from hilsplat.base.artifacts import read_json, sha256_of_file, sha256_of_json
 from hilsplat.base.errors import ArtifactError, ModelError
@@ -23,6 +24,43 @@ WHOLE_COPY = "fetch a complete copy"
 SWITCHES = ("do_resize", "do_rescale", "do_normalize")
 """Preprocessing steps that our code always performs."""
 
+SAM_SIDE_PX = 1024  # default of `size`
+MAX_SIDE_PX = 4096
+
+
+def _side_px(size: Any) -> Any:
+    """Return the side of a square size in any published form; return other values unchanged."""
+    if isinstance(size, dict) and size.keys() in ({"longest_edge"}, {"shortest_edge"}, {"height", "width"}):
+        size = list(size.values())
+    return size[0] if isinstance(size, list) and size and size.count(size[0]) == len(size) else size
+
+
+Side = Annotated[int, BeforeValidator(_side_px), Field(ge=1, le=MAX_SIDE_PX)]
+Mean = Annotated[list[Annotated[float, Field(ge=-255, le=255)]], Field(min_length=3, max_length=3)]
+Deviation = Annotated[list[Annotated[float, Field(ge=1e-3, le=255)]], Field(min_length=3, max_length=3)]
+
+
+class Preprocessing(BaseModel):
+    """Image preprocessing in the keys of `preprocessor_config.json` or open_clip; sizes are square, in px.
+
+    `resample` (one of Pillow's filters) applies only to SAM; `segment.crops` resizes the crops for CLIP.
+    """
+
+    model_config = ConfigDict(strict=True, allow_inf_nan=False)
+    do_resize: bool | None = None
+    do_rescale: bool | None = None
+    do_normalize: bool | None = None
+    do_pad: bool | None = None
+    do_center_crop: bool | None = None
+    do_convert_rgb: bool | None = None
+    size: Side | None = None
+    crop_size: Side | None = None
+    pad_size: Side | None = None
+    image_mean: Mean | None = Field(None, validation_alias=AliasChoices("image_mean", "mean"))
+    image_std: Deviation | None = Field(None, validation_alias=AliasChoices("image_std", "std"))
+    rescale_factor: Annotated[float, Field(gt=0, le=1)] | None = None
+    resample: Annotated[int, Field(ge=0, le=5)] | None = None
+
 
 @dataclass(frozen=True)
 class ModelFolder:
@@ -31,7 +69,7 @@ class ModelFolder:
     folder: Path
     layout: str  # key of `LAYOUTS`
     config: dict[str, Any]
-    preprocessing: dict[str, Any]  # image preprocessing, with the keys of `preprocessor_config.json`
+    preprocessing: dict[str, Any]  # the values given in `Preprocessing`
     networks: dict[str, Path]  # file of each network by name, including optional networks that exist
     files: tuple[Path, ...]  # all files included in the digest
 
@@ -157,33 +195,28 @@ def variants_of(folder: Path, layout: str) -> list[str]:
 
 
 def preprocessing_of(path: Path) -> dict[str, Any]:
-    """Read the image preprocessing settings, and convert open_clip's keys.
+    """Read and check the image preprocessing settings of a model (`Preprocessing`), without empty values.
 
-    A ModelError is raised if the file is unreadable, disables a step, or has an invalid mean or deviation.
+    A ModelError is raised if the file is unreadable, disables a step, or contains an invalid value.
     """
     try:
-        found = {key: value for key, value in read_json(path).items() if value is not None}
+        found = Preprocessing.model_validate(read_json(path)).model_dump(exclude_none=True)
     except ArtifactError as error:
         raise ModelError(f"{path} cannot be read: {error}", fix=WHOLE_COPY) from error
-    if switched_off := [key for key in SWITCHES if found.get(key) is False]:
+    except ValidationError as error:
+        fault = error.errors()[0]
+        problem = f"{path}: {fault['loc'][0] if fault['loc'] else 'its content'} is invalid"
+        value = str(fault["input"])[:80]
+        raise ModelError(problem, expected=fault["msg"], found=value, fix=WHOLE_COPY) from error
+    switches = SWITCHES if "pad_size" not in found else (*SWITCHES, "do_pad")
+    if switched_off := [key for key in switches if found.get(key) is False]:
         raise ModelError(
             f"{path} disables {', '.join(switched_off)}",
             expected="images resized, divided by 255 and normalised, as in the released models",
             fix="export the model again with its own preprocessor",
         )
-    if path.name == "preprocess_cfg.json":
-        size = found.get("size", 224)
-        found["size"] = size[0] if isinstance(size, list) else size
-        for ours, theirs in (("image_mean", "mean"), ("image_std", "std")):
-            if theirs in found:
-                found[ours] = found[theirs]
-    for key, least in (("image_mean", -math.inf), ("image_std", 0)):
-        values = found.get(key, [])
-        are_numbers = isinstance(values, list) and all(type(value) in (int, float) for value in values)
-        if not are_numbers or not all(least < value < math.inf for value in values):
-            expected = "finite numbers" + (" above 0" if least == 0 else "")
-            problem = f"{path}: {key} is invalid"
-            raise ModelError(problem, expected=expected, found=str(values)[:80], fix=WHOLE_COPY)
+    if found.get("pad_size", MAX_SIDE_PX) < found.get("size", SAM_SIDE_PX):
+        raise ModelError(f"{path}: pad_size is smaller than size", fix=WHOLE_COPY)
     return found
 
 
@@ -206,15 +239,7 @@ def external_weights(network: Path) -> list[Path]:
     return found
 
 
-def side_px(size: Any, default: int) -> int:
-    """Return the side of a square input from a preprocessor's size (a number, or a dict in any form)."""
-    if isinstance(size, dict):
-        size = next((size[key] for key in ("longest_edge", "shortest_edge", "height") if key in size), None)
-    return int(size) if size else default
-
-
 def input_side_px(model: ModelFolder) -> int:
     """Return the side of the image network's square input, px."""
-    key = "pad_size" if model.layout == "sam" else "crop_size"
-    size = model.preprocessing.get(key) or model.preprocessing.get("size")
-    return side_px(size, 1024 if model.kind == "sam" else 224)
+    key, default = ("pad_size", SAM_SIDE_PX) if model.kind == "sam" else ("crop_size", 224)
+    return int(model.preprocessing.get(key, model.preprocessing.get("size", default)))

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hilsplat.base.artifacts import ViewCache, atomic_path, sha256_of_json
+from hilsplat.base.removal import is_unfinished
 from hilsplat.models.fast_paths import or_as_exported
 from hilsplat.models.folder import ModelFolder, external_weights, input_side_px
 from hilsplat.models.network import CPU, Network, execution_providers
@@ -70,6 +71,8 @@ def int8_network(
     def prepare() -> Network:
         source = graph or Graph.read(model.networks[name])
         beside = model.folder.parent  # a new file in the model folder could change its digest
+        while is_unfinished(beside):  # `hilsplat models get` checks a model before it installs it
+            beside = beside.parent
         folder = beside if os.access(beside, os.W_OK) else cache
         path = folder / ".int8" / f"{sha256_of_json([source.digest, RECIPE, list(exact)])}.onnx"
         if not path.is_file():

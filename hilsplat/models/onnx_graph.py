@@ -14,6 +14,7 @@ import numpy as np
 
 from hilsplat.base.artifacts import atomic_path, sha256_of_bytes, sha256_of_json
 from hilsplat.base.errors import ModelError, first_line
+from hilsplat.base.files import regular
 
 WHOLE = "model.onnx"
 """Network with both halves, in the model folder itself or in its subfolder `onnx/`."""
@@ -120,7 +121,7 @@ def has_external_weights(path: Path) -> bool:
     """Return whether a network may refer to other files, without reading its weights."""
     if not path.stat().st_size:
         return False
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+    with regular(path).open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
         return content.find(b"location") >= 0  # key of every tensor stored outside the graph
 
 

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 import numpy as np
 import onnxruntime
 
+from hilsplat.base.cache import remembered
 from hilsplat.base.errors import ModelError
-from hilsplat.base.remembered import remembered
 from hilsplat.models.folder import ModelFolder
 from hilsplat.models.network import Network
 

@@ -7,13 +7,14 @@ import functools
 import json
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import platformdirs
 
-from hilsplat.base.artifacts import parse_json, sha256_of_path, write_json
+from hilsplat.base.artifacts import parse_json, read_memo, sha256_of_path, write_json
 from hilsplat.base.files import project_path
 from hilsplat.models.layouts import LAYOUTS, layout_of
 
@@ -147,13 +148,11 @@ def model_digest(folder: Path, cache: Path) -> str:
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     stamp = json.dumps([[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files])
     memo = cache / "digests.json"
-    try:
-        known = parse_json(memo.read_text())
-    except (OSError, ValueError):
-        known = {}
+    known = read_memo(memo, dict[str, str])
     if stamp not in known:
         known[stamp] = sha256_of_path(folder)
-        write_json(memo, known)
+        with suppress(OSError):  # a read-only folder of results
+            write_json(memo, known)
     return known[stamp]
 
 

@@ -2,16 +2,18 @@
 
 import shutil
 from collections import Counter, defaultdict
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 
-from hilsplat.base.artifacts import atomic_folder, sha256_of_file, write_text
-from hilsplat.base.errors import ImageError, SceneError
+from hilsplat.base.artifacts import atomic_folder, changing, sha256_of_file, write_text
+from hilsplat.base.errors import ImageError, SceneError, first_line
 from hilsplat.base.files import NAME_RULE, list_images, name_problem
-from hilsplat.base.images import open_image, read_image, resize_to_fit
+from hilsplat.base.images import open_image, read_image, require_usable_size, resize_to_fit
 from hilsplat.base.progress import track
+from hilsplat.base.removal import undone_on_error
 from hilsplat.photos.check import CHECK_SIDE_PX, CheckedPhoto, photo_doubts
 from hilsplat.photos.intake import prepared_photographs
 from hilsplat.scene.features import EXIF_ORIENTATION, exif_focal_px
@@ -110,8 +112,9 @@ def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
             continue
         try:
             pixels = read_image(path)
+            require_usable_size(path, pixels.shape[:2])
         except ImageError as error:
-            reason = str(error.__cause__ or error).replace(str(path), path.name)
+            reason = first_line(error.__cause__ or error).replace(str(path), path.name)
             unreadable.append((path.name, f"{reason} ({path.stat().st_size} bytes)"))
             continue
         size_hw = (pixels.shape[0], pixels.shape[1])
@@ -173,6 +176,28 @@ def add_scene(
             found=problem,
             fix="choose another name, such as my-desk_2",
         )
+    with changing(sheet) as sheet:  # `sheet` may be a link
+        _require_new(sheet, name)
+        root = project_root(sheet)
+        with prepared_photographs(photos, root / PHOTOS / name, frames) as (folder, made):
+            extra = _trained(folder, {"poses": poses, "gaussians": gaussians, "features": features})
+            notes = [*made, *_notes(folder, extra)]
+            annotated = root / "annotated" / PHOTOS / name
+            files = [] if annotated.exists() else _labels(folder, labels)
+            if files:
+                notes.append(f"labels for {len(files)} photographs, used for evaluation: {files[0].parent}")
+            report = replace(inspect_photos(folder, poses), notes=tuple(notes))
+            _check(report, has_known_poses(folder, poses))
+            if files:
+                with atomic_folder(annotated) as target:
+                    for path in files:
+                        shutil.copy2(path, target / path.name)
+            with undone_on_error(annotated) if files else nullcontext():
+                _append(sheet, name, folder, extra)
+        return report
+
+
+def _require_new(sheet: Path, name: str) -> None:
     rows = read_sheet(sheet, checked_groups=()) if sheet.exists() else []
     taken = {row.name.casefold(): row for row in rows}
     if (row := taken.get(f"{PHOTOS}/{name}".casefold())) is not None:
@@ -181,22 +206,6 @@ def add_scene(
             found=f"source {row.source}",
             fix="choose a different name, or remove the scene's line from the sheet first",
         )
-    root = project_root(sheet)
-    with prepared_photographs(photos, root / PHOTOS / name, frames) as (folder, made):
-        extra = _trained(folder, {"poses": poses, "gaussians": gaussians, "features": features})
-        notes = [*made, *_notes(folder, extra)]
-        annotated = root / "annotated" / PHOTOS / name
-        files = [] if annotated.exists() else _labels(folder, labels)
-        if files:
-            notes.append(f"labels for {len(files)} photographs, used for evaluation: {files[0].parent}")
-        report = replace(inspect_photos(folder, poses), notes=tuple(notes))
-        _check(report, has_known_poses(folder, poses))
-        if files:
-            with atomic_folder(annotated) as target:
-                for path in files:
-                    shutil.copy2(path, target / path.name)
-        _append(sheet, name, folder, extra)
-    return report
 
 
 def _trained(folder: Path, named: dict[str, Path | None]) -> dict[str, Path]:

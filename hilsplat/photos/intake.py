@@ -1,15 +1,16 @@
 """Conversion of videos and untrusted archives into folders of photographs."""
 
-import shutil
+import os
 import stat
 import zipfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path, PurePosixPath
 
-from hilsplat.base.artifacts import atomic_folder, read_json, require_free_space, write_json
+from hilsplat.base.artifacts import atomic_folder, read_memo, require_free_space, write_json
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, list_files, list_images
+from hilsplat.base.removal import undone_on_error
 from hilsplat.scene.layouts import has_known_poses, photo_folder, unwrapped
 
 MARK = ".made_from.json"
@@ -29,7 +30,8 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tu
 
     The source is a folder that contains photographs or only videos, a video, or a .zip (or Record3D's .r3d).
     A folder of photographs is used in place. Videos (at most `frames` frames in all) and archives are
-    converted into a new folder at `target`, which is removed if the block raises an error.
+    converted into a new folder at `target`; if the block raises an error, the files of a folder that this
+    call made are removed.
 
     Raises:
         SceneError: the source cannot be used, or the target exists and was made from different files.
@@ -52,7 +54,8 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tu
         )
     files = [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in videos or [source]]
     mark = {"files": files, "frames": frames}
-    if not target.exists():
+    is_new = not os.path.lexists(target)
+    if is_new:
         with atomic_folder(target) as folder:
             if videos:
                 from hilsplat.photos.video import extract_frames  # PyAV is slow to import
@@ -64,16 +67,13 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tu
                 unpack_photographs(source, folder)
                 notes = [f"{source.name} unpacked to {target}"]
             write_json(folder / MARK, mark)
-    elif (target / MARK).is_file() and read_json(target / MARK) == mark:
+    elif read_memo(target / MARK, dict) == mark:
         notes = [f"{target} already exists and was made from the same files"]  # left by a run that was killed
     else:
         fix = "choose another name for the scene, or move that folder"
         raise SceneError(f"{target} already exists", fix=fix)
-    try:
+    with undone_on_error(target) if is_new else nullcontext():
         yield unwrapped(target), notes
-    except BaseException:
-        shutil.rmtree(target, ignore_errors=True)
-        raise
 
 
 def _videos_of(source: Path) -> list[Path]:

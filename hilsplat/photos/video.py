@@ -33,6 +33,14 @@ GREY_SIDE_PX = 480
 SHARPNESS_SIDE_PX = 960
 """Longer side of the grey copies: `GREY_SIDE_PX` for motion, `SHARPNESS_SIDE_PX` for sharpness."""
 
+MAX_FRAME_PX = 8192 * 4352
+LIMIT = {"max_pixels": str(MAX_FRAME_PX)}
+"""Maximum size of a frame, as in level 6.2 of H.265 (8K); decoders keep up to 16 frames in memory."""
+
+OPTIONS = {"format_whitelist": "mov,matroska,avi", "protocol_whitelist": "file", "enable_drefs": "0"}
+"""FFmpeg's options that keep a video from naming other files to read: demuxers of `VIDEO_SUFFIXES` only,
+without playlists; no network; no tracks in external files."""
+
 JPEG_QUALITY = 95
 USUAL_RATE = 30.0
 """Assumed frames per second for files without a frame rate or timestamps."""
@@ -129,11 +137,11 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
 def _opened(video: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     """Open the first video stream of a file."""
     try:
-        container = av.open(str(video), metadata_errors="replace")
+        container = av.open(f"file:{video}", metadata_errors="replace", options=OPTIONS | LIMIT)
     except (av.error.FFmpegError, OSError) as error:
         raise SceneError(
             f"video {video} cannot be read: {error.strerror or error}",
-            expected="an intact file with a video stream; a truncated .mp4 or .mov lacks its index",
+            expected="an intact .mp4, .mov, .mkv, .webm or .avi; a truncated .mp4 or .mov lacks its index",
             found=f"a file of {video.stat().st_size} bytes" if video.is_file() else "no file",
             fix="copy it again from the camera, or convert it to H.264 in an .mp4",
         ) from error
@@ -145,6 +153,10 @@ def _opened(video: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
                 fix="pass a file that contains video",
             )
         stream = container.streams.video[0]
+        if stream.width * stream.height > MAX_FRAME_PX:
+            expected, found = "frames of at most 8192 x 4352 px", f"{stream.width} x {stream.height} px"
+            raise SceneError(f"video {video} is too large", expected=expected, found=found, fix="rescale it")
+        stream.codec_context.options = LIMIT  # frames may be larger than the header states
         stream.thread_type = "AUTO"
         yield container, stream
 

@@ -5,11 +5,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from hilsplat.base.artifacts import sha256_of_bytes
-from hilsplat.base.levels import LEVELS
+from hilsplat.base.levels import LEVELS, PATH_SEPARATOR, path_of
 from hilsplat.base.provenance import require_own_picture
 from hilsplat.query.hits import Hit, counted, doubts_of
-from hilsplat.query.language_scene import LanguageScene, path_of
-from hilsplat.query.names import PATH_SEPARATOR
+from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.node_search import NodeHits
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.segment.origin import made_from_truth, masks_label

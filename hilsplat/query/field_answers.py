@@ -9,7 +9,7 @@ from jaxtyping import Float32, Int64, UInt8
 
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.images import to_uint8
-from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.levels import LEVELS, Level, path_of
 from hilsplat.contributions.compositing import rendered_latents
 from hilsplat.field.code import Code, LanguageField, LinearCode
 from hilsplat.query.relevancy import LatentRelevancy
@@ -98,7 +98,7 @@ class FieldScene(SceneViews):
         """Return each Gaussian's field relevancy at a level or its maximum over levels; 0 without latents."""
         features = self.trained()[0].features
         out = np.zeros(len(features), np.float32)
-        vector = self.text_vectors([text])
+        vector = self.text_vectors(path_of(text)[-1:])
         for each in LEVELS:
             if level in ("auto", each.label):
                 latents = features[:, each.index]

@@ -15,12 +15,12 @@ from jaxtyping import Bool, Float32, Int64, UInt8
 
 from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import ArtifactError, ModelError, SettingsError
-from hilsplat.base.levels import LEVELS, NONE, Level
+from hilsplat.base.levels import LEVELS, NONE, Level, path_of
 from hilsplat.field.code import LanguageField, autoencoder_file, load_code
 from hilsplat.models.store import is_embedded, meaningless
 from hilsplat.query.field_answers import FieldScene
 from hilsplat.query.hits import Doubt, Hit, doubts_of
-from hilsplat.query.names import PATH_SEPARATOR, NodeNames, read_names
+from hilsplat.query.names import NodeNames, read_names
 from hilsplat.query.node_names import NodeNaming
 from hilsplat.query.node_search import NodeHits, TextAnswer, search
 from hilsplat.query.relevancy import margin_of_relevancy, margins, relevancy_of_margins
@@ -195,8 +195,8 @@ class LanguageScene(FieldScene):
             limit: maximum number of answers.
 
         Raises:
-            SettingsError: the text is empty, the level, answerer or view is unknown, a path has more texts
-                than levels, or the threshold is not between 0 and 1.
+            SettingsError: the text is empty or too long, the level, answerer or view is unknown, a path has
+                more texts than levels, or the threshold is not between 0 and 1.
         """
         found = self.select(text, level=level, answerer=answerer, view=view, threshold=threshold)
         return self.hits_of(found, limit)
@@ -380,22 +380,3 @@ class LanguageScene(FieldScene):
                 blended = shown.blend(values, float(values[nodes].min()))
                 found[row, level.index] = np.where(shown.covered, blended, -np.inf)[pixels]
         return found
-
-
-def path_of(text: str) -> tuple[str, ...]:
-    """Return the texts of a query, coarse to fine: one text, or a path such as "bear > head > nose".
-
-    Raises:
-        SettingsError: a text is empty or not UTF-8.
-    """
-    if not text.isascii() and text != text.encode(errors="replace").decode():
-        raise SettingsError(
-            f"the query {text!r} is not UTF-8 text", fix="set the terminal to UTF-8, or write it in ASCII"
-        )
-    path = tuple(part.strip() for part in text.split(PATH_SEPARATOR))
-    if not all(path):
-        raise SettingsError(
-            f"the query {text!r} contains an empty text",
-            fix='enter words, or a path such as "bear > head > nose"',
-        )
-    return path

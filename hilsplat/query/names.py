@@ -10,16 +10,25 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, NonNegativeInt, ValidationError
 
 from hilsplat.base.artifacts import read_json, read_npz, sha256_of_file, write_json
 from hilsplat.base.errors import ArtifactError, SettingsError
+from hilsplat.base.levels import PATH_SEPARATOR, plain_text
 from hilsplat.web.file_changes import NO_FILE, replacing, version_of
 
 FILE = "names.json"
-PATH_SEPARATOR = ">"
 LONGEST = 80
 """Maximum number of characters in a name."""
+NAME_RULE = f"at most {LONGEST} printable characters, without the separator {PATH_SEPARATOR!r}"
+
+
+def checked_name(name: str) -> str:
+    """Return a name from a user or a file with single spaces; raise ValueError if it breaks `NAME_RULE`."""
+    name = " ".join(name.split())
+    if len(name) > LONGEST or PATH_SEPARATOR in name or not name.isprintable():
+        raise ValueError(f"{name!r} is not a valid name")
+    return name
 
 
 @dataclass(frozen=True)
@@ -31,8 +40,7 @@ class NodeNames:
 
     def nodes_of(self, text: str) -> list[int]:
         """Return the nodes with this name, ignoring case and extra spaces."""
-        plain = " ".join(text.split()).casefold()
-        return [node for node, name in self.of_node.items() if " ".join(name.split()).casefold() == plain]
+        return [node for node, name in self.of_node.items() if plain_text(name) == plain_text(text)]
 
 
 def tree_digest(semantic_tree: Path) -> str:
@@ -47,6 +55,7 @@ def read_names(folder: Path, semantic_tree: Path) -> NodeNames:
         ArtifactError: the file is damaged, has a different format version, or names nodes that do not exist.
     """
     path = Path(folder) / FILE
+    version = version_of(path)  # read before the names: if they change meanwhile, they cannot be replaced
     kept = _kept(path).trees.get(tree_digest(semantic_tree), {})
     num_nodes = len(read_npz(Path(semantic_tree) / "tree.npz")["level"]) if kept else 0
     if beyond := [node for node in kept if node >= num_nodes]:
@@ -56,7 +65,7 @@ def read_names(folder: Path, semantic_tree: Path) -> NodeNames:
             found=", ".join(map(str, beyond[:5])),
             fix="correct the file, or move it elsewhere to start without names",
         )
-    return NodeNames(MappingProxyType(kept), version_of(path))
+    return NodeNames(MappingProxyType(kept), version)
 
 
 def write_names(
@@ -66,19 +75,16 @@ def write_names(
 
     Raises:
         StaleFileError: the file changed since `version` was read.
-        SettingsError: a name is too long, contains `PATH_SEPARATOR` or is not printable, or a row is invalid.
+        SettingsError: a name breaks `NAME_RULE`, or a row does not exist.
     """
     path = Path(folder) / FILE
-    given = {node: " ".join(name.split()) for node, name in names.items()}
-    for node, name in given.items():
-        if not 0 <= node < num_nodes:
-            raise SettingsError(f"node {node} does not exist", expected=f"0 to {num_nodes - 1}")
-        if len(name) > LONGEST or PATH_SEPARATOR in name or not name.isprintable():
-            raise SettingsError(
-                f"{name!r} is not a valid name",
-                expected=f"at most {LONGEST} printable characters, without the separator {PATH_SEPARATOR!r}",
-            )
-    with replacing(path, version, f"the names in {path}"):
+    if beyond := [node for node in names if not 0 <= node < num_nodes]:
+        raise SettingsError(f"node {beyond[0]} does not exist", expected=f"0 to {num_nodes - 1}")
+    try:
+        given = {node: checked_name(name) for node, name in names.items()}
+    except ValueError as error:
+        raise SettingsError(str(error), expected=NAME_RULE) from error
+    with replacing(path, version, f"the names in {path}") as path:
         found = _kept(path)
         found.trees[tree_digest(semantic_tree)] = {node: name for node, name in sorted(given.items()) if name}
         write_json(path, found.model_dump(mode="json"))
@@ -91,7 +97,7 @@ class NamesFile(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     format: Literal["hilsplat-names-1"]
-    trees: dict[str, dict[NonNegativeInt, Annotated[str, Field(max_length=LONGEST)]]]
+    trees: dict[str, dict[NonNegativeInt, Annotated[str, AfterValidator(checked_name)]]]
 
 
 def _kept(path: Path) -> NamesFile:
@@ -103,6 +109,7 @@ def _kept(path: Path) -> NamesFile:
         first = error.errors(include_url=False)[0]
         raise ArtifactError(
             f"{path} is damaged or in a different format: {'.'.join(map(str, first['loc']))}: {first['msg']}",
-            expected='{"format": "hilsplat-names-1", "trees": {<digest of a tree>: {"<row>": "<name>"}}}',
+            expected='{"format": "hilsplat-names-1", "trees": {<digest of a tree>: {"<row>": "<name>"}}}, '
+            f"with names of {NAME_RULE}",
             fix="correct the file, or move it elsewhere to start without names",
         ) from error

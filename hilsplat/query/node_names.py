@@ -24,12 +24,13 @@ from hilsplat.base.artifacts import (
     write_npy,
 )
 from hilsplat.base.errors import ArtifactError, SettingsError
+from hilsplat.base.files import regular
 from hilsplat.base.identity import code_digest
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel, open_clip_of
 from hilsplat.models.store import AUTO
-from hilsplat.query.names import tree_digest
+from hilsplat.query.names import NAME_RULE, checked_name, tree_digest
 from hilsplat.query.relevancy import margins
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import EvaluateSettings, QuerySettings
@@ -66,10 +67,10 @@ class Vocabulary:
         """Read a text file: texts on lines or between commas, in sections [things] (default), [parts], ...
 
         Raises:
-            SettingsError: the file cannot be read, has an unknown section or contains no text.
+            SettingsError: the file cannot be read or contains no text, or a section or name is invalid.
         """
         try:
-            lines = Path(path).read_text(encoding="utf-8").splitlines()
+            lines = regular(Path(path)).read_text(encoding="utf-8").splitlines()
         except (OSError, UnicodeDecodeError) as error:
             raise SettingsError(
                 f"the vocabulary {path} cannot be read: {error}", expected="a UTF-8 text file"
@@ -87,9 +88,11 @@ class Vocabulary:
                         found=text,
                     )
             else:
-                found[section] |= dict.fromkeys(
-                    " ".join(each.split()) for each in text.split(",") if each.strip()
-                )
+                try:
+                    names = (checked_name(each) for each in text.split(","))
+                    found[section] |= dict.fromkeys(name for name in names if name)
+                except ValueError as error:
+                    raise SettingsError(f"line {number} of {path}: {error}", expected=NAME_RULE) from error
         if not (found["things"] or found["parts"] or found["surfaces"]):
             raise SettingsError(f"the vocabulary {path} contains no texts", expected="one text per line")
         return Vocabulary(**{section: tuple(texts) for section, texts in found.items()})
@@ -125,7 +128,7 @@ class NodeNaming:
         rows = read_json(sealed(folder, "names.json"))
         try:
             found = NodeNaming(
-                tuple(str(row["name"]) for row in rows),
+                tuple(checked_name(str(row["name"])) for row in rows),
                 tuple(bool(row["surface"]) for row in rows),
                 read_npy(sealed(folder, "rivals.npy")).astype(np.float32),
             )

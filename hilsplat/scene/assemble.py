@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from hilsplat.base.artifacts import atomic_folder, write_json
-from hilsplat.base.images import read_image, write_png
+from hilsplat.base.images import read_image, require_usable_size, write_png
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.colmap import Points, pycolmap
 from hilsplat.scene.scene import Scene
@@ -49,6 +49,7 @@ def undistort(view: PosedView, folder: Path) -> PosedView:
         return replace(view, image=target)
     bitmap = pycolmap.Bitmap.from_array(read_image(view.image))
     warped, camera = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, view.camera)
+    require_usable_size(view.view, (camera.height, camera.width))
     write_png(target, warped.to_array())
     return replace(view, image=target, camera=camera)
 

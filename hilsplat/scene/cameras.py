@@ -12,6 +12,7 @@ from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 
 MAX_SIDE_PX = 2**15
+LIMITS = {"size_hw": (1, MAX_SIDE_PX)}
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,7 @@ class Cameras:
 
     def save(self, path: Path) -> None:
         """Write `cameras.npz` atomically."""
+        require_types(Cameras, vars(self), path, LIMITS)
         write_npz(
             path,
             names=np.array(self.names, dtype=np.str_),
@@ -89,7 +91,7 @@ class Cameras:
         """
         arrays = read_npz(path, "names", "cam_from_world", "K", "size_hw")
         numbers = {name: array for name, array in arrays.items() if name != "names"}
-        require_types(Cameras, numbers, path, {"size_hw": (1, MAX_SIDE_PX)})
+        require_types(Cameras, numbers, path, LIMITS)
         names, poses, K = arrays["names"], arrays["cam_from_world"], arrays["K"]
         are_rigid = are_rotations(poses[:, :3, :3], RIGID_TOLERANCE)
         if names.dtype.kind != "U" or names.shape != (len(poses),) or len(set(names.tolist())) != len(names):

@@ -18,8 +18,9 @@ Points = tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]
 
 
 def pose_matrix(pose: pycolmap.Rigid3d) -> Float64[np.ndarray, "4 4"]:
-    """Return a COLMAP pose as a 4 x 4 matrix."""
-    return np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]])
+    """Return a COLMAP pose as a 4 x 4 matrix; NaN if its quaternion is 0, which COLMAP takes for no turn."""
+    has_rotation = np.any(pose.rotation.quat)
+    return np.vstack([pose.matrix() if has_rotation else np.full((3, 4), np.nan), [0.0, 0.0, 0.0, 1.0]])
 
 
 def camera_of(image: pycolmap.Image) -> pycolmap.Camera:

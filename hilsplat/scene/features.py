@@ -9,7 +9,7 @@ import numpy as np
 from PIL import ExifTags, UnidentifiedImageError
 
 from hilsplat.base.errors import ImageError, SceneError
-from hilsplat.base.images import open_image, read_image, resize_to_fit, write_png
+from hilsplat.base.images import open_image, read_image, require_usable_size, resize_to_fit, write_png
 from hilsplat.base.progress import track
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.matching import match_pairs
@@ -92,7 +92,7 @@ def prepare_images(sources: Sequence[Path], folder: Path, max_side_px: int) -> l
     """Write each photograph to `folder` as an upright PNG with a longer side of at most `max_side_px`.
 
     Raises:
-        ImageError: files cannot be read; the message names all of them.
+        ImageError: files cannot be used; the message names all of them.
         SceneError: two files would become the same view.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -100,10 +100,12 @@ def prepare_images(sources: Sequence[Path], folder: Path, max_side_px: int) -> l
     damaged: list[tuple[Path, str]] = []
     for source, view in track(list(zip(sources, view_names(sources), strict=True)), "photographs read"):
         try:
-            pixels = resize_to_fit(read_image(source), max_side_px)
+            pixels = read_image(source)
+            require_usable_size(source, pixels.shape[:2], max_side_px)
         except ImageError as error:
             damaged.append((source, str(error)))
             continue
+        pixels = resize_to_fit(pixels, max_side_px)
         size_hw = (pixels.shape[0], pixels.shape[1])
         write_png(folder / view, pixels, WORK_COMPRESSION)
         images.append(WorkImage(view, source, size_hw, exif_focal_px(source, size_hw)))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from hilsplat.base.artifacts import read_index, sha256_of_file
+from hilsplat.base.artifacts import read_index, run_command, sha256_of_file
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.provenance import read_provenance
 from hilsplat.settings import EvaluateSettings
@@ -150,7 +150,7 @@ def finished_variants(folder: Path) -> list[str]:
 
 
 def _unfinished(folder: Path, missing: Path) -> ArtifactError:
-    return ArtifactError(f"{folder} is not finished: {missing} is missing", fix=f"hilsplat run {missing}")
+    return ArtifactError(f"{folder} is not finished: {missing} is missing", fix=run_command(missing))
 
 
 def _input_of(artifact: Path, name: str, folder: Path) -> Path:

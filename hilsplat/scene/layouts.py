@@ -6,7 +6,7 @@ from typing import Any
 
 from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import SceneError
-from hilsplat.base.files import list_images
+from hilsplat.base.files import list_images, regular
 
 TRAINED = ("output", "outputs", "exports", "language_features")
 """Folders that 3DGS, nerfstudio and LangSplat write beside photographs."""
@@ -27,7 +27,7 @@ EXPORTED = ("exports/*/splat.ply", "exports/splat.ply", "splat.ply", "point_clou
 def read_json_object(path: Path, fix: str) -> dict[str, Any]:
     """Read another program's JSON object; raise SceneError with the given fix if it cannot be read."""
     try:
-        content = parse_json(path.read_text(encoding="utf-8"))
+        content = parse_json(regular(path).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise SceneError(f"{path} is not valid JSON: {error}", fix=fix) from error
     if not isinstance(content, dict):

@@ -14,6 +14,8 @@ from hilsplat.base.files import list_images
 from hilsplat.base.images import read_image, resize_to_fit
 from hilsplat.base.processes import in_own_process
 from hilsplat.base.progress import stage_log
+from hilsplat.base.provenance import SOFTWARE, require_own_picture
+from hilsplat.base.removal import delete
 from hilsplat.scene.assemble import Posed, PosedView, split_views, write_scene
 from hilsplat.scene.colmap import camera_of, pose_matrix, pycolmap, reprojection_errors, sparse_points
 from hilsplat.scene.features import (
@@ -91,7 +93,8 @@ def run_poses(
     with stage_log("poses", name) as counts, work_folder(out) as work:
         known = find_known_poses(images, named) if images.is_dir() else None
         lost, kept = work / LOST_PICTURE, out.with_name(LOST_PICTURE)
-        kept.unlink(missing_ok=True)  # from an earlier run
+        require_own_picture(kept)
+        delete(kept, LOST_PICTURE)  # from an earlier run
         try:
             if known is None:
                 unit = "arbitrary"
@@ -326,4 +329,4 @@ def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> None:
             axes.set_axis_off()
         if not near:
             row[1].text(0, 0.5, "no verified match with a registered photograph", fontsize=8)
-    figure.savefig(path, format="png", dpi=100, metadata={"Software": None})
+    figure.savefig(path, format="png", dpi=100, metadata=SOFTWARE)

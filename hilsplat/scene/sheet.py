@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
-from hilsplat.base.files import IMAGE_SUFFIXES, NAME_RULE, list_images, name_problem
+from hilsplat.base.files import IMAGE_SUFFIXES, NAME_RULE, list_images, name_problem, regular
 from hilsplat.scene.layouts import NO_POSES, has_known_poses, photo_folder
 
 DEFAULT_SHEET = Path("config/scenes.tsv")
@@ -172,7 +172,7 @@ def choose_scenes(
 def content_lines(path: Path) -> list[tuple[int, str]]:
     """Return the sheet's lines with their line numbers, excluding comments and empty lines."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = regular(path).read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
         raise SceneError(f"scene sheet {path} is missing", fix="create it, or correct its path") from error
     except IsADirectoryError as error:
@@ -287,7 +287,7 @@ def _resolved(sheet: Path, place: str, data_root: str) -> Path | None:
 def _ply_problem(ply: Path) -> str:
     """Return why a file cannot be a PLY, or an empty string."""
     if not ply.is_file():
-        return "is a folder" if ply.exists() else "is missing"
+        return "is a folder" if ply.is_dir() else "is not a file" if ply.exists() else "is missing"
     with ply.open("rb") as stream:
         head = stream.read(4)
     return "" if head in (b"ply\n", b"ply\r") else f"is not a PLY: it begins with {head!r}"

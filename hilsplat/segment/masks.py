@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32, Int64, UInt8, UInt32
 
-from hilsplat.base.arrays import made
+from hilsplat.base.arrays import made, require_types
 from hilsplat.base.artifacts import read_npz, remake, write_npz
 from hilsplat.base.errors import ArtifactError, EmptyMaskError
 from hilsplat.base.levels import NONE, Level
@@ -191,6 +191,8 @@ class HierarchicalMasks:
 
     def save(self, path: Path) -> None:
         """Write `<view>.npz` atomically."""
+        require_types(HierarchicalMasks, vars(self), path, LIMITS)
+        self._require_whole(path)
         write_npz(path, **self.arrays())
 
     def arrays(self) -> dict[str, np.ndarray]:

@@ -22,7 +22,7 @@ from hilsplat.base.errors import ModelError
 from hilsplat.base.levels import Level
 from hilsplat.base.processes import in_order
 from hilsplat.models.fast_paths import or_as_exported
-from hilsplat.models.folder import ModelFolder, open_model_folder, side_px
+from hilsplat.models.folder import SAM_SIDE_PX, ModelFolder, input_side_px, open_model_folder
 from hilsplat.models.int8 import CHECKED_GRID, agreement_of_masks, considers_int8, int8_network, use_int8
 from hilsplat.models.layouts import DECODER, PREVIEW
 from hilsplat.models.network import CPU, Network, execution_providers
@@ -111,9 +111,8 @@ class SamModel:
         if PREVIEW in model.networks:
             self.previewer = DecoderNetwork(model, PREVIEW)
         preprocessing = model.preprocessing
-        self.longest_edge = side_px(preprocessing.get("size"), 1024)
-        padded_px = side_px(preprocessing.get("pad_size"), self.longest_edge)
-        self.padded_hw = (padded_px, padded_px)
+        self.longest_edge = preprocessing.get("size", SAM_SIDE_PX)
+        self.padded_hw = (input_side_px(model),) * 2
         self.resample = Image.Resampling(preprocessing.get("resample", Image.Resampling.BILINEAR))
         # defaults of transformers for missing keys: ImageNet statistics, values in 0..1
         self.mean = np.array(preprocessing.get("image_mean", (0.485, 0.456, 0.406)), dtype=np.float32)
@@ -257,8 +256,19 @@ class SamModel:
         points = in_input(points_xy, encoded.frame)
         if self.factored and encoded.terms:
             iou, logits, _ = self.factored.decode(encoded.terms, points, fine=True)
-            return iou, logits
-        return self.decoder(encoded.features, points[:, None])
+            return self._finite(iou), logits
+        iou, logits = self.decoder(encoded.features, points[:, None])
+        return self._finite(iou), logits
+
+    def _finite(self, iou: Float32[np.ndarray, "*n"]) -> Float32[np.ndarray, "*n"]:
+        """Return predicted IoUs; raise ModelError if they are not numbers, as otherwise no mask is kept."""
+        if not np.isfinite(iou).all():
+            raise ModelError(
+                f"the SAM model {self.model.folder} predicts {np.count_nonzero(~np.isfinite(iou))} IoUs of "
+                f"{iou.size} that are not finite",
+                fix="use another variant (masks.variant), or another export of the model",
+            )
+        return iou
 
     def decode_clicks(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "K 2"], inside: Bool[np.ndarray, " K"]
@@ -266,7 +276,7 @@ class SamModel:
         """Decode three masks of one object for several points (px) inside or outside it."""
         points = in_input(points_xy, encoded.frame)[None]
         iou, logits = self.decoder(encoded.features, points, inside[None])
-        return iou[0], logits[0]
+        return self._finite(iou[0]), logits[0]
 
     @property
     def previews(self) -> bool:
@@ -280,9 +290,10 @@ class SamModel:
         points = in_input(points_xy, encoded.frame)
         if self.factored and encoded.terms:
             iou, logits, kept = self.factored.decode(encoded.terms, points, fine=False)
-            return iou, logits, {"iou": iou, **kept}
+            return self._finite(iou), logits, {"iou": iou, **kept}
         assert self.previewer is not None
-        return *self.previewer(encoded.features, points[:, None]), {"points": points_xy}
+        iou, logits = self.previewer(encoded.features, points[:, None])
+        return self._finite(iou), logits, {"points": points_xy}
 
     def finish(
         self, encoded: Encoded, prompts: Prompts

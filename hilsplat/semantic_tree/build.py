@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
+from hilsplat.base.arrays import require_types
 from hilsplat.base.artifacts import atomic_folder, read_index, write_index, write_json, write_npz
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.progress import stage_log
@@ -29,7 +30,7 @@ from hilsplat.semantic_tree.nodes import (
     renumbered_without_empty,
     without_strays,
 )
-from hilsplat.semantic_tree.tree import SemanticTree, node_boxes
+from hilsplat.semantic_tree.tree import LIMITS, SemanticTree, node_boxes
 from hilsplat.semantic_tree.wholes import joined_regions
 from hilsplat.settings import SemanticTreeSettings
 
@@ -203,6 +204,7 @@ def run_semantic_tree(
             )
         with atomic_folder(out) as folder:
             fields = {name: value for name, value in vars(tree).items() if isinstance(value, np.ndarray)}
+            require_types(SemanticTree, fields, out / "tree.npz", LIMITS)
             write_npz(folder / "tree.npz", **fields)
             write_json(folder / "tree.json", {"scene": scene, "nodes": readable_nodes(tree)})
             write_index(

@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float, Float64
 from scipy.special import sph_harm_y
 
-from hilsplat.base.artifacts import read_json, sha256_of_file, write_json
+from hilsplat.base.artifacts import read_json, run_command, sha256_of_file, write_json
 from hilsplat.base.errors import ArtifactError, HilsplatError
+from hilsplat.base.provenance import require_as_written
 from hilsplat.base.rotations import are_rotations, multiply, quaternion_of
 from hilsplat.scene.importers.nerfstudio import source_from_dataparser
 from hilsplat.scene.scene import Scene
@@ -141,6 +142,7 @@ def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
     content = read_json(path)
     if not isinstance(content, dict) or "source_from_scene" not in content:
         return None
+    require_as_written(path, sha256_of_file(path))
     if content.get("ply_sha256") != (found := sha256_of_file(ply)):
         raise ArtifactError(
             f"{path} was written for a different {ply.name}",
@@ -173,11 +175,6 @@ def import_gaussians(
     gaussians = load_ply(ply, fix=FIX)
     if len(gaussians) == 0:
         raise ArtifactError(f"{ply} contains no Gaussians", fix=FIX)
-    lengths = np.linalg.norm(gaussians.quats.astype(np.float64), axis=1)
-    if (zero := int((lengths < 1e-12).sum())) > 0:
-        raise ArtifactError(
-            f"{ply}: {zero} of {len(gaussians)} Gaussians have no rotation: rot_0..3 are all zero", fix=FIX
-        )
     source_from_ply = read_source_from_scene(ply)
     moved = "in the coordinates of the scene's source"
     transform = scene.scene_from_source
@@ -206,7 +203,7 @@ def write_source_ply(ply: Path, out: Path) -> int:
     """
     source_from_scene = read_source_from_scene(ply)
     if source_from_scene is None:
-        raise ArtifactError(f"{ply.with_suffix('.json')} is missing", fix=f"hilsplat run {ply}")
+        raise ArtifactError(f"{ply.with_suffix('.json')} is missing", fix=run_command(ply))
     gaussians = move_gaussians(load_ply(ply), source_from_scene)
     save_ply(out, gaussians)
     return len(gaussians)

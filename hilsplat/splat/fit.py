@@ -22,6 +22,7 @@ from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.base.identity import code_digest
 from hilsplat.base.images import to_float, write_png
 from hilsplat.base.progress import stage_log, track
+from hilsplat.base.removal import delete, tag
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
@@ -57,6 +58,7 @@ class FitState:
 
     def save(self, path: Path) -> None:
         """Write a checkpoint."""
+        tag(path.parent)
         arrays = {f"{table}_{name}": getattr(self.adam, table)[name] for table in TABLES for name in FIELDS}
         write_stored_npz(  # compression would take longer than a hundred steps
             path,
@@ -76,19 +78,19 @@ class FitState:
             return None
         try:
             arrays = read_npz(path)
-        except ArtifactError as error:
+            values, first, second = ({name: arrays[f"{table}_{name}"] for name in FIELDS} for table in TABLES)
+            generator = np.random.default_rng()
+            generator.bit_generator.state = json.loads(arrays["generator"].item())
+            return FitState(
+                Adam(values, first, second, arrays["steps"].item()),
+                ScreenGradients(arrays["gradient_total"], arrays["gradient_seen"]),
+                generator,
+                arrays["order"].tolist(),
+                arrays["curve"].tolist(),
+            )
+        except (ArtifactError, KeyError, TypeError, ValueError) as error:
             logger.warning("ignoring the checkpoint and restarting the fit: %s", error)
             return None
-        parameters, first, second = ({name: arrays[f"{table}_{name}"] for name in FIELDS} for table in TABLES)
-        generator = np.random.default_rng()
-        generator.bit_generator.state = json.loads(arrays["generator"].item())
-        return FitState(
-            Adam(parameters, first, second, arrays["steps"].item()),
-            ScreenGradients(arrays["gradient_total"], arrays["gradient_seen"]),
-            generator,
-            arrays["order"].tolist(),
-            arrays["curve"].tolist(),
-        )
 
 
 def fit_step(
@@ -200,7 +202,7 @@ def fit_gaussians(
         prune(state.adam, settings, extent)
         state.adam.keep(morton_order(state.adam.parameters["means"]))
     if checkpoint:
-        checkpoint.unlink(missing_ok=True)
+        delete(checkpoint, r"[0-9a-f]{16}\.npz")
     return state.adam.as_gaussians(), np.array(state.curve).reshape(-1, 4)
 
 

@@ -4,10 +4,12 @@ import re
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from hilsplat.base.artifacts import atomic_path, remake
 from hilsplat.base.errors import ArtifactError
+from hilsplat.base.files import regular
 from hilsplat.splat.gaussians import Gaussians
 
 HEADER_BYTES = 2**14  # number of bytes that are searched for the vertex count
@@ -42,6 +44,7 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
         gaussians.quats,
     )
     values = np.concatenate(columns, axis=1)
+    _require_sound(values, path, "report this fault: the Gaussians were not fitted correctly")
     names = _names(sh.shape[1])
     table = np.ascontiguousarray(values, dtype="<f4").view([(name, "<f4") for name in names]).reshape(n)
     with atomic_path(path) as temporary:
@@ -51,7 +54,7 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
 def vertex_count(path: Path) -> int | None:
     """Return the number of Gaussians in a PLY's header; None if unreadable (`load_ply` reports the error)."""
     try:
-        with Path(path).open("rb") as stream:
+        with regular(Path(path)).open("rb") as stream:
             header = stream.read(HEADER_BYTES)
     except OSError:
         return None
@@ -66,7 +69,8 @@ def load_ply(path: Path, fix: str = "") -> Gaussians:
     properties not in 3DGS (colours, labels) are ignored. Errors suggest `fix` or, if it is empty, a rerun.
 
     Raises:
-        ArtifactError: if the file is missing, damaged or not a 3DGS PLY, or contains non-finite numbers.
+        ArtifactError: if the file is missing, damaged or not a 3DGS PLY, or contains non-finite numbers or
+            quaternions that are 0.
     """
     path = Path(path)
     fix = fix or remake(path)
@@ -92,13 +96,19 @@ def load_ply(path: Path, fix: str = "") -> Gaussians:
         )
 
     values = np.stack([np.asarray(vertex[name], dtype=np.float32) for name in names], axis=1)
-    finite = np.isfinite(values).all(axis=1)
-    if not finite.all():
-        raise ArtifactError(
-            f"{path}: {int((~finite).sum())} of {len(values)} Gaussians contain a non-finite number",
-            fix=fix,
-        )
+    _require_sound(values, path, fix)
     means, dc, rest, opacity, scales, quats = np.split(values, np.cumsum([3, 3, num_rest, 1, 3]), axis=1)
     rest = rest.reshape(len(values), 3, num_bases - 1).transpose(0, 2, 1)
     sh = np.concatenate([dc[:, None], rest], axis=1)
     return Gaussians(*(np.ascontiguousarray(each) for each in (means, scales, quats, opacity[:, 0], sh)))
+
+
+def _require_sound(values: Float[np.ndarray, "N P"], path: Path, fix: str) -> None:
+    """Raise ArtifactError unless all numbers are finite and the last four columns are quaternions."""
+    lengths = np.linalg.norm(values[:, -4:].astype(np.float64), axis=1)
+    for problem, is_bad in (
+        ("contain a non-finite number", ~np.isfinite(values).all(axis=1)),
+        ("have no rotation: rot_0..3 are all zero", lengths < 1e-12),
+    ):
+        if is_bad.any():
+            raise ArtifactError(f"{path}: {is_bad.sum()} of {len(values)} Gaussians {problem}", fix=fix)

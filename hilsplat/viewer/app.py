@@ -1,6 +1,7 @@
 """HTTP server of the viewer page, started by `hilsplat view` or embedded in a notebook."""
 
 import base64
+import io
 import secrets
 import threading
 from collections.abc import Callable, Mapping
@@ -15,7 +16,8 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from hilsplat.base.errors import SettingsError
+from hilsplat.base.errors import ImageError, SettingsError
+from hilsplat.base.images import read_image
 from hilsplat.query.names import write_names
 from hilsplat.query.tree_picture import crop
 from hilsplat.scene.finished import FinishedScene
@@ -25,6 +27,7 @@ from hilsplat.viewer.openapi import description
 from hilsplat.viewer.saved_files import SavedFiles
 from hilsplat.viewer.viewer_scene import ViewerScene
 from hilsplat.web.guard import Guard
+from hilsplat.web.messages import MAX_SIDE_PX
 from hilsplat.web.scene_thread import SceneThread
 from hilsplat.web.server import (
     Pages,
@@ -137,16 +140,11 @@ def _frame(shown: ViewerScene, asked: wire.Frame) -> Response:
 
 
 def _picture(text: str) -> np.ndarray:
-    import cv2
-
     try:
-        data = np.frombuffer(base64.b64decode(text, validate=True), np.uint8)
-        pixels = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
-    except ValueError:
-        pixels = None
-    if pixels is None:
-        raise SettingsError("the picture cannot be read", expected="a JPEG or PNG")
-    return np.ascontiguousarray(pixels[..., ::-1])
+        return read_image(io.BytesIO(base64.b64decode(text, validate=True)), MAX_SIDE_PX)
+    except (ValueError, ImageError) as error:
+        expected = f"a JPEG, PNG or WebP with sides of at most {MAX_SIDE_PX} px"
+        raise SettingsError("the picture cannot be read", expected=expected) from error
 
 
 def run_view(

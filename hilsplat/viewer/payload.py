@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from typing_extensions import TypedDict  # pydantic needs this class before Python 3.12
 
-from hilsplat.base.levels import LEVELS
+from hilsplat.base.levels import LEVELS, path_of
 from hilsplat.query.hits import Hit, doubts_of
-from hilsplat.query.language_scene import LanguageScene, path_of
+from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.scene_views import upright
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from hilsplat.base.artifacts import read_index, sha256_of_file
+from hilsplat.base.artifacts import read_index, run_command, sha256_of_file
 from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.query.language_scene import LanguageScene
@@ -59,7 +59,7 @@ class ViewerScene(ShownScene):
         require_scene_folder(self.folder)
         if not ply.exists():
             raise ArtifactError(
-                f"{folder} has no Gaussians to show yet: {ply} is missing", fix=f"hilsplat run {ply}"
+                f"{folder} has no Gaussians to show yet: {ply} is missing", fix=run_command(ply)
             )
         self.note((self.folder / "scene", ply))
         self.scene = self.opened.get(Scene.load, self.folder / "scene")

@@ -8,8 +8,9 @@ from jaxtyping import UInt8
 from pydantic import Field, field_validator, model_validator
 
 from hilsplat.base.errors import SettingsError
+from hilsplat.base.levels import MAX_TEXT
 from hilsplat.scene.cameras import Camera
-from hilsplat.web.messages import MAX_SIDE_PX, MAX_TEXT, Message, Text
+from hilsplat.web.messages import MAX_SIDE_PX, Message
 
 Row3 = tuple[float, float, float]
 Row4 = tuple[float, float, float, float]
@@ -58,7 +59,7 @@ class Style(Message):
     use: tuple[bool, bool, bool] = (True, True, True)
     mode: Literal["plain", "tint", "ghost", "isolate"] = "plain"
     ramp: Annotated[str, Field(max_length=1024)] = ""
-    text: Annotated[str, Field(max_length=MAX_TEXT)] = ""
+    text: str = ""
     level: LevelName = "auto"
 
     @model_validator(mode="after")
@@ -92,7 +93,7 @@ class Asked(Message):
 class Question(Message):
     """A text or a path, optionally with a minimum score or restricted to the nodes that a view shows."""
 
-    text: Text
+    text: str
     level: LevelName = "auto"
     threshold: Annotated[float, Field(gt=0, lt=1)] | None = None
     view: Annotated[int, Field(ge=0)] | None = None
@@ -114,7 +115,7 @@ class Like(Asked):
 class FieldRelevancy(Asked):
     """A query for each Gaussian's field relevancy, in the order of the PLY file or of the page's chunks."""
 
-    text: Text
+    text: str
     level: LevelName = "auto"
     order: Literal["file", "page"] = "file"
 

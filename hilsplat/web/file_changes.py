@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from hilsplat.base.artifacts import output_lock, sha256_of_bytes
+from hilsplat.base.artifacts import changing, sha256_of_bytes
 from hilsplat.base.errors import ArtifactError
 
 
@@ -26,15 +26,18 @@ def version_of(path: Path) -> str:
 
 
 @contextmanager
-def replacing(path: Path, version: str, what: str) -> Iterator[None]:
-    """Lock a file while its content is replaced; `what` (plural) describes the content in errors.
+def replacing(path: Path, version: str, what: str) -> Iterator[Path]:
+    """Lock and yield a file, or the one it links to, while its content is replaced.
+
+    Args:
+        what: the content in errors (plural).
 
     Raises:
         StaleFileError: the file changed since `version` was read.
     """
-    with output_lock(path):
+    with changing(path) as path:
         if version_of(path) != version:
             raise StaleFileError(
                 f"{what} have changed since they were read", fix="reload the page, and repeat the change"
             )
-        yield
+        yield path

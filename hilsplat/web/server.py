@@ -138,8 +138,8 @@ def listening_at(port: int) -> socket.socket:
 
 
 def configured(app: Guard) -> uvicorn.Config:
-    """Return the configuration of a server that prints only warnings."""
-    return uvicorn.Config(app, log_level="warning", access_log=False, server_header=False)
+    """Return the configuration of a server that logs only warnings, through the handlers of this process."""
+    return uvicorn.Config(app, log_config=None, log_level="warning", access_log=False, server_header=False)
 
 
 def serve(

@@ -48,6 +48,7 @@ class Plan:
     Attributes:
         rows: scenes in the sheet, and scenes found on disk for data sets whose scenes differ between users.
         absent: skipped scene -> reason.
+        ignored: lines about names in the configuration that match no scene.
     """
 
     def __init__(self, config: Mapping[str, Any]) -> None:
@@ -60,7 +61,7 @@ class Plan:
         rows = read_sheet(sheet, run.groups, run.data_root)
         found = unlisted({row.source for row in rows}, run.groups, run.data_root)
         self.rows = (*rows, *(row_of_data(name, run.data_root) for name in found))
-        require_known_scenes(run, [*self.rows, *read_sheet(INSTALLED / DEFAULT_SHEET, ())])
+        self.ignored = without_scene(run, [*self.rows, *read_sheet(INSTALLED / DEFAULT_SHEET, ())])
         self.data = SceneData(self.rows, run.data_root, self.path)
         chosen = choose_scenes(self.rows, run.groups, run.only)
         if more := {row.group for row in chosen} - set(run.groups):  # check their sources too
@@ -354,8 +355,12 @@ class Plan:
         return inert(json.dumps(self.run.queries.get(f"{job.dataset}/{job.scene}", of_dataset)))
 
 
-def require_known_scenes(run: RunSettings, rows: Iterable[SceneRow]) -> None:
-    """Refuse a misspelt scene in `overrides`, `queries` or `sweep_scenes`, and suggest the closest name."""
+def without_scene(run: RunSettings, rows: Iterable[SceneRow]) -> list[str]:
+    """Return a line for each scene in `overrides`, `queries` and `sweep_scenes` that is not in the rows.
+
+    SettingsError is raised if a name is probably misspelt, or is not that of a known group or data set.
+    """
+    require_known("groups", run.groups, GROUPS)
     datasets = {row.dataset for row in rows} | {PHOTOS}
     scenes = [row.name for row in rows]
     # Settings of a scene that was removed from the sheet may stay in the configuration.
@@ -367,14 +372,13 @@ def require_known_scenes(run: RunSettings, rows: Iterable[SceneRow]) -> None:
         **dict.fromkeys(gone, ("overrides or queries", scenes)),
         **dict.fromkeys(run.sweep_scenes, ("sweep_scenes", [row.scene for row in rows])),
     }
-    for key, (where, names) in sorted(known.items()):
-        near = difflib.get_close_matches(key, names, n=1, cutoff=0.85)
-        if key not in names and near:
-            raise SettingsError(
-                f"the configuration ({where}) names the scene {key!r}, which is not in {run.scenes}",
-                expected=f"did you mean {near[0]!r}?",
-                fix="correct or remove the name",
-            )
+    lines = []
+    for key, (where, names) in sorted((key, found) for key, found in known.items() if key not in found[1]):
+        line = f"the configuration ({where}) names the scene {key!r}, which is not in {run.scenes}"
+        if near := difflib.get_close_matches(key, names, n=1, cutoff=0.85):
+            raise SettingsError(line, expected=f"did you mean {near[0]!r}?", fix="correct or remove the name")
+        lines.append(f"{line}; it is ignored")
+    return lines
 
 
 def some(names: list[str]) -> str:

@@ -5,6 +5,7 @@ Warnings and errors are printed in full.
 """
 
 import logging
+import math
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping
@@ -19,6 +20,7 @@ from rich.live import Live
 from rich.text import Text
 
 from hilsplat.base.artifacts import parse_json
+from hilsplat.base.errors import KILLED, KILLED_FIX, visible
 from hilsplat.base.progress import last_progress, warnings_in
 from hilsplat.scene.finished import KEY_VIEWS, refining
 from hilsplat.workflow.resources import START_S, JobResources
@@ -41,6 +43,9 @@ LOOPS = {
     "comparison": "methods compared",
 }
 """Rule -> the loop (`base.progress.track`) that takes almost all of the rule's time."""
+
+SIGKILL = ("died with <Signals.SIGKILL", "exit status 137")
+"""How Snakemake reports a job that was killed."""
 
 STARTED = 0.1
 """Share of a loop from which its speed predicts the rest; before, start-up and compilation dominate."""
@@ -99,7 +104,9 @@ class Estimates:
                 job = {"dataset": row.dataset, "scene": row.scene}
                 try:
                     last = parse_json(file.read_text(encoding="utf-8").splitlines()[-1])
-                    self.learn(file.stem, job, max(float(last["cpu_time"]), float(last["s"])))
+                    core_s = max(float(last["cpu_time"]), float(last["s"]))
+                    if 0 <= core_s < math.inf:
+                        self.learn(file.stem, job, core_s)
                 except (OSError, ValueError, KeyError, IndexError, TypeError):  # a job may be writing to it
                     continue
 
@@ -171,7 +178,7 @@ class RunProgress:
     def line(self) -> str:
         """Return the terminal's status line; empty if nothing runs."""
         jobs = [self._describe(self.running[number]) for number in sorted(self.running)]
-        return f"{self.counts()} | {', '.join(jobs)}" if jobs else ""
+        return visible(f"{self.counts()} | {', '.join(jobs)}") if jobs else ""
 
     def _describe(self, job: RunningJob) -> str:
         progress = job.progress()
@@ -202,11 +209,12 @@ class RunProgress:
             return []
         if not (job.log.parents[1] / needed / "index.json").is_file():
             return []
-        scene = f"{job.wildcards['dataset']}/{job.wildcards['scene']}"
+        folder = job.log.parents[2]
+        scene = str(folder.relative_to("results") if folder.parts[0] == "results" else folder)
         commands = [] if self._hint_given else [f'  hilsplat query {scene} "..."', f"  hilsplat view {scene}"]
         if variant == KEY_VIEWS:
             self._refined.add(scene)
-            commands = [refining(job.log.parents[2]), *commands]
+            commands = [refining(folder), *commands]
         elif scene in self._refined:
             return [f"{scene} uses all photographs"]
         elif self._hint_given:
@@ -253,9 +261,11 @@ class ProgressDisplay:
             elif event == "job_error":
                 self.run.fail(facts["jobid"])
             lines = [self.text(record)]
+            if any(sign in lines[0] for sign in SIGKILL):
+                lines.append(f"the job was killed, {KILLED}\n  fix       {KILLED_FIX}")
         style = {logging.WARNING: "yellow", logging.ERROR: "red"}.get(record.levelno)
         for line in lines:
-            self._console.print(line, style=style)
+            self._console.print(visible(line), style=style)
         self._line.refresh()
 
     def close(self) -> None:

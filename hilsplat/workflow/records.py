@@ -4,17 +4,16 @@ Snakemake compares times and its own metadata. It does not detect a file that wa
 an unfinished output of a killed job, and it detects nothing if its metadata is lost.
 """
 
-import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hilsplat.base.artifacts import provenance_path, sha256_of_path, was_interrupted
+from hilsplat.base.artifacts import provenance_path, run_command, sha256_of_path, was_interrupted
 from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.base.progress import track
-from hilsplat.base.provenance import Provenance, read_provenance, sizes_of
+from hilsplat.base.provenance import Provenance, files_of, read_provenance, sizes_of
 from hilsplat.datasets.sources import is_exported
 from hilsplat.methods.registry import OURS
 from hilsplat.models.store import model_digest
@@ -96,13 +95,14 @@ def expected_artifacts(plan: Plan) -> dict[str, Expected]:
     return found | {table: Expected("table") for table in tables(plan)}
 
 
-def outdated(plan: Plan) -> dict[str, str]:
+def outdated(plan: Plan, *, every_byte: bool = False) -> dict[str, str]:
     """Map each existing output that must be rebuilt to the reason.
 
-    Contents are compared only if a job did not finish; otherwise, sizes are compared.
+    Without `every_byte`, contents are compared only if a job did not finish or a file is newer than its
+    record; otherwise, sizes are compared.
     """
     expected = expected_artifacts(plan)
-    records = Records(plan.results, every_byte=False)
+    records = Records(plan.results, every_byte=every_byte)
     found = {}
     for path, how in expected.items():
         if provenance_path(Path(path)).is_file() or Path(how.output or path).exists():
@@ -119,7 +119,7 @@ def verify(results: Path) -> tuple[str, bool]:
     or inputs have changed. Missing inputs outside the folder are ignored.
 
     Returns:
-        A report that ends with the repairing Snakemake command, and whether all artifacts are whole.
+        A report that ends with the repairing command, and whether all artifacts are whole.
 
     Raises:
         ArtifactError: the folder contains no artifacts.
@@ -130,21 +130,19 @@ def verify(results: Path) -> tuple[str, bool]:
         raise ArtifactError(
             f"{results} contains no artifacts", expected="a results folder with *.provenance.json files"
         )
-    counts, lines, again, records = Counter[str](), [], [], Records(results, every_byte=True)
+    counts, lines, records = Counter[str](), [], Records(results, every_byte=True)
     for path in track(paths, "artifacts read"):
         artifact = path.with_name(path.name.removesuffix(".provenance.json"))
         state, reason = records.state(artifact)
         counts[state] += 1
         if state != WHOLE:
             lines.append(f"{state:<8} {artifact}: {reason}")
-            # The rule `world` declares two subfolders as its outputs.
-            output = artifact / "images" if artifact.name == "world" else artifact
-            again.append("/".join(("results", *output.relative_to(results).parts)))
     states = ", ".join(f"{counts[state]} {state}" for state in (WHOLE, STALE, DAMAGED) if counts[state])
     lines.append(f"{len(paths)} artifacts in {results}: {states}")
-    if again:
-        lines.append(f"to rebuild them: snakemake --cores 2 --forcerun {shlex.join(again)}")
-    return "\n".join(lines), not again
+    is_whole = counts[WHOLE] == len(paths)
+    if not is_whole:
+        lines.append(f"to rebuild them, in the project that made them: {run_command(results, '--verify')}")
+    return "\n".join(lines), is_whole
 
 
 class Records:
@@ -152,7 +150,7 @@ class Records:
 
     Args:
         results: results folder; provenance refers to it as `results/...`, even if the folder was moved.
-        every_byte: compare contents instead of sizes.
+        every_byte: compare all contents; otherwise, those of files newer than their record.
     """
 
     def __init__(self, results: Path, *, every_byte: bool) -> None:
@@ -186,7 +184,9 @@ class Records:
                 return f"{gone[0]} is missing from {path.name}"
             if wrong := sorted(file for file in found if sizes.get(file) != found[file]):
                 return f"{path.name if wrong[0] == '.' else wrong[0]} was changed after it was written"
-            if not self.every_byte and not was_interrupted(artifact):
+            written_ns = provenance_path(artifact).stat().st_mtime_ns
+            is_older = all(file.stat().st_mtime_ns <= written_ns for file in files_of(path))
+            if not self.every_byte and is_older and not was_interrupted(artifact):
                 self._digests[path] = written.sha256
             elif self._digest(path) != written.sha256:
                 return f"{path.name} was changed after it was written"

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from PIL import Image
 
-from hilsplat.base.errors import ModelError
+from hilsplat.base.errors import ImageError, ModelError
+from hilsplat.base.images import opened_image
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.provenance import version_of
 from hilsplat.models.store import model_path, read_model
@@ -227,9 +227,9 @@ def _first_mp(images: Iterable[str], max_side_px: int) -> float:
     """Return the megapixels of the first image with a readable header, scaled as `poses` scales it."""
     for image in images:
         try:
-            with Image.open(image) as opened:
+            with opened_image(Path(image)) as opened:
                 width, height = opened.size
-        except OSError:  # labels, sheets and other files next to the images
+        except ImageError:  # labels, sheets and other files next to the images
             continue
         return width * height * min(1.0, max_side_px / max(width, height)) ** 2 / 1e6
     return UNKNOWN_MP

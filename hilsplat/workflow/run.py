@@ -15,17 +15,19 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from io import TextIOWrapper
 from pathlib import Path
+from typing import Any
 
 import yaml
 
-from hilsplat.base.artifacts import write_text
+from hilsplat.base.artifacts import RUN, write_json, write_text
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.base.files import INSTALLED, project_path
 from hilsplat.base.processes import PARENT, lock, remove_leftovers
+from hilsplat.base.removal import delete
 from hilsplat.configuration import CONFIG, first_unusable, merged_config, parse_run
 from hilsplat.scene.sheet import DEFAULT_SHEET, SceneRow, read_sheet
 from hilsplat.workflow.estimate import forecasts
@@ -35,6 +37,8 @@ from hilsplat.workflow.records import outdated
 logger = logging.getLogger(__name__)
 
 STATE = Path(".hilsplat")  # folder in the working folder for locks and markers
+
+MARKER = "run-[0-9a-f]{8}"  # name of the file in it that marks a run
 
 UNREGISTERED = "HILSPLAT_UNREGISTERED"
 """Environment variable that makes a Snakemake process skip our lock, as `snakemake --unlock` must."""
@@ -47,6 +51,7 @@ ELSEWHERE = ("--executor", "-e", "--profile", "--workflow-profile")
 
 
 _marks: list[TextIOWrapper] = []  # the marker of this process's run, if one is in progress
+_locks: list[TextIOWrapper] = []  # its lock on the results folder
 
 
 def prepare_process() -> TextIOWrapper | None:
@@ -58,20 +63,40 @@ def prepare_process() -> TextIOWrapper | None:
     """
     os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
     os.environ[PARENT] = str(os.getpid())
+    os.environ["PYTHONSAFEPATH"] = "1"  # jobs must not import modules from the working folder
     if os.environ.get(UNREGISTERED):
         return None
     with suppress(OSError):
-        return _locked("processes.lock", shared=True)
+        return _locked(STATE / "processes.lock", shared=True)
     return None
 
 
-def mark_run() -> None:
-    """Write a marker of this process's run and lock it; a killed run leaves it unlocked."""
-    if not _marks:  # `hilsplat run` and the Snakefile share a process
-        stream = _locked(f"run-{secrets.token_hex(4)}")
+def lock_results(results: Path) -> None:
+    """Lock a results folder, which several working folders may share, until this process's run ends."""
+    if _locks:  # `hilsplat run` and the Snakefile share a process
+        return
+    try:
+        _locks.append(_locked(results / ".run.lock", wait=False))
+    except BlockingIOError as error:
+        fix = "let it finish, or stop it"
+        raise HilsplatError(f"another hilsplat run has locked {results}", fix=fix) from error
+
+
+def mark_run(results: Path) -> None:
+    """Lock the results and a marker of this process's run; a killed run leaves the marker unlocked."""
+    lock_results(results)
+    if not _marks:
+        stream = _locked(STATE / f"run-{secrets.token_hex(4)}")
         stream.write(socket.gethostname())
         stream.flush()
         _marks.append(stream)
+
+
+def record_run(results: Path, configs: Sequence[Path], overrides: Mapping[str, Any]) -> None:
+    """Record a run's configuration in the results, for the commands that messages suggest (`run_command`)."""
+    files = [os.path.relpath(path) for path in configs]
+    values = [f"{key}={json.dumps(value)}" for key, value in overrides.items() if key != "only"]
+    write_json(results / RUN, {"results": [str(results)], "config": files, "overrides": values})
 
 
 def unmark_run() -> None:
@@ -85,13 +110,15 @@ def unmark_run() -> None:
             timer.cancel()
     while _marks:
         stream = _marks.pop()
-        Path(stream.name).unlink(missing_ok=True)
+        delete(Path(stream.name), MARKER)
         stream.close()
+    while _locks:
+        _locks.pop().close()
 
 
-def _locked(name: str, *, shared: bool = False, wait: bool = True) -> TextIOWrapper:
-    STATE.mkdir(exist_ok=True)
-    stream = (STATE / name).open("a", encoding="utf-8")
+def _locked(path: Path, *, shared: bool = False, wait: bool = True) -> TextIOWrapper:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    stream = path.open("a", encoding="utf-8")
     try:
         lock(stream, shared=shared, wait=wait)
     except OSError:
@@ -104,23 +131,26 @@ def start_project(folder: Path) -> list[Path]:
     """Copy the default configuration and scene sheet into a folder, unless either already exists."""
     written = [Path(folder) / path for path in (CONFIG, DEFAULT_SHEET)]
     for path in written:
-        if path.exists():
+        if os.path.lexists(path):
             raise HilsplatError(f"{path} already exists", fix="edit it, or choose another folder")
     for path, installed in zip(written, (CONFIG, DEFAULT_SHEET), strict=True):
         write_text(path, (INSTALLED / installed).read_text(encoding="utf-8"))
     return written
 
 
-def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str]) -> int:
+def run(
+    targets: Sequence[str], configs: Sequence[Path], options: Sequence[str], *, every_byte: bool = False
+) -> int:
     """Run the workflow in the working folder, and return Snakemake's exit status.
 
     Args:
         targets: scenes (`photos/desk`, `desk`), rules (`tables`) or files; empty for everything.
         configs: files that override config/config.yaml, in order.
         options: passed to Snakemake unchanged.
+        every_byte: read all results of earlier runs, and rebuild those that are damaged.
 
     Raises:
-        HilsplatError: another run is in progress in this folder, or the configuration is invalid.
+        HilsplatError: another run writes to these results, or the configuration is invalid.
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--config", "-C", nargs="*", action="extend", default=[])
@@ -156,26 +186,26 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
     command += ["--config", *given.config] if given.config else []
     if given.cores or not _has(others, *ELSEWHERE, "--jobs", "-j"):
         command += ["--cores", given.cores or str(_all_cores())]
+    for place in (Path.cwd(), Path(".snakemake")):
+        if place.exists() and not os.access(place, os.W_OK):
+            fix = "run in a folder of your own: hilsplat init there, or copy config/ to it"
+            raise HilsplatError(f"{place} cannot be written, but Snakemake keeps its state there", fix=fix)
     if _has(others, "-n", "--dry-run", "--dryrun"):
-        return _start(command, plan, targets, scenes)
+        return _start(command, plan, targets, scenes, every_byte)
+    lock_results(plan.results)
     try:
-        held = _locked("run.lock", wait=False)
-    except BlockingIOError as error:
-        raise HilsplatError(
-            f"another hilsplat run has locked {Path.cwd()}", fix="let it finish, or stop it"
-        ) from error
-    with held:
         _recover(command, plan.results)
         if not _has(others, *ELSEWHERE):
             cores = int(given.cores) if given.cores and given.cores.isdigit() else 0
             for line in forecasts(plan, cores or _all_cores()):
                 logger.info("%s", line)
-        mark_run()
-        status = _start(command, plan, targets, scenes)
+        mark_run(plan.results)
+        status = _start(command, plan, targets, scenes, every_byte)
         if status != 0:
             remove_leftovers(plan.results)  # left by killed jobs
-        unmark_run()
         return status
+    finally:
+        unmark_run()
 
 
 def _require_known(targets: Sequence[str], rows: Sequence[SceneRow], sheet: str) -> None:
@@ -190,11 +220,13 @@ def _require_known(targets: Sequence[str], rows: Sequence[SceneRow], sheet: str)
             )
 
 
-def _start(command: list[str], plan: Plan, targets: Sequence[str], scenes: Sequence[str]) -> int:
+def _start(
+    command: list[str], plan: Plan, targets: Sequence[str], scenes: Sequence[str], every_byte: bool
+) -> int:
     """Start Snakemake in this process, and rebuild artifacts that don't match their provenance."""
     files = [target for target in targets if target not in scenes]
     ending = ["--", *files] if files else []
-    wrong = outdated(plan)
+    wrong = outdated(plan, every_byte=every_byte)
     if wrong:
         summary = _snakemake(command, "--summary", *ending)
         needed = {line.split("\t")[0] for line in summary.stdout.splitlines()}
@@ -213,7 +245,7 @@ def _start(command: list[str], plan: Plan, targets: Sequence[str], scenes: Seque
 def _snakemake(command: Sequence[str], *words: str) -> subprocess.CompletedProcess[str]:
     """Run a Snakemake command that starts no jobs and takes no lock in this folder."""
     environment = {**os.environ, UNREGISTERED: "1"}
-    command = [sys.executable, "-m", *command, *words]
+    command = [sys.executable, "-P", "-m", *command, *words]
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
 
@@ -245,17 +277,17 @@ def _recover(command: Sequence[str], results: Path) -> None:
         return
     for marker in markers:
         try:
-            _locked(marker.name, wait=False).close()
+            _locked(marker, wait=False).close()
         except BlockingIOError as error:  # at its end, this run would remove the other run's locks
             raise HilsplatError(
                 f"another Snakemake process is running in {Path.cwd()}", fix="let it finish, or stop it"
             ) from error
     remove_leftovers(results)
     if any(marker.read_text(encoding="utf-8") != socket.gethostname() for marker in markers):
-        logger.warning("another machine may be running this workflow; if not, run: snakemake --unlock")
+        logger.warning("another machine may be running this workflow; if not, run: hilsplat run -- --unlock")
         return
     try:
-        alone = _locked("processes.lock", wait=False)
+        alone = _locked(STATE / "processes.lock", wait=False)
     except BlockingIOError:
         return
     with alone:
@@ -265,4 +297,4 @@ def _recover(command: Sequence[str], results: Path) -> None:
                 "the locks of a killed run cannot be removed", found=done.stderr.strip()[-500:]
             )
         for marker in markers:
-            marker.unlink(missing_ok=True)
+            delete(marker, MARKER)

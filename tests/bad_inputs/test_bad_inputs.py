@@ -3,6 +3,8 @@
 No command may end with a traceback or change a file that was in the project before.
 """
 
+import json
+import os
 import shutil
 import struct
 import zlib
@@ -16,8 +18,10 @@ import yaml
 from PIL import Image
 
 from hilsplat.base.arrays import read_tensors, write_tensors
+from hilsplat.base.artifacts import provenance_path, sha256_of_file
 from hilsplat.configuration import read_config
 from hilsplat.query.answer import answer, file_name
+from hilsplat.query.names import tree_digest
 from hilsplat.splat.ply import load_ply
 from hilsplat.workflow.plan import Plan
 from tests.bad_inputs.conftest import snapshot
@@ -31,6 +35,8 @@ FIELD, GAUSSIANS = SCENE / "default/field.safetensors", SCENE / "gaussians.ply"
 INDEX = CONTRIBUTIONS / "index.json"
 DEEP = "[" * 100_000
 HUGE_PLY = "ply\nformat ascii 1.0\nelement vertex 1000000000000\nproperty float x\nend_header\n1\n"
+NAN_PLY = "ply\nformat ascii 1.0\nelement vertex 1\n"
+NAN_PLY += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\nnan 0 1\n"
 OUT = ("--out", "results/new")
 
 OWN_CONFIG = partial(read_config, Path("config/config.yaml"))
@@ -69,6 +75,19 @@ def damage(path: Path, kind: str, share: float) -> Callable[[], object]:
     return lambda: path.write_bytes(damaged_bytes(path.read_bytes(), (kind, share, 2)))
 
 
+def changed(artifact: Path) -> tuple[str, str]:
+    """Return parts of the message about an artifact that differs from its provenance."""
+    return f"{artifact} was changed after it was written", f"hilsplat run --verify {artifact}"
+
+
+def without_provenance(folder: Path, index: str) -> Callable[[], object]:
+    return lambda: [provenance_path(folder).unlink(), write(folder / "index.json", index)()]
+
+
+def as_pipe(path: Path) -> Callable[[], object]:
+    return lambda: [path.unlink(), os.mkfifo(path)]
+
+
 def field_of_nan() -> None:
     arrays, about = read_tensors(FIELD)
     write_tensors(FIELD, {"features": arrays["features"] * np.nan}, **about)
@@ -94,6 +113,33 @@ def photographs(*names: str, folder: str = "photos") -> Callable[[], object]:
 
 def with_photographs(name: str, content: str | bytes) -> Callable[[], object]:
     return lambda: [photographs()(), write(f"photos/{name}", content)()]
+
+
+def write_names_of(name: str) -> None:
+    """Write names.json with JSON of the first node's name."""
+    digest = tree_digest(SCENE / "default/semantic_tree")
+    content = f'{{"format": "hilsplat-names-1", "trees": {{"{digest}": {{"0": {name}}}}}}}'
+    (SCENE / "names.json").write_text(content)
+
+
+def colmap_without_rotation() -> None:
+    """Write photographs and a COLMAP model in which the quaternion of the second view is 0."""
+    photographs()()
+    rotations = {"a": "1 0 0 0", "b": "0 0 0 0", "c": "1 0 0 0"}
+    views = [f"{n} {rotations[each]} {n} 0 5 1 {each}.png\n\n" for n, each in enumerate(rotations, 1)]
+    for name, text in {
+        "cameras": "1 PINHOLE 64 48 50 50 32 24\n",
+        "images": "".join(views),
+        "points3D": "1 0 0 1 9 9 9 0.5\n",
+    }.items():
+        write(f"photos/sparse/0/{name}.txt", text)()
+
+
+def without_rotation() -> None:
+    GAUSSIANS.write_bytes(GAUSSIANS.read_bytes()[:-16] + bytes(16))
+    json_file = GAUSSIANS.with_suffix(".json")
+    content = json.loads(json_file.read_text()) | {"ply_sha256": sha256_of_file(GAUSSIANS)}
+    json_file.write_text(json.dumps(content))
 
 
 def with_model(file: str, content: str) -> Callable[[], object]:
@@ -124,22 +170,28 @@ def plan(**config: object) -> Callable[[], object]:
 ROWS = {
     # ---- damaged artifacts: the message has the command that rebuilds them
     "masks with bytes that do not unpack": row(
-        damage(MASKS / "000.png.npz", "zero", 0.5),
-        COVERAGE,
-        "000.png.npz cannot be read",
-        f"snakemake --cores 2 --forcerun {MASKS}",
+        damage(MASKS / "000.png.npz", "zero", 0.5), COVERAGE, *changed(MASKS)
     ),
-    "an index that is a list": row(
-        write(MASKS / "index.json", "[]"), COVERAGE, "index.json is not an artifact index"
+    "an index that is a list": row(write(MASKS / "index.json", "[]"), COVERAGE, *changed(MASKS)),
+    "an index 100,000 deep": row(write(MASKS / "index.json", DEEP), COVERAGE, *changed(MASKS)),
+    "an index of a copy without provenance": row(
+        without_provenance(MASKS, "[]"), COVERAGE, "index.json is not an artifact index"
     ),
-    "an index 100,000 deep": row(write(MASKS / "index.json", DEEP), COVERAGE, "nested too deeply"),
+    "a deep index of a copy without provenance": row(
+        without_provenance(MASKS, DEEP), COVERAGE, "nested too deeply"
+    ),
+    "a pipe instead of an index": row(as_pipe(INDEX), SOLVE, *changed(CONTRIBUTIONS)),
+    "a pipe instead of the configuration": row(
+        as_pipe(Path("config/config.yaml")), CHECK[:1], "config.yaml is a pipe or device", "save its content"
+    ),
+    "a pipe instead of the scene sheet": row(
+        as_pipe(Path("config/scenes.tsv")), NEW, "scenes.tsv is a pipe or device"
+    ),
     "a PLY that states 10^12 Gaussians": row(
         write("huge.ply", HUGE_PLY), lambda: load_ply(Path("huge.ply")), "huge.ply is not a readable PLY"
     ),
-    "a field that is a folder": row(as_folder(FIELD), ASK, "field.safetensors cannot be read", "--forcerun"),
-    "a code that is a folder": row(
-        as_folder(CODE / "autoencoder.safetensors"), SOLVE, "autoencoder.safetensors is a folder"
-    ),
+    "a field that is a folder": row(as_folder(FIELD), ASK, "field.safetensors cannot be read", "--verify"),
+    "a code that is a folder": row(as_folder(CODE / "autoencoder.safetensors"), SOLVE, *changed(CODE)),
     "one bit of a field": row(
         damage(FIELD, "flip", 0.7), ASK, "field.safetensors cannot be read", "changed after"
     ),
@@ -147,19 +199,20 @@ ROWS = {
     "an index with another number": row(
         lambda: INDEX.write_text(INDEX.read_text().replace('"num_gaussians": 8', '"num_gaussians": 9')),
         SOLVE,
-        "index.json was changed after it was written",
-        f"--forcerun {CONTRIBUTIONS}",
+        *changed(CONTRIBUTIONS),
     ),
     "one number of G": row(
         damage(CONTRIBUTIONS / "G/values.npy", "flip", 0.5),
         SOLVE,
-        "G/values.npy was changed after it was written",
-        f"--forcerun {CONTRIBUTIONS}",
+        *changed(CONTRIBUTIONS),
     ),
     "Gaussians of another scene beside a tree": row(
         lambda: GAUSSIANS.write_bytes(GAUSSIANS.read_bytes()[:-4] + b"\0\0\x80?"),
         ASK,
         "the semantic tree of photos/desk was made for a different gaussians.ply",
+    ),
+    "Gaussians without a rotation": row(
+        without_rotation, ("export", "photos/desk", "--as", "ply"), "gaussians.ply", "1 of", "no rotation"
     ),
     "provenance whose outputs are a list": row(
         lambda: write_record(FIELD, outputs=[]), ASK, "field.safetensors.provenance.json is damaged: outputs"
@@ -175,7 +228,25 @@ ROWS = {
         "hilsplat run",
     ),
     "a query that is not UTF-8": row(nothing, ("query", "photos/desk", "mug \udcff"), "is not UTF-8"),
+    "a query of a separator alone": row(
+        nothing, ("query", "photos/desk", ">"), "contains an empty text", "up to 500 characters", "fix"
+    ),
+    "a query that ends with a separator": row(
+        nothing, ("query", "photos/desk", "a >"), "contains an empty text", "'a >', 3 characters"
+    ),
+    "a query of 10,000 letters": row(
+        nothing, ("query", "photos/desk", "a" * 10_000), "the query is too long", "10000 characters"
+    ),
     "an unknown view": row(nothing, (*ASK, "--view", "x"), "x"),
+    "a name with an escape sequence": row(
+        lambda: write_names_of(r'"\u001b]0;x\u0007"'), ASK, "names.json is damaged", "is not a valid name"
+    ),
+    "a name with a lone surrogate": row(
+        lambda: write_names_of(r'"a\ud800"'), ("export", "photos/desk"), "names.json is damaged"
+    ),
+    "names with a duplicate key": row(
+        lambda: write_names_of('"a", "0": "b"'), ASK, "names.json is not valid JSON", "key '0' is duplicated"
+    ),
     # ---- photographs and imports
     "a photograph with a brace": row(photographs("a{1}.png"), NEW, "a{1}.png", "brace", "rename"),
     "a scene name that is an option": row(photographs(), ("new", "--", "-n", "photos"), "name", "'-'"),
@@ -188,6 +259,20 @@ ROWS = {
     ),
     "frames that are numbers": row(
         with_photographs("transforms.json", '{"frames": [1, 2, 3]}'), POSES, "`frames` is missing"
+    ),
+    "poses with a duplicate key": row(
+        with_photographs("transforms.json", '{"w": 4, "frames": [], "w": 5}'), POSES, "key 'w' is duplicated"
+    ),
+    "COLMAP poses with a quaternion of 0": row(
+        colmap_without_rotation, POSES, "camera rotation of view b.png", "sparse/0"
+    ),
+    "points that are not finite": row(
+        lambda: [
+            with_photographs("transforms.json", '{"frames": [], "ply_file_path": "points.ply"}')(),
+            write("photos/points.ply", NAN_PLY)(),
+        ],
+        POSES,
+        "1 points of photos/transforms.json are not finite",
     ),
     "LLFF poses that are text": row(
         lambda: [photographs()(), np.save("photos/poses_bounds.npy", np.array([["a"] * 17] * 3))],
@@ -214,6 +299,9 @@ ROWS = {
     ),
     # ---- numbers and JSON on the command line
     "settings that are no JSON": row(nothing, (*COVERAGE, "--settings", "{"), "coverage_tree", "JSON"),
+    "settings with a duplicate key": row(
+        nothing, (*COVERAGE, "--settings", '{"theta": 0.5, "theta": 0.9}'), "key 'theta' is duplicated"
+    ),
     "names that are no JSON": row(
         nothing,
         ("table", "lerf", "--published", "config/published/lerf.csv", "--labels", "[1", *OUT),
@@ -245,6 +333,19 @@ ROWS = {
         "sweep_scenes",
         "tabel-2",
         "did you mean 'table-2'",
+    ),
+    "a misspelt group": row(nothing, plan(groups=["ci", "bechmark"]), "groups.bechmark", "'benchmark'"),
+    "variants that differ only in case": row(
+        nothing, plan(variants={"big": {}, "Big": {}}), "variants.Big", "by the variant big"
+    ),
+    "a variant named like a folder in other case": row(
+        nothing, plan(variants={"Scene": {}}), "variants.Scene", "for files in a scene folder"
+    ),
+    "a variant named like the default in other case": row(
+        nothing, plan(variants={"DEFAULT": {}}), "variants.DEFAULT", "by the variant default"
+    ),
+    "a panel query of a separator alone": row(
+        nothing, plan(queries={"photos": [">"]}), "contains an empty text", "queries.photos"
     ),
     "a null byte in a label": row(nothing, plan(labels={"default": "a\0b"}), "null byte"),
     "a misspelt data set in queries": row(nothing, plan(queries={"foto": ["a"]}), "queries.foto", "photos"),

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from hilsplat.base.artifacts import write_text
+from hilsplat.base.errors import DiskSpaceError
 from tests.bad_inputs.conftest import snapshot
 from tests.bad_inputs.test_bad_inputs import SOLVE
 from tests.unit.artifact_changes import write_record
@@ -55,6 +57,15 @@ SCENE_IN, CACHE = ("--scene", str(SCENE / "scene")), ("--cache", "disk/cache")
 WORLD = ("world", "make", "--source", "world:tabletop:1", "--settings", '{"views": 3, "image_px": 64}')
 POSES = ("poses", "--images", "photos")
 FIT = ("gaussians", *SCENE_IN, "--settings", '{"iterations": 20}', *CACHE, "--report", "disk/gaussians")
+
+
+def test_a_disk_that_cannot_hold_more_files_is_reported(disk: Path) -> None:
+    subprocess.run(["mount", "-o", "remount,nr_inodes=8", str(disk)], check=True)
+    with pytest.raises(DiskSpaceError, match=r"MiB free of(.|\n)*cannot hold more files \(inodes\)"):
+        for number in range(8):
+            write_text(disk / f"{number}.txt", "text")
+
+
 STAGES = {
     # output: command, KiB of free space
     "field.safetensors": (SOLVE[: SOLVE.index("--out")], 4),

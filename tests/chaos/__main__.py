@@ -2,11 +2,15 @@
 
     make chaos                                       # 30 kills, seed 0
     python -m tests.chaos --kills 5 --seed 3 --work ../chaos
+    python -m tests.chaos --strange                  # the same as an unknown user, in a strange place
 
 A fault is injected into a run at a random time; then the same command is started again. When the run is
 complete, its tables are compared byte by byte with those of an undisturbed run, and the next run starts
 without results. After that, user commands are killed while they write (`commands`). The final report
 lists the faults. The exit code is 1 if a table differs, or if a start without a fault failed.
+
+With --strange, the runs belong to a user without a name, home and cache, some or all of their standard
+streams are closed, and the working folder contains files named like modules (needs root and setpriv).
 
 The faults of a full and a read-only disk need results on a small tmpfs; they are skipped with a notice if
 this user may not mount one.
@@ -25,9 +29,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from tests.chaos.commands import kill_commands
-from tests.chaos.faults import FAULTS, Run, mounted
+from tests.chaos.faults import FAULTS, STREAMS, Run, mounted
 from tests.conftest import PROJECT
-from tests.workflow.conftest import Project, copy_project
+from tests.workflow.conftest import Project, copy_project, given_to_stranger, with_decoys
 
 DISK_MIB = 1000  # size of the results disk, MiB; the ci configuration needs less than a tenth of it
 
@@ -83,7 +87,7 @@ def torment(
     chance, tally = random.Random(options.seed), Tally()
     faults = [fault for fault in FAULTS if disk or not fault.needs_disk]
     while True:
-        run, may_fail = Run(project), False
+        run, may_fail = Run(project, chance.choice(STREAMS) if options.strange else ""), False
         run.watch_for(whole_s + SLACK_S, until_a_job=True)
         while run.is_running() and tally.kills < options.kills:
             run.watch_for(chance.uniform(0, 4 * whole_s / options.kills))  # two runs' worth
@@ -129,6 +133,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.chaos", description=__doc__.splitlines()[0])
     parser.add_argument("--kills", type=int, default=30, help="number of kills")
     parser.add_argument("--seed", type=int, default=0, help="seed of times and faults")
+    parser.add_argument("--strange", action="store_true", help="run as an unknown user in a strange place")
     parser.add_argument("--work", type=Path, help="working folder; its undisturbed run is reused")
     options = parser.parse_args()
     work = options.work or Path(tempfile.mkdtemp(prefix="hilsplat-chaos-"))
@@ -142,9 +147,12 @@ def main() -> None:
     disk = mounted(results, "-t", "tmpfs", "-o", f"size={DISK_MIB}m", "tmpfs")
     if not disk:
         print("no full or read-only disk: this user may not mount a tmpfs", flush=True)
+    if options.strange:
+        project = given_to_stranger(with_decoys(root, reference.root))
     try:
         tally = torment(project, reference, whole_s, options, disk)
         chance = random.Random(options.seed)
+        tally.problems += [f"{path} was run" for path in root.rglob("*.ran")]
         tally.problems += kill_commands(root / "commands", max(1, options.kills // 3), chance)
         kept = bool(tally.problems)
         if kept:

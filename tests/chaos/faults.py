@@ -14,7 +14,9 @@ from pathlib import Path
 
 from tests.workflow.conftest import Project
 
-COMMAND = (sys.executable, "-m", "hilsplat", "run", "--config", "config/ci.yaml", "--", "--cores", "2")
+STREAMS = ("", "<&-", "<&- >&-", "<&- >&- 2>&-")
+"""Redirections of a run among strangers: no stream, some or all are closed, as by cron and daemons."""
+COMMAND = (sys.executable, "-P", "-m", "hilsplat", "run", "--config", "config/ci.yaml", "--", "--cores", "2")
 POLL_S = 0.25
 LEFT_KIB = 64  # space left on a full disk
 WAKE_S = 60  # maximum time in which a job that was frozen at its start detects that its Snakemake has ended
@@ -40,7 +42,8 @@ def children(pid: int) -> list[int]:
 class Run:
     """A run of `COMMAND` in a project, and problems that need manual intervention."""
 
-    def __init__(self, project: Project) -> None:
+    def __init__(self, project: Project, streams: str = "") -> None:
+        """Start a run; `streams` are redirections of a shell, such as "<&-", which closes stdin."""
         self.project = project
         self.problems: list[str] = []
         self.jobs: dict[int, str] = {}  # process -> stage
@@ -48,7 +51,8 @@ class Run:
         self._log = project.root / "said.log"
         self._filler = project.root / "results/filler"
         with self._log.open("w") as stream:
-            self.process = project.start(*COMMAND, output=stream)
+            closing = ("sh", "-c", f'exec "$@" {streams}', "sh") if streams else ()
+            self.process = project.start(*closing, *COMMAND, output=stream)
 
     def said(self) -> str:
         """Return the end of its output."""

@@ -10,12 +10,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hilsplat.base.artifacts import read_npz, write_index, write_npy, write_npz
+from hilsplat.base.artifacts import read_npz, visible_files, write_index, write_npy, write_npz
 from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.contributions.rows import Contributions
 from hilsplat.embed.vectors import mask_embeddings
 from hilsplat.field.code import LanguageField, load_code, load_latents
 from hilsplat.field.field import read_parents
+from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.node_names import NodeNaming
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
@@ -215,3 +216,31 @@ def test_clip_vectors_are_of_length_one(tmp_path, fault):
     change_index(clip)
     with pytest.raises(ArtifactError, match=r"1 CLIP vectors of a\.png"):
         mask_embeddings(clip, masks)
+
+
+def test_a_query_never_answers_from_a_file_with_a_flipped_bit(desk):
+    def ask() -> list[Any]:
+        opened = LanguageScene.open(desk)
+        return [
+            [hit.score, hit.gaussians]
+            for how in ("tree", "field")
+            for hit in opened.query("mug", answerer=how)
+        ]
+
+    expected, refused = ask(), set()
+    for number, path in enumerate(visible_files(desk), 1):
+        content = path.read_bytes()
+        try:
+            path.write_bytes(damaged_bytes(content, ("flip", 0.6, number)))
+            assert equal(ask(), expected), path
+        except HilsplatError:
+            refused.add(path.name)
+        finally:
+            path.write_bytes(content)
+    assert refused >= {
+        "gaussians.ply",
+        "field.safetensors",
+        "autoencoder.safetensors",
+        "tree.npz",
+        "cameras.npz",
+    }

@@ -41,7 +41,7 @@ def test_shipped_configurations_are_valid(project: Path, name: str) -> None:
             r"variants\.x\.poses: variants cannot change this section",
         ),
         ({"main_variants": ["nope"]}, "variant 'nope' is not defined"),
-        ({"queries": {"synthetic": ["mug", " "]}}, r"queries\.synthetic: a query is empty"),
+        ({"queries": {"synthetic": ["mug", " "]}}, r"empty text(.|\n)*queries\.synthetic"),
         ({"data_root": "</script>"}, "data_root: String should match pattern"),
         ({"gaussians": {"iterations": True}}, "YAML reads yes, no, on and off"),
         ({"masks": {"predicted_iou_min": float("inf")}}, r"masks\.predicted_iou_min"),
@@ -70,6 +70,19 @@ def test_names_that_a_shell_or_a_folder_could_misread_are_refused(where: str, na
 def test_a_variant_cannot_have_the_name_of_a_file_in_the_scene_folder(name: str) -> None:
     with pytest.raises(SettingsError, match="is reserved for files"):
         parse_run({"variants": {name: {}}})
+
+
+@pytest.mark.parametrize("names", [("a", "A"), ("a", "a.seed1"), ("Logs",), ("Default",)])
+def test_variants_that_would_share_a_folder_are_refused(names: tuple[str, ...]) -> None:
+    with pytest.raises(SettingsError, match="is reserved"):
+        parse_run({"variants": {name: {} for name in names}, "seeds": 2})
+
+
+def test_settings_as_json_are_checked_like_those_of_a_file() -> None:
+    assert parse_section("coverage_tree", '{"theta": 0.6}') == SECTIONS["coverage_tree"](theta=0.6)
+    for text in ('{"theta": 0.5, "theta": 0.9}', "{", "[" * 100_000):
+        with pytest.raises(SettingsError, match="coverage_tree: the settings are not valid JSON"):
+            parse_section("coverage_tree", text)
 
 
 def test_a_duplicate_key_is_refused_but_a_merged_one_may_be_overridden(tmp_path: Path) -> None:

@@ -23,14 +23,21 @@ UNFINISHED = shutil.ignore_patterns("*.pyc", "*.pyc.*", "*.tmp.*")
 
 @dataclass(frozen=True)
 class Project:
-    """A copy of the project in which commands run on the copy's own code."""
+    """A copy of the project in which commands run on the copy's own code.
+
+    Attributes:
+        package: folder of the package, if it is not in the copy.
+        before: words before each command, such as those of another user.
+    """
 
     root: Path
+    package: Path | None = None
+    before: tuple[str, ...] = ()
 
     def run(self, *command: str, check: bool = True, **environment: str) -> subprocess.CompletedProcess[str]:
         """Run a command there and capture its output."""
         how = {"cwd": self.root, "env": self.environment(**environment), "timeout": 1500}
-        result = subprocess.run(command, **how, capture_output=True, text=True, check=False)
+        result = subprocess.run([*self.before, *command], **how, capture_output=True, text=True, check=False)
         if check and result.returncode != 0:
             raise AssertionError(
                 f"{command} ended with {result.returncode}:\n{result.stdout}\n{result.stderr}"
@@ -40,7 +47,7 @@ class Project:
     def start(self, *command: str, output: IO[str] | int = subprocess.DEVNULL) -> subprocess.Popen:
         """Start a command there, in its own process group."""
         where = {"cwd": self.root, "env": self.environment(), "start_new_session": True}
-        return subprocess.Popen(command, **where, stdout=output, stderr=output)
+        return subprocess.Popen([*self.before, *command], **where, stdout=output, stderr=output)
 
     def environment(self, **more: str) -> dict[str, str]:
         """Return the environment variables for running the copy's `hilsplat` and `snakemake`."""
@@ -48,7 +55,7 @@ class Project:
         return {
             **os.environ,
             "PATH": f"{scripts}{os.pathsep}{os.environ['PATH']}",
-            "PYTHONPATH": str(self.root),
+            "PYTHONPATH": str(self.package or self.root),
             "PYTHONDONTWRITEBYTECODE": "1",
             **more,
         }
@@ -117,6 +124,37 @@ def copy_project(source: Path, target: Path, *, results: bool) -> Project:
         rows = sheet.read_text().splitlines(keepends=True)
         sheet.write_text("".join(row for row in rows if not row.startswith("photos\t")))
     return Project(target)
+
+
+DECOY = "open(__file__ + '.ran', 'w')\nraise SystemExit('a file of the user ran')\n"
+DECOYS = ("numpy.py", "random.py", "yaml.py", "snakemake.py", "hilsplat/__init__.py", "hilsplat/__main__.py")
+STRANGER = 54321
+AS_STRANGER = (
+    *("setpriv", f"--reuid={STRANGER}", f"--regid={STRANGER}", "--clear-groups"),
+    *("--inh-caps=+dac_read_search", "--ambient-caps=+dac_read_search"),  # the checkout may be private
+    *("env", "HOME=/nonexistent", "XDG_CACHE_HOME=", "NUMBA_CACHE_DIR=", "MPLCONFIGDIR="),
+)
+"""Words before a command that run it as a user without a name, a home and a cache."""
+
+
+def with_decoys(root: Path, package: Path) -> Project:
+    """Replace the package in a copy of the project by files named like modules, which must never run."""
+    shutil.rmtree(root / "hilsplat")
+    for name in DECOYS:
+        (root / name).parent.mkdir(exist_ok=True)
+        (root / name).write_text(DECOY)
+    return Project(root, package)
+
+
+def given_to_stranger(project: Project) -> Project:
+    """Give a project to the stranger, who runs all commands in it."""
+    for path in (project.root, *project.root.rglob("*")):
+        os.chown(path, STRANGER, STRANGER, follow_symlinks=False)
+    for path in project.root.parents:  # folders of temporary files are private
+        if path.stat().st_mode & 0o077 == 0:
+            path.chmod(0o711)
+    temporary = f"TMPDIR={project.root}"
+    return Project(project.root, project.package, (*AS_STRANGER, temporary))
 
 
 @pytest.fixture(scope="session")

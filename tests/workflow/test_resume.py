@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from hilsplat.base.artifacts import read_index
+from hilsplat.base.artifacts import provenance_path, read_index
 from hilsplat.scene.scene import Scene
 from tests.unit.artifact_changes import change_index
 from tests.workflow.conftest import SCENE, Project
@@ -79,6 +79,7 @@ def test_one_more_view_costs_one_view(copy_of_finished: Project) -> None:
         for name, entry in entries.items():
             entry["split"] = "train" if name in views else "test"
         change_index(folder / "scene", views=entries)
+        provenance_path(folder / "scene").unlink(missing_ok=True)
         for stage in ("masks", "contributions", "semantic_tree", "clip"):
             shutil.rmtree(folder / "default" / stage)
             record = json.loads((folder / f"default/{stage}.provenance.json").read_text())

@@ -1,6 +1,8 @@
 """`hilsplat run` repairs damage and recovers from kills, shown on the quickest jobs of the tiny scene."""
 
 import os
+import re
+import shlex
 import signal
 import sys
 import time
@@ -30,7 +32,12 @@ def damage_provenance(project: Project) -> None:
     (project.root / f"{SCENE}/world.provenance.json").write_text("{")
 
 
-@pytest.mark.parametrize("damage", [damage_file, damage_provenance])
+def change_file(project: Project) -> None:
+    path = sorted((project.root / IMAGES).glob("*.png"))[0]
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+
+
+@pytest.mark.parametrize("damage", [damage_file, damage_provenance, change_file])
 def test_damage_is_repaired_even_without_snakemakes_records(
     drawn: Project, damage: Callable[[Project], None]
 ) -> None:
@@ -39,11 +46,30 @@ def test_damage_is_repaired_even_without_snakemakes_records(
     for record in (drawn.root / ".snakemake/metadata").iterdir():
         record.unlink()
     found = drawn.run(sys.executable, "-m", "hilsplat", "verify", check=False)
-    assert f"snakemake --cores 2 --forcerun {IMAGES}" in found.stdout
+    assert (
+        "to rebuild them, in the project that made them: hilsplat run --config config/ci.yaml" in found.stdout
+    )
     made = drawn.hilsplat_run(IMAGES)
     assert f"rebuilding {IMAGES}: " in made.stderr
     assert drawn.files(IMAGES) == before
     assert "Nothing to be done" in drawn.hilsplat_run(IMAGES).stderr
+
+
+def test_a_decayed_file_is_repaired_by_the_advice_of_the_stage_that_reads_it(drawn: Project) -> None:
+    """A bit that the disk lost changes neither the size nor the time of a file."""
+    before, path = drawn.files(IMAGES), sorted((drawn.root / IMAGES).glob("*.png"))[0]
+    times = path.stat().st_atime_ns, path.stat().st_mtime_ns
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    os.utime(path, ns=times)
+    assert "Nothing to be done" in drawn.hilsplat_run(IMAGES).stderr
+    refused = drawn.hilsplat_run(f"{SCENE}/scene", check=False)
+    said = refused.stdout + refused.stderr
+    assert refused.returncode != 0 and f"{IMAGES} was changed after it was written" in said
+    (command,) = set(re.findall(rf"fix +(hilsplat run .*{IMAGES})$", said, re.MULTILINE))
+    drawn.run(sys.executable, "-m", *shlex.split(command))
+    assert drawn.files(IMAGES) == before
 
 
 def test_an_unusable_setting_is_refused_before_any_job(drawn: Project) -> None:

@@ -8,7 +8,7 @@ this format for your own scenes (data set `annotated`) and adds `origin`: drawn,
 Missing files, invalid ids and levels, and unusable label files raise SceneError.
 """
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from hilsplat.base.errors import SceneError
-from hilsplat.base.levels import Level
+from hilsplat.base.levels import Level, plain_text
 from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.images.isat import IsatFile, IsatObject, fill_polygons, read_isat
 from hilsplat.datasets.images.lerf_ovs import label_files, merged_regions
@@ -70,7 +70,7 @@ def open_annotated(root: Path, scene: str) -> LabelledScene:
 
 
 def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, ...]:
-    """Return one region per object in a file, skipping unaccepted proposals; append to `warnings`."""
+    """Return one region per object in a file, skipping proposals and repetitions; append to `warnings`."""
     waiting = [thing for thing in labels.objects if thing.keys.get("origin") == PROPOSED]
     if waiting:
         warnings.append(f"{labels.path.name}: ignored {len(waiting)} unaccepted proposal(s)")
@@ -80,7 +80,13 @@ def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, .
     parents = parents_of(labels, objects, warnings)
     warnings += _nesting_violations(labels, objects, parents)
     regions = []
+    first: dict[Hashable, int] = {}
     for number, thing in objects.items():
+        rings = tuple(polygon.tobytes() for polygon in thing.polygons)
+        twin = first.setdefault((plain_text(thing.category), thing.keys["level"], rings), number)
+        if twin != number:
+            warnings.append(f"{labels.path.name}: id {number} ({thing.category}) repeats id {twin}; ignored")
+            continue
         path = [thing.category]
         ancestor = parents[number]
         while ancestor is not None:

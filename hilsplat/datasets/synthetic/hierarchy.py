@@ -14,11 +14,10 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Int32
-from PIL import Image
 
 from hilsplat.base.artifacts import read_json, write_json
 from hilsplat.base.errors import ArtifactError
-from hilsplat.base.images import write_png
+from hilsplat.base.images import opened_image, write_png
 from hilsplat.base.levels import LEVELS, NONE, Level
 
 FORMAT = "hilsplat-hierarchy-1"
@@ -59,7 +58,8 @@ class HierarchyAnnotations:
 
     def label_image(self, view: str, level: Level) -> Int32[np.ndarray, "H W"]:
         """Return the node id per pixel, -1 for none."""
-        return np.asarray(Image.open(label_path(self.folder, view, level))).astype(np.int32) - 1
+        with opened_image(label_path(self.folder, view, level), "label image") as image:
+            return np.asarray(image).astype(np.int32) - 1
 
     def texts(self, view: str, level: Level) -> dict[str, tuple[int, ...]]:
         """Return the texts annotated in a view at a level, with the ids of their nodes."""

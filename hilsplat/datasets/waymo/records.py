@@ -82,7 +82,11 @@ def matrix(compressed: bytes, dtype: type) -> np.ndarray:
         DecodeError, zlib.error, ValueError: the data is damaged, or the shape does not match the values.
     """
     kind = MESSAGES["MatrixInt32" if dtype is np.int32 else "MatrixFloat"]
-    found = kind.FromString(zlib.decompress(compressed))
+    unpacker = zlib.decompressobj()
+    content = unpacker.decompress(compressed, 2**26)  # 16 times the largest matrix of Waymo
+    if not unpacker.eof:
+        raise ValueError("its data is truncated, or unpacks to more than 64 MiB")
+    found = kind.FromString(content)
     return np.array(found.data, dtype=dtype).reshape(tuple(found.shape.dims))
 
 

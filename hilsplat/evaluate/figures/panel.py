@@ -11,14 +11,14 @@ from jaxtyping import Bool
 from matplotlib.figure import Figure, FigureBase
 
 from hilsplat.base.artifacts import atomic_path, read_index
-from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.levels import LEVELS, Level, path_of
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.registry import open_labelled
 from hilsplat.evaluate.metrics.masks import iou, peak_points
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
 from hilsplat.evaluate.protocols.view_truth import ViewTruth, truths_of
 from hilsplat.evaluate.protocols.views import rule_of
-from hilsplat.query.language_scene import LanguageScene, path_of
+from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.node_search import NodeHits
 from hilsplat.query.pictures import (
     TITLE_LETTERS,

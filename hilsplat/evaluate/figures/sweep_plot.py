@@ -1,6 +1,5 @@
 """Plots of the sweeps over theta and Omega, drawn from the finished tables."""
 
-import csv
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,6 +7,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from hilsplat.base.errors import ArtifactError
+from hilsplat.base.tables import read_csv
 from hilsplat.query.pictures import save_png_and_pdf
 
 SWEEPS = {"theta": ("coverage threshold theta", 0.9), "omega": ("similarity degree Omega", 10.0)}
@@ -31,11 +31,7 @@ def run_sweep_plot(name: str, table: Path, out: Path) -> None:
 
 def read_lines(table: Path, default: float) -> Lines:
     """Map (kind of row, column) to sorted (setting, percentage) pairs; a curve has at least two."""
-    try:
-        with Path(table).open(encoding="utf-8", newline="") as stream:
-            rows = list(csv.DictReader(stream))
-    except FileNotFoundError as error:
-        raise ArtifactError(f"{table} is missing", fix="build the table first") from error
+    rows = read_csv(table, None, "build the table first")
     lines = {}
     for kind in dict.fromkeys(row["kind"] for row in rows):
         for column in COLUMNS:

@@ -10,9 +10,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from hilsplat.base.artifacts import parse_json, write_text
+from hilsplat.base.artifacts import parse_json, sha256_of_file, write_text
 from hilsplat.base.errors import ArtifactError
-from hilsplat.base.provenance import read_provenance, require_beginning
+from hilsplat.base.provenance import read_provenance, require_as_written, require_beginning
 from hilsplat.base.tables import markdown_table, read_csv, write_csv
 from hilsplat.configuration import SECTIONS
 from hilsplat.datasets.sources import LEVELLED
@@ -73,7 +73,9 @@ def read_costs(scores: Iterable[Path]) -> list[Cost]:
     """Return the costs of the scenes and variants in score files, from the records beside the artifacts."""
     found = []
     for path in scores:
-        rows = read_csv(Path(path).with_name(TIMES), TIME_COLUMNS, "run the evaluate stage again")
+        table = Path(path).with_name(TIMES)
+        rows = read_csv(table, TIME_COLUMNS, "run the evaluate stage again")
+        require_as_written(table, sha256_of_file(table))
         if not rows:  # a scene without labels
             continue
         jobs = jobs_of(Path(path))

@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 
 from hilsplat.base.errors import ImageError, RegistrationError, SceneError
 from hilsplat.base.files import list_images
-from hilsplat.base.images import open_image, read_image, resize_to_fit, write_png
+from hilsplat.base.images import open_image, read_image, require_usable_size, resize_to_fit, write_png
 from hilsplat.base.processes import in_own_process
 from hilsplat.base.progress import track
 from hilsplat.scene.assemble import Posed, PosedView, split_views, undistort
@@ -114,6 +114,7 @@ def _with_pixels(view: KnownView, file: Path, view_name: str, folder: Path, max_
     camera = pycolmap.Camera(view.camera.todict())
     if view.border_px:
         pixels = _without_border(pixels, camera, view.border_px)
+    require_usable_size(file, pixels.shape[:2], max_side_px)
     pixels = resize_to_fit(pixels, max_side_px)
     camera.rescale(pixels.shape[1], pixels.shape[0])
     write_png(folder / view_name, pixels)

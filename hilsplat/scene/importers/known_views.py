@@ -17,7 +17,7 @@ from jaxtyping import Float64
 from hilsplat.base.artifacts import read_npy
 from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES, list_images
-from hilsplat.base.images import open_image
+from hilsplat.base.images import opened_image
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.cameras import MAX_SIDE_PX
 from hilsplat.scene.colmap import Points, camera_of, pose_matrix, pycolmap, reprojection_errors, sparse_points
@@ -64,10 +64,11 @@ class KnownView:
 
 def read_source(known: KnownPoses) -> tuple[list[KnownView], Points | None]:
     """Read the posed views of a folder in any supported format, with points if available."""
-    if known.kind == "colmap":
-        return read_colmap(known)
-    if known.kind == "transforms":
-        return read_transforms(known)
+    if known.kind in ("colmap", "transforms"):
+        views, points = (read_colmap if known.kind == "colmap" else read_transforms)(known)
+        if points is not None and (bad := int((~np.isfinite(points[0]).all(axis=1)).sum())):
+            raise SceneError(f"{bad} points of {known.files[0]} are not finite", fix=AGAIN)
+        return views, points
     readers = {"polycam": read_polycam, "record3d": read_record3d, "llff": read_llff}
     return checked(readers[known.kind](known), known), None
 
@@ -184,7 +185,7 @@ def _frame_camera(where: str, frame: Mapping[str, Any], image: Path | None) -> p
         if width is None or height is None:
             width = height = 2  # not used, because a view without an image is skipped
             if image is not None:
-                with open_image(image) as opened:
+                with opened_image(image) as opened:
                     width, height = opened.size
         width, height = int(width), int(height)
         if "fl_x" in frame:
@@ -219,7 +220,7 @@ def _read_ply_points(path: Path) -> Points:
     try:
         vertex = PlyData.read(path)["vertex"].data
         xyz = np.stack([vertex[axis] for axis in ("x", "y", "z")], axis=1).astype(np.float64)
-    except (OSError, PlyParseError, KeyError, ValueError) as error:
+    except (OSError, PlyParseError, KeyError, ValueError, MemoryError) as error:
         raise SceneError(
             f"the points in {path} cannot be read: {error}",
             fix="put the file there, or remove ply_file_path from the transforms file to triangulate points",
@@ -264,7 +265,7 @@ def read_llff(known: KnownPoses) -> list[KnownView]:
         down, right, back, position, (_, width_px, focal_px) = row[:15].reshape(3, 5).T
         matrix = np.stack([right, down, -back, position], axis=1)
         source_from_cam = rigid_pose(matrix, f"{path}, row {number}")
-        with open_image(image) as opened:
+        with opened_image(image) as opened:
             width, height = opened.size
         params = [float(focal_px * width / width_px), width / 2, height / 2]
         camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=params)

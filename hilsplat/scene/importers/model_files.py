@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
+from hilsplat.base.files import regular
 
 PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 2, 3, 3, 4, 6, 5)
 """Number of lens parameters, by COLMAP's camera model id."""
@@ -86,7 +87,7 @@ def require_whole_files(folder: Path) -> None:
 
 
 def _require_whole(path: Path, record: Callable[[mmap.mmap], None]) -> None:
-    with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+    with regular(path).open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
         count = _number(data, "Q")
         if count > len(data):
             raise ValueError(f"it declares {count} records but has only {len(data)} bytes")

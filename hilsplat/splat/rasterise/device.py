@@ -10,8 +10,8 @@ from functools import cache
 from importlib.util import find_spec
 from typing import Literal
 
+from hilsplat.base.cache import forget, remembered
 from hilsplat.base.errors import DeviceError, first_line
-from hilsplat.base.remembered import forget, remembered
 
 logger = logging.getLogger(__name__)
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from hilsplat.base.cache import remembered
 from hilsplat.base.identity import code_digest
-from hilsplat.base.remembered import remembered
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise import api

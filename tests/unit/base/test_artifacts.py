@@ -260,7 +260,7 @@ def test_two_nodes_that_compute_one_view_leave_one_whole_entry(tmp_path: Path, m
     monkeypatch.setattr(artifacts, "_write_zip", write_beside_the_other)
     mine = cache.get(key, lambda: {"x": np.arange(3)})
     np.testing.assert_array_equal(mine["x"], artifacts.read_npz(cache.path(key))["x"])
-    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [cache.path(key)]
+    assert [path for path in tmp_path.rglob("*.npz") if path.is_file()] == [cache.path(key)]
 
 
 def test_an_entry_that_another_node_prunes_is_still_read(tmp_path: Path, monkeypatch) -> None:

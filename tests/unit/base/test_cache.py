@@ -1,4 +1,4 @@
-"""The caches: their size, and the entries that are deleted."""
+"""The caches: their size, the entries that are deleted, and the files of users that are not."""
 
 import os
 import shutil
@@ -10,6 +10,7 @@ import pytest
 from hilsplat.base.cache import prune_cache, size_table
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.processes import host_token
+from hilsplat.base.removal import tag
 
 MIB = 2**20
 
@@ -18,12 +19,13 @@ MIB = 2**20
 def cache(tmp_path) -> Path:
     """Entries of 1 MiB: masks unused for 0 to 3 days, a CLIP entry for 9; other files for 99 days."""
     for place, days in (("masks", 0), ("masks", 1), ("masks", 2), ("masks", 3), ("clip", 9), ("models", 99)):
-        path = tmp_path / place / f"{days}" / f"{days}.npz"
+        path = tmp_path / place / f"0{days % 10}" / f"{days:064}.npz"
+        tag(tmp_path / place)
         path.parent.mkdir(parents=True)
         path.write_bytes(b"x" * MIB)
         used = time.time() - days * 86400 - 60
         os.utime(path, (used, used))
-    unfinished = tmp_path / f"masks/.writing-{'0' * 8}-x/new.npz"
+    unfinished = tmp_path / "masks/.writing-00000000-01234567/new.npz"
     unfinished.parent.mkdir()
     unfinished.write_bytes(b"x")
     (tmp_path / "digests.json").write_bytes(b"x" * MIB)
@@ -37,10 +39,10 @@ def left(cache: Path) -> list[str]:
 def test_the_table_names_each_cache(cache):
     lines = size_table(cache).splitlines()
     assert [line.split() for line in lines[1:]] == [
-        ["clip", "1", "files", "1.0", "MiB"],
+        ["clip", "2", "files", "1.0", "MiB"],
         ["digests.json", "1", "files", "1.0", "MiB"],
-        ["masks", "4", "files", "4.0", "MiB"],
-        ["models", "1", "files", "1.0", "MiB"],
+        ["masks", "5", "files", "4.0", "MiB"],
+        ["models", "2", "files", "1.0", "MiB"],
         ["all", "7.0", "MiB"],
     ]
 
@@ -49,10 +51,10 @@ def test_only_old_view_entries_are_deleted(cache, tmp_path):
     assert prune_cache(tmp_path / "nowhere", [], days=0.0) == (0, 0)
     assert prune_cache(cache, [], days=2.0) == (3, 3.0)
     assert left(cache) == [
-        "masks/.writing-00000000-x/new.npz",
-        "masks/0/0.npz",
-        "masks/1/1.npz",
-        "models/99/99.npz",
+        "masks/.writing-00000000-01234567/new.npz",
+        f"masks/00/{0:064}.npz",
+        f"masks/01/{1:064}.npz",
+        f"models/09/{99:064}.npz",
     ]
 
 
@@ -73,21 +75,49 @@ def test_an_unknown_cache_is_refused(cache):
     ],
 )
 def test_checkpoints_are_pruned_unless_their_fit_may_still_run(cache, options, expected):
-    (cache / "gaussians").mkdir()
-    for name, hours in (("today", 23), ("yesterday", 25), ("old", 240)):
+    tag(cache / "gaussians")
+    names = {f"{23:016}": "today", f"{25:016}": "yesterday", f"{240:016}": "old"}
+    for name, hours in zip(names, (23, 25, 240), strict=True):
         path = cache / f"gaussians/{name}.npz"
         path.write_bytes(b"x" * MIB)
         written = time.time() - hours * 3600
         os.utime(path, (written, written))
     prune_cache(cache, **options)
-    assert {path.stem for path in (cache / "gaussians").iterdir()} == expected
+    assert {names[path.stem] for path in (cache / "gaussians").glob("*.npz")} == expected
 
 
 def test_without_a_limit_only_unfinished_files_of_dead_jobs_are_deleted(tmp_path_factory, cache):
     results = tmp_path_factory.mktemp("project") / "results"
-    leftover = results / f"photos/desk/.writing-{host_token()}-x"
+    leftover = results / f"photos/desk/.writing-{host_token()}-01234567"
     leftover.mkdir(parents=True)
     shutil.copytree(cache, results / ".cache")
     assert prune_cache(results / ".cache", []) == (0, 0)
     assert not leftover.exists()
     assert left(results / ".cache") == left(cache)
+
+
+def test_files_in_folders_named_like_a_cache_are_kept(cache, tmp_path_factory):
+    """Drawings, videos, a scene's own masks, and files in a cache that do not have the names of entries."""
+    folder = tmp_path_factory.mktemp("holiday")
+    shutil.copytree(cache / "masks", folder / "masks")
+    (folder / "masks/CACHEDIR.TAG").unlink()
+    for name in ("clip/film.mp4", "gaussians/0123456789abcdef.npz", "contributions/me.txt"):
+        (folder / name).parent.mkdir()
+        (folder / name).touch()
+    own = ["00/drawing.png", "a.npz", "00/a.npz", f"00/{1:064}.npy", f"x/{1:064}.npz", f"00/x/{1:064}.npz"]
+    for name in own:
+        (cache / "masks" / name).parent.mkdir(exist_ok=True)
+        (cache / "masks" / name).touch()
+    before = sorted(folder.rglob("*"))
+    assert prune_cache(folder, [], days=0.0, max_mib=0.0) == (0, 0)
+    assert sorted(folder.rglob("*")) == before
+    assert prune_cache(cache, [], days=0.0, max_mib=0.0) == (5, 5.0)
+    assert all((cache / "masks" / name).exists() for name in own)
+
+
+def test_a_link_in_a_cache_is_deleted_without_its_target(cache, tmp_path_factory):
+    drawing = tmp_path_factory.mktemp("mine") / "drawing.npz"
+    drawing.touch()
+    (cache / f"masks/00/{5:064}.npz").symlink_to(drawing)
+    prune_cache(cache, ["masks"], days=0.0, max_mib=0.0)
+    assert drawing.exists()

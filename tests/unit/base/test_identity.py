@@ -1,6 +1,7 @@
 """A code digest covers exactly the definitions that a function can reach."""
 
 import ast
+import json
 import shutil
 from pathlib import Path
 
@@ -284,7 +285,12 @@ def test_a_digest_is_computed_once_until_a_module_changes(tmp_path, monkeypatch)
     assert changed != first
     forget()
     (kept,) = (root / "__pycache__").glob("identity.*.json")
-    kept.write_text("damaged")
+    state = identity._read_state(root)
+    for damaged in ("damaged", "[]", '{"state": 1, "digests": {}}', f'{{"state": "{state}", "digests": []}}'):
+        kept.write_text(damaged)
+        assert code_digest("hilsplat.a:g", root=root) == changed
+        forget()
+    kept.write_text(json.dumps({"state": state, "digests": {"hilsplat.a:g": 7}}))
     assert code_digest("hilsplat.a:g", root=root) == changed
     forget()
 

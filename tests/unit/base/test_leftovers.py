@@ -9,25 +9,25 @@ from pathlib import Path
 
 import pytest
 
-from hilsplat.base import artifacts, processes
+from hilsplat.base import processes, removal
 from hilsplat.base.artifacts import atomic_folder, write_text
 from hilsplat.base.processes import host_token, remove_leftovers
 
 KILL = """
 import ctypes, errno, os, shutil, signal, sys
 from pathlib import Path
-from hilsplat.base import artifacts, processes
+from hilsplat.base import artifacts, processes, removal
 
 kind, folder = sys.argv[1], Path(sys.argv[2])
 path = folder / "artifact"
-TRACED = {artifacts.__file__, processes.__file__, shutil.__file__}
+TRACED = {artifacts.__file__, processes.__file__, removal.__file__, shutil.__file__}
 
 def no_exchange(*arguments):
     ctypes.set_errno(errno.EINVAL)
     return -1
 
 if "without exchange" in kind:
-    artifacts._renameat2 = no_exchange
+    removal._renameat2 = no_exchange
 
 def write(text):
     if kind == "file":
@@ -66,8 +66,9 @@ while is_killed:
     if "old" not in found():
         write("old")
     if kind == "clean-up":
-        former = folder / f".writing-{processes.host_token()}-x/.former"
+        former = folder / f".writing-{processes.host_token()}-01234567/.former"
         former.mkdir(parents=True)
+        (former.parent / ".lock").touch()
         path.rename(former / "artifact")
         write("new")
         is_killed = killed_before(line, lambda: processes.remove_leftovers(folder))
@@ -138,9 +139,12 @@ def test_only_folders_of_unfinished_files_of_this_host_are_removed(tmp_path):
     folder = tmp_path / "d/s"
     leftover = folder / f".writing-{host_token()}-01234567"
     (leftover / f".writing-{host_token()}-01234567").mkdir(parents=True)
-    kept = [folder / ".writing-00000000-01234567", folder / ".masks.lock", folder / "masks"]
+    (leftover / ".lock").touch()
+    of_user = folder / f".writing-{host_token()}-89abcdef"  # without a lock
+    kept = [folder / ".writing-00000000-01234567", folder / ".masks.lock", folder / "masks", of_user]
     for path in kept:
         path.mkdir()
+    (of_user / "drawing.png").touch()
     assert remove_leftovers(tmp_path) == [leftover]
     assert sorted(folder.iterdir()) == sorted(kept)
     assert remove_leftovers(tmp_path / "nowhere") == []
@@ -175,7 +179,7 @@ def test_every_name_that_fits_a_folder_can_be_written(tmp_path):
 @pytest.mark.parametrize("can_exchange", [True, False])
 def test_the_old_folder_remains_until_the_new_one_is_complete(tmp_path, monkeypatch, can_exchange):
     if not can_exchange:
-        monkeypatch.setattr(artifacts, "_renameat2", None)
+        monkeypatch.setattr(removal, "_renameat2", None)
     out = tmp_path / "out"
     for text in ("one", "two"):
         with atomic_folder(out) as folder:
@@ -189,7 +193,7 @@ def test_the_old_folder_remains_until_the_new_one_is_complete(tmp_path, monkeypa
 
 def test_the_old_folder_is_restored_if_the_new_one_cannot_replace_it(tmp_path, monkeypatch):
     write_text(tmp_path / "out/former", "text")
-    monkeypatch.setattr(artifacts, "_renameat2", None)
+    monkeypatch.setattr(removal, "_renameat2", None)
     rename = Path.rename
 
     def refuse(path: Path, target: Path) -> Path:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from hilsplat.base.errors import HilsplatError
 from hilsplat.base.processes import in_order, in_own_process, in_processes
 
 
@@ -135,3 +136,12 @@ def test_under_a_debugger_items_are_computed_in_the_main_thread():
     finally:
         sys.settrace(before)
     assert threads == {threading.get_ident()}
+
+
+def end_by_signal(number: int) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_killed_process_of_a_pool_is_explained():
+    with pytest.raises(HilsplatError, match=r"was killed, probably because memory ran out(.|\n)*fewer cores"):
+        list(in_processes(end_by_signal, [(1,), (2,)], 2))

@@ -189,5 +189,5 @@ def test_queries_open_the_recorded_variant_without_its_image_network(red_scene, 
     assert opened.text.path.name == "text_model_fp16.onnx"
     assert opened.width == model.width == len(opened.embed_texts(["mug"])[0])
     assert "vision" not in vars(opened)
-    picture = np.zeros((6, 6, 3), np.uint8)
+    picture = np.full((6, 6, 3), 99, np.uint8)
     np.testing.assert_array_equal(opened.embed_picture(picture), model.embed_picture(picture))

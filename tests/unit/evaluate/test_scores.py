@@ -23,6 +23,18 @@ def test_score_files_are_sorted_and_stable(tmp_path):
     assert frame["value"].tolist() == [0.5, 0.5, 0.333333]
 
 
+def test_queries_like_formulas_are_inert_in_spreadsheets_and_read_back_unchanged(tmp_path):
+    write_scores(
+        tmp_path / "scores.csv", [score("iou", 0.5, query='=HYPERLINK("x")'), score("iou", 0.0, query="-")]
+    )
+    assert ",\"'=HYPERLINK" in (tmp_path / "scores.csv").read_text()
+    assert list(read_scores([tmp_path / "scores.csv"])["query"]) == ["-", '=HYPERLINK("x")']
+    text = (tmp_path / "scores.csv").read_text()
+    (tmp_path / "scores.csv").write_text(text.replace("0.500000", "half"))
+    with pytest.raises(ArtifactError, match=r"scores\.csv cannot be read: .*'half'"):
+        read_scores([tmp_path / "scores.csv"])
+
+
 def test_other_columns_are_refused_by_name(tmp_path):
     (tmp_path / "scores.csv").write_text("a,b\n1,2\n")
     with pytest.raises(ArtifactError, match=r"found     a, b"):

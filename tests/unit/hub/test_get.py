@@ -394,6 +394,27 @@ def test_weights_in_a_file_of_any_name_are_fetched(changed):
     assert "onnx/Constant_62_attr__value" in files_of(Path("models/changed"))
 
 
+def test_files_of_the_user_in_a_model_folder_outlive_its_replacement(hub, changed):
+    get_models(["sam-vit-base"])
+    (TARGET / "vocabulary.txt").write_text("mug")
+    (TARGET / "onnx/mine").mkdir()
+    (TARGET / "onnx/mine/drawing.png").touch()
+    (changed / "preprocessor_config.json").write_text(
+        (changed / "preprocessor_config.json").read_text() + " "
+    )
+    hub.repositories[SAM] = changed
+    get_models(["sam-vit-base"])
+    assert origin_of(TARGET)["revision"] == hub.commit(SAM)
+    assert (TARGET / "vocabulary.txt").read_text() == "mug" and (TARGET / "onnx/mine/drawing.png").is_file()
+
+
+def test_a_folder_named_like_a_download_is_not_used(hub):
+    (STAGING / "mine").mkdir(parents=True)
+    with pytest.raises(DownloadError, match=r"\.part exists, but is not a download(.|\n)*remove it"):
+        get_models(["sam-vit-base"])
+    assert [path.name for path in STAGING.rglob("*")] == ["mine"]
+
+
 def test_a_folder_of_the_user_is_not_replaced(hub):
     TARGET.mkdir(parents=True)
     (TARGET / "mine.onnx").write_text("mine")
@@ -459,7 +480,7 @@ def test_exported_weights_give_the_vectors_of_transformers(hub, clip_parts):
     assert origin["repository"] == REPOSITORY and "optimum-onnx" in origin["exported"]
     assert "model.safetensors" in [entry["path"] for entry in origin["files"]]
     assert not {"model.onnx", "model.safetensors"} & set(files_of(folder))
-    assert sorted(path.name for path in Path("models").iterdir() if path.is_dir()) == [EXPORTED]
+    assert sorted(path.name for path in Path("models").iterdir() if path.is_dir()) == [".int8", EXPORTED]
     inputs = processor.tokenizer(["red mug"], return_tensors="pt")
     with torch.no_grad():
         (expected,) = model.get_text_features(**inputs).numpy()

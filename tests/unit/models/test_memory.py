@@ -13,7 +13,7 @@ def folder(tmp_path, layout: str, config: dict, size: int, megabytes: int = 0) -
     network = tmp_path / "vision_encoder.onnx"
     with network.open("wb") as file:
         file.truncate(megabytes * 2**20)
-    preprocessing = {"size": {"longest_edge": size}}
+    preprocessing = {"size": size}
     return ModelFolder(tmp_path, layout, config, preprocessing, {"vision_encoder": network}, (network,))
 
 

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from hilsplat.base.artifacts import sha256_of_path
 from hilsplat.configuration import with_models
-from hilsplat.models.store import model_path, present_models, read_model, real_model
+from hilsplat.models.store import model_digest, model_path, present_models, read_model, real_model
 from hilsplat.settings import ClipSettings, FieldSettings, MasksSettings
 
 AUTO = MasksSettings(segmenter="auto", model="auto")
@@ -86,3 +87,22 @@ def test_models_of_the_user_are_found_from_any_folder_after_those_of_the_project
     assert model_path("models/sam-vit-huge") == of_user / "sam-vit-huge"
     assert model_path("models/sam-vit-base") == Path("models/sam-vit-base")
     assert model_path("models/none") == Path("models/none")
+
+
+@pytest.mark.parametrize("memo", ["[]", '"x"', "{", '{"a": 1}', '{"a": "b", "a": "c"}', "[" * 100_000])
+def test_a_damaged_cache_of_digests_is_replaced(models, memo):
+    cache = Path("cache")
+    expected = sha256_of_path(models / "sam-tiny")
+    cache.mkdir()
+    (cache / "digests.json").write_text(memo)
+    model_digest.cache_clear()
+    assert model_digest(models / "sam-tiny", cache) == expected
+    assert list(json.loads((cache / "digests.json").read_text()).values()) == [expected]
+
+
+def test_a_cached_digest_of_the_wrong_type_is_computed_again(models):
+    expected = model_digest(models / "clip-tiny", Path("cache"))
+    memo = Path("cache/digests.json")
+    memo.write_text(json.dumps(dict.fromkeys(json.loads(memo.read_text()), 7)))
+    model_digest.cache_clear()
+    assert model_digest(models / "clip-tiny", Path("cache")) == expected

@@ -335,3 +335,38 @@ def test_damaged_and_encrypted_archives_are_refused(tmp_path, photos_in_zip, she
     with pytest.raises(SceneError, match=r"locked\.zip: entry '0\.jpg' is encrypted"):
         add_scene(sheet, "desk", tmp_path / "locked.zip")
     assert not (tmp_path / "project/photos/desk").exists()
+
+
+def test_a_failing_command_keeps_the_folder_of_an_earlier_one(tmp_path, photos_in_zip, sheet):
+    archive, folder = zipped(tmp_path / "desk.zip", photos_in_zip), tmp_path / "project/photos/desk"
+    add_scene(sheet, "desk", archive)
+    (folder / "mine.txt").write_text("mine")
+    sheet.unlink()  # for example because the user starts a new sheet
+    before = sorted(folder.rglob("*"))
+    (tmp_path / "labels").mkdir()
+    with pytest.raises(SceneError, match=r"--labels .* contains no label file"):
+        add_scene(sheet, "desk", archive, labels=tmp_path / "labels")
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_an_interrupted_command_leaves_nothing_of_its_own(tmp_path, photos_in_zip, sheet, monkeypatch):
+    folder = tmp_path / "project/photos/desk"
+
+    def interrupt(*_):
+        (folder / "mine.txt").touch()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("hilsplat.photos.add.inspect_photos", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        add_scene(sheet, "desk", zipped(tmp_path / "desk.zip", photos_in_zip))
+    assert [path.name for path in folder.rglob("*")] == ["mine.txt"]
+
+
+def test_a_linked_sheet_is_changed_where_it_is(tmp_path, photos_in_zip, sheet):
+    archive, shared = zipped(tmp_path / "desk.zip", photos_in_zip), sheet.with_name("shared.tsv")
+    add_scene(sheet, "desk", archive)
+    sheet.rename(shared)
+    sheet.symlink_to("shared.tsv")
+    add_scene(sheet, "room", archive)
+    assert sheet.is_symlink()
+    assert [row.scene for row in read_sheet(shared)] == ["desk", "room"]

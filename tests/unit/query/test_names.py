@@ -94,9 +94,12 @@ def test_names_of_another_tree_are_kept_but_not_used(desk, tmp_path):
     assert dict(read_names(desk, other).of_node) == {1: "cup"}
 
 
+UNUSABLE = ("a > b", "x" * 81, "\x07", "\x1b]0;x\x07", "a\ud800", "a\u202eb")
+
+
 @pytest.mark.parametrize(
     ("node", "name", "message"),
-    [*((0, name, "valid name") for name in ("a > b", "x" * 81, "\x07")), (99, "mug", "node 99 does")],
+    [*((0, name, "valid name") for name in UNUSABLE), (99, "mug", "node 99 does")],
 )
 def test_a_name_that_cannot_be_requested_is_refused(desk, node, name, message):
     with pytest.raises(SettingsError, match=message):
@@ -116,6 +119,7 @@ FORMAT = "hilsplat-names-1"
         {"format": FORMAT, "trees": {"DIGEST": {"-1": "mug"}}},
         {"format": FORMAT, "trees": {"DIGEST": {"99999": "mug"}}},
         {"format": FORMAT, "trees": {"DIGEST": {"0": 7}}},
+        *({"format": FORMAT, "trees": {"DIGEST": {"0": name}}} for name in UNUSABLE),
         ["mug"],
     ],
 )

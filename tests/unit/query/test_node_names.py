@@ -44,7 +44,13 @@ def test_sections_comments_and_repeated_texts_of_a_file(tmp_path):
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [(b"[colours]\nred", "line 1 .* unknown section"), (b"# nothing", "no texts"), (b"\xff", "read")],
+    [
+        (b"mug\nred, a > b", r"line 2 of .*'a > b' is not a valid name"),
+        (b"mug\x1b[2J", "line 1 of .* is not a valid name"),
+        (b"[colours]\nred", "line 1 .* unknown section"),
+        (b"# nothing", "no texts"),
+        (b"\xff", "read"),
+    ],
 )
 def test_invalid_vocabularies_are_refused(tmp_path, content, message):
     (tmp_path / "words.txt").write_bytes(content)
@@ -106,7 +112,8 @@ def test_names_of_another_tree_are_not_shown_and_damaged_ones_are_refused(desk, 
     change_index(other, tree_sha256="another")
     assert NodeNaming.load(other, tree, clip) is None
     whole = read_json(desk / "default/names/names.json")
-    for damaged in ([{"name": "mug"}], whole[:-1], [*whole[:-1], 7], {}):
+    hostile = [{**whole[0], "name": "\x1b[2J"}, *whole[1:]]
+    for damaged in (hostile, [{"name": "mug"}], whole[:-1], [*whole[:-1], 7], {}):
         (other / "names.json").write_text(json.dumps(damaged))
         change_index(other, tree_sha256=own)
         with pytest.raises(ArtifactError, match=r"names\.json or rivals\.npy is damaged"):

@@ -90,3 +90,14 @@ def test_networks_with_undeclared_shapes_are_checked_when_they_run(tmp_path):
     require_one_space(tmp_path, 512, None)
     with pytest.raises(ModelError, match=r"do not belong together(.|\n)*512(.|\n)*768"):
         require_one_space(tmp_path, 512, 768)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_decoder_whose_ious_are_not_numbers_is_named(disc_sam, monkeypatch, value):
+    model = SamModel.load(disc_sam)
+    encoded = model.encode(np.zeros((16, 16, 3), np.uint8))
+    iou, logits = model.decode(encoded, np.full((2, 2), 8.0))
+    monkeypatch.setattr(model, "factored", None)
+    monkeypatch.setattr(model, "decoder", lambda *_: (np.full_like(iou, value), logits))
+    with pytest.raises(ModelError, match=r"predicts 6 IoUs of 6 that are not finite(.|\n)*masks.variant"):
+        model.decode(encoded, np.full((2, 2), 8.0))

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit
 
-from hilsplat.base.artifacts import read_index, read_json
+from hilsplat.base.artifacts import read_index, read_json, read_npz, write_stored_npz
 from hilsplat.base.errors import SceneError
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
@@ -104,6 +104,27 @@ def test_threads_and_interruptions_do_not_change_the_bytes(stage, tmp_path, monk
     assert coordinates["unit"] == "arbitrary"
     assert coordinates["scale"] == 1.0
     assert coordinates["origin"] == {"kind": "fitted", "strategy": strategy, "iterations": 60, "seed": 3}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda arrays: arrays.pop("steps"),
+        lambda arrays: arrays.update(generator=np.array("[]")),
+        lambda arrays: arrays.update(generator=np.array("{")),
+        lambda arrays: arrays.update(generator=np.array(7)),
+    ],
+)
+def test_a_checkpoint_with_other_content_is_ignored(scene, tmp_path, change):
+    generator, cameras = np.random.default_rng(0), [scene.cameras[view] for view in scene.views("train")]
+    adam = Adam.start(first_gaussians(scene, cameras, SETTINGS, generator))
+    path = tmp_path / f"{'0' * 16}.npz"
+    fit.FitState(adam, ScreenGradients.start(len(adam)), generator).save(path)
+    assert fit.FitState.load(path) is not None
+    arrays = read_npz(path)
+    change(arrays)
+    write_stored_npz(path, **arrays)
+    assert fit.FitState.load(path) is None
 
 
 def test_random_points_are_in_view_of_cameras(scene):

@@ -15,12 +15,12 @@ import cv2
 import jsonschema
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import EpsImagePlugin, Image, ImageFile
 from plyfile import PlyData
 from pycocotools import mask as coco_masks
 from starlette.requests import Request
 
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.query.names import FILE
 from hilsplat.splat.ply import load_ply
 from hilsplat.viewer import exports
@@ -29,6 +29,7 @@ from hilsplat.viewer.frames import painted
 from hilsplat.viewer.saved_files import SavedFiles
 from hilsplat.viewer.viewer_scene import ViewerScene
 from hilsplat.web.scene_thread import SceneThread
+from tests.unit.base.test_untrusted_files import png, write_eps
 from tests.unit.finished_desk import SCENE
 from tests.unit.splat.spz_reader import decoded
 from tests.unit.viewer.conftest import browsing, in_steps, run_apart, wire_camera
@@ -86,6 +87,12 @@ def test_a_photograph_and_a_level_restrict_the_answers(client, scene):
     found = ask(client, "mug", level="part", view=view)["hits"]
     assert [hit["node"] for hit in found] == [hit.node for hit in hits]
     assert client.post("/api/query", json={"text": "mug", "view": 99}).status_code == 422
+    for text in ("", ">", "mug >", "x" * 10_000):
+        with pytest.raises(SettingsError) as refusal:  # the command line and the page give the same message
+            scene.query(text)
+        for api in ("query", "field"):
+            refused = client.post(f"/api/{api}", json={"text": text})
+            assert (refused.status_code, refused.json()["error"]) == (422, str(refusal.value))
 
 
 def test_nodes_similar_to_a_node_or_a_picture(client, scene):
@@ -101,6 +108,30 @@ def test_nodes_similar_to_a_node_or_a_picture(client, scene):
     assert client.post("/api/like", json=sent).json()["hits"][0]["node"] == book["node"]
     for bad in ("", "AAAA", "?"):
         assert client.post("/api/like", json={"picture": bad}).status_code == 422
+
+
+@pytest.mark.parametrize("kind", ["PNG", "JPEG", "WEBP", "AVIF"])
+def test_pictures_in_the_formats_of_browsers_are_read(client, scene, kind):
+    held = io.BytesIO()
+    Image.new("RGB", (33, 17), (0, 0, 250)).save(held, format=kind)
+    sent = {"picture": base64.b64encode(held.getvalue()).decode()}
+    (book,) = ask(client, "book", level="whole")["hits"]
+    assert client.post("/api/like", json=sent).json()["hits"][0]["node"] == book["node"]
+
+
+@pytest.mark.parametrize("size", [(28_000, 28_000), (4097, 8), (8, 4097)])
+def test_a_large_picture_is_refused_before_decoding(client, monkeypatch, size):
+    monkeypatch.setattr(ImageFile.ImageFile, "load", lambda *_: pytest.fail("it was decoded"))
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    sent = {"picture": base64.b64encode(png(*size)).decode()}
+    answer = client.post("/api/like", json=sent)
+    assert answer.status_code == 422 and "4096 px" in answer.text
+
+
+def test_a_picture_cannot_choose_its_decoder(client, tmp_path, monkeypatch):
+    monkeypatch.setattr(EpsImagePlugin, "Ghostscript", lambda *_, **__: pytest.fail("Ghostscript ran"))
+    sent = {"picture": base64.b64encode(write_eps(tmp_path / "a.png").read_bytes()).decode()}
+    assert client.post("/api/like", json=sent).status_code == 422
 
 
 def test_field_relevancy_of_every_gaussian(client, scene, shown):

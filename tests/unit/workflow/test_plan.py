@@ -8,10 +8,13 @@ from types import SimpleNamespace
 import pytest
 
 from hilsplat.base.errors import HilsplatError, SettingsError
+from hilsplat.configuration import merged_config, parse_run
+from hilsplat.scene.sheet import read_sheet
 from hilsplat.workflow import targets
 from hilsplat.workflow.models import models_of_photographs
-from hilsplat.workflow.plan import Plan
+from hilsplat.workflow.plan import Plan, without_scene
 from hilsplat.workflow.records import expected_artifacts
+from tests.conftest import PROJECT
 from tests.unit.models.test_store import write_model
 from tests.unit.workflow.plans import BENCHMARK, Job, plan_of
 
@@ -278,6 +281,26 @@ def test_queries_of_a_scene_come_before_those_of_its_data_set(tmp_path):
     found = plan(tmp_path, queries={"photos": ["cup"], "photos/desk": ["mug"]})
     assert json.loads(found.queries(Job("photos", "desk"))) == ["mug"]
     assert json.loads(found.queries(Job("photos", "other"))) == ["cup"]
+
+
+def test_names_that_match_no_scene_are_reported(tmp_path):
+    config = {
+        "sweep_scenes": ["one", "table-1", "former"],
+        "overrides": {"photos/gone": {}, "rooms/room": {}},
+    }
+    found = plan(tmp_path, **config, queries={"photos/gone": ["mug"], "lerf/teatime": ["bear"]}).ignored
+    sheet = tmp_path / "config/scenes.tsv"
+    assert found == [  # `table-1` and `teatime` are in the installed sheet
+        f"the configuration (sweep_scenes) names the scene 'former', which is not in {sheet}; it is ignored",
+        f"the configuration (overrides or queries) names the scene 'photos/gone', which is not in {sheet}; "
+        "it is ignored",
+    ]
+
+
+@pytest.mark.parametrize("path", sorted((PROJECT / "config").glob("*.yaml")), ids=lambda path: path.name)
+def test_every_name_in_a_shipped_configuration_matches_a_scene(path):
+    run = parse_run(merged_config([path]))
+    assert without_scene(run, read_sheet(PROJECT / "config/scenes.tsv", ())) == []
 
 
 def test_a_segmenter_without_weights_and_a_missing_model_have_no_digest(tmp_path):

@@ -106,9 +106,28 @@ def test_in_a_file_a_finished_stage_is_one_plain_line(screen, clock):
     assert screen.text == "Job stats\nphotos/desk gaussians: 290 s (1 of 3 done, about 2 min left)\n"
 
 
+def test_texts_from_logs_and_jobs_cannot_control_the_terminal(run, tmp_path):
+    log = tmp_path / "gaussians.log"
+    log_lines(
+        log,
+        (logging.WARNING, "hilsplat", "image \x1b]0;x\x07"),
+        (20, "hilsplat.base.progress", "\x1b[2J: 1 of 3"),
+    )
+    lines = Screen(run, io.StringIO())
+    lines.tell(text="job \x9b31m failed", level=logging.ERROR)
+    lines.start(1, "gaussians", log)
+    terminal = Screen(run, Terminal())
+    terminal.display.show(logging.makeLogRecord({"event": "progress", "msg": ""}))
+    terminal.display.close()
+    assert "\\x1b[2J 1 of 3" in terminal.text and "\x1b[2J:" not in terminal.text
+    lines.end(1)
+    assert lines.text.startswith("job \\x9b31m failed\nimage \\x1b]0;x\\x07\n")
+
+
 @pytest.mark.parametrize("order", [("semantic_tree", "clip"), ("clip", "semantic_tree")])
-def test_the_query_commands_are_printed_once_tree_and_vectors_exist(screen, tmp_path, order):
-    variant = tmp_path / "photos/desk/default"
+def test_the_query_commands_are_printed_once_tree_and_vectors_exist(screen, tmp_path, order, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    variant = Path("results/photos/desk/default")
     for rule in (*order, *order):
         assert "ready" not in screen.text or (variant / rule).exists()
         write_index(variant / rule, {})
@@ -118,8 +137,19 @@ def test_the_query_commands_are_printed_once_tree_and_vectors_exist(screen, tmp_
     assert screen.text.count('hilsplat query photos/desk "..."') == 1
 
 
-def test_queries_of_key_views_are_announced_before_those_of_all_views(screen, tmp_path):
-    scene = tmp_path / "photos/desk"
+def test_commands_name_the_path_of_a_scene_outside_results(screen, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    variant = Path("elsewhere/photos/desk/default")
+    for rule in ("clip", "semantic_tree"):
+        write_index(variant / rule, {})
+    screen.start(2, "clip", variant / "logs/clip.log")
+    screen.end(2)
+    assert "  hilsplat view elsewhere/photos/desk" in screen.text.splitlines()
+
+
+def test_queries_of_key_views_are_announced_before_those_of_all_views(screen, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scene = Path("results/photos/desk")
     write_index(scene / "scene", {name: {"split": "test" if name == "c" else "train"} for name in "abc"})
     write_index(scene / "key-views/masks", {"a": {}})
     for number, variant in enumerate(("key-views", "default")):
@@ -134,6 +164,12 @@ def test_queries_of_key_views_are_announced_before_those_of_all_views(screen, tm
         "  hilsplat view photos/desk",
     ]
     assert lines[6:] == ["photos/desk uses all photographs"]
+
+
+@pytest.mark.parametrize("how", ["died with <Signals.SIGKILL: 9>", "returned non-zero exit status 137"])
+def test_a_killed_job_is_explained(screen, how):
+    screen.tell(text=f"CalledProcessError: Command 'python' {how}.", level=logging.ERROR)
+    assert "the job was killed, probably because memory ran out\n  fix       use fewer cores" in screen.text
 
 
 def test_errors_are_shown_in_full_and_a_retry_counts_once(screen, run):
@@ -229,6 +265,12 @@ def test_benchmark_files_of_earlier_runs_correct_the_estimates(tmp_path, monkeyp
     np.savez(folder / "scene/cameras.npz", size_hw=np.array([(500, 1000)] * 2, np.int32))
     (folder / "benchmarks/poses.jsonl").write_text(json.dumps({"s": 82.0, "cpu_time": 90.0}) + "\n")
     (folder / "default/benchmarks/clip.jsonl").write_text('{"s": 5')
+    for name, content in {
+        "a": "[]",
+        "b": '{"s": "x", "cpu_time": 1}',
+        "c": '{"s": NaN, "cpu_time": 1e999}',
+    }.items():
+        (folder / f"benchmarks/{name}.jsonl").write_text(content)
     resources = JobResources(plan_of(tmp_path, BENCHMARK[:1]))
     estimates = Estimates(resources)
     estimates.learn_from_benchmarks()

@@ -1,13 +1,14 @@
 """Artifacts compared with their provenance, and provenance compared with a plan."""
 
 import json
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from hilsplat.base.artifacts import lock_path, output_lock, provenance_path
+from hilsplat.base.artifacts import lock_path, output_lock, provenance_path, write_json
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.provenance import Inputs, write_provenance
 from hilsplat.models.store import model_digest
@@ -48,8 +49,8 @@ def results(tmp_path, monkeypatch) -> Path:
     return Path("results")
 
 
-def problems(expected: dict[Path, Expected] | None = None) -> dict[str, str]:
-    records = Records(Path("results"), every_byte=False)
+def problems(expected: dict[Path, Expected] | None = None, *, every_byte: bool = False) -> dict[str, str]:
+    records = Records(Path("results"), every_byte=every_byte)
     found = {path.name: records.state(path, how)[1] for path, how in (expected or EXPECTED).items()}
     return {name: reason for name, reason in found.items() if reason}
 
@@ -80,7 +81,7 @@ def test_missing_and_cut_files_are_found(results):
 
 def test_other_code_and_damaged_provenance_are_found(results):
     path = provenance_path(TREE)
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"code": "0" * 64}))
+    write_json(path, {**json.loads(path.read_text()), "code": "0" * 64, "seal": None})
     assert problems() == {"coverage_tree": "it was made by different code"}
     for text in ("", "{", "[]", '{"stage": 3}', "[" * 100_000):
         path.write_text(text)
@@ -95,7 +96,8 @@ def test_an_artifact_made_from_other_inputs_is_found(results):
 def test_every_byte_is_read_after_a_writer_that_did_not_finish(results):
     """It may have replaced one of several outputs by another of the same size."""
     (MASKS / "a.npz").write_text("two")
-    assert problems() == {}, "sizes agree"
+    os.utime(MASKS / "a.npz", (0, 0))
+    assert problems() == {}, "sizes agree, and the file is not newer than its record"
     with pytest.raises(KeyboardInterrupt), output_lock(MASKS):
         raise KeyboardInterrupt
     assert problems()["masks"] == "masks was changed after it was written"
@@ -104,6 +106,23 @@ def test_every_byte_is_read_after_a_writer_that_did_not_finish(results):
     with output_lock(MASKS):
         pass
     assert lock_path(MASKS).read_text() == ""
+
+
+def test_a_file_that_is_newer_than_its_record_is_read(results):
+    (MASKS / "a.npz").write_text("two")
+    assert problems()["masks"] == "masks was changed after it was written"
+    (MASKS / "a.npz").write_text("one")
+    assert problems() == {}
+
+
+@pytest.mark.parametrize("place", range(0, 1200, 7))
+def test_a_flipped_bit_in_a_record_is_found(results, place):
+    path = provenance_path(TREE)
+    content = bytearray(path.read_bytes())
+    place %= len(content)
+    content[place] ^= 1 << place % 7
+    path.write_bytes(content)
+    assert problems(every_byte=True) == {"coverage_tree": "its provenance is damaged"}
 
 
 def test_imported_artifacts_are_not_compared_with_settings(results):
@@ -168,7 +187,7 @@ def test_verify_reads_every_byte_and_prints_the_repair(results):
         f"stale    {TREE}: its input masks has changed: {MASKS}",
         f"damaged  {MASKS}: masks was changed after it was written",
         "2 artifacts in results: 1 stale, 1 damaged",
-        f"to rebuild them: snakemake --cores 2 --forcerun {TREE} {MASKS}",
+        "to rebuild them, in the project that made them: hilsplat run --verify",
     ]
 
 

@@ -15,10 +15,11 @@ from tests.unit.workflow.plans import write_sheet
 
 HOLD = """
 import sys, time
+from pathlib import Path
 from hilsplat.workflow.run import mark_run, prepare_process
 stream = prepare_process()
 if "marked" in sys.argv:
-    mark_run()
+    mark_run(Path("other-results"))
 print("held", flush=True)
 time.sleep(60)
 """
@@ -106,8 +107,11 @@ def test_needed_outputs_that_do_not_match_their_provenance_are_rebuilt(folder, s
     assert started[0][-4:] == ["--forcerun", file, "--", file]
 
 
-def test_a_second_run_of_the_folder_is_refused(folder, started):
-    lock = runs._locked("run.lock")
+def test_a_second_run_with_the_same_results_is_refused(folder, started, tmp_path, monkeypatch):
+    """It may run in another folder, whose `results` is a link."""
+    Path("results").mkdir()
+    (tmp_path / "elsewhere").symlink_to(folder / "results")
+    lock = runs._locked(tmp_path / "elsewhere/.run.lock")
     with pytest.raises(HilsplatError, match="another hilsplat run"):
         runs.run([], [], [])
     assert runs.run([], [], ["-n"]) == 3, "a dry run needs no lock"
@@ -127,7 +131,7 @@ def test_the_locks_of_a_dead_run_are_removed_once(folder, started, unlocked):
 def leave_marker(host: str = "") -> None:
     """Leave the marker of a run that was killed."""
     STATE.mkdir(exist_ok=True)
-    (STATE / "run-1").write_text(host or socket.gethostname())
+    (STATE / "run-00000001").write_text(host or socket.gethostname())
 
 
 @pytest.mark.parametrize("is_marked", [False, True])

@@ -248,6 +248,27 @@ def test_invalid_parents_and_children_outside_their_parent_are_reported(hi):
     assert paths["head"] == ("head",) and paths["nose"] == ("nose",) and paths["paw"] == ("bear", "paw")
 
 
+def test_repeated_objects_are_ignored_and_similar_texts_reported(tmp_path):
+    first = {"id": 1, "level": 1, "segmentation": SQUARE}
+    other = [[2.0, 3.0], [5.0, 3.0], [5.0, 7.0]]
+    objects = [
+        thing("mug", **first),
+        thing(" Mug", **{**first, "id": 2}),
+        thing("mug", **{**first, "id": 3, "segmentation": other}),  # another mug
+        thing("mug", **{**first, "id": 4, "level": 2}),
+        thing("red  Cup", **{**first, "id": 5}),
+        thing("Red cup", **{**first, "id": 6, "segmentation": other}),
+    ]
+    label_file(tmp_path / "annotated/photos/desk", objects, name="DSC_1")
+    scene = open_labelled("annotated/photos/desk", tmp_path)
+    found = [(region.text, region.level) for region in scene.views["DSC_1.png"]]
+    assert found == [("mug", 1), ("mug", 1), ("mug", 2), ("red  Cup", 1), ("Red cup", 1)]
+    ignored, similar = scene.warnings
+    assert ignored == "DSC_1.json: id 2 ( Mug) repeats id 1; ignored"
+    assert similar == "'Red cup' and 'red  Cup' differ only in case or spaces, but are scored separately"
+    assert scene.report().warnings[:2] == scene.warnings
+
+
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [

@@ -229,6 +229,9 @@ def test_a_matrix_by_hand():
     assert matrix(zlib.compress(message), np.int32).tolist() == [[1], [300]]
     with pytest.raises(ValueError, match="reshape"):
         matrix(zlib.compress(message[:-1] + b"\x02"), np.int32)
+    for damaged in (zlib.compress(bytes(2**27)), zlib.compress(message)[:-5]):
+        with pytest.raises(ValueError, match="truncated, or unpacks to more than 64 MiB"):
+            matrix(damaged, np.int32)
 
 
 def test_both_releases_give_the_same_scene(root, tmp_path):

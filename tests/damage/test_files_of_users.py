@@ -1,0 +1,169 @@
+"""Every option that names an output or a cache, pointed at files of a user: none of them changes."""
+
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from hilsplat.base.errors import HilsplatError
+from hilsplat.cli.main import app
+from tests.conftest import PROJECT
+from tests.unit.finished_desk import SCENE
+
+VARIANT = SCENE / "default"
+VALUES = {
+    "--masks": VARIANT / "masks",
+    "--clip": VARIANT / "clip",
+    "--contributions": VARIANT / "contributions",
+    "--autoencoder": VARIANT / "autoencoder",
+    "--scene": SCENE / "scene",
+    "--gaussians": SCENE / "gaussians.ply",
+    "--coverage-tree": VARIANT / "coverage_tree",
+    "--semantic-tree": VARIANT / "semantic_tree",
+    "--field": VARIANT / "field.safetensors",
+    "--fit": SCENE / "scene",
+    "--images": SCENE / "scene/images",
+    "--dataset": "photos",
+    "--name": "photos/desk",
+    "--method": "mine",
+    "--published": PROJECT / "config/published.csv",
+    "--table": "table.csv",
+    "--variants": '["default"]',
+    "--source": "world:tabletop:1",
+    "--data-root": ".",
+    "--folder": SCENE,
+    "--report": "made/report",
+    "--out": "made/out",
+}
+"""Values of required options that are not pointed at the user's files."""
+WORDS = {
+    "new": ("chair", "photos.zip"),
+    "evaluate-files": ("predictions",),
+    "table": ("lerf",),
+    "sweep": ("theta",),
+    "query": ("photos/desk", "mug"),
+    "export": ("photos/desk",),
+    "world masks": ("photos/desk",),
+    "datasets export": ("scannet/scene0000_00",),
+}
+FAST = {
+    "gaussians": ("--settings", '{"iterations": 10}'),
+    "masks": ("--settings", '{"segmenter": "graph"}'),
+    "clip": ("--settings", '{"model": "models/colours"}'),
+    "names": ("--settings", '{"vocabulary": "words.txt"}'),
+    "world make": ("--settings", '{"views": 3, "image_px": 32}'),
+}
+OUTPUTS = {"out", "report", "cache", "folder", "sheet"}
+NO_OUTPUTS = {"models check", "comparison", "cache"}
+"""Commands whose `folder` is only read, and the one that runs in its own process below."""
+
+
+def commands(command: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+    if hasattr(command, "commands"):
+        for name, each in command.commands.items():
+            yield from commands(each, (*words, name))
+    if command.params and words:
+        yield " ".join(words), command
+
+
+COMMANDS = dict(commands(typer.main.get_command(app)))
+OPTIONS = [
+    (name, parameter.name)
+    for name, command in COMMANDS.items()
+    for parameter in command.params
+    if parameter.name in OUTPUTS and not (name in NO_OUTPUTS and parameter.name == "folder")
+]
+NAMES = (
+    *("drawing.png", "film.mp4", "masks/a.png", "clip/b.mp4", "contributions/c.txt", "results/d.csv"),
+    *("images/1.jpg", "index.json", "scenes.tsv", ".run.json", "photos/chair/f.jpg"),
+    *("gaussians/0123456789abcdef.npz", f"masks/01/{'0' * 64}.npz", ".writing-01234567-01234567/e.png"),
+)
+"""Files of the user or of other tools, some with names like ours."""
+THEIRS = ("trained.ply", "deep/1.npz")
+LINKS = {"link.ply": "trained.ply", "folder": "deep", "lost.json": "nowhere"}
+"""Links in the user's folder to files elsewhere."""
+PLACES = ("", "drawing.png", "film.mp4", "masks", "results", "link.ply", "folder", "lost.json", "scenes.tsv")
+
+
+@pytest.fixture(scope="module")
+def project(desk_project: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished scene, the configuration, and the user's folder `mine` with links out of it."""
+    copy = Path(shutil.copytree(desk_project, tmp_path_factory.mktemp("users") / "project"))
+    shutil.copytree(PROJECT / "config", copy / "config")
+    (copy / "words.txt").write_text("mug\nbook\n")
+    (copy / "table.csv").write_text("a,b\n")
+    with zipfile.ZipFile(copy / "photos.zip", "w") as archive:
+        for path in sorted((copy / SCENE / "scene/images").iterdir()):
+            archive.write(path, path.name)
+    mine, theirs = copy / "mine", copy / "theirs"
+    for name in NAMES:
+        (mine / name).parent.mkdir(parents=True, exist_ok=True)
+        (mine / name).write_text(f"{name} of the user")
+    (theirs / "deep").mkdir(parents=True)
+    for name in THEIRS:
+        (theirs / name).write_text(f"{name} elsewhere")
+    for name, target in LINKS.items():
+        (mine / name).symlink_to(theirs / target)
+    return copy
+
+
+def files_of_user(project: Path) -> dict[str, bytes | str | None]:
+    """Return the contents of the user's files and the targets of the links; None for what is missing."""
+    links = {
+        name: str((project / "mine" / name).readlink())
+        for name in LINKS
+        if (project / "mine" / name).is_symlink()
+    }
+    places = [*(project / "mine" / name for name in NAMES), *(project / "theirs" / name for name in THEIRS)]
+    return links | {str(path): path.read_bytes() if path.is_file() else None for path in places}
+
+
+@pytest.mark.parametrize(("name", "option"), OPTIONS)
+def test_no_option_changes_a_users_file(project: Path, monkeypatch, name: str, option: str) -> None:
+    monkeypatch.chdir(project)
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    before = files_of_user(project)
+    command = COMMANDS[name]
+    (chosen,) = (parameter for parameter in command.params if parameter.name == option)
+    for place in PLACES:
+        words = list(name.split())
+        for parameter in command.params:
+            if parameter is chosen or not parameter.required or parameter.param_type_name != "option":
+                continue
+            words += [parameter.opts[0], str(VALUES[parameter.opts[0]])]
+        path = str(Path("mine") / place)
+        given = [chosen.opts[0], path] if chosen.param_type_name == "option" else [path]
+        words += [*given, *FAST.get(name, ()), *WORDS.get(name, ())]
+        try:
+            app(words)
+        except HilsplatError:
+            pass
+        except SystemExit as ended:
+            assert ended.code != 2, f"not the arguments of the command: {words}"
+        except OSError as error:  # reported by `main`
+            assert error.errno is not None
+        shutil.rmtree("made", ignore_errors=True)
+        after = files_of_user(project)
+        assert after == before, words
+
+
+def test_neither_a_log_nor_pruning_changes_a_users_file(project: Path) -> None:
+    before = files_of_user(project)
+    for place in PLACES:
+        for words in (
+            ["--log", f"mine/{place}", "settings"],
+            ["cache", "--folder", f"mine/{place}", "prune", "--days", "0", "--max-mib", "0"],
+        ):
+            command = [sys.executable, "-m", "hilsplat", *words]
+            environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
+            done = subprocess.run(command, cwd=project, capture_output=True, text=True, env=environment)
+            assert done.returncode != 2 and "Traceback" not in done.stderr, (words, done.stderr)
+    after = files_of_user(project)
+    assert after == before
