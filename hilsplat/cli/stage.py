@@ -12,7 +12,7 @@ import typer
 
 from hilsplat.base.artifacts import output_lock, parse_json, provenance_path, require_free_space
 from hilsplat.base.cache import writable
-from hilsplat.base.errors import HilsplatError, SettingsError, system_error, visible
+from hilsplat.base.errors import HilsplatError, SettingsError, visible
 from hilsplat.base.plugins import load
 from hilsplat.base.progress import LOG_FORMAT, LogFormatter
 from hilsplat.base.removal import delete
@@ -107,42 +107,32 @@ def stage(
     start_logging(timestamps=True)
     device = getattr(settings, "device", None)
     given = {key: paths for key, paths in (inputs or {}).items() if paths is not None}
-    try:
-        paths: list[Path] = []
-        for each in given.values():
-            paths += [each] if isinstance(each, Path) else each
-        require_replaceable((out, *beside), name, paths)
-        require_free_space(out.parent, MIN_FREE_MIB)
-        with output_lock(out):
-            read, code = Inputs(name, given), stage_code(name, plugins)
-            yield load(STAGES[name])
-            try:
-                read.require_unchanged()
-            except HilsplatError:
-                delete(provenance_path(out), r".+\.provenance\.json")  # so that the output is rebuilt
-                raise
-            written = [path.with_suffix(kind) for path in (out, *beside) for kind in (".pdf", ".report.json")]
-            write_provenance(
-                out,
-                stage=name,
-                code=code,
-                command=_command(),
-                settings=_recorded(settings),
-                seed=seed,
-                inputs=read,
-                beside=(*beside, *filter(Path.exists, written)),
-                plugins=plugins,
-                device=None if device is None else choose_device(device),
-            )
-    except HilsplatError:
-        raise
-    except Exception as error:  # a system error, or a bug, whose traceback is logged
-        if (problem := system_error(error)) is not None:
-            raise problem from error
-        if sys.gettrace() is not None:  # for post-mortem debugging
+    paths: list[Path] = []
+    for each in given.values():
+        paths += [each] if isinstance(each, Path) else each
+    require_replaceable((out, *beside), name, paths)
+    require_free_space(out.parent, MIN_FREE_MIB)
+    with output_lock(out):
+        read, code = Inputs(name, given), stage_code(name, plugins)
+        yield load(STAGES[name])
+        try:
+            read.require_unchanged()
+        except HilsplatError:
+            delete(provenance_path(out), r".+\.provenance\.json")  # so that the output is rebuilt
             raise
-        logging.getLogger("hilsplat").exception("stage %s failed; output: %s", name, out)
-        sys.exit(1)
+        written = [path.with_suffix(kind) for path in (out, *beside) for kind in (".pdf", ".report.json")]
+        write_provenance(
+            out,
+            stage=name,
+            code=code,
+            command=_command(),
+            settings=_recorded(settings),
+            seed=seed,
+            inputs=read,
+            beside=(*beside, *filter(Path.exists, written)),
+            plugins=plugins,
+            device=None if device is None else choose_device(device),
+        )
 
 
 def _command() -> list[str]:
