@@ -89,7 +89,7 @@ NAMES = (
 THEIRS = ("trained.ply", "deep/1.npz")
 LINKS = {"link.ply": "trained.ply", "folder": "deep", "lost.json": "nowhere"}
 """Links in the user's folder to files elsewhere."""
-PLACES = ("", "drawing.png", "film.mp4", "masks", "results", "link.ply", "folder", "lost.json", "scenes.tsv")
+PLACES = ("", "drawing.png", "masks", "link.ply", "folder", "lost.json")
 
 
 @pytest.fixture(scope="module")

@@ -82,6 +82,10 @@ def test_a_written_file_is_read_back_and_scored_without_proposals(tmp_path):
     write_labels(path, "DSC_1.png", SIZE, given[::-1], version)
     assert path.read_bytes() == first  # the order of drawing does not matter
     assert write_labels(path, "DSC_1.png", SIZE, [], version) == NO_FILE and not path.exists()
+    shared = path.with_name("shared.json")
+    path.symlink_to(shared)
+    write_labels(path, "DSC_1.png", SIZE, given, NO_FILE)
+    assert path.is_symlink() and shared.is_file()
 
 
 def test_a_file_of_another_size_is_refused(tmp_path):

@@ -408,6 +408,15 @@ def test_files_of_the_user_in_a_model_folder_outlive_its_replacement(hub, change
     assert (TARGET / "vocabulary.txt").read_text() == "mug" and (TARGET / "onnx/mine/drawing.png").is_file()
 
 
+@pytest.mark.parametrize("origin", ["[]", "{}", "{", f'{{"repository": "{SAM}", "holds": []}}'])
+def test_a_folder_with_an_unusable_origin_is_not_replaced(hub, origin):
+    TARGET.mkdir(parents=True)
+    (TARGET / "origin.json").write_text(origin)
+    with pytest.raises(DownloadError, match="already exists and was not downloaded"):
+        get_models(["sam-vit-base"])
+    assert (TARGET / "origin.json").read_text() == origin
+
+
 def test_a_folder_named_like_a_download_is_not_used(hub):
     (STAGING / "mine").mkdir(parents=True)
     with pytest.raises(DownloadError, match=r"\.part exists, but is not a download(.|\n)*remove it"):

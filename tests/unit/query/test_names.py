@@ -142,3 +142,26 @@ def test_nodes_similar_to_a_node_are_ranked_by_cosine(desk):
     assert {hit.level for hit in likes} == {hilsplat.Level.PART} and len(scene.like_node(0, limit=0)) == 0
     with pytest.raises(SettingsError, match="node 99 does not exist"):
         scene.like_node(99)
+
+
+def test_a_link_to_names_stays_a_link(desk, tmp_path):
+    shared = tmp_path / "names.json"
+    (desk / FILE).symlink_to(shared)
+    name_nodes(desk, {0: "mug"})
+    assert (desk / FILE).is_symlink() and "mug" in shared.read_text()
+
+
+def test_names_that_change_while_they_are_read_cannot_be_replaced(desk, monkeypatch):
+    """The version is that of the names that were read, or an older one."""
+    first = name_nodes(desk, {0: "mug"})
+
+    def change(*_):
+        monkeypatch.undo()
+        name_nodes(desk, {0: "mug", 1: "book"}, first.version)
+        return tree_digest(desk / "default/semantic_tree")
+
+    monkeypatch.setattr("hilsplat.query.names.tree_digest", change)
+    read = read_names(desk, desk / "default/semantic_tree")
+    assert read.of_node == {0: "mug"}
+    with pytest.raises(StaleFileError):
+        name_nodes(desk, {0: "cup"}, read.version)
