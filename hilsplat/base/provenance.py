@@ -4,7 +4,8 @@ import functools
 import os
 import platform
 import subprocess
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from hilsplat.base.artifacts import (
     provenance_path,
     read_json,
+    read_memo,
     remake,
     seal_of,
     sha256_of_path,
@@ -267,6 +269,29 @@ def _is_own_picture(path: Path) -> bool:
             return bool(image.info.get("Software") == SOFTWARE["Software"])
     except ImageError:
         return False
+
+
+WRITTEN = ".written.json"
+"""Hidden file in a folder that may be replaced: size and time of each of its files."""
+
+
+@contextmanager
+def replaced_folder(folder: Path) -> Iterator[None]:
+    """Replace a folder in the block; raise ArtifactError if a file in it is not from the last such block."""
+    known = read_memo(folder / WRITTEN, dict[str, list[int]])
+    if others := sorted(name for name, stat in _stats(folder).items() if known.get(name) != stat):
+        raise ArtifactError(
+            f"{folder} contains files that hilsplat did not write, or that were changed later",
+            found=", ".join(others[:3]),
+            fix="move them elsewhere, or choose another folder (--out)",
+        )
+    yield
+    write_json(folder / WRITTEN, _stats(folder))
+
+
+def _stats(folder: Path) -> dict[str, list[int]]:
+    stats = {file.relative_to(folder).as_posix(): file.stat() for file in files_of(folder)}
+    return {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
 
 
 def require_beginning(path: Path, line: str) -> None:

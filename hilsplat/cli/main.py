@@ -16,6 +16,7 @@ from typing import Annotated
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_name] = "1"
 os.environ["MPLBACKEND"] = "agg"
+os.environ["PYTHONSAFEPATH"] = "1"  # processes that we start import no module from the working folder
 warnings.filterwarnings("ignore", "Glyph .* missing from font")  # pictures show boxes instead of such letters
 for _name in (
     "NUMBA_DISABLE_JIT",

@@ -110,7 +110,11 @@ def stage(
     paths: list[Path] = []
     for each in given.values():
         paths += [each] if isinstance(each, Path) else each
-    require_replaceable((out, *beside), name, paths)
+    # A PNG has a PDF beside it, and a field a report; a file of this name without them is the user's.
+    kinds = {".png": ".pdf", ".safetensors": ".report.json"}
+    extra = {each.with_suffix(kinds[each.suffix]): each for each in (out, *beside) if each.suffix in kinds}
+    foreign = [path for path, each in extra.items() if not each.exists()]
+    require_replaceable((out, *beside, *foreign), name, paths)
     require_free_space(out.parent, MIN_FREE_MIB)
     with output_lock(out):
         read, code = Inputs(name, given), stage_code(name, plugins)
@@ -120,7 +124,6 @@ def stage(
         except HilsplatError:
             delete(provenance_path(out), r".+\.provenance\.json")  # so that the output is rebuilt
             raise
-        written = [path.with_suffix(kind) for path in (out, *beside) for kind in (".pdf", ".report.json")]
         write_provenance(
             out,
             stage=name,
@@ -129,7 +132,7 @@ def stage(
             settings=_recorded(settings),
             seed=seed,
             inputs=read,
-            beside=(*beside, *filter(Path.exists, written)),
+            beside=(*beside, *filter(Path.exists, extra)),
             plugins=plugins,
             device=None if device is None else choose_device(device),
         )

@@ -143,21 +143,30 @@ def export(
 
     Poses and Gaussians are in the coordinates of the scene's source.
     """
+    from hilsplat.base.provenance import replaced_folder
+
     folder = scene_folder(scene, results)
-    if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ArtifactError(f"--out {out} exists", fix="choose a new folder, or remove this one first")
-    out = out or folder / "export" / (form if variant == "default" else f"{form}-{variant}")
+    if out is not None:
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise ArtifactError(f"--out {out} exists", fix="choose a new folder, or remove this one first")
+        echo(_export(folder, form, variant, data_root, out, threads))
+        return
+    out = folder / "export" / (form if variant == "default" else f"{form}-{variant}")
+    with replaced_folder(out):
+        echo(_export(folder, form, variant, data_root, out, threads))
+
+
+def _export(folder: Path, form: str, variant: str, data_root: Path, out: Path, threads: int) -> str:
+    """Write an export, and return the line to print."""
     if form == "tree":
         from hilsplat.query.tree_picture import export_tree
 
-        echo(export_tree(folder, variant, out, threads))
-        return
+        return export_tree(folder, variant, out, threads)
     if form == "ply":
         from hilsplat.splat.coordinates import write_source_ply
 
         ply = out / "point_cloud.ply"
-        echo(f"wrote {write_source_ply(folder / 'gaussians.ply', ply)} Gaussians to {ply}")
-        return
+        return f"wrote {write_source_ply(folder / 'gaussians.ply', ply)} Gaussians to {ply}"
     from hilsplat.scene.scene import Scene
 
     opened = Scene.load(folder / "scene")
@@ -181,7 +190,7 @@ def export(
             "nerfstudio": (write_nerfstudio, "images, transforms.json and points.ply"),
         }[form]
         write(opened, out)
-    echo(f"wrote {what} of {views} views to {out}")
+    return f"wrote {what} of {views} views to {out}"
 
 
 Port = Annotated[int, typer.Option(min=0, max=65535, help="port of the page; 0: any free port")]

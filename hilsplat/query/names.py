@@ -55,7 +55,7 @@ def read_names(folder: Path, semantic_tree: Path) -> NodeNames:
         ArtifactError: the file is damaged, has a different format version, or names nodes that do not exist.
     """
     path = Path(folder) / FILE
-    version = version_of(path)  # read before the names: if they change meanwhile, they cannot be replaced
+    version = version_of(path)  # before the names: if these change in between, they cannot be replaced
     kept = _kept(path).trees.get(tree_digest(semantic_tree), {})
     num_nodes = len(read_npz(Path(semantic_tree) / "tree.npz")["level"]) if kept else 0
     if beyond := [node for node in kept if node >= num_nodes]:

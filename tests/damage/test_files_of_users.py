@@ -83,13 +83,14 @@ OPTIONS = [
 NAMES = (
     *("drawing.png", "film.mp4", "masks/a.png", "clip/b.mp4", "contributions/c.txt", "results/d.csv"),
     *("images/1.jpg", "index.json", "scenes.tsv", ".run.json", "photos/chair/f.jpg"),
+    *("new.pdf", "new.csv", "new.md", "new.json", "new.report.json", "new.tex", "new.html"),
     *("gaussians/0123456789abcdef.npz", f"masks/01/{'0' * 64}.npz", ".writing-01234567-01234567/e.png"),
 )
 """Files of the user or of other tools, some with names like ours."""
 THEIRS = ("trained.ply", "deep/1.npz")
 LINKS = {"link.ply": "trained.ply", "folder": "deep", "lost.json": "nowhere"}
 """Links in the user's folder to files elsewhere."""
-PLACES = ("", "drawing.png", "masks", "link.ply", "folder", "lost.json")
+PLACES = ("", "drawing.png", "masks", "link.ply", "folder", "lost.json", "new.png", "new.safetensors")
 
 
 @pytest.fixture(scope="module")
@@ -167,3 +168,19 @@ def test_neither_a_log_nor_pruning_changes_a_users_file(project: Path) -> None:
             assert done.returncode != 2 and "Traceback" not in done.stderr, (words, done.stderr)
     after = files_of_user(project)
     assert after == before
+
+
+@pytest.mark.parametrize("form", ["tree", "colmap"])
+def test_an_export_replaces_only_its_own_files(own_desk: Path, monkeypatch, form: str) -> None:
+    monkeypatch.chdir(own_desk.parents[2])
+    words, folder = ["export", "photos/desk", "--as", form], SCENE / "export" / form
+    app(words, standalone_mode=False)
+    app(words, standalone_mode=False)
+    written = sorted(path for path in folder.rglob("*") if path.is_file() and path.name[0] != ".")
+    for name in (Path("mine/drawing.png"), written[0].relative_to(folder)):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text("of the user")
+        with pytest.raises(HilsplatError, match=rf"did not write, or that were changed(.|\n)*{name.name}"):
+            app(words, standalone_mode=False)
+        assert (folder / name).read_text() == "of the user"
+        (folder / name).unlink()

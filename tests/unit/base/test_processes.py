@@ -15,6 +15,7 @@ import pytest
 
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.processes import in_order, in_own_process, in_processes
+from tests.conftest import PROJECT
 
 
 def square(base: int, number: int) -> tuple[int, int]:
@@ -145,3 +146,21 @@ def end_by_signal(number: int) -> None:
 def test_a_killed_process_of_a_pool_is_explained():
     with pytest.raises(HilsplatError, match=r"was killed, probably because memory ran out(.|\n)*fewer cores"):
         list(in_processes(end_by_signal, [(1,), (2,)], 2))
+
+
+def test_a_spawned_process_imports_nothing_from_the_working_folder(tmp_path):
+    """As from the command `hilsplat`, which Python starts without -P."""
+    (tmp_path / "bin").mkdir()
+    script = tmp_path / "bin/hilsplat"
+    script.write_text(
+        "import hilsplat.cli.main\nfrom hilsplat.base.processes import in_processes\n"
+        "if __name__ == '__main__':\n    print(*in_processes(abs, [(-1,), (-2,)], 2))\n"
+    )
+    for name in ("pickle", "socket", "random", "numpy"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('a file of the user ran')")
+    environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
+    environment.pop("PYTHONSAFEPATH", None)
+    done = subprocess.run(
+        [sys.executable, str(script)], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert done.stdout == "1 2\n", done.stderr

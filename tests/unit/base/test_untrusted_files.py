@@ -115,7 +115,7 @@ def test_an_llff_image_that_cannot_be_read_is_refused(tmp_path):
 
 
 def png(width: int, height: int) -> bytes:
-    """Return a valid PNG of zeros, one bit per pixel; its size hardly depends on the number of pixels."""
+    """Return a valid PNG of zeros, one bit per pixel; large ones are only a little longer."""
 
     def chunk(name: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
