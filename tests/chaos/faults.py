@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from tests.workflow.conftest import Project
@@ -138,8 +138,9 @@ class Run:
     def clean_up_elsewhere(self, chance: random.Random) -> None:
         """Clean up the shared folder as another machine of the same name, with other process numbers."""
         code = "import sys; from hilsplat.base import processes; processes.remove_leftovers(sys.argv[1])"
-        command = ("unshare", "--pid", "--fork", "--mount-proc", sys.executable, "-c", code, "results")
-        ended = self.project.run(*command, check=False)
+        command = ("unshare", "--pid", "--fork", "--mount-proc", sys.executable, "-P", "-c", code)
+        itself = replace(self.project, before=())  # only root may unshare
+        ended = itself.run(*command, "results", check=False)
         if ended.returncode:
             self.problems.append(f"no clean-up in another process namespace: {ended.stderr}")
 
