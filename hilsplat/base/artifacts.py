@@ -24,7 +24,7 @@ import numpy as np
 from hilsplat.base.errors import ArtifactError, DiskSpaceError, HilsplatError
 from hilsplat.base.files import regular
 from hilsplat.base.processes import lock, unfinished_folder
-from hilsplat.base.removal import UNFINISHED, delete, is_unfinished, replace_file, replace_folder, tag
+from hilsplat.base.removal import UNFINISHED, delete, is_unfinished, replace_folder, tag
 
 logger = logging.getLogger(__name__)
 
@@ -95,7 +95,7 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
             yield temporary
         if durable:
             _flush(temporary)
-        replace_file(temporary, path)
+        temporary.replace(path)
         if durable:
             _flush(path.parent)
 
@@ -243,7 +243,7 @@ def read_memo(path: Path, kind: Any) -> Any:
     from pydantic import TypeAdapter
 
     try:
-        return TypeAdapter(kind).validate_python(parse_json(path.read_bytes()), strict=True)
+        return TypeAdapter(kind).validate_python(parse_json(regular(path).read_bytes()), strict=True)
     except (OSError, ValueError):
         return {}
 

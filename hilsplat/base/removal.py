@@ -1,6 +1,6 @@
-"""Deletion and replacement of files: no other module deletes or renames (tests/unit/base/test_removal.py).
+"""Deletion and replacement: no other module deletes, and of all others only `atomic_path` renames.
 
-Nothing is deleted because of its place alone. A name must have a form that only hilsplat gives, a folder of
+tests/unit/base/test_removal.py looks for such calls. Nothing is deleted because of its place alone. A name must have a form that only hilsplat gives, a folder of
 entries must contain our tag, and clean-up deletes only what the same call created.
 """
 
@@ -77,11 +77,6 @@ def undone_on_error(folder: Path) -> Iterator[None]:
             with suppress(OSError):  # a folder that contains other files
                 path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink()
         raise
-
-
-def replace_file(new: Path, path: Path) -> None:
-    """Rename a file to `path`, replacing any file there."""
-    new.replace(path)
 
 
 def replace_folder(new: Path, path: Path, work: Path) -> None:
