@@ -1,7 +1,8 @@
 """Deletion and replacement: no other module deletes, and of all others only `atomic_path` renames.
 
-tests/unit/base/test_removal.py looks for such calls. Nothing is deleted because of its place alone. A name must have a form that only hilsplat gives, a folder of
-entries must contain our tag, and clean-up deletes only what the same call created.
+Nothing is deleted because of its place alone. A name must have a form that only hilsplat gives, a folder of
+entries must contain our tag, and clean-up deletes only what the same call created. A test looks for calls
+elsewhere (tests/unit/base/test_removal.py).
 """
 
 import ctypes
