@@ -10,7 +10,13 @@ from typing import Annotated, Any
 
 import typer
 
-from hilsplat.base.artifacts import output_lock, parse_json, provenance_path, require_free_space
+from hilsplat.base.artifacts import (
+    output_lock,
+    parse_json,
+    provenance_path,
+    require_free_space,
+    was_interrupted,
+)
 from hilsplat.base.cache import writable
 from hilsplat.base.errors import HilsplatError, SettingsError, visible
 from hilsplat.base.plugins import load
@@ -110,10 +116,11 @@ def stage(
     paths: list[Path] = []
     for each in given.values():
         paths += [each] if isinstance(each, Path) else each
-    # A PNG has a PDF beside it, and a field a report; a file of this name without them is the user's.
+    # A PNG has a PDF beside it, and a field a report; before the first run, such a file is the user's.
     kinds = {".png": ".pdf", ".safetensors": ".report.json"}
     extra = {each.with_suffix(kinds[each.suffix]): each for each in (out, *beside) if each.suffix in kinds}
-    foreign = [path for path, each in extra.items() if not each.exists()]
+    is_first = not (provenance_path(out).exists() or was_interrupted(out))
+    foreign = [path for path, each in extra.items() if is_first and not each.exists()]
     require_replaceable((out, *beside, *foreign), name, paths)
     require_free_space(out.parent, MIN_FREE_MIB)
     with output_lock(out):

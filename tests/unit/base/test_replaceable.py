@@ -142,3 +142,20 @@ def test_tables_replace_only_tables_with_the_same_header(tmp_path):
     table.write_text("name,price\n")
     with pytest.raises(ArtifactError, match="did not write it"):
         require_beginning(table, "stage,seconds")
+
+
+def test_a_pdf_beside_a_picture_is_the_users_only_before_the_first_run(tmp_path):
+    """Snakemake deletes the pictures of killed and repeated jobs, but not their PDFs, which no rule declares."""
+    out, pdf = tmp_path / "theta.png", tmp_path / "theta.pdf"
+    pdf.write_text("a paper")
+    with (
+        pytest.raises(ArtifactError, match=r"theta\.pdf exists, but sweep did not write it"),
+        stage("sweep", out),
+    ):
+        pass
+    lock_path(out).write_text("unfinished\n")
+    with stage("sweep", out):
+        out.write_text("a picture")
+    out.unlink()
+    with stage("sweep", out):
+        out.write_text("a picture")
