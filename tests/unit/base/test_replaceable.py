@@ -145,7 +145,7 @@ def test_tables_replace_only_tables_with_the_same_header(tmp_path):
 
 
 def test_a_pdf_beside_a_picture_is_the_users_only_before_the_first_run(tmp_path):
-    """Snakemake deletes the pictures of killed and repeated jobs, but not their PDFs, which no rule declares."""
+    """Snakemake deletes the pictures of killed and repeated jobs, but not the PDFs beside them."""
     out, pdf = tmp_path / "theta.png", tmp_path / "theta.pdf"
     pdf.write_text("a paper")
     with (
