@@ -10,6 +10,8 @@ classes and module-level statements of this package. Parts that cannot change a 
 - function annotations, except those of roots, whose arguments come from outside;
 - the entries of a `Plugins` table: a stage that uses one adds it to its roots.
 
+The data of a module, in a JSON file beside it with the same name, count like its statements.
+
 A class that is reached counts as a whole. If anything in a module is reached, the statements that bind no
 name also count, as do definitions whose decorators may register them: importing the module runs both.
 """
@@ -79,7 +81,7 @@ def _read_state(root: Path) -> str:
     for folder in folders:
         with os.scandir(folder) as entries:
             for entry in entries:
-                if entry.name.endswith(".py"):
+                if entry.name.endswith((".py", ".json")):
                     stat = entry.stat()
                     found.append((entry.path, stat.st_mtime_ns, stat.st_size))
                 elif entry.is_dir() and entry.name != "__pycache__":
@@ -188,6 +190,8 @@ def _reach(roots: tuple[str, ...], root: Path) -> dict[Key, list[bytes]]:
             statements: Iterable[Statement] = [facts.bindings[name]]
         else:
             statements = facts.effects
+            data = (path_of(module, root) or root).with_suffix(".json")
+            found[module, name] += [data.read_bytes()] if data.is_file() else []
             packages = module.split(".")[:-1]
             for depth in range(len(packages)):
                 reach(".".join(packages[: depth + 1]), "")

@@ -300,3 +300,10 @@ def test_a_read_only_package_has_a_digest(tmp_path):
     (root / "__pycache__").write_text("no folder")
     other = package(tmp_path / "other", **BASE)
     assert code_digest("hilsplat.a:g", root=root) == code_digest("hilsplat.a:g", root=other)
+
+
+def test_data_beside_a_module_count_as_its_code(copy, project):
+    data = copy / "datasets/classes.json"
+    data.write_text(data.read_text().replace("wall", "a wall", 1))
+    found = changed(copy, project)
+    assert "evaluate" in found and not {"masks", "clip", "semantic_tree", "field"} & found
