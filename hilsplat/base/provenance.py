@@ -271,14 +271,11 @@ def _is_own_picture(path: Path) -> bool:
         return False
 
 
-WRITTEN = ".written.json"
-"""Hidden file in a folder that may be replaced: size and time of each of its files."""
-
-
 @contextmanager
 def replaced_folder(folder: Path) -> Iterator[None]:
     """Replace a folder in the block; raise ArtifactError if a file in it is not from the last such block."""
-    known = read_memo(folder / WRITTEN, dict[str, list[int]])
+    record = folder.with_name(f".{folder.name}.written.json")  # size and time of each file
+    known = read_memo(record, dict[str, list[int]])
     if others := sorted(name for name, stat in _stats(folder).items() if known.get(name) != stat):
         raise ArtifactError(
             f"{folder} contains files that hilsplat did not write, or that were changed later",
@@ -286,7 +283,7 @@ def replaced_folder(folder: Path) -> Iterator[None]:
             fix="move them elsewhere, or choose another folder (--out)",
         )
     yield
-    write_json(folder / WRITTEN, _stats(folder))
+    write_json(record, _stats(folder))
 
 
 def _stats(folder: Path) -> dict[str, list[int]]:

@@ -17,6 +17,7 @@ PROSE = {
     "wrote",
     "may",
     "does",
+    "did",
     "keeps",
     "import",
     "reads",
