@@ -54,7 +54,11 @@ rule all:
 
 onstart:
     mark_or_refuse()
-    record_run(PLAN.results, workflow.config_settings.configfiles, workflow.config_settings.config)
+    record_run(
+        PLAN.results,
+        workflow.config_settings.configfiles,
+        workflow.config_settings.config,
+    )
     for line in PLAN.ignored:
         logger.warning(line)
     for line in PLAN.model_lines():
