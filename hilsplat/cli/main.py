@@ -18,11 +18,8 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 os.environ["MPLBACKEND"] = "agg"
 os.environ["PYTHONSAFEPATH"] = "1"  # processes that we start import no module from the working folder
 warnings.filterwarnings("ignore", "Glyph .* missing from font")  # pictures show boxes instead of such letters
-for _name in (
-    "NUMBA_DISABLE_JIT",
-    "NUMBA_NUM_THREADS",
-    "NUMBA_OPT",
-):  # they break our loops or change results
+# These variables break our loops or change results.
+for _name in ("NUMBA_DISABLE_JIT", "NUMBA_NUM_THREADS", "NUMBA_OPT"):
     os.environ.pop(_name, None)
 
 # Otherwise, a file would get the number of a stream that is closed (cron, daemons), and receive its output.

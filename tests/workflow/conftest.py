@@ -52,8 +52,10 @@ class Project:
     def environment(self, **more: str) -> dict[str, str]:
         """Return the environment variables for running the copy's `hilsplat` and `snakemake`."""
         scripts = sysconfig.get_path("scripts")
+        # Importing the commands sets PYTHONSAFEPATH in this process; users start without it.
+        inherited = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}
         return {
-            **os.environ,
+            **inherited,
             "PATH": f"{scripts}{os.pathsep}{os.environ['PATH']}",
             "PYTHONPATH": str(self.package or self.root),
             "PYTHONDONTWRITEBYTECODE": "1",
