@@ -1,6 +1,8 @@
 """Errors that a user can fix."""
 
 import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 try:
@@ -59,6 +61,11 @@ def first_line(error: object) -> str:
     """Return the first line of an error from elsewhere, without unprintable characters, or its type."""
     lines = str(error)[:1000].strip().splitlines() or [type(error).__name__]
     return "".join(letter for letter in lines[0] if letter.isprintable())[:200]
+
+
+def in_one_line(error: HilsplatError) -> str:
+    """Return an error's message and lines as one line."""
+    return "; ".join(" ".join(line.split()) for line in str(error).splitlines())
 
 
 def require_working_directory() -> None:
@@ -135,3 +142,24 @@ class DiskSpaceError(HilsplatError):
 
 class DeviceError(HilsplatError):
     """This machine does not have the device selected in the settings."""
+
+
+@contextmanager
+def foreign(
+    what: object,
+    error: type[HilsplatError] = SceneError,
+    *,
+    expected: object = None,
+    fix: str = "export it again",
+) -> Iterator[None]:
+    """Turn every exception of a block that parses another program's data into `error`, which names `what`.
+
+    Parsers raise nearly every exception on damaged data, so types aren't listed. Errors of ours pass.
+    """
+    try:
+        yield
+    except HilsplatError:
+        raise
+    except Exception as cause:
+        reason = f"{first_line(cause)} is missing" if isinstance(cause, KeyError) else first_line(cause)
+        raise error(f"{what} cannot be read: {reason}", expected=expected, fix=fix) from cause

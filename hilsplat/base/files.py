@@ -1,8 +1,9 @@
 """Rules for names in paths, image lists of folders, and paths in the installed project."""
 
+import os
 import re
 from collections.abc import Collection
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 from hilsplat.base.errors import HilsplatError
 
@@ -31,6 +32,16 @@ def project_path(path: str | Path) -> Path:
     return installed if not Path(path).exists() and installed.exists() else Path(path)
 
 
+def is_outside(name: str) -> bool:
+    """Return whether a path in a file is absolute, also on Windows, or leads out of its folder."""
+    depth = 0
+    for part in name.replace("\\", "/").split("/"):
+        depth += {"..": -1, ".": 0, "": 0}.get(part, 1)
+        if depth < 0:
+            return True
+    return bool(PureWindowsPath(name).anchor)
+
+
 def regular(path: Path) -> Path:
     """Return a path; raise HilsplatError for a pipe or device, because reading it could wait for ever."""
     if path.exists() and not (path.is_file() or path.is_dir()):
@@ -43,6 +54,20 @@ def regular(path: Path) -> Path:
 def list_images(folder: Path) -> list[Path]:
     """Return the image files in a folder, sorted; skip hidden files."""
     return list_files(folder, IMAGE_SUFFIXES)
+
+
+DEEPEST = 4
+"""Maximum depth of folders in which images of a source are searched."""
+
+
+def images_below(folder: Path) -> list[Path]:
+    """Return the image files in a folder and the folders below it, sorted; skip hidden ones."""
+    found = []
+    for place, folders, _ in os.walk(folder):
+        depth = len(Path(place).relative_to(folder).parts)
+        folders[:] = [name for name in sorted(folders) if name[0] != "." and depth < DEEPEST]
+        found += list_images(Path(place))
+    return found
 
 
 def list_files(folder: Path, suffixes: Collection[str]) -> list[Path]:

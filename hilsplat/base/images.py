@@ -5,12 +5,13 @@ import io
 import logging
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from PIL import Image, ImageCms, ImageOps, PngImagePlugin
+from PIL import ExifTags, Image, ImageCms, PngImagePlugin
 
 from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.errors import ImageError
@@ -20,6 +21,12 @@ logger = logging.getLogger(__name__)
 FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", "AVIF", "HEIF")
 """Pillow's names of the formats of `IMAGE_SUFFIXES` (JPEG includes phones' MPO). All other formats are
 refused whatever the suffix: for EPS, Pillow starts Ghostscript, which runs the program in the file."""
+
+UPRIGHT = dict(zip(range(2, 9), (Image.Transpose(move) for move in (0, 3, 1, 5, 4, 6, 2)), strict=True))
+"""How to turn a picture upright, by EXIF orientation."""
+
+PROFILE_MODES = {b"RGB ": "RGB", b"GRAY": "L", b"CMYK": "CMYK"}
+"""Pillow's mode of a colour profile, by the colour space in its header."""
 
 MIN_SIDE_PX, MAX_ASPECT = 16, 20  # limits on photographs; all stages were run on 16 x 16 and 320 x 16 px
 
@@ -41,8 +48,7 @@ def open_image(file: Path | io.BytesIO, max_side_px: int = 2**16) -> Image.Image
 
     pillow_heif.register_heif_opener()
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        with warnings.catch_warnings(action="ignore"):  # about large images and odd EXIF tags
             image = Image.open(file, formats=FORMATS)
         if max(image.size) > max_side_px:
             raise Image.DecompressionBombError(f"{image.width} x {image.height} px")
@@ -66,11 +72,32 @@ def opened_image(path: Path, what: str = "image") -> Iterator[Image.Image]:
         raise ImageError(f"{what} {path} cannot be read: {error}", fix=fix) from error
 
 
-def read_image(file: Path | io.BytesIO, max_side_px: int = 2**16) -> UInt8[np.ndarray, "H W 3"]:
-    """Read an image as upright sRGB.
+def exif_tags(image: Image.Image, ifd: ExifTags.IFD | None = None) -> Mapping[int, Any]:
+    """Return an image's EXIF tags, those of its main directory or of `ifd`; skip damaged ones."""
+    found = {}
+    with warnings.catch_warnings(action="ignore"), suppress(Exception):  # Pillow raises anything
+        exif = image.getexif()
+        tags: Mapping[int, Any] = exif if ifd is None else exif.get_ifd(ifd)
+        for tag in tags:
+            with suppress(Exception):
+                found[tag] = tags[tag]
+    return found
 
-    The EXIF orientation is applied. Colours with an embedded profile (Display P3 from phones, Adobe RGB) and
-    CMYK are converted, alpha is dropped, grey is copied to all channels, and 16-bit values become 8-bit.
+
+def orientation(image: Image.Image) -> int:
+    """Return the EXIF orientation, 1 to 8; 1 if there is none."""
+    value = exif_tags(image).get(ExifTags.Base.Orientation)
+    return value if isinstance(value, int) and value in UPRIGHT else 1
+
+
+def read_image(
+    file: Path | io.BytesIO, max_side_px: int = 2**16, *, as_stored: bool = False
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Read an image as sRGB, upright or, for poses computed without EXIF, as stored.
+
+    Upright, the EXIF orientation is applied. Colours with an embedded profile (Display P3 from phones, Adobe
+    RGB) and CMYK are converted, alpha is dropped, grey is copied to all channels, and 16-bit values become
+    8-bit.
 
     Raises:
         ImageError: the file is missing, empty, truncated, too large (`open_image`) or not an image.
@@ -80,17 +107,13 @@ def read_image(file: Path | io.BytesIO, max_side_px: int = 2**16) -> UInt8[np.nd
             if (num_frames := _frames(image)) > 1:
                 raise ValueError(f"it contains {num_frames} frames of the same size, like an animation")
             image.load()
-            upright = ImageOps.exif_transpose(image)
-            if upright.mode.startswith("I"):  # Pillow would clip values above 255
-                values = np.asarray(upright).astype(np.int64)
-                if values.min() < 0 or values.max() > np.iinfo(np.uint16).max:
-                    raise ValueError(
-                        f"its grey values, {values.min()} to {values.max()}, do not fit into 16 bits"
-                    )
-                upright = Image.fromarray(((values + 128) // 257).astype(np.uint8))  # 257: 65535 / 255
-            if upright.mode == "F":
+            move = None if as_stored else UPRIGHT.get(orientation(image))
+            pixels = image if move is None else image.transpose(move)
+            if image.mode.startswith("I"):
+                pixels = Image.fromarray(_eight_bits(np.asarray(pixels)))
+            if image.mode == "F":
                 raise ValueError("its pixels are floating-point numbers of unknown range")
-            return np.asarray(_to_srgb(upright, file))
+            return np.asarray(_to_srgb(pixels, image.info.get("icc_profile"), file))
     except FileNotFoundError as error:
         raise ImageError(f"image {file} is missing") from error
     except DAMAGE as error:
@@ -100,6 +123,41 @@ def read_image(file: Path | io.BytesIO, max_side_px: int = 2**16) -> UInt8[np.nd
             found=f"a file of {size} bytes",
             fix="remove it from the folder, or replace it with an intact copy",
         ) from error
+
+
+def _eight_bits(values: np.ndarray) -> UInt8[np.ndarray, "H W"]:
+    """Convert 16-bit grey values, which Pillow would clip at 255."""
+    values = values.astype(np.int64)
+    if values.min() < 0 or values.max() > np.iinfo(np.uint16).max:
+        raise ValueError(f"its grey values, {values.min()} to {values.max()}, do not fit into 16 bits")
+    return ((values + 128) // 257).astype(np.uint8)  # 257: 65535 / 255
+
+
+def read_mask(path: Path) -> UInt8[np.ndarray, "H W"]:
+    """Read the grey values of a mask, 0 to 255, as stored.
+
+    They are the alpha channel, scaled to 255, if it isn't constant (cut-outs, brushes); else the colours as
+    grey. In a palette of black and one other colour, the other colour is 255. 16-bit values above 255 become
+    8-bit.
+
+    Raises:
+        ImageError: the file is missing or not an image.
+    """
+    with opened_image(path, "mask") as image:
+        if image.mode == "P" and "transparency" not in image.info:
+            brightest = np.asarray(image.convert("RGB")).max(axis=2)
+            if np.unique(np.asarray(image)).size == 2 and (brightest == 0).any():
+                return np.where(brightest > 0, 255, 0).astype(np.uint8)
+        if image.has_transparency_data:
+            alpha = np.asarray(image.convert("RGBA"))[..., 3]
+            if alpha.min() < alpha.max():
+                return (alpha.astype(np.float64) * 255 / alpha.max() + 0.5).astype(np.uint8)
+        if image.mode.startswith("I"):
+            values = np.asarray(image)
+            return _eight_bits(values) if values.max() > 255 else values.astype(np.uint8)
+        return np.asarray(
+            image.convert("RGB").convert("L") if image.mode in ("LA", "PA") else image.convert("L")
+        )
 
 
 def require_usable_size(image: object, size_hw: tuple[int, ...], max_side_px: int = 2**16) -> None:
@@ -125,11 +183,11 @@ def _frames(image: Image.Image) -> int:
     return num_frames if same else 1
 
 
-def _to_srgb(image: Image.Image, file: object) -> Image.Image:
+def _to_srgb(image: Image.Image, profile: bytes | None, file: object) -> Image.Image:
     """Convert to sRGB with the embedded profile; if it is missing or damaged, assume sRGB pixels."""
-    profile = image.info.get("icc_profile")
-    if profile and image.mode in ("RGB", "RGBA", "CMYK"):
-        colours = image.convert("RGB") if image.mode == "RGBA" else image
+    base = {"RGBA": "RGB", "P": "RGB", "LA": "L", "1": "L"}.get(image.mode, image.mode)
+    if profile and PROFILE_MODES.get(profile[16:20], base) == base:  # grey images may carry a profile of RGB
+        colours = image if base == image.mode else image.convert(base)
         try:
             converted = ImageCms.profileToProfile(
                 colours, io.BytesIO(profile), _srgb_profile(), outputMode="RGB"

@@ -60,6 +60,9 @@ def new(
     labels: Annotated[
         Path | None, typer.Option(help="LERF-OVS labels for scoring; none: no labels; default: use any found")
     ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="report what was found and would be used, and add nothing")
+    ] = False,
 ) -> None:
     """Add photographs, a video, or a scene from COLMAP, 3DGS, nerfstudio or LangSplat to the scene sheet.
 
@@ -69,9 +72,11 @@ def new(
     from hilsplat.scene.sheet import PHOTOS, read_sheet
     from hilsplat.workflow.models import models_of_photographs
 
-    report = add_scene(
-        sheet, name, photos, frames=frames, poses=poses, gaussians=gaussians, features=features, labels=labels
-    )
+    parts = {"poses": poses, "gaussians": gaussians, "features": features, "labels": labels}
+    report = add_scene(sheet, name, photos, frames=frames, **parts, dry_run=dry_run)
+    if dry_run:
+        echo(f"{report}\n\nnothing was added (--dry-run)")
+        return
     following = f"  hilsplat run {name}\n  hilsplat query {name} 'bear nose'"
     echo(f"{report}\n\nadded photos/{name} to {sheet}. Next:\n{following}")
     (row,) = (row for row in read_sheet(sheet, checked_groups=()) if row.name == f"{PHOTOS}/{name}")

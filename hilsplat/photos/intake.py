@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 
 from hilsplat.base.artifacts import atomic_folder, read_memo, require_free_space, write_json
 from hilsplat.base.errors import SceneError
-from hilsplat.base.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, list_files, list_images
+from hilsplat.base.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_outside, list_files, list_images
 from hilsplat.base.removal import undone_on_error
 from hilsplat.scene.layouts import has_known_poses, photo_folder, unwrapped
 
@@ -44,7 +44,7 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tu
     if source.is_dir() and not videos:
         beside = list_files(photo_folder(source), VIDEO_SUFFIXES)
         note = f"{len(beside)} videos beside the photographs (Live Photos) are not used"
-        yield source, [note] if beside else []
+        yield unwrapped(source), [note] if beside else []
         return
     if not videos and source.suffix.lower() not in (".zip", ".r3d"):
         raise SceneError(
@@ -129,8 +129,9 @@ def _check_entries(archive: Path, entries: list[zipfile.ZipInfo]) -> None:
         )
     names: set[str] = set()
     for entry in entries:
+        entry.filename = entry.filename.replace("\\", "/")  # written on Windows
         name = PurePosixPath(entry.filename)
-        if name.is_absolute() or ".." in name.parts or "\\" in entry.filename:
+        if is_outside(entry.filename) or ".." in name.parts:
             problem = "would be unpacked outside the folder"
         elif stat.S_ISLNK(entry.external_attr >> 16):
             problem = "is a link"

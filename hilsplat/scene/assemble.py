@@ -10,13 +10,18 @@ import numpy as np
 from jaxtyping import Float64
 
 from hilsplat.base.artifacts import atomic_folder, write_json
+from hilsplat.base.errors import ImageError
 from hilsplat.base.images import read_image, require_usable_size, write_png
-from hilsplat.scene.cameras import Cameras
-from hilsplat.scene.colmap import Points, pycolmap
+from hilsplat.scene.cameras import Cameras, Photo
+from hilsplat.scene.colmap import Points, is_pinhole, pycolmap
 from hilsplat.scene.scene import Scene
 
 MIN_VIEWS_FOR_TEST = 8
 """Minimum number of views for a test split; with fewer, the fit needs all of them."""
+
+CHECKED_DIRECTIONS = 33
+MOST_SHIFT_PX = 1.0
+"""Directions per side at which a lens must be invertible, and the tolerance."""
 
 MIN_LEVELNESS_GAP = 3.0
 """Minimum ratio of the second-smallest to the smallest eigenvalue for the cameras' x axes to define up."""
@@ -24,34 +29,66 @@ MIN_LEVELNESS_GAP = 3.0
 
 @dataclass(frozen=True)
 class PosedView:
-    """One view: a PNG, its camera (before or after undistortion), and its pose in source coordinates."""
+    """One view: a PNG, its camera (before or after undistortion), and its pose in source coordinates.
+
+    `photo` is the photograph, if the PNG isn't a scaled copy of it.
+    """
 
     view: str
     image: Path
     camera: pycolmap.Camera
     cam_from_source: Float64[np.ndarray, "4 4"]
+    photo: Photo | None = None
 
 
 Posed = tuple[list[PosedView], Points, dict[str, str], dict[str, Any]]
 """Views and sparse points in source coordinates, the split ("train" or "test") by view, and the report."""
 
 
-def undistort(view: PosedView, folder: Path) -> PosedView:
+def photo_of(camera: pycolmap.Camera) -> Photo:
+    """Return a camera's lens as that of a photograph."""
+    return Photo(camera.model_name, tuple(camera.params.tolist()), (camera.height, camera.width))
+
+
+def undistort(view: PosedView, folder: Path, max_side_px: int = 2**16) -> PosedView:
     """Write the pinhole image of a view to a folder, and return the view with its pinhole camera.
 
-    An image without distortion is copied byte for byte, so that labels stay aligned with it. Otherwise, the
-    image is warped to the largest size without blank pixels.
+    An image without distortion is copied byte for byte. Otherwise, the image is warped to the largest size
+    without blank pixels, but with sides up to `max_side_px`.
+
+    Raises:
+        ImageError: the distortion cannot be undone.
     """
     folder.mkdir(parents=True, exist_ok=True)
     target = folder / view.view
-    if view.camera.is_undistorted():
+    if is_pinhole(view.camera):
         shutil.copyfile(view.image, target)
         return replace(view, image=target)
     bitmap = pycolmap.Bitmap.from_array(read_image(view.image))
-    warped, camera = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, view.camera)
+    options = pycolmap.UndistortCameraOptions()
+    options.max_image_size = max_side_px
+    warped, camera = pycolmap.undistort_image(options, bitmap, view.camera)
     require_usable_size(view.view, (camera.height, camera.width))
+    _require_invertible(view, camera)
     write_png(target, warped.to_array())
-    return replace(view, image=target, camera=camera)
+    return replace(view, image=target, camera=camera, photo=view.photo or photo_of(view.camera))
+
+
+def _require_invertible(view: PosedView, pinhole: pycolmap.Camera) -> None:
+    """Raise ImageError if a lens maps several directions within the pinhole image to one pixel."""
+    across = (np.linspace(0, side, CHECKED_DIRECTIONS) for side in (pinhole.width, pinhole.height))
+    xy = np.stack(np.meshgrid(*across), axis=-1).reshape(-1, 2)
+    wanted = (xy - [pinhole.principal_point_x, pinhole.principal_point_y]) / pinhole.mean_focal_length()
+    seen = view.camera.img_from_cam(np.column_stack([wanted, np.ones(len(xy))]))
+    found = np.asarray(view.camera.cam_from_img(np.asarray(seen)))
+    shift_px = np.abs(found - wanted).max() * pinhole.mean_focal_length()
+    if not (shift_px < MOST_SHIFT_PX):  # also true for NaN
+        raise ImageError(
+            f"the lens distortion of view {view.view} cannot be undone",
+            expected="a lens that maps each direction in the image to another pixel",
+            found=f"{view.camera.model_name} {np.round(view.camera.params, 6).tolist()}",
+            fix="correct the lens, or undistort the image with the program that calibrated it",
+        )
 
 
 def up_direction(cam_from_source: Float64[np.ndarray, "V 4 4"]) -> Float64[np.ndarray, " 3"]:
@@ -133,7 +170,9 @@ def split_views(names: Sequence[str], test_every: int) -> dict[str, str]:
     }
 
 
-def write_scene(out: Path, name: str, unit: str, posed: Posed, *, turn: bool, lost: Path) -> None:
+def write_scene(
+    out: Path, name: str, unit: str, posed: Posed, *, turn: bool, lost: Path, max_side_px: int
+) -> None:
     """Write the scene artifact with its registration report, atomically.
 
     Args:
@@ -148,12 +187,13 @@ def write_scene(out: Path, name: str, unit: str, posed: Posed, *, turn: bool, lo
     scene_from_source = normalising_similarity(source_poses, points, metric=unit == "metre", turn=turn)
     points = points @ scene_from_source[:3, :3].T + scene_from_source[:3, 3]
     with atomic_folder(out) as folder:
-        pinhole = [undistort(view, folder / "images") for view in views]
+        pinhole = [undistort(view, folder / "images", max_side_px) for view in views]
         cameras = Cameras(
             names=tuple(view.view for view in pinhole),
             cam_from_world=move_cameras(source_poses, scene_from_source),
             K=np.stack([view.camera.calibration_matrix() for view in pinhole]),
             size_hw=np.array([(view.camera.height, view.camera.width) for view in pinhole], dtype=np.int32),
+            photos={view.view: view.photo for view in pinhole if view.photo is not None},
         )
         xyz = points.astype(np.float32)
         scene = Scene(folder, name, unit, cameras, split, xyz, colours, scene_from_source)

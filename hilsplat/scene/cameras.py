@@ -1,6 +1,7 @@
 """Posed pinhole cameras of a scene, keyed by view name."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,23 @@ from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 
 MAX_SIDE_PX = 2**15
 LIMITS = {"size_hw": (1, MAX_SIDE_PX)}
+MOST_PARAMETERS = 16
+"""Number of parameters of COLMAP's largest lens model."""
+
+
+@dataclass(frozen=True)
+class Photo:
+    """The photograph from which a view was cropped or undistorted; both have the same pose.
+
+    Attributes:
+        model: COLMAP's name of the lens model.
+        params: its parameters, for the size `size_hw`, px.
+        size_hw: height and width of the photograph, px.
+    """
+
+    model: str
+    params: tuple[float, ...]
+    size_hw: tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -24,12 +42,15 @@ class Camera:
         cam_from_world: `x_cam = cam_from_world @ x_world`, scene units.
         K: intrinsics, px; the centre of the top-left pixel is (0.5, 0.5).
         size_hw: image height and width, px.
+        photo: the photograph, if it was cropped or undistorted; else the view is the photograph, or a scaled
+            copy.
     """
 
     name: str
     cam_from_world: Float[np.ndarray, "4 4"]
     K: Float[np.ndarray, "3 3"]
     size_hw: tuple[int, int]
+    photo: Photo | None = None
 
     @property
     def centre(self) -> Float[np.ndarray, " 3"]:
@@ -40,7 +61,7 @@ class Camera:
     def scaled(self, size_hw: tuple[int, int]) -> "Camera":
         """Return the camera for a resized image, with K scaled along each side."""
         scale = np.array([size_hw[1] / self.size_hw[1], size_hw[0] / self.size_hw[0], 1.0])
-        return Camera(self.name, self.cam_from_world, scale[:, None] * self.K, size_hw)
+        return replace(self, K=scale[:, None] * self.K, size_hw=size_hw)
 
 
 @dataclass(frozen=True)
@@ -50,12 +71,14 @@ class Cameras:
     Attributes:
         names: view names (file names of the images), in the order of the rows.
         cam_from_world, K, size_hw: as in `Camera`, one row per view.
+        photos: as in `Camera`, by name.
     """
 
     names: tuple[str, ...]
     cam_from_world: Float[np.ndarray, "V 4 4"]
     K: Float[np.ndarray, "V 3 3"]
     size_hw: Int32[np.ndarray, "V 2"]
+    photos: Mapping[str, Photo] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -69,17 +92,28 @@ class Cameras:
                 expected=f"one of {len(self.names)} views: {', '.join(self.names[:5])}, ...",
             ) from error
         height, width = self.size_hw[row].tolist()
-        return Camera(name, self.cam_from_world[row], self.K[row], (height, width))
+        return Camera(name, self.cam_from_world[row], self.K[row], (height, width), self.photos.get(name))
 
     def save(self, path: Path) -> None:
         """Write `cameras.npz` atomically."""
         require_types(Cameras, vars(self), path, LIMITS)
+        lenses: dict[str, np.ndarray] = {}
+        if self.photos:
+            none = Photo("", (), (0, 0))
+            photos = [self.photos.get(name, none) for name in self.names]
+            params = [np.pad(photo.params, (0, MOST_PARAMETERS - len(photo.params))) for photo in photos]
+            lenses = {
+                "photo_model": np.array([photo.model for photo in photos], dtype=np.str_),
+                "photo_params": np.array(params, dtype=np.float64),
+                "photo_size_hw": np.array([photo.size_hw for photo in photos], dtype=np.int32),
+            }
         write_npz(
             path,
             names=np.array(self.names, dtype=np.str_),
             cam_from_world=self.cam_from_world.astype(np.float64),
             K=self.K.astype(np.float64),
             size_hw=self.size_hw.astype(np.int32),
+            **lenses,
         )
 
     @staticmethod
@@ -104,4 +138,13 @@ class Cameras:
             fault = ""
         if fault:
             raise ArtifactError(f"{path} does not contain valid cameras", expected=fault, fix=remake(path))
-        return Cameras(tuple(str(name) for name in names), poses, K, arrays["size_hw"])
+        order = tuple(str(name) for name in names)
+        photos = {}
+        if "photo_model" in arrays:
+            columns = (arrays[f"photo_{what}"] for what in ("model", "params", "size_hw"))
+            for name, model, params, size_hw in zip(
+                order, *(column.tolist() for column in columns), strict=True
+            ):
+                if model:
+                    photos[name] = Photo(model, tuple(params), tuple(size_hw))
+        return Cameras(order, poses, K, arrays["size_hw"], photos)

@@ -4,6 +4,8 @@ Measured with pycolmap 4.2.1 and Pillow 13.0: if pycolmap is loaded before Pillo
 Pillow corrupts the heap, and the process aborts or hangs. The reverse order works.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float64, UInt8
 from PIL import Image
@@ -11,7 +13,17 @@ from PIL import Image
 # isort: split
 import pycolmap
 
-__all__ = ["Image", "Points", "camera_of", "pose_matrix", "pycolmap", "reprojection_errors", "sparse_points"]
+__all__ = [
+    "Image",
+    "Points",
+    "camera_of",
+    "is_pinhole",
+    "pose_matrix",
+    "pycolmap",
+    "reprojection_errors",
+    "rotation_matrix",
+    "sparse_points",
+]
 
 Points = tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]
 """Positions and colours."""
@@ -21,6 +33,29 @@ def pose_matrix(pose: pycolmap.Rigid3d) -> Float64[np.ndarray, "4 4"]:
     """Return a COLMAP pose as a 4 x 4 matrix; NaN if its quaternion is 0, which COLMAP takes for no turn."""
     has_rotation = np.any(pose.rotation.quat)
     return np.vstack([pose.matrix() if has_rotation else np.full((3, 4), np.nan), [0.0, 0.0, 0.0, 1.0]])
+
+
+LENGTH_TOLERANCE = 0.01
+"""Maximum deviation of a quaternion's length from 1; programs write at least 3 digits."""
+
+
+def rotation_matrix(quat_xyzw: Sequence[float]) -> Float64[np.ndarray, "3 3"]:
+    """Return the rotation of a unit quaternion from another program; NaN if its length is not 1."""
+    quat = np.array(quat_xyzw, np.float64)
+    length = np.linalg.norm(quat)
+    is_unit = abs(length - 1) <= LENGTH_TOLERANCE  # false for NaN
+    return pycolmap.Rotation3d(quat / length).matrix() if is_unit else np.full((3, 3), np.nan)
+
+
+PERSPECTIVE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "FOV", "SIMPLE_DIVISION", "DIVISION")
+"""Lens models that are pinhole cameras if all their distortion coefficients are zero; fisheyes aren't."""
+
+
+def is_pinhole(camera: pycolmap.Camera) -> bool:
+    """Return whether a lens has no distortion. `camera.is_undistorted()` is true for some fisheye lenses."""
+    if camera.model_name in ("PINHOLE", "SIMPLE_PINHOLE"):
+        return True
+    return camera.model_name in PERSPECTIVE and not any(camera.params[i] for i in camera.extra_params_idxs())
 
 
 def camera_of(image: pycolmap.Image) -> pycolmap.Camera:

@@ -6,10 +6,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import ExifTags, UnidentifiedImageError
+from PIL import ExifTags
 
 from hilsplat.base.errors import ImageError, SceneError
-from hilsplat.base.images import open_image, read_image, require_usable_size, resize_to_fit, write_png
+from hilsplat.base.images import (
+    exif_tags,
+    open_image,
+    read_image,
+    require_usable_size,
+    resize_to_fit,
+    write_png,
+)
 from hilsplat.base.progress import track
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.matching import match_pairs
@@ -38,7 +45,6 @@ WORK_COMPRESSION = 1
 
 PLANE_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """Millimetres per unit of the focal plane resolution, by EXIF unit code (default: inch)."""
-EXIF_ORIENTATION = ExifTags.Base.Orientation
 DIAGONAL_35MM = 43.2666
 """Diagonal of a 35 mm frame in mm, the reference of the equivalent focal length in EXIF."""
 
@@ -64,12 +70,8 @@ def exif_focal_px(path: Path, size_hw: tuple[int, int]) -> float | None:
 
     It is computed from the 35 mm equivalent or else from the focal length and the focal plane resolution.
     """
-    try:
-        with open_image(path) as image:
-            tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
-            size = image.size
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError):
-        return None  # damaged EXIF is ignored; unreadable pixels are reported elsewhere
+    with open_image(path) as image:
+        tags, size = exif_tags(image, ExifTags.IFD.Exif), image.size
 
     def number(tag: ExifTags.Base) -> float:
         try:
@@ -88,36 +90,41 @@ def exif_focal_px(path: Path, size_hw: tuple[int, int]) -> float | None:
     return number(ExifTags.Base.FocalLength) * pixels_per_mm * max(size_hw) / stored_px or None
 
 
-def prepare_images(sources: Sequence[Path], folder: Path, max_side_px: int) -> list[WorkImage]:
+def prepare_images(
+    sources: Sequence[Path], folder: Path, max_side_px: int, least_share: float = 1.0
+) -> tuple[list[WorkImage], dict[Path, str]]:
     """Write each photograph to `folder` as an upright PNG with a longer side of at most `max_side_px`.
 
+    Returns:
+        the copies, and why the other photographs cannot be used.
+
     Raises:
-        ImageError: files cannot be used; the message names all of them.
+        ImageError: fewer than `least_share` of the files can be used; the message names all others.
         SceneError: two files would become the same view.
     """
     folder.mkdir(parents=True, exist_ok=True)
     images = []
-    damaged: list[tuple[Path, str]] = []
+    damaged: dict[Path, str] = {}
     for source, view in track(list(zip(sources, view_names(sources), strict=True)), "photographs read"):
         try:
             pixels = read_image(source)
             require_usable_size(source, pixels.shape[:2], max_side_px)
         except ImageError as error:
-            damaged.append((source, str(error)))
+            damaged[source] = str(error)
             continue
         pixels = resize_to_fit(pixels, max_side_px)
         size_hw = (pixels.shape[0], pixels.shape[1])
         write_png(folder / view, pixels, WORK_COMPRESSION)
         images.append(WorkImage(view, source, size_hw, exif_focal_px(source, size_hw)))
-    if len(damaged) == 1:
-        raise ImageError(damaged[0][1])
-    if damaged:
+    if damaged and len(images) < least_share * len(sources):
+        if len(damaged) == 1:
+            raise ImageError(*damaged.values())
         raise ImageError(
-            f"{len(damaged)} of {len(sources)} images in {damaged[0][0].parent} cannot be read",
-            found=", ".join(f"{path.name} ({path.stat().st_size} bytes)" for path, _ in damaged),
+            f"{len(damaged)} of {len(sources)} images in {sources[0].parent} cannot be read",
+            found=", ".join(f"{path.name} ({path.stat().st_size} bytes)" for path in damaged),
             fix="remove them from the folder or replace them with intact copies",
         )
-    return images
+    return images, damaged
 
 
 def lenses_of(images: Sequence[WorkImage], camera_model: str, single_camera: str) -> list[Lens]:

@@ -1,15 +1,22 @@
 """Folder layouts of photographs and known poses. This module imports quickly, for workflow start-up."""
 
-from dataclasses import dataclass
+import re
+import time
+from collections import Counter
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from hilsplat.base.artifacts import parse_json
-from hilsplat.base.errors import SceneError
+from hilsplat.base.errors import HilsplatError, SceneError, foreign
 from hilsplat.base.files import list_images, regular
 
 TRAINED = ("output", "outputs", "exports", "language_features")
 """Folders that 3DGS, nerfstudio and LangSplat write beside photographs."""
+
+PHOTO_FOLDERS = ("images", "input")
+"""Folders of photographs: COLMAP's and nerfstudio's, then that of 3DGS's `convert.py`."""
 
 POSES_BOUNDS = "poses_bounds.npy"
 """Pose file of LLFF."""
@@ -26,33 +33,40 @@ EXPORTED = ("exports/*/splat.ply", "exports/splat.ply", "splat.ply", "point_clou
 
 def read_json_object(path: Path, fix: str) -> dict[str, Any]:
     """Read another program's JSON object; raise SceneError with the given fix if it cannot be read."""
-    try:
-        content = parse_json(regular(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise SceneError(f"{path} is not valid JSON: {error}", fix=fix) from error
+    with foreign(path, expected="valid JSON in UTF-8", fix=fix):
+        content = parse_json(regular(path).read_text(encoding="utf-8-sig"))
     if not isinstance(content, dict):
         raise SceneError(f"{path} is not a JSON object", found=type(content).__name__, fix=fix)
     return content
 
 
-def trained_gaussians(folder: Path) -> Path | None:
-    """Return the PLY that 3DGS, LangSplat or nerfstudio wrote to a folder after the most steps, or None.
+def trained_gaussians(folder: Path) -> list[Path]:
+    """Return the PLYs that 3DGS, LangSplat, nerfstudio or a viewer wrote to a folder, best first.
 
-    LangSplat's process.sh keeps 3DGS in `<scene>/<case>` and copies it to `<case>_1`, `_2` and `_3`, one for
-    each level. Of equal numbers of steps, 3DGS's own PLY is preferred, then the first level's.
+    3DGS's come first, by number of steps; names without a number, such as `iteration_best`, are last. Then
+    come those in `EXPORTED`. Among equals, the newest is preferred. LangSplat's process.sh keeps 3DGS in
+    `<scene>/<case>` and copies it to `<case>_1`, `_2` and `_3`, one for each level. Of equal numbers of
+    steps, 3DGS's own PLY is preferred, then the first level's.
     """
     starts = ("output/*/", "output/", "*/", "")
-    patterns = [f"{start}point_cloud/iteration_*/point_cloud.ply" for start in starts]
-    found = {path for pattern in patterns for path in folder.glob(pattern)}
+    patterns = [*EXPORTED, *(f"{start}point_cloud/iteration_*/point_cloud.ply" for start in starts)]
+    found = [(place, path) for place, pattern in enumerate(patterns) for path in folder.glob(pattern)]
+    place_of = {path: min(place, len(EXPORTED)) for place, path in found if path.is_file()}
 
-    def rank(path: Path) -> tuple[int, int, int, str]:
-        steps = path.parent.name.partition("_")[2]
-        level = langsplat_level(path)
-        return int(steps) if steps.isdecimal() else 0, -(level or 0), path.stat().st_mtime_ns, str(path)
+    def rank(path: Path) -> tuple[int, int, int, str, str]:
+        numbered = re.fullmatch(r"iteration_(\d+)", path.parent.name)
+        steps = int(numbered[1]) if numbered else -1
+        return place_of[path], steps, -(langsplat_level(path) or 0), _written(path), str(path)
 
-    others = [path for name in EXPORTED for path in sorted(folder.glob(name))]
-    every = [*others, *sorted(found, key=rank)]
-    return every[-1] if every else None
+    return sorted(place_of, key=rank, reverse=True)
+
+
+def _written(path: Path) -> str:
+    """Return a timestamp for comparisons: the one that a file's folder is named after, or else the file's."""
+    if re.fullmatch(r"\d{4}-\d\d-\d\d\w*", path.parent.name):
+        return path.parent.name
+    time_s, ns = divmod(path.stat().st_mtime_ns if path.exists() else 0, 10**9)
+    return time.strftime("%Y-%m-%d_%H%M%S", time.localtime(time_s)) + f".{ns:09}"
 
 
 def langsplat_level(ply: Path) -> int | None:
@@ -66,13 +80,15 @@ def langsplat_level(ply: Path) -> int | None:
 def dataparser_of(ply: Path, source: Path) -> Path | None:
     """Return the `DATAPARSER` file of a PLY trained by nerfstudio, or None for other PLYs.
 
-    It is searched for in the PLY's folder and, if the PLY has nerfstudio's file name, in the source folder
-    and the folder of the latest training run.
+    It is searched for in the PLY's folder and, if the PLY has nerfstudio's file name, in the folder above it,
+    the source folder, and the folder of the latest training run that began before the PLY was written. If no
+    run did, the PLY's time is that of a copy, and the latest run is used.
     """
     places = [ply.parent]
     if ply.name == "splat.ply":
-        runs = sorted(source.glob(f"outputs/*/*/*/{DATAPARSER}"))  # the last folder is a timestamp
-        places += [source, *(run.parent for run in runs[-1:])]
+        runs = sorted(source.glob(f"outputs/*/*/*/{DATAPARSER}"), key=_written)
+        earlier = [run for run in runs if _written(run) <= _written(ply)]
+        places += [ply.parent.parent, source, *(run.parent for run in (earlier or runs)[-1:])]
     return next((place / DATAPARSER for place in places if (place / DATAPARSER).is_file()), None)
 
 
@@ -98,13 +114,42 @@ def label_files(folder: Path) -> list[Path]:
 
 
 def photo_folder(folder: Path) -> Path:
-    """Return the folder of a source's photographs: the source, its `images/`, or a phone export's images."""
-    if list_images(folder):
+    """Return the folder of a source's photographs.
+
+    It is the source itself or, if that has fewer images, its `images/` or `input/` (in any case); else a
+    phone export's images; else the only folder with images up to two levels below. Of several such folders,
+    none is chosen (`folders_with_images` lists them).
+    """
+    own = len(list_images(folder))
+    for name in PHOTO_FOLDERS:
+        for below in sorted(folder.iterdir()):
+            if below.name.lower() == name and below.is_dir() and len(list_images(below)) > own:
+                return below
+    if own:
         return folder
-    if (folder / "images").is_dir():
-        return folder / "images"
-    export = polycam_folders(folder) or record3d_export(folder)
-    return export[0] if export else folder
+    if export := polycam_folders(folder) or record3d_export(folder):
+        return export[0]
+    places = folders_with_images(folder)
+    return next(iter(places)) if len(places) == 1 else folder
+
+
+def folders_with_images(folder: Path) -> dict[Path, int]:
+    """Return the number of images of each folder with images, up to two levels below a source."""
+    return {
+        place: count
+        for pattern in ("*/", "*/*/")
+        for place in sorted(folder.glob(pattern))
+        if not any(part[0] == "." or part in TRAINED for part in place.relative_to(folder).parts)
+        if (count := len(list_images(place)))
+    }
+
+
+def contents(folder: Path) -> str:
+    """Return what a folder without usable photographs contains, for messages."""
+    kinds = Counter(file.suffix.lower() or "no suffix" for file in folder.iterdir() if file.is_file())
+    found = [f"{count} files ({kind})" for kind, count in sorted(kinds.items())]
+    found += [f"{count} images in {place}/" for place, count in folders_with_images(folder).items()]
+    return ", ".join(found[:8]) or "nothing"
 
 
 def has_known_poses(folder: Path, named: Path | None = None) -> bool:
@@ -124,18 +169,21 @@ class KnownPoses:
         kind: "colmap", "transforms", "llff", "polycam" or "record3d".
         files: COLMAP's model folder; the transforms files (training, then test); LLFF's file; Polycam's
             folders of images and cameras; or Record3D's image folder and pose file.
+        others: what else in the folder has poses, and is not used.
     """
 
     root: Path
     kind: str
     files: tuple[Path, ...]
+    others: tuple[Path, ...] = ()
 
 
 def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | None:
     """Find poses from COLMAP, transforms files, LLFF, Polycam or Record3D, in this order, or return None.
 
-    If `named` is a COLMAP model, a transforms file, or a folder with either, it is used instead of the poses
-    in `folder`; `NO_POSES` ignores all poses.
+    Of several COLMAP models, the one with the most images is taken. If `named` is a COLMAP model, a
+    transforms file, or a folder with either, it is used instead of the poses in `folder`; `NO_POSES` ignores
+    all poses.
 
     Raises:
         SceneError: there is a `sparse/` folder without a complete model, or `named` has no poses.
@@ -144,24 +192,23 @@ def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | No
         return None
     if named is not None:
         return _named_poses(folder, named)
-    for place in ("sparse/0", "sparse"):
-        if _is_model(folder / place):
-            return KnownPoses(folder, "colmap", (folder / place,))
+    found: list[tuple[str, tuple[Path, ...]]] = [("colmap", (place,)) for place in colmap_models(folder)]
     for name in ("transforms.json", "transforms_train.json"):
         if (folder / name).is_file():
-            files = [folder / name]
-            if name == "transforms_train.json" and (folder / "transforms_test.json").is_file():
-                files.append(folder / "transforms_test.json")
-            return KnownPoses(folder, "transforms", tuple(files))
+            held_out = [folder / f"transforms_{split}.json" for split in ("test", "val")]
+            tests = [path for path in held_out if path.is_file()] if name == "transforms_train.json" else []
+            found.append(("transforms", (folder / name, *tests[:1])))
     if (folder / POSES_BOUNDS).is_file():
-        return KnownPoses(folder, "llff", (folder / POSES_BOUNDS,))
-    for kind, export in (("polycam", polycam_folders(folder)), ("record3d", record3d_export(folder))):
-        if export is not None:
-            return KnownPoses(folder, kind, export)
+        found.append(("llff", (folder / POSES_BOUNDS,)))
+    exports = (("polycam", polycam_folders(folder)), ("record3d", record3d_export(folder)))
+    found += [(kind, export) for kind, export in exports if export is not None]
+    if found:
+        (kind, files), *rest = found
+        return KnownPoses(folder, kind, files, tuple(others[-1] for _, others in rest))
     if (folder / "sparse").is_dir():
         raise SceneError(
             f"{folder / 'sparse'} does not contain a complete COLMAP model",
-            expected="cameras, images and points3D, all .bin or all .txt, in sparse/0/ or sparse/",
+            expected="cameras and images, both .bin or both .txt, in sparse/ or a folder in it",
             found=", ".join(sorted(path.name for path in (folder / "sparse").rglob("*"))) or "nothing",
             fix="add the missing files, or rename sparse/ so that the poses are computed",
         )
@@ -171,7 +218,7 @@ def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | No
 def _named_poses(folder: Path, named: Path) -> KnownPoses:
     if named.is_file() and named.suffix == ".json":
         return KnownPoses(folder, "transforms", (named,))
-    if _is_model(named):
+    if model_files(named):
         return KnownPoses(folder, "colmap", (named,))
     found = find_known_poses(named) if named.is_dir() else None
     if found is None or found.kind not in ("colmap", "transforms"):
@@ -180,12 +227,37 @@ def _named_poses(folder: Path, named: Path) -> KnownPoses:
             expected="a COLMAP model, a transforms.json, or a folder with either",
             fix="correct the path, or omit it to use the poses beside the images",
         )
-    return KnownPoses(folder, found.kind, found.files)
+    return replace(found, root=folder)
 
 
-def _is_model(folder: Path) -> bool:
-    names = ("cameras", "images", "points3D")
-    return any(all((folder / f"{name}{suffix}").is_file() for name in names) for suffix in (".bin", ".txt"))
+def model_files(folder: Path) -> list[Path]:
+    """Return the files of the COLMAP model in a folder: cameras, images and, if present, points."""
+    for suffix in (".bin", ".txt"):
+        cameras, images, points = (folder / f"{name}{suffix}" for name in ("cameras", "images", "points3D"))
+        if cameras.is_file() and images.is_file():
+            return [cameras, images, *([points] if points.is_file() else [])]
+    return []
+
+
+def colmap_models(folder: Path) -> list[Path]:
+    """Return the folders of the COLMAP models in `sparse/`, those with the most images first."""
+    places = [*sorted((folder / "sparse").glob("*/")), folder / "sparse"]
+    return sorted((place for place in places if model_files(place)), key=lambda place: -_num_images(place))
+
+
+def _num_images(model: Path) -> int:
+    """Return the number of images that a COLMAP model declares; 0 if it is damaged (its reader says so)."""
+    images = model_files(model)[1]
+    with suppress(OSError, HilsplatError):
+        if images.suffix == ".txt":
+            return len(IMAGE_LINE.findall(regular(images).read_bytes()))
+        with regular(images).open("rb") as stream:
+            return int.from_bytes(stream.read(8), "little")
+    return 0
+
+
+IMAGE_LINE = re.compile(rb"^ *\d+( +[-+.\deE]+){7} +\d+ +[^ \r\n]", re.MULTILINE)
+"""A line of images.txt with id, pose, camera and name."""
 
 
 def polycam_folders(folder: Path) -> tuple[Path, Path] | None:
@@ -208,9 +280,9 @@ def record3d_export(folder: Path) -> tuple[Path, Path] | None:
 
 def unwrapped(folder: Path) -> Path:
     """Return the folder with the actual files, because archives often wrap them in a single folder."""
-    while photo_folder(folder) == folder and not list_images(folder) and not has_known_poses(folder):
+    while not list_images(folder) and not has_known_poses(folder):
         inside = [path for path in folder.iterdir() if not path.name.startswith(".")]
-        if len(inside) != 1 or not inside[0].is_dir():
+        if len(inside) != 1 or not inside[0].is_dir() or inside[0].name.lower() in PHOTO_FOLDERS:
             break
         folder = inside[0]
     return folder

@@ -109,7 +109,7 @@ def run_poses(
         report = posed[3]
         for warning in report["warnings"]:
             logger.warning("%s: %s", name, warning)
-        write_scene(out, name, unit, posed, turn=known is None, lost=lost)
+        write_scene(out, name, unit, posed, turn=known is None, lost=lost, max_side_px=settings.max_side_px)
         counts["views"] = f"{report['registered']} of {report['images']}"
         counts["points"] = report["points"]
         if report["mean_reprojection_error_px"] is not None:
@@ -135,7 +135,8 @@ def _reconstruct(
     camera_model = settings.camera_model
     if camera_model == "auto":
         camera_model = "simple_pinhole" if is_render else "simple_radial"
-    work_images = prepare_images(sources, work / "images", settings.max_side_px)
+    least = settings.min_registered_share
+    work_images, unreadable = prepare_images(sources, work / "images", settings.max_side_px, least)
     database, lenses = work / "features.db", lenses_of(work_images, camera_model, settings.single_camera)
     logger.info("%s: extracting and matching the features of %d images", name, len(work_images))
     matcher = in_own_process(find_matches, database, work / "images", lenses, settings, seed, threads)
@@ -147,6 +148,10 @@ def _reconstruct(
     how = f"structure from motion, {settings.mapper} mapper, {matcher} matching, {camera_model}"
     report = {"scene": name, "poses": how, "seed": seed, **report}
     plot_lost(work / LOST_PICTURE, work / "images", report)
+    report["images"] += len(unreadable)
+    for source, reason in unreadable.items():
+        lost = {"file": source.name, "registered": False, "why_not": reason.splitlines()[0]}
+        report["views"].setdefault(source.name, lost)
     check_registration(images, name, report, settings)
     model, views = models[0], []
     for image in (model.images[image_id] for image_id in model.reg_image_ids()):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES, NAME_RULE, list_images, name_problem, regular
-from hilsplat.scene.layouts import NO_POSES, has_known_poses, photo_folder
+from hilsplat.scene.layouts import NO_POSES, contents, has_known_poses, photo_folder
 
 DEFAULT_SHEET = Path("config/scenes.tsv")
 """Default scene sheet, relative to the project."""
@@ -301,14 +301,10 @@ def _check_source(where: str, folder: Path) -> None:
             fix="correct the path, or remove the line",
         )
     if not list_images(photo_folder(folder)) and not has_known_poses(folder):
-        kinds = Counter(file.suffix.lower() or "no suffix" for file in folder.iterdir() if file.is_file())
-        found = ", ".join(f"{count} files ({kind})" for kind, count in sorted(kinds.items()))
-        below = sorted(sub.name for sub in folder.iterdir() if sub.is_dir() and list_images(sub))
-        if below and not found:
-            found = f"subfolders with images: {', '.join(below[:5])}"
         raise SceneError(
             f"{where}: folder {folder} has no images",
-            expected=f"files with suffix {', '.join(sorted(IMAGE_SUFFIXES))} in it or in its images/ folder",
-            found=found or "nothing",
-            fix="correct the path, or convert the photographs to JPEG or PNG",
+            expected=f"files with suffix {', '.join(sorted(IMAGE_SUFFIXES))} in it, in its images/ or input/ "
+            "folder, or in a single folder below",
+            found=contents(folder),
+            fix="correct the path, choose one of several folders, or convert the photographs to JPEG or PNG",
         )

@@ -1,11 +1,15 @@
 """View names, derived from the file names of the photographs."""
 
 import os
+import re
+import unicodedata
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import takewhile
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
+from hilsplat.base.files import IMAGE_SUFFIXES
 
 
 def view_name(stem: str) -> str:
@@ -17,11 +21,66 @@ LONGEST_NAME = 200
 """Maximum length of a photograph's file name, bytes; later stages extend it, and file systems allow 255."""
 
 
+def name_parts(name: str) -> tuple[str, ...]:
+    """Return the parts of a name in another program's file, comparable: separators, case, Unicode, suffix.
+
+    "Images\\IMG 1.JPG" and "images/img 1.png" have the same parts.
+    """
+    plain = unicodedata.normalize("NFC", name).replace("\\", "/").casefold()
+    parts = [part for part in plain.split("/") if part not in ("", ".", "..") and not part.endswith(":")]
+    if parts:
+        stem, dot, suffix = parts[-1].rpartition(".")
+        parts[-1] = stem if dot and f".{suffix}" in IMAGE_SUFFIXES else parts[-1]
+    return tuple(parts)
+
+
+ADDED = re.compile(r"^[0-9a-f]{8}-|_(?:jpe?g|png)\.rf\.[0-9a-f]{32}$")
+"""What Label Studio puts before, and Roboflow behind, the name of an uploaded picture."""
+
+
+def match_names(names: Iterable[str], candidates: Iterable[str]) -> dict[str, str | None]:
+    """Return for each name in another program's file the candidate that it means, or None if it isn't clear.
+
+    Candidates are view names, or paths in a folder. Separators, case, suffix and Unicode form are ignored;
+    the rest of the last part must be equal. Of several candidates, the one with the most equal folders is
+    meant, then the one in the fewest folders, then the one with the same suffix and case. View names have
+    their folders as a prefix: "cam1/a.jpg" may be "cam1_a.png". If nothing fits, what upload pages `ADDED` is
+    ignored.
+    """
+    by_last: dict[str, list[tuple[tuple[str, ...], str]]] = {}
+    for candidate in candidates:
+        if parts := name_parts(candidate):
+            by_last.setdefault(parts[-1], []).append((parts, candidate))
+
+    def match(name: str) -> str | None:
+        parts = name_parts(name)
+        last, suffix = re.split(r"[/\\]", name)[-1], name.casefold().rpartition(".")[2]
+        for wanted in (parts, (*parts[:-1], ADDED.sub("", parts[-1]))) if parts else ():
+            ranked = []
+            for length in range(1, len(wanted) + 1):
+                for other, candidate in by_last.get("_".join(wanted[-length:]), ()):
+                    pairs = zip(reversed(wanted[:-length]), reversed(other[:-1]), strict=False)
+                    same = length + sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
+                    alike = (candidate.casefold().rpartition(".")[2] == suffix, candidate.endswith(last))
+                    ranked.append(((same, -len(other), *alike), candidate))
+            best = [candidate for rank, candidate in ranked if rank == max(ranked)[0]]
+            if best:
+                return best[0] if len(best) == 1 else None
+        return None
+
+    return {name: match(name) for name in names}
+
+
+def match_name(name: str, candidates: Iterable[str]) -> str | None:
+    """Return the candidate that a single name means; see `match_names`."""
+    return match_names([name], candidates)[name]
+
+
 def view_names(sources: Sequence[Path]) -> list[str]:
     """Return the view names of image files: the file names with the suffix .png ("DSC_1.jpg" -> "DSC_1.png").
 
-    Files with the same name in different folders ("train/r_0.png", "test/r_0.png") get their folder as a
-    prefix: "train_r_0.png".
+    Files with the same name in different folders ("train/r_0.png", "test/r_0.png") get their folders as a
+    prefix, as many as make them unique: "train_r_0.png".
 
     Raises:
         SceneError: two files would get the same view name, or later stages cannot use a file's name.
@@ -34,12 +93,19 @@ def view_names(sources: Sequence[Path]) -> list[str]:
         if num_bytes > LONGEST_NAME:
             limit, problem = f"at most {LONGEST_NAME} bytes", f"the name of photograph {source} is too long"
             raise SceneError(problem, expected=limit, found=num_bytes, fix="rename it")
-    stems = Counter(source.stem for source in sources)
     same_folder = Counter((source.parent, source.stem) for source in sources)
-    names = []
-    for source in sources:
-        apart = stems[source.stem] > 1 and same_folder[source.parent, source.stem] == 1
-        names.append(view_name(f"{source.parent.name}_{source.stem}" if apart else source.stem))
+    prefixes = [[folder.name for folder in source.parents] for source in sources]
+    names = [view_name(source.stem) for source in sources]
+    for depth in range(1, 1 + max((len(prefix) for prefix in prefixes), default=0)):
+        same_name = Counter(names)
+        if max(same_name.values()) == 1:
+            break
+        names = [
+            view_name("_".join([*reversed(prefix[:depth]), source.stem]))
+            if same_name[name] > 1 and same_folder[source.parent, source.stem] == 1
+            else name
+            for name, prefix, source in zip(names, prefixes, sources, strict=True)
+        ]
     for name, count in Counter(names).items():
         if count > 1:
             files = [str(source) for source, other in zip(sources, names, strict=True) if other == name]

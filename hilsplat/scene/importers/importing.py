@@ -8,21 +8,25 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from hilsplat.base.errors import ImageError, RegistrationError, SceneError
+from hilsplat.base.errors import ImageError, RegistrationError, SceneError, in_one_line
 from hilsplat.base.files import list_images
-from hilsplat.base.images import open_image, read_image, require_usable_size, resize_to_fit, write_png
+from hilsplat.base.images import (
+    opened_image,
+    orientation,
+    read_image,
+    require_usable_size,
+    resize_to_fit,
+    write_png,
+)
 from hilsplat.base.processes import in_own_process
 from hilsplat.base.progress import track
-from hilsplat.scene.assemble import Posed, PosedView, split_views, undistort
+from hilsplat.scene.assemble import Posed, PosedView, photo_of, split_views, undistort
 from hilsplat.scene.colmap import Points, pycolmap, sparse_points
-from hilsplat.scene.features import EXIF_ORIENTATION, find_matches, incremental_options
-from hilsplat.scene.importers.known_views import KnownView, read_source
+from hilsplat.scene.features import find_matches, incremental_options
+from hilsplat.scene.importers.known_views import ASPECT_TOLERANCE, KnownView, read_source
 from hilsplat.scene.layouts import KnownPoses
 from hilsplat.scene.view_names import view_names
 from hilsplat.settings import PosesSettings
-
-ASPECT_TOLERANCE = 0.01
-"""Relative tolerance of an image's aspect ratio: a scaled copy is accepted, a different crop is not."""
 
 
 def import_poses(
@@ -37,57 +41,69 @@ def import_poses(
         SceneError: the model or transforms file cannot be used.
         RegistrationError: too few of the source's views have an image.
     """
-    described, points = read_source(known)
-    present = [view for view in described if view.image is not None]
-    files = [view.image for view in described if view.image is not None]
-    missing = sorted(view.name for view in described if view.image is None)
-    total, least = len(described), settings.min_registered_share
+    source, least = read_source(known), settings.min_registered_share
+    points, left_out = source.points, dict(source.left_out)
+    source.require_most(least, known.files[0])
+    missing = sorted(view.name for view in source.views if view.image is None)
+    total = len(source.views) + len(left_out)
     if total == 0:
         raise SceneError(f"{known.files[0]} of {name} contains no posed views", fix="export it again")
-    if not present or len(present) < least * total:
-        listed = ", ".join(missing[:20]) + (f" and {len(missing) - 20} more" if len(missing) > 20 else "")
+    files = [view.image for view in source.views if view.image is not None]
+    used = set(files)
+    named = list(
+        zip([view for view in source.views if view.image is not None], view_names(files), strict=True)
+    )
+    views, present = [], []
+    for view, view_name in track(named, "images read"):
+        try:
+            taken = _with_pixels(view, view_name, work / "images", settings.max_side_px)
+            views.append(undistort(taken, work / "pinhole", settings.max_side_px))
+            present.append(view)
+        except ImageError as error:
+            left_out[view.name] = in_one_line(error)
+    if not views or len(views) < least * total:
+        reasons = [*missing[:20], *([f"and {len(missing) - 20} more"] if len(missing) > 20 else [])]
+        reasons += [*left_out.values()][:3]
         raise RegistrationError(
             f"too few posed views of {name} have an image in {known.root}",
             expected=f"at least {least:.0%} of {total} (poses.min_registered_share)",
-            found=f"{len(present)}; missing: {listed}",
+            found=f"{len(views)}; missing: {', '.join(reasons)}",
             fix="put the images where the pose file expects them: in this folder or its images/ folder",
         )
-    named = list(zip(present, files, view_names(files), strict=True))
-    views = [
-        _with_pixels(view, file, view_name, work / "images", settings.max_side_px)
-        for view, file, view_name in track(named, "images read")
-    ]
     origin_of_points = "source"
-    warnings = [f"{len(missing)} of {len(described)} posed views have no image file"] if missing else []
+    warnings = [*source.notes, *(f"left out: {reason}" for reason in left_out.values())]
+    if missing:
+        warnings.append(f"{len(missing)} of {total} posed views have no image file")
     if points is None:
-        views = [undistort(view, work / "pinhole") for view in views]
         points = triangulate(views, work, settings, seed, threads)
         origin_of_points = "triangulated from the known poses"
-    beside, used = known.root / "images", set(files)
+    beside = known.root / "images"
     others = list_images(beside) if known.kind == "colmap" and beside.is_dir() else []
     unposed = [path for path in others if path not in used]
     if unposed:
         warnings.append(f"{len(unposed)} images have no pose and are skipped")
     entries: dict[str, Any] = {}
-    for posed, file, view in zip(present, files, views, strict=True):
-        entries[view.view] = {"file": file.name, "registered": True, **posed.report}
+    for known_view, posed in zip(present, views, strict=True):
+        entries[posed.view] = {"file": Path(known_view.name).name, "registered": True, **known_view.report}
+    for lost, reason in left_out.items():
+        entries[lost] = {"file": lost, "registered": False, "why_not": reason}
     for gone in missing:
         entries[gone] = {"file": gone, "registered": False, "why_not": "its image file is missing"}
     for path in unposed:
         lacks = {"file": path.name, "registered": False, "why_not": "the source has no pose for it"}
         entries.setdefault(path.name, lacks)
-    observed = [view.report for view in described if view.report.get("observations")]
+    observed = [view.report for view in source.views if view.report.get("observations")]
     num_observations = sum(entry["observations"] for entry in observed)
     total_error = sum(entry["observations"] * entry["reprojection_error_px"] for entry in observed)
-    source = ", ".join(
+    origin = ", ".join(
         path.relative_to(known.root).as_posix() if path.is_relative_to(known.root) else path.name
         for path in known.files
     )
     report = {
         "scene": name,
-        "poses": f"imported from {source}",
+        "poses": f"imported from {origin}",
         "seed": seed,
-        "images": len(described) + len(unposed),
+        "images": total + len(unposed),
         "registered": len(views),
         "models": [len(views)],
         "points": len(points[0]),
@@ -107,48 +123,43 @@ def import_poses(
     return views, points, split, report
 
 
-def _with_pixels(view: KnownView, file: Path, view_name: str, folder: Path, max_side_px: int) -> PosedView:
+def _with_pixels(view: KnownView, view_name: str, folder: Path, max_side_px: int) -> PosedView:
     """Read an image in the orientation of its camera, write the work image, and adapt the camera to it."""
     folder.mkdir(parents=True, exist_ok=True)
-    pixels = _read_as_described(file, view.camera)
+    assert view.image is not None  # the caller leaves out views without one
+    pixels = _read_as_described(view.image, view.camera)
     camera = pycolmap.Camera(view.camera.todict())
+    camera.rescale(pixels.shape[1], pixels.shape[0])
+    photo = photo_of(camera)
     if view.border_px:
-        pixels = _without_border(pixels, camera, view.border_px)
-    require_usable_size(file, pixels.shape[:2], max_side_px)
+        border_px = math.ceil(view.border_px * camera.width / view.camera.width)
+        camera.width -= 2 * border_px
+        camera.height -= 2 * border_px
+        camera.principal_point_x -= border_px
+        camera.principal_point_y -= border_px
+        pixels = np.ascontiguousarray(pixels[border_px:-border_px, border_px:-border_px])
+    require_usable_size(view.image, pixels.shape[:2], max_side_px)
     pixels = resize_to_fit(pixels, max_side_px)
     camera.rescale(pixels.shape[1], pixels.shape[0])
     write_png(folder / view_name, pixels)
-    return PosedView(view_name, folder / view_name, camera, view.cam_from_source)
-
-
-def _without_border(
-    pixels: UInt8[np.ndarray, "H W 3"], camera: pycolmap.Camera, border_px: int
-) -> UInt8[np.ndarray, "h w 3"]:
-    """Crop a border, specified in camera px, from an image, and adapt the camera in place."""
-    border_px = math.ceil(border_px * pixels.shape[1] / camera.width)
-    camera.rescale(pixels.shape[1], pixels.shape[0])
-    camera.width -= 2 * border_px
-    camera.height -= 2 * border_px
-    camera.principal_point_x -= border_px
-    camera.principal_point_y -= border_px
-    return np.ascontiguousarray(pixels[border_px:-border_px, border_px:-border_px])
+    cropped = photo if view.border_px else None
+    return PosedView(view_name, folder / view_name, camera, view.cam_from_source, cropped)
 
 
 def _read_as_described(path: Path, camera: pycolmap.Camera) -> UInt8[np.ndarray, "H W 3"]:
     """Read an image in the orientation whose shape fits the camera, or as stored if both orientations fit."""
-    upright = read_image(path)
-    candidates = [upright]
-    with open_image(path) as image:
-        if image.getexif().get(EXIF_ORIENTATION, 1) != 1:
-            candidates.insert(0, np.asarray(image.convert("RGB")))
-    for pixels in candidates:
+    with opened_image(path) as image:
+        is_turned = orientation(image) > 1
+        width, height = image.size
+    for as_stored in (True, False) if is_turned else (False,):
+        pixels = read_image(path, as_stored=as_stored)
         ratio = (pixels.shape[1] / pixels.shape[0]) / (camera.width / camera.height)
         if abs(ratio - 1) <= ASPECT_TOLERANCE:
             return pixels
     raise ImageError(
         f"image {path} does not match the size of its camera",
         expected=f"{camera.width} x {camera.height} px (width x height), or a scaled copy",
-        found=f"{upright.shape[1]} x {upright.shape[0]} px",
+        found=f"{width} x {height} px",
         fix="use the images that the poses were computed from",
     )
 

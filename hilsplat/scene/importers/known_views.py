@@ -1,44 +1,30 @@
-"""Readers of posed views: COLMAP, transforms.json (nerfstudio, Blender), LLFF, Polycam, Record3D.
+"""Posed views as other programs describe them: what is read, what is left out, and why."""
 
-All readers raise SceneError if a file cannot be used. The layouts and axes of phone exports match those in
-nerfstudio's `polycam_utils.py`, `record3d_utils.py` and `process_data.py`.
-"""
-
-import math
-import os
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
-from hilsplat.base.artifacts import read_npy
-from hilsplat.base.errors import ArtifactError, SceneError
-from hilsplat.base.files import IMAGE_SUFFIXES, list_images
+from hilsplat.base.errors import SceneError, foreign, in_one_line
+from hilsplat.base.files import IMAGE_SUFFIXES, images_below, is_outside, list_images
 from hilsplat.base.images import opened_image
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.cameras import MAX_SIDE_PX
-from hilsplat.scene.colmap import Points, camera_of, pose_matrix, pycolmap, reprojection_errors, sparse_points
-from hilsplat.scene.importers.model_files import require_whole_files
-from hilsplat.scene.layouts import KnownPoses, read_json_object
-from hilsplat.scene.posed_images import OPENGL_TO_OPENCV, rigid_pose
+from hilsplat.scene.colmap import Points, pycolmap
+from hilsplat.scene.importers.colmap_model import ModelImage, read_model
+from hilsplat.scene.layouts import KnownPoses
+from hilsplat.scene.posed_images import rigid_pose
+from hilsplat.scene.view_names import match_names
 
-AGAIN = "export it again"
+ASPECT_TOLERANCE = 0.01
+"""Relative tolerance of an image's aspect ratio: a scaled copy is accepted, a different crop is not."""
 
 FARTHEST = 1e9
 """Maximum coordinate, in the source's units; beyond it, 32-bit numbers are too coarse."""
-
-MAX_VIEWS = 300
-"""Maximum number of views used from a phone export, sampled evenly: a recording has many more frames than a
-scene needs (nerfstudio: 300 for Record3D, 600 for Polycam)."""
-
-POLYCAM_BORDER_PX = 15
-"""Width of black borders left by undistortion in corrected images (nerfstudio: `crop_border_pixels`)."""
-
-Z_UP_FROM_Y_UP = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""ARKit's world has y up; scenes here have z up. This is a cyclic permutation, so nothing is mirrored."""
 
 
 @dataclass(frozen=True)
@@ -62,177 +48,226 @@ class KnownView:
     report: dict[str, Any] = field(default_factory=dict)
 
 
-def read_source(known: KnownPoses) -> tuple[list[KnownView], Points | None]:
-    """Read the posed views of a folder in any supported format, with points if available."""
-    if known.kind in ("colmap", "transforms"):
-        views, points = (read_colmap if known.kind == "colmap" else read_transforms)(known)
-        if points is not None and (bad := int((~np.isfinite(points[0]).all(axis=1)).sum())):
-            raise SceneError(f"{bad} points of {known.files[0]} are not finite", fix=AGAIN)
-        return views, points
-    readers = {"polycam": read_polycam, "record3d": read_record3d, "llff": read_llff}
-    return checked(readers[known.kind](known), known), None
+@dataclass
+class Source:
+    """The content of a source of poses.
 
+    Attributes:
+        views: the posed views that can be used, with or without an image.
+        points: sparse points; None if the source has none.
+        left_out: why a view cannot be used, by name.
+        notes: what else in the source is not used, one sentence each.
+    """
 
-def checked(views: list[KnownView], known: KnownPoses) -> list[KnownView]:
-    """Return the views; refuse invalid lenses and poses, and three or more views that all share one pose."""
-    for view in views:
-        values = np.array([*view.camera.params, view.camera.width, view.camera.height], np.float64)
-        focal = [view.camera.params[row] for row in view.camera.focal_length_idxs()]
-        pose = view.cam_from_source
-        is_size = (values[-2:] > 0).all() and (values[-2:] <= MAX_SIDE_PX).all()
-        if not np.isfinite(values).all() or min(focal, default=0) <= 0 or not is_size:
-            fault, found = "lens", f"{view.camera.model_name} {values.tolist()}"
-            expected = f"finite numbers, a focal length above 0, sides of 1 to {MAX_SIDE_PX} px"
-        elif not np.isfinite(pose).all() or not are_rotations(pose[:3, :3], RIGID_TOLERANCE):
-            fault, found = "rotation", np.array2string(pose[:3, :3], precision=4).replace("\n", "")
-            expected = "a matrix that neither scales nor mirrors, or a quaternion that is not 0"
-        elif np.abs(pose[:3, 3]).max() > FARTHEST:
-            fault, found, expected = "position", str(pose[:3, 3].tolist()), "coordinates up to 1e9"
+    views: list[KnownView] = field(default_factory=list)
+    points: Points | None = None
+    left_out: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    @cached_property
+    def found(self) -> list[KnownView]:
+        """The views that have an image, each with its own."""
+        return [view for view in self.views if view.image is not None]
+
+    def add(self, name: str, described: Callable[..., KnownView], *args: Any) -> None:
+        """Add the view `described(*args)`; leave it out if its description, lens or pose is not valid."""
+        try:
+            with foreign(f"view {name}"):
+                view = described(*args)
+                require_valid(view)
+        except SceneError as error:
+            self.left_out[name] = in_one_line(error)
         else:
-            continue
+            self.views.append(view)
+
+    def require_most(self, least_share: float, files: object) -> None:
+        """Raise SceneError if fewer than this share of the views can be used, with the first reasons."""
+        total = len(self.views) + len(self.left_out)
+        if self.left_out and len(self.views) < max(1, least_share * total):
+            reasons = list(self.left_out.values())
+            rest = f"\n            and {len(reasons) - 3} more" if len(reasons) > 3 else ""
+            raise SceneError(
+                f"{len(reasons)} of {total} views of {files} cannot be used",
+                expected=f"at least {least_share:.0%} of the views (poses.min_registered_share)",
+                found="\n            ".join(reasons[:3]) + rest,
+                fix="export the poses again",
+            )
+
+
+@dataclass(frozen=True)
+class Keys:
+    """The keys of a format.
+
+    Attributes:
+        used: keys that the reader understands.
+        harmless: keys that don't change the meaning of others, and are skipped.
+        refused: what a key means that the reader cannot apply.
+    """
+
+    used: Set[str]
+    harmless: Set[str]
+    refused: Mapping[str, str]
+
+    def check(self, objects: Iterable[Mapping[str, Any]], file: Path) -> list[str]:
+        """Return a note about the keys of a file that are unknown; raise SceneError if one is refused."""
+        unknown: dict[str, None] = {}
+        for content in objects:
+            for key in content.keys() - self.used - self.harmless:
+                if key in self.refused and np.any(content[key]):
+                    raise SceneError(
+                        f"{file} describes {self.refused[key]}, which is not supported",
+                        found=f"{key}: {str(content[key])[:60]}",
+                        fix="export undistorted images of ordinary cameras",
+                    )
+                unknown.setdefault(key)
+        names = ", ".join(sorted(key for key in unknown if key not in self.refused))
+        return [f"keys of {file.name} that are not used: {names}"] if names else []
+
+
+def read_source(known: KnownPoses) -> Source:
+    """Read the posed views of a folder in any supported format, with points if available.
+
+    Views that cannot be used are left out, with the reason. Views are matched to images by name; points that
+    are not finite are dropped.
+
+    Raises:
+        SceneError: a file cannot be used, or at least three views all have one pose.
+    """
+    from hilsplat.scene.importers.phones import read_polycam, read_record3d
+    from hilsplat.scene.importers.transforms import read_transforms
+
+    readers = {
+        "colmap": read_colmap,
+        "transforms": read_transforms,
+        "polycam": read_polycam,
+        "record3d": read_record3d,
+        "llff": read_llff,
+    }
+    source = readers[known.kind](known)
+    poses = np.array([view.cam_from_source for view in source.views])
+    if len(poses) > 2 and np.allclose(poses, poses[0]):
         raise SceneError(
-            f"the camera {fault} of view {view.name} is not valid",
-            expected=expected,
-            found=found,
-            fix=f"export the poses again: {known.files[0]}",
+            f"all {len(poses)} views of {known.files[0]} have the same pose", fix="export it again"
         )
-    poses = np.stack([view.cam_from_source for view in views]) if views else np.zeros((0, 4, 4))
-    if len(views) > 2 and np.allclose(poses, poses[0]):
-        raise SceneError(f"all {len(views)} views of {known.files[0]} have the same pose", fix=AGAIN)
-    return views
+    images = [view.image for view in source.views if view.image is not None]
+    for view in [view for view in source.views if view.image is not None and images.count(view.image) > 1]:
+        source.views.remove(view)
+        source.left_out[view.name] = f"view {view.name}: other views have the same image {view.image}"
+    source.notes += [f"{other} also has poses, which are not used" for other in known.others]
+    if source.points is not None:
+        xyz, rgb = source.points
+        is_finite = np.isfinite(xyz).all(axis=1)
+        if bad := int((~is_finite).sum()):
+            source.notes.append(f"{bad} of {len(xyz)} points are not finite and are left out")
+        # Without points, they are triangulated.
+        source.points = (xyz[is_finite], rgb[is_finite]) if is_finite.any() else None
+    return source
 
 
-def read_colmap(known: KnownPoses) -> tuple[list[KnownView], Points]:
-    """Read a COLMAP model."""
-    folder = known.files[0]
-    require_whole_files(folder)
-    try:
-        model = pycolmap.Reconstruction(folder)
-        views, errors = [], reprojection_errors(model)
-        images = (model.images[image_id] for image_id in model.reg_image_ids())
-        for image in sorted(images, key=lambda image: image.name):
-            file, camera = _find_image(known.root, image.name), camera_of(image)
-            pose, px = pose_matrix(image.cam_from_world()), errors[image.name]
-            mean = round(float(px.mean()), 4) if len(px) else None
-            report = {"observations": len(px), "reprojection_error_px": mean}
-            views.append(KnownView(image.name, file, camera, pose, report=report))
-        points = sparse_points(model)
-    except (ValueError, RuntimeError, IndexError) as error:  # also raised for references to missing entries
-        raise SceneError(f"the COLMAP model in {folder} cannot be read: {error}", fix=AGAIN) from error
-    return checked(views, known), points
+def require_valid(view: KnownView) -> None:
+    """Raise SceneError if the lens or pose of a view is not valid."""
+    values = np.array([*view.camera.params, view.camera.width, view.camera.height], np.float64)
+    focal = [view.camera.params[row] for row in view.camera.focal_length_idxs()]
+    pose = view.cam_from_source
+    is_size = (values[-2:] > 0).all() and (values[-2:] <= MAX_SIDE_PX).all()
+    if not focal:
+        fault, found = "lens", view.camera.model_name
+        expected = "a lens with a focal length: panoramas are not supported"
+    elif not np.isfinite(values).all() or min(focal) <= 0 or not is_size:
+        fault, found = "lens", f"{view.camera.model_name} {values.tolist()}"
+        expected = f"finite numbers, a focal length above 0, sides of 1 to {MAX_SIDE_PX} px"
+    elif not np.isfinite(pose).all() or not are_rotations(pose[:3, :3], RIGID_TOLERANCE):
+        fault, found = "rotation", np.array2string(pose[:3, :3], precision=4).replace("\n", "")
+        expected = "a matrix that neither scales nor mirrors, or a quaternion of length 1"
+    elif np.abs(pose[:3, 3]).max() > FARTHEST:
+        fault, found, expected = "position", str(pose[:3, 3].tolist()), f"coordinates up to {FARTHEST:g}"
+    else:
+        return
+    raise SceneError(f"the camera {fault} of view {view.name} is not valid", expected=expected, found=found)
 
 
-def _find_image(root: Path, name: str) -> Path | None:
-    """Find an image by the name in the pose file, with or without a suffix, in `root` or its `images/`."""
-    _check_inside(root, name)
-    for base in (root / "images", root):
-        for suffix in ("", *sorted(IMAGE_SUFFIXES)):
-            if (image := base / f"{name}{suffix}").is_file():
-                return image
-    return None
+def image_size(path: Path) -> tuple[int, int]:
+    """Return width and height of an image as stored, px."""
+    with opened_image(path) as image:
+        return image.size
 
 
-def _check_inside(root: Path, name: str) -> None:
-    """Refuse paths outside the source folder, so that downloaded data cannot access other files."""
-    if Path(name).is_absolute() or Path(os.path.normpath(name)).parts[:1] == ("..",):
+def find_images(root: Path, names: Sequence[str]) -> dict[str, Path | None]:
+    """Return the image of each name in a pose file, from `root`, its `images/` or folders below, or None.
+
+    Downloaded data cannot access other files: a path that leads outside the folder means the image in the
+    folder with the same name (`match_names`).
+
+    Raises:
+        SceneError: a path leads outside the folder, which has no such image.
+    """
+    found: dict[str, Path | None] = {}
+    for name in names:
+        plain = name.replace("\\", "/")
+        is_inside = not is_outside(name)
+        places = [
+            base / f"{plain}{end}"
+            for base in (root / "images", root)
+            for end in ("", *sorted(IMAGE_SUFFIXES))
+        ]
+        found[name] = next((place for place in places if place.is_file()), None) if is_inside else None
+    if missing := [name for name, image in found.items() if image is None]:
+        below = {path.relative_to(root).as_posix(): path for path in images_below(root)}
+        matched = match_names(missing, below)
+        found |= {name: below[match] if (match := matched[name]) is not None else None for name in missing}
+    for name in missing:
+        if found[name] is None:
+            require_inside(root, name)
+    return found
+
+
+def require_inside(root: Path, name: str) -> None:
+    """Refuse a path outside the source folder, so that downloaded data cannot access other files."""
+    if is_outside(name):
         raise SceneError(
             f"the poses in {root} refer to a file outside it: {name}",
             expected="paths inside the folder",
-            fix="put the images into the folder, and correct the names in the pose file",
+            fix="put the file into the folder, and correct the name in the pose file",
         )
 
 
-def read_transforms(known: KnownPoses) -> tuple[list[KnownView], Points | None]:
-    """Read transforms files: camera-to-world matrices in OpenGL axes, and intrinsics per file or frame.
+def read_colmap(known: KnownPoses) -> Source:
+    """Read a COLMAP model."""
+    folder = known.files[0]
+    model, source = read_model(folder), Source()
+    point_ids, xyz, rgb = model.points or (np.zeros(0, np.int64), np.zeros((0, 3)), None)
+    files = find_images(known.root, [image.name for image in model.images])
 
-    Returns the views and, if a file contains `ply_file_path`, its points.
-    """
-    views: list[KnownView] = []
-    points = None
-    for file in known.files:
-        content = read_json_object(file, AGAIN)
-        frames = content.get("frames")
-        if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-            raise SceneError(f"{file}: `frames` is missing, or is not a list of objects", fix=AGAIN)
-        for number, frame in enumerate(frames):
-            views.append(_read_frame(known, file, number, {**content, **frame}))
-        if points is None and isinstance(content.get("ply_file_path"), str):
-            _check_inside(file.parent, content["ply_file_path"])
-            points = _read_ply_points(file.parent / content["ply_file_path"])
-    return checked(views, known), points
+    def described(image: ModelImage) -> KnownView:
+        if image.camera_id not in model.lenses:
+            raise SceneError(f"view {image.name} has camera {image.camera_id}, which the model lacks")
+        camera = model.lenses[image.camera_id].camera()
+        return KnownView(image.name, files[image.name], camera, image.cam_from_world)
 
-
-def _read_frame(known: KnownPoses, file: Path, number: int, frame: Mapping[str, Any]) -> KnownView:
-    """Read one frame of a transforms file; the frame's keys override those of the file."""
-    where = f"{file}, frame {number}"
-    try:
-        name = str(frame["file_path"]).removeprefix("./")
-        matrix = np.array(frame["transform_matrix"], dtype=np.float64)
-    except (KeyError, ValueError, TypeError) as error:
-        raise SceneError(
-            f"{where}: file_path or transform_matrix is not valid: {error!r}", fix=AGAIN
-        ) from error
-    source_from_cam = rigid_pose(matrix, f"{where} ({name}), transform_matrix") @ OPENGL_TO_OPENCV
-    image = _find_image(known.root, name)
-    camera = _frame_camera(where, frame, image)
-    return KnownView(name, image, camera, np.linalg.inv(source_from_cam), file.name == "transforms_test.json")
-
-
-def _frame_camera(where: str, frame: Mapping[str, Any], image: Path | None) -> pycolmap.Camera:
-    """Read the lens of a frame: PINHOLE, or OPENCV if it has distortion (k1, k2, p1, p2)."""
-    try:
-        width, height = frame.get("w"), frame.get("h")
-        if width is None or height is None:
-            width = height = 2  # not used, because a view without an image is skipped
-            if image is not None:
-                with opened_image(image) as opened:
-                    width, height = opened.size
-        width, height = int(width), int(height)
-        if "fl_x" in frame:
-            focal_x = float(frame["fl_x"])
-        else:
-            focal_x = width / 2 / math.tan(float(frame["camera_angle_x"]) / 2)
-        focal_y = float(frame.get("fl_y", focal_x))
-        params = [focal_x, focal_y, float(frame.get("cx", width / 2)), float(frame.get("cy", height / 2))]
-        distortion = [float(frame.get(key, 0.0)) for key in ("k1", "k2", "p1", "p2")]
-        further = [float(frame.get(key, 0.0)) for key in ("k3", "k4")]
-        name, params = ("OPENCV", params + distortion) if any(distortion) else ("PINHOLE", params)
-        camera = pycolmap.Camera(model=name, width=width, height=height, params=params)
-    except KeyError as error:
-        expected = "fl_x (px) or camera_angle_x (radians)"
-        raise SceneError(f"{where} has no focal length", expected=expected, fix=AGAIN) from error
-    except (TypeError, ValueError, ArithmeticError, OSError) as error:
-        raise SceneError(f"{where}: the intrinsics are not valid: {error}", fix=AGAIN) from error
-    model = str(frame.get("camera_model", "OPENCV"))
-    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE") or any(further):
-        raise SceneError(
-            f"{where}: lens {model} with k3, k4 = {further} is not supported",
-            expected="PINHOLE or OPENCV with k1, k2, p1, p2",
-            fix="undistort the images first",
-        )
-    return camera
+    num_lost = 0
+    for image in sorted(model.images, key=lambda image: image.name):
+        source.add(image.name, described, image)
+        if image.name in source.left_out:
+            continue
+        view, (xy, seen) = source.views[-1], image.seen
+        rows = np.searchsorted(point_ids, seen)
+        rows[rows == len(point_ids)] = 0
+        is_known = point_ids[rows] == seen if len(point_ids) else np.zeros(len(seen), bool)
+        num_lost += int((~is_known).sum())
+        seen_xyz = xyz[rows[is_known]] @ view.cam_from_source[:3, :3].T + view.cam_from_source[:3, 3]
+        projected = view.camera.img_from_cam(seen_xyz, check_cheirality=False)
+        px = np.linalg.norm(projected - xy[is_known], axis=1) if len(seen_xyz) else np.zeros(0)
+        px = px[np.isfinite(px)]
+        mean = round(float(px.mean()), 4) if len(px) else None
+        view.report.update(observations=len(px), reprojection_error_px=mean)
+    if rgb is not None:
+        source.points = xyz, rgb
+        if num_lost:
+            source.notes.append(f"{num_lost} observations refer to points that {folder} does not contain")
+    return source
 
 
-def _read_ply_points(path: Path) -> Points:
-    """Read the points and colours of a PLY file (grey if it has no colours)."""
-    from plyfile import PlyData, PlyParseError
-
-    try:
-        vertex = PlyData.read(path)["vertex"].data
-        xyz = np.stack([vertex[axis] for axis in ("x", "y", "z")], axis=1).astype(np.float64)
-    except (OSError, PlyParseError, KeyError, ValueError, MemoryError) as error:
-        raise SceneError(
-            f"the points in {path} cannot be read: {error}",
-            fix="put the file there, or remove ply_file_path from the transforms file to triangulate points",
-        ) from error
-    if {"red", "green", "blue"} <= set(vertex.dtype.names):
-        rgb = np.stack([vertex[colour] for colour in ("red", "green", "blue")], axis=1).astype(np.uint8)
-    else:
-        rgb = np.full(xyz.shape, 128, dtype=np.uint8)
-    return xyz, rgb
-
-
-def read_llff(known: KnownPoses) -> list[KnownView]:
+def read_llff(known: KnownPoses) -> Source:
     """Read the posed views of an LLFF scene; row i of `poses_bounds.npy` belongs to the i-th image by name.
 
     The first 15 of a row's 17 numbers are a 3 x 5 matrix, by rows: rotation columns (down, right, back),
@@ -241,17 +276,10 @@ def read_llff(known: KnownPoses) -> list[KnownView]:
     image size on disk.
     """
     path, folder = known.files[0], known.root / "images"
-    try:
-        rows = read_npy(path)
-    except ArtifactError as error:
-        raise SceneError(str(error).splitlines()[0], fix="unpack it again") from error
-    if rows.ndim != 2 or rows.shape[1] != 17 or not np.isfinite(rows).all():
-        raise SceneError(
-            f"{path} does not contain LLFF poses",
-            expected="finite numbers of shape (images, 17)",
-            found=f"shape {rows.shape}",
-            fix="unpack it again",
-        )
+    with foreign(path, fix="unpack it again"):
+        rows = np.load(path, allow_pickle=False)
+        if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "fiu":
+            raise ValueError(f"it contains {rows.dtype} of shape {rows.shape}, not numbers (images, 17)")
     images = sorted(list_images(folder if folder.is_dir() else known.root), key=lambda image: image.stem)
     if len(images) != len(rows):
         raise SceneError(
@@ -260,87 +288,20 @@ def read_llff(known: KnownPoses) -> list[KnownView]:
             found=f"{images[0].name} to {images[-1].name}" if images else "no images",
             fix="unpack the images again, and remove files that are not photographs of the scene",
         )
-    views = []
-    for number, (image, row) in enumerate(zip(images, rows.astype(np.float64), strict=True)):
-        down, right, back, position, (_, width_px, focal_px) = row[:15].reshape(3, 5).T
-        matrix = np.stack([right, down, -back, position], axis=1)
-        source_from_cam = rigid_pose(matrix, f"{path}, row {number}")
-        with opened_image(image) as opened:
-            width, height = opened.size
+
+    def described(number: int, image: Path) -> KnownView:
+        matrix = rows[number, :15].astype(np.float64).reshape(3, 5)
+        down, right, back, position, (height_px, width_px, focal_px) = matrix.T
+        pose = np.stack([right, down, -back, position], axis=1)
+        source_from_cam = rigid_pose(pose, f"{path}, row {number}")
+        width, height = image_size(image)
+        if abs(width * height_px - height * width_px) > ASPECT_TOLERANCE * width * height_px:
+            raise SceneError(f"{path}, row {number}: {image.name} has another shape than its pose states")
         params = [float(focal_px * width / width_px), width / 2, height / 2]
         camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
-        views.append(KnownView(image.name, image, camera, np.linalg.inv(source_from_cam)))
-    return views
+        return KnownView(image.name, image, camera, np.linalg.inv(source_from_cam))
 
-
-def read_polycam(known: KnownPoses) -> list[KnownView]:
-    """Read the posed views of a raw Polycam export.
-
-    `keyframes/cameras/<stem>.json`, or its corrected version, contains fx, fy, cx, cy, width, height in px,
-    and t_00 ... t_23, the rows of the camera-to-world matrix, in metres and OpenGL axes.
-    """
-    images, cameras = known.files
-    border_px = POLYCAM_BORDER_PX if images.name.startswith("corrected") else 0
-    views = []
-    for image in _spread(list_images(images)):
-        file = cameras / f"{image.stem}.json"
-        if not file.is_file():
-            continue  # Polycam omits cameras that it could not correct
-        content = read_json_object(file, AGAIN)
-        try:
-            entries = [float(content[f"t_{row}{column}"]) for row in range(3) for column in range(4)]
-            size = {side: int(content[side]) for side in ("width", "height")}
-            params = [float(content[key]) for key in ("fx", "fy", "cx", "cy")]
-            camera = pycolmap.Camera(model="PINHOLE", params=params, **size)
-        except (KeyError, TypeError, ValueError) as error:
-            raise SceneError(
-                f"{file} is not a Polycam camera file: {error!r}",
-                expected="fx, fy, cx, cy, width, height and t_00 to t_23",
-                fix="export the raw data again (developer mode)",
-            ) from error
-        pose = _phone_pose(np.array(entries).reshape(3, 4), str(file))
-        views.append(KnownView(image.name, image, camera, pose, border_px=border_px))
-    return views
-
-
-def read_record3d(known: KnownPoses) -> list[KnownView]:
-    """Read the posed views of a Record3D export.
-
-    `metadata` contains `K` in column order, `w` and `h` in px, and `poses`. Row i of `poses` is the camera's
-    quaternion (xyzw) and position in the world for image <i>.jpg, in metres and OpenGL axes.
-    """
-    from scipy.spatial.transform import Rotation
-
-    folder, file = known.files
-    content = read_json_object(file, AGAIN)
-    try:
-        intrinsics = np.array(content["K"], dtype=np.float64).reshape(3, 3).T
-        width, height = int(content["w"]), int(content["h"])
-        rows = np.array(content["poses"], dtype=np.float64).reshape(-1, 7)
-        matrices = np.concatenate([Rotation.from_quat(rows[:, :4]).as_matrix(), rows[:, 4:, None]], axis=2)
-    except (KeyError, TypeError, ValueError) as error:
-        raise SceneError(
-            f"{file} does not contain Record3D poses: {error!r}",
-            expected="K (9 numbers), w, h, and poses (rows of 7 numbers)",
-            fix="export the recording again",
-        ) from error
-    images = {int(path.stem): path for path in list_images(folder) if path.stem.isdigit()}
-    params = [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]
-    views = []
-    for number in _spread(sorted(number for number in images if number < len(matrices))):
-        camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
-        pose = _phone_pose(matrices[number], f"{file}, pose {number}")
-        views.append(KnownView(images[number].name, images[number], camera, pose))
-    return views
-
-
-def _spread(items: list[Any]) -> list[Any]:
-    """Sample at most `MAX_VIEWS` items evenly, including the first and the last."""
-    if len(items) <= MAX_VIEWS:
-        return items
-    return [items[row] for row in np.linspace(0, len(items) - 1, MAX_VIEWS).round().astype(int)]
-
-
-def _phone_pose(world_from_cam: Float64[np.ndarray, "3 4"], where: str) -> Float64[np.ndarray, "4 4"]:
-    """Convert a camera-to-world matrix (OpenGL axes, y up) to world-to-camera (OpenCV axes, z up)."""
-    return np.linalg.inv(Z_UP_FROM_Y_UP @ rigid_pose(world_from_cam, where) @ OPENGL_TO_OPENCV)
+    source = Source()
+    for number, image in enumerate(images):
+        source.add(image.name, described, number, image)
+    return source

@@ -20,7 +20,7 @@ from hilsplat.datasets.labelled import image_size_hw
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations, label_path
 from hilsplat.embed.langsplat_files import read_view
 from hilsplat.evaluate.files_stage import read_view_masks
-from hilsplat.photos.add import inspect_photos
+from hilsplat.photos.inspection import inspect_photos
 from hilsplat.scene.importers.known_views import read_source
 from hilsplat.scene.layouts import KnownPoses
 from hilsplat.workflow.resources import UNKNOWN_MP, _first_mp

@@ -1,14 +1,19 @@
 """The scene sheet: errors name the cell and the fix; new scenes are appended."""
 
+import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
 from hilsplat.base.errors import SceneError
-from hilsplat.photos.add import add_scene, inspect_photos
+from hilsplat.photos.add import add_scene
+from hilsplat.photos.inspection import inspect_photos
+from hilsplat.scene.exporting import pinhole_model
 from hilsplat.scene.layouts import NO_POSES
+from hilsplat.scene.posed_images import PosedImage
 from hilsplat.scene.sheet import choose_scenes, read_sheet
 from hilsplat.workflow.scene_data import SceneData
 from tests.unit.scene.test_poses import write_noise
@@ -129,14 +134,22 @@ def write_files(folder: Path, *paths: str) -> None:
 def langsplat_scene(folder: Path) -> Path:
     """Photographs, and beside them what COLMAP, 3DGS and LangSplat write."""
     write_noise(folder / "images", 3)
+    poses = [np.eye(4) for _ in range(3)]
+    for number, pose in enumerate(poses):
+        pose[0, 3] = number
+    lens = np.array([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
+    images = [PosedImage(f"{number}.png", Path(), pose, lens, (30, 40)) for number, pose in enumerate(poses)]
+    (folder / "sparse/0").mkdir(parents=True)
+    pinhole_model(images, np.zeros((1, 3)), np.zeros((1, 3), np.uint8)).write_binary(folder / "sparse/0")
     write_files(
         folder,
-        *(f"sparse/0/{name}.bin" for name in ("cameras", "images", "points3D")),
         *(f"output/a/point_cloud/iteration_{steps}/point_cloud.ply" for steps in (7000, 30000)),
         "output/a/chkpnt30000.pth",
         "language_features/000_s.npy",
-        "label/0.json",
     )
+    labels = {"info": {"width": 40, "height": 30}, "objects": []}
+    (folder / "label").mkdir()
+    (folder / "label/0.json").write_text(json.dumps(labels))
     return folder
 
 
@@ -146,7 +159,7 @@ def test_files_of_3dgs_and_langsplat_are_found_reported_and_recorded(tmp_path):
     report = str(add_scene(sheet, "desk", folder))
     assert "iteration_30000/point_cloud.ply" in report and "language_features" in report
     assert "skipped, because pickle files can run code: chkpnt30000.pth" in report
-    assert "labels for 1 photographs" in report
+    assert "labels: 0 in 1 photographs" in report
     assert (tmp_path / "annotated/photos/desk/0.json").is_file()
     old, new = read_sheet(sheet)
     assert (old.gaussians, old.features) == (None, None)
@@ -212,7 +225,9 @@ def test_nerfstudios_export_is_found_with_the_record_of_its_coordinates(tmp_path
     folder = tmp_path / "theirs"
     write_noise(folder / "images", 3)
     runs = [f"outputs/desk/splatfacto/2026-0{month}-01/dataparser_transforms.json" for month in (2, 1)]
-    write_files(folder, "exports/splat/splat.ply", "transforms.json", *runs)
+    write_files(folder, "exports/splat/splat.ply", *runs)
+    frames = [{"file_path": "images/0.png", "transform_matrix": np.eye(4).tolist()}]
+    (folder / "transforms.json").write_text(json.dumps({"fl_x": 50, "frames": frames}))
     sheet = write_sheet(tmp_path)
     report = str(add_scene(sheet, "desk", folder))
     latest = folder / runs[0]

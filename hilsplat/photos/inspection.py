@@ -1,0 +1,115 @@
+"""Report on a folder of photographs: what can be read, and what is likely to fail."""
+
+from collections import Counter, defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+
+from hilsplat.base.artifacts import sha256_of_file
+from hilsplat.base.errors import ImageError, first_line
+from hilsplat.base.files import list_images
+from hilsplat.base.images import opened_image, orientation, read_image, require_usable_size, resize_to_fit
+from hilsplat.base.progress import track
+from hilsplat.photos.check import CHECK_SIDE_PX, CheckedPhoto, photo_doubts
+from hilsplat.scene.features import exif_focal_px
+from hilsplat.scene.layouts import has_known_poses, photo_folder
+from hilsplat.scene.view_names import view_names
+
+OTHER_PHOTO_SUFFIXES = frozenset({".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".gif", ".jxl"})
+"""Suffixes of unsupported photograph formats. Such files are counted and reported as skipped."""
+
+
+@dataclass(frozen=True)
+class PhotoReport:
+    """Report on a folder of photographs.
+
+    Attributes:
+        sizes: number of readable photographs per upright size (height, width), px.
+        unreadable: (file name, reason) of each image that cannot be read.
+        num_rotated: number of photographs that are rotated according to their EXIF orientation.
+        duplicates: groups of file names with identical bytes.
+        passed_over: number of skipped files in unsupported photograph formats, by suffix.
+        doubts: likely problems and what to do about them (`check`).
+        notes: how the folder was made (`intake`), and what else in it is used or left out (`findings`).
+    """
+
+    folder: Path
+    sizes: dict[tuple[int, int], int]
+    unreadable: tuple[tuple[str, str], ...]
+    num_rotated: int
+    duplicates: tuple[tuple[str, ...], ...]
+    passed_over: dict[str, int]
+    doubts: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def num_readable(self) -> int:
+        """Number of readable photographs, including identical copies."""
+        return sum(self.sizes.values())
+
+    def __str__(self) -> str:
+        lines = [*self.notes, f"{self.num_readable} photographs in {self.folder}"]
+        for (height, width), count in sorted(self.sizes.items(), key=lambda item: (-item[1], item[0])):
+            lines.append(f"  {count:>5}  of {width} x {height} px (width x height)")
+        if self.num_rotated:
+            lines.append(f"  {self.num_rotated:>5}  rotated upright according to their EXIF orientation")
+        for names in self.duplicates:
+            lines.append(f"  {len(names):>5}  are identical: {', '.join(names)}")
+        for suffix, count in sorted(self.passed_over.items()):
+            lines.append(f"  {count:>5}  {suffix} files skipped: convert them to JPEG or PNG to use them")
+        if self.unreadable:
+            lines.append(f"  {len(self.unreadable):>5}  cannot be read and are left out:")
+            lines += [f"           {name}: {reason}" for name, reason in self.unreadable]
+        lines += [f"  warning: {doubt}" for doubt in self.doubts]
+        return "\n".join(lines)
+
+
+def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
+    """Decode all photographs in a folder (or its `images/`), and report its contents and likely problems.
+
+    If given, `poses` are used instead of those in the folder (`has_known_poses`).
+
+    Raises:
+        SceneError: a photograph has an unusable name, or two photographs differ only in their suffix.
+    """
+    where = photo_folder(folder)
+    photos = list_images(where)
+    view_names(photos)
+    sizes: Counter[tuple[int, int]] = Counter()
+    unreadable: list[tuple[str, str]] = []
+    by_digest: dict[str, list[str]] = defaultdict(list)
+    num_rotated = 0
+    checked: list[CheckedPhoto] = []
+    for path in track(photos, "photographs checked"):
+        if not path.exists() or path.stat().st_size == 0:
+            is_link = not path.exists()
+            reason = "it is a link to a file that does not exist" if is_link else "the file is empty"
+            unreadable.append((path.name, reason))
+            continue
+        try:
+            pixels = read_image(path)
+            require_usable_size(path, pixels.shape[:2])
+        except ImageError as error:
+            reason = first_line(error.__cause__ or error).replace(str(path), path.name)
+            unreadable.append((path.name, f"{reason} ({path.stat().st_size} bytes)"))
+            continue
+        size_hw = (pixels.shape[0], pixels.shape[1])
+        sizes[size_hw] += 1
+        with opened_image(path) as image:
+            num_rotated += orientation(image) > 1
+        grey = cv2.cvtColor(resize_to_fit(pixels, CHECK_SIDE_PX), cv2.COLOR_RGB2GRAY)
+        checked.append(CheckedPhoto(path.name, size_hw, exif_focal_px(path, size_hw), grey))
+        by_digest[sha256_of_file(path)].append(path.name)
+    copies = {name for names in by_digest.values() for name in names[1:]}
+    distinct = [photo for photo in checked if photo.name not in copies]
+    suffixes = Counter(path.suffix.lower() for path in where.iterdir() if path.is_file())
+    return PhotoReport(
+        folder=where,
+        sizes=dict(sizes),
+        unreadable=tuple(unreadable),
+        num_rotated=num_rotated,
+        duplicates=tuple(tuple(names) for names in by_digest.values() if len(names) > 1),
+        passed_over={suffix: count for suffix, count in suffixes.items() if suffix in OTHER_PHOTO_SUFFIXES},
+        doubts=tuple(photo_doubts(distinct, have_poses=has_known_poses(folder, poses))),
+    )

@@ -1,0 +1,238 @@
+"""Reader of COLMAP models, binary and text, as COLMAP and other programs write them.
+
+pycolmap's reader allocates unlimited memory for wrong counts, ends names at the first space, and expects
+every detail of the text format. Rigs and frames are not read, because images have their own poses.
+"""
+
+import re
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from jaxtyping import Float64, Int64, UInt8
+
+from hilsplat.base.errors import SceneError, foreign
+from hilsplat.base.files import regular
+from hilsplat.scene.colmap import pycolmap, rotation_matrix
+from hilsplat.scene.layouts import model_files
+
+FIX = "copy it again, or export the model again with COLMAP"
+
+PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
+"""Number of lens parameters, by COLMAP's camera model id."""
+
+
+Row = TypeVar("Row")
+
+
+class Lens(NamedTuple):
+    """A camera in a model: COLMAP's name of the lens model, image size and parameters, px."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    def camera(self) -> pycolmap.Camera:
+        """Return pycolmap's camera."""
+        return pycolmap.Camera(
+            model=self.model, width=self.width, height=self.height, params=list(self.params)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ModelImage:
+    """A registered image; its pose is NaN if the quaternion in the file is not a rotation.
+
+    Attributes:
+        seen: observed position, px, and point id of each observation of a point.
+    """
+
+    name: str
+    camera_id: int
+    cam_from_world: Float64[np.ndarray, "4 4"]
+    seen: tuple[Float64[np.ndarray, "n 2"], Int64[np.ndarray, " n"]]
+
+
+@dataclass(frozen=True, eq=False)
+class ColmapModel:
+    """A COLMAP model; points are sorted by id, and None if the model has no file of points."""
+
+    lenses: dict[int, Lens]
+    images: list[ModelImage]
+    points: tuple[Int64[np.ndarray, " P"], Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]] | None
+
+
+def read_model(folder: Path) -> ColmapModel:
+    """Read a model; raise SceneError with file and record or line if a file is damaged."""
+    cameras, images, *points = model_files(folder)
+    rows: list[tuple[float, ...]] = []
+    if cameras.suffix == ".bin":
+        lenses, records = _binary(cameras, _binary_lens), _binary(images, _binary_image)
+        rows = _binary(points[0], _binary_point) if points else []
+    else:
+        lenses = _text(cameras, "CAMERA_ID MODEL WIDTH HEIGHT, and all parameters of the model", _text_lens)
+        records = _text_images(images)
+        rows = _text(points[0], "POINT3D_ID X Y Z R G B ...", _text_point) if points else []
+    table = np.array(rows, np.float64).reshape(-1, 7)
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    rgb = np.clip(np.nan_to_num(table[:, 4:]), 0, 255).astype(np.uint8)
+    return ColmapModel(
+        dict(lenses), records, (table[:, 0].astype(np.int64), table[:, 1:4], rgb) if points else None
+    )
+
+
+def _image(
+    name: str, camera_id: int, pose: Sequence[float], xy: np.ndarray, point_ids: np.ndarray
+) -> ModelImage:
+    """Return an image, given quaternion (wxyz) and translation, and its observations (point id -1: none)."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation_matrix((*pose[1:4], pose[0])), pose[4:]
+    is_point = point_ids >= 0
+    return ModelImage(name, camera_id, matrix, (xy[is_point], point_ids[is_point]))
+
+
+# -- binary ---------------------------------------------------------------------------------------
+
+
+class _Bytes:
+    """The bytes of a file, read in order."""
+
+    def __init__(self, path: Path) -> None:
+        self.data, self.at = regular(path).read_bytes(), 0
+
+    def take(self, form: str) -> tuple[Any, ...]:
+        """Read numbers laid out as `form`; raise struct.error past the end."""
+        found = struct.unpack_from(f"<{form}", self.data, self.at)
+        self.at += struct.calcsize(f"<{form}")
+        return found
+
+    def name(self) -> str:
+        """Read a name that ends with a zero byte."""
+        end = self.data.index(b"\0", self.at)
+        found = self.data[self.at : end].decode("utf-8", "surrogateescape")
+        self.at = end + 1
+        return found
+
+    def skip(self, count: int) -> int:
+        """Pass over bytes, and return where they begin; raise struct.error past the end."""
+        if count > len(self.data) - self.at:
+            raise struct.error
+        self.at += count
+        return self.at - count
+
+
+def _binary(path: Path, record: Callable[[_Bytes], Row]) -> list[Row]:
+    """Read each record of a file, which must end after the last one."""
+    rows: list[Row] = []
+    with foreign(path, fix=FIX):
+        data = _Bytes(path)
+        (count,) = data.take("Q")
+        if count > len(data.data):
+            raise ValueError(f"it declares {count} records but has only {len(data.data)} bytes")
+        for number in range(count):
+            try:
+                rows.append(record(data))
+            except (struct.error, ValueError) as error:
+                reason = "it ends" if isinstance(error, struct.error) else f"{error}"
+                raise ValueError(f"{reason} within record {number + 1} of {count}") from error
+        if rest := len(data.data) - data.at:
+            raise ValueError(f"{rest} bytes follow its {count} records")
+    return rows
+
+
+def _binary_lens(data: _Bytes) -> tuple[int, Lens]:
+    number, model, width, height = data.take("IiQQ")
+    if not 0 <= model < len(PARAMETERS):
+        raise ValueError(f"unknown camera model {model}")
+    params = data.take(f"{PARAMETERS[model]}d")
+    return number, Lens(pycolmap.CameraModelId(model).name, width, height, params)
+
+
+def _binary_image(data: _Bytes) -> ModelImage:
+    _, *pose, camera_id = data.take("I7dI")
+    name = data.name()
+    (count,) = data.take("Q")
+    start = data.skip(24 * count)
+    seen = np.frombuffer(data.data, [("xy", "<f8", 2), ("id", "<i8")], count, start)
+    return _image(name, camera_id, pose, seen["xy"], seen["id"])
+
+
+def _binary_point(data: _Bytes) -> tuple[float, ...]:
+    *point, _, length = data.take("Q3d3BdQ")
+    data.skip(8 * length)
+    return tuple(map(float, point))
+
+
+# -- text -----------------------------------------------------------------------------------------
+
+
+def _text(path: Path, expected: str, record: Callable[[str], Row | None]) -> list[Row]:
+    """Read each line of a file but comments; `record` returns None for a line without a record of its own."""
+    rows = []
+    with foreign(path, fix=FIX):
+        text = regular(path).read_text(encoding="utf-8-sig", errors="surrogateescape")
+    for number, line in enumerate(text.splitlines(), 1):
+        if line.startswith("#"):
+            continue
+        try:
+            row = record(line.strip())
+        except (ValueError, IndexError) as error:
+            where = f"{path}, line {number}, cannot be read"
+            raise SceneError(where, expected=expected, found=repr(line[:80]), fix=FIX) from error
+        if row is not None:
+            rows.append(row)
+    return rows
+
+
+def _text_lens(line: str) -> tuple[int, Lens] | None:
+    if not line:
+        return None
+    number, model, width, height, *params = line.split()
+    model_id = (
+        int(pycolmap.CameraModelId.__members__[model]) if model in pycolmap.CameraModelId.__members__ else -1
+    )
+    if model_id < 0 or len(params) != PARAMETERS[model_id]:
+        raise ValueError
+    return int(number), Lens(model, int(width), int(height), tuple(map(float, params)))
+
+
+def _text_point(line: str) -> tuple[float, ...] | None:
+    return tuple(map(float, line.split(maxsplit=7)[:7])) if line else None
+
+
+class _TextImages:
+    """The state between the two lines of an image; the second one, its points, may be missing."""
+
+    def __init__(self) -> None:
+        self.may_be_points = False
+
+    def __call__(self, line: str) -> Any:
+        cells = line.split()
+        if self.may_be_points and len(cells) % 3 == 0 and NUMBERS.fullmatch(line):
+            self.may_be_points = False
+            return np.array(cells, np.float64).reshape(-1, 3)
+        self.may_be_points = bool(line)
+        if not line:
+            return None
+        *numbers, name = line.split(maxsplit=9)
+        int(numbers[0])
+        return name, int(numbers[8]), tuple(map(float, numbers[1:8]))
+
+
+NUMBERS = re.compile(r"[-+0-9.eE\snainfNAINF]*")
+
+
+def _text_images(path: Path) -> list[ModelImage]:
+    expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line with X Y POINT3D_ID for each point"
+    images: list[ModelImage] = []
+    rows = _text(path, expected, _TextImages())
+    for row, after in zip(rows, [*rows[1:], None], strict=True):
+        if isinstance(row, tuple):
+            seen = after if isinstance(after, np.ndarray) else np.zeros((0, 3))
+            name, camera_id, pose = row
+            images.append(_image(name, camera_id, pose, seen[:, :2], seen[:, 2].astype(np.int64)))
+    return images

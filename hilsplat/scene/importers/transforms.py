@@ -1,0 +1,225 @@
+"""Reader of transforms.json, as nerfstudio, instant-ngp and Blender write it.
+
+The meaning of keys follows nerfstudio's `nerfstudio_dataparser.py` and instant-ngp's `nerf_loader.cu`.
+"""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilsplat.base.errors import SceneError, foreign
+from hilsplat.scene.colmap import Points, pycolmap
+from hilsplat.scene.importers.known_views import (
+    Keys,
+    KnownView,
+    Source,
+    find_images,
+    image_size,
+    require_inside,
+)
+from hilsplat.scene.layouts import KnownPoses, read_json_object
+from hilsplat.scene.posed_images import OPENGL_TO_OPENCV, rigid_pose
+from hilsplat.scene.view_names import match_names
+
+FOCAL = {axis: (f"fl_{axis}", f"camera_angle_{axis}", f"{axis}_fov") for axis in "xy"}
+"""Keys of a focal length: px, field of view in radians, and in degrees."""
+
+FOCAL_TOLERANCE = 0.01
+"""Relative difference between several statements of one focal length, above which they contradict."""
+
+MODELS = {
+    **dict.fromkeys(
+        ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"), "OPENCV"
+    ),
+    **dict.fromkeys(
+        ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), "OPENCV_FISHEYE"
+    ),
+}
+"""COLMAP's lens model with the distortion coefficients of a `camera_model`."""
+
+COEFFICIENTS = {"OPENCV": ("k1", "k2", "p1", "p2", "k3"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4")}
+
+SPLITS = ("train_filenames", "val_filenames", "test_filenames")
+
+KEYS = Keys(
+    used={
+        *("frames", "file_path", "transform_matrix", "w", "h", *FOCAL["x"], *FOCAL["y"], "cx", "cy"),
+        *("k1", "k2", "k3", "k4", "p1", "p2", "camera_model", "is_fisheye", "ply_file_path", *SPLITS),
+        *("applied_transform", "applied_scale"),  # for Gaussians, see `nerfstudio.py`
+    },
+    harmless={
+        *(
+            "aabb_scale",
+            "scale",
+            "offset",
+            "n_frames",
+            "from_na",
+            "up",
+            "sharpness",
+            "rotation",
+            "render_aabb",
+        ),
+        *("orientation_override", "colmap_im_id", "depth_file_path", "depth_path", "depth_unit_scale_factor"),
+        *("integer_depth_scale", "enable_depth_loading", "normal_file_path", "sharpen", "white_transparent"),
+        *("black_transparent", "timestamp", "auto_scale_poses_override", "center_method", "version"),
+    },
+    refused={
+        **dict.fromkeys(("ortho", "is_ortho", "orthographic"), "orthographic pictures"),
+        **dict.fromkeys(("latlong", "equirectangular"), "panoramas"),
+        **dict.fromkeys(
+            ("rolling_shutter", "transform_matrix_start", "transform_matrix_end"), "a rolling shutter"
+        ),
+        **dict.fromkeys(("shift_x", "shift_y", "skew"), "a shifted or skewed lens"),
+        **dict.fromkeys((f"ftheta_p{number}" for number in range(5)), "an f-theta lens"),
+        **dict.fromkeys(("k5", "k6", "p3", "p4", "s1", "s2", "s3", "s4", "b1", "b2"), "more lens distortion"),
+        "distortion_params": "a list of distortion coefficients",
+        "lens_mode": "a special lens",
+    },
+)
+
+
+def read_transforms(known: KnownPoses) -> Source:
+    """Read transforms files: camera-to-world matrices in OpenGL axes, and intrinsics per file or frame.
+
+    A frame's keys override those of its file. Without a size, it is the image's. Lists of file names are the
+    source's split: a view is held out unless it is in `train_filenames`, or else if it is in one of the
+    other lists. Points are read if `ply_file_path` names them.
+    """
+    source = Source()
+    for file in known.files:
+        content = read_json_object(file, "export it again")
+        frames = content.get("frames")
+        if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+            raise SceneError(
+                f"{file}: `frames` is missing, or is not a list of objects", fix="export it again"
+            )
+        source.notes += KEYS.check([content, *frames], file)
+        names = [str(frame.get("file_path", f"frame {number}")) for number, frame in enumerate(frames)]
+        images, held_out = find_images(known.root, names), _held_out(content, names, source.notes)
+        is_test = file.name != known.files[0].name and file.name in (
+            "transforms_test.json",
+            "transforms_val.json",
+        )
+        for number, (name, frame) in enumerate(zip(names, frames, strict=True)):
+            own = {axis: any(key in frame for key in FOCAL[axis]) for axis in "xy"}
+            shared = {
+                key: value
+                for key, value in content.items()
+                if not (own["x"] or own["y"]) or key not in (*FOCAL["x"], *FOCAL["y"])
+            }
+            where = f"{file}, frame {number} ({name})"
+            merged = {**shared, **frame}
+            source.add(
+                name, _view, where, merged, name, images[name], is_test or name in held_out, source.notes
+            )
+        if source.points is None and isinstance(content.get("ply_file_path"), str):
+            place = content["ply_file_path"].replace("\\", "/")
+            require_inside(file.parent, place)
+            source.points = read_ply_points(file.parent / place)
+    source.notes = list(dict.fromkeys(source.notes))
+    return source
+
+
+def _held_out(content: Mapping[str, Any], names: list[str], notes: list[str]) -> set[str]:
+    """Return the frames that the file's lists of names keep from training."""
+    listed: dict[str, set[str]] = {}
+    for key in SPLITS:
+        value = content.get(key) or []
+        with foreign(key):
+            matched = match_names([str(name) for name in value], names)
+        listed[key] = {name for name in matched.values() if name is not None}
+        if lost := sum(name is None for name in matched.values()):
+            notes.append(f"{lost} names in {key} belong to no frame")
+    train, *others = (listed[key] for key in SPLITS)
+    return set(names) - train if train else set().union(*others)
+
+
+def _view(
+    where: str, frame: Mapping[str, Any], name: str, image: Path | None, is_test: bool, notes: list[str]
+) -> KnownView:
+    with foreign(where, expected="file_path, and transform_matrix as a 4 x 4 matrix"):
+        if not isinstance(frame["file_path"], str):
+            raise ValueError("file_path is not a text")
+        matrix = np.array(frame["transform_matrix"], dtype=np.float64)
+    pose = rigid_pose(matrix, f"{where}, transform_matrix") @ OPENGL_TO_OPENCV
+    return KnownView(name, image, _lens(where, frame, image, notes), np.linalg.inv(pose), is_test)
+
+
+def _lens(where: str, frame: Mapping[str, Any], image: Path | None, notes: list[str]) -> pycolmap.Camera:
+    """Return the lens of a frame: PINHOLE, or with distortion OPENCV, FULL_OPENCV or OPENCV_FISHEYE."""
+    with foreign(where, expected="finite numbers", fix="export it again"):
+        stated = str(frame.get("camera_model", "OPENCV")).upper()
+        model = "OPENCV_FISHEYE" if frame.get("is_fisheye") else MODELS.get(stated)
+        values = {key: float(frame.get(key) or 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
+        rest = {
+            key: value
+            for key, value in values.items()
+            if value and key not in COEFFICIENTS.get(model or "", ())
+        }
+        if model is None or rest:
+            raise SceneError(
+                f"{where}: lens {stated}{f' with {rest}' if rest else ''} is not supported",
+                expected="; ".join(f"{lens} with {' '.join(keys)}" for lens, keys in COEFFICIENTS.items()),
+                fix="undistort the images first",
+            )
+        width, height = frame.get("w"), frame.get("h")
+        if width is None or height is None:
+            width, height = image_size(image) if image is not None else (2, 2)  # not used without an image
+        width, height = int(width), int(height)
+        focal = {
+            axis: _focal(where, frame, axis, side, notes) for axis, side in (("x", width), ("y", height))
+        }
+        focal_x, focal_y = focal["x"] or focal["y"], focal["y"] or focal["x"]
+        if not focal_x or not focal_y:
+            expected = "fl_x (px), camera_angle_x (radians) or x_fov (degrees), or the same for y"
+            raise SceneError(f"{where} has no focal length", expected=expected, fix="export it again")
+        params = [focal_x, focal_y, float(frame.get("cx", width / 2)), float(frame.get("cy", height / 2))]
+        coefficients = [values[key] for key in COEFFICIENTS[model]]
+        if model == "OPENCV" and values["k3"]:
+            model, coefficients = "FULL_OPENCV", [*coefficients, 0.0, 0.0, 0.0]
+        elif model == "OPENCV":
+            model, coefficients = ("OPENCV", coefficients[:4]) if any(coefficients) else ("PINHOLE", [])
+        return pycolmap.Camera(model=model, width=width, height=height, params=params + coefficients)
+
+
+def _focal(where: str, frame: Mapping[str, Any], axis: str, side_px: int, notes: list[str]) -> float:
+    """Return the focal length along an axis, px; 0 if none is stated. The first of several counts."""
+    stated = {}
+    for key in FOCAL[axis]:
+        if frame.get(key) is not None:
+            value = float(frame[key])
+            angle = math.radians(value) if key.endswith("fov") else value
+            stated[key] = value if key.startswith("fl_") else side_px / 2 / math.tan(angle / 2)
+    if not stated:
+        return 0.0
+    first, *others = stated
+    for key in others:
+        if abs(stated[key] - stated[first]) > FOCAL_TOLERANCE * abs(stated[first]):
+            notes.append(f"{key} contradicts {first}, which is used")
+    return stated[first]
+
+
+def read_ply_points(path: Path) -> Points:
+    """Read the points of a PLY file, and their colours: integers, or floats from 0 to 1; grey without any.
+
+    Colours may be named red, green, blue, or r, g, b, or have the prefix diffuse_.
+    """
+    from plyfile import PlyData
+
+    fix = "put the file there, or remove ply_file_path from the transforms file to triangulate points"
+    with foreign(f"{path}, with the points,", fix=fix):
+        vertex = PlyData.read(path)["vertex"].data
+        xyz = np.stack([vertex[axis] for axis in ("x", "y", "z")], axis=1).astype(np.float64)
+        names = [("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue")]
+        found = next((each for each in names if set(each) <= set(vertex.dtype.names)), None)
+        if found is None:
+            return xyz, np.full(xyz.shape, 128, dtype=np.uint8)
+        rgb = np.stack([vertex[name] for name in found], axis=1)
+        most = float(np.nanmax(rgb)) if rgb.size else 0.0
+        # Floats are usually in [0, 1]; 16-bit colours of laser scanners may use only 8 bits.
+        limit = 1 if rgb.dtype.kind == "f" and most <= 1 else 255 if most <= 255 else 65535
+        rgb = np.nan_to_num(rgb.astype(np.float64) * (255 / limit), nan=128.0)
+    return xyz, np.clip(np.rint(rgb), 0, 255).astype(np.uint8)

@@ -1,0 +1,73 @@
+"""What was drawn on a photograph (labels, masks, maps), at the pixels of the view made from it."""
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Int64, Shaped
+
+from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.scene.cameras import Camera, Photo
+
+SHAPE_TOLERANCE = 0.01
+"""Relative difference in aspect ratio, between a drawing and its picture, that is attributed to rounding."""
+
+OUTSIDE = -1
+
+Placement = Callable[[Shaped[np.ndarray, "H W"]], Shaped[np.ndarray, "h w"]]
+
+
+def placement(camera: Camera, drawn_hw: tuple[int, int], where: str) -> Placement | None:
+    """Return a function that brings a drawing of this size from the photograph to the view.
+
+    Each pixel takes the value at its centre's place in the photograph; a place outside it gives 0. Return
+    None if the drawing has the view's size, or is a scaled copy of the view. A drawing whose shape fits view
+    and photograph belongs to the closer of the two.
+
+    Raises:
+        MisalignedArtifactError: the shape fits neither.
+    """
+    if drawn_hw == camera.size_hw:
+        return None
+    pictures = {"undistorted": camera.size_hw}
+    if camera.photo is not None:
+        pictures["photograph"] = camera.photo.size_hw
+    # In px of the drawing, which is compared at its own width.
+    misfit = {
+        name: abs(drawn_hw[0] - drawn_hw[1] * height / width) for name, (height, width) in pictures.items()
+    }
+    best = min(misfit, key=lambda name: (misfit[name], name == "undistorted"))
+    if misfit[best] > max(1.0, SHAPE_TOLERANCE * drawn_hw[0]):
+        raise MisalignedArtifactError(
+            f"{where} does not match the size of its image",
+            expected=" or ".join(
+                f"{width} x {height} px ({name})" for name, (height, width) in pictures.items()
+            )
+            + ", or a scaled copy",
+            found=f"{drawn_hw[1]} x {drawn_hw[0]} px (width x height)",
+            fix="use what was drawn on this image",
+        )
+    if best == "undistorted":
+        return None
+    assert camera.photo is not None
+    pixels = _pixels_of_photo(camera.photo, tuple(camera.K.ravel().tolist()), camera.size_hw, drawn_hw)
+    return lambda drawn: np.where(pixels == OUTSIDE, 0, drawn.ravel()[pixels]).astype(drawn.dtype)
+
+
+@lru_cache(maxsize=4)
+def _pixels_of_photo(
+    photo: Photo, K: tuple[float, ...], size_hw: tuple[int, int], drawn_hw: tuple[int, int]
+) -> Int64[np.ndarray, "h w"]:
+    """Return for each pixel of the view the pixel of the drawing (row * width + column), or `OUTSIDE`."""
+    from hilsplat.scene.colmap import pycolmap
+
+    lens = pycolmap.Camera.create_from_model_name(1, photo.model, 1.0, *photo.size_hw[::-1])
+    lens.params = photo.params[: len(lens.params)]
+    columns, rows = np.meshgrid(np.arange(size_hw[1]) + 0.5, np.arange(size_hw[0]) + 0.5)
+    seen = np.stack([columns.ravel(), rows.ravel(), np.ones(rows.size)], axis=1)
+    xy = lens.img_from_cam(seen @ np.linalg.inv(np.reshape(K, (3, 3))).T)
+    xy = np.floor(xy * (np.array(drawn_hw[::-1]) / photo.size_hw[::-1]))
+    inside = (xy >= 0).all(axis=1) & (xy < drawn_hw[::-1]).all(axis=1)  # false for NaN
+    found = np.full(len(xy), OUTSIDE, np.int64)
+    found[inside] = (xy[inside] @ [1, drawn_hw[1]]).astype(np.int64)
+    return found.reshape(size_hw)
