@@ -27,7 +27,7 @@ from hilsplat.annotate.labels import (
     write_labels,
 )
 from hilsplat.annotate.proposals import Clicks, Proposals
-from hilsplat.base.errors import ArtifactError, SettingsError
+from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError, first_line
 from hilsplat.datasets.images.isat import fill_polygons
 from hilsplat.scene.scene import Scene
 from hilsplat.web.file_changes import version_of
@@ -242,15 +242,24 @@ def _carry(opened: OpenedScene, asked: Carry) -> list[dict[str, Any]]:
 
 
 def _import(opened: OpenedScene, asked: Given) -> dict[str, Any]:
-    """Merge the annotations with those in files, and return them by view number; nothing is written."""
-    cameras = opened.scene.cameras
-    files = [imported(file.name, file.text, cameras) for file in asked.files]
+    """Merge the annotations with those in files, and return them by view number; nothing is written.
+
+    A file that cannot be used is noted; a single one is refused.
+    """
+    cameras, files, notes = opened.scene.cameras, [], list[str]()
+    for file in asked.files:
+        try:
+            files.append(imported(file.name, file.text, cameras, notes))
+        except HilsplatError as error:
+            if len(asked.files) == 1:
+                raise
+            notes.append(first_line(error))
     sizes_hw = {view: cameras[view].size_hw for view in cameras.names}
     found, added, known = merged(opened.known(), files, sizes_hw)
     views = {
         cameras.names.index(view): [label.model_dump() for label in labels] for view, labels in found.items()
     }
-    return {"views": views, "added": added, "known": known}
+    return {"views": views, "added": added, "known": known, "notes": notes}
 
 
 def _export(opened: OpenedScene, of: Mapping[str, Any]) -> Response:

@@ -4,24 +4,32 @@ In these formats, levels and parents are extra keys, which other programs ignore
 these keys are imported as wholes.
 """
 
+import base64
 import io
 import json
-import shutil
+import math
+import re
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
+from PIL import Image, ImageDraw
+from pycocotools import mask as coco_masks
 
-from hilsplat.annotate.labels import Label, as_file, known_labels, labels_of, traced, whole_pixels
+from hilsplat.annotate.labels import Label, as_file, known_labels, placed, placed_rings, traced
 from hilsplat.base.artifacts import atomic_folder, parse_json, write_text
-from hilsplat.base.errors import SceneError
-from hilsplat.datasets.images.isat import fill_polygons, parse_isat, trace_polygons
+from hilsplat.base.errors import HilsplatError, SceneError, first_line, foreign
+from hilsplat.base.images import open_image
+from hilsplat.datasets.images.isat import fill_polygons, read_object, stated_size
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
-from hilsplat.scene.cameras import Cameras
+from hilsplat.scene.cameras import Camera, Cameras
+from hilsplat.scene.placement import placement
 from hilsplat.scene.scene import Scene
+from hilsplat.scene.view_names import match_name, match_names
 from hilsplat.web.coco import coco_content, coco_region
 
 Kind = Literal["hilsplat", "isat", "labelme", "coco"]
@@ -45,9 +53,11 @@ def export_labels(scene: Scene, folder: Path, data_root: Path, out: Path) -> int
     """Write a scene's annotations, or a synthetic scene's ground truth, in the layout of LERF-OVS's labels.
 
     The folder `out`, such as `label/teatime`, is replaced. It contains `<view>.json` and the image of each
-    labelled view. Each polygon is an object, as LangSplat's evaluation requires; that evaluation ignores the
-    keys for levels and parents. Annotations are read from `annotated/<dataset>/<scene>` below `data_root`.
-    Return the number of labelled views.
+    labelled view as `<view>.jpg`. Each polygon is an object, as LangSplat's evaluation requires; that
+    evaluation ignores the keys for levels and parents. It reads only views named frame_<number>, and compares
+    them with the rendering at position <number> - 1, so the frames must be numbered from 1 without gaps;
+    rename other photographs before `hilsplat new`. Annotations are read from `annotated/<dataset>/<scene>`
+    below `data_root`. Return the number of labelled views.
 
     Raises:
         SceneError: the scene has no labels.
@@ -64,9 +74,9 @@ def export_labels(scene: Scene, folder: Path, data_root: Path, out: Path) -> int
         )
     with atomic_folder(out) as temporary:
         for view, labels in known.items():
-            text = _isat(view, scene.cameras[view].size_hw, labels)
-            write_text(temporary / f"{Path(view).stem}.json", text + "\n")
-            shutil.copyfile(scene.image_path(view), temporary / view)
+            text, stem = _isat(view, scene.cameras[view].size_hw, labels), Path(view).stem
+            write_text(temporary / f"{stem}.json", text + "\n")
+            Image.fromarray(scene.image(view)).save(temporary / f"{stem}.jpg", quality=95)
     return len(known)
 
 
@@ -94,7 +104,8 @@ def labels_of_truth(truth: HierarchyAnnotations, views: Sequence[str]) -> dict[s
 def _isat(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
     """Format labels as ISAT, one polygon per entry; all pieces of a labelled object have the same group."""
     size = {"width": size_hw[1], "height": size_hw[0]}
-    info = {"description": "ISAT", "folder": "", "name": view, **size, "depth": 3, "note": ""}
+    name = f"{Path(view).stem}.jpg"  # LangSplat's evaluation reads the number before ".jpg"
+    info = {"description": "ISAT", "folder": "", "name": name, **size, "depth": 3, "note": ""}
     objects = []
     for label in labels:
         for ring in label.polygons:
@@ -143,170 +154,262 @@ def _coco(known: Mapping[str, Sequence[Label]], cameras: Cameras) -> dict[str, A
 # -- import ---------------------------------------------------------------------------------------
 
 
-def imported(name: str, text: str, cameras: Cameras) -> dict[str, list[Label]]:
+MOST_INVALID = 0.5
+"""Maximum share of invalid annotations in a file; if it is exceeded, the file is probably misread."""
+
+SLACK = 0.25
+"""Maximum distance of a vertex from its image, in image sides; beyond it, the stated size is wrong."""
+
+NO_AREA = {"point", "points", "line", "linestrip"}
+POLYGONS = {"polygon", "oriented_rectangle", "rotation", "quadrilateral"}
+"""Shape types of labelme, and of X-AnyLabeling, which has the same format."""
+
+
+class Piece(NamedTuple):
+    """A region in a file; pieces of a view with the same text and number are one object."""
+
+    view: str
+    text: str
+    number: Any  # None if the piece is a separate object
+    rings: list[list[tuple[int, int]]]  # in whole pixels of the view
+    keys: Mapping[str, Any]  # in the file
+
+
+def imported(
+    name: str, text: str, cameras: Cameras, notes: list[str] | None = None
+) -> dict[str, list[Label]]:
     """Return the annotations in a file, which may have any of the four formats, by view.
 
-    Objects are numbered from 1 unless the file has ids. Without a photograph's name, the file's name counts.
+    Each format's own rule determines a region's pixels in an image of the size that the file states. Regions
+    drawn on the photograph, or on a scaled copy, are then transferred to the view. Objects are numbered from
+    1 unless the file has ids. Without a photograph's name, the file's name counts.
+
+    Args:
+        notes: if annotations are left out, a sentence with their number and the reasons is appended.
 
     Raises:
-        SceneError: the format is unknown, or the file does not fit the scene.
+        HilsplatError: the format is unknown, the photograph is not in the scene, more than `MOST_INVALID` of
+            the annotations are invalid, or none can be used.
     """
-    readers = {"shapes": _from_labelme, "annotations": _from_coco, "objects": _from_isat}
-    try:
+    readers = {"shapes": _labelme_reader, "annotations": _coco_reader, "objects": _isat_reader}
+    with foreign(name, expected="a complete JSON file"):
         content = parse_json(text)
-        for key, read in readers.items():
-            if isinstance(content, dict) and isinstance(content.get(key), list):
-                return read(name, content, cameras)
-    except (TypeError, ValueError, KeyError, AttributeError, OverflowError) as error:
-        # Any value may be invalid or have an unexpected type: a list as an id, an infinite number.
-        raise SceneError(f"{name} cannot be read: {error}", expected="a complete JSON file") from error
-    raise SceneError(
-        f"{name} has an unknown format",
-        expected="the key 'objects' (ISAT, LERF-OVS, hilsplat), 'shapes' (labelme) or 'annotations' (COCO)",
-        found=f"keys {', '.join(content)}" if isinstance(content, dict) else type(content).__name__,
-    )
+        given = content if isinstance(content, dict) else {}
+        kind = next((key for key in readers if isinstance(given.get(key), list)), None)
+        if kind is None:
+            raise SceneError(
+                f"{name} has an unknown format",
+                expected="the key 'objects' (ISAT, hilsplat), 'shapes' (labelme) or 'annotations' (COCO)",
+                found=f"keys {', '.join(given)}" if given else type(content).__name__,
+                fix="export the annotations as COCO",
+            )
+        read = readers[kind](name, content, cameras)
+    pieces: dict[str, list[Piece]] = {}
+    left: Counter[str] = Counter()
+    errors: list[HilsplatError] = []  # of invalid annotations
+    for row, entry in enumerate(content[kind]):
+        try:
+            with foreign(where := f"{name}, {kind[:-1]} {row}"):
+                piece = read(where, entry)
+        except HilsplatError as error:
+            errors.append(error)
+            continue
+        if isinstance(piece, str):
+            left[piece] += 1
+        elif piece.rings:
+            pieces.setdefault(piece.view, []).append(piece)
+        else:
+            left["without pixels in the view"] += 1
+    found = {view: labels for view, same in pieces.items() if (labels := _joined(name, same, errors))}
+    total = len(content[kind])
+    if len(errors) > MOST_INVALID * total or (errors and not found):
+        errors[0].add_line("invalid", f"{len(errors)} of {total} annotations in {name}")
+        raise errors[0]
+    if errors:
+        left[f"invalid ({first_line(errors[0])})"] = len(errors)
+    reasons = "; ".join(f"{count} {reason}" for reason, count in left.items())
+    if left and not found:
+        raise SceneError(f"{name} has no annotation for this scene", found=f"annotations: {reasons}")
+    if left and notes is not None:
+        notes.append(f"{name}: {left.total()} of {total} annotations are left out: {reasons}")
+    return found
 
 
-Piece = tuple[str, Any, np.ndarray, Mapping[str, Any]]
-"""Text, identifier of the object (or None), vertices, and the keys in the file."""
-
-
-def _joined(name: str, pieces: Sequence[Piece]) -> list[Label]:
-    """Join pieces into one label per object; pieces without an identifier are separate objects."""
+def _joined(name: str, pieces: Sequence[Piece], errors: list[HilsplatError]) -> list[Label]:
+    """Join the pieces of a view into one label per object; append errors of invalid labels."""
     things: dict[Any, list[Piece]] = {}
     for row, piece in enumerate(pieces):
-        things.setdefault((piece[0], piece[1]) if piece[1] is not None else row, []).append(piece)
-    own = [same[0][1] for same in things.values()]
+        key = row if piece.number is None else repr((piece.text, piece.number))
+        things.setdefault(key, []).append(piece)
+    own = [same[0].number for same in things.values()]
     is_id = all(type(number) is int and number > 0 for number in own) and len(set(own)) == len(own)
-    numbers = own if is_id else range(1, 1 + len(own))
-    return [_label(name, number, same, is_id) for number, same in zip(numbers, things.values(), strict=True)]
-
-
-def _label(name: str, number: int, pieces: Sequence[Piece], has_ids: bool) -> Label:
-    text, _, _, keys = pieces[0]
-    return Label.read(
-        name,
-        id=number,
-        level=keys.get("level") or 1,
-        parent=keys.get("parent") if has_ids else None,
-        text=text,
-        polygons=[whole_pixels(piece[2]) for piece in pieces],
-        origin=keys.get("origin") or "drawn",
-    )
-
-
-def _from_isat(name: str, content: Mapping[str, Any], cameras: Cameras) -> dict[str, list[Label]]:
-    labels = parse_isat(Path(name), content)
-    view = _view(name, str(content["info"].get("name") or name), cameras, *labels.size_hw)
-    if labels.objects and all("id" in thing.keys for thing in labels.objects):
-        return {view: labels_of(labels)}
-    pieces: list[Piece] = []
-    for thing in labels.objects:
-        # Without our keys, groups are ignored: in LERF-OVS's files, group numbers are not unique.
-        group = thing.keys.get("group") if "level" in thing.keys else None
-        pieces += [(thing.category, group, polygon, thing.keys) for polygon in thing.polygons]
-    return {view: _joined(name, pieces)}
-
-
-def _from_labelme(name: str, content: Mapping[str, Any], cameras: Cameras) -> dict[str, list[Label]]:
-    image = str(content.get("imagePath") or name)
-    view = _view(name, image, cameras, content.get("imageHeight"), content.get("imageWidth"))
-    pieces: list[Piece] = []
-    for row, shape in enumerate(content["shapes"]):
-        where = f"{name}, shape {row}"
+    labels = []
+    for number, same in zip(own if is_id else range(1, 1 + len(own)), things.values(), strict=True):
+        keys = same[0].keys
         try:
-            points = np.array(shape["points"], np.float64).reshape(-1, 2)
-            kind, text = shape.get("shape_type", "polygon"), str(shape["label"])
-        except (TypeError, KeyError, ValueError) as error:
-            raise SceneError(f"{where} cannot be read: {error!r}", expected="label and points") from error
-        if kind == "rectangle" and len(points) == 2:
-            (x0, y0), (x1, y1) = points
-            points = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
-        elif kind != "polygon":
-            raise SceneError(
-                f"{where} ({text}) is a {kind}", expected="polygon or rectangle", fix="redraw it"
+            label = Label.read(
+                name,
+                id=number,
+                level=keys.get("level") or 1,
+                parent=keys.get("parent") if is_id else None,
+                text=same[0].text,
+                polygons=[ring for piece in same for ring in piece.rings],
+                origin=keys.get("origin") or "drawn",
             )
-        pieces.append((text, shape.get("group_id"), points, shape))
-    return {view: _joined(name, pieces)}
+            labels.append(label)
+        except SceneError as error:
+            errors.append(error)
+    return labels
 
 
-def _from_coco(name: str, content: Mapping[str, Any], cameras: Cameras) -> dict[str, list[Label]]:
-    try:
-        texts = {each["id"]: str(each["name"]) for each in content["categories"]}
-        images = {each["id"]: each for each in content["images"]}
-        views = {
-            number: _view(name, str(each["file_name"]), cameras, each.get("height"), each.get("width"))
-            for number, each in images.items()
-        }
-        found: dict[str, list[Label]] = {view: [] for view in views.values()}
-        for row, each in enumerate(content["annotations"]):
-            view = views[each["image_id"]]
-            where, size_hw = f"{name}, annotation {row}", cameras[view].size_hw
-            polygons = _coco_polygons(where, each["segmentation"], size_hw)
-            number, has_ids = each.get("thing", 1 + len(found[view])), "thing" in each
-            pieces = [(texts[each["category_id"]], None, polygon, each) for polygon in polygons]
-            if pieces:
-                found[view].append(_label(name, number, pieces, has_ids))
-    except (TypeError, KeyError) as error:
-        raise SceneError(f"{name} is not a COCO file: {error!r} is missing or has the wrong type") from error
-    return {view: labels for view, labels in found.items() if labels}
+Reader = Callable[[str, Any], Piece | str]
+"""Converts an annotation, quoting its place in errors, or returns the reason why it is left out."""
 
 
-def _coco_polygons(where: str, value: Any, size_hw: tuple[int, int]) -> list[np.ndarray]:
-    """Read polygons from flat lists x1, y1, x2, ..., or from run lengths, plain or compressed."""
-    if isinstance(value, list):
-        return [np.array(flat, np.float64).reshape(-1, 2) for flat in value]
-    counts = value["counts"]
-    if tuple(value["size"]) != tuple(size_hw):
-        raise SceneError(
-            f"{where} does not match the size of its photograph",
-            expected=f"size {list(size_hw)}",
-            found=value["size"],
-        )
-    runs = unpacked_counts(counts) if isinstance(counts, str) else [int(count) for count in counts]
-    if sum(runs) != size_hw[0] * size_hw[1] or min(runs, default=0) < 0:
-        raise SceneError(f"{where}: run lengths do not match the photograph's size", found=f"{sum(runs)} px")
-    values = np.arange(len(runs)) % 2 == 1  # the inverse of `web.coco.coco_counts`
-    return trace_polygons(np.ascontiguousarray(np.repeat(values, runs).reshape(size_hw[::-1]).T))
+def _isat_reader(name: str, content: Mapping[str, Any], cameras: Cameras) -> Reader:
+    drawn_hw = stated_size(name, content.get("info"))
+    view = _view(name, content["info"].get("name"), cameras)
+
+    def read(where: str, entry: Any) -> Piece:
+        thing = read_object(where, entry, drawn_hw, [])
+        # Without our keys, groups are ignored: in LERF-OVS's files, group numbers are not unique.
+        number = entry.get("id", entry.get("group") if "level" in entry else None)
+        rings = placed_rings(thing.polygons, drawn_hw, cameras[view], where)
+        return Piece(view, thing.category, number, rings, entry)
+
+    return read
 
 
-def unpacked_counts(text: str) -> list[int]:
-    """Decode COCO's compressed run lengths.
+def _labelme_reader(name: str, content: Mapping[str, Any], cameras: Cameras) -> Reader:
+    view = _view(name, content.get("imagePath"), cameras)
+    size = {side: content.get(f"image{side.title()}") for side in ("height", "width")}
 
-    Each character has five bits, low bits first; after three runs, each is relative to the run two earlier.
+    def read(where: str, entry: Any) -> Piece | str:
+        drawn_hw = _drawn_hw(where, size, cameras[view])
+        kind, text = entry.get("shape_type") or "polygon", entry["label"]
+        if kind in NO_AREA:
+            return "without an area (points, lines)"
+        points = _vertices(entry["points"], drawn_hw)
+        if kind == "polygon" and "level" in entry:  # exported by us
+            rings = placed_rings([points], drawn_hw, cameras[view], where)
+        else:
+            mask = _labelme_mask(f"{where} ({text})", kind, points, entry.get("mask"), drawn_hw)
+            rings = traced(placed(mask, cameras[view], where))
+        return Piece(view, text, entry.get("group_id"), rings, entry)
+
+    return read
+
+
+def _labelme_mask(
+    where: str, kind: str, points: Float[np.ndarray, "P 2"], patch: Any, size_hw: tuple[int, int]
+) -> Bool[np.ndarray, "H W"]:
+    """Return the region of a shape as labelme draws it: with Pillow, or as a PNG in base64 at a box."""
+    canvas = Image.new("1", size_hw[::-1])
+    draw = ImageDraw.Draw(canvas)
+    if kind == "mask" and len(points) == 2:
+        with open_image(io.BytesIO(base64.b64decode(patch))) as image:
+            pixels = Image.fromarray(np.asarray(image) != 0)
+        corner, opposite = np.rint(points).astype(int)
+        if (points == np.trunc(points)).all():  # labelme uses the box for whole numbers, else the PNG's size
+            pixels = pixels.crop((0, 0, *(opposite - corner + 1).tolist()))
+        canvas.paste(pixels, tuple(corner.tolist()))
+    elif kind == "circle" and len(points) == 2:
+        radius = math.dist(*points.tolist())
+        draw.ellipse([*(points[0] - radius), *(points[0] + radius)], fill=1, outline=1)
+    elif kind == "rectangle" and len(points) > 1:
+        draw.rectangle([*points.min(axis=0), *points.max(axis=0)], fill=1, outline=1)
+    elif kind in POLYGONS and len(points) > 2:
+        draw.polygon(points.ravel().tolist(), fill=1, outline=1)
+    else:
+        expected = "circle or mask (2 points), rectangle (2 or more) or polygon (3 or more)"
+        raise SceneError(f"{where} is a {kind} with {len(points)} points", expected=expected)
+    return np.asarray(canvas)
+
+
+def _coco_reader(name: str, content: Mapping[str, Any], cameras: Cameras) -> Reader:
+    images, categories = _by_id(content["images"]), _by_id(content["categories"])
+    used = {repr(each.get("image_id")) for each in content["annotations"] if isinstance(each, dict)}
+    files = {str(image.get("file_name")) for number, image in images.items() if number in used}
+    views = match_names(files, cameras.names)
+    num_files = Counter(views.values())
+    foreign_names = ", ".join(sorted(file for file in files if views[file] is None)[:3])
+
+    def read(where: str, entry: Any) -> Piece | str:
+        image = images.get(repr(entry.get("image_id")), {})
+        text = categories.get(repr(entry.get("category_id")), {}).get("name")
+        view, region = views.get(str(image.get("file_name"))), entry.get("segmentation")
+        if view is None:
+            return f"of images that are not in the scene ({foreign_names or 'unknown ids'})"
+        if num_files[view] > 1:  # such as copies that were cropped or mirrored for training
+            return "of different images whose names fit the same photograph"
+        if text is None:
+            return "of unknown categories"
+        if not region:
+            return "without a region (boxes, keypoints)"
+        mask = _coco_mask(where, region, image, cameras[view])
+        return Piece(view, str(text), entry.get("thing"), traced(placed(mask, cameras[view], where)), entry)
+
+    return read
+
+
+def _by_id(rows: Sequence[Any]) -> dict[str, dict[str, Any]]:
+    """Return rows by id; an id that different rows have is omitted."""
+    rows = [row for row in rows if isinstance(row, dict)]
+    found = {repr(row.get("id")): row for row in rows}
+    twice = {number for row in rows if found[number := repr(row.get("id"))] != row}
+    return {number: row for number, row in found.items() if number not in twice}
+
+
+def _coco_mask(where: str, region: Any, image: Mapping[str, Any], camera: Camera) -> Bool[np.ndarray, "H W"]:
+    """Fill polygons (flat lists x1, y1, x2, ...) or run lengths, plain or compressed, as pycocotools does.
+
+    The values are checked here, because pycocotools crashes or reads random memory if they are invalid.
     """
-    runs: list[int] = []
-    value = shift = 0
-    for character in text:
-        bits = ord(character) - 48
-        value |= (bits & 31) << shift
-        shift += 5
-        if bits & 32:
-            continue
-        if bits & 16:
-            value -= 1 << shift
-        runs.append(value + (runs[-2] if len(runs) > 2 else 0))
-        value = shift = 0
-    return runs
+    if isinstance(region, list):
+        size_hw = _drawn_hw(where, image, camera)
+        nested = region if isinstance(region[0], list) and len(region[0]) > 2 else [region]
+        polygons = [_vertices(flat, size_hw) for flat in nested]
+        flat = [points.ravel().tolist() for points in polygons if len(points) > 2]  # 2 points would be a box
+        if not flat:
+            return np.zeros(size_hw, bool)
+        return coco_masks.decode(coco_masks.merge(coco_masks.frPyObjects(flat, *size_hw))).astype(bool)
+    height, width = _drawn_hw(where, dict(zip(("height", "width"), region["size"], strict=True)), camera)
+    runs = {"size": [height, width], "counts": region["counts"]}
+    if not isinstance(runs["counts"], str):
+        runs = coco_masks.frPyObjects(runs, height, width)
+    elif not re.fullmatch("([P-o]{0,6}[0-O])+", runs["counts"]):
+        raise ValueError("the run lengths are damaged")
+    try:
+        coco_masks.decode({**runs, "size": [1, height * width - 1]})
+    except ValueError:  # as it must be: the run lengths don't fit into an image that lacks one pixel
+        return coco_masks.decode(runs).astype(bool)
+    raise ValueError("the run lengths do not cover the image")
 
 
-def _view(name: str, image: str, cameras: Cameras, height: Any, width: Any) -> str:
-    """Return the view whose photograph has the given name and size; folder and suffix are ignored."""
-    stem = Path(image.replace("\\", "/")).stem
-    view = next((each for each in cameras.names if Path(each).stem == stem), None)
+def _vertices(value: Any, size_hw: tuple[int, int]) -> Float[np.ndarray, "P 2"]:
+    """Return vertices, given as pairs or as a flat list; raise ValueError if one is far outside the image."""
+    points = np.array(value, np.float64).reshape(-1, 2)
+    share = points / size_hw[::-1]
+    if not ((share >= -SLACK) & (share <= 1 + SLACK)).all():  # also if it isn't a number
+        raise ValueError(f"a vertex is far outside the image of {size_hw[1]} x {size_hw[0]} px")
+    return points
+
+
+def _drawn_hw(where: str, image: Mapping[str, Any], camera: Camera) -> tuple[int, int]:
+    """Return the stated size of the image that was drawn on; without one, assume the view."""
+    if image.get("height") is None and image.get("width") is None:
+        return camera.size_hw
+    size_hw = stated_size(where, image)
+    placement(camera, size_hw, where)  # raises an error if the shape does not fit
+    return size_hw
+
+
+def _view(name: str, image: Any, cameras: Cameras) -> str:
+    """Return the view of a photograph, or else of the file; raise SceneError if there is none."""
+    view = match_name(image := str(image or name), cameras.names)
     if view is None:
-        raise SceneError(
-            f"{name} does not match a photograph in this scene",
-            expected=f"a name such as {cameras.names[0]}",
-            found=image,
-        )
-    size_hw = cameras[view].size_hw
-    if (height, width) != (None, None) and (height, width) != tuple(size_hw):
-        raise SceneError(
-            f"{name} does not match the size of its photograph",
-            expected=f"{size_hw[1]} x {size_hw[0]} px (width x height), undistorted",
-            found=f"{width} x {height} px",
-        )
+        expected = f"a name such as {cameras.names[0]}"
+        raise SceneError(f"{name} does not match a photograph in this scene", expected=expected, found=image)
     return view
 
 
@@ -337,13 +440,13 @@ def merged(
     for found in files:
         for view, labels in found.items():
             here = views.setdefault(view, [])
-            number_of: dict[int, int] = {}
+            number_of: dict[tuple[int, int], int] = {}  # of an id in the file and its level
             for label in sorted(labels, key=lambda label: label.level):
-                parent = number_of.get(label.parent) if label.parent is not None else None
+                parent = number_of.get((label.parent or 0, label.level - 1))
                 mask = label.mask(sizes_hw[view])
                 row = _row_of(label, mask, here, sizes_hw[view])
                 number = here[row].id if row is not None else _number(label, here, things)
-                number_of[label.id], things[number] = number, _kind(label)
+                number_of[label.id, label.level], things[number] = number, _kind(label)
                 label = label.model_copy(update={"id": number, "parent": parent})
                 if row is None:
                     here.append(label)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
+import cv2
 import numpy as np
 from jaxtyping import Bool
 from pydantic import AfterValidator, Field, ValidationError
@@ -19,8 +20,9 @@ from hilsplat.base.errors import SceneError, SettingsError
 from hilsplat.base.levels import Level
 from hilsplat.base.removal import delete
 from hilsplat.datasets.images.hi import by_id, parents_of
-from hilsplat.datasets.images.isat import IsatFile, fill_polygons, read_isat, trace_polygons
-from hilsplat.scene.cameras import Cameras
+from hilsplat.datasets.images.isat import IsatFile, Polygon, fill_polygons, read_isat, trace_polygons
+from hilsplat.scene.cameras import Camera, Cameras
+from hilsplat.scene.placement import placement
 from hilsplat.web.file_changes import replacing, version_of
 from hilsplat.web.messages import MAX_SIDE_PX, Message, Text
 
@@ -78,6 +80,28 @@ def traced(mask: Bool[np.ndarray, "H W"]) -> list[list[tuple[int, int]]]:
     return [whole_pixels(polygon) for polygon in trace_polygons(mask)]
 
 
+def placed(mask: Bool[np.ndarray, "H W"], camera: Camera, where: str) -> Bool[np.ndarray, "h w"]:
+    """Transfer a mask drawn on a view's photograph, or on a scaled copy of either, to the view's pixels.
+
+    Each pixel takes the value at its centre. For errors, see `placement`.
+    """
+    if (place := placement(camera, mask.shape, where)) is not None:
+        return place(mask)
+    if mask.shape == camera.size_hw:
+        return mask
+    size = camera.size_hw[::-1]
+    return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT).astype(bool)
+
+
+def placed_rings(
+    polygons: Sequence[Polygon], drawn_hw: tuple[int, int], camera: Camera, where: str
+) -> list[list[tuple[int, int]]]:
+    """Transfer polygons as `placed` does, from an image of the given size."""
+    if drawn_hw == camera.size_hw:
+        return [whole_pixels(polygon) for polygon in polygons]
+    return traced(placed(fill_polygons(polygons, drawn_hw), camera, where))
+
+
 def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[Label]:
     """Cut every child to its parent, coarse to fine, so that subparts also stay inside their wholes.
 
@@ -122,28 +146,39 @@ def label_path(folder: Path, view: str) -> Path:
     return Path(folder) / f"{Path(view).stem}.json"
 
 
-def read_labels(path: Path, size_hw: tuple[int, int]) -> list[Label]:
+def read_labels(path: Path, size_hw: tuple[int, int], camera: Camera | None = None) -> list[Label]:
     """Read the annotations of a view; empty if there is no file.
 
+    With the view's camera, labels drawn on its photograph or on a scaled copy are transferred to the view;
+    labels outside the view are left out.
+
     Raises:
-        SceneError: the file is invalid, or was drawn on a photograph of a different size.
+        SceneError: the file is invalid, or was drawn on an image of a different size.
+        MisalignedArtifactError: its size fits neither the camera nor the photograph.
     """
     if not path.is_file():
         return []
     found = read_isat(path)
-    if found.size_hw != tuple(size_hw):
+    if found.size_hw != tuple(size_hw) and camera is None:
         raise SceneError(
             f"label file {path} does not match the size of its photograph",
             expected=f"{size_hw[1]} x {size_hw[0]} px (width x height)",
             found=f"{found.size_hw[1]} x {found.size_hw[0]} px",
             fix="annotate the scene on which the labels were drawn, or move the file elsewhere",
         )
-    return labels_of(found)
+    labels, where = labels_of(found), f"label file {path}"
+    if camera is None:
+        return labels
+    rings = [placed_rings(label.polygons, found.size_hw, camera, where) for label in labels]
+    moved = zip(labels, rings, strict=True)
+    return [label.model_copy(update={"polygons": polygons}) for label, polygons in moved if polygons]
 
 
 def known_labels(folder: Path, cameras: Cameras, views: Sequence[str]) -> dict[str, list[Label]]:
     """Return the annotations of all annotated views; for errors, see `read_labels`."""
-    found = {view: read_labels(label_path(folder, view), cameras[view].size_hw) for view in views}
+    found = {
+        view: read_labels(label_path(folder, view), cameras[view].size_hw, cameras[view]) for view in views
+    }
     return {view: labels for view, labels in found.items() if labels}
 
 
@@ -165,7 +200,7 @@ def labels_of(found: IsatFile) -> list[Label]:
     ]
 
 
-def whole_pixels(points: np.ndarray) -> list[tuple[int, int]]:
+def whole_pixels(points: Polygon) -> list[tuple[int, int]]:
     """Truncate vertices to whole pixels, as polygon filling does."""
     return [(int(x), int(y)) for x, y in points]
 

@@ -1,6 +1,5 @@
 """Rules for names in paths, image lists of folders, and paths in the installed project."""
 
-import os
 import re
 from collections.abc import Collection
 from pathlib import Path, PureWindowsPath
@@ -54,20 +53,6 @@ def regular(path: Path) -> Path:
 def list_images(folder: Path) -> list[Path]:
     """Return the image files in a folder, sorted; skip hidden files."""
     return list_files(folder, IMAGE_SUFFIXES)
-
-
-DEEPEST = 4
-"""Maximum depth of folders in which images of a source are searched."""
-
-
-def images_below(folder: Path) -> list[Path]:
-    """Return the image files in a folder and the folders below it, sorted; skip hidden ones."""
-    found = []
-    for place, folders, _ in os.walk(folder):
-        depth = len(Path(place).relative_to(folder).parts)
-        folders[:] = [name for name in sorted(folders) if name[0] != "." and depth < DEEPEST]
-        found += list_images(Path(place))
-    return found
 
 
 def list_files(folder: Path, suffixes: Collection[str]) -> list[Path]:

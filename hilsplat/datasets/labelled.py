@@ -4,8 +4,9 @@ Labels, images and poses are keyed by view name ("frame_00041.png", see `scene.v
 a label matches its image and camera even if other views are missing.
 """
 
+import logging
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,14 +17,18 @@ from jaxtyping import Bool, Int
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import list_images
-from hilsplat.base.images import opened_image
+from hilsplat.base.images import opened_image, read_mask
 from hilsplat.base.levels import Level, plain_text
 from hilsplat.datasets.dataset import SceneReport
+from hilsplat.scene.cameras import Camera
 from hilsplat.scene.layouts import find_known_poses
+from hilsplat.scene.placement import placement
 from hilsplat.scene.view_names import view_name
 
 if TYPE_CHECKING:  # imports pycolmap, which evaluation doesn't need
     from hilsplat.scene.importers.known_views import KnownView
+
+logger = logging.getLogger(__name__)
 
 ROUNDING_PX = 1.0
 """Rounding tolerance, px, for the height of a label scaled to the width of its image."""
@@ -63,6 +68,25 @@ class LabelledRegion:
             return mask
         return cv2.resize(mask.astype(np.uint8), size_hw[::-1], interpolation=cv2.INTER_NEAREST).astype(bool)
 
+    def on(self, camera: Camera, where: str) -> "LabelledRegion":
+        """Return the region on a view if it was drawn on the view's photograph; else the same region.
+
+        A box becomes the extent of its pixels in the view; a box outside the view is omitted. For errors, see
+        `placement`.
+        """
+        place = placement(camera, self.size_hw, where)
+        if place is None:
+            return self
+        boxes, grey = self.boxes_xyxy, self.any_grey
+        if boxes is not None:
+            # Row and column in the photograph, from 1, because pixels outside it are 0.
+            rows, columns = map(place, np.indices(self.size_hw, np.uint16) + np.uint16(1))
+            left, top, right, bottom = (boxes.T + 1)[:, :, None, None]
+            inside = (rows >= top) & (rows <= bottom) & (columns >= left) & (columns <= right)
+            boxes = np.concatenate([boxes[:0], *map(extent, inside)])
+        placed = replace(self, size_hw=camera.size_hw, boxes_xyxy=boxes, pixels=lambda: place(self.pixels()))
+        return placed if grey is None else replace(placed, any_grey=lambda: place(grey()))
+
     def boxes(self, size_hw: tuple[int, int] | None = None) -> Int[np.ndarray, "B 4"]:
         """Return the annotated boxes, borders included, or the region's extent if no box is annotated.
 
@@ -71,16 +95,19 @@ class LabelledRegion:
         """
         boxes = self.boxes_xyxy
         if boxes is None:
-            mask = self.pixels()
-            rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-            if not len(rows):
-                return np.zeros((0, 4), dtype=np.int64)
-            boxes = np.array([[columns[0], rows[0], columns[-1], rows[-1]]])
+            boxes = extent(self.pixels())
         if size_hw is None or tuple(size_hw) == self.size_hw:
             return boxes
         scale = np.array([size_hw[1] / self.size_hw[1], size_hw[0] / self.size_hw[0]] * 2)
         scaled = np.floor((boxes + 0.5) * scale).astype(np.int64)
         return np.clip(scaled, 0, np.array([size_hw[1], size_hw[0]] * 2) - 1)
+
+
+def extent(mask: Bool[np.ndarray, "H W"]) -> Int[np.ndarray, "B 4"]:
+    """Return the box of a mask, xyxy with borders included; no box if the mask is empty."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    boxes = [[columns[0], rows[0], columns[-1], rows[-1]]] if len(rows) else []
+    return np.array(boxes, np.int64).reshape(-1, 4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +119,8 @@ class LabelledScene:
         poses: folder in which `find_known_poses` finds poses; None if the scene has none.
         views: labelled regions by view, in label order.
         warnings: one sentence for each item that was reinterpreted or is doubtful.
+        least_posed: minimum share of labelled views with a pose. Scores of a published data set are
+            comparable only if every labelled view counts.
     """
 
     dataset: str
@@ -100,6 +129,7 @@ class LabelledScene:
     poses: Path | None
     views: Mapping[str, tuple[LabelledRegion, ...]]
     warnings: tuple[str, ...] = ()
+    least_posed: float = 1.0
 
     def __post_init__(self) -> None:
         """Add a warning for each text that resembles another one."""
@@ -119,17 +149,26 @@ class LabelledScene:
         """Number of (view, text) pairs."""
         return sum(len({region.text for region in regions}) for regions in self.views.values())
 
-    def check_posed(self, names: Collection[str]) -> None:
-        """Raise a SceneError that lists the labelled views without a pose, if there are any."""
+    def check_posed(self, names: Collection[str]) -> list[str]:
+        """Return the labelled views that have a pose; log the others.
+
+        Raises:
+            SceneError: the share of views that have one is below `least_posed`.
+        """
+        posed = [view for view in self.views if view in names]
         missing = [view for view in self.views if view not in names]
-        if missing:
+        lacking = f"labelled views of {self.dataset}/{self.scene} have no pose: {', '.join(missing)}"
+        if len(posed) < self.least_posed * len(self.views):
             shown = [*sorted(names)[:5], *(["..."] if len(names) > 5 else [])]
             raise SceneError(
-                f"labelled views of {self.dataset}/{self.scene} have no pose: {', '.join(missing)}",
-                expected=f"a pose for each of the {len(self.views)} labelled views",
+                lacking,
+                expected=f"a pose for {self.least_posed:.0%} of the {len(self.views)} labelled views",
                 found=f"{len(names)} posed views: {', '.join(shown)}",
                 fix="use the poses included in the data set, or register these images",
             )
+        if missing:
+            logger.warning("%s; they are not scored", lacking)
+        return posed
 
     def report(self) -> SceneReport:
         """Read every mask and the poses of the scene, and report what was found."""
@@ -209,9 +248,8 @@ def mask_region(
 
 
 def read_mask_file(path: Path, least: int) -> Bool[np.ndarray, "H W"]:
-    """Return which values in a grey mask file are at least `least`; raise ImageError if it is damaged."""
-    with opened_image(path, "mask") as image:
-        return np.asarray(image.convert("L")) >= least
+    """Return which values in a mask file (`read_mask`) are at least `least`."""
+    return read_mask(path) >= least
 
 
 def check_label_size(
@@ -260,6 +298,7 @@ def posed_images(folder: Path, dataset: str) -> dict[str, "KnownView"]:
         SceneError: the folder has no poses, they cannot be read, or the lenses have distortion, which
             would misalign labels drawn on undistorted images.
     """
+    from hilsplat.scene.colmap import is_pinhole
     from hilsplat.scene.importers.known_views import read_source
 
     known = find_known_poses(folder)
@@ -269,8 +308,9 @@ def posed_images(folder: Path, dataset: str) -> dict[str, "KnownView"]:
             expected="a COLMAP model in sparse/0/",
             fix=f"unpack the whole archive of {dataset} again",
         )
-    views = read_source(known)[0]
-    bent = sorted({view.camera.model.name for view in views if not view.camera.is_undistorted()})
+    source = read_source(known)
+    source.require_most(1.0, known.files[0])
+    bent = sorted({view.camera.model_name for view in source.views if not is_pinhole(view.camera)})
     if bent:
         raise SceneError(
             f"the cameras in {known.files[0]} have lens distortion",
@@ -278,5 +318,5 @@ def posed_images(folder: Path, dataset: str) -> dict[str, "KnownView"]:
             found=", ".join(bent),
             fix="use the COLMAP model of the undistorted images, or undistort images and labels",
         )
-    by_stem = {Path(view.name).stem: view for view in views}
+    by_stem = {Path(view.name).stem: view for view in source.views}
     return {view_name(stem): by_stem[stem] for stem in sorted(by_stem)}

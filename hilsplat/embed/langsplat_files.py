@@ -18,6 +18,8 @@ from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel, unit
+from hilsplat.scene.cameras import Camera
+from hilsplat.scene.placement import placement
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import MASKS_SHA256, digest_of, index_entry
 from hilsplat.segment.masks import HierarchicalMasks, runs_of_labels
@@ -26,8 +28,6 @@ from hilsplat.settings import ClipSettings
 
 logger = logging.getLogger(__name__)
 
-SHAPE_TOLERANCE = 0.01
-"""Maximum relative difference in aspect ratio between maps and view that is attributed to rounding."""
 LEAST_SHARE = 0.5
 """Minimum share of training views with files; if fewer, the files probably belong to a different scene."""
 CHECKED_MASKS, LEAST_COSINE = 32, 0.8
@@ -52,17 +52,18 @@ def stems_of(views: list[str]) -> dict[str, str]:
 
 
 def read_view(
-    folder: Path, view: str, size_hw: tuple[int, int]
+    folder: Path, view: str, size_hw: tuple[int, int], camera: Camera | None = None
 ) -> tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]:
     """Read the masks and vectors of one view, with rows in `content_order`.
 
     The mixed-level map is ignored. Where masks of one level overlap, the files contain only the mask
-    painted last. The files contain no scores, so predicted IoU and stability are set to 1. Maps of a
-    different size but the same aspect ratio, such as LangSplat's 1080 rows, are resampled (nearest pixel).
+    painted last. The files contain no scores, so predicted IoU and stability are set to 1. With the view's
+    camera, maps of its photograph or of a scaled copy, such as LangSplat's 1080 rows, are transferred to the
+    view (nearest pixel).
 
     Raises:
         ArtifactError: a file is missing, damaged, pickled, or in a different format.
-        MisalignedArtifactError: the maps' aspect ratio differs from the view's.
+        MisalignedArtifactError: the maps have a different size, and fit neither camera nor photograph.
     """
     maps_path, vectors_path = (folder / f"{stem_of(view)}_{kind}.npy" for kind in "sf")
     maps, vectors = read_npy(maps_path), read_npy(vectors_path)
@@ -84,14 +85,12 @@ def read_view(
             fix="use two files from the same preprocessing run",
         )
     height, width = labels.shape[1:]
-    if (height, width) != size_hw:
-        if abs(height * size_hw[1] / (width * size_hw[0]) - 1) > SHAPE_TOLERANCE:
-            raise MisalignedArtifactError(
-                f"{maps_path} and view {view} differ in aspect ratio",
-                expected=f"{size_hw} (height, width), or the same aspect ratio",
-                found=f"{(height, width)}",
-                fix="create the map from the view's image; undistortion changes an image's size",
-            )
+    if (height, width) != size_hw and camera is None:
+        wrong = f"{maps_path} does not match the size of view {view}"
+        raise MisalignedArtifactError(wrong, expected=size_hw, found=(height, width))
+    if camera is not None and (move := placement(camera, (height, width), str(maps_path))) is not None:
+        labels = np.stack([move(each + 1) - 1 for each in labels])  # 0 is outside the photograph
+    else:
         rows = ((np.arange(size_hw[0]) + 0.5) * height / size_hw[0]).astype(int)
         columns = ((np.arange(size_hw[1]) + 0.5) * width / size_hw[1]).astype(int)
         labels = labels[:, rows[:, None], columns]
@@ -126,8 +125,9 @@ def _read_all(scene: Scene, folder: Path) -> dict[str, tuple[HierarchicalMasks, 
         )
     if missing:
         logger.warning("%s: %s", lacking, ", ".join(missing[:5]))
-    sizes = {view: scene.cameras[view].size_hw for view in views}
-    return {view: read_view(folder, view, sizes[view]) for view in track(views, "LangSplat's files")}
+    cameras = {view: scene.cameras[view] for view in views}
+    posed = track(list(cameras.items()), "LangSplat's files")
+    return {view: read_view(folder, view, camera.size_hw, camera) for view, camera in posed}
 
 
 def read_masks(scene_folder: Path, files: Path, out: Path) -> None:

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from hilsplat.base.artifacts import read_npz
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, SettingsError
-from hilsplat.base.images import opened_image
+from hilsplat.base.images import read_mask
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import stage_log
 from hilsplat.datasets.labelled import image_size_hw
@@ -284,7 +284,8 @@ def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.nd
             fix="write them, or create an empty folder if nothing was found",
         )
     files = sorted(place.rglob("*.png"))
-    return {_key(path.relative_to(place).with_suffix("").as_posix()): _read_png(path) for path in files}
+    names = {path: _key(path.relative_to(place).with_suffix("").as_posix()) for path in files}
+    return {name: _as_mask(read_mask(path), str(path)) for path, name in names.items()}
 
 
 def read_point_classes(path: Path, num_points: int) -> Int64[np.ndarray, " P"]:
@@ -347,12 +348,6 @@ def read_point_instances(
 def _key(name: str) -> tuple[str, str]:
     first, _, rest = name.partition("/")
     return (first, rest) if rest and first in [level.label for level in LEVELS] else ("", name)
-
-
-def _read_png(path: Path) -> Bool[np.ndarray, "h w"]:
-    with opened_image(path, "mask") as image:
-        grey = np.asarray(image.convert("L"))
-    return _as_mask(grey, str(path))
 
 
 def _as_mask(array: np.ndarray, where: str) -> Bool[np.ndarray, "h w"]:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from hilsplat.base.errors import SceneError, in_one_line
+from hilsplat.base.errors import SceneError, foreign, in_one_line
 from hilsplat.base.files import list_images
 from hilsplat.scene.layouts import (
     NO_POSES,
@@ -14,7 +14,9 @@ from hilsplat.scene.layouts import (
     langsplat_features,
     langsplat_level,
     photo_folder,
+    read_json_object,
     trained_gaussians,
+    vertex_count,
 )
 from hilsplat.scene.view_names import match_names, view_names
 from hilsplat.settings import PosesSettings
@@ -95,8 +97,6 @@ def _gaussians(folder: Path, named: dict[str, Path | None], found: Findings) -> 
     if named["gaussians"] is None and not has_known_poses(folder, named["poses"]):
         found.lines.append(f"Gaussians: not used, because they need the poses they were made with: {ply}")
         return
-    from hilsplat.splat.ply import vertex_count
-
     found.columns["gaussians"] = ply.resolve()
     found.lines.append(f"Gaussians: {vertex_count(ply) or 'unknown number'} from {ply}")
     if others:
@@ -129,14 +129,13 @@ def _labels(folder: Path, named: Path | None, views: list[str], found: Findings)
             raise SceneError(f"--labels {named} contains no label file", expected=expected)
     if not files:
         return
-    from hilsplat.datasets.images.isat import read_isat  # OpenCV
-
     lost: dict[str, str] = {}
     num_objects = 0
     matched = match_names([path.stem for path in files], views)
     for path in files:
         try:
-            num_objects += len(read_isat(path).objects)
+            with foreign(path, expected="an ISAT file, as in LERF-OVS"):
+                num_objects += len(list(read_json_object(path, "export it again")["objects"]))
             found.labels.append(path)
         except SceneError as error:
             lost[path.name] = in_one_line(error)

@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import groupby, pairwise
 from pathlib import Path
 
@@ -11,12 +11,13 @@ import av
 import cv2
 import numpy as np
 from av.container import InputContainer
+from av.stream import Disposition
 from av.video.stream import VideoStream
 from jaxtyping import Int64, UInt8
 from PIL import Image
 
 from hilsplat.base.artifacts import sha256_of_file, write_json
-from hilsplat.base.errors import SceneError
+from hilsplat.base.errors import SceneError, foreign
 from hilsplat.base.progress import track
 from hilsplat.photos.video_colours import rgb_pixels
 
@@ -70,12 +71,13 @@ class Frame:
 
 @dataclass
 class Decoding:
-    """Decoding statistics: duration in the file's metadata, time of the last intact frame, and counts."""
+    """Decoding statistics: duration in the file's metadata, time of the last intact frame, counts, notes."""
 
     stated_s: float | None = None
     decoded_s: float = 0.0
     num_frames: int = 0
     num_damaged: int = 0
+    notes: list[str] = field(default_factory=list)
 
 
 def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str]:
@@ -83,8 +85,9 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
 
     The camera path through all videos, measured by the displacement of image corners, is divided into `count`
     sections of equal length, and the sharpest frame of each is selected. A camera at rest yields one frame; a
-    short path yields fewer than `count`. Frames are rotated upright according to the stream's display matrix,
-    and stored as 0001.jpg, 0002.jpg, ... at full size and quality 95. The same videos produce the same bytes.
+    short path yields fewer than `count`. Frames are stretched to square pixels, rotated upright according to
+    the stream's display matrix, and stored as 0001.jpg, 0002.jpg, ... at full size and quality 95. The same
+    videos produce the same bytes.
 
     A video is decoded twice, once to select and once to write frames, so that only small copies are kept
     in memory.
@@ -96,13 +99,15 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
     candidates: list[Frame] = []
     for position, video in enumerate(videos):
         decoding = Decoding()
-        candidates += _candidates(video, position, CANDIDATES_PER_FRAME * count, decoding)
+        with foreign(f"video {video}", fix="convert it to H.264 in an .mp4"):
+            candidates += _candidates(video, position, CANDIDATES_PER_FRAME * count, decoding)
         if not decoding.num_frames:
             raise SceneError(
                 f"no frame of video {video} can be decoded",
                 found=f"{decoding.num_damaged} damaged packets, {video.stat().st_size} bytes",
                 fix="play it to see whether it is intact; copy it again, or convert it to H.264 in an .mp4",
             )
+        notes += [f"{video.name}: {note}" for note in decoding.notes]
         if decoding.num_damaged:
             notes.append(f"{video.name}: {decoding.num_damaged} damaged packets or frames were skipped")
         if decoding.stated_s is not None and decoding.decoded_s < 0.9 * decoding.stated_s - 1:
@@ -135,26 +140,31 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
 
 @contextmanager
 def _opened(video: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """Open the first video stream of a file."""
-    try:
+    """Open the best video stream of a file; cover art and other attached pictures are never opened."""
+    expected = "an intact .mp4, .mov, .mkv, .webm or .avi; a truncated .mp4 or .mov lacks its index"
+    fix = "copy it again from the camera, or convert it to H.264 in an .mp4"
+    with foreign(f"video {video}", expected=expected, fix=fix):
         container = av.open(f"file:{video}", metadata_errors="replace", options=OPTIONS | LIMIT)
-    except (av.error.FFmpegError, OSError) as error:
-        raise SceneError(
-            f"video {video} cannot be read: {error.strerror or error}",
-            expected="an intact .mp4, .mov, .mkv, .webm or .avi; a truncated .mp4 or .mov lacks its index",
-            found=f"a file of {video.stat().st_size} bytes" if video.is_file() else "no file",
-            fix="copy it again from the camera, or convert it to H.264 in an .mp4",
-        ) from error
     with container:
-        if not container.streams.video:
+        picture = Disposition.attached_pic | Disposition.timed_thumbnails | Disposition.still_image
+        decodable = [s for s in container.streams.video if s.codec_context and not s.disposition & picture]
+        if not decodable:
             raise SceneError(
                 f"{video} has no video stream",
                 found=", ".join(stream.type for stream in container.streams) or "no stream",
-                fix="pass a file that contains video",
+                fix="pass a file that contains video, not only cover art, in a codec that FFmpeg decodes",
             )
-        stream = container.streams.video[0]
-        if stream.width * stream.height > MAX_FRAME_PX:
-            expected, found = "frames of at most 8192 x 4352 px", f"{stream.width} x {stream.height} px"
+        # Thumbnails have one frame or these codecs. FFmpeg's choice may only reflect the order of streams.
+        thumbnail, best = ("mjpeg", "png"), container.streams.best("video")
+        rank_of = {
+            s: (s.frames != 1, s.codec_context.name not in thumbnail, s.width * s.height, s == best)
+            for s in decodable
+        }
+        stream = max(rank_of, key=rank_of.__getitem__)
+        aspect = float(stream.sample_aspect_ratio or 1)
+        if not 0.1 < aspect < 10 or stream.width * stream.height * max(aspect, 1) > MAX_FRAME_PX:
+            expected = "frames of at most 8192 x 4352 px"
+            found = f"{stream.width} x {stream.height} px with a pixel aspect ratio of {aspect:.3g}"
             raise SceneError(f"video {video} is too large", expected=expected, found=found, fix="rescale it")
         stream.codec_context.options = LIMIT  # frames may be larger than the header states
         stream.thread_type = "AUTO"
@@ -199,14 +209,20 @@ def _candidates(video: Path, position: int, most: int, decoding: Decoding) -> li
     """
     best: dict[int, Frame] = {}
     with _opened(video) as (container, stream):
+        if (num_streams := len(container.streams.video)) > 1:
+            used = f"{stream.index} ({stream.width} x {stream.height} px)"
+            decoding.notes.append(f"video stream {used} is used, the best of {num_streams}")
         if stream.duration is not None and stream.time_base is not None:
             decoding.stated_s = float(stream.duration * stream.time_base)
         elif container.duration is not None:
-            decoding.stated_s = container.duration / av.time_base
+            # Matroska's duration may include the time before the first frame.
+            decoding.stated_s = (container.duration - max(container.start_time or 0, 0)) / av.time_base
         span_s = max((decoding.stated_s or 0.0) / most, 1e-3)
         expected = round((decoding.stated_s or 0.0) * float(stream.average_rate or USUAL_RATE)) or None
         decoded = track(_decoded(container, stream, decoding), f"frames of {video.name}", expected)
         for number, (frame, time_s) in enumerate(decoded):
+            if number == 0 and frame.interlaced_frame:
+                decoding.notes.append("it is interlaced: deinterlace it first if edges are combed")
             row = int(time_s / span_s)
             score = sharpness(_grey(frame, SHARPNESS_SIDE_PX))
             if row in best and best[row].sharpness >= score:
@@ -232,7 +248,8 @@ def _write_frames(video: Path, name_of_frame: dict[int, str], folder: Path) -> N
         for number, (frame, _) in enumerate(_decoded(container, stream, Decoding())):
             if number in missing:
                 # The display matrix rotates anticlockwise; only quarter turns are applied.
-                pixels = np.ascontiguousarray(np.rot90(rgb_pixels(frame), round(frame.rotation / 90) % 4))
+                square = rgb_pixels(frame, round(frame.width * (stream.sample_aspect_ratio or 1)))
+                pixels = np.ascontiguousarray(np.rot90(square, round(frame.rotation / 90) % 4))
                 Image.fromarray(pixels).save(folder / missing.pop(number), quality=JPEG_QUALITY)
             if not missing:
                 break

@@ -34,8 +34,8 @@ BT709_FROM_BT2020: Float64[np.ndarray, "3 3"] = np.array(
 BT2020_LUMA = np.array([0.2627, 0.6780, 0.0593], dtype=np.float32)
 
 
-def rgb_pixels(frame: VideoFrame) -> UInt8[np.ndarray, "H W 3"]:
-    """Convert a decoded frame to 8-bit sRGB, without rotating it.
+def rgb_pixels(frame: VideoFrame, width: int | None = None) -> UInt8[np.ndarray, "H W 3"]:
+    """Convert a decoded frame to 8-bit sRGB, scaled to a width (px) if given, without rotating it.
 
     If a stream states no matrix, video players' default is used: BT.709 for 720 lines or more, else BT.601.
     HDR (PQ or HLG) is converted to linear light with BT.709 primaries and compressed highlights.
@@ -47,7 +47,9 @@ def rgb_pixels(frame: VideoFrame) -> UInt8[np.ndarray, "H W 3"]:
         matrix = BT709 if min(frame.width, frame.height) >= 720 else BT601
     is_hdr = int(frame.color_trc) in (PQ, HLG)
     kind = "rgb48le" if is_hdr else "rgb24"
-    pixels = frame.reformat(format=kind, src_colorspace=matrix, interpolation=exact, threads=1).to_ndarray()
+    pixels = frame.reformat(
+        width, format=kind, src_colorspace=matrix, interpolation=exact, threads=1
+    ).to_ndarray()
     if not is_hdr:
         return pixels
     is_hlg = int(frame.color_trc) == HLG

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from hilsplat.base.artifacts import parse_json
-from hilsplat.base.errors import HilsplatError, SceneError, foreign
-from hilsplat.base.files import list_images, regular
+from hilsplat.base.artifacts import parse_json, visible_files
+from hilsplat.base.errors import HilsplatError, SceneError, first_line
+from hilsplat.base.files import IMAGE_SUFFIXES, list_images, regular
 
 TRAINED = ("output", "outputs", "exports", "language_features")
 """Folders that 3DGS, nerfstudio and LangSplat write beside photographs."""
@@ -31,13 +31,29 @@ EXPORTED = ("exports/*/splat.ply", "exports/splat.ply", "splat.ply", "point_clou
 """Paths of a PLY exported by nerfstudio or a viewer; a PLY written by 3DGS is preferred."""
 
 
+HEADER_BYTES = 2**14  # number of bytes that are searched for the vertex count
+
+
 def read_json_object(path: Path, fix: str) -> dict[str, Any]:
     """Read another program's JSON object; raise SceneError with the given fix if it cannot be read."""
-    with foreign(path, expected="valid JSON in UTF-8", fix=fix):
+    try:
         content = parse_json(regular(path).read_text(encoding="utf-8-sig"))
+    except Exception as error:
+        raise SceneError(f"{path} is not valid JSON: {first_line(error)}", fix=fix) from error
     if not isinstance(content, dict):
         raise SceneError(f"{path} is not a JSON object", found=type(content).__name__, fix=fix)
     return content
+
+
+def vertex_count(path: Path) -> int | None:
+    """Return the number of Gaussians in a PLY's header; None if unreadable (its reader says so)."""
+    try:
+        with regular(Path(path)).open("rb") as stream:
+            header = stream.read(HEADER_BYTES)
+    except OSError:
+        return None
+    found = re.search(rb"^element vertex ([0-9]+)\s*$", header, re.MULTILINE)
+    return int(found[1]) if found else None
 
 
 def trained_gaussians(folder: Path) -> list[Path]:
@@ -135,12 +151,12 @@ def photo_folder(folder: Path) -> Path:
 
 def folders_with_images(folder: Path) -> dict[Path, int]:
     """Return the number of images of each folder with images, up to two levels below a source."""
+    images = (path for path in visible_files(folder) if path.suffix.lower() in IMAGE_SUFFIXES)
+    counts = Counter(path.parent for path in images)
     return {
         place: count
-        for pattern in ("*/", "*/*/")
-        for place in sorted(folder.glob(pattern))
-        if not any(part[0] == "." or part in TRAINED for part in place.relative_to(folder).parts)
-        if (count := len(list_images(place)))
+        for place, count in sorted(counts.items())
+        if 1 <= len(parts := place.relative_to(folder).parts) <= 2 and not set(parts) & set(TRAINED)
     }
 
 

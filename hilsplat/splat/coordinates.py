@@ -15,7 +15,7 @@ from hilsplat.base.rotations import are_rotations, multiply, quaternion_of
 from hilsplat.scene.importers.nerfstudio import source_from_dataparser
 from hilsplat.scene.scene import Scene
 from hilsplat.splat.gaussians import Gaussians
-from hilsplat.splat.ply import load_ply, save_ply
+from hilsplat.splat.ply import import_ply, load_ply, save_ply
 
 logger = logging.getLogger(__name__)
 
@@ -172,7 +172,8 @@ def import_gaussians(
     Raises:
         ArtifactError: if the file cannot be used.
     """
-    gaussians = load_ply(ply, fix=FIX)
+    gaussians, notes, unknown = import_ply(ply, FIX)
+    notes += [f"unknown properties are not used: {', '.join(unknown)}"] if unknown else []
     if len(gaussians) == 0:
         raise ArtifactError(f"{ply} contains no Gaussians", fix=FIX)
     source_from_ply = read_source_from_scene(ply)
@@ -184,12 +185,14 @@ def import_gaussians(
     elif dataparser is not None:
         transform = transform @ source_from_dataparser(dataparser, transforms)
         moved = f"in nerfstudio's training coordinates, from {dataparser.name}"
-    logger.info("%s: %d Gaussians from %s, %s", scene.name, len(gaussians), ply, moved)
+    said = "; ".join([moved, *notes])
+    logger.info("%s: %d Gaussians from %s, %s", scene.name, len(gaussians), ply, said)
     origin = {
         "kind": "imported",
         "file": ply.name,  # its folder is in the provenance record
         "sha256": sha256_of_file(ply),
         "taken_as": moved,
+        "notes": notes,
         "scene_from_ply": np.asarray(transform).tolist(),
     }
     return move_gaussians(gaussians, transform), origin

@@ -4,15 +4,34 @@ import re
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
-from plyfile import PlyData, PlyElement, PlyParseError
+from jaxtyping import Bool, Float, Float32, Float64
+from plyfile import PlyData, PlyElement
 
 from hilsplat.base.artifacts import atomic_path, remake
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.errors import ArtifactError, foreign
 from hilsplat.base.files import regular
 from hilsplat.splat.gaussians import Gaussians
 
-HEADER_BYTES = 2**14  # number of bytes that are searched for the vertex count
+SATURATED_LOGIT = 16.0  # replaces infinite opacity logits; a float32 sigmoid of 17 is 1
+LARGEST = 1e15  # values and scales above it overflow when squared in float32
+MAX_UNUSABLE = 0.5  # share of unusable Gaussians above which a PLY is not imported
+UNUSABLE = "contain a non-finite or huge number, or have no rotation (rot_0..3 are zero)"
+
+HARMLESS = re.compile(
+    r"n[xyz]|red|green|blue|alpha|[rgb]|id|confidence|quality|intensity|radius|state|flags|face|camera|node_\w+"
+    r"|extrinsic|intrinsic|image_size|frame|disparity|color_space|version"
+    r"|\w*(normal|label|class|object|instance|segment|identity|obj_dc|ins_feat|semantic|language|feature)\w*"
+)
+"""Properties and elements of other programs that leave the meaning of 3DGS's properties unchanged."""
+
+REFUSED = {
+    r"packed_\w+|chunk|codebook\w*": "is compressed",
+    r"\w*(offset|anchor|ancestry)\w*": "contains anchors or levels of detail, not Gaussians",
+    r"t|time\w*|t_\w+|\w+_t|scale_t\w*|rot_r\w*|(trbf|motion|omega|velocity|delta)\w*": "changes over time",
+    r"beta\w*|sb_\w+|shape\w*|nu": "contains kernels other than Gaussians",
+    r"(scale|rot|opacity|f_dc)(_\w+)?|\w*filter\w*": "contains parameters that 3DGS does not have",
+}
+"""Properties and elements that change the meaning of 3DGS's properties -> what is wrong with the PLY."""
 
 
 def _names(num_bases: int) -> list[str]:
@@ -44,71 +63,102 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
         gaussians.quats,
     )
     values = np.concatenate(columns, axis=1)
-    _require_sound(values, path, "report this fault: the Gaussians were not fitted correctly")
+    if number := _unusable(values).sum():
+        fix = "report this fault: the Gaussians were not fitted correctly"
+        raise ArtifactError(f"{path}: {number} of {n} Gaussians {UNUSABLE}", fix=fix)
     names = _names(sh.shape[1])
     table = np.ascontiguousarray(values, dtype="<f4").view([(name, "<f4") for name in names]).reshape(n)
     with atomic_path(path) as temporary:
         PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(temporary)
 
 
-def vertex_count(path: Path) -> int | None:
-    """Return the number of Gaussians in a PLY's header; None if unreadable (`load_ply` reports the error)."""
-    try:
-        with regular(Path(path)).open("rb") as stream:
-            header = stream.read(HEADER_BYTES)
-    except OSError:
-        return None
-    found = re.search(rb"^element vertex ([0-9]+)\s*$", header, re.MULTILINE)
-    return int(found[1]) if found else None
-
-
 def load_ply(path: Path, fix: str = "") -> Gaussians:
-    """Read a 3DGS PLY from this or another package; the number of f_rest columns determines the degree.
-
-    The file may be binary or ASCII, with properties in any order and of any numeric type. Normals and
-    properties not in 3DGS (colours, labels) are ignored. Errors suggest `fix` or, if it is empty, a rerun.
+    """Read a 3DGS PLY of this package; errors suggest `fix` or, if it is empty, a rerun.
 
     Raises:
-        ArtifactError: if the file is missing, damaged or not a 3DGS PLY, or contains non-finite numbers or
-            quaternions that are 0.
+        ArtifactError: as in `import_ply`, and if anything would be changed or left out.
     """
-    path = Path(path)
-    fix = fix or remake(path)
-    try:
-        vertex = PlyData.read(path)["vertex"]
-    except FileNotFoundError as error:
-        raise ArtifactError(f"{path} is missing", fix=fix) from error
-    except (PlyParseError, KeyError, ValueError, EOFError, OSError, MemoryError) as error:
-        raise ArtifactError(f"{path} is not a readable PLY: {error}", fix=fix) from error
-    found = {prop.name for prop in vertex.properties}
-    if "packed_position" in found:
-        raise ArtifactError(f"{path} is a compressed PLY", expected="a plain 3DGS PLY", fix=fix)
-    num_rest = sum(name.startswith("f_rest_") for name in found)
-    num_bases = num_rest // 3 + 1
-    names = [name for name in _names(num_bases) if name not in ("nx", "ny", "nz")]
-    missing = [name for name in names if name not in found]
+    fix = fix or remake(Path(path))
+    gaussians, notes, _ = import_ply(Path(path), fix)
+    if notes:
+        raise ArtifactError(f"{path} is not as this package writes it: {'; '.join(notes)}", fix=fix)
+    return gaussians
+
+
+def import_ply(path: Path, fix: str) -> tuple[Gaussians, list[str], list[str]]:
+    """Read a 3DGS PLY of any program; return notes on what was changed or left out, and unknown properties.
+
+    The file may be binary or ASCII, with properties in any order and of any float type. `filter_3D`, the
+    smoothing filter of Mip-Splatting and GOF, is applied. Infinite opacity logits are clamped, and other
+    unusable Gaussians are left out.
+
+    Raises:
+        ArtifactError: if the file is missing, damaged or not a 3DGS PLY, contains anything in `REFUSED`, or
+            more than `MAX_UNUSABLE` of its Gaussians are unusable.
+    """
+    if not path.exists():
+        raise ArtifactError(f"{path} is missing", fix=fix)
+    with foreign(path, ArtifactError, expected="a 3DGS PLY", fix=fix), np.errstate(over="ignore"):
+        ply = PlyData.read(regular(path))
+        vertex = ply["vertex"]
+        kinds = {prop.name: vertex.data.dtype[prop.name].kind for prop in vertex.properties}
+        others = sorted({*kinds, *(element.name for element in ply)} - {*_names(16), "filter_3D", "vertex"})
+        for pattern, problem in REFUSED.items():
+            if refused := [name for name in others if re.fullmatch(pattern, name)]:
+                raise ArtifactError(f"{path} {problem}", found=", ".join(refused[:5]), fix=fix)
+        names = _columns(path, kinds, fix)
+        values = np.stack([np.asarray(vertex[name], dtype=np.float32) for name in names], axis=1)
+        if "filter_3D" in kinds:
+            _smooth(values, np.asarray(vertex["filter_3D"], np.float64))
+    notes = ["filter_3D was applied to scales and opacities"] if "filter_3D" in kinds else []
+    infinite = np.isinf(values[:, -8])
+    if infinite.any():
+        values[infinite, -8] = np.copysign(SATURATED_LOGIT, values[infinite, -8])
+        notes.append(f"{infinite.sum()} infinite opacities are clamped")
+    unusable = _unusable(values)
+    if unusable.any():
+        notes.append(f"left out: {unusable.sum()} of {len(values)} Gaussians {UNUSABLE}")
+    if unusable.sum() > MAX_UNUSABLE * len(values):
+        raise ArtifactError(f"{path}: {notes[-1].removeprefix('left out: ')}", fix=fix)
+    unknown = {re.sub(r"\d+$", "*", name) for name in others if not HARMLESS.fullmatch(name)}
+    return _gaussians(values[~unusable]), notes, sorted(unknown)
+
+
+def _columns(path: Path, kinds: dict[str, str], fix: str) -> list[str]:
+    """Return 3DGS's properties, without normals; the number of f_rest columns determines the degree."""
+    num_rest = sum(name.startswith("f_rest_") for name in kinds)
+    names = [name for name in _names(num_rest // 3 + 1) if name not in ("nx", "ny", "nz")]
+    missing = [name for name in names if kinds.get(name) != "f"]  # integers are indices into a codebook
     if missing or num_rest not in (0, 9, 24, 45):
+        what = "contains flat disks (2DGS)" if missing == ["scale_2"] else "is not a 3DGS PLY"
+        found = f"; missing, or not floats: {', '.join(missing[:5])}" if missing else ""
         raise ArtifactError(
-            f"{path} is not a 3DGS PLY",
-            expected="x y z, f_dc_0..2, 0, 9, 24 or 45 f_rest_*, opacity, scale_0..2, rot_0..3",
-            found=f"{num_rest} f_rest columns" + (f"; missing: {', '.join(missing[:5])}" if missing else ""),
+            f"{path} {what}",
+            expected="floats x y z, f_dc_0..2, 0, 9, 24 or 45 f_rest_*, opacity, scale_0..2, rot_0..3",
+            found=f"{num_rest} f_rest columns{found}",
             fix=fix,
         )
+    return names
 
-    values = np.stack([np.asarray(vertex[name], dtype=np.float32) for name in names], axis=1)
-    _require_sound(values, path, fix)
+
+def _gaussians(values: Float32[np.ndarray, "N P"]) -> Gaussians:
+    num_rest = values.shape[1] - 14
     means, dc, rest, opacity, scales, quats = np.split(values, np.cumsum([3, 3, num_rest, 1, 3]), axis=1)
-    rest = rest.reshape(len(values), 3, num_bases - 1).transpose(0, 2, 1)
+    rest = rest.reshape(len(values), 3, num_rest // 3).transpose(0, 2, 1)
     sh = np.concatenate([dc[:, None], rest], axis=1)
     return Gaussians(*(np.ascontiguousarray(each) for each in (means, scales, quats, opacity[:, 0], sh)))
 
 
-def _require_sound(values: Float[np.ndarray, "N P"], path: Path, fix: str) -> None:
-    """Raise ArtifactError unless all numbers are finite and the last four columns are quaternions."""
-    lengths = np.linalg.norm(values[:, -4:].astype(np.float64), axis=1)
-    for problem, is_bad in (
-        ("contain a non-finite number", ~np.isfinite(values).all(axis=1)),
-        ("have no rotation: rot_0..3 are all zero", lengths < 1e-12),
-    ):
-        if is_bad.any():
-            raise ArtifactError(f"{path}: {is_bad.sum()} of {len(values)} Gaussians {problem}", fix=fix)
+def _smooth(values: Float32[np.ndarray, "N P"], filter_3d: Float64[np.ndarray, " N"]) -> None:
+    """Replace s by sqrt(s^2 + f^2) =: s' and o by o sqrt(prod s^2 / prod s'^2) (Mip-Splatting, Eq. 9)."""
+    log_scales, logits = values[:, -7:-4].astype(np.float64), values[:, -8].astype(np.float64)
+    with np.errstate(all="ignore"):  # f = 0 and infinite logits are valid
+        smooth = np.logaddexp(2 * log_scales, 2 * np.log(np.abs(filter_3d))[:, None]) / 2
+        log_opacity = (log_scales - smooth).sum(axis=1) - np.logaddexp(0, -logits)
+        values[:, -7:-4], values[:, -8] = smooth, log_opacity - np.log(-np.expm1(log_opacity))
+
+
+def _unusable(values: Float[np.ndarray, "N P"]) -> Bool[np.ndarray, " N"]:
+    """Return which Gaussians have a value or scale that is not finite or too large, or no rotation."""
+    sound = (np.abs(values) < LARGEST).all(axis=1) & (values[:, -7:-4] < np.log(LARGEST)).all(axis=1)
+    return ~sound | (np.linalg.norm(values[:, -4:].astype(np.float64), axis=1) < 1e-12)

@@ -6,6 +6,7 @@ from typing import Any
 import cv2
 import numpy as np
 from jaxtyping import Bool
+from pycocotools import mask as coco_masks
 
 from hilsplat.scene.cameras import Cameras
 
@@ -27,18 +28,11 @@ def coco_content(
 
 
 def coco_region(mask: Bool[np.ndarray, "H W"]) -> dict[str, Any]:
-    """Return the annotation keys that describe a mask; the region is encoded as run lengths."""
+    """Return the annotation keys that describe a mask; the region is encoded as compressed run lengths."""
+    runs = coco_masks.encode(np.asfortranarray(mask, np.uint8))
     return {
         "iscrowd": 0,
         "area": int(mask.sum()),
         "bbox": list(cv2.boundingRect(mask.astype(np.uint8))),
-        "segmentation": {"size": list(mask.shape), "counts": coco_counts(mask)},
+        "segmentation": {"size": list(mask.shape), "counts": runs["counts"].decode()},
     }
-
-
-def coco_counts(mask: Bool[np.ndarray, "H W"]) -> list[int]:
-    """Return COCO's uncompressed run lengths: column by column, starting with zeros."""
-    flat = mask.T.ravel()
-    edges = np.flatnonzero(flat[1:] != flat[:-1]) + 1
-    runs = np.diff(np.concatenate([[0], edges, [len(flat)]])).tolist()
-    return [0, *runs] if flat[0] else runs

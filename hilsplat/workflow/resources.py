@@ -23,9 +23,9 @@ from hilsplat.base.images import opened_image
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.provenance import version_of
 from hilsplat.models.store import model_path, read_model
+from hilsplat.scene.layouts import vertex_count
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.settings import MasksSettings
-from hilsplat.splat.ply import vertex_count
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.scene_data import Job
 

@@ -188,7 +188,7 @@ ROWS = {
         as_pipe(Path("config/scenes.tsv")), NEW, "scenes.tsv is a pipe or device"
     ),
     "a PLY that states 10^12 Gaussians": row(
-        write("huge.ply", HUGE_PLY), lambda: load_ply(Path("huge.ply")), "huge.ply is not a readable PLY"
+        write("huge.ply", HUGE_PLY), lambda: load_ply(Path("huge.ply")), "huge.ply cannot be read"
     ),
     "a field that is a folder": row(as_folder(FIELD), ASK, "field.safetensors cannot be read", "--verify"),
     "a code that is a folder": row(as_folder(CODE / "autoencoder.safetensors"), SOLVE, *changed(CODE)),

@@ -259,10 +259,10 @@ function fresh(child = false) {
 async function take_in(files) {
   await store.saving;   // the server compares the files with the saved annotations
   const given = await Promise.all(files.map(async (file) => ({ name: file.name, text: await file.text() })));
-  const { views, added, known } = await ask("/api/import", { files: given });
+  const { views, added, known, notes } = await ask("/api/import", { files: given });
   const after = Object.entries(views).map(([number, labels]) => [Number(number), labels]);
   if (after.length) store.change(after);
-  tell(`${counted(added, "label")} imported into ${counted(after.length, "photograph")}${known ? `; already present: ${known}` : ""}.`);
+  tell(`${counted(added, "label")} imported into ${counted(after.length, "photograph")}${known ? `; already present: ${known}` : ""}.${notes.slice(0, 3).map((note) => ` ${note}.`).join("")}${notes.length > 3 ? ` ${notes.length - 3} more notes.` : ""}`);
 }
 
 // -- input -----------------------------------------------------------------------------------------

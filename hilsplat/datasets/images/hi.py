@@ -29,6 +29,9 @@ IMAGES_OF = {"hi_lerf": "lerf_ovs", "hi_3dovs": "3d_ovs"}
 PROPOSED = "proposed"
 """Value of `origin` for objects proposed by a program, which are ignored until the user accepts them."""
 
+LEAST_POSED = 0.5
+"""Minimum share of annotated photographs with a pose; below it, they probably show another scene."""
+
 OUTSIDE_SHARE = 0.01
 """Share of a child's area that may be outside its parent, to allow for rasterised borders."""
 
@@ -56,7 +59,7 @@ def open_annotated(root: Path, scene: str) -> LabelledScene:
     """Read your annotations of a scene, such as "photos/desk": one region per drawn or accepted object.
 
     Files whose objects have no level are read like those of LERF-OVS: one region per text. The images are
-    the scene's own undistorted photographs; evaluation compares the labels' size with the scene's cameras.
+    the scene's own photographs, distorted or not; evaluation compares the labels' size with the cameras.
     """
     ANNOTATED.require(root, scene)
     warnings: list[str] = []
@@ -66,7 +69,7 @@ def open_annotated(root: Path, scene: str) -> LabelledScene:
         warnings += labels.warnings
         has_levels = any("level" in thing.keys for thing in labels.objects)
         views[view] = regions_of(labels, warnings) if has_levels else merged_regions(labels)
-    return LabelledScene("annotated", scene, {}, None, views, tuple(warnings))
+    return LabelledScene("annotated", scene, {}, None, views, tuple(warnings), LEAST_POSED)
 
 
 def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, ...]:

@@ -6,7 +6,7 @@ because its numbers restart and repeat. Unknown keys are ignored.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -96,15 +96,7 @@ def read_isat(path: Path, image: Path | None = None) -> IsatFile:
         SceneError: the file is not JSON, a key is missing or has the wrong type, a polygon is entirely
             outside the image, a box is [x, y, width, height], or the aspect ratios differ.
     """
-    labels = parse_isat(path, read_json_object(path, "unpack or export the labels again"))
-    if image is None:
-        return labels
-    resized = check_label_size(f"label file {path}", labels.size_hw, image_size_hw(image))
-    return replace(labels, warnings=(*labels.warnings, *resized))
-
-
-def parse_isat(path: Path, content: Mapping[str, Any]) -> IsatFile:
-    """Convert and check the contents of a label file, as in `read_isat`; messages quote `path`."""
+    content = read_json_object(path, "unpack or export the labels again")
     if not isinstance(content.get("objects"), list):
         raise SceneError(
             f"label file {path} has no `objects` list",
@@ -112,28 +104,37 @@ def parse_isat(path: Path, content: Mapping[str, Any]) -> IsatFile:
             found=f"keys {', '.join(content)}",
             fix="convert labels from other tools (labelme, COCO) to ISAT",
         )
-    info: Any = content.get("info")
-    info = info if isinstance(info, dict) else {}
-    size_hw = height, width = info.get("height"), info.get("width")
-    if not all(isinstance(side, int) and 0 < side <= LARGEST_SIDE_PX for side in size_hw):
-        raise SceneError(
-            f"label file {path} does not state a valid image size",
-            expected=f"info.width and info.height in pixels, at most {LARGEST_SIDE_PX}",
-            found=f"height {height!r}, width {width!r}",
-            fix="export the labels again",
-        )
+    size_hw = stated_size(f"label file {path}", content.get("info"))
     warnings: list[str] = []
-    name = info.get("name")
+    name = content["info"].get("name")
     if isinstance(name, str) and name and Path(name).stem != path.stem:
         warnings.append(f"{path.name} names {name} as its image, but is used for {path.stem}")
     objects = tuple(
-        _read_object(f"{path}, object {number}", entry, size_hw, warnings)
+        read_object(f"{path}, object {number}", entry, size_hw, warnings)
         for number, entry in enumerate(content["objects"])
     )
+    if image is not None:
+        warnings += check_label_size(f"label file {path}", size_hw, image_size_hw(image))
     return IsatFile(path, size_hw, objects, tuple(warnings))
 
 
-def _read_object(where: str, entry: Any, size_hw: tuple[int, int], warnings: list[str]) -> IsatObject:
+def stated_size(where: str, content: Any) -> tuple[int, int]:
+    """Return the size under the keys `height` and `width`; raise SceneError if it is missing or invalid."""
+    sides: list[Any] = [
+        content.get(key) if isinstance(content, dict) else None for key in ("height", "width")
+    ]
+    if not all(type(side) is int and 0 < side <= LARGEST_SIDE_PX for side in sides):
+        raise SceneError(
+            f"{where} does not state a valid image size",
+            expected=f"height and width in pixels, at most {LARGEST_SIDE_PX}",
+            found=f"height {sides[0]!r}, width {sides[1]!r}",
+            fix="export the labels again",
+        )
+    return sides[0], sides[1]
+
+
+def read_object(where: str, entry: Any, size_hw: tuple[int, int], warnings: list[str]) -> IsatObject:
+    """Convert and check one object; append irregularities to `warnings`. For errors, see `read_isat`."""
     if not isinstance(entry, dict):
         raise SceneError(
             f"{where} is not a JSON object", found=repr(entry)[:80], fix="export the labels again"

@@ -19,13 +19,11 @@ from hilsplat.datasets.labelled import (
 )
 from hilsplat.datasets.published import FRAMES, differences
 from hilsplat.scene.layouts import POSES_BOUNDS
+from hilsplat.scene.placement import SHAPE_TOLERANCE
 from hilsplat.scene.view_names import view_name
 
 FOREGROUND = 255
 """The original loader computes int8(value / 255), which is 0 for smaller values."""
-
-SHAPE_TOLERANCE = 0.01
-"""Relative tolerance between the aspect ratios of a view's masks and its image, which differ slightly."""
 
 
 def open_scene(root: Path, scene: str) -> LabelledScene:

@@ -105,14 +105,16 @@ def run_label_fits(
     """
     folder, scene = Path(folder), Scene.load(folder / "scene")
     labelled, masks = open_labelled(labels, data_root), folder / variant / "masks"
-    truths_of(labelled, scene, 0)  # raises if they don't fit
+    views = list(truths_of(labelled, scene, 0))  # raises if they don't fit
     tree = SemanticTree.load(folder / variant / "semantic_tree")
     gaussians = load_ply(folder / "gaussians.ply")
     fits = defaultdict[tuple[str, str], dict[Level, Fits]](lambda: {level: Fits() for level in LEVELS})
     with stage_log("label_fits", scene.name) as counts:
-        for view in track(list(labelled.views), "views compared"):
+        for view in track(views, "views compared"):
             camera = scene.cameras[view]
-            regions = [(region, region.mask(camera.size_hw)) for region in labelled.views[view]]
+            regions = [
+                (region, region.on(camera, view).mask(camera.size_hw)) for region in labelled.views[view]
+            ]
             split = "held out" if scene.split[view] == "test" else "training"
             raw = pixel_weights(gaussians, camera, min_weight=tree.min_weight, threads=threads)
             found = {"nodes": nodes_of_view(tree, normalised_weights(raw))}
@@ -120,7 +122,7 @@ def run_label_fits(
                 found[f"masks, {masks_label(masks)}"] = masks_of_view(masks / f"{view}.npz")
             for what, by_level in found.items():
                 add_view(fits[what, split], regions, by_level)
-        counts["views"] = len(labelled.views)
+        counts["views"] = len(views)
     rows = [
         [scene.name, what, split, level.label, *each[level].row()]
         for (what, split), each in sorted(fits.items())

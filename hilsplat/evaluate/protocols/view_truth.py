@@ -15,15 +15,13 @@ from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.labelled import LabelledRegion, LabelledScene, check_label_size
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
+from hilsplat.scene.placement import SHAPE_TOLERANCE
 from hilsplat.scene.scene import Scene
 
 logger = logging.getLogger(__name__)
 
 EIGHTH = 8
 """3D-OVS compares masks at one eighth of the image's height and width."""
-
-SHAPE_TOLERANCE = 0.01
-"""Tolerated relative difference in aspect ratio between labels and view, which rounding can cause."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +174,12 @@ def truths_of(
     """Return the ground-truth regions by view, loaded on demand.
 
     For a synthetic scene (a ground-truth folder), these are the regions of at least `min_region_px` pixels in
-    annotated test views; for a published data set, all regions in all labelled views.
+    annotated test views; for other labels, all regions in all labelled views that have a pose. Labels drawn
+    on photographs with lens distortion are transferred to the undistorted views.
+
+    Raises:
+        SceneError: too few labelled views have a pose (`LabelledScene.check_posed`).
+        MisalignedArtifactError: labels and view differ in aspect ratio.
     """
     truths: dict[str, Callable[[], ViewTruth]] = {}
     if isinstance(known, Path):
@@ -189,11 +192,11 @@ def truths_of(
     name = f"{known.dataset}/{known.scene}"
     for sentence in known.warnings:
         logger.warning("%s: %s", name, sentence)
-    known.check_posed(posed.cameras.names)
-    for view, regions in known.views.items():
-        size_hw = posed.cameras[view].size_hw
+    for view in known.check_posed(posed.cameras.names):
+        camera, where = posed.cameras[view], f"a label of view {view}"
+        regions = [region.on(camera, where) for region in known.views[view]]
         for label_hw in sorted({region.size_hw for region in regions}):
-            for sentence in check_label_size(f"a label of view {view}", label_hw, size_hw, SHAPE_TOLERANCE):
+            for sentence in check_label_size(where, label_hw, camera.size_hw, SHAPE_TOLERANCE):
                 logger.warning("%s: %s", name, sentence)
-        truths[view] = partial(ViewTruth.of_regions, regions, size_hw)
+        truths[view] = partial(ViewTruth.of_regions, regions, camera.size_hw)
     return truths

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from hilsplat.base.artifacts import visible_files
 from hilsplat.base.errors import SceneError, foreign, in_one_line
-from hilsplat.base.files import IMAGE_SUFFIXES, images_below, is_outside, list_images
+from hilsplat.base.files import IMAGE_SUFFIXES, is_outside, list_images
 from hilsplat.base.images import opened_image
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.cameras import MAX_SIDE_PX
@@ -212,7 +213,8 @@ def find_images(root: Path, names: Sequence[str]) -> dict[str, Path | None]:
         ]
         found[name] = next((place for place in places if place.is_file()), None) if is_inside else None
     if missing := [name for name, image in found.items() if image is None]:
-        below = {path.relative_to(root).as_posix(): path for path in images_below(root)}
+        images = (path for path in visible_files(root) if path.suffix.lower() in IMAGE_SUFFIXES)
+        below = {path.relative_to(root).as_posix(): path for path in images}
         matched = match_names(missing, below)
         found |= {name: below[match] if (match := matched[name]) is not None else None for name in missing}
     for name in missing:
@@ -278,8 +280,13 @@ def read_llff(known: KnownPoses) -> Source:
     path, folder = known.files[0], known.root / "images"
     with foreign(path, fix="unpack it again"):
         rows = np.load(path, allow_pickle=False)
-        if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "fiu":
-            raise ValueError(f"it contains {rows.dtype} of shape {rows.shape}, not numbers (images, 17)")
+    if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "fiu" or not np.isfinite(rows).any():
+        raise SceneError(
+            f"{path} does not contain LLFF poses",
+            expected="finite numbers of shape (images, 17)",
+            found=f"{rows.dtype} of shape {rows.shape}",
+            fix="unpack it again",
+        )
     images = sorted(list_images(folder if folder.is_dir() else known.root), key=lambda image: image.stem)
     if len(images) != len(rows):
         raise SceneError(
@@ -291,12 +298,10 @@ def read_llff(known: KnownPoses) -> Source:
 
     def described(number: int, image: Path) -> KnownView:
         matrix = rows[number, :15].astype(np.float64).reshape(3, 5)
-        down, right, back, position, (height_px, width_px, focal_px) = matrix.T
+        down, right, back, position, (_, width_px, focal_px) = matrix.T
         pose = np.stack([right, down, -back, position], axis=1)
         source_from_cam = rigid_pose(pose, f"{path}, row {number}")
         width, height = image_size(image)
-        if abs(width * height_px - height * width_px) > ASPECT_TOLERANCE * width * height_px:
-            raise SceneError(f"{path}, row {number}: {image.name} has another shape than its pose states")
         params = [float(focal_px * width / width_px), width / 2, height / 2]
         camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
         return KnownView(image.name, image, camera, np.linalg.inv(source_from_cam))

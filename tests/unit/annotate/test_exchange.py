@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from pycocotools import mask as coco_masks
 
-from hilsplat.annotate.exchange import exported, imported, merged, unpacked_counts
+from hilsplat.annotate.exchange import exported, imported, merged
 from hilsplat.annotate.labels import Label
-from hilsplat.base.errors import SceneError
+from hilsplat.base.errors import HilsplatError
 from hilsplat.scene.cameras import Cameras
 
 SIZE = (30, 40)
@@ -56,13 +56,11 @@ def test_exported_files_are_read_back_with_levels_and_parents_and_change_nothing
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_compressed_run_lengths_are_those_of_pycocotools(seed, cameras):
+def test_compressed_run_lengths_of_pycocotools_are_read(seed, cameras):
     mask = np.random.default_rng(seed).random(SIZE) < (0.5, 0.02, 0.98)[seed % 3]
     if seed > 2:
         mask = np.repeat(mask[:3], 10, axis=0)
     runs = coco_masks.encode(np.asfortranarray(mask, np.uint8))
-    counts = unpacked_counts(runs["counts"].decode())
-    assert sum(counts) == mask.size
     region = {"image_id": 5, "category_id": 2, "segmentation": {**runs, "counts": runs["counts"].decode()}}
     content = {
         "images": [{"id": 5, "file_name": "photos/DSC_2.jpg", "height": 30, "width": 40}],
@@ -95,8 +93,9 @@ def test_labelme_rectangles_and_groups(cameras):
     assert mug.mask(SIZE).sum() == 64 and len(cup.polygons) == 2
 
 
-def shapes(shape: str) -> str:
-    return f'{{"shapes": [{shape}], "imagePath": "DSC_1"}}'
+def shapes(shape: str, size_hw: tuple = SIZE) -> str:
+    size = f'"imageHeight": {size_hw[0]}, "imageWidth": {size_hw[1]}'
+    return f'{{"shapes": [{shape}], "imagePath": "DSC_1", {size}}}'
 
 
 @pytest.mark.parametrize(
@@ -105,23 +104,22 @@ def shapes(shape: str) -> str:
         ("{", "cannot be read"),
         ("[]", "has an unknown format"),
         ('{"shapes": [], "imagePath": "DSC_9.jpg"}', "not match a photograph"),
-        ('{"shapes": [], "imagePath": "DSC_1.jpg", "imageHeight": 60, "imageWidth": 80}', "80 x 60 px"),
+        (shapes('{"label": "a", "points": [[1, 1], [9, 1], [9, 9]]}', (61, 99)), "99 x 61 px"),
         (shapes('{"label": "a", "points": [[1, 1]], "shape_type": "circle"}'), "circle"),
-        (shapes('{"label": "  ", "points": [[1, 1], [5, 5]]}'), "text: "),
-        (shapes('{"label": "a\\u0007", "points": [[1, 1], [5, 5]]}'), "text: "),
+        (shapes('{"label": "  ", "points": [[1, 1], [5, 5], [1, 5]]}'), "text: "),
+        (shapes('{"label": "a\\u0007", "points": [[1, 1], [5, 5], [1, 5]]}'), "text: "),
         (200_000 * "[" + 200_000 * "]", "nested too deeply"),
         (shapes('{"label": "a", "points": [[1, 1e999], [5, 5]]}'), "read"),
-        (shapes('{"label": "a", "points": [[1, 1]], "group_id": [1]}'), "read"),
+        (shapes('{"label": "a", "points": [[1, 1]], "group_id": [1]}'), "polygon with 1 points"),
         (shapes("7"), "read"),
-        ('{"shapes": [], "imagePath": "DSC_1", "imageHeight": [1], "imageWidth": NaN}', "not match the size"),
-        ('{"annotations": [], "images": [], "categories": [{"id": [1], "name": "a"}]}', "COCO"),
+        (shapes('{"label": "a", "points": [[1, 1], [9, 1], [9, 9]]}', ("[1]", "NaN")), "valid image size"),
         ('{"objects": [7], "info": {"name": "DSC_1", "width": 40, "height": 30}}', "file.json, object 0"),
         ('{"objects": [], "info": 7}', "valid image size"),
         ('{"annotations": [{}], "images": []}', "'categories'"),
     ],
 )
 def test_invalid_files_are_refused(content, message, cameras):
-    with pytest.raises(SceneError, match=message):
+    with pytest.raises(HilsplatError, match=message):
         imported("file.json", content, cameras)
 
 

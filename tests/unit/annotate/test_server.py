@@ -1,5 +1,6 @@
 """Server of the annotation page: access, versions of saved files, shapes, proposals, transfer to views."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -169,6 +170,27 @@ def test_things_are_transferred_by_their_gaussians_with_their_parts_inside(clien
 def test_a_scene_without_poses_is_refused(tmp_path):
     with pytest.raises(ArtifactError, match="has no photographs to annotate yet"):
         OpenedScene(tmp_path, tmp_path / "labels", "default", 1)
+
+
+def test_files_that_cannot_be_imported_are_noted_beside_the_others(client):
+    def file(name, *shapes):
+        content = {
+            "imagePath": f"{name}.jpg",
+            "imageHeight": SIZE[0],
+            "imageWidth": SIZE[1],
+            "shapes": shapes,
+        }
+        return {"name": f"{name}.json", "text": json.dumps(content)}
+
+    cup = {"label": "cup", "points": [[1, 1], [9, 1], [9, 9]]}
+    point = {"label": "cup", "points": [[1, 1]], "shape_type": "point"}
+    lost = file("IMG_9", cup)
+    sent = client.post("/api/import", json={"files": [lost, file("002", cup, point)]}).json()
+    assert (list(sent["views"]), sent["added"], sent["known"]) == (["2"], 1, 0)
+    first, second = sent["notes"]
+    assert "IMG_9.json does not match a photograph" in first and "1 without an area" in second
+    alone = client.post("/api/import", json={"files": [lost]})
+    assert alone.status_code == 422 and "does not match a photograph" in alone.json()["error"]
 
 
 # -- a scene that is rebuilt ------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """LangSplat's files: exported files are read back, and files of other programs are checked."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from hilsplat.base.images import read_image
 from hilsplat.embed.clip import ClipModel
 from hilsplat.embed.langsplat_export import maps_of, write_langsplat
 from hilsplat.embed.langsplat_files import read_clip, read_masks, read_view
+from hilsplat.scene.cameras import Camera
 from hilsplat.segment.digests import digest_of, index_entry
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ClipSettings
@@ -99,9 +101,12 @@ def test_a_view_may_have_no_masks(tmp_path):
 
 
 def test_maps_of_another_size_are_resized_and_of_another_shape_refused(files):
-    with pytest.raises(MisalignedArtifactError, match=r"in aspect ratio(.|\n)*\(12, 12\)(.|\n)*\(6, 8\)"):
-        read_view(files, "a.png", (12, 12))
-    masks, _ = read_view(files, "a.png", (12, 16))
+    camera = Camera("a.png", np.eye(4), np.eye(3), (12, 16))
+    with pytest.raises(MisalignedArtifactError, match=r"the size of view a.png\n.*\(12, 16\)\n.*\(6, 8\)"):
+        read_view(files, "a.png", (12, 16))  # without a camera, nobody knows what the maps were drawn on
+    with pytest.raises(MisalignedArtifactError, match=r"12 x 12 px(.|\n)*8 x 6 px"):
+        read_view(files, "a.png", (12, 12), replace(camera, size_hw=(12, 12)))
+    masks, _ = read_view(files, "a.png", (12, 16), camera)
     np.testing.assert_array_equal(masks.area_px, 4 * nested().area_px)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilsplat.base.errors import SceneError
+from hilsplat.base.errors import MisalignedArtifactError, SceneError
 from hilsplat.base.levels import Level
 from hilsplat.datasets.labelled import LabelledScene
 from hilsplat.datasets.registry import open_labelled
@@ -85,7 +85,7 @@ def test_labelled_views_without_pose_and_labels_of_another_shape_are_refused(blo
         rows(labelled(block_world, views=("001.png", "007.png")))
     wide = region_of(np.ones((64, 80), bool), "bear")
     scene = LabelledScene("lerf_ovs", "blocks", {}, None, {"001.png": (wide,)})
-    with pytest.raises(SceneError, match=r"label of view 001.png does not match"):
+    with pytest.raises(MisalignedArtifactError, match=r"label of view 001.png does not match"):
         rows(scene)
 
 

@@ -265,7 +265,7 @@ def test_an_r3d_archive_is_unpacked_without_depth_maps(tmp_path):
     [
         ("{}", "'K' is missing(.|\n)*K \\(9 numbers\\), w, h, and poses"),
         ("[]", "is not a JSON object"),
-        ("{", "expected +valid JSON"),
+        ("{", "is not valid JSON"),
         (
             '{"K": [1,0,0,0,1,0,0,0,1], "w": 1, "h": 1, "poses": [[0,0,0,0,0,0,0]]}',
             "pose 0: the pose is not a rotation",

@@ -207,7 +207,7 @@ def test_saved_masks_are_those_of_the_hits_in_every_view_and_of_every_group(clie
             view, (_, hit) = scene.views[entry["image_id"]], named[entry["category_id"] - 1]
             png = Image.open(io.BytesIO(archive.read(f"masks/{Path(view).stem}/{entry['node']}.png")))
             np.testing.assert_array_equal(np.asarray(png.convert("L")) > 0, hit.mask(view))
-            runs = coco_masks.frPyObjects(entry["segmentation"], *entry["segmentation"]["size"])
+            runs = entry["segmentation"]
             np.testing.assert_array_equal(coco_masks.decode(runs).astype(bool), hit.mask(view))
             assert entry["area"] == hit.mask(view).sum() and entry["bbox"] == coco_masks.toBbox(runs).tolist()
 

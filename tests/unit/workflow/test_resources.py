@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from hilsplat.splat.ply import vertex_count
+from hilsplat.scene.layouts import vertex_count
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.resources import COSTS, RUNNER_MB, JobResources, Size
 from tests.conftest import PROJECT

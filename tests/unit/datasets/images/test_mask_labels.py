@@ -165,7 +165,8 @@ ENTRY = np.arange(17)
     ("change", "message"),
     [
         (lambda rows: rows[:, :16], r"shape \(4, 16\)"),
-        (lambda rows: np.where(ENTRY == 3, np.nan, rows), "does not contain LLFF poses"),
+        (lambda rows: np.where(ENTRY == 3, np.nan, rows), "row 0: the pose is not a rotation"),
+        (lambda rows: rows * np.nan, "does not contain LLFF poses"),
         (lambda rows: rows * np.where(ENTRY % 5 == 0, -1, 1), "row 0: the pose is not a rotation"),
         (lambda rows: np.where((ENTRY == 14) & (np.arange(4) == 2)[:, None], 0, rows), "lens of view 02.jpg"),
         (lambda rows: rows[:3], "has 3 poses for 4 images"),

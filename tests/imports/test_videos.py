@@ -1,0 +1,187 @@
+"""Videos as cameras and programs write them: pixels that are not square, several streams, pixel formats."""
+
+import json
+from fractions import Fraction
+
+import av
+import numpy as np
+import pytest
+from av.stream import Disposition
+from PIL import Image
+
+from hilsplat.base.errors import SceneError
+from hilsplat.photos.video import extract_frames
+
+HEIGHT = 96
+
+
+def picture(size, turn=0.0):
+    """A smooth picture of (height, width), a function of the position relative to the sides only."""
+    y, x = ((np.arange(n) + 0.5) / n for n in size)
+    x, y = np.meshgrid(x, y)
+    waves = (7 * x + 2 * y, 5 * y - 3 * x + turn, 6 * x * y + 1)
+    return np.stack([127 + 90 * np.sin(wave) for wave in waves], -1).round().astype(np.uint8)
+
+
+def write(path, *streams):
+    """Write streams of equal pictures: dicts of size (height, width) and options."""
+    with av.open(str(path), "w") as container:
+        opened = []
+        for form in streams:
+            stream = container.add_stream(form.get("codec", "libx264"), rate=10)
+            stream.height, stream.width = form["size"]
+            stream.pix_fmt = form.get("format", "yuv420p")
+            stream.options = form.get("options", {"crf": "8", "preset": "ultrafast"})
+            if "aspect" in form:
+                stream.codec_context.sample_aspect_ratio = form["aspect"]
+            if "rotation" in form:
+                stream.set_display_rotation(form["rotation"])
+            if "disposition" in form:
+                stream.disposition = form["disposition"]
+            opened.append(stream)
+        for form, stream in zip(streams, opened, strict=True):
+            frame = av.VideoFrame.from_ndarray(picture(form["size"], form.get("turn", 0)), "rgb24")
+            for _ in range(form.get("frames", 6)):
+                container.mux(stream.encode(frame.reformat(format=stream.pix_fmt)))
+            container.mux(stream.encode())
+    return path
+
+
+def extracted(path, count=2):
+    """The first extracted picture, and the notes."""
+    folder = path.parent / "frames"
+    folder.mkdir()
+    notes = extract_frames([path], folder, count)
+    assert json.loads((folder / "origin.json").read_text())["frames"]
+    return np.asarray(Image.open(folder / "0001.jpg")), notes
+
+
+def psnr(found, expected):
+    assert found.shape == expected.shape
+    return 10 * np.log10(255**2 / np.square(found.astype(float) - expected).mean())
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mov", "mkv"])
+@pytest.mark.parametrize(("rotation", "turns"), [(0, 0), (90, 1), (-90, 3), (180, 2)])
+@pytest.mark.parametrize(
+    ("width", "aspect", "shown"),
+    [(144, (4, 3), 192), (144, (16, 15), 154), (128, (3, 4), 96), (128, (1, 1), 128), (64, (2, 1), 128)],
+)
+def test_frames_are_stretched_to_square_pixels(tmp_path, suffix, rotation, turns, width, aspect, shown):
+    stream = {"size": (HEIGHT, width), "aspect": Fraction(*aspect), "rotation": rotation}
+    found, notes = extracted(write(tmp_path / f"a.{suffix}", stream))
+    assert psnr(found, np.rot90(picture((HEIGHT, shown)), turns)) > 38  # lossy: x264, 4:2:0 and JPEG
+    assert notes == [] or "too similar" in notes[0]
+
+
+@pytest.mark.parametrize("aspect", [Fraction(40, 1), Fraction(1, 40)])
+def test_impossible_pixels_are_refused(tmp_path, aspect):
+    path = write(tmp_path / "a.mkv", {"size": (HEIGHT, 128), "aspect": aspect})
+    with pytest.raises(SceneError, match=r"a\.mkv is too large(.|\n)*aspect"):
+        extract_frames([path], tmp_path, 2)
+
+
+MAIN = {"size": (HEIGHT, 128), "turn": 1.5}
+SMALL = {"size": (48, 64)}
+COVER = {"size": (300, 300), "codec": "mjpeg", "format": "yuvj420p", "options": {}, "frames": 1}
+THUMBNAILS = {"size": (120, 160), "codec": "mjpeg", "format": "yuvj420p", "options": {}}
+ATTACHED = {**COVER, "disposition": Disposition.attached_pic}
+STREAMS = {
+    "cover art": (ATTACHED, MAIN),
+    "cover art without its flag": (COVER, MAIN),
+    "a small stream first": (SMALL, MAIN),
+    "a small default stream": (
+        {**SMALL, "disposition": Disposition.default},
+        {**MAIN, "disposition": Disposition(0)},
+    ),
+    "a small stream last": (MAIN, SMALL),
+    "thumbnails of a larger size": (THUMBNAILS, MAIN),
+    "both": (ATTACHED, SMALL, MAIN),
+}
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+@pytest.mark.parametrize("case", STREAMS)
+def test_the_best_stream_is_used_and_others_are_reported(tmp_path, case, suffix):
+    found, notes = extracted(write(tmp_path / f"a.{suffix}", *STREAMS[case]))
+    assert psnr(found, picture(MAIN["size"], MAIN["turn"])) > 35
+    assert psnr(found, picture(MAIN["size"])) < 20  # the others' picture
+    assert f"a.{suffix}: video stream" in notes[0] and "128 x 96 px" in notes[0]
+    assert notes[0].endswith(f"of {len(STREAMS[case])}")
+
+
+def test_equal_streams_are_ranked_by_the_container(tmp_path):
+    first, second = ({**MAIN, "turn": turn} for turn in (0.0, 1.5))
+    streams = [{**first, "disposition": Disposition(0)}, {**second, "disposition": Disposition.default}]
+    found, _ = extracted(write(tmp_path / "a.mkv", *streams))
+    assert psnr(found, picture(MAIN["size"], 1.5)) > 35
+
+
+def test_a_video_of_motion_jpeg_is_read(tmp_path):
+    found, notes = extracted(write(tmp_path / "a.avi", {**THUMBNAILS, "options": {"qscale": "1"}}))
+    assert psnr(found, picture(THUMBNAILS["size"])) > 30
+    assert not any("stream" in note for note in notes)
+
+
+def test_a_file_with_only_a_cover_is_refused(tmp_path):
+    with av.open(str(tmp_path / "song.mp4"), "w") as container:
+        sound = container.add_stream("aac", rate=44100)
+        cover = container.add_stream("mjpeg", rate=1)
+        cover.height, cover.width, cover.pix_fmt = 64, 64, "yuvj420p"
+        cover.disposition = Disposition.attached_pic
+        frame = av.AudioFrame.from_ndarray(np.zeros((2, 1024), np.float32), "fltp", "stereo")
+        frame.rate = 44100
+        container.mux([*sound.encode(frame), *sound.encode()])
+        image = av.VideoFrame.from_ndarray(picture((64, 64)), "rgb24").reformat(format="yuvj420p")
+        container.mux([*cover.encode(image), *cover.encode()])
+    with pytest.raises(SceneError, match=r"song\.mp4 has no video stream(.|\n)*cover art"):
+        extract_frames([tmp_path / "song.mp4"], tmp_path, 2)
+
+
+def test_interlaced_video_is_reported(tmp_path):
+    options = {"crf": "8", "x264-params": "interlaced=1:tff=1"}
+    _, notes = extracted(write(tmp_path / "a.mp4", {**MAIN, "options": options}))
+    assert notes[0].startswith("a.mp4: it is interlaced")
+
+
+@pytest.mark.parametrize(
+    ("codec", "form", "suffix"),
+    [
+        ("ffv1", "yuv420p10le", "mkv"),
+        ("prores_ks", "yuv422p10le", "mov"),
+        ("prores_ks", "yuva444p10le", "mov"),
+        ("ffv1", "yuva420p", "mkv"),
+        ("qtrle", "argb", "mov"),
+        ("png", "rgb24", "mov"),
+        ("libvpx-vp9", "yuv420p", "webm"),
+    ],
+)
+def test_pixel_formats_keep_their_colours(tmp_path, codec, form, suffix):
+    stream = {"size": (HEIGHT, 128), "codec": codec, "format": form, "options": {}}
+    found, _ = extracted(write(tmp_path / f"a.{suffix}", stream))
+    assert psnr(found, picture((HEIGHT, 128))) > 35
+
+
+@pytest.mark.parametrize(
+    ("suffix", "start_ms"), [("mp4", -650), ("mp4", 0), ("mp4", 500_000), ("mkv", 0), ("mkv", 500_000)]
+)
+def test_times_start_at_the_first_frame_that_is_shown(tmp_path, suffix, start_ms):
+    """MP4 gets an edit list that hides frames before 0, as phones write for trimmed videos."""
+    path = tmp_path / f"a.{suffix}"
+    times = [0, 200, 650, 2000]
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=10)
+        stream.height, stream.width, stream.pix_fmt = HEIGHT, 128, "yuv420p"
+        stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
+        rng = np.random.default_rng(2)
+        for time_ms in times:  # pictures without a common corner, so that each is selected
+            frame = av.VideoFrame.from_ndarray(rng.integers(0, 256, (HEIGHT, 128, 3), np.uint8), "rgb24")
+            frame = frame.reformat(format="yuv420p")
+            frame.pts, frame.time_base = start_ms + time_ms, Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    times = times if start_ms >= 0 else [0, 1350]
+    notes = extract_frames([path], tmp_path, len(times))
+    assert notes == []
+    frames = json.loads((tmp_path / "origin.json").read_text())["frames"].values()
+    assert [round(1000 * frame["seconds"]) for frame in frames] == times
