@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Int
 
-from hilsplat.base.errors import SceneError
+from hilsplat.base.errors import ImageError, SceneError
 from hilsplat.base.files import list_images
 from hilsplat.base.images import opened_image, read_mask
 from hilsplat.base.levels import Level, plain_text
@@ -248,8 +248,12 @@ def mask_region(
 
 
 def read_mask_file(path: Path, least: int) -> Bool[np.ndarray, "H W"]:
-    """Return which values in a mask file (`read_mask`) are at least `least`."""
-    return read_mask(path) >= least
+    """Return which values in a mask file (`read_mask`) are at least `least`; ImageError if all are 0 or 1."""
+    values = read_mask(path)
+    if values.max() == 1 < least:
+        expected, fix = "0 and 255", "multiply its values by 255"
+        raise ImageError(f"mask {path} has only the values 0 and 1", expected=expected, fix=fix)
+    return values >= least
 
 
 def check_label_size(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.errors import ArtifactError, ImageError
 from hilsplat.datasets.labelled import read_mask_file
 from hilsplat.evaluate.files_stage import read_view_masks
 
@@ -67,3 +67,9 @@ def test_masks_without_a_clear_foreground_are_refused(image, tmp_path):
     image.save(tmp_path / "000/cup.png")
     with pytest.raises(ArtifactError, match="has non-zero values, but none is foreground"):
         read_view_masks(tmp_path, "000.png")
+
+
+def test_label_bitmaps_of_zeros_and_ones_are_refused(tmp_path):
+    Image.fromarray(MASK.astype(np.uint8)).save(tmp_path / "cup.png")
+    with pytest.raises(ImageError, match=r"cup.png has only the values 0 and 1"):
+        read_mask_file(tmp_path / "cup.png", 129)

@@ -62,12 +62,13 @@ def import_poses(
         except ImageError as error:
             left_out[view.name] = in_one_line(error)
     if not views or len(views) < least * total:
-        reasons = [*missing[:20], *([f"and {len(missing) - 20} more"] if len(missing) > 20 else [])]
-        reasons += [*left_out.values()][:3]
+        more = [f"and {len(missing) - 20} more"] if len(missing) > 20 else []
+        found = f"{len(views)}; missing: {', '.join([*missing[:20], *more]) or 'none'}"
+        found += "".join(f"\n            left out: {reason}" for reason in [*left_out.values()][:3])
         raise RegistrationError(
             f"too few posed views of {name} have an image in {known.root}",
             expected=f"at least {least:.0%} of {total} (poses.min_registered_share)",
-            found=f"{len(views)}; missing: {', '.join(reasons)}",
+            found=found,
             fix="put the images where the pose file expects them: in this folder or its images/ folder",
         )
     origin_of_points = "source"

@@ -77,9 +77,14 @@ class Source:
                 view = described(*args)
                 require_valid(view)
         except SceneError as error:
-            self.left_out[name] = in_one_line(error)
+            self.leave_out(name, in_one_line(error))
         else:
             self.views.append(view)
+
+    def leave_out(self, name: str, reason: str) -> None:
+        """Record why a view is not used; names may repeat in damaged files."""
+        repeated = sum(each.partition("#")[0] == name for each in self.left_out)
+        self.left_out[f"{name}#{repeated + 1}" if repeated else name] = reason
 
     def require_most(self, least_share: float, files: object) -> None:
         """Raise SceneError if fewer than this share of the views can be used, with the first reasons."""
@@ -153,7 +158,7 @@ def read_source(known: KnownPoses) -> Source:
     images = [view.image for view in source.views if view.image is not None]
     for view in [view for view in source.views if view.image is not None and images.count(view.image) > 1]:
         source.views.remove(view)
-        source.left_out[view.name] = f"view {view.name}: other views have the same image {view.image}"
+        source.leave_out(view.name, f"view {view.name}: other views have the same image {view.image}")
     source.notes += [f"{other} also has poses, which are not used" for other in known.others]
     if source.points is not None:
         xyz, rgb = source.points
