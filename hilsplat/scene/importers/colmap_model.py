@@ -4,10 +4,11 @@ pycolmap's reader allocates unlimited memory for wrong counts, ends names at the
 every detail of the text format. Rigs and frames are not read, because images have their own poses.
 """
 
-import re
 import struct
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -201,7 +202,10 @@ def _text_lens(line: str) -> tuple[int, Lens] | None:
 
 
 def _text_point(line: str) -> tuple[float, ...] | None:
-    return tuple(map(float, line.split(maxsplit=7)[:7])) if line else None
+    if not line:
+        return None
+    x, y, z, red, green, blue = map(float, line.split(maxsplit=7)[1:7])
+    return float(line.split(maxsplit=1)[0]), x, y, z, red, green, blue
 
 
 class _TextImages:
@@ -212,9 +216,11 @@ class _TextImages:
 
     def __call__(self, line: str) -> Any:
         cells = line.split()
-        if self.may_be_points and len(cells) % 3 == 0 and NUMBERS.fullmatch(line):
-            self.may_be_points = False
-            return np.array(cells, np.float64).reshape(-1, 3)
+        if self.may_be_points and len(cells) % 3 == 0:
+            with suppress(ValueError):
+                points = np.array(cells, np.float64).reshape(-1, 3)
+                self.may_be_points = False
+                return points
         self.may_be_points = bool(line)
         if not line:
             return None
@@ -223,14 +229,11 @@ class _TextImages:
         return name, int(numbers[8]), tuple(map(float, numbers[1:8]))
 
 
-NUMBERS = re.compile(r"[-+0-9.eE\snainfNAINF]*")
-
-
 def _text_images(path: Path) -> list[ModelImage]:
     expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line with X Y POINT3D_ID for each point"
     images: list[ModelImage] = []
     rows = _text(path, expected, _TextImages())
-    for row, after in zip(rows, [*rows[1:], None], strict=True):
+    for row, after in pairwise([*rows, None]):
         if isinstance(row, tuple):
             seen = after if isinstance(after, np.ndarray) else np.zeros((0, 3))
             name, camera_id, pose = row

@@ -1,0 +1,251 @@
+"""COLMAP models as COLMAP and other programs write them."""
+
+import struct
+
+import numpy as np
+import pycolmap
+import pytest
+
+from hilsplat.base.errors import HilsplatError, SceneError
+from hilsplat.scene.importers.colmap_model import read_model
+from hilsplat.scene.importers.known_views import read_source
+from hilsplat.scene.layouts import find_known_poses
+from tests.imports import analytic_world as world
+
+WIDTH, HEIGHT, LENS = 96, 72, "PINHOLE 80 78 47 37"
+RAYS = world.pinhole(80, 78, 47, 37)
+POSES = world.cameras(6)
+PICTURES = [world.picture(RAYS, WIDTH, HEIGHT, pose) for pose in POSES]
+POINTS = [(0.5 * row, -0.25, 0.125, 10 * row, 20, 30) for row in range(8)]
+
+
+def write(folder, name="{:03d}.png", model="sparse/0", count=6):
+    """Pictures and the model of the first `count` of them."""
+    names = [name.format(number) for number in range(len(POSES))]
+    world.save(folder / "images", dict(zip(names, PICTURES, strict=True)), suffix="")
+    images = dict(zip(names[:count], POSES, strict=False))
+    world.write_colmap(folder / model, LENS, (WIDTH, HEIGHT), images, POINTS)
+    return folder
+
+
+def edit(folder, file, change):
+    path = folder / "sparse/0" / file
+    path.write_bytes(change(path.read_bytes()))
+
+
+def without_blank_lines(text):
+    return b"\n".join(line for line in text.split(b"\n") if line) + b"\n"
+
+
+def with_observations(text):
+    """Give the first image two observations, of point 3 and of a point that is missing, and a feature."""
+    lines = text.split(b"\n")
+    lines[1] = b"10.5 20.25 3 1.5 2.5 -1 30.0 40.0 99999"
+    return b"\n".join(lines)
+
+
+FORMS = {
+    "as written": [],
+    "without blank lines": [("images.txt", without_blank_lines)],
+    "some blank lines missing": [("images.txt", lambda text: text.replace(b"\n\n", b"\n", 2))],
+    "no newline at the end": [("images.txt", lambda text: text.rstrip(b"\n"))],
+    "newlines of Windows": [
+        (file, lambda text: text.replace(b"\n", b"\r\n"))
+        for file in ("cameras.txt", "images.txt", "points3D.txt")
+    ],
+    "byte order mark": [("images.txt", lambda text: b"\xef\xbb\xbf" + text)],
+    "comments": [("images.txt", lambda text: b"# Image list\n#   POINTS2D[]\n" + text)],
+    "tabs and several spaces": [("cameras.txt", lambda text: text.replace(b" ", b" \t "))],
+    "spaces at line ends": [("images.txt", lambda text: text.replace(b"png\n", b"png  \n"))],
+    "a point that is missing": [("images.txt", with_observations)],
+    "numbers with exponents": [("cameras.txt", lambda text: text.replace(b" 80 ", b" 8.0E+01 "))],
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_text_models_are_read(form, tmp_path, imported):
+    folder = write(tmp_path / "in")
+    for file, change in FORMS[form]:
+        edit(folder, file, change)
+    views, (xyz, rgb), *_ = imported(folder)
+    world.require_right(views, {f"{number:03d}.png": pose for number, pose in enumerate(POSES)}, 45)
+    np.testing.assert_allclose(xyz, [point[:3] for point in POINTS])
+    assert rgb.tolist() == [list(point[3:]) for point in POINTS]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("my photo ({}) ä#%.png", "IMG {}.PNG", "{}.png", "cam 1/{}.png", "DSC_{}.JPG.png", "[{}] a+b.png"),
+        *("ein Bild mit 3 4 5 {}.png", "-1 {}.png"),
+    ],
+)
+@pytest.mark.parametrize("form", ["text", "binary"])
+def test_names_with_spaces_and_signs_are_read(name, form, tmp_path, imported):
+    folder = write(tmp_path / "in", name)
+    if form == "binary":  # the text is read by hand here, because pycolmap ends names at spaces
+        rewrite_as_binary(folder / "sparse/0", name)
+    views, *_ = imported(folder)
+    assert len(views) == len(POSES)
+    for view in views:
+        number = next(
+            row for row in range(6) if view.view.endswith(f"{name.format(row).rpartition('/')[2][:-4]}.png")
+        )
+        np.testing.assert_allclose(view.cam_from_source, np.linalg.inv(POSES[number]), atol=1e-9)
+
+
+def rewrite_as_binary(folder, name):
+    model = pycolmap.Reconstruction()
+    lens, *params = LENS.split()
+    camera = pycolmap.Camera(
+        model=lens, width=WIDTH, height=HEIGHT, params=list(map(float, params)), camera_id=1
+    )
+    model.add_camera_with_trivial_rig(camera)
+    for number, pose in enumerate(POSES):
+        image = pycolmap.Image(name=name.format(number), camera_id=1, image_id=number + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.linalg.inv(pose)[:3]))
+    for *xyz, red, green, blue in POINTS:
+        model.add_point3D(np.array(xyz), pycolmap.Track(), np.array([red, green, blue], np.uint8))
+    for path in folder.iterdir():
+        path.unlink()
+    model.write_binary(folder)
+
+
+@pytest.mark.parametrize("write_model", ["write_text", "write_binary"])
+def test_models_with_observations_are_read_as_by_pycolmap(write_model, tmp_path):
+    """Lenses of all models, observations and tracks, in a model made by COLMAP's own synthesiser."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 2, 2, 3
+    options.num_points3D = 40
+    model = pycolmap.synthesize_dataset(options)
+    getattr(model, write_model)(tmp_path)
+    read, again = read_model(tmp_path), pycolmap.Reconstruction(tmp_path)
+    assert len(read.images) == again.num_reg_images() == 12
+    for image in read.images:
+        (theirs,) = [other for other in again.images.values() if other.name == image.name]
+        np.testing.assert_allclose(image.cam_from_world[:3], theirs.cam_from_world().matrix(), atol=1e-12)
+        lens, camera = read.lenses[image.camera_id], theirs.camera
+        assert (lens.model, lens.width, lens.height) == (camera.model_name, camera.width, camera.height)
+        np.testing.assert_array_equal(lens.params, camera.params)
+        seen = theirs.get_observation_points2D()
+        np.testing.assert_array_equal(image.seen[0], [point.xy for point in seen])
+        assert image.seen[1].tolist() == [point.point3D_id for point in seen]
+    ids, xyz, _ = read.points
+    assert ids.tolist() == sorted(again.points3D)
+    np.testing.assert_array_equal(xyz, [again.points3D[point_id].xyz for point_id in ids])
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "message"),
+    [
+        (
+            "cameras.txt",
+            lambda text: text.replace(b"80 78", b"80,0 78"),
+            r"cameras\.txt, line 1, cannot be read",
+        ),
+        ("cameras.txt", lambda text: text.replace(b" 37", b""), r"cameras\.txt, line 1"),
+        ("cameras.txt", lambda text: text.replace(b"PINHOLE", b"PINHOLLE"), r"cameras\.txt, line 1"),
+        ("cameras.txt", lambda text: b"\n\n" + text[:9], r"cameras\.txt, line 3"),
+        ("images.txt", lambda text: text.replace(b" 1 002.png", b" one 002.png"), r"images\.txt, line 5"),
+        ("images.txt", lambda text: b"1 2 3\n" + text, r"images\.txt, line 1"),
+        ("points3D.txt", lambda text: text.replace(b"3 1.0", b"3 x"), r"points3D\.txt, line 3"),
+        ("points3D.txt", lambda text: text + b"9 1 2 3\n", r"points3D\.txt, line 9"),
+        ("cameras.txt", lambda text: b"2" + text[1:], "has camera 1, which the model lacks"),
+        ("images.txt", lambda text: b"", "contains no posed views"),
+    ],
+)
+def test_unreadable_lines_are_named(file, change, message, tmp_path, imported):
+    folder = write(tmp_path / "in")
+    edit(folder, file, change)
+    with pytest.raises(HilsplatError, match=message):
+        imported(folder)
+
+
+@pytest.mark.parametrize("change", [b"0 0 0 0", b"nan 0 0 1", b"0.5 0.5 0.5 0.9"])
+def test_one_quaternion_that_is_not_a_rotation_leaves_out_its_view(change, tmp_path, imported):
+    folder = write(tmp_path / "in")
+
+    def changed(text):
+        lines = text.split(b"\n")
+        cells = lines[4].split(b" ")
+        lines[4] = b" ".join([cells[0], change, *cells[5:]])
+        return b"\n".join(lines)
+
+    edit(folder, "images.txt", changed)
+    views, _, _, report = imported(folder)
+    assert [view.view for view in views] == [f"{number:03d}.png" for number in (0, 1, 3, 4, 5)]
+    assert "a quaternion of length 1" in report["views"]["002.png"]["why_not"]
+
+
+@pytest.mark.parametrize(
+    ("models", "chosen"),
+    [
+        ({"sparse/0": 3, "sparse/1": 6}, "sparse/1"),
+        ({"sparse/0": 4, "sparse/1": 3, "sparse/2": 5}, "sparse/2"),
+        ({"sparse/0": 6, "sparse/1": 6}, "sparse/0"),
+        ({"sparse": 6, "sparse/0": 3}, "sparse"),
+        ({"sparse/model": 6}, "sparse/model"),
+    ],
+)
+@pytest.mark.parametrize("form", ["text", "binary"])
+def test_the_model_with_the_most_images_is_taken_and_others_are_named(models, chosen, form, tmp_path):
+    for model, count in models.items():
+        write(tmp_path, model=model, count=count)
+        if form == "binary":
+            read = pycolmap.Reconstruction(tmp_path / model)
+            for path in (tmp_path / model).glob("*.txt"):
+                path.unlink()
+            read.write_binary(tmp_path / model)
+    known = find_known_poses(tmp_path)
+    assert known.files == (tmp_path / chosen,)
+    source = read_source(known)
+    assert len(source.views) == max(models.values())
+    assert {note.partition(" also has poses")[0] for note in source.notes} == {
+        str(tmp_path / model) for model in models if model != chosen
+    }
+
+
+def test_other_kinds_of_poses_in_the_folder_are_named(tmp_path):
+    folder = write(tmp_path)
+    (folder / "transforms.json").write_text("{}")
+    np.save(folder / "poses_bounds.npy", np.zeros((6, 17)))
+    notes = " ".join(read_source(find_known_poses(folder)).notes)
+    assert "transforms.json also has poses" in notes and "poses_bounds.npy also has poses" in notes
+
+
+def test_without_points_they_are_triangulated(tmp_path, imported):
+    folder = write(tmp_path / "in")
+    (folder / "sparse/0/points3D.txt").unlink()
+    *_, report = imported(folder)
+    assert report["points_from"] == "triangulated from the known poses"
+    world.write_colmap(folder / "sparse/0", LENS, (WIDTH, HEIGHT), {"000.png": POSES[0]}, [])
+    source = read_source(find_known_poses(folder))
+    assert source.points is None
+
+
+def test_points_that_are_not_finite_are_dropped_with_a_note(tmp_path):
+    folder = write(tmp_path)
+    edit(folder, "points3D.txt", lambda text: text.replace(b"2 0.5", b"2 nan").replace(b"4 1.5", b"4 inf"))
+    source = read_source(find_known_poses(folder))
+    assert source.notes == ["2 of 8 points are not finite and are left out"]
+    np.testing.assert_allclose(source.points[0][:, 0], [0, 1, 2, 2.5, 3, 3.5])
+
+
+def test_rigs_whose_cameras_share_file_names_keep_every_view(tmp_path, imported):
+    """COLMAP's rigs: rig1/camera1/0000.png, rig1/camera2/0000.png, rig2/camera1/0000.png, ..."""
+    names = [f"rig{rig}/camera{camera}/0000.png" for rig in (1, 2) for camera in (1, 2, 3)]
+    world.save(tmp_path / "in/images", dict(zip(names, PICTURES, strict=True)), suffix="")
+    images = dict(zip(names, POSES, strict=True))
+    world.write_colmap(tmp_path / "in/sparse/0", LENS, (WIDTH, HEIGHT), images, POINTS)
+    views, *_ = imported(tmp_path / "in")
+    right = {f"{name.replace('/', '_')}": pose for name, pose in images.items()}
+    world.require_right(views, right, 45)
+
+
+@pytest.mark.parametrize("count", [2**40, 2**63, 7])
+def test_wrong_counts_of_binary_models_are_refused(count, tmp_path):
+    folder = write(tmp_path)
+    rewrite_as_binary(folder / "sparse/0", "{:03d}.png")
+    edit(folder, "images.bin", lambda content: struct.pack("<Q", count) + content[8:])
+    with pytest.raises(SceneError, match=r"images\.bin cannot be read"):
+        read_source(find_known_poses(folder))
