@@ -51,6 +51,17 @@ def cache_folder(wildcards, input):
     return str(Path(input.scene).parents[2] / ".cache")
 
 
+def given(files):
+    """Return an input function whose files outside the results get no prefix from a module."""
+
+    def found(wildcards):
+        paths = files(wildcards)
+        is_own = isinstance(paths, str) or PLAN.data.truth(wildcards) == paths
+        return paths if is_own else [local(path) for path in paths]
+
+    return found
+
+
 try:
     PLAN = Plan(merged_config([], config))
     PLAN.require_usable(devices=own_cores() is not None)

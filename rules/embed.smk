@@ -4,7 +4,7 @@ rule clip:
         scene="<results>/{dataset}/{scene}/scene",
         masks=PLAN.shared("masks", "masks"),
         semantic_tree=PLAN.crops_tree,  # empty if every mask is embedded
-        features=PLAN.data.features,  # empty, except for LangSplat's vectors
+        features=given(PLAN.data.features),  # empty, except for LangSplat's vectors
     output:
         clip=directory("<results>/{dataset}/{scene}/{variant}/clip"),
     log:
@@ -20,6 +20,7 @@ rule clip:
         runtime=RESOURCES.minutes("clip"),
         gpu=RESOURCES.gpus("clip"),
     params:
+        files=PLAN.data.content(PLAN.data.features),
         settings=PLAN.settings("clip"),
         model=PLAN.model("clip"),
         option=PLAN.crops_tree_option,
@@ -36,7 +37,7 @@ rule names:
         scene="<results>/{dataset}/{scene}/scene",
         semantic_tree=PLAN.shared("semantic_tree", "semantic_tree"),
         clip=PLAN.shared("clip", "clip"),
-        vocabulary=PLAN.vocabulary,  # empty, unless you supply a file
+        vocabulary=given(PLAN.vocabulary),  # empty, unless you supply a file
     output:
         names=directory("<results>/{dataset}/{scene}/{variant}/names"),
     log:
@@ -50,6 +51,7 @@ rule names:
         mem_mb=RESOURCES.memory_mb("names"),
         runtime=RESOURCES.minutes("names"),
     params:
+        files=PLAN.data.content(PLAN.vocabulary),
         settings=PLAN.settings("query"),
         evaluate=PLAN.settings("evaluate"),
         cache=cache_folder,

@@ -2,7 +2,7 @@
 rule evaluate:
     input:
         scene="<results>/{dataset}/{scene}/scene",
-        truth=PLAN.data.truth_or_labels,
+        truth=given(PLAN.data.truth_or_labels),
         gaussians="<results>/{dataset}/{scene}/gaussians.ply",
         semantic_tree=PLAN.shared("semantic_tree", "semantic_tree"),
         field=PLAN.shared("field", "field.safetensors"),
@@ -25,6 +25,7 @@ rule evaluate:
         mem_mb=RESOURCES.memory_mb("evaluate"),
         runtime=RESOURCES.minutes("evaluate"),
     params:
+        files=PLAN.data.content(PLAN.data.label_files),
         settings=PLAN.settings("evaluate"),
         code=PLAN.code("evaluate", PLAN.data.label_readers),
         truth=PLAN.data.truth_option,

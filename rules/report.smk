@@ -3,7 +3,7 @@ rule figures:
     input:
         scene="<results>/{dataset}/{scene}/scene",
         fit="<results>/{dataset}/{scene}/gaussians",
-        truth=PLAN.data.truth_or_labels,
+        truth=given(PLAN.data.truth_or_labels),
         gaussians="<results>/{dataset}/{scene}/gaussians.ply",
         masks="<results>/{dataset}/{scene}/default/masks",
         clip="<results>/{dataset}/{scene}/default/clip",
@@ -43,6 +43,7 @@ rule figures:
         mem_mb=RESOURCES.memory_mb("figures"),
         runtime=RESOURCES.minutes("figures"),
     params:
+        files=PLAN.data.content(PLAN.data.label_files),
         settings=PLAN.settings("figures"),
         evaluate=PLAN.settings("evaluate"),
         queries=PLAN.queries,
@@ -91,7 +92,7 @@ rule mask_truth:
 rule comparison:
     input:
         scene="<results>/{dataset}/{scene}/scene",
-        truth=PLAN.data.truth_or_labels,
+        truth=given(PLAN.data.truth_or_labels),
         gaussians="<results>/{dataset}/{scene}/gaussians.ply",
         masks=PLAN.compared("masks", "masks"),
         clip=PLAN.compared("clip", "clip"),
@@ -132,6 +133,7 @@ rule comparison:
         mem_mb=RESOURCES.memory_mb("comparison"),
         runtime=RESOURCES.minutes("comparison"),
     params:
+        files=PLAN.data.content(PLAN.data.label_files),
         folder=lambda wildcards, input: str(Path(input.gaussians).parent),
         variants=json.dumps(PLAN.run.main_variants),
         names=PLAN.names,

@@ -1,7 +1,7 @@
 # Camera poses: structure from motion, or import.
 rule source:
     input:
-        PLAN.data.source_files,
+        given(PLAN.data.source_files),
     output:
         directory("<results>/{dataset}/{scene}/source"),
     log:
@@ -16,6 +16,7 @@ rule source:
         mem_mb=RESOURCES.memory_mb("source"),
         runtime=RESOURCES.minutes("source"),
     params:
+        files=PLAN.data.content(PLAN.data.source_files),
         name=PLAN.data.source_name,
         root=str(Path(PLAN.run.data_root)),
         code=PLAN.code("source", PLAN.data.source_reader),
@@ -25,7 +26,7 @@ rule source:
 
 rule poses:
     input:
-        PLAN.data.image_files,
+        given(PLAN.data.image_files),
     output:
         scene=directory("<results>/{dataset}/{scene}/scene"),
     log:
@@ -40,6 +41,7 @@ rule poses:
         mem_mb=RESOURCES.memory_mb("poses"),
         runtime=RESOURCES.minutes("poses"),
     params:
+        files=PLAN.data.content(PLAN.data.image_files),
         images=PLAN.data.images,
         unit=lambda wildcards: PLAN.row(wildcards).unit,
         poses=PLAN.data.poses_option,

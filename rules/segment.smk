@@ -6,7 +6,7 @@ rule masks:
         gaussians=PLAN.key_gaussians,  # empty, except for key views and guided prompts
         key_masks=lambda wildcards: PLAN.key_parts(wildcards, "masks"),
         key_tree=lambda wildcards: PLAN.key_parts(wildcards, "semantic_tree"),
-        features=PLAN.data.features,  # empty, except for LangSplat's masks
+        features=given(PLAN.data.features),  # empty, except for LangSplat's masks
     output:
         masks=directory("<results>/{dataset}/{scene}/{variant}/masks"),
     log:
@@ -22,6 +22,7 @@ rule masks:
         runtime=RESOURCES.minutes("masks"),
         gpu=RESOURCES.gpus("masks"),
     params:
+        files=PLAN.data.content(PLAN.data.features),
         settings=PLAN.settings("masks"),
         model=PLAN.model("masks"),
         option=PLAN.masks_option,

@@ -2,7 +2,7 @@
 rule gaussians:
     input:
         scene="<results>/{dataset}/{scene}/scene",
-        existing=PLAN.data.existing_gaussians,
+        existing=given(PLAN.data.existing_gaussians),
     output:
         ply="<results>/{dataset}/{scene}/gaussians.ply",
         coordinates="<results>/{dataset}/{scene}/gaussians.json",
@@ -20,6 +20,7 @@ rule gaussians:
         runtime=RESOURCES.minutes("gaussians"),
         gpu=RESOURCES.gpus("gaussians"),
     params:
+        files=PLAN.data.content(PLAN.data.existing_gaussians),
         settings=PLAN.settings("gaussians"),
         existing=PLAN.data.existing_gaussians_option,
         seed=PLAN.run.seed,

@@ -13,7 +13,8 @@ import shutil
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tokenize import TokenError
@@ -48,6 +49,9 @@ def provenance_path(artifact: Path) -> Path:
 
 RUN = ".run.json"
 """Hidden file in a results folder that records the options of the run that writes to it."""
+
+CONVERTED = ".made_from.json"
+"""Hidden file in a folder of extracted frames or unpacked photographs that records their source."""
 
 
 def run_command(path: Path, *options: str) -> str:
@@ -350,11 +354,45 @@ def sha256_of_path(path: Path) -> str:
     return sha256_of_json([(file.relative_to(path).as_posix(), sha256_of_file(file)) for file in files])
 
 
+def digests_of(paths: Collection[str], memo: Path) -> dict[str, str]:
+    """Map each path to its file's SHA-256, or "unreadable"; only files that changed since `memo` are read.
+
+    Programs cannot set the status change time, so it reveals a replacement of the same size and time.
+    """
+    known = read_memo(memo, dict[str, str])
+
+    def entry(path: str) -> str:
+        with suppress(OSError, HilsplatError):  # the stage reports them
+            stat = Path(path).stat()
+            stamp = f"{stat.st_size} {stat.st_mtime_ns} {stat.st_ctime_ns} "
+            found = known.get(path, "")
+            return found if found.startswith(stamp) else stamp + sha256_of_file(Path(path))
+        return "unreadable"
+
+    with ThreadPoolExecutor() as threads:
+        entries = dict(zip(paths, threads.map(entry, paths), strict=True))
+    if not entries.items() <= known.items():
+        with suppress(OSError):  # a read-only folder of results
+            write_json(memo, known | entries)
+    return {path: each.split()[-1] for path, each in entries.items()}
+
+
 def visible_files(folder: Path) -> list[Path]:
-    """Return the files in a folder and its subfolders, sorted; skip hidden files and hidden folders."""
-    folder = Path(folder)
-    files = (path for path in folder.rglob("*") if path.is_file())
-    return sorted(f for f in files if not any(part[0] == "." for part in f.relative_to(folder).parts))
+    """Return the files in a folder and its subfolders, sorted; follow links, and skip what is hidden.
+
+    Subfolders that hilsplat wrote are skipped too, because a project may be in a folder of photographs.
+    """
+    found = []
+    for place, folders, names in os.walk(folder, followlinks=True):
+        folders[:] = [name for name in folders if name[0] != "." and not is_apart(Path(place, name))]
+        found += [path for name in names if name[0] != "." and (path := Path(place, name)).is_file()]
+    return sorted(found)
+
+
+def is_apart(folder: Path) -> bool:
+    """Return whether a folder is results, an artifact, a converted source, or a link to a parent folder."""
+    own = (folder / RUN, folder / CONVERTED, provenance_path(folder))
+    return any(map(Path.is_file, own)) or folder.parent.resolve().is_relative_to(folder.resolve())
 
 
 def write_index(folder: Path, views: Mapping[str, Any], **more: Any) -> None:

@@ -58,6 +58,8 @@ def open_image(file: Path | io.BytesIO, max_side_px: int = 2**16) -> Image.Image
             expected=f"at most {2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} MP, {max_side_px} px per side",
             fix="shrink or remove it",
         ) from error
+    if image.format == "TIFF":
+        image.filename = ""  # else Pillow 13 maps the file into memory, and scrambles turned pictures
     return image
 
 
@@ -106,9 +108,13 @@ def read_image(
         with open_image(file, max_side_px) as image:
             if (num_frames := _frames(image)) > 1:
                 raise ValueError(f"it contains {num_frames} frames of the same size, like an animation")
+            turn = orientation(image)
             image.load()
-            move = None if as_stored else UPRIGHT.get(orientation(image))
-            pixels = image if move is None else image.transpose(move)
+            if image.format == "TIFF":  # Pillow turned it upright
+                turn = {6: 8, 8: 6}.get(turn, turn) if as_stored else 1
+            elif as_stored:
+                turn = 1
+            pixels = image if turn == 1 else image.transpose(UPRIGHT[turn])
             if image.mode.startswith("I"):
                 pixels = Image.fromarray(_eight_bits(np.asarray(pixels)))
             if image.mode == "F":

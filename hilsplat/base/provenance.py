@@ -50,8 +50,11 @@ class Inputs:
         self._files = self._signatures()
         self.records = {name: self._record(path) for name, path in paths.items()}
         for record in self.records.values():
-            for path, digest in record.get("files", {record["path"]: record.get("sha256")}).items():
-                require_as_written(Path(path), digest)
+            files = record.get("files", {record["path"]: record.get("sha256")})
+            has_record = functools.cache(_has_record)  # a folder may contain thousands of photographs
+            for path, digest in files.items():
+                if has_record(Path(path).parent):
+                    require_as_written(Path(path), digest)
 
     def require_unchanged(self) -> None:
         """Raise HilsplatError if an input changed; files with the same size, time and inode are skipped."""
@@ -175,6 +178,10 @@ def read_provenance(artifact: Path) -> Provenance | None:
         raise ArtifactError(
             f"{path} is damaged: {'.'.join(map(str, first['loc']))}: {first['msg']}", fix=remake(artifact)
         ) from error
+
+
+def _has_record(folder: Path) -> bool:
+    return provenance_path(folder).is_file() or any(folder.glob(f"*{provenance_path(Path()).name}"))
 
 
 def require_as_written(path: Path, sha256: str | None) -> None:

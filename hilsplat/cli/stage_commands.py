@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from hilsplat.base.artifacts import provenance_path
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.cli.scene_commands import POSES_HELP
 from hilsplat.cli.stage import (
@@ -49,9 +50,12 @@ def find_poses(
     threads: Threads = 1,
 ) -> None:
     """Compute the camera poses of photographs, or import a COLMAP model or transforms.json."""
+    from hilsplat.datasets.sources import photo_files
+
     section = section_of("poses", settings)
-    inputs = {"images": images, "poses": poses if poses and poses.exists() else None}
-    with stage("poses", out, settings=section, seed=seed, inputs=inputs) as run:
+    is_own = any(provenance_path(place).is_file() for place in (images, images.parent))
+    read = photo_files(images, poses) if images.is_dir() and not is_own else images
+    with stage("poses", out, settings=section, seed=seed, inputs={"images": read}) as run:
         run(images, out, name, unit, render, section, seed, threads, poses)
 
 

@@ -4,17 +4,15 @@ This module opens no networks, so that importing it to plan a run is fast.
 """
 
 import functools
-import json
 import os
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import platformdirs
 
-from hilsplat.base.artifacts import parse_json, read_memo, sha256_of_path, write_json
+from hilsplat.base.artifacts import digests_of, parse_json, sha256_of_json, visible_files
 from hilsplat.base.files import project_path
 from hilsplat.models.layouts import LAYOUTS, layout_of
 
@@ -141,19 +139,12 @@ def _folders() -> list[Path]:
 def model_digest(folder: Path, cache: Path) -> str:
     """Return the digest of a model folder, or "... is missing"; the stage reports how to fix it.
 
-    Digests are kept in `cache`, keyed by file sizes and modification times; reading ViT-H takes seconds.
+    The digest is that of `sha256_of_path`. Those of files are kept in `cache`; reading ViT-H takes seconds.
     """
     if not folder.is_dir():
         return f"{folder} is missing"
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    stamp = json.dumps([[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files])
-    memo = cache / "digests.json"
-    known = read_memo(memo, dict[str, str])
-    if stamp not in known:
-        known[stamp] = sha256_of_path(folder)
-        with suppress(OSError):  # a read-only folder of results
-            write_json(memo, known)
-    return known[stamp]
+    found = digests_of([str(path) for path in visible_files(folder)], cache / "digests.json")
+    return sha256_of_json([(Path(path).relative_to(folder).as_posix(), found[path]) for path in found])
 
 
 def real_model(family: str) -> Path | None:

@@ -7,14 +7,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path, PurePosixPath
 
-from hilsplat.base.artifacts import atomic_folder, read_memo, require_free_space, write_json
+from hilsplat.base.artifacts import CONVERTED, atomic_folder, read_memo, require_free_space, write_json
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_outside, list_files, list_images
 from hilsplat.base.removal import undone_on_error
 from hilsplat.scene.layouts import has_known_poses, photo_folder, unwrapped
-
-MARK = ".made_from.json"
-"""Hidden file in a converted folder that records its source files."""
 
 MAX_FILES = 50_000
 MAX_TOTAL_GIB = 20
@@ -66,8 +63,8 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tu
             else:
                 unpack_photographs(source, folder)
                 notes = [f"{source.name} unpacked to {target}"]
-            write_json(folder / MARK, mark)
-    elif read_memo(target / MARK, dict) == mark:
+            write_json(folder / CONVERTED, mark)
+    elif read_memo(target / CONVERTED, dict) == mark:
         notes = [f"{target} already exists and was made from the same files"]  # left by a run that was killed
     else:
         fix = "choose another name for the scene, or move that folder"

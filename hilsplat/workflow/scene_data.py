@@ -5,17 +5,19 @@ wildcards of a rule, or a row of the sheet. Only evaluation and figures read lab
 """
 
 import functools
+import os
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Protocol, runtime_checkable
 
+from hilsplat.base.artifacts import digests_of, sha256_of_json
 from hilsplat.base.errors import SettingsError
 from hilsplat.datasets.registry import readers_of
-from hilsplat.datasets.sources import DATA_PREFIX, absence, image_files, is_exported, label_files, label_sets
-from hilsplat.scene.layouts import TRAINED, dataparser_of, transforms_of
-from hilsplat.scene.sheet import SceneRow
+from hilsplat.datasets.sources import absence, image_files, is_exported, label_files, label_sets, photo_files
+from hilsplat.scene.layouts import dataparser_of, transforms_of
+from hilsplat.scene.sheet import DATA_PREFIX, SceneRow
 
 
 @runtime_checkable  # for the type checker of the tests
@@ -49,6 +51,11 @@ def options_of(named: Mapping[str, Any]) -> str:
     return " ".join(f"--{name} {shlex.quote(str(value))}" for name, value in named.items() if value)
 
 
+def portable(path: Path | None) -> str:
+    """Return a path, relative if it is in the working folder, so that moving a project reruns nothing."""
+    return os.path.relpath(path) if path and path.is_relative_to(Path.cwd()) else str(path or "")
+
+
 class SceneData:
     """Inputs and options of the jobs that read a scene's photographs, Gaussians and labels."""
 
@@ -57,7 +64,8 @@ class SceneData:
         self._row_of = {(row.dataset, row.scene): row for row in rows}
         # A thousand scenes have tens of thousands of jobs, so folders are read once.
         self.absence = functools.cache(lambda row: absence(row.source, data_root))
-        self._folder_files = functools.cache(self._files_of)
+        self._folder_files = functools.cache(lambda row: [*map(portable, photo_files(row.folder, row.poses))])
+        self._digest = functools.cache(lambda memo, *files: sha256_of_json(digests_of(files, memo)))
         self._labels = functools.cache(lambda row: label_sets(row.source, data_root, row.name))
 
     def row(self, job: Job) -> SceneRow:
@@ -66,33 +74,28 @@ class SceneData:
     def images(self, job: Job, input: Sequence[str]) -> str:
         """Return the parameter of `poses`: the image folder."""
         row = self.row(job)
-        return input[0] if row.world or is_exported(row.source) else str(row.folder)
+        return input[0] if row.world or is_exported(row.source) else portable(row.folder)
 
     def image_files(self, job: Job) -> str | list[str]:
-        """Return the input of `poses`: a folder that a rule writes, or all files in a photograph folder."""
+        """Return the input of `poses`: a folder that a rule writes, or the files used in a source folder."""
         row = self.row(job)
         if row.world:
             return self.path(job, "world/images")
         return self.path(job, "source") if is_exported(row.source) else self._folder_files(row)
 
-    def _files_of(self, row: SceneRow) -> list[str]:
-        """Return the files in a folder of photographs, without labels and other programs' trained output."""
-        assert row.folder is not None, row.name  # scenes without data were skipped
-        labels = set(self._label_files(row))
-        files = [
-            str(path)
-            for path in row.folder.rglob("*")
-            if path.is_file()
-            and not path.name.startswith(".")
-            and path.relative_to(row.folder).parts[0] not in TRAINED
-            and str(path) not in labels
-        ]
-        named = [] if row.poses is None else [row.poses, *row.poses.rglob("*")]
-        return sorted({*files, *(str(path) for path in named if path.is_file())})
+    def content(self, files: Callable[[Any], str | list[str]]) -> Callable[[Job], str]:
+        """Return the parameter function for the digest of a user's files; Snakemake compares only times."""
+
+        def digest(job: Job) -> str:
+            found = files(job)
+            memo = Path(self.path(job)).parents[1] / ".cache/inputs" / job.dataset / f"{job.scene}.json"
+            return self._digest(memo, *(() if isinstance(found, str) else found))  # a rule writes a folder
+
+        return digest
 
     def poses_option(self, job: Job) -> str:
         row = self.row(job)
-        return "--render" if row.world else options_of({"poses": row.poses})
+        return "--render" if row.world else options_of({"poses": portable(row.poses)})
 
     def require_no_braces(self, row: SceneRow) -> None:
         """Raise SettingsError for file names with braces, which Snakemake interprets as wildcards."""
@@ -107,7 +110,7 @@ class SceneData:
 
     def source_files(self, job: Job) -> list[str]:
         """Return the input of `source`: a data set's files that contain the images and poses."""
-        return [str(path) for path in image_files(self.row(job).source, self.data_root)]
+        return [portable(path) for path in image_files(self.row(job).source, self.data_root)]
 
     def source_name(self, job: Job) -> str:
         return self.row(job).source.removeprefix(DATA_PREFIX)
@@ -123,10 +126,11 @@ class SceneData:
             return []
         beside = ply.with_suffix(".json")
         described = [beside] if beside.is_file() else self._nerfstudio(job).values()
-        return [str(path) for path in (ply, *described)]
+        return [portable(path) for path in (ply, *described)]
 
     def existing_gaussians_option(self, job: Job) -> str:
-        return options_of({"existing": self.row(job).gaussians, **self._nerfstudio(job)})
+        named = {"existing": self.row(job).gaussians, **self._nerfstudio(job)}
+        return options_of({name: portable(path) for name, path in named.items()})
 
     def _nerfstudio(self, job: Job) -> dict[str, Path]:
         """Return files that relate the coordinates of nerfstudio's PLY to those of the poses, by option."""
@@ -141,7 +145,7 @@ class SceneData:
     def features(self, job: Job) -> list[str]:
         """Return the input of `masks` and `clip`: LangSplat's files, which replace SAM and CLIP, if any."""
         folder = self.row(job).features
-        return sorted(str(path) for path in folder.glob("*_[sf].npy")) if folder is not None else []
+        return sorted(portable(path) for path in folder.glob("*_[sf].npy")) if folder is not None else []
 
     def labels(self, row: SceneRow) -> tuple[str, ...]:
         """Return the labels of a scene, as `data set/scene`: published labels and your own annotations."""
@@ -150,11 +154,12 @@ class SceneData:
     def label_readers(self, job: Job) -> tuple[str, ...]:
         return readers_of(self.labels(self.row(job)))
 
-    def _label_files(self, row: SceneRow) -> list[str]:
+    def label_files(self, job: Job) -> list[str]:
         """Return the label files, which only evaluation reads, so that editing one reruns no other stage."""
-        return [
-            str(path.resolve()) for labels in self.labels(row) for path in label_files(labels, self.data_root)
-        ]
+        found = (
+            path for labels in self.labels(self.row(job)) for path in label_files(labels, self.data_root)
+        )
+        return [portable(path.resolve()) for path in found]
 
     def truth(self, job: Job) -> list[str]:
         """Return the input that contains a synthetic scene's annotations; empty for other scenes."""
@@ -162,7 +167,7 @@ class SceneData:
 
     def truth_or_labels(self, job: Job) -> list[str]:
         """Return the input of `evaluate`: a synthetic scene's annotations, or another scene's label files."""
-        return self.truth(job) or self._label_files(self.row(job))
+        return self.truth(job) or self.label_files(job)
 
     def truth_option(self, job: Job, input: Any) -> str:
         """Return the options of `evaluate`: the ground truth or labels that a scene is scored against."""

@@ -149,10 +149,15 @@ def save(folder, pictures, suffix=".png", **options):
 
 
 def quaternion(rotation):
-    """Return wxyz of a rotation matrix (w is not 0 for the cameras here)."""
-    w = np.sqrt(max(1 + np.trace(rotation), 1e-12)) / 2
-    axis = [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    return np.array([w, *(np.array(axis) / (4 * w))])
+    """Return wxyz of a rotation matrix: the quaternion q that maximises the sum of q's matrix times it."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation
+    table = [
+        [a + e + i, h - f, c - g, d - b],
+        [h - f, a - e - i, b + d, c + g],
+        [c - g, b + d, e - a - i, f + h],
+        [d - b, c + g, f + h, i - a - e],
+    ]
+    return np.linalg.eigh(np.array(table))[1][:, -1]
 
 
 def write_colmap(folder, lens, size, images, points=((0.0, 0.0, 0.0, 9, 8, 7),)):

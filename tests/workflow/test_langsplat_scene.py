@@ -1,6 +1,7 @@
 """A scene of LangSplat, with poses, Gaussians and features, needs two commands."""
 
 import json
+import os
 import re
 import sys
 from pathlib import Path
@@ -60,7 +61,20 @@ def test_a_scene_of_langsplat_answers_after_two_commands(
     # a rerun of an early stage keeps the imported masks
     project.hilsplat("run", "theirs", "--", "--cores", "2", "--forcerun", "poses")
     assert read_index(results / "default/masks")["segmenter"] == "langsplat"
-    # other Gaussians rerun the stage
+    # other labels, Gaussians and features rerun their stages, even if they are older
+    labels = sorted((project.root / "annotated/photos/theirs").glob("*.json"))[0]
+    replace_by_older(labels, labels.read_bytes() + b"\n")
+    printed = project.hilsplat("run", "theirs", "--", "-n")
+    assert "rule evaluate:" in printed and "rule masks:" not in printed and "rule gaussians:" not in printed
     ply = theirs / "output/tiny/point_cloud/iteration_30000/point_cloud.ply"
-    ply.write_bytes(ply.read_bytes()[:-4] + b"\0\0\0\0")
-    assert "rule gaussians:" in project.hilsplat("run", "theirs", "--", "-n")
+    features = sorted((theirs / "language_features").glob("*_s.npy"))[0]
+    for path in (ply, features):
+        content = path.read_bytes()
+        replace_by_older(path, content[:-1] + bytes([content[-1] ^ 1]))
+    printed = project.hilsplat("run", "theirs", "--", "-n")
+    assert "rule masks:" in printed and "rule gaussians:" in printed and "rule poses:" not in printed
+
+
+def replace_by_older(path: Path, content: bytes) -> None:
+    path.write_bytes(content)
+    os.utime(path, (0, 0))

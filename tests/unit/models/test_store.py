@@ -97,7 +97,7 @@ def test_a_damaged_cache_of_digests_is_replaced(models, memo):
     (cache / "digests.json").write_text(memo)
     model_digest.cache_clear()
     assert model_digest(models / "sam-tiny", cache) == expected
-    assert list(json.loads((cache / "digests.json").read_text()).values()) == [expected]
+    assert len(json.loads((cache / "digests.json").read_text())) > 1, "one entry for each file"
 
 
 def test_a_cached_digest_of_the_wrong_type_is_computed_again(models):

@@ -1,0 +1,140 @@
+"""Phone exports: Polycam and Record3D, to the pixel."""
+
+import json
+
+import numpy as np
+import pytest
+
+from hilsplat.base.errors import HilsplatError
+from hilsplat.scene.importers.known_views import read_source
+from hilsplat.scene.layouts import find_known_poses
+from tests.imports import analytic_world as world
+
+WIDTH, HEIGHT = 112, 84
+POSES = world.cameras(6)
+LENSES = [(90.0 + 2 * row, 91.0 + row, 56 + 2 * np.sin(row), 42 + np.cos(row)) for row in range(6)]
+# ARKit's world has y up; x, y, z of ARKit are y, z, x of a world with z up.
+ARKIT = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+
+
+@pytest.fixture(autouse=True)
+def no_points(monkeypatch):
+    """Phone exports have no points; `test_importers.py` triangulates them."""
+    points = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    monkeypatch.setattr("hilsplat.scene.importers.importing.triangulate", lambda *args: points)
+
+
+def phone_pose(pose):
+    return ARKIT @ pose @ world.OPENGL
+
+
+def pictures(lenses):
+    return {
+        str(row): world.picture(world.pinhole(*lens), WIDTH, HEIGHT, pose)
+        for row, (lens, pose) in enumerate(zip(lenses, POSES, strict=True))
+    }
+
+
+def record3d(folder, lenses, **more):
+    world.save(folder / "rgb", pictures(lenses), ".png")
+    rows = []
+    for pose in POSES:
+        w, *xyz = world.quaternion(phone_pose(pose)[:3, :3])
+        rows.append([*xyz, w, *phone_pose(pose)[:3, 3]])
+    fx, fy, cx, cy = lenses[0]
+    by_columns = [fx, 0, 0, 0, fy, 0, cx, cy, 1]
+    content = {"K": by_columns, "w": WIDTH, "h": HEIGHT, "poses": rows, "fps": 60, "dw": 192, **more}
+    (folder / "metadata.json").write_text(json.dumps(content))
+    return folder
+
+
+def polycam(folder, border_px=0, **more):
+    prefix = "corrected_" if border_px else ""
+    world.save(folder / f"keyframes/{prefix}images", pictures(LENSES), ".png")
+    (folder / f"keyframes/{prefix}cameras").mkdir(parents=True)
+    for row, (lens, pose) in enumerate(zip(LENSES, POSES, strict=True)):
+        matrix = phone_pose(pose)
+        content = {f"t_{i}{j}": matrix[i, j] for i in range(3) for j in range(4)}
+        content |= dict(zip(("fx", "fy", "cx", "cy"), lens, strict=True))
+        content |= {"width": WIDTH, "height": HEIGHT, "blur_score": 3.5, "timestamp": 17, **more}
+        (folder / f"keyframes/{prefix}cameras/{row}.json").write_text(json.dumps(content))
+    return folder
+
+
+RIGHT = {f"{row}.png": pose for row, pose in enumerate(POSES)}
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_record3d_s_lenses_of_frames_are_applied(own, tmp_path, imported):
+    lenses = LENSES if own else LENSES[:1] * 6
+    more = {"perFrameIntrinsicCoeffs": [list(lens) for lens in lenses]} if own else {}
+    views, _, _, report = imported(record3d(tmp_path / "in", lenses, **more))
+    world.require_right(views, RIGHT, 45)
+    assert not report["warnings"]
+
+
+def test_polycam_s_pictures_are_right_with_and_without_their_border(tmp_path, imported):
+    views, *_ = imported(polycam(tmp_path / "plain"))
+    world.require_right(views, RIGHT, 45)
+    views, *_ = imported(polycam(tmp_path / "corrected", border_px=15))
+    world.require_right(views, RIGHT, 45)
+    view = views[0]
+    assert (view.camera.width, view.camera.height) == (WIDTH - 30, HEIGHT - 30)
+    assert view.photo.size_hw == (HEIGHT, WIDTH)  # labels drawn on the picture with its border
+
+
+@pytest.mark.parametrize("missing", [("width",), ("width", "height")])
+def test_polycam_s_size_is_that_of_the_picture_if_it_is_missing(missing, tmp_path, imported):
+    folder = polycam(tmp_path / "in")
+    for path in (folder / "keyframes/cameras").iterdir():
+        content = json.loads(path.read_text())
+        path.write_text(json.dumps({key: value for key, value in content.items() if key not in missing}))
+    views, *_ = imported(folder)
+    world.require_right(views, RIGHT, 45)
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"t_00": 1}', '{"fx": null}'])
+def test_one_damaged_camera_of_polycam_leaves_out_its_view(content, tmp_path, imported):
+    folder = polycam(tmp_path / "in")
+    (folder / "keyframes/cameras/2.json").write_text(content)
+    views, _, _, report = imported(folder)
+    world.require_right(views, {name: pose for name, pose in RIGHT.items() if name != "2.png"}, 45)
+    assert "2.json" in report["views"]["2.png"]["why_not"]
+
+
+@pytest.mark.parametrize(
+    ("write", "more"),
+    [
+        (record3d, {"perFrameIntrinsicCoeffs": [[90, 90, 56, 42]] * 5}),
+        (record3d, {"perFrameIntrinsicCoeffs": [[90, 90, 56]] * 6}),
+        (record3d, {"distortion": [0.1, 0]}),
+        (record3d, {"poses": [[1, 2, 3]]}),
+        (record3d, {"K": [1, 2]}),
+        (record3d, {"w": "wide"}),
+        (polycam, {"k1": 0.1}),
+        (polycam, {"fx": -1}),
+    ],
+)
+def test_what_cannot_be_applied_is_refused(write, more, tmp_path, imported):
+    folder = record3d(tmp_path, LENSES, **more) if write is record3d else polycam(tmp_path, **more)
+    with pytest.raises(HilsplatError):
+        imported(folder)
+
+
+def test_unknown_keys_are_reported(tmp_path):
+    folder = record3d(tmp_path / "r", LENSES, exposure=[1])
+    assert read_source(find_known_poses(folder)).notes == [
+        "keys of metadata.json that are not used: exposure"
+    ]
+    folder = polycam(tmp_path / "p", hdr=True)
+    assert read_source(find_known_poses(folder)).notes == ["keys of cameras that are not used: hdr"]
+
+
+def test_a_quaternion_that_is_not_a_rotation_leaves_out_its_view(tmp_path, imported):
+    folder = record3d(tmp_path / "in", LENSES[:1] * 6)
+    path = folder / "metadata.json"
+    content = json.loads(path.read_text())
+    content["poses"][1][:4] = [0.5, 0.5, 0.5, 0.9]
+    path.write_text(json.dumps(content))
+    views, _, _, report = imported(folder)
+    assert len(views) == 5 and not report["views"]["1.png"]["registered"]
