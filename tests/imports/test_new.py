@@ -1,0 +1,209 @@
+"""`hilsplat new` says what it will use, what it leaves out and why, before anything runs."""
+
+import json
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from hilsplat.base.errors import SceneError
+from hilsplat.cli.main import app
+from hilsplat.photos.add import add_scene
+from hilsplat.scene.importers.known_views import read_source
+from hilsplat.scene.layouts import find_known_poses, photo_folder
+from hilsplat.scene.sheet import read_sheet
+from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.ply import save_ply
+from tests.imports import analytic_world as world
+
+WIDTH, HEIGHT = 64, 48
+POSES = world.cameras(6)
+PICTURES = {
+    f"{row:03d}": world.picture(world.pinhole(60, 60, 32, 24), WIDTH, HEIGHT, p)
+    for row, p in enumerate(POSES)
+}
+POINTS = [(0.1 * row, 0, 0, 1, 2, 3) for row in range(7)]
+
+
+def photographs(folder, count=6):
+    world.save(folder, dict(list(PICTURES.items())[:count]), ".jpg", quality=95)
+    return folder
+
+
+def model(folder, place="sparse/0", count=6):
+    images = {f"{name}.jpg": pose for name, pose in zip(list(PICTURES)[:count], POSES, strict=False)}
+    world.write_colmap(folder / place, "PINHOLE 60 60 32 24", (WIDTH, HEIGHT), images, POINTS)
+
+
+def gaussians(path, count):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    ones = np.ones((count, 3), np.float32)
+    quats = np.tile(np.float32([1, 0, 0, 0]), (count, 1))
+    save_ply(path, Gaussians(ones, ones, quats, ones[:, 0], np.ones((count, 1, 3), np.float32)))
+
+
+def new(folder, project, *options):
+    project.mkdir(exist_ok=True)
+    words = ["new", "desk", str(folder), "--sheet", str(project / "config/scenes.tsv"), *options]
+    return CliRunner().invoke(app, words)
+
+
+@pytest.mark.parametrize("options", [(), ("--dry-run",)])
+def test_every_part_is_counted_and_what_is_left_out_is_named(options, tmp_path):
+    folder = photographs(tmp_path / "theirs/images").parent
+    model(folder), model(folder, "sparse/1", 2)
+    (folder / "images/004.jpg").unlink()
+    gaussians(folder / "output/a/point_cloud/iteration_30000/point_cloud.ply", 11)
+    gaussians(folder / "output/a/point_cloud/iteration_best/point_cloud.ply", 12)
+    (folder / "language_features").mkdir()
+    for name in ("000", "001"):
+        np.save(folder / f"language_features/{name}_s.npy", np.zeros(1))
+    (folder / "label").mkdir()
+    for name in ("001", "002", "004", "zzz"):
+        labels = {"info": {"name": f"{name}.jpg", "width": WIDTH, "height": HEIGHT}, "objects": [{}, {}]}
+        (folder / f"label/{name}.json").write_text(json.dumps(labels))
+    (folder / "label/000.json").write_text("{")
+    result = new(folder, tmp_path / "project", *options)
+    assert result.exit_code == 0, result.output
+    for line in (
+        f"poses: {folder}/sparse/0: 5 views with an image",
+        "  left out: 1 views without an image: 004.jpg",
+        "  points: 7",
+        f"  {folder}/sparse/1 also has poses, which are not used",
+        f"Gaussians: 11 from {folder}/output/a/point_cloud/iteration_30000/point_cloud.ply",
+        "  not used: output/a/point_cloud/iteration_best/point_cloud.ply",
+        f"features: {folder}/language_features: masks and vectors of 2 of 5 views",
+        f"labels: 8 in 4 photographs, used for evaluation: {folder}/label",
+        "  not scored, because their views have no pose: 004.json, zzz.json",
+        "5 photographs in",
+    ):
+        assert line in result.output, result.output
+    assert "left out: " in result.output and "000.json is not valid JSON" in result.output
+    assert (tmp_path / "project/config/scenes.tsv").exists() == (not options)
+    assert (tmp_path / "project/annotated/photos/desk/001.json").exists() == (not options)
+    assert not (tmp_path / "project/annotated/photos/desk/000.json").exists()
+
+
+@pytest.mark.parametrize("kind", ["zip", "r3d"])
+def test_a_dry_run_of_an_archive_leaves_nothing(kind, tmp_path):
+    photographs(tmp_path / "a")
+    with zipfile.ZipFile(tmp_path / f"a.{kind}", "w") as archive:
+        for path in (tmp_path / "a").iterdir():
+            archive.write(path, path.name)
+    result = new(tmp_path / f"a.{kind}", tmp_path / "project", "--dry-run")
+    assert "6 photographs in" in result.output and "nothing was added" in result.output
+    assert not list((tmp_path / "project").rglob("*"))
+
+
+@pytest.mark.parametrize(
+    ("places", "chosen"),
+    [
+        (["."], "."),
+        (["images"], "images"),
+        (["Images"], "Images"),
+        (["input"], "input"),
+        (["images", "input"], "images"),
+        (["images", "images_2", "images_4"], "images"),
+        (["DCIM/100APPLE"], "DCIM/100APPLE"),
+        (["photos"], "photos"),
+        (["day/morning"], "day/morning"),
+        (["output/renders", "photos"], "photos"),
+        ([".thumbnails", "photos"], "photos"),
+    ],
+)
+def test_photographs_are_found_where_people_have_them(places, chosen, tmp_path):
+    for place in places:
+        photographs(tmp_path / place)
+    assert photo_folder(tmp_path) == (tmp_path / chosen)
+    report = add_scene(tmp_path / "p/scenes.tsv", "a", tmp_path)
+    assert report.num_readable == 6 and report.folder == tmp_path / chosen
+
+
+def test_a_stray_picture_beside_a_folder_of_photographs_is_not_the_set(tmp_path):
+    photographs(tmp_path / "images")
+    photographs(tmp_path, 1)
+    assert photo_folder(tmp_path) == tmp_path / "images"
+
+
+@pytest.mark.parametrize("places", [["monday", "tuesday"], ["DCIM/100APPLE", "DCIM/101APPLE"]])
+def test_several_folders_of_photographs_are_listed(places, tmp_path):
+    for place in places:
+        photographs(tmp_path / "photos" / place, 4)
+    with pytest.raises(SceneError, match=r"0 distinct readable(.|\n)*4 images in(.|\n)*4 images in"):
+        add_scene(tmp_path / "scenes.tsv", "a", tmp_path / "photos")
+
+
+def test_poses_in_a_single_folder_below_are_found(tmp_path):
+    photographs(tmp_path / "desk/desk/images")
+    model(tmp_path / "desk/desk")
+    report = add_scene(tmp_path / "p/config/scenes.tsv", "a", tmp_path / "desk")
+    assert "6 views with an image" in str(report)
+    (row,) = read_sheet(tmp_path / "p/config/scenes.tsv")
+    assert row.folder == tmp_path / "desk/desk"
+
+
+def test_images_of_poses_are_found_in_input(tmp_path):
+    photographs(tmp_path / "input")
+    model(tmp_path)
+    assert all(view.image is not None for view in read_source(find_known_poses(tmp_path)).views)
+
+
+@pytest.mark.parametrize("content", [b"", b"no picture", "too large"])
+def test_one_photograph_that_cannot_be_read_is_left_out(content, tmp_path):
+    folder = photographs(tmp_path / "a")
+    if content == "too large":
+        Image.new("1", (20_000, 10_000)).save(folder / "bad.png")  # 200 megapixels
+    else:
+        (folder / "bad.png").write_bytes(content)
+    report = str(add_scene(tmp_path / "scenes.tsv", "a", folder))
+    assert "6 photographs in" in report and "1  cannot be read and are left out" in report
+    assert "bad.png: " in report
+    for row in range(4):
+        (folder / f"bad{row}.png").write_bytes(b"")
+    with pytest.raises(SceneError, match="5 of 11 photographs in .* cannot be read"):
+        add_scene(tmp_path / "scenes.tsv", "b", folder)
+
+
+@pytest.mark.parametrize("name", ["photos\\{}", "a\\b\\{}", "{}"])
+def test_archives_made_on_windows_are_unpacked(name, tmp_path):
+    photographs(tmp_path / "a")
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        for path in (tmp_path / "a").iterdir():
+            entry = zipfile.ZipInfo("x")
+            entry.filename = name.format(path.name)
+            archive.writestr(entry, path.read_bytes())
+    assert add_scene(tmp_path / "p/scenes.tsv", "a", tmp_path / "a.zip").num_readable == 6
+
+
+@pytest.mark.parametrize("name", ["..\\{}", "C:\\a\\{}", "\\\\host\\share\\{}", "a\\..\\..\\{}", "/{}"])
+def test_archives_that_lead_outside_are_refused(name, tmp_path):
+    photographs(tmp_path / "a")
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        for path in (tmp_path / "a").iterdir():
+            entry = zipfile.ZipInfo("x")
+            entry.filename = name.format(path.name)
+            archive.writestr(entry, path.read_bytes())
+    with pytest.raises(SceneError, match="outside the folder"):
+        add_scene(tmp_path / "p/scenes.tsv", "a", tmp_path / "a.zip")
+    assert not (tmp_path / "p/photos").exists()
+
+
+def test_other_programs_gaussians_without_poses_are_named_but_not_used(tmp_path):
+    folder = photographs(tmp_path / "a")
+    gaussians(folder / "point_cloud.ply", 3)
+    report = str(add_scene(tmp_path / "scenes.tsv", "a", folder))
+    assert "Gaussians: not used, because they need the poses they were made with" in report
+    (row,) = read_sheet(tmp_path / "scenes.tsv")
+    assert row.gaussians is None
+
+
+def test_damaged_poses_are_refused_before_the_scene_is_added(tmp_path):
+    folder = photographs(tmp_path / "theirs/images").parent
+    model(folder)
+    Path(folder / "sparse/0/images.txt").write_text("1 2 3\n")
+    result = new(folder, tmp_path / "project")
+    assert result.exit_code == 1 and "images.txt, line 1, cannot be read" in result.output
+    assert not (tmp_path / "project/config").exists()
