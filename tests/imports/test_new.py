@@ -163,7 +163,7 @@ def test_one_photograph_that_cannot_be_read_is_left_out(content, tmp_path):
     assert "bad.png: " in report
     for row in range(4):
         (folder / f"bad{row}.png").write_bytes(b"")
-    with pytest.raises(SceneError, match="5 of 11 photographs in .* cannot be read"):
+    with pytest.raises(SceneError, match=r"5 of 11 photographs in .* cannot be read"):
         add_scene(tmp_path / "scenes.tsv", "b", folder)
 
 
@@ -188,7 +188,7 @@ def test_archives_that_lead_outside_are_refused(name, tmp_path):
             archive.writestr(entry, path.read_bytes())
     with pytest.raises(SceneError, match="outside the folder"):
         add_scene(tmp_path / "p/scenes.tsv", "a", tmp_path / "a.zip")
-    assert not (tmp_path / "p/photos").exists()
+    assert not list((tmp_path / "p").rglob("*.jpg"))
 
 
 def test_other_programs_gaussians_without_poses_are_named_but_not_used(tmp_path):
@@ -205,5 +205,5 @@ def test_damaged_poses_are_refused_before_the_scene_is_added(tmp_path):
     model(folder)
     Path(folder / "sparse/0/images.txt").write_text("1 2 3\n")
     result = new(folder, tmp_path / "project")
-    assert result.exit_code == 1 and "images.txt, line 1, cannot be read" in result.output
+    assert "images.txt, line 1, cannot be read" in str(result.exception)
     assert not (tmp_path / "project/config").exists()
