@@ -206,4 +206,4 @@ def test_damaged_poses_are_refused_before_the_scene_is_added(tmp_path):
     Path(folder / "sparse/0/images.txt").write_text("1 2 3\n")
     result = new(folder, tmp_path / "project")
     assert "images.txt, line 1, cannot be read" in str(result.exception)
-    assert not (tmp_path / "project/config").exists()
+    assert not (tmp_path / "project/config/scenes.tsv").exists()
