@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
-import cv2
 import numpy as np
 from jaxtyping import Bool
 from pydantic import AfterValidator, Field, ValidationError
@@ -22,7 +21,7 @@ from hilsplat.base.removal import delete
 from hilsplat.datasets.images.hi import by_id, parents_of
 from hilsplat.datasets.images.isat import IsatFile, Polygon, fill_polygons, read_isat, trace_polygons
 from hilsplat.scene.cameras import Camera, Cameras
-from hilsplat.scene.placement import placement
+from hilsplat.scene.placement import placed
 from hilsplat.web.file_changes import replacing, version_of
 from hilsplat.web.messages import MAX_SIDE_PX, Message, Text
 
@@ -78,19 +77,6 @@ class Label(Message):
 def traced(mask: Bool[np.ndarray, "H W"]) -> list[list[tuple[int, int]]]:
     """Return polygons that contain exactly the pixels of a mask."""
     return [whole_pixels(polygon) for polygon in trace_polygons(mask)]
-
-
-def placed(mask: Bool[np.ndarray, "H W"], camera: Camera, where: str) -> Bool[np.ndarray, "h w"]:
-    """Transfer a mask drawn on a view's photograph, or on a scaled copy of either, to the view's pixels.
-
-    Each pixel takes the value at its centre. For errors, see `placement`.
-    """
-    if (place := placement(camera, mask.shape, where)) is not None:
-        return place(mask)
-    if mask.shape == camera.size_hw:
-        return mask
-    size = camera.size_hw[::-1]
-    return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT).astype(bool)
 
 
 def placed_rings(

@@ -19,7 +19,7 @@ from hilsplat.base.levels import Level
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel, unit
 from hilsplat.scene.cameras import Camera
-from hilsplat.scene.placement import placement
+from hilsplat.scene.placement import placed
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import MASKS_SHA256, digest_of, index_entry
 from hilsplat.segment.masks import HierarchicalMasks, runs_of_labels
@@ -88,12 +88,8 @@ def read_view(
     if (height, width) != size_hw and camera is None:
         wrong = f"{maps_path} does not match the size of view {view}"
         raise MisalignedArtifactError(wrong, expected=size_hw, found=(height, width))
-    if camera is not None and (move := placement(camera, (height, width), str(maps_path))) is not None:
-        labels = np.stack([move(each + 1) - 1 for each in labels])  # 0 is outside the photograph
-    else:
-        rows = ((np.arange(size_hw[0]) + 0.5) * height / size_hw[0]).astype(int)
-        columns = ((np.arange(size_hw[1]) + 0.5) * width / size_hw[1]).astype(int)
-        labels = labels[:, rows[:, None], columns]
+    if camera is not None:  # 0 is outside the photograph
+        labels = np.stack([placed(each + 1, camera, str(maps_path)) for each in labels]) - 1
     parts, vector_rows = [], []
     for place, level in enumerate(MAPS):
         if level is None:

@@ -54,6 +54,20 @@ def placement(camera: Camera, drawn_hw: tuple[int, int], where: str) -> Placemen
     return lambda drawn: np.where(pixels == OUTSIDE, 0, drawn.ravel()[pixels]).astype(drawn.dtype)
 
 
+def placed(drawn: Shaped[np.ndarray, "H W"], camera: Camera, where: str) -> Shaped[np.ndarray, "h w"]:
+    """Bring a drawing from a view's photograph, or from a scaled copy of either, to the view's pixels.
+
+    Each pixel takes the value at its centre. For errors, see `placement`.
+    """
+    if (place := placement(camera, drawn.shape, where)) is not None:
+        return place(drawn)
+    rows, columns = (
+        ((np.arange(side) + 0.5) * old / side).astype(np.int64)
+        for side, old in zip(camera.size_hw, drawn.shape, strict=True)
+    )
+    return drawn[rows[:, None], columns]
+
+
 @lru_cache(maxsize=4)
 def _pixels_of_photo(
     photo: Photo, K: tuple[float, ...], size_hw: tuple[int, int], drawn_hw: tuple[int, int]

@@ -112,7 +112,7 @@ def test_square_photographs_with_known_poses_stay_as_stored(turn, tmp_path, impo
 
 @pytest.mark.parametrize("turn", range(1, 9))
 def test_poses_of_upright_pictures_get_upright_pictures(turn, tmp_path, imported):
-    """Other programs turn photographs before they compute poses; then the shape tells."""
+    """Other programs turn photographs before they compute poses; then the shape decides."""
     upright = PICTURES[0]
     turned = {1: 1, 2: 2, 3: 3, 4: 4, 5: 5, 6: 8, 7: 7, 8: 6}[turn]  # the opposite turn
     raw = io.BytesIO()

@@ -103,7 +103,7 @@ def test_a_view_may_have_no_masks(tmp_path):
 def test_maps_of_another_size_are_resized_and_of_another_shape_refused(files):
     camera = Camera("a.png", np.eye(4), np.eye(3), (12, 16))
     with pytest.raises(MisalignedArtifactError, match=r"the size of view a.png\n.*\(12, 16\)\n.*\(6, 8\)"):
-        read_view(files, "a.png", (12, 16))  # without a camera, nobody knows what the maps were drawn on
+        read_view(files, "a.png", (12, 16))  # without a camera, it is unknown what the maps were drawn on
     with pytest.raises(MisalignedArtifactError, match=r"12 x 12 px(.|\n)*8 x 6 px"):
         read_view(files, "a.png", (12, 12), replace(camera, size_hw=(12, 12)))
     masks, _ = read_view(files, "a.png", (12, 16), camera)
