@@ -20,14 +20,14 @@ from jaxtyping import Bool, Float
 from PIL import Image, ImageDraw
 from pycocotools import mask as coco_masks
 
-from hilsplat.annotate.labels import Label, as_file, known_labels, placed, placed_rings, traced
+from hilsplat.annotate.labels import Label, as_file, known_labels, placed_rings, traced
 from hilsplat.base.artifacts import atomic_folder, parse_json, write_text
 from hilsplat.base.errors import HilsplatError, SceneError, first_line, foreign
 from hilsplat.base.images import open_image
 from hilsplat.datasets.images.isat import fill_polygons, read_object, stated_size
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.scene.cameras import Camera, Cameras
-from hilsplat.scene.placement import placement
+from hilsplat.scene.placement import placed, placement
 from hilsplat.scene.scene import Scene
 from hilsplat.scene.view_names import match_name, match_names
 from hilsplat.web.coco import coco_content, coco_region
@@ -250,7 +250,7 @@ def _joined(name: str, pieces: Sequence[Piece], errors: list[HilsplatError]) -> 
             label = Label.read(
                 name,
                 id=number,
-                level=keys.get("level") or 1,
+                level=1 if keys.get("level") is None else keys["level"],
                 parent=keys.get("parent") if is_id else None,
                 text=same[0].text,
                 polygons=[ring for piece in same for ring in piece.rings],
@@ -342,7 +342,7 @@ def _coco_reader(name: str, content: Mapping[str, Any], cameras: Cameras) -> Rea
             return f"of images that are not in the scene ({foreign_names or 'unknown ids'})"
         if num_files[view] > 1:  # such as copies that were cropped or mirrored for training
             return "of different images whose names fit the same photograph"
-        if text is None:
+        if not isinstance(text, str | int):
             return "of unknown categories"
         if not region:
             return "without a region (boxes, keypoints)"
@@ -376,6 +376,8 @@ def _coco_mask(where: str, region: Any, image: Mapping[str, Any], camera: Camera
     height, width = _drawn_hw(where, dict(zip(("height", "width"), region["size"], strict=True)), camera)
     runs = {"size": [height, width], "counts": region["counts"]}
     if not isinstance(runs["counts"], str):
+        if {*map(type, runs["counts"])} - {int}:
+            raise ValueError("the run lengths are not whole numbers")
         runs = coco_masks.frPyObjects(runs, height, width)
     elif not re.fullmatch("([P-o]{0,6}[0-O])+", runs["counts"]):
         raise ValueError("the run lengths are damaged")

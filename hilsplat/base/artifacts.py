@@ -318,7 +318,10 @@ def write_npy(path: Path, array: np.ndarray) -> None:
 def read_npy(path: Path) -> np.ndarray:
     """Read a numeric array from an .npy file without unpickling; raise ArtifactError for anything else."""
     with _readable(path):
-        array = np.load(regular(Path(path)), allow_pickle=False)
+        with regular(Path(path)).open("rb") as stream:
+            array = np.load(stream, allow_pickle=False)
+            if stream.read(1):
+                raise ValueError("bytes follow its array")
         if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
             raise ValueError(f"it contains {getattr(array, 'dtype', 'an archive')}, not numbers")
     return array

@@ -108,9 +108,10 @@ def read_image(
         with open_image(file, max_side_px) as image:
             if (num_frames := _frames(image)) > 1:
                 raise ValueError(f"it contains {num_frames} frames of the same size, like an animation")
-            turn = orientation(image)
-            image.load()
-            if image.format == "TIFF":  # Pillow turned it upright
+            turn = orientation(image) if image.format == "TIFF" else 0  # read first: Pillow turns it upright
+            image.load()  # raises only the first time, so nothing may have loaded it before
+            turn = turn or orientation(image)
+            if image.format == "TIFF":
                 turn = {6: 8, 8: 6}.get(turn, turn) if as_stored else 1
             elif as_stored:
                 turn = 1

@@ -70,10 +70,19 @@ def new(
     """
     from hilsplat.photos.add import add_scene
     from hilsplat.scene.sheet import PHOTOS, read_sheet
+    from hilsplat.splat.coordinates import read_gaussians
     from hilsplat.workflow.models import models_of_photographs
 
     parts = {"poses": poses, "gaussians": gaussians, "features": features, "labels": labels}
-    report = add_scene(sheet, name, photos, frames=frames, **parts, dry_run=dry_run)
+    report = add_scene(
+        sheet,
+        name,
+        photos,
+        frames=frames,
+        **parts,
+        check_ply=lambda ply: read_gaussians(ply)[1],
+        dry_run=dry_run,
+    )
     if dry_run:
         echo(f"{report}\n\nnothing was added (--dry-run)")
         return

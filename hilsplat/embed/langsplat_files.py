@@ -70,7 +70,7 @@ def read_view(
     if maps.ndim != 3 or len(maps) != len(MAPS) or not maps.size:
         shape = "an array of shape (4, height, width): default, s, m, l"
         raise ArtifactError(f"{maps_path} is not a LangSplat map", expected=shape, found=f"{maps.shape}")
-    if vectors.ndim != 2 or vectors.dtype.kind != "f" or not np.isfinite(vectors).all():
+    if vectors.ndim != 2 or vectors.dtype.kind != "f" or not (np.abs(vectors) < 1e9).all():
         raise ArtifactError(
             f"{vectors_path} is not an array of vectors",
             expected="finite floating-point numbers of shape (masks, channels)",

@@ -10,7 +10,7 @@ from hilsplat.base.artifacts import atomic_folder, changing, write_text
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import NAME_RULE, name_problem
 from hilsplat.base.removal import undone_on_error
-from hilsplat.photos.findings import find_parts
+from hilsplat.photos.findings import CheckPly, find_parts
 from hilsplat.photos.inspection import PhotoReport, inspect_photos
 from hilsplat.photos.intake import prepared_photographs
 from hilsplat.scene.layouts import contents, has_known_poses
@@ -28,6 +28,7 @@ def add_scene(
     features: Path | None = None,
     labels: Path | None = None,
     *,
+    check_ply: CheckPly | None = None,
     dry_run: bool = False,
 ) -> PhotoReport:
     """Append your own photographs to the sheet as scene `photos/<name>`, creating the sheet if it is missing.
@@ -45,6 +46,7 @@ def add_scene(
         features: folder of LangSplat's masks and CLIP vectors, used instead of SAM and CLIP.
         labels: folder of label files from LERF-OVS or `hilsplat annotate`, used only for evaluation and
             copied to `annotated/photos/<name>/` in the project.
+        check_ply: reads the Gaussians and returns notes on them; None trusts them.
         dry_run: only report; videos and archives are converted in a temporary folder.
 
     Raises:
@@ -66,7 +68,7 @@ def add_scene(
         with TemporaryDirectory() if dry_run else nullcontext(root) as place:
             target = Path(place) / PHOTOS / name
             with prepared_photographs(photos, target, frames) as (folder, made):
-                found = find_parts(folder, named)
+                found = find_parts(folder, named, check_ply)
                 annotated = root / "annotated" / PHOTOS / name
                 files = [] if annotated.exists() else found.labels
                 report = replace(inspect_photos(folder, poses), notes=(*made, *found.lines))

@@ -1,5 +1,6 @@
 """What a scene's folder offers besides photographs: what will be used, what is left out, and why."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -40,8 +41,13 @@ class Findings:
     lines: list[str] = field(default_factory=list)
 
 
-def find_parts(folder: Path, named: dict[str, Path | None]) -> Findings:
+CheckPly = Callable[[Path], list[str]]
+
+
+def find_parts(folder: Path, named: dict[str, Path | None], check_ply: CheckPly | None) -> Findings:
     """Find poses, Gaussians, features and labels: those that the user named, or else those in the folder.
+
+    `check_ply` reads a PLY and returns notes on what cannot be used.
 
     Without known poses, the coordinates of another program's Gaussians are unknown, so these are ignored.
 
@@ -53,7 +59,7 @@ def find_parts(folder: Path, named: dict[str, Path | None]) -> Findings:
             raise SceneError(f"--{what} {path} is missing", fix="correct the path, or pass `none`")
     found = Findings()
     views = _poses(folder, named["poses"], found)
-    _gaussians(folder, named, found)
+    _gaussians(folder, named, check_ply, found)
     _features(folder, named["features"], views, found)
     _labels(folder, named["labels"], views, found)
     if skipped := [path.name for path in sorted(folder.rglob("*.pth"))[:3]]:
@@ -89,7 +95,9 @@ def _poses(folder: Path, named: Path | None, found: Findings) -> list[str]:
     return view_names(files)
 
 
-def _gaussians(folder: Path, named: dict[str, Path | None], found: Findings) -> None:
+def _gaussians(
+    folder: Path, named: dict[str, Path | None], check_ply: CheckPly | None, found: Findings
+) -> None:
     every = [named["gaussians"]] if named["gaussians"] is not None else trained_gaussians(folder)
     if not every or every[0] == NO_POSES:
         return
@@ -99,6 +107,7 @@ def _gaussians(folder: Path, named: dict[str, Path | None], found: Findings) -> 
         return
     found.columns["gaussians"] = ply.resolve()
     found.lines.append(f"Gaussians: {vertex_count(ply) or 'unknown number'} from {ply}")
+    found.lines += [f"  {note}" for note in (check_ply(ply) if check_ply else [])]
     if others:
         names = [str(path.relative_to(folder)) for path in others]
         found.lines.append(f"  not used: {_listed(names)}")

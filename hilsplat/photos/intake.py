@@ -2,13 +2,14 @@
 
 import os
 import stat
+import struct
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path, PurePosixPath
 
 from hilsplat.base.artifacts import CONVERTED, atomic_folder, read_memo, require_free_space, write_json
-from hilsplat.base.errors import SceneError
+from hilsplat.base.errors import HilsplatError, SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_outside, list_files, list_images
 from hilsplat.base.removal import undone_on_error
 from hilsplat.scene.layouts import has_known_poses, photo_folder, unwrapped
@@ -94,17 +95,34 @@ def unpack_photographs(archive: Path, folder: Path) -> None:
     """
     try:
         with zipfile.ZipFile(archive) as opened:
-            entries = [entry for entry in opened.infolist() if not entry.is_dir()]
+            listed = opened.infolist()
+            if _num_listed(archive) not in (len(listed), 2**16 - 1):
+                raise zipfile.BadZipFile(f"its list of files is damaged after {len(listed)} files")
+            entries = [entry for entry in listed if not entry.filename.endswith(("/", "\\"))]
             _check_entries(archive, entries)
             chosen = [entry for entry in entries if _is_wanted(PurePosixPath(entry.filename))]
             require_free_space(folder, sum(entry.file_size for entry in chosen) / 2**20 + 200)
-            opened.extractall(folder, chosen)  # stops at the declared size; checks the size and the CRC
-    except (zipfile.BadZipFile, NotImplementedError, EOFError, OSError, RuntimeError) as error:
+            opened.extractall(folder, chosen)  # stops at the declared size; checks the CRC
+            for entry in chosen:
+                if (folder / entry.filename).stat().st_size != entry.file_size:
+                    raise zipfile.BadZipFile(f"{entry.filename} is incomplete")
+    except HilsplatError:
+        raise
+    except Exception as error:  # zipfile and zlib raise nearly everything on damaged data
         raise SceneError(
             f"archive {archive} cannot be unpacked: {error}",
             found=f"a file of {archive.stat().st_size} bytes" if archive.is_file() else "no file",
             fix="copy it again, or unpack it yourself and pass the folder",
         ) from error
+
+
+def _num_listed(archive: Path) -> int:
+    """Return the number of files that an archive declares, which zipfile ignores; 65535 if it is large."""
+    with archive.open("rb") as stream:
+        stream.seek(max(0, archive.stat().st_size - 2**16 - 22))  # the longest comment, and the record itself
+        end = stream.read()
+    (count,) = struct.unpack_from("<H", end, end.rfind(b"PK\5\6") + 10)
+    return count
 
 
 def _is_wanted(name: PurePosixPath) -> bool:

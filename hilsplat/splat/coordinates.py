@@ -157,6 +157,15 @@ def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
     return matrix
 
 
+def read_gaussians(ply: Path) -> tuple[Gaussians, list[str]]:
+    """Read another program's PLY; return notes on what was changed and left out (`import_ply`)."""
+    gaussians, notes, unknown = import_ply(ply, FIX)
+    notes += [f"unknown properties are not used: {', '.join(unknown)}"] if unknown else []
+    if len(gaussians) == 0:
+        raise ArtifactError(f"{ply} contains no Gaussians", fix=FIX)
+    return gaussians, notes
+
+
 def import_gaussians(
     ply: Path, scene: Scene, dataparser: Path | None = None, transforms: Path | None = None
 ) -> tuple[Gaussians, dict[str, Any]]:
@@ -172,10 +181,7 @@ def import_gaussians(
     Raises:
         ArtifactError: if the file cannot be used.
     """
-    gaussians, notes, unknown = import_ply(ply, FIX)
-    notes += [f"unknown properties are not used: {', '.join(unknown)}"] if unknown else []
-    if len(gaussians) == 0:
-        raise ArtifactError(f"{ply} contains no Gaussians", fix=FIX)
+    gaussians, notes = read_gaussians(ply)
     source_from_ply = read_source_from_scene(ply)
     moved = "in the coordinates of the scene's source"
     transform = scene.scene_from_source

@@ -9,7 +9,7 @@ from plyfile import PlyData, PlyElement
 
 from hilsplat.base.artifacts import atomic_path, remake
 from hilsplat.base.errors import ArtifactError, foreign
-from hilsplat.base.files import regular
+from hilsplat.scene.importers.ply_file import read_ply
 from hilsplat.splat.gaussians import Gaussians
 
 SATURATED_LOGIT = 16.0  # replaces infinite opacity logits; a float32 sigmoid of 17 is 1
@@ -99,12 +99,12 @@ def import_ply(path: Path, fix: str) -> tuple[Gaussians, list[str], list[str]]:
     if not path.exists():
         raise ArtifactError(f"{path} is missing", fix=fix)
     with foreign(path, ArtifactError, expected="a 3DGS PLY", fix=fix), np.errstate(over="ignore"):
-        ply = PlyData.read(regular(path))
+        ply = read_ply(path)
         vertex = ply["vertex"]
         kinds = {prop.name: vertex.data.dtype[prop.name].kind for prop in vertex.properties}
         others = sorted({*kinds, *(element.name for element in ply)} - {*_names(16), "filter_3D", "vertex"})
         for pattern, problem in REFUSED.items():
-            if refused := [name for name in others if re.fullmatch(pattern, name)]:
+            if refused := [name for name in others if re.fullmatch(pattern, name, re.IGNORECASE)]:
                 raise ArtifactError(f"{path} {problem}", found=", ".join(refused[:5]), fix=fix)
         names = _columns(path, kinds, fix)
         values = np.stack([np.asarray(vertex[name], dtype=np.float32) for name in names], axis=1)

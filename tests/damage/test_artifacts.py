@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hilsplat.base.artifacts import read_npz, visible_files, write_index, write_npy, write_npz
+from hilsplat.base.artifacts import read_npz, write_index, write_npy, write_npz
 from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.contributions.rows import Contributions
 from hilsplat.embed.vectors import mask_embeddings
@@ -228,7 +228,8 @@ def test_a_query_never_answers_from_a_file_with_a_flipped_bit(desk):
         ]
 
     expected, refused = ask(), set()
-    for number, path in enumerate(visible_files(desk), 1):
+    files = [path for path in sorted(desk.rglob("*")) if path.is_file() and "/." not in str(path)]
+    for number, path in enumerate(files, 1):
         content = path.read_bytes()
         try:
             path.write_bytes(damaged_bytes(content, ("flip", 0.6, number)))

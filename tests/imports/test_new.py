@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from plyfile import PlyData
 from typer.testing import CliRunner
 
 from hilsplat.base.errors import SceneError
@@ -45,6 +46,13 @@ def gaussians(path, count):
     save_ply(path, Gaussians(ones, ones, quats, ones[:, 0], np.ones((count, 1, 3), np.float32)))
 
 
+def without_some(path, bad):
+    """Spoil Gaussians: positions that are not numbers."""
+    ply = PlyData.read(path)
+    ply["vertex"].data["x"][:bad] = np.nan
+    ply.write(path)
+
+
 def new(folder, project, *options):
     project.mkdir(exist_ok=True)
     words = ["new", "desk", str(folder), "--sheet", str(project / "config/scenes.tsv"), *options]
@@ -58,6 +66,7 @@ def test_every_part_is_counted_and_what_is_left_out_is_named(options, tmp_path):
     (folder / "images/004.jpg").unlink()
     gaussians(folder / "output/a/point_cloud/iteration_30000/point_cloud.ply", 11)
     gaussians(folder / "output/a/point_cloud/iteration_best/point_cloud.ply", 12)
+    without_some(folder / "output/a/point_cloud/iteration_30000/point_cloud.ply", 2)
     (folder / "language_features").mkdir()
     for name in ("000", "001"):
         np.save(folder / f"language_features/{name}_s.npy", np.zeros(1))
@@ -74,6 +83,7 @@ def test_every_part_is_counted_and_what_is_left_out_is_named(options, tmp_path):
         "  points: 7",
         f"  {folder}/sparse/1 also has poses, which are not used",
         f"Gaussians: 11 from {folder}/output/a/point_cloud/iteration_30000/point_cloud.ply",
+        "  left out: 2 of 11 Gaussians",
         "  not used: output/a/point_cloud/iteration_best/point_cloud.ply",
         f"features: {folder}/language_features: masks and vectors of 2 of 5 views",
         f"labels: 8 in 4 photographs, used for evaluation: {folder}/label",

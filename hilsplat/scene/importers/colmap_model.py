@@ -78,12 +78,12 @@ def read_model(folder: Path) -> ColmapModel:
         lenses = _text(cameras, "CAMERA_ID MODEL WIDTH HEIGHT, and all parameters of the model", _text_lens)
         records = _text_images(images)
         rows = _text(points[0], "POINT3D_ID X Y Z R G B ...", _text_point) if points else []
+    if len(dict(lenses)) < len(set(lenses)):
+        raise SceneError(f"{cameras} has different cameras with the same id", fix=FIX)
     table = np.array(rows, np.float64).reshape(-1, 7)
     table = table[np.argsort(table[:, 0], kind="stable")]
-    rgb = np.clip(np.nan_to_num(table[:, 4:]), 0, 255).astype(np.uint8)
-    return ColmapModel(
-        dict(lenses), records, (table[:, 0].astype(np.int64), table[:, 1:4], rgb) if points else None
-    )
+    arrays = table[:, 0].astype(np.int64), table[:, 1:4], table[:, 4:].astype(np.uint8)
+    return ColmapModel(dict(lenses), records, arrays if points else None)
 
 
 def _image(
@@ -176,10 +176,12 @@ def _text(path: Path, expected: str, record: Callable[[str], Row | None]) -> lis
     rows = []
     with foreign(path, fix=FIX):
         text = regular(path).read_text(encoding="utf-8-sig", errors="surrogateescape")
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(text.split("\n"), 1):
         if line.startswith("#"):
             continue
         try:
+            if any("_" in cell and not cell[0].isalpha() for cell in line.split(maxsplit=9)[:9]):
+                raise ValueError  # Python reads 1_0 as 10
             row = record(line.strip())
         except (ValueError, IndexError) as error:
             where = f"{path}, line {number}, cannot be read"
@@ -196,7 +198,7 @@ def _text_lens(line: str) -> tuple[int, Lens] | None:
     model_id = (
         int(pycolmap.CameraModelId.__members__[model]) if model in pycolmap.CameraModelId.__members__ else -1
     )
-    if model_id < 0 or len(params) != PARAMETERS[model_id]:
+    if model_id < 0 or len(params) != PARAMETERS[model_id] or "_" in "".join(params):
         raise ValueError
     return int(number), Lens(model, int(width), int(height), tuple(map(float, params)))
 
@@ -204,8 +206,11 @@ def _text_lens(line: str) -> tuple[int, Lens] | None:
 def _text_point(line: str) -> tuple[float, ...] | None:
     if not line:
         return None
-    x, y, z, red, green, blue = map(float, line.split(maxsplit=7)[1:7])
-    return float(line.split(maxsplit=1)[0]), x, y, z, red, green, blue
+    number, *cells = line.split(maxsplit=7)[:7]
+    x, y, z, *rgb = map(float, cells)
+    if len(rgb) != 3 or not set(rgb) <= set(range(256)):
+        raise ValueError
+    return float(int(number)), x, y, z, *rgb
 
 
 class _TextImages:

@@ -126,8 +126,8 @@ class Keys:
                         fix="export undistorted images of ordinary cameras",
                     )
                 unknown.setdefault(key)
-        names = ", ".join(sorted(key for key in unknown if key not in self.refused))
-        return [f"keys of {file.name} that are not used: {names}"] if names else []
+        names = sorted(key for key in unknown if key not in self.refused)
+        return [f"keys of {file.name} that are not used: {', '.join(names)}"] if names else []
 
 
 def read_source(known: KnownPoses) -> Source:
@@ -280,11 +280,13 @@ def read_llff(known: KnownPoses) -> Source:
     The first 15 of a row's 17 numbers are a 3 x 5 matrix, by rows: rotation columns (down, right, back),
     translation, and the column (height, width, focal). OpenCV's axes are x = right, y = down, z = -back. The
     last two are the near and far depths. The lens is SIMPLE_PINHOLE with its centre in the middle, for the
-    image size on disk.
+    image size on disk; an image of another shape than stated is noted.
     """
     path, folder = known.files[0], known.root / "images"
-    with foreign(path, fix="unpack it again"):
-        rows = np.load(path, allow_pickle=False)
+    with foreign(path, fix="unpack it again"), path.open("rb") as stream:
+        rows = np.load(stream, allow_pickle=False)
+        if stream.read(1):
+            raise ValueError("bytes follow its array")
     if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "fiu" or not np.isfinite(rows).any():
         raise SceneError(
             f"{path} does not contain LLFF poses",
@@ -303,10 +305,12 @@ def read_llff(known: KnownPoses) -> Source:
 
     def described(number: int, image: Path) -> KnownView:
         matrix = rows[number, :15].astype(np.float64).reshape(3, 5)
-        down, right, back, position, (_, width_px, focal_px) = matrix.T
+        down, right, back, position, (height_px, width_px, focal_px) = matrix.T
         pose = np.stack([right, down, -back, position], axis=1)
         source_from_cam = rigid_pose(pose, f"{path}, row {number}")
         width, height = image_size(image)
+        if abs(width * height_px - height * width_px) > ASPECT_TOLERANCE * width * height_px:
+            source.notes.append(f"{image.name} has another shape than {path.name} states")
         params = [float(focal_px * width / width_px), width / 2, height / 2]
         camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
         return KnownView(image.name, image, camera, np.linalg.inv(source_from_cam))

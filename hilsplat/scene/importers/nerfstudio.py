@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from hilsplat.base.errors import SceneError
+from hilsplat.base.errors import SceneError, foreign
 from hilsplat.scene.layouts import read_json_object
+from hilsplat.scene.posed_images import rigid_pose
 
 FIX = "copy it again from nerfstudio"
 
@@ -31,31 +32,19 @@ def source_from_dataparser(dataparser: Path, transforms: Path | None) -> Float64
             applied = _matrix(transforms, "applied_transform", saved)
         elif (transforms.parent / "colmap/sparse/0").is_dir():
             applied[:3] = BEFORE_APPLIED_TRANSFORM
-        applied_scale = _scale(transforms, "applied_scale", saved)
+        applied_scale = _scale(transforms, "applied_scale", {"applied_scale": 1.0, **saved})
     training_from_source = _matrix(dataparser, "transform", content) @ np.linalg.inv(applied)
     training_from_source[:3] *= _scale(dataparser, "scale", content) / applied_scale
     return np.linalg.inv(training_from_source)
 
 
 def _matrix(path: Path, key: str, content: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
-    matrix = np.eye(4)
-    try:
-        matrix[:3] = np.array(content[key], np.float64)[:3]
-        usable = bool(np.isfinite(matrix).all()) and abs(np.linalg.det(matrix)) > 1e-12
-    except (KeyError, TypeError, ValueError, IndexError):
-        usable = False
-    if not usable:
-        raise SceneError(
-            f"{path}: {key} is not valid",
-            expected="an invertible 3 x 4 matrix",
-            found=repr(content.get(key))[:80],
-            fix=FIX,
-        )
-    return matrix
+    with foreign(f"{path}: {key}", fix=FIX):
+        return rigid_pose(np.array(content[key], np.float64), f"{path}: {key}")
 
 
 def _scale(path: Path, key: str, content: dict[str, Any]) -> float:
-    value = content.get(key, 1.0)
+    value = content.get(key)
     if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value < float("inf"):
         raise SceneError(f"{path}: {key} is not a positive number", found=repr(value)[:80])
     return float(value)

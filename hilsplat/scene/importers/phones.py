@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from hilsplat.base.errors import foreign
+from hilsplat.base.errors import SceneError, foreign
 from hilsplat.base.files import list_images
 from hilsplat.scene.colmap import pycolmap, rotation_matrix
 from hilsplat.scene.importers.known_views import Keys, KnownView, Source, image_size
@@ -110,20 +110,22 @@ def read_record3d(known: KnownPoses) -> Source:
         width, height = int(content["w"]), int(content["h"])
         rows = np.array(content["poses"], dtype=np.float64).reshape(-1, 7)
         lenses = np.tile([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], (len(rows), 1))
-        if own := content.get("perFrameIntrinsicCoeffs"):
+        if (own := content.get("perFrameIntrinsicCoeffs")) is not None:
             lenses = np.array(own, dtype=np.float64)
             if lenses.shape != (len(rows), 4):
                 raise ValueError(f"perFrameIntrinsicCoeffs has shape {lenses.shape}, but {len(rows)} poses")
     images = {int(path.stem): path for path in list_images(folder) if path.stem.isdigit()}
 
     def described(number: int) -> KnownView:
+        if number >= len(rows):
+            raise SceneError(f"{file} has only {len(rows)} poses, the first one for image 0")
         camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=lenses[number])
         matrix = np.column_stack([rotation_matrix(rows[number, :4].tolist()), rows[number, 4:]])
         pose = _phone_pose(matrix, f"{file}, pose {number}")
         return KnownView(images[number].name, images[number], camera, pose)
 
     source = Source(notes=RECORD3D_KEYS.check([content], file))
-    for number in _spread(sorted(number for number in images if number < len(rows)), source):
+    for number in _spread(sorted(images), source):
         source.add(images[number].name, described, number)
     return source
 

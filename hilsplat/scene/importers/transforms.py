@@ -20,6 +20,7 @@ from hilsplat.scene.importers.known_views import (
     image_size,
     require_inside,
 )
+from hilsplat.scene.importers.ply_file import read_ply
 from hilsplat.scene.layouts import KnownPoses, read_json_object
 from hilsplat.scene.posed_images import OPENGL_TO_OPENCV, rigid_pose
 from hilsplat.scene.view_names import match_names
@@ -115,8 +116,8 @@ def read_transforms(known: KnownPoses) -> Source:
             source.add(
                 name, _view, where, merged, name, images[name], is_test or name in held_out, source.notes
             )
-        if source.points is None and isinstance(content.get("ply_file_path"), str):
-            place = content["ply_file_path"].replace("\\", "/")
+        if source.points is None and content.get("ply_file_path") is not None:
+            place = str(content["ply_file_path"]).replace("\\", "/")
             require_inside(file.parent, place)
             source.points = read_ply_points(file.parent / place)
     source.notes = list(dict.fromkeys(source.notes))
@@ -127,9 +128,11 @@ def _held_out(content: Mapping[str, Any], names: list[str], notes: list[str]) ->
     """Return the frames that the file's lists of names keep from training."""
     listed: dict[str, set[str]] = {}
     for key in SPLITS:
-        value = content.get(key) or []
-        with foreign(key):
-            matched = match_names([str(name) for name in value], names)
+        value = [] if content.get(key) is None else content[key]
+        if not isinstance(value, list):
+            notes.append(f"{key} is not a list of names, and is not used")
+            value = []
+        matched = match_names([str(name) for name in value], names)
         listed[key] = {name for name in matched.values() if name is not None}
         if lost := sum(name is None for name in matched.values()):
             notes.append(f"{lost} names in {key} belong to no frame")
@@ -152,8 +155,11 @@ def _lens(where: str, frame: Mapping[str, Any], image: Path | None, notes: list[
     """Return the lens of a frame: PINHOLE, or with distortion OPENCV, FULL_OPENCV or OPENCV_FISHEYE."""
     with foreign(where, expected="finite numbers", fix="export it again"):
         stated = str(frame.get("camera_model", "OPENCV")).upper()
-        model = "OPENCV_FISHEYE" if frame.get("is_fisheye") else MODELS.get(stated)
-        values = {key: float(frame.get(key) or 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
+        given = {key: value for key, value in frame.items() if value is not None}
+        if (fisheye := given.get("is_fisheye", False)) not in (True, False):
+            raise ValueError(f"is_fisheye is {fisheye!r}, not true or false")
+        model = "OPENCV_FISHEYE" if fisheye else MODELS.get(stated)
+        values = {key: float(given.get(key, 0.0)) for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
         rest = {
             key: value
             for key, value in values.items()
@@ -165,14 +171,16 @@ def _lens(where: str, frame: Mapping[str, Any], image: Path | None, notes: list[
                 expected="; ".join(f"{lens} with {' '.join(keys)}" for lens, keys in COEFFICIENTS.items()),
                 fix="undistort the images first",
             )
-        width, height = frame.get("w"), frame.get("h")
+        width, height = given.get("w"), given.get("h")
         if width is None or height is None:
             width, height = image_size(image) if image is not None else (2, 2)  # not used without an image
         width, height = int(width), int(height)
         focal = {
-            axis: _focal(where, frame, axis, side, notes) for axis, side in (("x", width), ("y", height))
+            axis: _focal(frame, axis, side, notes)
+            for axis, side in (("x", width), ("y", height))
+            if given.keys() & FOCAL[axis]
         }
-        focal_x, focal_y = focal["x"] or focal["y"], focal["y"] or focal["x"]
+        focal_x, focal_y = focal.get("x", focal.get("y")), focal.get("y", focal.get("x"))
         if not focal_x or not focal_y:
             expected = "fl_x (px), camera_angle_x (radians) or x_fov (degrees), or the same for y"
             raise SceneError(f"{where} has no focal length", expected=expected, fix="export it again")
@@ -185,16 +193,14 @@ def _lens(where: str, frame: Mapping[str, Any], image: Path | None, notes: list[
         return pycolmap.Camera(model=model, width=width, height=height, params=params + coefficients)
 
 
-def _focal(where: str, frame: Mapping[str, Any], axis: str, side_px: int, notes: list[str]) -> float:
-    """Return the focal length along an axis, px; 0 if none is stated. The first of several counts."""
+def _focal(frame: Mapping[str, Any], axis: str, side_px: int, notes: list[str]) -> float:
+    """Return the focal length along an axis, px. The first of several counts."""
     stated = {}
     for key in FOCAL[axis]:
         if frame.get(key) is not None:
             value = float(frame[key])
             angle = math.radians(value) if key.endswith("fov") else value
             stated[key] = value if key.startswith("fl_") else side_px / 2 / math.tan(angle / 2)
-    if not stated:
-        return 0.0
     first, *others = stated
     for key in others:
         if abs(stated[key] - stated[first]) > FOCAL_TOLERANCE * abs(stated[first]):
@@ -207,11 +213,9 @@ def read_ply_points(path: Path) -> Points:
 
     Colours may be named red, green, blue, or r, g, b, or have the prefix diffuse_.
     """
-    from plyfile import PlyData
-
     fix = "put the file there, or remove ply_file_path from the transforms file to triangulate points"
     with foreign(f"{path}, with the points,", fix=fix):
-        vertex = PlyData.read(path)["vertex"].data
+        vertex = read_ply(path)["vertex"].data
         xyz = np.stack([vertex[axis] for axis in ("x", "y", "z")], axis=1).astype(np.float64)
         names = [("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue")]
         found = next((each for each in names if set(each) <= set(vertex.dtype.names)), None)

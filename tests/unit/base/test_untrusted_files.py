@@ -12,7 +12,7 @@ import pytest
 from PIL import EpsImagePlugin, Image
 
 from hilsplat.base.artifacts import read_npy, read_npz
-from hilsplat.base.errors import ArtifactError, HilsplatError, ImageError
+from hilsplat.base.errors import ArtifactError, HilsplatError, ImageError, RegistrationError
 from hilsplat.base.images import FORMATS, open_image, read_image, require_usable_size
 from hilsplat.base.levels import Level
 from hilsplat.base.provenance import require_own_picture
@@ -21,8 +21,8 @@ from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations, label_pa
 from hilsplat.embed.langsplat_files import read_view
 from hilsplat.evaluate.files_stage import read_view_masks
 from hilsplat.photos.inspection import inspect_photos
-from hilsplat.scene.importers.known_views import read_source
-from hilsplat.scene.layouts import KnownPoses
+from hilsplat.scene.poses import run_poses
+from hilsplat.settings import PosesSettings
 from hilsplat.workflow.resources import UNKNOWN_MP, _first_mp
 from tests.conftest import PROJECT
 
@@ -110,8 +110,8 @@ def test_an_llff_image_that_cannot_be_read_is_refused(tmp_path):
     rows[0, :15] = np.column_stack([[0, -1, 0], [1, 0, 0], [0, 0, 1], [0, 0, 0], [40, 40, 40]]).ravel()
     np.save(tmp_path / "poses_bounds.npy", rows)
     write_eps(tmp_path / "images/a.png")
-    with pytest.raises(ImageError, match=r"a.png cannot be read"):
-        read_source(KnownPoses(tmp_path, "llff", (tmp_path / "poses_bounds.npy",)))
+    with pytest.raises(RegistrationError, match=r"a.png cannot be read"):
+        run_poses(tmp_path, tmp_path / "out", "photos/a", "metre", False, PosesSettings(), 0, 1)
 
 
 def png(width: int, height: int) -> bytes:
