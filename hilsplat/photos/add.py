@@ -70,15 +70,15 @@ def add_scene(
             with prepared_photographs(photos, target, frames) as (folder, made):
                 found = find_parts(folder, named, check_ply)
                 annotated = root / "annotated" / PHOTOS / name
-                files = [] if annotated.exists() else found.labels
+                files = {} if annotated.exists() else found.labels
                 report = replace(inspect_photos(folder, poses), notes=(*made, *found.lines))
                 _check(report, has_known_poses(folder, poses))
                 if dry_run:
                     return report
                 if files:
                     with atomic_folder(annotated) as copies:
-                        for path in files:
-                            shutil.copy2(path, copies / path.name)
+                        for path, copied in files.items():
+                            shutil.copy2(path, copies / copied)
                 with undone_on_error(annotated) if files else nullcontext():
                     _append(sheet, name, folder, found.columns)
         return report

@@ -32,12 +32,12 @@ class Findings:
 
     Attributes:
         columns: paths for the scene sheet, by column.
-        labels: label files to copy.
+        labels: label files to copy, and the names of the copies, which are those of the views.
         lines: what was found, used and left out, for the user.
     """
 
     columns: dict[str, Path] = field(default_factory=dict)
-    labels: list[Path] = field(default_factory=list)
+    labels: dict[Path, str] = field(default_factory=dict)
     lines: list[str] = field(default_factory=list)
 
 
@@ -145,7 +145,7 @@ def _labels(folder: Path, named: Path | None, views: list[str], found: Findings)
         try:
             with foreign(path, expected="an ISAT file, as in LERF-OVS"):
                 num_objects += len(list(read_json_object(path, "export it again")["objects"]))
-            found.labels.append(path)
+            found.labels[path] = f"{Path(matched[path.stem] or path.name).stem}.json"
         except SceneError as error:
             lost[path.name] = in_one_line(error)
     if len(lost) > len(files) / 2:

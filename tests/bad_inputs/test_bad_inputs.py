@@ -252,7 +252,10 @@ ROWS = {
     "a scene name that is an option": row(photographs(), ("new", "--", "-n", "photos"), "name", "'-'"),
     "a name of 243 bytes": row(photographs("n" * 239 + ".png"), NEW, "too long", "at most 200 bytes", "243"),
     "an image of 400 megapixels": row(
-        with_photographs("big.png", png_of(20_000, 20_000)), NEW, "big.png", "400000000 pixels"
+        lambda: [with_photographs(name, png_of(20_000, 20_000))() for name in ("big.png", "other.png")],
+        NEW,
+        "big.png",
+        "400000000 pixels",
     ),
     "poses that are a list": row(
         with_photographs("transforms.json", "[]"), POSES, "transforms.json is not a JSON object"
@@ -266,19 +269,19 @@ ROWS = {
     "COLMAP poses with a quaternion of 0": row(
         colmap_without_rotation, POSES, "camera rotation of view b.png", "sparse/0"
     ),
-    "points that are not finite": row(
+    "points that are damaged": row(
         lambda: [
             with_photographs("transforms.json", '{"frames": [], "ply_file_path": "points.ply"}')(),
-            write("photos/points.ply", NAN_PLY)(),
+            write("photos/points.ply", NAN_PLY[:-4])(),
         ],
         POSES,
-        "1 points of photos/transforms.json are not finite",
+        "points.ply, with the points, cannot be read",
     ),
     "LLFF poses that are text": row(
         lambda: [photographs()(), np.save("photos/poses_bounds.npy", np.array([["a"] * 17] * 3))],
         POSES,
-        "poses_bounds.npy cannot be read",
-        "not numbers",
+        "poses_bounds.npy does not contain LLFF poses",
+        "<U1",
     ),
     # ---- output paths
     "an output below a file": row(

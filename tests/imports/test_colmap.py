@@ -231,6 +231,13 @@ def test_points_that_are_not_finite_are_dropped_with_a_note(tmp_path):
     np.testing.assert_allclose(source.points[0][:, 0], [0, 1, 2, 2.5, 3, 3.5])
 
 
+def test_colours_from_0_to_1_become_bytes(tmp_path):
+    folder = write(tmp_path)
+    points = [(0, 0, 0, 0.4, 1, 0)]
+    world.write_colmap(folder / "sparse/0", LENS, (WIDTH, HEIGHT), {"000.png": POSES[0]}, points)
+    assert read_source(find_known_poses(folder)).points[1].tolist() == [[102, 255, 0]]
+
+
 def test_rigs_whose_cameras_share_file_names_keep_every_view(tmp_path, imported):
     """COLMAP's rigs: rig1/camera1/0000.png, rig1/camera2/0000.png, rig2/camera1/0000.png, ..."""
     names = [f"rig{rig}/camera{camera}/0000.png" for rig in (1, 2) for camera in (1, 2, 3)]

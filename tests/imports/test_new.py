@@ -210,6 +210,16 @@ def test_other_programs_gaussians_without_poses_are_named_but_not_used(tmp_path)
     assert row.gaussians is None
 
 
+def test_label_files_are_copied_under_the_names_of_their_views(tmp_path):
+    folder = photographs(tmp_path / "theirs/images").parent
+    model(folder)
+    labels = {"info": {"width": WIDTH, "height": HEIGHT}, "objects": []}
+    (folder / "label").mkdir()
+    (folder / "label/90fbb0c7-003.json").write_text(json.dumps(labels))
+    add_scene(tmp_path / "p/config/scenes.tsv", "a", folder)
+    assert [path.name for path in (tmp_path / "p/annotated/photos/a").iterdir()] == ["003.json"]
+
+
 def test_damaged_poses_are_refused_before_the_scene_is_added(tmp_path):
     folder = photographs(tmp_path / "theirs/images").parent
     model(folder)

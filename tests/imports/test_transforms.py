@@ -250,6 +250,14 @@ def test_one_frame_that_cannot_be_used_is_left_out_with_the_reason(change, reaso
         imported(folder)
 
 
+def test_one_damaged_image_is_left_out_even_if_it_states_the_size(tmp_path, imported):
+    folder = write(tmp_path / "in", PLAIN, NUMBERS, MANY)
+    (folder / "images/c.png").write_bytes(b"no picture")
+    views, _, _, report = imported(folder)
+    world.require_right(views, {f"{name}.png": pose for name, pose in MANY.items() if name != "c"}, 45)
+    assert "c.png cannot be read" in " ".join(report["warnings"])
+
+
 def test_two_frames_with_one_image_are_both_left_out(tmp_path):
     folder = changed(
         write(tmp_path, PLAIN, {**SIZE, **NUMBERS}, MANY),

@@ -82,6 +82,10 @@ def read_model(folder: Path) -> ColmapModel:
         raise SceneError(f"{cameras} has different cameras with the same id", fix=FIX)
     table = np.array(rows, np.float64).reshape(-1, 7)
     table = table[np.argsort(table[:, 0], kind="stable")]
+    if (table[:, 4:] % 1).any():  # scripts write colours from 0 to 1
+        if table[:, 4:].max() > 1:
+            raise SceneError(f"{points[0]} has colours that are neither whole numbers nor at most 1", fix=FIX)
+        table[:, 4:] = np.rint(255 * table[:, 4:])
     arrays = table[:, 0].astype(np.int64), table[:, 1:4], table[:, 4:].astype(np.uint8)
     return ColmapModel(dict(lenses), records, arrays if points else None)
 
@@ -208,7 +212,7 @@ def _text_point(line: str) -> tuple[float, ...] | None:
         return None
     number, *cells = line.split(maxsplit=7)[:7]
     x, y, z, *rgb = map(float, cells)
-    if len(rgb) != 3 or not set(rgb) <= set(range(256)):
+    if len(rgb) != 3 or not all(0 <= value <= 255 for value in rgb):
         raise ValueError
     return float(int(number)), x, y, z, *rgb
 

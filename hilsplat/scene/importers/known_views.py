@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from hilsplat.base.artifacts import visible_files
-from hilsplat.base.errors import SceneError, foreign, in_one_line
+from hilsplat.base.errors import HilsplatError, SceneError, foreign, in_one_line
 from hilsplat.base.files import IMAGE_SUFFIXES, is_outside, list_images
 from hilsplat.base.images import opened_image
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
@@ -65,18 +64,13 @@ class Source:
     left_out: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
-    @cached_property
-    def found(self) -> list[KnownView]:
-        """The views that have an image, each with its own."""
-        return [view for view in self.views if view.image is not None]
-
     def add(self, name: str, described: Callable[..., KnownView], *args: Any) -> None:
         """Add the view `described(*args)`; leave it out if its description, lens or pose is not valid."""
         try:
             with foreign(f"view {name}"):
                 view = described(*args)
                 require_valid(view)
-        except SceneError as error:
+        except HilsplatError as error:
             self.leave_out(name, in_one_line(error))
         else:
             self.views.append(view)

@@ -28,38 +28,22 @@ POLYCAM_BORDER_PX = 15
 Z_UP_FROM_Y_UP = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """ARKit's world has y up; scenes here have z up. This is a cyclic permutation, so nothing is mirrored."""
 
+POLYCAM_HARMLESS = """angular_velocity blur_score center_depth exposure_duration iso manual_keyframe neighbors
+neighbors_2 timestamp version lens white_balance"""
 POLYCAM_KEYS = Keys(
     used={
         *(f"t_{row}{column}" for row in range(3) for column in range(4)),
-        "fx",
-        "fy",
-        "cx",
-        "cy",
-        "width",
-        "height",
+        *["fx", "fy", "cx", "cy", "width", "height"],
     },
-    harmless={
-        *("angular_velocity", "blur_score", "center_depth", "exposure_duration", "iso", "manual_keyframe"),
-        *("neighbors", "neighbors_2", "timestamp", "version", "lens", "white_balance"),
-    },
-    refused=dict.fromkeys(("k1", "k2", "k3", "p1", "p2", "distortion"), "lens distortion"),
+    harmless=set(POLYCAM_HARMLESS.split()),
+    refused=dict.fromkeys(["k1", "k2", "k3", "p1", "p2", "distortion"], "lens distortion"),
 )
+RECORD3D_HARMLESS = """fps dw dh initPose cameraType frameTimestamps confidenceWidth confidenceHeight
+userComment rangeOfInterest hardwareModel"""
 RECORD3D_KEYS = Keys(
     used={"K", "w", "h", "poses", "perFrameIntrinsicCoeffs"},
-    harmless={
-        *(
-            "fps",
-            "dw",
-            "dh",
-            "initPose",
-            "cameraType",
-            "frameTimestamps",
-            "confidenceWidth",
-            "confidenceHeight",
-        ),
-        *("userComment", "rangeOfInterest", "hardwareModel"),
-    },
-    refused={"lensDistortionLookupTable": "lens distortion", "distortion": "lens distortion"},
+    harmless=set(RECORD3D_HARMLESS.split()),
+    refused=dict.fromkeys(("lensDistortionLookupTable", "distortion"), "lens distortion"),
 )
 
 

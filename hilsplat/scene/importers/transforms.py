@@ -31,54 +31,34 @@ FOCAL = {axis: (f"fl_{axis}", f"camera_angle_{axis}", f"{axis}_fov") for axis in
 FOCAL_TOLERANCE = 0.01
 """Relative difference between several statements of one focal length, above which they contradict."""
 
-MODELS = {
-    **dict.fromkeys(
-        ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"), "OPENCV"
-    ),
-    **dict.fromkeys(
-        ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), "OPENCV_FISHEYE"
-    ),
-}
+PERSPECTIVES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
+FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+MODELS = dict.fromkeys(PERSPECTIVES, "OPENCV") | dict.fromkeys(FISHEYES, "OPENCV_FISHEYE")
 """COLMAP's lens model with the distortion coefficients of a `camera_model`."""
 
 COEFFICIENTS = {"OPENCV": ("k1", "k2", "p1", "p2", "k3"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4")}
 
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 
+# applied_transform and applied_scale are used for Gaussians, see `nerfstudio.py`.
+USED = """frames file_path transform_matrix w h cx cy k1 k2 k3 k4 p1 p2 camera_model is_fisheye ply_file_path
+applied_transform applied_scale"""
+HARMLESS = """aabb_scale scale offset n_frames from_na up sharpness rotation render_aabb orientation_override
+colmap_im_id depth_file_path depth_path depth_unit_scale_factor integer_depth_scale enable_depth_loading
+normal_file_path sharpen white_transparent black_transparent timestamp auto_scale_poses_override center_method
+version"""
+REFUSED = {
+    "ortho is_ortho orthographic": "orthographic pictures",
+    "latlong equirectangular": "panoramas",
+    "rolling_shutter transform_matrix_start transform_matrix_end": "a rolling shutter",
+    "shift_x shift_y skew": "a shifted or skewed lens",
+    "ftheta_p0 ftheta_p1 ftheta_p2 ftheta_p3 ftheta_p4 lens_mode": "a special lens",
+    "k5 k6 p3 p4 s1 s2 s3 s4 b1 b2 distortion_params": "more lens distortion",
+}
 KEYS = Keys(
-    used={
-        *("frames", "file_path", "transform_matrix", "w", "h", *FOCAL["x"], *FOCAL["y"], "cx", "cy"),
-        *("k1", "k2", "k3", "k4", "p1", "p2", "camera_model", "is_fisheye", "ply_file_path", *SPLITS),
-        *("applied_transform", "applied_scale"),  # for Gaussians, see `nerfstudio.py`
-    },
-    harmless={
-        *(
-            "aabb_scale",
-            "scale",
-            "offset",
-            "n_frames",
-            "from_na",
-            "up",
-            "sharpness",
-            "rotation",
-            "render_aabb",
-        ),
-        *("orientation_override", "colmap_im_id", "depth_file_path", "depth_path", "depth_unit_scale_factor"),
-        *("integer_depth_scale", "enable_depth_loading", "normal_file_path", "sharpen", "white_transparent"),
-        *("black_transparent", "timestamp", "auto_scale_poses_override", "center_method", "version"),
-    },
-    refused={
-        **dict.fromkeys(("ortho", "is_ortho", "orthographic"), "orthographic pictures"),
-        **dict.fromkeys(("latlong", "equirectangular"), "panoramas"),
-        **dict.fromkeys(
-            ("rolling_shutter", "transform_matrix_start", "transform_matrix_end"), "a rolling shutter"
-        ),
-        **dict.fromkeys(("shift_x", "shift_y", "skew"), "a shifted or skewed lens"),
-        **dict.fromkeys((f"ftheta_p{number}" for number in range(5)), "an f-theta lens"),
-        **dict.fromkeys(("k5", "k6", "p3", "p4", "s1", "s2", "s3", "s4", "b1", "b2"), "more lens distortion"),
-        "distortion_params": "a list of distortion coefficients",
-        "lens_mode": "a special lens",
-    },
+    used={*USED.split(), *FOCAL["x"], *FOCAL["y"], *SPLITS},
+    harmless=set(HARMLESS.split()),
+    refused={key: meaning for keys, meaning in REFUSED.items() for key in keys.split()},
 )
 
 

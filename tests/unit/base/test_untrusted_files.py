@@ -12,7 +12,7 @@ import pytest
 from PIL import EpsImagePlugin, Image
 
 from hilsplat.base.artifacts import read_npy, read_npz
-from hilsplat.base.errors import ArtifactError, HilsplatError, ImageError, RegistrationError
+from hilsplat.base.errors import ArtifactError, HilsplatError, ImageError, SceneError
 from hilsplat.base.images import FORMATS, open_image, read_image, require_usable_size
 from hilsplat.base.levels import Level
 from hilsplat.base.provenance import require_own_picture
@@ -110,7 +110,7 @@ def test_an_llff_image_that_cannot_be_read_is_refused(tmp_path):
     rows[0, :15] = np.column_stack([[0, -1, 0], [1, 0, 0], [0, 0, 1], [0, 0, 0], [40, 40, 40]]).ravel()
     np.save(tmp_path / "poses_bounds.npy", rows)
     write_eps(tmp_path / "images/a.png")
-    with pytest.raises(RegistrationError, match=r"a.png cannot be read"):
+    with pytest.raises(SceneError, match=r"a.png cannot be read"):
         run_poses(tmp_path, tmp_path / "out", "photos/a", "metre", False, PosesSettings(), 0, 1)
 
 
