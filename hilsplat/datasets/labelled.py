@@ -119,7 +119,7 @@ class LabelledScene:
         poses: folder in which `find_known_poses` finds poses; None if the scene has none.
         views: labelled regions by view, in label order.
         warnings: one sentence for each item that was reinterpreted or is doubtful.
-        least_posed: minimum share of labelled views with a pose. Scores of published data sets are
+        least_posed: minimum share of labelled views with a pose; 1 for published data sets, whose scores are
             comparable only if every labelled view counts.
     """
 

@@ -234,7 +234,7 @@ def whole(text: str) -> int:
 
 
 def colmap_text(root: Path) -> Views:
-    """Read the text form. A line with 10 words of which 9 are the numbers of an image is an image."""
+    """Read the text form. A line with 10 words is an image if 9 of them are its numbers."""
     folder = root / "sparse/0"
 
     def lines(name: str) -> list[str]:
