@@ -177,25 +177,25 @@ def test_one_photograph_that_cannot_be_read_is_left_out(content, tmp_path):
         add_scene(tmp_path / "scenes.tsv", "b", folder)
 
 
-@pytest.mark.parametrize("name", ["photos\\{}", "a\\b\\{}", "{}"])
-def test_archives_made_on_windows_are_unpacked(name, tmp_path):
-    photographs(tmp_path / "a")
-    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
-        for path in (tmp_path / "a").iterdir():
+def archive_with(folder, name):
+    """An archive whose entries are named as given, which zipfile would change on Linux."""
+    photographs(folder / "a")
+    with zipfile.ZipFile(folder / "a.zip", "w") as archive:
+        for path in (folder / "a").iterdir():
             entry = zipfile.ZipInfo("x")
             entry.filename = name.format(path.name)
             archive.writestr(entry, path.read_bytes())
+
+
+@pytest.mark.parametrize("name", ["photos\\{}", "a\\b\\{}", "{}"])
+def test_archives_made_on_windows_are_unpacked(name, tmp_path):
+    archive_with(tmp_path, name)
     assert add_scene(tmp_path / "p/scenes.tsv", "a", tmp_path / "a.zip").num_readable == 6
 
 
 @pytest.mark.parametrize("name", ["..\\{}", "C:\\a\\{}", "\\\\host\\share\\{}", "a\\..\\..\\{}", "/{}"])
 def test_archives_that_lead_outside_are_refused(name, tmp_path):
-    photographs(tmp_path / "a")
-    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
-        for path in (tmp_path / "a").iterdir():
-            entry = zipfile.ZipInfo("x")
-            entry.filename = name.format(path.name)
-            archive.writestr(entry, path.read_bytes())
+    archive_with(tmp_path, name)
     with pytest.raises(SceneError, match="outside the folder"):
         add_scene(tmp_path / "p/scenes.tsv", "a", tmp_path / "a.zip")
     assert not list((tmp_path / "p").rglob("*.jpg"))

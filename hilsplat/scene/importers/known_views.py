@@ -77,8 +77,9 @@ class Source:
 
     def leave_out(self, name: str, reason: str) -> None:
         """Record why a view is not used; names may repeat in damaged files."""
-        repeated = sum(each.partition("#")[0] == name for each in self.left_out)
-        self.left_out[f"{name}#{repeated + 1}" if repeated else name] = reason
+        while name in self.left_out:
+            name += " (again)"
+        self.left_out[name] = reason
 
     def require_most(self, least_share: float, files: object) -> None:
         """Raise SceneError if fewer than this share of the views can be used, with the first reasons."""
