@@ -46,7 +46,7 @@ from hilsplat.settings import (
 from hilsplat.splat.gaussians import Gaussians, morton_order
 from hilsplat.splat.ply import save_ply
 from hilsplat.splat.rasterise.api import pixel_weights
-from hilsplat.world.views import looking_at
+from hilsplat_world.views import looking_at
 
 ROWS = 20  # number of rows and of columns of balls, which are one metre apart
 RADIUS = 0.38

@@ -16,9 +16,9 @@ import hilsplat
 from hilsplat.base.artifacts import read_json
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.tables import markdown_table
-from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
-from hilsplat.evaluate.diagnostics.tree_truth import measure_tree, true_votes
+from hilsplat.datasets.hierarchy import HierarchyAnnotations
 from hilsplat.query.node_names import Vocabulary
+from hilsplat_world.diagnostics.tree_truth import measure_tree, true_votes
 
 ABSENT = 200  # maximum number of queries for absent texts, spread over the vocabulary
 

@@ -16,15 +16,15 @@ from PIL import Image
 from hilsplat.base.levels import LEVELS
 from hilsplat.scene.cameras import Camera
 from hilsplat.segment.pictures import row_colours
-from hilsplat.world.objects.builder import ObjectModel
-from hilsplat.world.objects.catalogue import TABLETOP, build_object
-from hilsplat.world.paints import Paint
-from hilsplat.world.pictures import coloured, show_panel
-from hilsplat.world.render import label_view, render_view
-from hilsplat.world.scenes.kinds import KINDS, build_scene, scene_cameras
-from hilsplat.world.scenes.scene import Assembly, Style, WorldScene, footprint_of
-from hilsplat.world.shapes import box
-from hilsplat.world.views import on_sphere, square_camera
+from hilsplat_world.objects.builder import ObjectModel
+from hilsplat_world.objects.catalogue import TABLETOP, build_object
+from hilsplat_world.paints import Paint
+from hilsplat_world.pictures import coloured, show_panel
+from hilsplat_world.render import label_view, render_view
+from hilsplat_world.scenes.kinds import KINDS, build_scene, scene_cameras
+from hilsplat_world.scenes.scene import Assembly, Style, WorldScene, footprint_of
+from hilsplat_world.shapes import box
+from hilsplat_world.views import on_sphere, square_camera
 
 CLASS_PX = 150
 CLASS_COLUMNS = 9

@@ -13,16 +13,17 @@ from jaxtyping import install_import_hook
 PROJECT = Path(__file__).resolve().parents[1]
 
 UNCHECKED = (
-    "hilsplat.base.identity",
-    "hilsplat.world.objects.",
-    "hilsplat.world.paints",
-    "hilsplat.world.shapes",
+    "hilsplat.base.code",
+    "hilsplat_world.objects.",
+    "hilsplat_world.paints",
+    "hilsplat_world.shapes",
 )
 """Modules of small functions that are called tens of thousands of times; checks would take five times as long
 as the tests themselves."""
 
 # All other modules have the shapes and types of arguments and results checked at every call.
-sources = [*(PROJECT / "hilsplat").rglob("[!_]*.py"), *(PROJECT / "models/training").glob("[!_]*.py")]
+packages = ("hilsplat", "hilsplat_world", "models/training")
+sources = [path for package in packages for path in (PROJECT / package).rglob("[!_]*.py")]
 files = [path.relative_to(PROJECT).with_suffix("") for path in sources]
 checked = [name for name in map(".".join, (file.parts for file in files)) if not name.startswith(UNCHECKED)]
 install_import_hook(checked, "beartype.beartype")

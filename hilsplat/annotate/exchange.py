@@ -24,8 +24,8 @@ from hilsplat.annotate.labels import Label, as_file, known_labels, placed_rings,
 from hilsplat.base.artifacts import atomic_folder, parse_json, write_text
 from hilsplat.base.errors import HilsplatError, SceneError, first_line, foreign
 from hilsplat.base.images import open_image
+from hilsplat.datasets.hierarchy import HierarchyAnnotations
 from hilsplat.datasets.images.isat import fill_polygons, read_object, stated_size
-from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.scene.placement import placed, placement
 from hilsplat.scene.scene import Scene

@@ -46,7 +46,7 @@ def world_show(
     results: Results = Path("results"),
 ) -> None:
     """Write a contact sheet to world.png: views, labels by level, and the tree with its texts."""
-    from hilsplat.world.pictures import show_world
+    from hilsplat_world.pictures import show_world
 
     target = results / scene / "world.png"
     show_world(results / scene / "world", target)

@@ -31,8 +31,8 @@ from hilsplat.base.artifacts import (
     write_index,
     write_npz,
 )
+from hilsplat.base.code import code_digest
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
-from hilsplat.base.identity import code_digest
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.contributions.compositing import normalised_weights

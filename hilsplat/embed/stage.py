@@ -19,8 +19,8 @@ from hilsplat.base.artifacts import (
     write_index,
     write_npy,
 )
+from hilsplat.base.code import code_digest
 from hilsplat.base.errors import MisalignedArtifactError, ModelError
-from hilsplat.base.identity import code_digest
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel, unit

@@ -17,7 +17,6 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import stage_log
 from hilsplat.datasets.labelled import image_size_hw
 from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
-from hilsplat.datasets.synthetic.world_labels import labelled_points
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.metrics.instances import InstanceMatches
 from hilsplat.evaluate.protocols import cards
@@ -29,6 +28,7 @@ from hilsplat.evaluate.protocols.views import consistency_rows
 from hilsplat.evaluate.scores import Measured, Score, write_instances, write_scores
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import EvaluateSettings
+from hilsplat_world.labels import labelled_points
 
 logger = logging.getLogger(__name__)
 

@@ -13,8 +13,6 @@ from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.labelled import LabelledScene
 from hilsplat.datasets.points.labelled_points import PointScene
-from hilsplat.datasets.synthetic.world_labels import labelled_points
-from hilsplat.evaluate.diagnostics.world_consistency import measure_world_consistency
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.metrics.instances import InstanceMatches
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
@@ -29,6 +27,8 @@ from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.finished import SceneParts
 from hilsplat.segment.origin import masks_label
 from hilsplat.settings import EvaluateSettings
+from hilsplat_world.diagnostics.world_consistency import measure_world_consistency
+from hilsplat_world.labels import labelled_points
 
 logger = logging.getLogger(__name__)
 

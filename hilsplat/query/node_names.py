@@ -23,9 +23,9 @@ from hilsplat.base.artifacts import (
     write_json,
     write_npy,
 )
+from hilsplat.base.code import code_digest
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.files import regular
-from hilsplat.base.identity import code_digest
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel, open_clip_of

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from hilsplat.base.artifacts import ViewCache, atomic_folder, sha256_of_file, sha256_of_json, write_index
+from hilsplat.base.code import code_digest
 from hilsplat.base.errors import SceneError
-from hilsplat.base.identity import code_digest
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track

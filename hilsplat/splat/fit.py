@@ -18,8 +18,8 @@ from hilsplat.base.artifacts import (
     write_json,
     write_stored_npz,
 )
+from hilsplat.base.code import code_digest
 from hilsplat.base.errors import ArtifactError, SceneError
-from hilsplat.base.identity import code_digest
 from hilsplat.base.images import to_float, write_png
 from hilsplat.base.progress import stage_log, track
 from hilsplat.base.removal import delete, tag

@@ -1,17 +1,17 @@
 """Registry of stages and their functions."""
 
+from hilsplat.base.code import code_digest
 from hilsplat.base.errors import HilsplatError
-from hilsplat.base.identity import code_digest
 
 STAGES: dict[str, str] = {
-    "world": "hilsplat.world.stage:run_world",
+    "world": "hilsplat_world.stage:run_world",
     "source": "hilsplat.datasets.sources:export_images",
     "poses": "hilsplat.scene.poses:run_poses",
     "gaussians": "hilsplat.splat.fit:run_gaussians",
     "masks": "hilsplat.segment.stage:run_masks",
     "key_masks": "hilsplat.contributions.key_views:run_key_masks",
     "guided_masks": "hilsplat.semantic_tree.guided_masks:run_guided_masks",
-    "truth_masks": "hilsplat.world.truth_masks:run_truth_masks",
+    "truth_masks": "hilsplat_world.truth_masks:run_truth_masks",
     "coverage_tree": "hilsplat.segment.coverage:run_coverage_tree",
     "clip": "hilsplat.embed.stage:run_clip",
     "langsplat": "hilsplat.embed.langsplat_files",
@@ -29,10 +29,10 @@ STAGES: dict[str, str] = {
     "figures": "hilsplat.evaluate.figures.panel:run_figures",
     "comparison": "hilsplat.evaluate.figures.comparison:run_comparison",
     "sweep": "hilsplat.evaluate.figures.sweep_plot:run_sweep_plot",
-    "consistency": "hilsplat.evaluate.diagnostics.world_consistency:run_consistency",
-    "mask_truth": "hilsplat.evaluate.diagnostics.mask_truth:run_mask_truth",
-    "tree_truth": "hilsplat.evaluate.diagnostics.tree_truth:run_tree_truth",
-    "label_fits": "hilsplat.evaluate.diagnostics.label_fits:run_label_fits",
+    "consistency": "hilsplat_world.diagnostics.world_consistency:run_consistency",
+    "mask_truth": "hilsplat_world.diagnostics.mask_truth:run_mask_truth",
+    "tree_truth": "hilsplat_world.diagnostics.tree_truth:run_tree_truth",
+    "label_fits": "hilsplat.evaluate.label_fits:run_label_fits",
 }
 """Stage -> the function that its command calls; a module stands for all of its functions."""
 

@@ -3,12 +3,12 @@
 import numpy as np
 
 from hilsplat.scene.cameras import Camera
-from hilsplat.world.scenes import room, tabletop
-from hilsplat.world.scenes.floorplan import Room
-from hilsplat.world.scenes.room import path_points, room_of
-from hilsplat.world.scenes.scene import WorldScene
-from hilsplat.world.scenes.street import DRIVE_X, FRONT
-from hilsplat.world.views import Sight, on_sphere, square_camera
+from hilsplat_world.scenes import room, tabletop
+from hilsplat_world.scenes.floorplan import Room
+from hilsplat_world.scenes.room import path_points, room_of
+from hilsplat_world.scenes.scene import WorldScene
+from hilsplat_world.scenes.street import DRIVE_X, FRONT
+from hilsplat_world.views import Sight, on_sphere, square_camera
 
 
 def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int) -> Camera:

@@ -79,7 +79,7 @@ def draw_masks(folder: Path, encoder: SamEncoder, decoder: SamDecoder, views: La
     write_png(folder / "masks.png", np.vstack(lines))
 
 
-WARNING = """This network was trained only on one synthetic world (the scenes of `hilsplat.world`).
+WARNING = """This network was trained only on one synthetic world (the scenes of `hilsplat_world`).
 It replaces {real} so that the complete method can be run, tested and measured without a download.
 Its results on photographs are meaningless, and its scores don't apply to {real}."""
 

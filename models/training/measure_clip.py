@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hilsplat.base.levels import LEVELS
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.world.paints import COLOURS
+from hilsplat_world.paints import COLOURS
 from models.training.clip import CANONICAL, ClipText, ClipVision
 from models.training.crops import CropTable, list_segmented
 from models.training.data import LabelledViews, normalised

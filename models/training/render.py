@@ -14,13 +14,13 @@ from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.processes import in_processes
 from hilsplat.base.progress import track
-from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
-from hilsplat.world.objects.builder import ObjectModel
-from hilsplat.world.objects.catalogue import CLASSES, GENERATOR_VERSION, build_object
-from hilsplat.world.render import label_view, render_view
-from hilsplat.world.scenes.kinds import KINDS, build_scene
-from hilsplat.world.scenes.scene import WorldScene
-from hilsplat.world.seeds import TRAINING_SEEDS, split_of_seed
+from hilsplat.datasets.hierarchy import AnnotatedNode
+from hilsplat_world.objects.builder import ObjectModel
+from hilsplat_world.objects.catalogue import CLASSES, GENERATOR_VERSION, build_object
+from hilsplat_world.render import label_view, render_view
+from hilsplat_world.scenes.kinds import KINDS, build_scene
+from hilsplat_world.scenes.scene import WorldScene
+from hilsplat_world.seeds import TRAINING_SEEDS, split_of_seed
 from models.training.cameras import training_camera
 from models.training.data import LabelledNode, LabelledViews
 from models.training.sam import FRAME_PX

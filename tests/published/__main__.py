@@ -23,7 +23,7 @@ import yaml
 
 from hilsplat.evaluate.tables.build import TABLES
 from hilsplat.settings import WorldSettings
-from hilsplat.world.stage import run_world
+from hilsplat_world.stage import run_world
 from tests.conftest import PROJECT
 from tests.unit.datasets.writers.labelled import (
     LERF_STEMS,

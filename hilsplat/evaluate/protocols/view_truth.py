@@ -13,8 +13,8 @@ from PIL import Image
 
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, Level
+from hilsplat.datasets.hierarchy import HierarchyAnnotations
 from hilsplat.datasets.labelled import LabelledRegion, LabelledScene, check_label_size
-from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.scene.placement import SHAPE_TOLERANCE
 from hilsplat.scene.scene import Scene
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from hilsplat.base.cache import remembered
-from hilsplat.base.identity import code_digest
+from hilsplat.base.code import code_digest
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise import api

@@ -5,7 +5,7 @@ import pytest
 
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import Level
-from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, write_hierarchy
+from hilsplat.datasets.hierarchy import AnnotatedNode, write_hierarchy
 from hilsplat.scene.cameras import Cameras
 from tests.unit.datasets.writers.labelled import TrueWorld
 

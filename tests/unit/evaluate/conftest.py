@@ -9,7 +9,7 @@ import scipy.sparse as sp
 
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnotations, write_hierarchy
+from hilsplat.datasets.hierarchy import AnnotatedNode, HierarchyAnnotations, write_hierarchy
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import EvaluateSettings
 from tests.unit.evaluate.builders import box, cameras_of, masks_of

@@ -17,7 +17,7 @@ from hilsplat.scene.poses import check_registration, name_neighbours, plot_lost,
 from hilsplat.scene.scene import Scene
 from hilsplat.scene.view_names import view_name, view_names
 from hilsplat.settings import PosesSettings
-from hilsplat.world.views import numbered_cameras
+from hilsplat_world.views import numbered_cameras
 
 
 def pose_photos(folder, out, **settings):

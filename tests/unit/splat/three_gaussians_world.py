@@ -11,7 +11,7 @@ from hilsplat.scene.scene import Scene
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.photometric import psnr
 from hilsplat.splat.rasterise.api import render
-from hilsplat.world.views import numbered_cameras
+from hilsplat_world.views import numbered_cameras
 
 NUM_VIEWS, SIZE_PX = 9, 48
 

@@ -5,9 +5,9 @@ import pytest
 
 from hilsplat.base.artifacts import read_json
 from hilsplat.base.errors import SceneError, SettingsError
-from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
-from hilsplat.world.render import label_view
-from hilsplat.world.scenes.kinds import KINDS, build_scene
+from hilsplat.datasets.hierarchy import AnnotatedNode
+from hilsplat_world.render import label_view
+from hilsplat_world.scenes.kinds import KINDS, build_scene
 from models.training.cameras import training_camera
 from models.training.card import RECORD, digests
 from models.training.render import phrases_of, scene_of_seed, training_seeds

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
-from hilsplat.world.paints import Paint
-from hilsplat.world.scenes.scene import Style, WorldScene
-from hilsplat.world.shapes import Mesh
+from hilsplat.datasets.hierarchy import AnnotatedNode
+from hilsplat_world.paints import Paint
+from hilsplat_world.scenes.scene import Style, WorldScene
+from hilsplat_world.shapes import Mesh
 
 GREY = Paint("grey", "mottled", (0.5, 0.5, 0.5), (0.5, 0.5, 0.5), 9.0, 0.0, 10.0, 0.0, (5.0, 6.0, 7.0))
 

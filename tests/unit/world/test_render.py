@@ -7,16 +7,16 @@ from embreex.rtcore_scene import EmbreeScene
 from scipy.ndimage import map_coordinates
 
 from hilsplat.scene.cameras import Camera
-from hilsplat.world import render
-from hilsplat.world.paints import Paint
-from hilsplat.world.rays import RayCaster
-from hilsplat.world.render import label_view, render_and_label, render_view
-from hilsplat.world.scenes.kinds import build_scene, scene_cameras
-from hilsplat.world.scenes.scene import Style
-from hilsplat.world.shapes import box, joined
-from hilsplat.world.textures import fractal_noise, grains
-from hilsplat.world.truth import true_depth
-from hilsplat.world.views import square_camera
+from hilsplat_world import render
+from hilsplat_world.paints import Paint
+from hilsplat_world.rays import RayCaster
+from hilsplat_world.render import label_view, render_and_label, render_view
+from hilsplat_world.scenes.kinds import build_scene, scene_cameras
+from hilsplat_world.scenes.scene import Style
+from hilsplat_world.shapes import box, joined
+from hilsplat_world.textures import fractal_noise, grains
+from hilsplat_world.truth import true_depth
+from hilsplat_world.views import square_camera
 from tests.unit.world.scenes import scene_of
 
 STONE = Paint("grey", "stone", (0.6, 0.5, 0.4), (0.3, 0.3, 0.3), 8.0, 0.0, 10.0, 0.3, (5.0, 6.0, 7.0))

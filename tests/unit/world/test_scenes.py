@@ -6,13 +6,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from hilsplat.world.objects.catalogue import CLASSES
-from hilsplat.world.scenes import tabletop
-from hilsplat.world.scenes.kinds import KINDS, build_scene, scene_cameras
-from hilsplat.world.scenes.room import room_of
-from hilsplat.world.scenes.scene import footprint_of
-from hilsplat.world.scenes.street import part_boxes
-from hilsplat.world.seeds import SPLITS, split_of_seed
+from hilsplat_world.objects.catalogue import CLASSES
+from hilsplat_world.scenes import tabletop
+from hilsplat_world.scenes.kinds import KINDS, build_scene, scene_cameras
+from hilsplat_world.scenes.room import room_of
+from hilsplat_world.scenes.scene import footprint_of
+from hilsplat_world.scenes.street import part_boxes
+from hilsplat_world.seeds import SPLITS, split_of_seed
 
 
 @cache

@@ -10,15 +10,15 @@ from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.base.files import list_images
 from hilsplat.base.images import read_image
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnotations
+from hilsplat.datasets.hierarchy import AnnotatedNode, HierarchyAnnotations
 from hilsplat.scene.cameras import Cameras
 from hilsplat.settings import WorldSettings
-from hilsplat.world.objects.catalogue import GENERATOR_VERSION, TABLETOP
-from hilsplat.world.pictures import show_world, tree_lines
-from hilsplat.world.render import label_view
-from hilsplat.world.scenes.kinds import build_scene
-from hilsplat.world.stage import parse_source, run_world
-from hilsplat.world.truth import annotated_nodes
+from hilsplat_world.objects.catalogue import GENERATOR_VERSION, TABLETOP
+from hilsplat_world.pictures import show_world, tree_lines
+from hilsplat_world.render import label_view
+from hilsplat_world.scenes.kinds import build_scene
+from hilsplat_world.stage import parse_source, run_world
+from hilsplat_world.truth import annotated_nodes
 from tests.conftest import PROJECT
 
 SETTINGS = WorldSettings(views=3, image_px=64, arc_deg=30, objects=3, samples=1)

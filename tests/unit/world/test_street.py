@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.world import lidar
-from hilsplat.world.lidar import ABOVE_CAMERA_M, BEAMS, INCLINATION_DEG, MAX_RANGE_M, scan_street
-from hilsplat.world.render import label_view, render_view
-from hilsplat.world.scenes.kinds import build_scene, scene_cameras
-from hilsplat.world.scenes.scene import WorldScene
-from hilsplat.world.scenes.street import FRONT, KERB, LANE, LANE_Y, MAX_STEP, SWEEP_DEG, WALK_Z
-from hilsplat.world.truth import true_depth
-from hilsplat.world.views import square_camera
+from hilsplat_world import lidar
+from hilsplat_world.lidar import ABOVE_CAMERA_M, BEAMS, INCLINATION_DEG, MAX_RANGE_M, scan_street
+from hilsplat_world.render import label_view, render_view
+from hilsplat_world.scenes.kinds import build_scene, scene_cameras
+from hilsplat_world.scenes.scene import WorldScene
+from hilsplat_world.scenes.street import FRONT, KERB, LANE, LANE_Y, MAX_STEP, SWEEP_DEG, WALK_Z
+from hilsplat_world.truth import true_depth
+from hilsplat_world.views import square_camera
 
 
 @pytest.fixture(scope="module")

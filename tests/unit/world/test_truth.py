@@ -9,9 +9,9 @@ from plyfile import PlyData
 from hilsplat.base.errors import SceneError
 from hilsplat.base.levels import LEVELS
 from hilsplat.scene.cameras import Cameras
-from hilsplat.world.shapes import Mesh, box
-from hilsplat.world.truth import load_surface, refined, true_depth, unique_rows, views_of_points, write_mesh
-from hilsplat.world.views import numbered_cameras
+from hilsplat_world.shapes import Mesh, box
+from hilsplat_world.truth import load_surface, refined, true_depth, unique_rows, views_of_points, write_mesh
+from hilsplat_world.views import numbered_cameras
 from tests.unit.world.scenes import scene_of
 
 

@@ -17,10 +17,10 @@ from hilsplat.base.errors import HilsplatError, MisalignedArtifactError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.cli import stage_commands
-from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, write_hierarchy
+from hilsplat.datasets.hierarchy import AnnotatedNode, write_hierarchy
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import PerturbSettings
-from hilsplat.world.truth_masks import (
+from hilsplat_world.truth_masks import (
     FAULTS,
     Draws,
     TrueNodes,

@@ -17,9 +17,9 @@ from PIL import Image
 from hilsplat.base.artifacts import write_json, write_text
 from hilsplat.base.images import read_image, write_png
 from hilsplat.base.levels import LEVELS, Level
+from hilsplat.datasets.hierarchy import HierarchyAnnotations
 from hilsplat.datasets.images.isat import trace_polygons
 from hilsplat.datasets.points.labelled_points import PlyMesh
-from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.scene.exporting import pinhole_model
 from hilsplat.scene.layouts import POSES_BOUNDS

@@ -19,10 +19,9 @@ from plyfile import PlyData, PlyElement
 from hilsplat.base.artifacts import read_npz, write_json, write_text
 from hilsplat.base.images import read_image
 from hilsplat.datasets.classes import REPLICA_NAMES
+from hilsplat.datasets.hierarchy import HierarchyAnnotations
 from hilsplat.datasets.points.labelled_points import PlyMesh
 from hilsplat.datasets.points.scannet import LABEL_TABLE
-from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
-from hilsplat.datasets.synthetic.world_labels import replica_id, scannet_ids, waymo_labels
 from hilsplat.datasets.waymo.frames import (
     CAMERAS,
     CV_FROM_WAYMO,
@@ -37,7 +36,8 @@ from hilsplat.datasets.waymo.frames import (
 from hilsplat.datasets.waymo.parquet import CAMERA, FRAME, INTRINSIC, LASER, component_path
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage
-from hilsplat.world.lidar import AZIMUTH_STEPS, BEAMS, INCLINATION_DEG
+from hilsplat_world.labels import replica_id, scannet_ids, waymo_labels
+from hilsplat_world.lidar import AZIMUTH_STEPS, BEAMS, INCLINATION_DEG
 
 
 def write_ply(

@@ -1,0 +1,249 @@
+"""Construction of a synthetic object as a ground-truth tree of whole, parts and subparts."""
+
+from collections import defaultdict
+from dataclasses import dataclass
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from jaxtyping import Float, Int32
+
+from hilsplat.base.levels import NONE
+from hilsplat.datasets.hierarchy import AnnotatedNode
+from hilsplat_world.paints import COLOURS, Paint, PaintBox, difference
+from hilsplat_world.shapes import Mesh, joined
+
+Word = TypeVar("Word", bound="str | None")
+
+PARENT_CONTRAST = 24.0
+"""Minimum distance in L*a*b* between a subpart and its part."""
+
+NEIGHBOUR_CONTRAST = 11.0
+"""Minimum distance in L*a*b* between other adjacent parts and subparts of an object."""
+
+CORNERS = ((-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0))
+"""Signs of x and y, for legs and wheels."""
+
+_SHADES = (1.0, 0.85, 1.15, 0.72, 1.3, 0.6, 1.45, 0.5, 1.6)
+_TOUCH = 0.03  # maximum gap between touching boxes, relative to the object's size
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectModel:
+    """One object in its own frame, with its lowest point at z = 0 and its front towards +x.
+
+    Attributes:
+        nodes: tree of the object, with ids and parents as rows; row 0 is the whole.
+        triangles: corner positions; `normals` are the shading normals at the corners.
+        node_ids: rows in `nodes` for each triangle (whole, part, subpart; -1: none).
+        material_ids: row in `materials` for each triangle.
+        materials: shader parameters (`Paint.row`).
+    """
+
+    name: str
+    nodes: tuple[AnnotatedNode, ...]
+    triangles: Float[np.ndarray, "F 3 3"]
+    normals: Float[np.ndarray, "F 3 3"]
+    node_ids: Int32[np.ndarray, "F 3"]
+    material_ids: Int32[np.ndarray, " F"]
+    materials: Float[np.ndarray, "M 14"]
+
+
+class Node(NamedTuple):
+    """A node of an unfinished object.
+
+    Attributes:
+        word: name of the node without the object's name.
+        at: preposition before the parent, as in "knob on the kettle lid".
+    """
+
+    builder: "Builder"
+    row: int
+    level: int
+    parent: int
+    word: str
+    aliases: tuple[str, ...]
+    at: str = "on"
+
+    def subpart(self, names: str, paint: Paint | str = "", *meshes: Mesh, at: str = "on") -> "Node":
+        """Add a subpart and return it; for the arguments, see `Builder.part`."""
+        return self.builder.added(3, self.row, names, at).put(paint, *meshes)
+
+    def put(self, paint: Paint | str, *meshes: Mesh) -> "Node":
+        """Add meshes to the node and return it; for the arguments, see `Builder.part`."""
+        if meshes:
+            drawn = self.builder.paint(paint) if isinstance(paint, str) else paint
+            self.builder.pieces.append((self.row, joined(*meshes), drawn))
+        return self
+
+
+class Builder:
+    """Nodes and meshes of one object while it is being drawn.
+
+    Args:
+        names: class and aliases, separated by ", ".
+    """
+
+    def __init__(self, names: str, rng: np.random.Generator) -> None:
+        self.rng = rng
+        self.paint = PaintBox(rng).draw
+        self.nodes: list[Node] = []
+        self.pieces: list[tuple[int, Mesh, Paint]] = []
+        self.added(1, NONE, names)
+
+    def paints(self, *specs: str) -> list[Paint]:
+        """Draw one paint for each specification (see `PaintBox.draw`)."""
+        return [self.paint(spec) for spec in specs]
+
+    def between(self, low: float | int, high: float | int) -> float:
+        """Draw a uniform random number."""
+        return float(self.rng.uniform(low, high))
+
+    def chance(self, probability: float) -> bool:
+        """Return True with the given probability."""
+        return bool(self.rng.random() < probability)
+
+    def part(self, names: str, paint: Paint | str = "", *meshes: Mesh) -> Node:
+        """Add a part and return it.
+
+        Args:
+            names: the part's name without the object's name, and aliases, separated by ", ".
+            paint: paint of the meshes; a string draws a new paint (`PaintBox.draw`).
+            meshes: shape of the part itself, if any, without its subparts.
+        """
+        return self.added(2, 0, names).put(paint, *meshes)
+
+    def added(self, level: int, parent: int, names: str, at: str = "on") -> Node:
+        """Add a node and return it."""
+        word, *aliases = names.split(", ")
+        self.nodes.append(Node(self, len(self.nodes), level, parent, word, tuple(aliases), at))
+        return self.nodes[-1]
+
+    def turn(self, degrees: float | int) -> None:
+        """Rotate everything added so far about the vertical axis."""
+        self.pieces = [(row, mesh.turned("z", degrees), paint) for row, mesh, paint in self.pieces]
+
+    def build(self) -> ObjectModel:
+        """Return the object, with its lowest point at z = 0 and contrast between touching parts."""
+        triples = []
+        for node in self.nodes:
+            part, subpart = {1: (NONE, NONE), 2: (node.row, NONE), 3: (node.parent, node.row)}[node.level]
+            triples.append((0, part, subpart))
+        node_ids = np.array(triples, np.int32)
+        pieces = self._contrasted()
+        paints = list(dict.fromkeys(paint for _, _, paint in pieces))
+        area: dict[int, dict[Paint, float]] = defaultdict(lambda: defaultdict(float))
+        for row, mesh, paint in pieces:
+            for owner in triples[row]:
+                if owner != NONE:
+                    area[owner][paint] += _surface(mesh)
+        triangles = np.concatenate([mesh.triangles for _, mesh, _ in pieces])
+        triangles[..., 2] -= triangles[..., 2].min()
+        return ObjectModel(
+            self.nodes[0].word,
+            tuple(self._described(node, area[node.row]) for node in self.nodes),
+            triangles,
+            np.concatenate([mesh.normals for _, mesh, _ in pieces]),
+            np.concatenate([np.tile(node_ids[row], (len(mesh), 1)) for row, mesh, _ in pieces]),
+            np.concatenate([np.full(len(mesh), paints.index(paint), np.int32) for _, mesh, paint in pieces]),
+            np.stack([paint.row() for paint in paints]),
+        )
+
+    def _contrasted(self) -> list[tuple[int, Mesh, Paint]]:
+        """Return the pieces; parts and subparts that look too similar to a neighbour are repainted.
+
+        Nodes with the same name (four legs) form a group with a common look. Groups are processed in order of
+        creation. Each group's main paint is replaced by a shade of itself, or by another colour if no shade
+        suffices, so that the group differs from its parent and from earlier neighbours.
+        """
+        groups: dict[tuple[int, str, str], list[int]] = {}
+        surface: dict[int, dict[Paint, float]] = defaultdict(lambda: defaultdict(float))
+        corners: dict[int, list[np.ndarray]] = defaultdict(list)
+        for node in self.nodes[1:]:
+            groups.setdefault((node.level, self.nodes[node.parent].word, node.word), []).append(node.row)
+        for row, mesh, paint in self.pieces:
+            surface[row][paint] += _surface(mesh)
+            corners[row].append(mesh.triangles.reshape(-1, 3))
+        boxes = {}
+        for row, parts in corners.items():
+            points = np.concatenate(parts)
+            boxes[row] = np.stack([points.min(axis=0), points.max(axis=0)])
+        reach = _TOUCH * float(np.ptp(np.concatenate(list(boxes.values())), axis=0).max())
+        settled: dict[tuple[int, str, str], Paint] = {}
+        repaint: dict[tuple[int, Paint], Paint] = {}
+        for key, rows in groups.items():
+            rows = [row for row in rows if row in boxes]
+            if not rows:
+                continue
+            own: dict[Paint, float] = defaultdict(float)
+            for row in rows:
+                for paint, size in surface[row].items():
+                    own[paint] += size
+            main = max(own, key=own.__getitem__)
+            parents = {self.nodes[row].parent for row in rows}
+            rivals = []
+            for other, paint in settled.items():
+                if parents & set(groups[other]):
+                    rivals.append((paint, PARENT_CONTRAST))
+                    continue
+                near = [boxes[other_row] for other_row in groups[other] if other_row in boxes]
+                if any(_touch(boxes[row], box, reach) for row in rows for box in near):
+                    rivals.append((paint, NEIGHBOUR_CONTRAST))
+            settled[key] = _distinct(main, rivals)
+            for row in rows:
+                repaint[row, main] = settled[key]
+        return [(row, mesh, repaint.get((row, paint), paint)) for row, mesh, paint in self.pieces]
+
+    def _described(self, node: Node, area: dict[Paint, float]) -> AnnotatedNode:
+        """Return a node with its queries: the canonical name, then aliases, relations and attributes."""
+        whole = self.nodes[0]
+        text, others = whole.word, list(whole.aliases)
+        if node.level > 1:
+            text = f"{whole.word} {node.word}"
+            others = [f"{whole.word} {alias}" for alias in node.aliases]
+            others += [f"{name} of the {whole.word}" for name in (node.word, *node.aliases)]
+            others += [f"{node.word} of the {alias}" for alias in whole.aliases]
+        if node.level == 3:
+            others.append(f"{node.word} {node.at} the {whole.word} {self.nodes[node.parent].word}")
+        share = 0.5 if node.level == 1 else 0.6
+        colour, coloured = _prevailing([(paint.colour, size) for paint, size in area.items()], share)
+        material, made = _prevailing([(paint.adjective, size) for paint, size in area.items()], share)
+        if coloured:
+            others.append(f"{colour} {text}")
+        if made and material is not None:
+            others.append(f"{material} {text}")
+            if coloured:
+                others.append(f"{colour} {material} {text}")
+        return AnnotatedNode(node.row, node.level, node.parent, text, tuple(dict.fromkeys(others)))
+
+
+def _surface(mesh: Mesh) -> float:
+    edges = mesh.triangles[:, 1:] - mesh.triangles[:, :1]
+    return float(np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum()) / 2
+
+
+def _touch(first: np.ndarray, second: np.ndarray, reach: float) -> bool:
+    """Return whether two boxes (lowest and highest corner) are less than `reach` apart on every axis."""
+    return bool((np.maximum(first[0], second[0]) - np.minimum(first[1], second[1]) < reach).all())
+
+
+def _distinct(paint: Paint, rivals: list[tuple[Paint, float]]) -> Paint:
+    """Return the least changed version of a paint that keeps the minimum distance to every rival."""
+
+    def short(candidate: Paint) -> float:
+        """Return the largest shortfall in a candidate's distance to a rival, or 0 if there is none."""
+        return max([0.0, *(minimum - difference(candidate, rival) for rival, minimum in rivals)])
+
+    shades = [paint if factor == 1 else paint.shaded(factor) for factor in _SHADES]
+    allowed = paint.choices or tuple(COLOURS)
+    tried = [shade for shade in shades if shade.colour in allowed]
+    tried += [paint.recoloured(word) for word in allowed if word != paint.colour]
+    return min(tried or [paint], key=short)  # the first, which is the smallest change, wins ties
+
+
+def _prevailing(sizes: list[tuple[Word, float]], share: float) -> tuple[Word, bool]:
+    """Return the word for most of a surface, and whether it covers at least `share` of the surface."""
+    per_word: dict[Word, float] = defaultdict(float)
+    for word, size in sizes:
+        per_word[word] += size
+    word = max(per_word, key=per_word.__getitem__)
+    return word, per_word[word] >= share * sum(per_word.values())

@@ -1,0 +1,44 @@
+"""Kinds of synthetic scene, with functions that build the scenes and choose their cameras."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from hilsplat.scene.cameras import Cameras
+from hilsplat_world.scenes import room, street, tabletop
+from hilsplat_world.scenes.scene import WorldScene
+from hilsplat_world.views import Sight, numbered_cameras
+
+
+class SceneKind(NamedTuple):
+    """One kind of scene.
+
+    Attributes:
+        build: builds a scene from (seed, objects).
+        sights: returns cameras and their field of view in degrees for (scene, views, arc_deg). The cameras
+            are jittered with the scene's seed, and close enough together for structure from motion.
+    """
+
+    build: Callable[[int, int], WorldScene]
+    sights: Callable[[WorldScene, int, float | int], tuple[list[Sight], float]]
+
+
+KINDS: dict[str, SceneKind] = {
+    "tabletop": SceneKind(tabletop.build_tabletop, tabletop.ring_sights),
+    "room": SceneKind(room.build_room, room.loop_sights),
+    "street": SceneKind(street.build_street, street.drive_sights),
+}
+"""Scene kinds by name in the scene sheet."""
+
+
+def build_scene(kind: str, seed: int, objects: int) -> WorldScene:
+    """Build a scene with a number of objects (on a street, vehicles and people).
+
+    The same seed and number always yield the same scene.
+    """
+    return KINDS[kind].build(seed, objects)
+
+
+def scene_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | int) -> Cameras:
+    """Return the views of a scene that the world stage renders: square images 000.png, 001.png, ..."""
+    sights, fov_deg = KINDS[scene.kind].sights(scene, views, arc_deg)
+    return numbered_cameras(sights, image_px, fov_deg)

@@ -1,0 +1,62 @@
+"""Masks and nodes against annotated regions, counted by hand on the desk, where one Gaussian is one pixel."""
+
+import csv
+
+import numpy as np
+
+from hilsplat.annotate.labels import Label, label_path, traced, write_labels
+from hilsplat.base.levels import Level
+from hilsplat.evaluate.label_fits import Fits, add_view, masks_of_view, run_label_fits
+from hilsplat.query.names import NO_FILE
+from tests.unit.evaluate.builders import box, masks_of, region_of
+from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, region_mask
+
+
+def strip(begin, end):
+    """A picture of 1 x 12 pixels with some of them set."""
+    return box((0, 1), (begin, end), (1, 12))
+
+
+def test_levels_are_compared_with_their_own_and_with_all_and_children_with_their_parents():
+    mug, rim = strip(0, 8), strip(0, 4)
+    regions = [
+        (region_of(mug, "mug", Level.WHOLE), mug),
+        (region_of(rim, "rim", Level.PART, ("mug", "rim")), rim),
+    ]
+    found = {
+        Level.WHOLE: np.concatenate([strip(0, 4), strip(1, 8)]),
+        Level.PART: strip(0, 2),
+        Level.SUBPART: np.zeros((0, 12), bool),
+    }
+    fits = {level: Fits() for level in Level}
+    add_view(fits, regions, found)
+    assert fits[Level.WHOLE].best == [7 / 8] and fits[Level.WHOLE].containment == []
+    assert fits[Level.PART].best == [2 / 4] and fits[Level.PART].anywhere == [1.0]
+    assert fits[Level.PART].containment == [1 / 2]  # pixel 1 of the rim's best mask 0..1 is in the mug's 1..7
+
+
+def test_a_view_may_lack_masks_at_a_level(tmp_path):
+    masks_of([strip(0, 4), strip(2, 8)], [1, 1]).save(tmp_path / "v.npz")
+    shapes = {level: masks.shape for level, masks in masks_of_view(tmp_path / "v.npz").items()}
+    assert shapes == {Level.WHOLE: (2, 12), Level.PART: (0, 12), Level.SUBPART: (0, 12)}
+
+
+def test_a_finished_scene_is_measured_by_level_and_split(desk_project, tmp_path):
+    for number in (1, NUM_VIEWS - 1):  # a training view and the one held out
+        view, mug, handle = f"{number:03d}.png", region_mask("mug", number), region_mask("handle", number)
+        labels = [
+            Label(id=1, level=1, text="mug", polygons=traced(mug)),
+            Label(id=2, level=2, parent=1, text="handle", polygons=traced(handle)),
+        ]
+        folder = tmp_path / "annotated/photos/desk"
+        write_labels(label_path(folder, view), view, (HEIGHT, WIDTH + NUM_VIEWS), labels, NO_FILE)
+    out = tmp_path / "fits.csv"
+    run_label_fits(desk_project / SCENE, "default", "annotated/photos/desk", tmp_path, out)
+    rows = list(csv.DictReader(out.open()))
+    found = {(row["what"].split(",")[0], row["views"], row["level"]) for row in rows}
+    places = [("nodes", "held out"), ("nodes", "training"), ("masks", "training")]  # held out: no masks
+    assert found == {(*place, level) for place in places for level in ("whole", "part")}
+    assert all(row["regions"] == "1" for row in rows)
+    assert all(float(row["best_iou"]) > 0.7 and float(row["recall"]) == 1 for row in rows)
+    assert all(float(row["any_level_iou"]) >= float(row["best_iou"]) for row in rows)
+    assert all(float(row["containment"]) > 0.9 for row in rows if row["level"] == "part")
