@@ -34,8 +34,8 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $(STAMP)
 
 lint: $(STAMP)
-	ruff check hilsplat hilsplat_world models snakemake_logger_plugin_hilsplat tests benchmarks docs/*.py
-	ruff format --check hilsplat hilsplat_world models snakemake_logger_plugin_hilsplat tests benchmarks docs/*.py
+	ruff check cpusplat hilsplat hilsplat_world models snakemake_logger_plugin_hilsplat tests benchmarks docs/*.py
+	ruff format --check cpusplat hilsplat hilsplat_world models snakemake_logger_plugin_hilsplat tests benchmarks docs/*.py
 	lint-imports
 	mypy
 	snakefmt --check Snakefile workflow/Snakefile rules

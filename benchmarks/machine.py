@@ -6,7 +6,7 @@ from typing import no_type_check
 import numba
 import numpy as np
 
-from hilsplat.base.lanes import lane_sum, lanes
+from cpusplat.lanes import lane_sum, lanes
 
 CHAINS = 12  # number of independent sums, enough to hide a latency of 4 to 5 cycles on 2 units
 

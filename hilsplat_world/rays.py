@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32
 from numba import types
 
-from hilsplat.base.compiled import compiled
+from cpusplat.compiled import compiled
 
 LANES = 16
 """Number of rays in a packet."""

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 
-from hilsplat.base.compiled import compiled
+from cpusplat.compiled import compiled
 from hilsplat.scene.cameras import Camera
 from hilsplat_world.paints import srgb_from_linear
 from hilsplat_world.rays import Hits

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from hilsplat.base.compiled import compiled
+from cpusplat.compiled import compiled
 
 # Hash increments of a lattice cell per step in x, y, z and salt.
 _X, _Y = np.uint32(0x27D4EB2D), np.uint32(0x165667B1)

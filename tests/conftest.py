@@ -22,7 +22,7 @@ UNCHECKED = (
 as the tests themselves."""
 
 # All other modules have the shapes and types of arguments and results checked at every call.
-packages = ("hilsplat", "hilsplat_world", "models/training")
+packages = ("cpusplat", "hilsplat", "hilsplat_world", "models/training")
 sources = [path for package in packages for path in (PROJECT / package).rglob("[!_]*.py")]
 files = [path.relative_to(PROJECT).with_suffix("") for path in sources]
 checked = [name for name in map(".".join, (file.parts for file in files)) if not name.startswith(UNCHECKED)]

@@ -5,7 +5,7 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from hilsplat.base.compiled import compiled
+from cpusplat.compiled import compiled
 
 RIGID_TOLERANCE = 1e-3
 """Maximum deviation of a camera's R R' from the identity; poses in text files may have only four digits."""

@@ -5,8 +5,8 @@ import scipy.sparse as sp
 from jaxtyping import Float32
 from numba.extending import intrinsic
 
-from hilsplat.base.compiled import compiled
-from hilsplat.base.lanes import LANES, WIDTH, lanes, load, store
+from cpusplat.compiled import compiled
+from cpusplat.lanes import LANES, WIDTH, lanes, load, store
 
 MIN_ALPHA = 0.5
 """Pixels with a smaller alpha are ignored, because their features would be extrapolated."""

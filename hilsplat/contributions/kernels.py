@@ -5,8 +5,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from hilsplat.base.compiled import compiled
-from hilsplat.base.lanes import prefetch, splat
+from cpusplat.compiled import compiled
+from cpusplat.lanes import prefetch, splat
 
 SUMS = 4
 """Number of sums per pair that are stored as one vector: one per level, plus padding."""

@@ -9,8 +9,8 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Float32, Int64, UInt8
 
-from hilsplat.base.compiled import compiled
-from hilsplat.base.lanes import WIDTH, lanes, load, store
+from cpusplat.compiled import compiled
+from cpusplat.lanes import WIDTH, lanes, load, store
 from hilsplat.base.processes import over_edges
 from hilsplat.contributions.compositing import padded, plus
 

@@ -6,7 +6,7 @@ from typing import TypeVar, no_type_check
 
 import numpy as np
 
-from hilsplat.base.compiled import compiled
+from cpusplat.compiled import compiled
 
 BETA1, BETA2 = 0.9, 0.999  # decay rates of the moments, as in torch
 LEAST_MOMENT = np.float32(1e-36)  # smaller moments are set to 0

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int64
 
+from cpusplat.compiled import compiled
 from hilsplat.base.artifacts import atomic_folder, read_index, sha256_of_file, write_index, write_npz
-from hilsplat.base.compiled import compiled
 from hilsplat.base.progress import stage_log
 from hilsplat.embed.vectors import mask_embeddings, require_every_vector
 from hilsplat.field.adam import Adam

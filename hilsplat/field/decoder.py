@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from hilsplat.base.compiled import compiled
-from hilsplat.base.lane_products import MOST_ROWS, WIDE_COLUMNS, rows_of_products
-from hilsplat.base.lanes import (
+from cpusplat.compiled import compiled
+from cpusplat.lane_products import MOST_ROWS, WIDE_COLUMNS, rows_of_products
+from cpusplat.lanes import (
     WIDTH,
     bits_ge,
     keep_gt,

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from hilsplat.base.compiled import compiled
+from cpusplat.compiled import compiled
 from hilsplat.contributions.mask_operator import MaskOperator, lifted_average, lifted_median
 from hilsplat.contributions.quadratic import Quadratic, level_mass
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Float32
 
-from hilsplat.base.compiled import compiled
+from cpusplat.compiled import compiled
 from hilsplat.field.contrast import Contrast
 from hilsplat.field.problem import QuadraticProblem, add_slope, conjugate_gradient
 

@@ -22,8 +22,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from hilsplat.base.compiled import compiled
-from hilsplat.base.lanes import QUAD, load_quad, splat, store
+from cpusplat.compiled import compiled
+from cpusplat.lanes import QUAD, load_quad, splat, store
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
 from hilsplat.field.adam import Adam, in_random_order

@@ -18,7 +18,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float32, Int64
 
-from hilsplat.base.compiled import compiled
+from cpusplat.compiled import compiled
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
 from hilsplat.field.adam import Adam, in_random_order

@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from hilsplat.base.compiled import compiled
+from cpusplat.compiled import compiled
 from hilsplat.base.levels import NONE
 from hilsplat.methods.common.groups import cluster_field, nearest, thresholds_of
 from hilsplat.methods.common.training import alike, product, train, unit

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilsplat.base.compiled import compiled
+from cpusplat.compiled import compiled
 
 BLOCK = 2048
 """Number of pixels processed at once: sums fit in the L1 cache, and blocks are long enough to prefetch."""

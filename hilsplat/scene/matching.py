@@ -16,7 +16,7 @@ import numpy as np
 import onnxruntime
 from jaxtyping import Float64, Int8, Int32, UInt8, UInt32
 
-from hilsplat.base.compiled import compiled
+from cpusplat.compiled import compiled
 from hilsplat.models.network import one_thread_session
 from hilsplat.models.onnx_graph import Graph
 from hilsplat.scene.colmap import pycolmap

@@ -9,9 +9,9 @@ from typing import no_type_check
 
 import numpy as np
 
-from hilsplat.base.compiled import compiled
-from hilsplat.base.lane_products import MOST_ROWS, WIDE_COLUMNS, rows_of_products
-from hilsplat.base.lanes import (
+from cpusplat.compiled import compiled
+from cpusplat.lane_products import MOST_ROWS, WIDE_COLUMNS, rows_of_products
+from cpusplat.lanes import (
     WIDTH,
     exp2_negative,
     lane_max,

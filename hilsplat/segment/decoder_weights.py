@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
+from cpusplat.lanes import WIDTH
 from hilsplat.base.errors import ModelError
-from hilsplat.base.lanes import WIDTH
 from hilsplat.models.onnx_graph import Graph
 from hilsplat.segment import decoder_kernels as kernels
 

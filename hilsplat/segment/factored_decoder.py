@@ -27,8 +27,8 @@ import numpy as np
 import onnxruntime
 from jaxtyping import Float, Float32, Float64
 
+from cpusplat.lanes import WIDTH
 from hilsplat.base.errors import ModelError
-from hilsplat.base.lanes import WIDTH
 from hilsplat.models.network import one_thread_session
 from hilsplat.models.onnx_graph import Graph
 from hilsplat.segment import decoder_kernels as kernels

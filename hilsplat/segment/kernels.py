@@ -7,7 +7,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from hilsplat.base.compiled import compiled
+from cpusplat.compiled import compiled
 
 BAND_WORDS = 2**17
 """64-bit words per band of packed masks in `shared_pixels`: 1 MiB, which fits into a core's cache."""

@@ -7,7 +7,7 @@ is summed over the views of their members. The run time grows with the number of
 import numpy as np
 from jaxtyping import Float, Int64
 
-from hilsplat.base.compiled import compiled
+from cpusplat.compiled import compiled
 from hilsplat.semantic_tree.evidence import Evidence
 
 ROWS_OF_A_BLOCK = 256

@@ -7,9 +7,9 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float32, Int32, Int64, UInt8
 
+from cpusplat.compiled import compiled
 from hilsplat.base.arrays import made
 from hilsplat.base.artifacts import read_index, read_npz, remake, sealed
-from hilsplat.base.compiled import compiled
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.embed.vectors import mask_embeddings

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int, Int32
 from scipy.special import comb, expit, logit
 
-from hilsplat.base.compiled import compiled
+from cpusplat.compiled import compiled
 from hilsplat.base.rotations import matrix_entries, rotate, unit_quaternions
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.gaussians import FIELDS

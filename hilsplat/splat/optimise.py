@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilsplat.base.compiled import compiled
-from hilsplat.base.lanes import WIDTH, lanes, load, root, store
+from cpusplat.compiled import compiled
+from cpusplat.lanes import WIDTH, lanes, load, root, store
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise.cpu import Gradients, over_ranges

@@ -7,8 +7,8 @@ channel, with zeros beyond the border and the constants 0.01^2 and 0.03^2 for va
 import numpy as np
 from jaxtyping import Float32
 
-from hilsplat.base.compiled import compiled
-from hilsplat.base.lanes import lanes, load, reciprocal, store
+from cpusplat.compiled import compiled
+from cpusplat.lanes import lanes, load, reciprocal, store
 from hilsplat.splat.rasterise.cpu import over_ranges
 
 RADIUS = 5

@@ -14,7 +14,6 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
 from hilsplat.base.artifacts import existing_folder
-from hilsplat.base.definitions import PACKAGE
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.provenance import version_of
 from hilsplat.configuration import merged_config
@@ -51,7 +50,7 @@ def examine() -> Iterator[Finding]:
 
 
 def python() -> Iterator[Finding]:
-    required = importlib.metadata.metadata(PACKAGE)["Requires-Python"]
+    required = importlib.metadata.metadata("hilsplat")["Requires-Python"]
     found = platform.python_version()
     problem = "" if SpecifierSet(required).contains(found) else f"{found}, but {required} is required"
     sound = f"{found} on {platform.system()} {platform.machine()}"
@@ -60,7 +59,7 @@ def python() -> Iterator[Finding]:
 
 def libraries() -> Iterator[Finding]:
     wrong, number = [], 0
-    for text in importlib.metadata.requires(PACKAGE) or ():
+    for text in importlib.metadata.requires("hilsplat") or ():
         requirement = Requirement(text)
         if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
             continue
@@ -72,7 +71,7 @@ def libraries() -> Iterator[Finding]:
             wrong.append(f"{requirement.name} is missing")
         elif not requirement.specifier.contains(found, prereleases=True):
             wrong.append(f"{requirement.name} {found} does not satisfy {requirement.specifier}")
-    fix = f"pip install --upgrade {PACKAGE}, with the repository's constraints.txt"
+    fix = "pip install --upgrade hilsplat, with the repository's constraints.txt"
     yield verdict("libraries", "; ".join(wrong), f"{number} libraries in the required versions", fix)
 
 

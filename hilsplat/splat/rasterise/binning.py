@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int32, Int64
 
-from hilsplat.base.compiled import compiled
-from hilsplat.base.lanes import bits_ge, lanes, larger, load, prefetch, smaller
+from cpusplat.compiled import compiled
+from cpusplat.lanes import bits_ge, lanes, larger, load, prefetch, smaller
 from hilsplat.splat.rasterise.project import MIN_ALPHA
 
 TILE = 16

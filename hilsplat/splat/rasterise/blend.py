@@ -21,8 +21,8 @@ of tile t is gaussian[tile_start[t] - base] .. gaussian[tile_end[t] - base]; geo
 
 import numpy as np
 
-from hilsplat.base.compiled import compiled
-from hilsplat.base.lanes import (
+from cpusplat.compiled import compiled
+from cpusplat.lanes import (
     aligned,
     any_ge,
     column_bits,

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 from scipy.sparse import csr_matrix
 
+from cpusplat.lanes import WIDTH, aligned
 from hilsplat.base.errors import HilsplatError
-from hilsplat.base.lanes import WIDTH, aligned
 from hilsplat.base.processes import over_edges
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians

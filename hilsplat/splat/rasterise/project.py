@@ -13,8 +13,8 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from hilsplat.base.compiled import compiled
-from hilsplat.base.lanes import (
+from cpusplat.compiled import compiled
+from cpusplat.lanes import (
     WIDTH,
     aligned,
     exp2_negative,

@@ -3,7 +3,7 @@
 import numba
 import numpy as np
 
-from hilsplat.base.lanes import (
+from cpusplat.lanes import (
     bits_ge,
     exp2_negative,
     first_bit,

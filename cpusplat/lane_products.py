@@ -7,7 +7,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from hilsplat.base.lanes import LANES, WIDTH, splat
+from cpusplat.lanes import LANES, WIDTH, splat
 
 _HAS_AVX512 = bool(binding.get_host_cpu_features().get("avx512f"))
 """With AVX-512, a core has 32 registers of 16 numbers each; without it, 16 registers of at most 8 numbers."""

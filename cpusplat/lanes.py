@@ -20,7 +20,7 @@ from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, lower_cast, models, register_model
 
-from hilsplat.base.compiled import compiled
+from cpusplat.compiled import compiled
 
 WIDTH = 16
 _FLOAT = ir.FloatType()

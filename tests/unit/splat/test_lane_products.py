@@ -4,8 +4,8 @@ import numba
 import numpy as np
 import pytest
 
-from hilsplat.base.lane_products import WIDE_COLUMNS, rows_of_products
-from hilsplat.base.lanes import WIDTH
+from cpusplat.lane_products import WIDE_COLUMNS, rows_of_products
+from cpusplat.lanes import WIDTH
 
 
 @pytest.mark.parametrize("rows", [1, 3, 8])
