@@ -5,14 +5,82 @@
 #   snakemake --cores 2 tables                                      the tables
 #   snakemake --report results/report.html                          the report of a finished run
 #
-# `hilsplat run` starts Snakemake with checks and all cores (docs/workflow.md). rules/common.smk reads
-# config/config.yaml, because the `config:` of a `module:` would replace a configfile here.
+# `hilsplat run` starts Snakemake with checks and all cores (docs/workflow.md).
+#
+# A rule names the inputs, outputs and priority of a stage; its command and other parameters derive from the
+# stage's definition in hilsplat/stages.py. Where several stages can make a file, `jobs_of` tells them apart.
+#
+# Priorities minimise the time to a scene's first answer: jobs closest to the CLIP vectors of a semantic tree
+# run first, and fields, scores and pictures run after all of them. Gaussians precede masks because users can
+# view them. After the vectors, the longest chain runs first: trained code, baseline field, our fields, scores.
+from snakemake.exceptions import WorkflowError
+from snakemake.logging import logger
+from snakemake.utils import min_version
+
+from hilsplat.base.errors import HilsplatError
+from hilsplat.base.files import INSTALLED, project_path
+from hilsplat.base.plugins import entry_points
+from hilsplat.configuration import CONFIG, merged_config
+from hilsplat.evaluate.tables.build import TABLES, published_values
+from hilsplat.workflow import targets
+from hilsplat.workflow.plan import PARTS, Plan, any_of
+from hilsplat.workflow.progress import estimates
+from hilsplat.workflow.resources import JobResources
+from hilsplat.workflow.run import mark_run, prepare_process, record_run, unmark_run
+
+min_version("9.20")
+
+
+configfile: str(project_path(CONFIG))
 
 
 report: "workflow/report/overview.rst"
 
 
-include: "rules/common.smk"
+LOCK = prepare_process()
+
+
+def own_cores():
+    """Return this machine's cores if it runs the jobs, or None on a cluster, where --jobs applies instead."""
+    try:
+        cores = workflow.cores
+    except WorkflowError:
+        return None
+    if cores < 1:
+        raise WorkflowError("with --cores 0, no job can start; expected at least 1")
+    return cores
+
+
+def given(files):
+    """Return an input function for files outside the results, whose paths get no prefix from a module."""
+
+    def paths(wildcards):
+        names = files(wildcards)
+        return names if isinstance(names, str) else [local(name) for name in names]
+
+    return paths
+
+
+def picture(path, category, name, **labels):
+    """Return a picture or table for the report."""
+    caption = INSTALLED / "workflow/report" / f"{name}.rst"
+    return report(path, caption=str(caption), category=category, **labels)
+
+
+def scene_picture(name):
+    path = f"<results>/figures/{{dataset}}/{{scene}}/{name}.png"
+    labels = {"figure": targets.PICTURES[name]}
+    return picture(path, "Scenes", name, subcategory="{dataset}/{scene}", labels=labels)
+
+
+try:
+    PLAN = Plan(
+        merged_config([], config)
+    )  # a module's `config:` replaces the configfile
+    PLAN.require_usable(devices=own_cores() is not None)
+except HilsplatError as error:  # users can fix these errors without a traceback
+    raise WorkflowError(str(error)) from None
+RESOURCES = JobResources(PLAN, own_cores())
 
 
 pathvars:
@@ -22,27 +90,40 @@ pathvars:
 wildcard_constraints:
     dataset=any_of(row.dataset for row in PLAN.rows),
     scene=any_of(row.scene for row in PLAN.rows),
-    variant=PLAN.variants(),
+    variant=any_of(PLAN.run.every_variant()),
 
 
-include: "rules/world.smk"
-
-
-if (INSTALLED / "models/training").is_dir():  # only in a checkout
-
-    include: "rules/models.smk"
+# What the rules of all stages share; it is no target.
+rule stage:
+    log:
+        "<results>/logs/stage.log",
+    conda:
+        "workflow/envs/hilsplat.yaml"
+    threads: RESOURCES.threads
+    shell:
+        "python -m hilsplat --log {log:q} {params.command} --threads {threads}"
+        " --memory {resources.mem_mib} --out {output[0]:q}"
 
 
 include: "rules/scene.smk"
 include: "rules/splat.smk"
 include: "rules/segment.smk"
-include: "rules/embed.smk"
 include: "rules/contributions.smk"
 include: "rules/semantic_tree.smk"
+include: "rules/embed.smk"
 include: "rules/field.smk"
-include: "rules/methods.smk"
 include: "rules/evaluate.smk"
 include: "rules/report.smk"
+
+
+for path in entry_points("hilsplat.rules").values():
+
+    include: str(path)
+
+
+if (INSTALLED / "models/training").is_dir():  # only in a checkout
+
+    include: "models/training/train.smk"
 
 
 rule all:
@@ -53,12 +134,18 @@ rule all:
 
 
 onstart:
-    mark_or_refuse()
+    try:
+        mark_run(PLAN.results)
+    except HilsplatError as error:  # another run writes to the same results
+        raise WorkflowError(str(error)) from None
     record_run(
         PLAN.results,
         workflow.config_settings.configfiles,
         workflow.config_settings.config,
     )
+    estimates.resources = RESOURCES
+    for name, reason in PLAN.absent.items():
+        logger.warning(f"{name} is skipped: {reason}")
     for line in PLAN.ignored:
         logger.warning(line)
     for line in PLAN.model_lines():

@@ -6,16 +6,17 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar, Union, get_args, get_origin
 
 import yaml
-from pydantic import BaseModel, ValidationError, field_validator
+from pydantic import BaseModel, ValidationError, create_model, field_validator
 
 from hilsplat import settings
 from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.files import NAME_RULE, name_problem, project_path, regular
 from hilsplat.base.levels import path_of
+from hilsplat.base.plugins import entry_points
 from hilsplat.models.store import AUTO, EMBEDDED, read_model, real_model
 from hilsplat.settings import LARGEST, Section, knob
 
@@ -25,14 +26,12 @@ CONFIG = Path("config/config.yaml")
 LONGEST_SHOWN = 120  # maximum number of characters of a value in a message
 
 
-class StageSettings(Section):
-    """All sections by name."""
+class CoreSettings(Section):
+    """The sections of the pipeline by name; plugins add their own."""
 
-    world: settings.WorldSettings = settings.WorldSettings()
     poses: settings.PosesSettings = settings.PosesSettings()
     gaussians: settings.GaussiansSettings = settings.GaussiansSettings()
     masks: settings.MasksSettings = settings.MasksSettings()
-    perturb: settings.PerturbSettings = settings.PerturbSettings()
     coverage_tree: settings.CoverageTreeSettings = settings.CoverageTreeSettings()
     clip: settings.ClipSettings = settings.ClipSettings()
     contributions: settings.ContributionsSettings = settings.ContributionsSettings()
@@ -44,7 +43,7 @@ class StageSettings(Section):
     query: settings.QuerySettings = settings.QuerySettings()
     figures: settings.FiguresSettings = settings.FiguresSettings()
 
-    def with_models(self) -> "StageSettings":
+    def with_models(self) -> Self:
         """Return all sections after resolving values that depend on others: models, crops, theta."""
         clip, masks = with_models(self.clip), with_models(self.masks)
         if masks.levels == "tree" and masks.theta is None:
@@ -54,19 +53,18 @@ class StageSettings(Section):
             clip = clip.model_copy(update={"crops": crops})
         return self.model_copy(update={"masks": masks, "clip": clip})
 
-    def upstream(self, stage: str) -> tuple[str, ...]:
-        """Return the sections on which a stage depends, directly or through its inputs."""
-        sections = UPSTREAM[stage]
-        if "semantic_tree" in sections and self.semantic_tree.evidence == "features":
-            return tuple(name for name in VARIANT_SECTIONS if name in {*sections, "coverage_tree", "field"})
-        return sections
 
-    def depends_on_seed(self, stage: str) -> bool:
-        """Return whether the result of a stage or of its inputs depends on the variant's seed."""
-        return any(getattr(self, section).is_random for section in self.upstream(stage))
+_PLUGIN_SECTIONS: dict[str, type[Section]] = dict(entry_points("hilsplat.settings"))
+
+if TYPE_CHECKING:
+    StageSettings = CoreSettings
+else:
+    _fields = {name: (section, section()) for name, section in _PLUGIN_SECTIONS.items()}
+    StageSettings = create_model("StageSettings", __base__=CoreSettings, **_fields)
 
 
-SECTIONS: dict[str, type[Section]] = {name: type(section) for name, section in StageSettings()}
+SECTIONS: dict[str, type[Section]] = _PLUGIN_SECTIONS | {name: type(part) for name, part in StageSettings()}
+"""Section -> its class; those of plugins first, because they make what the pipeline reads."""
 
 
 def parse_section(name: str, text: str) -> Any:
@@ -124,25 +122,7 @@ def settings_error(error: ValidationError, where: str, model: type[BaseModel]) -
     return SettingsError("the settings are not valid:\n  " + "\n  ".join(lines))
 
 
-VARIANT_SECTIONS = (
-    *("masks", "perturb", "coverage_tree", "clip", "contributions"),
-    *("semantic_tree", "autoencoder", "field", "method", "evaluate"),
-)
-"""Sections that a variant may override; all variants share the stages before them."""
-
-UPSTREAM: dict[str, tuple[str, ...]] = {
-    "masks": ("masks", "perturb"),
-    "coverage_tree": ("masks", "perturb", "coverage_tree"),
-    "contributions": ("masks", "perturb", "contributions"),
-    "semantic_tree": ("masks", "perturb", "contributions", "semantic_tree"),
-    "clip": ("masks", "perturb", "contributions", "semantic_tree", "clip"),
-    "autoencoder": ("masks", "perturb", "contributions", "semantic_tree", "clip", "autoencoder"),
-    "field": VARIANT_SECTIONS[:-1],
-    "evaluate": VARIANT_SECTIONS,
-}
-"""Stage -> sections on which it depends, directly or through its inputs; see `upstream`."""
-
-RESERVED = ("annotations", "benchmarks", "export", "gaussians", "logs", "queries", "scene", "world")
+RESERVED = ("annotations", "benchmarks", "export", "gaussians", "logs", "queries", "scene")
 """Names of files and folders in a scene folder; a variant cannot have such a name."""
 
 SEEDED = re.compile(r"(.+)\.seed([0-9]+)")
@@ -191,7 +171,7 @@ class RunSettings(StageSettings):
     def every_variant(self) -> list[str]:
         """Return all variants, tabulated or not, once per seed, in order: "default", then `variants`."""
         return [
-            name for first in dict.fromkeys(["default", *self.variants]) for name in self._all_seeds(first)
+            name for first in dict.fromkeys(["default", *self.variants]) for name in self.all_seeds(first)
         ]
 
     def variant_names(self) -> list[str]:
@@ -200,14 +180,10 @@ class RunSettings(StageSettings):
             *("default", *self.main_variants, *self.ablation_variants, *self.component_variants),
             *(*self.theta_variants, *self.omega_variants, *self.pruning_variants),
         ]
-        return [name for first in dict.fromkeys(names) for name in self._all_seeds(first)]
+        return [name for first in dict.fromkeys(names) for name in self.all_seeds(first)]
 
-    def seeded(self, variant: str, scopes: tuple[str, ...] = ()) -> list[str]:
-        """Return a variant's name and, if it is random, the names for other seeds: `<name>.seed1`, ..."""
-        is_random = self.stages(variant, scopes).depends_on_seed("evaluate")
-        return self._all_seeds(variant) if is_random else [variant]
-
-    def _all_seeds(self, variant: str) -> list[str]:
+    def all_seeds(self, variant: str) -> list[str]:
+        """Return a variant's name, and its names with the other seeds: `<name>.seed1`, ..."""
         return [variant, *(f"{variant}.seed{number}" for number in range(1, self.seeds))]
 
     def seed_of(self, variant: str) -> int:
@@ -234,12 +210,6 @@ class RunSettings(StageSettings):
         for where, layer in layers:
             require_known(where, layer, SECTIONS)
             for section, values in layer.items():
-                if where.startswith("variants.") and section not in VARIANT_SECTIONS:
-                    raise SettingsError(
-                        f"{where}.{section}: variants cannot change this section, because they share it",
-                        expected=f"one of {', '.join(VARIANT_SECTIONS)}",
-                        fix="put it under overrides for a group or a scene, or in a separate configuration",
-                    )
                 changed = sections[section].model_dump() | values
                 try:
                     sections[section] = SECTIONS[section].model_validate(changed)
@@ -271,7 +241,7 @@ def parse_run(config: dict[str, Any]) -> RunSettings:
                 expected=NAME_RULE,
                 fix="rename it in the configuration",
             )
-    taken = dict.fromkeys(RESERVED, "for files in a scene folder")
+    taken = dict.fromkeys((*RESERVED, *entry_points("hilsplat.generators")), "for files in a scene folder")
     for name in dict.fromkeys(["default", *run.variants]):
         # Names that differ only in case share a folder on some file systems; other seeds have own folders.
         key = _parts_of(name)[0].casefold()

@@ -14,12 +14,12 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.processes import in_processes
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.hierarchy import write_hierarchy
-from hilsplat.settings import WorldSettings
 from hilsplat_world.lidar import scan_street
 from hilsplat_world.objects.catalogue import GENERATOR_VERSION
 from hilsplat_world.render import render_and_label
 from hilsplat_world.scenes.kinds import KINDS, build_scene, scene_cameras
 from hilsplat_world.seeds import TRAINING_SEEDS, split_of_seed
+from hilsplat_world.settings import WorldSettings
 from hilsplat_world.truth import MIN_SUBPART_AREA, annotated_nodes, write_mesh
 
 logger = logging.getLogger(__name__)
@@ -51,11 +51,11 @@ def parse_source(source: str) -> tuple[str, int]:
     return words[1], seed
 
 
-def run_world(source: str, settings: WorldSettings, out: Path, threads: int) -> None:
+def run_world(source: str, settings: WorldSettings, images: Path, truth: Path, threads: int) -> None:
     """Render a synthetic scene and write its ground truth.
 
-    Each of the two output folders is complete or absent. The next stages read only `out/images` (000.png,
-    001.png, ...). Only `evaluate` may read `out/truth`: annotations.json and labels/ in the hierarchy format,
+    Each of the two output folders is complete or absent. The next stages read only `images` (000.png,
+    001.png, ...). Only `evaluate` may read `truth`: annotations.json and labels/ in the hierarchy format,
     cameras.npz, mesh.ply, scene.json and, for a street, lidar.npz. The files' bytes depend on `source` and
     `settings`, not on `threads`.
 
@@ -64,16 +64,15 @@ def run_world(source: str, settings: WorldSettings, out: Path, threads: int) -> 
         DiskSpaceError: if there is not enough disk space.
     """
     kind, seed = parse_source(source)
-    out = Path(out)
     with stage_log("world", source) as counts:
         scene = _scene(kind, seed, settings.objects)
         cameras = scene_cameras(scene, settings.views, settings.image_px, settings.arc_deg)
-        require_free_space(out, needed_mib=5 + settings.views * settings.image_px**2 * 4 / 2**20)
+        require_free_space(images, needed_mib=5 + settings.views * settings.image_px**2 * 4 / 2**20)
         smallest: dict[Level, float | int] = dict.fromkeys(LEVELS, settings.min_area_px)
         smallest[Level.SUBPART] = MIN_SUBPART_AREA * settings.image_px**2
         labels, annotated = {}, {}
         size = {"height": settings.image_px, "width": settings.image_px}
-        with atomic_folder(out / "images") as folder:
+        with atomic_folder(images) as folder:
             jobs = [(kind, seed, settings, row) for row in range(settings.views)]
             results = in_processes(_render, jobs, threads)
             views = zip(cameras.names, results, strict=True)
@@ -82,7 +81,7 @@ def run_world(source: str, settings: WorldSettings, out: Path, threads: int) -> 
                 labels[name] = {level: label[level.index] for level in LEVELS}
                 annotated[name] = annotated_nodes(label, scene.nodes, scene.background, smallest)
             write_index(folder, dict.fromkeys(cameras.names, size), source=source)
-        with atomic_folder(out / "truth") as folder:
+        with atomic_folder(truth) as folder:
             write_hierarchy(folder, scene.nodes, labels, annotated)
             cameras.save(folder / "cameras.npz")
             write_mesh(folder / "mesh.ply", scene, cameras, MESH_EDGE.get(kind))

@@ -1,28 +1,17 @@
 # Weights of each Gaussian in each mask, from one pass over the views.
-rule contributions:
+use rule stage as contributions with:
     input:
+        **PLAN.shared("masks"),
         scene="<results>/{dataset}/{scene}/scene",
         gaussians="<results>/{dataset}/{scene}/gaussians.ply",
-        masks=PLAN.shared("masks", "masks"),
     output:
-        contributions=directory("<results>/{dataset}/{scene}/{variant}/contributions"),
+        directory("<results>/{dataset}/{scene}/{variant}/contributions"),
     log:
-        "<results>/{dataset}/{scene}/{variant}/logs/contributions.log",
+        PLAN.log("contributions"),
     benchmark:
-        "<results>/{dataset}/{scene}/{variant}/benchmarks/contributions.jsonl"
+        PLAN.benchmark("contributions")
     priority: 60
-    conda:
-        ENVIRONMENT
-    threads: RESOURCES.threads
     resources:
-        mem_mb=RESOURCES.memory_mb("contributions"),
-        runtime=RESOURCES.minutes("contributions"),
-        gpu=RESOURCES.gpus("contributions"),
+        **RESOURCES.of("contributions"),
     params:
-        settings=PLAN.settings("contributions"),
-        cache=cache_folder,
-        code=PLAN.code("contributions"),
-    shell:
-        "python -m hilsplat --log {log:q} contributions --scene {input.scene:q} --gaussians {input.gaussians:q} --masks {input.masks:q}"
-        " --settings {params.settings:q} --threads {threads} --cache {params.cache:q}"
-        " --out {output.contributions:q}"
+        **PLAN.params("contributions"),

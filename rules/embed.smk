@@ -1,61 +1,51 @@
-# CLIP vectors of the crops that show each node best, or of every mask.
-rule clip:
+# CLIP vectors of the crops that show each node best, or of every mask; names of nodes from a vocabulary.
+use rule stage as clip with:
     input:
+        **PLAN.shared("masks"),
         scene="<results>/{dataset}/{scene}/scene",
-        masks=PLAN.shared("masks", "masks"),
         semantic_tree=PLAN.crops_tree,  # empty if every mask is embedded
-        features=given(PLAN.data.features),  # empty, except for LangSplat's vectors
     output:
-        clip=directory("<results>/{dataset}/{scene}/{variant}/clip"),
+        directory("<results>/{dataset}/{scene}/{variant}/clip"),
     log:
-        "<results>/{dataset}/{scene}/{variant}/logs/clip.log",
+        PLAN.log("clip"),
     benchmark:
-        "<results>/{dataset}/{scene}/{variant}/benchmarks/clip.jsonl"
+        PLAN.benchmark("clip")
+    wildcard_constraints:
+        dataset=PLAN.jobs_of("clip"),
     priority: 80
-    conda:
-        ENVIRONMENT
-    threads: RESOURCES.threads
     resources:
-        mem_mb=RESOURCES.memory_mb("clip"),
-        runtime=RESOURCES.minutes("clip"),
-        gpu=RESOURCES.gpus("clip"),
+        **RESOURCES.of("clip"),
     params:
-        files=PLAN.data.content(PLAN.data.features),
-        settings=PLAN.settings("clip"),
-        model=PLAN.model("clip"),
-        option=PLAN.crops_tree_option,
-        cache=cache_folder,
-        code=PLAN.code(PLAN.clip_stage),
-    shell:
-        "python -m hilsplat --log {log:q} clip --scene {input.scene:q} --masks {input.masks:q} {params.option} --settings {params.settings:q}"
-        " --threads {threads} --memory {resources.mem_mib} --cache {params.cache:q} --out {output.clip:q}"
+        **PLAN.params("clip"),
 
 
-# Names of the nodes from a vocabulary, and vectors of words for absent objects, to estimate chance scores.
-rule names:
+use rule clip as imported_clip with:
     input:
+        **PLAN.shared("masks"),
         scene="<results>/{dataset}/{scene}/scene",
-        semantic_tree=PLAN.shared("semantic_tree", "semantic_tree"),
-        clip=PLAN.shared("clip", "clip"),
+        files=given(PLAN.data.features),
+    wildcard_constraints:
+        dataset=PLAN.jobs_of("imported_clip"),
+    params:
+        **PLAN.params(
+            "imported_clip",
+            files=PLAN.data.features,
+            features=PLAN.data.features_folder,
+        ),
+
+
+use rule stage as names with:
+    input:
+        **PLAN.shared("semantic_tree", "clip"),
         vocabulary=given(PLAN.vocabulary),  # empty, unless you supply a file
     output:
-        names=directory("<results>/{dataset}/{scene}/{variant}/names"),
+        directory("<results>/{dataset}/{scene}/{variant}/names"),
     log:
-        "<results>/{dataset}/{scene}/{variant}/logs/names.log",
+        PLAN.log("names"),
     benchmark:
-        "<results>/{dataset}/{scene}/{variant}/benchmarks/names.jsonl"
-    conda:
-        ENVIRONMENT
+        PLAN.benchmark("names")
     threads: 1
     resources:
-        mem_mb=RESOURCES.memory_mb("names"),
-        runtime=RESOURCES.minutes("names"),
+        **RESOURCES.of("names"),
     params:
-        files=PLAN.data.content(PLAN.vocabulary),
-        settings=PLAN.settings("query"),
-        evaluate=PLAN.settings("evaluate"),
-        cache=cache_folder,
-        code=PLAN.code("names"),
-    shell:
-        "python -m hilsplat --log {log:q} names --semantic-tree {input.semantic_tree:q} --clip {input.clip:q}"
-        " --settings {params.settings:q} --evaluate {params.evaluate:q} --cache {params.cache:q} --out {output.names:q}"
+        **PLAN.params("names", files=PLAN.vocabulary),

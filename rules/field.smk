@@ -1,60 +1,60 @@
-# The autoencoder of the scene's CLIP vectors, and the language field.
-rule autoencoder:
+# The autoencoder of the scene's CLIP vectors, and the language field: ours, or that of a baseline.
+use rule stage as autoencoder with:
     input:
-        clip=PLAN.shared("clip", "clip"),
-        semantic_tree=PLAN.shared("semantic_tree", "semantic_tree"),
-        contributions=PLAN.shared("contributions", "contributions"),
+        **PLAN.shared("clip", "semantic_tree", "contributions"),
     output:
-        autoencoder=directory("<results>/{dataset}/{scene}/{variant}/autoencoder"),
+        directory("<results>/{dataset}/{scene}/{variant}/autoencoder"),
     log:
-        "<results>/{dataset}/{scene}/{variant}/logs/autoencoder.log",
+        PLAN.log("autoencoder"),
     benchmark:
-        "<results>/{dataset}/{scene}/{variant}/benchmarks/autoencoder.jsonl"
+        PLAN.benchmark("autoencoder")
     priority: 8
-    conda:
-        ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=RESOURCES.memory_mb("autoencoder"),
-        runtime=RESOURCES.minutes("autoencoder"),
+        **RESOURCES.of("autoencoder"),
     params:
-        settings=PLAN.settings("autoencoder"),
-        seed=PLAN.seed,
-        code=PLAN.code("autoencoder"),
-    shell:
-        "python -m hilsplat --log {log:q} autoencoder --clip {input.clip:q} --semantic-tree {input.semantic_tree:q}"
-        " --contributions {input.contributions:q} --settings {params.settings:q} --seed {params.seed:q}"
-        " --out {output.autoencoder:q}"
+        **PLAN.params("autoencoder"),
 
 
-rule field:
+use rule stage as field with:
     input:
-        contributions=PLAN.shared("contributions", "contributions"),
-        coverage_tree=PLAN.shared("coverage_tree", "coverage_tree"),
-        autoencoder=PLAN.shared("autoencoder", "autoencoder"),
-        rendered=PLAN.rendered,  # empty, except for trainer: literal
+        **PLAN.shared("contributions", "coverage_tree", "autoencoder"),
+        scene=PLAN.rendered("scene"),  # empty, except for trainer: literal
+        gaussians=PLAN.rendered("gaussians"),
+        masks=PLAN.rendered("masks"),
         start=PLAN.first_field,  # empty, except for start: langsplat
     output:
-        field="<results>/{dataset}/{scene}/{variant}/field.safetensors",
+        "<results>/{dataset}/{scene}/{variant}/field.safetensors",
     log:
-        "<results>/{dataset}/{scene}/{variant}/logs/field.log",
+        PLAN.log("field"),
     benchmark:
-        "<results>/{dataset}/{scene}/{variant}/benchmarks/field.jsonl"
+        PLAN.benchmark("field")
     wildcard_constraints:
-        variant=PLAN.variants(by_baseline=False),
+        dataset=PLAN.jobs_of("field"),
     priority: 4
-    conda:
-        ENVIRONMENT
     threads: RESOURCES.variant_threads
     resources:
-        mem_mb=RESOURCES.memory_mb("field"),
-        runtime=RESOURCES.minutes("field"),
+        **RESOURCES.of("field"),
     params:
-        settings=PLAN.settings("field"),
-        option=PLAN.field_option,
-        seed=PLAN.field_seed,
-        code=PLAN.code("field"),
-    shell:
-        "python -m hilsplat --log {log:q} field --contributions {input.contributions:q} --coverage-tree {input.coverage_tree:q}"
-        " --autoencoder {input.autoencoder:q} --settings {params.settings:q} {params.option} --seed {params.seed:q}"
-        " --threads {threads} --out {output.field:q}"
+        **PLAN.params("field"),
+
+
+use rule stage as method with:
+    input:
+        **PLAN.shared("masks", "contributions", "autoencoder"),
+        scene="<results>/{dataset}/{scene}/scene",
+        gaussians="<results>/{dataset}/{scene}/gaussians.ply",
+    output:
+        "<results>/{dataset}/{scene}/{variant}/field.safetensors",
+    log:
+        PLAN.log("method"),
+    benchmark:
+        PLAN.benchmark("method")
+    wildcard_constraints:
+        dataset=PLAN.jobs_of("method"),
+    priority: 6
+    threads: RESOURCES.variant_threads
+    resources:
+        **RESOURCES.of("method"),
+    params:
+        **PLAN.params("method", plugins=PLAN.baseline),

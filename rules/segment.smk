@@ -1,56 +1,69 @@
-# Masks at three levels and the coverage tree of each view.
-rule masks:
+# Masks at three levels by one of several stages, and the coverage tree of each view.
+use rule stage as masks with:
     input:
         scene="<results>/{dataset}/{scene}/scene",
-        truth=PLAN.masks_truth,  # empty, except for the diagnostic segmenter
-        gaussians=PLAN.key_gaussians,  # empty, except for key views and guided prompts
-        key_masks=lambda wildcards: PLAN.key_parts(wildcards, "masks"),
-        key_tree=lambda wildcards: PLAN.key_parts(wildcards, "semantic_tree"),
-        features=given(PLAN.data.features),  # empty, except for LangSplat's masks
     output:
-        masks=directory("<results>/{dataset}/{scene}/{variant}/masks"),
+        directory("<results>/{dataset}/{scene}/{variant}/masks"),
     log:
-        "<results>/{dataset}/{scene}/{variant}/logs/masks.log",
+        PLAN.log("masks"),
     benchmark:
-        "<results>/{dataset}/{scene}/{variant}/benchmarks/masks.jsonl"
+        PLAN.benchmark("masks")
+    wildcard_constraints:
+        dataset=PLAN.jobs_of("masks"),
     priority: PLAN.masks_priority
-    conda:
-        ENVIRONMENT
-    threads: RESOURCES.threads
     resources:
-        mem_mb=RESOURCES.memory_mb("masks"),
-        runtime=RESOURCES.minutes("masks"),
-        gpu=RESOURCES.gpus("masks"),
+        **RESOURCES.of("masks"),
     params:
-        files=PLAN.data.content(PLAN.data.features),
-        settings=PLAN.settings("masks"),
-        model=PLAN.model("masks"),
-        option=PLAN.masks_option,
-        cache=cache_folder,
-        code=PLAN.code(PLAN.masks_stage),
-    shell:
-        "python -m hilsplat --log {log:q} masks --scene {input.scene:q} --settings {params.settings:q} {params.option}"
-        " --threads {threads} --memory {resources.mem_mib} --cache {params.cache:q} --out {output.masks:q}"
+        **PLAN.params("masks"),
 
 
-rule coverage_tree:
+use rule masks as key_masks with:
     input:
-        masks=PLAN.shared("masks", "masks"),
+        scene="<results>/{dataset}/{scene}/scene",
+        gaussians="<results>/{dataset}/{scene}/gaussians.ply",
+    wildcard_constraints:
+        dataset=PLAN.jobs_of("key_masks"),
+    params:
+        **PLAN.params("key_masks"),
+
+
+use rule masks as guided_masks with:
+    input:
+        scene="<results>/{dataset}/{scene}/scene",
+        gaussians="<results>/{dataset}/{scene}/gaussians.ply",
+        key_masks=PLAN.of_key_views("masks"),
+        key_tree=PLAN.of_key_views("semantic_tree"),
+    wildcard_constraints:
+        dataset=PLAN.jobs_of("guided_masks"),
+    params:
+        **PLAN.params("guided_masks"),
+
+
+use rule masks as imported_masks with:
+    input:
+        scene="<results>/{dataset}/{scene}/scene",
+        files=given(PLAN.data.features),
+    wildcard_constraints:
+        dataset=PLAN.jobs_of("imported_masks"),
+    params:
+        **PLAN.params(
+            "imported_masks",
+            files=PLAN.data.features,
+            features=PLAN.data.features_folder,
+        ),
+
+
+use rule stage as coverage_tree with:
+    input:
+        **PLAN.shared("masks"),
     output:
-        coverage_tree=directory("<results>/{dataset}/{scene}/{variant}/coverage_tree"),
+        directory("<results>/{dataset}/{scene}/{variant}/coverage_tree"),
     log:
-        "<results>/{dataset}/{scene}/{variant}/logs/coverage_tree.log",
+        PLAN.log("coverage_tree"),
     benchmark:
-        "<results>/{dataset}/{scene}/{variant}/benchmarks/coverage_tree.jsonl"
-    conda:
-        ENVIRONMENT
+        PLAN.benchmark("coverage_tree")
     threads: 1
     resources:
-        mem_mb=RESOURCES.memory_mb("coverage_tree"),
-        runtime=RESOURCES.minutes("coverage_tree"),
+        **RESOURCES.of("coverage_tree"),
     params:
-        settings=PLAN.settings("coverage_tree"),
-        code=PLAN.code("coverage_tree"),
-    shell:
-        "python -m hilsplat --log {log:q} coverage-tree --masks {input.masks:q} --settings {params.settings:q}"
-        " --out {output.coverage_tree:q}"
+        **PLAN.params("coverage_tree"),

@@ -1,26 +1,26 @@
-# Masks of all views, linked into a tree of 3D nodes.
-rule semantic_tree:
+# A tree of nodes in 3D: masks linked across views, or Gaussians clustered by features.
+use rule stage as semantic_tree with:
     input:
-        contributions=PLAN.shared("contributions", "contributions"),
-        masks=PLAN.shared("masks", "masks"),
-        coverage_tree=PLAN.tree_parents,  # empty, except for evidence: features
+        **PLAN.shared("contributions", "masks"),
     output:
-        semantic_tree=directory("<results>/{dataset}/{scene}/{variant}/semantic_tree"),
+        directory("<results>/{dataset}/{scene}/{variant}/semantic_tree"),
     log:
-        "<results>/{dataset}/{scene}/{variant}/logs/semantic_tree.log",
+        PLAN.log("semantic_tree"),
     benchmark:
-        "<results>/{dataset}/{scene}/{variant}/benchmarks/semantic_tree.jsonl"
+        PLAN.benchmark("semantic_tree")
+    wildcard_constraints:
+        dataset=PLAN.jobs_of("semantic_tree"),
     priority: 70
-    conda:
-        ENVIRONMENT
-    threads: RESOURCES.threads
     resources:
-        mem_mb=RESOURCES.memory_mb("semantic_tree"),
-        runtime=RESOURCES.minutes("semantic_tree"),
+        **RESOURCES.of("semantic_tree"),
     params:
-        settings=PLAN.settings("semantic_tree"),
-        option=PLAN.tree_option,
-        code=PLAN.code(PLAN.tree_stage),
-    shell:
-        "python -m hilsplat --log {log:q} semantic-tree --contributions {input.contributions:q} --masks {input.masks:q}"
-        " --settings {params.settings:q} {params.option} --threads {threads} --out {output.semantic_tree:q}"
+        **PLAN.params("semantic_tree"),
+
+
+use rule semantic_tree as feature_tree with:
+    input:
+        **PLAN.shared("contributions", "masks", "coverage_tree"),
+    wildcard_constraints:
+        dataset=PLAN.jobs_of("feature_tree"),
+    params:
+        **PLAN.params("feature_tree"),

@@ -1,32 +1,21 @@
 # Base 3D Gaussian Splatting: a fit, or supplied Gaussians (column gaussians of the scene sheet).
-rule gaussians:
+use rule stage as gaussians with:
     input:
         scene="<results>/{dataset}/{scene}/scene",
-        existing=given(PLAN.data.existing_gaussians),
+        existing=given(PLAN.data.gaussians("existing")),
+        beside=given(PLAN.data.gaussians("beside")),
+        dataparser=given(PLAN.data.gaussians("dataparser")),
+        transforms=given(PLAN.data.gaussians("transforms")),
     output:
         ply="<results>/{dataset}/{scene}/gaussians.ply",
         coordinates="<results>/{dataset}/{scene}/gaussians.json",
         report=directory("<results>/{dataset}/{scene}/gaussians"),
     log:
-        "<results>/{dataset}/{scene}/logs/gaussians.log",
+        PLAN.log("gaussians"),
     benchmark:
-        "<results>/{dataset}/{scene}/benchmarks/gaussians.jsonl"
+        PLAN.benchmark("gaussians")
     priority: 40
-    conda:
-        ENVIRONMENT
-    threads: RESOURCES.threads
     resources:
-        mem_mb=RESOURCES.memory_mb("gaussians"),
-        runtime=RESOURCES.minutes("gaussians"),
-        gpu=RESOURCES.gpus("gaussians"),
+        **RESOURCES.of("gaussians"),
     params:
-        files=PLAN.data.content(PLAN.data.existing_gaussians),
-        settings=PLAN.settings("gaussians"),
-        existing=PLAN.data.existing_gaussians_option,
-        seed=PLAN.run.seed,
-        cache=cache_folder,
-        code=PLAN.code("gaussians"),
-    shell:
-        "python -m hilsplat --log {log:q} gaussians --scene {input.scene:q} --settings {params.settings:q} --seed {params.seed:q}"
-        " {params.existing} --threads {threads} --cache {params.cache:q} --report {output.report:q}"
-        " --out {output.ply:q}"
+        **PLAN.params("gaussians", files=PLAN.data.gaussians_files),

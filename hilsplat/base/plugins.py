@@ -2,6 +2,8 @@
 
 import importlib
 from collections.abc import Iterator, Mapping
+from functools import cache
+from importlib import metadata
 from typing import Any, Generic, TypeVar
 
 Part = TypeVar("Part")
@@ -17,8 +19,8 @@ def load(place: str) -> Any:
 class Plugins(Mapping[str, Part], Generic[Part]):
     """Components by name, imported on first access.
 
-    The code identity (`base.identity`) does not follow the entries. A stage that uses one component depends
-    only on that one, and adds the component's import path in `places` to the roots of its digest.
+    The digest of code (`base.code`) does not follow the entries. A stage that uses one component depends only
+    on that one, and adds the component's import path in `places` to the roots of its digest.
     """
 
     def __init__(self, places: Mapping[str, str]) -> None:
@@ -35,3 +37,9 @@ class Plugins(Mapping[str, Part], Generic[Part]):
 
     def __contains__(self, name: object) -> bool:
         return name in self.places  # without importing the component
+
+
+@cache
+def entry_points(group: str) -> Plugins[Any]:
+    """Return the components that installed packages offer as Python entry points of a group, by name."""
+    return Plugins({point.name: point.value for point in metadata.entry_points(group=group)})

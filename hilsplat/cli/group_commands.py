@@ -1,109 +1,13 @@
-"""Command groups: the synthetic world, model folders, caches, and published data sets."""
+"""Command groups: model folders, caches, and published data sets."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from hilsplat.cli.stage import (
-    DEFAULT_CACHE,
-    DataRoot,
-    PathOut,
-    Results,
-    Settings,
-    Threads,
-    cache_app,
-    datasets_app,
-    echo,
-    models_app,
-    section_of,
-    stage,
-    world_app,
-)
-
-SceneWithMasks = Annotated[str, typer.Argument(help="synthetic scene that has masks, as dataset/scene")]
-MeasuredMasks = Annotated[str, typer.Option(help="variant whose masks are measured")]
-NEIGHBOURS = 2  # number of nearest views that each view is compared with
-
-
-@world_app.command("make")
-def world_make(
-    source: Annotated[str, typer.Option(help="scene to make, as world:KIND:SEED")],
-    out: PathOut,
-    settings: Settings = "{}",
-    threads: Threads = 1,
-) -> None:
-    """Make a synthetic scene: images, and ground truth for evaluation only."""
-    section = section_of("world", settings)
-    beside = (out / "images", out / "truth")
-    with stage("world", out, settings=section, beside=beside) as run:
-        run(source, section, out, threads)
-
-
-@world_app.command("show")
-def world_show(
-    scene: Annotated[str, typer.Argument(help="finished synthetic scene, as dataset/scene")],
-    results: Results = Path("results"),
-) -> None:
-    """Write a contact sheet to world.png: views, labels by level, and the tree with its texts."""
-    from hilsplat_world.pictures import show_world
-
-    target = results / scene / "world.png"
-    show_world(results / scene / "world", target)
-    echo(f"wrote {target}")
-
-
-@world_app.command("inconsistency")
-def world_inconsistency(
-    scene: SceneWithMasks, variant: MeasuredMasks = "default", results: Results = Path("results")
-) -> None:
-    """Measure, using exact geometry, how often a surface point has different masks in neighbouring views.
-
-    Writes consistency.csv beside the masks.
-    """
-    truth, masks_folder = results / scene / "world" / "truth", results / scene / variant / "masks"
-    target = masks_folder.with_name("consistency.csv")
-    with stage("consistency", target, inputs={"truth": truth, "masks": masks_folder}) as run:
-        table = run(truth, masks_folder, target, NEIGHBOURS)
-    echo(table)
-
-
-@world_app.command("masks")
-def world_masks(
-    scene: SceneWithMasks,
-    variant: MeasuredMasks = "default",
-    results: Results = Path("results"),
-    out: Annotated[Path | None, typer.Option(help="PNG, CSV and PDF; default: beside the masks")] = None,
-) -> None:
-    """Compare masks with ground-truth regions at each level, and draw the errors."""
-    folder = results / scene
-    truth, masks_folder = folder / "world" / "truth", folder / variant / "masks"
-    target = out or masks_folder.with_name("masks_truth.png")
-    inputs = {"scene": folder / "scene", "truth": truth, "masks": masks_folder}
-    with stage("mask_truth", target, inputs=inputs, beside=(target.with_suffix(".csv"),)) as run:
-        table = run(folder / "scene", truth, masks_folder, target)
-    echo(table)
-
-
-@world_app.command("semantic-tree")
-def world_tree(
-    scene: Annotated[str, typer.Argument(help="synthetic scene that has a tree, as dataset/scene")],
-    variant: Annotated[str, typer.Option(help="variant whose tree is measured")] = "default",
-    results: Results = Path("results"),
-    threads: Threads = 2,
-) -> None:
-    """Compare the 3D semantic tree with the ground-truth nodes: matches, purity, parents.
-
-    Writes tree_truth.csv beside the tree.
-    """
-    folder = results / scene
-    semantic_tree, truth = folder / variant / "semantic_tree", folder / "world" / "truth"
-    target = semantic_tree.with_name("tree_truth.csv")
-    posed, ply = folder / "scene", folder / "gaussians.ply"
-    inputs = {"scene": posed, "gaussians": ply, "truth": truth, "semantic_tree": semantic_tree}
-    with stage("tree_truth", target, inputs=inputs) as run:
-        table = run(posed, ply, semantic_tree, truth, target, threads)
-    echo(table)
+from hilsplat.cli.common import Results, cache_app, datasets_app, echo, models_app
+from hilsplat.stage import DEFAULT_CACHE, DataRoot, Threads
+from hilsplat.stages import label_fits
 
 
 @models_app.command("get")
@@ -223,21 +127,6 @@ def datasets_check(
         raise typer.Exit(1)
 
 
-@datasets_app.command("export")
-def datasets_export(
-    name: Annotated[str, typer.Argument(help="scene with labelled points, such as scannet/scene0000_00")],
-    data_root: DataRoot,
-    out: PathOut,
-) -> None:
-    """Write the images and poses of a scene to a folder that the poses command can import."""
-    from hilsplat.datasets.registry import readers_of
-    from hilsplat.datasets.sources import DATA_PREFIX, image_files
-
-    files = image_files(f"{DATA_PREFIX}{name}", str(data_root))
-    with stage("source", out, plugins=readers_of([name]), inputs={"files": files}) as run:
-        run(name, data_root, out)
-
-
 @datasets_app.command("fits")
 def datasets_fits(
     scene: Annotated[str, typer.Argument(help="scene with a tree in the results folder, as dataset/scene")],
@@ -253,13 +142,9 @@ def datasets_fits(
 
     Writes label_fits.csv beside the tree.
     """
-    folder = results / scene
-    name, semantic_tree = labels or f"annotated/{scene}", folder / variant / "semantic_tree"
-    target = semantic_tree.with_name("label_fits.csv")
-    inputs = {"scene": folder / "scene", "gaussians": folder / "gaussians.ply"}
-    inputs |= {"masks": folder / variant / "masks", "semantic_tree": semantic_tree}
-    from hilsplat.datasets.registry import readers_of
-
-    with stage("label_fits", target, inputs=inputs, plugins=readers_of([name])) as run:
-        table = run(folder, variant, name, data_root, target, threads)
-    echo(table)
+    folder, tree = results / scene, results / scene / variant / "semantic_tree"
+    name, target = labels or f"annotated/{scene}", tree.with_name("label_fits.csv")
+    masks = folder / variant / "masks"
+    echo(
+        label_fits(folder / "scene", folder / "gaussians.ply", masks, tree, target, name, data_root, threads)
+    )

@@ -36,7 +36,7 @@ import typer  # noqa: E402
 from hilsplat.base.cache import use_writable_cache  # noqa: E402
 from hilsplat.base.errors import HilsplatError, require_working_directory, system_error  # noqa: E402
 from hilsplat.base.processes import end_with_workflow, keep_freed_memory  # noqa: E402
-from hilsplat.cli.stage import app, echo, start_logging  # noqa: E402
+from hilsplat.cli.common import app, echo, start_logging  # noqa: E402
 
 # `hilsplat --help` lists the commands in this order.
 # isort: off

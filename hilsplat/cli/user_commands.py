@@ -10,7 +10,8 @@ from typing import Annotated, Literal
 import typer
 
 from hilsplat.base.errors import ArtifactError, SettingsError
-from hilsplat.cli.stage import DataRoot, Results, Threads, app, echo
+from hilsplat.cli.common import Results, app, echo
+from hilsplat.stage import DataRoot, Threads
 
 SceneName = Annotated[str, typer.Argument(help="scene in results/, such as desk or photos/desk, or its path")]
 
@@ -74,6 +75,20 @@ def scene_folder(scene: str, results: Path) -> Path:
         if found:
             return found[0]
     return path if path.is_dir() and not named.is_dir() else named
+
+
+@app.command("show-masks")
+def show_masks(
+    scene: Annotated[Path, typer.Option(help="posed scene")],
+    masks: Annotated[Path, typer.Option(help="masks of the views")],
+    out: Annotated[Path, typer.Option(help="PNG to write, with the trees beside it")] = Path("masks.png"),
+    coverage_tree: Annotated[Path | None, typer.Option(help="coverage trees to draw as well")] = None,
+    view: Annotated[str | None, typer.Option(help="name of the view; default: the middle one")] = None,
+) -> None:
+    """Draw a view's masks at three levels, and its coverage trees."""
+    from hilsplat.segment.pictures import masks_overview
+
+    echo(f"wrote {out}, view {masks_overview(scene, masks, out, view, coverage_tree)}")
 
 
 @app.command()

@@ -28,7 +28,6 @@ from hilsplat.evaluate.protocols.views import consistency_rows
 from hilsplat.evaluate.scores import Measured, Score, write_instances, write_scores
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import EvaluateSettings
-from hilsplat_world.labels import labelled_points
 
 logger = logging.getLogger(__name__)
 
@@ -56,7 +55,7 @@ def run_evaluate_files(
     data_root: Path = Path(),
     truth: Path | None = None,
     scene: Path | None = None,
-    kind: str = "",
+    source: str = "",
     dataset: str = "synthetic",
     name: str = "",
     min_region_px: int | None = None,
@@ -70,9 +69,9 @@ def run_evaluate_files(
     Args:
         method: name of the program, used as the variant in its rows.
         labels: labels of a published data set, such as "lerf_ovs/figurines".
-        truth: a synthetic scene's ground truth, instead of `labels`; needs the posed `scene` (which defines
-            the test views), `kind` as in `run_evaluate`, and the data set and name for the rows.
-        min_region_px: smaller regions of a synthetic scene are not scored; None for the default setting.
+        truth: a generated scene's ground truth, instead of `labels`; needs the posed `scene` (which defines
+            the test views), `source` as in `run_evaluate`, and the data set and name for the rows.
+        min_region_px: smaller regions of a generated scene are not scored; None for the default setting.
 
     Raises:
         ArtifactError: a view has no predictions, or a file is missing or malformed.
@@ -82,15 +81,15 @@ def run_evaluate_files(
     if bool(labels) == (truth is not None) or (truth is None) != (scene is None):
         raise SettingsError(
             "predictions must be scored against exactly one set of labels",
-            expected="--labels for a data set, or --truth and --scene for a synthetic scene",
+            expected="--labels for a data set, or --truth, --source and --scene for a generated scene",
         )
     with stage_log("evaluate-files", str(predictions)) as counts:
         views: dict[str, Callable[[], ViewTruth]] = {}
         points: Mapping[str, LabelledPoints] = {}
         if truth is not None and scene is not None:
-            extra = ExtraProtocols.of_world(kind)
+            exact, extra = ExtraProtocols.generated(source, truth)
             if any((predictions / file).is_file() for card in extra.points for file in _files_of(card)):
-                points = labelled_points(truth.parent, kind)
+                points = exact.points()
             else:
                 min_px = min_region_px or EvaluateSettings().min_region_px
                 views = truths_of(truth, Scene.load(scene), min_px)

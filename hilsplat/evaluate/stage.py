@@ -11,6 +11,7 @@ from jaxtyping import Float64
 
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.progress import stage_log, track
+from hilsplat.datasets.generators import Truth
 from hilsplat.datasets.labelled import LabelledScene
 from hilsplat.datasets.points.labelled_points import PointScene
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
@@ -27,8 +28,6 @@ from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.finished import SceneParts
 from hilsplat.segment.origin import masks_label
 from hilsplat.settings import EvaluateSettings
-from hilsplat_world.diagnostics.world_consistency import measure_world_consistency
-from hilsplat_world.labels import labelled_points
 
 logger = logging.getLogger(__name__)
 
@@ -38,8 +37,8 @@ MAX_CAMERA_ERROR_M = 0.1
 TIMED_TEXTS = 3
 """Number of timed queries, all in one view."""
 
-Annotations = LabelledScene | PointScene | Path
-"""Labels of a published data set, or the ground-truth folder of a synthetic scene."""
+Annotations = LabelledScene | PointScene | Truth
+"""Labels of a published data set, or the ground truth of a generated scene."""
 
 
 def run_evaluate(
@@ -51,7 +50,7 @@ def run_evaluate(
     scene: str,
     variant: str = "default",
     truth: Path | None = None,
-    kind: str = "",
+    source: str = "",
     labels: Sequence[str] = (),
     data_root: Path = Path(),
     threads: int = 1,
@@ -64,12 +63,12 @@ def run_evaluate(
 
     Args:
         dataset: data set recorded in every row, as are `scene` and `variant`.
-        truth: ground-truth folder of a synthetic scene, whose `kind` determines its benchmarks.
+        truth: ground-truth folder of a generated scene, whose `source` determines its benchmarks.
         labels: labels of published data sets, such as "lerf_ovs/figurines", instead of `truth`.
 
     Raises:
         MisalignedArtifactError: label images and cameras differ in size.
-        SceneError: a data set or kind is unknown, a labelled view has no pose, or labels differ from their
+        SceneError: a data set or source is unknown, a labelled view has no pose, or labels differ from their
             view in aspect ratio.
     """
     scores: list[Score] = []
@@ -87,7 +86,7 @@ def run_evaluate(
             ExtraProtocols.open(name, data_root) for name in labels
         ]
         if truth is not None:
-            scored.append((dataset, truth, ExtraProtocols.of_world(kind)))
+            scored.append((dataset, *ExtraProtocols.generated(source, truth)))
         if not scored:
             logger.info("%s/%s has no annotations: nothing to score", dataset, scene)
         else:
@@ -96,7 +95,8 @@ def run_evaluate(
             for data, known, protocols in scored:
                 truths = {}
                 if not isinstance(known, PointScene):
-                    truths = truths_of(known, posed, settings.min_region_px)
+                    labels_of = known if isinstance(known, LabelledScene) else known.folder
+                    truths = truths_of(labels_of, posed, settings.min_region_px)
                     if not truths:
                         logger.warning("no view of %s is annotated: nothing to score", posed.name)
                 counts[f"views of {data}"] = len(truths)
@@ -110,8 +110,9 @@ def run_evaluate(
                         texts = [query.text for query in of_view.categories[:TIMED_TEXTS]]
                         seconds = time_queries(answers, view, texts, settings)
                     answers.forget(view)  # reusing the freed memory avoids clearing new pages
-                if isinstance(known, Path) and truths and settings.view_consistency:
-                    for view, row in measure_world_consistency(selections, truths, kept, known, settings):
+                is_checked = bool(truths) and settings.view_consistency
+                if is_checked and not isinstance(known, LabelledScene | PointScene):
+                    for view, row in known.consistency(selections, truths, kept, settings):
                         keep(data, view, row)
                 for each in point_rows(answers, known, protocols, settings, threads):
                     if isinstance(each, Measured):
@@ -139,9 +140,8 @@ def point_rows(
             logger.warning("%s: %s", known.name, sentence)
         points, transform = known.truth, answers.scene.scene_from_source
     else:
-        kind = "street" if any(card.classes.startswith("waymo") for card in extra.points) else "room"
-        points = labelled_points(known.parent, kind)
-        transform, error = scene_from_true(Cameras.load(known / "cameras.npz"), answers.scene.cameras)
+        points = known.points()
+        transform, error = scene_from_true(known.cameras(), answers.scene.cameras)
         if error > MAX_CAMERA_ERROR_M:
             sentence = "%s: the median camera error is %.2f m, so point scores are meaningless"
             logger.warning(sentence, answers.scene.name, error)

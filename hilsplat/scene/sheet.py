@@ -8,9 +8,11 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES, NAME_RULE, list_images, name_problem, regular
+from hilsplat.base.plugins import entry_points
 from hilsplat.scene.layouts import NO_POSES, contents, has_known_poses, photo_folder
 
 DEFAULT_SHEET = Path("config/scenes.tsv")
@@ -42,7 +44,23 @@ MIN_PHOTOS = 3
 
 DATA_PREFIX = "data:"
 """Prefix of a source in the folder of published data sets (`data_root`)."""
-WORLD_SOURCE = re.compile(r"world:([a-z][a-z0-9_-]*):([0-9]{1,9})")
+GENERATED = re.compile(r"([a-z][a-z0-9_]*):([a-z][a-z0-9_-]*):([0-9]{1,9})")
+
+
+class Generated(NamedTuple):
+    """Parts of the source of a scene that a plugin generates (`datasets.generators`)."""
+
+    generator: str
+    kind: str
+    seed: int
+
+
+def generated_of(source: str) -> Generated | None:
+    """Return the parts of a generated scene's source; None if it is another source."""
+    match = GENERATED.fullmatch(source)
+    if match is None or match[1] not in entry_points("hilsplat.generators"):
+        return None
+    return Generated(match[1], match[2], int(match[3]))
 
 
 @dataclass(frozen=True)
@@ -52,9 +70,9 @@ class SceneRow:
     Attributes:
         dataset: first part of the scene's path under `results/`; `scene` is the second.
         group: one of `GROUPS`.
-        source: `world:<kind>:<seed>`, `data:<folder below data_root>`, or a folder.
+        source: `<generator>:<kind>:<seed>`, `data:<folder below data_root>`, or a folder.
         unit: unit of the source's lengths, "metre" or "arbitrary".
-        folder: the source folder; None for a world.
+        folder: the source folder; None for a generated scene.
         gaussians: 3DGS PLY in the source's coordinates, used instead of a fit; None to fit.
         features: folder of LangSplat's masks and CLIP vectors; None to run SAM and CLIP.
         poses: COLMAP model or transforms file used instead of the poses in the folder; `NO_POSES` to ignore
@@ -77,10 +95,9 @@ class SceneRow:
         return f"{self.dataset}/{self.scene}"
 
     @property
-    def world(self) -> tuple[str, int] | None:
-        """Kind and seed if the source is a synthetic world, else None."""
-        match = WORLD_SOURCE.fullmatch(self.source)
-        return (match[1], int(match[2])) if match else None
+    def generated(self) -> Generated | None:
+        """Generator, kind and seed of a generated scene; None for other scenes."""
+        return generated_of(self.source)
 
 
 def project_root(sheet: Path) -> Path:
@@ -225,12 +242,12 @@ def _row(
     is_checked = checked_groups is None or cells["group"] in checked_groups
     if not source:
         raise fault("source", "it is empty", fix="enter world:<kind>:<seed>, or a folder of images")
-    if source.startswith("world:"):
-        if not WORLD_SOURCE.fullmatch(source):
+    if source.partition(":")[0] in entry_points("hilsplat.generators"):
+        if generated_of(source) is None:
             raise fault(
                 "source",
-                f"{source!r} does not name a synthetic scene",
-                expected="world:<kind>:<seed>, as in world:tabletop:201",
+                f"{source!r} does not name a generated scene",
+                expected="<generator>:<kind>:<seed>, as in world:tabletop:201",
                 fix="correct the source",
             )
     else:

@@ -19,11 +19,9 @@ from hilsplat.base.provenance import version_of
 from hilsplat.configuration import merged_config
 from hilsplat.models.memory import machine_mib
 from hilsplat.models.store import RECOMMENDED, broken_models, present_models, user_models
+from hilsplat.stages import all_stages
 from hilsplat.workflow.plan import Plan
-from hilsplat.workflow.resources import JobResources
-
-RULES = ("poses", "gaussians", "masks", "contributions", "semantic_tree", "clip", "field", "figures")
-"""Rules whose memory and disk requirements are compared with the machine's capacity."""
+from hilsplat.workflow.resources import COSTS, JobResources
 
 
 @dataclass(frozen=True)
@@ -160,9 +158,10 @@ def space() -> Iterator[Finding]:
         yield Finding("configuration", "note", str(error), fix)
         return
     resources, disk_mb, memory = JobResources(plan), 0.0, (0.0, "", "")
+    names = [name for name, stage in all_stages().items() if stage.scope != "run" and stage.name in COSTS]
     for row in plan.scenes:
-        disk_mb += sum(resources.disk_mb(rule, row) for rule in RULES)
-        for rule in RULES:
+        disk_mb += sum(resources.disk_mb(rule, row) for rule in names)
+        for rule in names:
             memory = max(memory, (resources.memory_mb(rule)(row, threads=1, attempt=1), rule, row.name))
     folder = existing_folder(plan.results)
     free, needed = shutil.disk_usage(folder).free / 2**30, disk_mb * 1e6 / 2**30

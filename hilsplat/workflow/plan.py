@@ -4,15 +4,16 @@ import difflib
 import functools
 import json
 import re
+import shlex
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.files import INSTALLED, project_path
 from hilsplat.configuration import SECTIONS, RunSettings, StageSettings, parse_run, require_known
 from hilsplat.datasets.sources import unlisted
-from hilsplat.methods.registry import METHODS, OURS, require_method
+from hilsplat.methods.registry import METHODS, require_method
 from hilsplat.models.store import AUTO, model_digest, model_path, read_model
 from hilsplat.scene.finished import KEY_VIEWS
 from hilsplat.scene.sheet import (
@@ -24,12 +25,30 @@ from hilsplat.scene.sheet import (
     read_sheet,
     row_of_data,
 )
+from hilsplat.stage import Facts, Stage
+from hilsplat.stages import all_stages, family_of, kinds_of, stage_of
 from hilsplat.workflow.models import check_device, check_models, describe_models, doubt_about_photographs
-from hilsplat.workflow.scene_data import Job, SceneData, VariantJob, of_variant, options_of
-from hilsplat.workflow.stages import stage_code
+from hilsplat.workflow.scene_data import Job, SceneData, VariantJob, of_variant
 
-LEAST_PHOTOGRAPHS = 16
+MIN_PHOTOGRAPHS = 16
 """Minimum number of photographs for key views; with fewer, the key views (half) would link too few masks."""
+
+PARTS = ("semantic_tree", "field", "autoencoder", "clip", "masks")
+"""Artifacts of a variant that queries read."""
+
+SCORED = "evaluate"
+"""The stage that reads everything that a variant may change."""
+
+Option = Callable[..., Any] | str
+"""An option of a stage's command: its value, or a function of the wildcards and the input."""
+
+
+class Identity(NamedTuple):
+    """What an artifact of a variant is made from; artifacts with equal identities are the same."""
+
+    stages: tuple[str, ...]
+    settings: tuple[tuple[str, Any], ...]  # section and its values
+    seed: int | None
 
 
 def any_of(names: Iterable[str]) -> str:
@@ -37,9 +56,18 @@ def any_of(names: Iterable[str]) -> str:
     return "|".join(sorted({re.escape(name) for name in names})) or "(?!)"
 
 
-def inert(text: str) -> str:
+def escape_json_for_report(text: str) -> str:
     """Return the same JSON with `<` escaped: Snakemake's report copies parameters unescaped into a script."""
     return text.replace("<", "\\u003c")
+
+
+def options_of(name: str, value: Any) -> list[str]:
+    """Return an option of a command line for each value; none for an empty value."""
+    option = f"--{name.replace('_', '-')}"
+    if value is True:
+        return [option]
+    values = value if isinstance(value, list | tuple) else [value]
+    return [f"{option} {shlex.quote(str(item))}" for item in values if item not in ("", None, False)]
 
 
 class Plan:
@@ -57,6 +85,7 @@ class Plan:
         self.results = Path(run.results)
         for name in run.every_variant():
             require_method(run.stages(name).method.name)
+        require_variant_sections(run)
         sheet = project_path(run.scenes)
         rows = read_sheet(sheet, run.groups, run.data_root)
         found = unlisted({row.source for row in rows}, run.groups, run.data_root)
@@ -83,9 +112,25 @@ class Plan:
             )
         # A thousand scenes have tens of thousands of jobs, so settings are resolved and folders read once.
         self.stages_of = functools.cache(lambda *which: run.stages(*which).with_models())
-        self._seeded = functools.cache(run.seeded)
-        self._section = functools.cache(self._section_of)
-        self._first_alike = functools.cache(self._first_with_equal_settings)
+        self.defaults = {name: getattr(self.stages_of("default", ()), name) for name in SECTIONS}
+        self.options: dict[str, Option] = {
+            "images": self.data.images,
+            "unit": self.data.unit,
+            "render": self.data.is_render,
+            "poses": self.data.poses,
+            "source": self.data.generated_source,
+            "dataset": lambda job, *_: job.dataset,
+            "variant": lambda job, *_: job.variant,
+            "labels": self.data.label_names,
+            "data_root": str(Path(run.data_root)),
+            "names": self.names,
+            "queries": self.queries,
+            "folder": lambda job, input, _: str(Path(input.gaussians).parent),
+            "results": lambda job, _, output: str(Path(output[0]).parent),
+        }
+        self._json = functools.cache(lambda section, *which: self._section(section, *which).model_dump_json())
+        self.identity = functools.cache(self._identity)
+        self._first_alike = functools.cache(self._first_with_equal_identity)
         for row in self.scenes:
             self.data.require_no_braces(row)
 
@@ -107,14 +152,6 @@ class Plan:
     def path(self, job: Job, *parts: str) -> str:
         return "/".join([self.run.results, job.dataset, job.scene, *parts])
 
-    def variants(self, by_baseline: bool | None = None) -> str:
-        """Return a regular expression of all variants, or of those with or without a baseline's field."""
-        return any_of(
-            name
-            for name in self.run.every_variant()
-            if by_baseline is None or (self.stages_of(name).method.name != OURS) == by_baseline
-        )
-
     def row(self, job: Job) -> SceneRow:
         return self.data.row(job)
 
@@ -126,31 +163,95 @@ class Plan:
         """Return the variant and the overrides that determine a job's settings."""
         return getattr(job, "variant", "default"), self.scopes(self.row(job))
 
-    def _section_of(self, section: str, variant: str, scopes: tuple[str, ...]) -> tuple[str, dict[str, Any]]:
-        settings = getattr(self.stages_of(variant, scopes), section)
-        return inert(settings.model_dump_json()), settings.model_dump(mode="json")
+    def _section(self, section: str, variant: str, scopes: tuple[str, ...]) -> Any:
+        return getattr(self.stages_of(variant, scopes), section)
 
-    def settings(self, section: str) -> Callable[[Job], str]:
-        """Return the parameter function for a section's settings as JSON."""
-        return lambda job: self._section(section, *self.which(job))[0]
-
-    def values(self, section: str, job: Job) -> dict[str, Any]:
-        """Return a section's settings for a job; empty for stages without a section."""
-        return self._section(section, *self.which(job))[1] if section in SECTIONS else {}
+    def settings(self, section: str, job: Job) -> str:
+        """Return a section's settings for a job, as JSON."""
+        return escape_json_for_report(self._json(section, *self.which(job)))
 
     def seeded(self, variant: str, row: SceneRow) -> list[str]:
         """Return a variant and, if it is random, its repetitions with other seeds."""
-        return self._seeded(variant, self.scopes(row))
+        is_random = self.identity(SCORED, variant, *self._situation(row)).seed is not None
+        return self.run.all_seeds(variant) if is_random else [variant]
 
-    def seed(self, job: VariantJob) -> int:
-        """Return the seed of a variant's networks."""
-        return self.run.seed_of(job.variant)
+    def seed(self, stage: Stage[..., Any], job: Job) -> int:
+        """Return a job's seed, 0 for a variant's stage that is deterministic."""
+        if stage.scope != "variant":
+            return self.run.seed
+        sections = [self._section(section, *self.which(job)) for section in stage.sections.values()]
+        is_random = any(section.is_random for section in sections)
+        return self.run.seed_of(getattr(job, "variant", "default")) if is_random else 0
 
-    def code(
-        self, stage: str | Callable[[Any], str], plugins: Callable[[Any], tuple[str, ...]] = lambda job: ()
-    ) -> Callable[[Any], str]:
-        """Return the parameter function for the digest of a stage's code and of its readers or baseline."""
-        return lambda job: stage_code(stage(job) if callable(stage) else stage, plugins(job))
+    def log(self, name: str, wildcards: str = "") -> str:
+        """Return the path of a stage's log."""
+        return self._beside(name, "logs", f"{wildcards}.log")
+
+    def benchmark(self, name: str, wildcards: str = "") -> str:
+        """Return the path of a stage's benchmark."""
+        return self._beside(name, "benchmarks", f"{wildcards}.jsonl")
+
+    @staticmethod
+    def _beside(name: str, folder: str, ending: str) -> str:
+        stage = stage_of(name)
+        places = {"run": "", "scene": "/{dataset}/{scene}", "variant": "/{dataset}/{scene}/{variant}"}
+        return f"<results>{places[stage.scope]}/{folder}/{family_of(stage)}{ending}"
+
+    def params(
+        self,
+        name: str,
+        /,
+        *,
+        files: Callable[[Any], list[str] | str] | None = None,
+        plugins: Callable[[Any], tuple[str, ...]] = lambda job: (),
+        **options: Option,
+    ) -> dict[str, Any]:
+        """Return the parameters of a stage's rule: the command, and digests of what Snakemake can't compare.
+
+        Args:
+            files: input function of a user's files, whose contents count.
+            plugins: function of a job's readers or baseline, whose code counts.
+            options: values of the stage's parameters that are neither inputs of the rule nor settings, if
+                they differ from `self.options`.
+        """
+        stage = stage_of(name)
+
+        def command(wildcards: Any, input: Any, output: Any) -> str:
+            words = [stage.command]
+            for option, value in self._options(stage, wildcards, input, output, options).items():
+                words += options_of(option, value)
+            return " ".join(words)
+
+        params: dict[str, Any] = {
+            "command": command,
+            "code": lambda wildcards: stage.code_digest(plugins(wildcards)),
+        }
+        if files is not None:
+            params["files"] = self.data.content(files)
+        models = [name for name in stage.sections.values() if hasattr(self.defaults[name], "model")]
+        return params | ({"model": self.model(models[0])} if models else {})
+
+    def _options(
+        self, stage: Stage[..., Any], job: Any, input: Any, output: Any, options: Mapping[str, Option]
+    ) -> dict[str, Any]:
+        """Return the value of each option of a stage's command, in the order of the stage's parameters."""
+        depth = {"run": 0, "scene": 2, "variant": 3}[stage.scope]
+        values: dict[str, Any] = {}
+        for name in stage.hints:
+            if (option := options.get(name, self.options.get(name))) is not None:
+                values[name] = option(job, input, output) if callable(option) else option
+            elif name in stage.inputs:
+                paths = getattr(input, name, "")
+                values[name] = paths if isinstance(paths, str) else list(paths)
+            elif name in stage.sections:
+                values[name] = self.settings(stage.sections[name], job)
+            elif name in stage.outputs[1:]:
+                values[name] = getattr(output, name)
+            elif name == "seed":
+                values[name] = str(self.seed(stage, job))
+            elif name == "cache":  # in the results folder, whose path a module may prefix
+                values[name] = str(Path(output[0]).parents[depth] / ".cache")
+        return values
 
     def vocabulary(self, job: Job) -> list[str]:
         """Return the input of `names`: the user's own vocabulary, if any."""
@@ -161,10 +262,9 @@ class Plan:
         """Return the parameter function for the digest of a section's model folder, or "none"."""
 
         def digest(job: Job) -> str:
-            stages = self.stages(job)
-            if section == "masks" and stages.masks.segmenter != "sam":
-                return "none"
-            return model_digest(model_path(getattr(stages, section).model), self.results / ".cache")
+            settings = getattr(self.stages(job), section)
+            uses_model = settings.uses_model and not self.row(job).features
+            return model_digest(model_path(settings.model), self.results / ".cache") if uses_model else "none"
 
         return digest
 
@@ -174,71 +274,118 @@ class Plan:
         for row in self.scenes:
             stages = self.stages_of("default", self.scopes(row))
             described = describe_models(stages, row.features)
-            key = (described, "" if row.world else doubt_about_photographs(stages))
+            key = (described, "" if row.generated else doubt_about_photographs(stages))
             scenes.setdefault(key, []).append(row.name)
         return [
             line
             for (models, doubt), names in scenes.items()
-            for line in (f"{some(names)}: {models}", doubt)
+            for line in (f"{shorten_list(names)}: {models}", doubt)
             if line
         ]
 
-    def shared(self, stage: str, path: str) -> Callable[[VariantJob], str]:
-        """Return the input function for a stage's output, from the first variant with the same settings.
+    def shared(self, *artifacts: str) -> dict[str, Callable[[VariantJob], str]]:
+        """Return input functions for artifacts, each of the first variant whose artifact is the same.
 
         Variants that are in no table are included, so that shared files do not move when tables change.
         """
-        return lambda job: self.path(job, self.shared_variant(stage, job), path)
+        return {name: functools.partial(self.shared_path, name) for name in artifacts}
 
-    def compared(self, stage: str, path: str) -> Callable[[Job], list[str]]:
-        """Return the input function for a stage's outputs under all variants in the main tables."""
-        return lambda job: list(dict.fromkeys(map(self.shared(stage, path), self._main_jobs(job))))
+    def compared(self, *artifacts: str) -> dict[str, Callable[[Job], list[str]]]:
+        """Return input functions for the artifacts of all variants in the main tables."""
+
+        def paths(name: str, job: Job) -> list[str]:
+            return list(dict.fromkeys(self.shared_path(name, main) for main in self._main_jobs(job)))
+
+        return {name: functools.partial(paths, name) for name in artifacts}
+
+    def of_key_views(self, artifact: str) -> Callable[[Job], str]:
+        """Return the input function for an artifact of the key views."""
+        return lambda job: self.shared_path(artifact, of_variant(job, KEY_VIEWS))
+
+    def shared_path(self, artifact: str, job: VariantJob) -> str:
+        """Return the path of an artifact, of the first variant whose artifact is the same."""
+        stage = kinds_of(artifact)[-1]
+        variant = [self.shared_variant(artifact, job)] if stage.scope == "variant" else []
+        return self.path(job, *variant, stage.file)
 
     def compared_scores(self, job: Job) -> list[str]:
         """Return the input of `comparison`: the scores of each variant in the main tables."""
-        return [self.path(each, each.variant, "scores.csv") for each in self._main_jobs(job)]
+        return [self.path(main, main.variant, "scores.csv") for main in self._main_jobs(job)]
 
     def _main_jobs(self, job: Job) -> list[VariantJob]:
         return [of_variant(job, name) for name in self.run.main_variants]
 
-    def shared_variant(self, stage: str, job: VariantJob) -> str:
-        """Return the first variant whose settings up to a stage equal those of the job's variant."""
-        return self._first_alike(stage, job.variant, self.scopes(self.row(job)))
+    def shared_variant(self, artifact: str, job: VariantJob) -> str:
+        """Return the first variant whose artifact equals that of the job's variant."""
+        return self._first_alike(artifact, job.variant, *self._situation(self.row(job)))
 
-    def _first_with_equal_settings(self, stage: str, variant: str, scopes: tuple[str, ...]) -> str:
-        own = self.stages_of(variant, scopes)
-        seed = self.run.seed_of(variant) if own.depends_on_seed(stage) else None
-        for name in self.run.every_variant():
-            other = self.stages_of(name, scopes)
-            same = all(getattr(other, part) == getattr(own, part) for part in own.upstream(stage))
-            if same and seed in (None, self.run.seed_of(name)):
-                return name
-        return variant
+    def _first_with_equal_identity(self, artifact: str, variant: str, *situation: Any) -> str:
+        identity = self.identity(artifact, variant, *situation)
+        names = self.run.every_variant()
+        return next(
+            (name for name in names if self.identity(artifact, name, *situation) == identity), variant
+        )
+
+    def _situation(self, row: SceneRow) -> tuple[tuple[str, ...], bool]:
+        """Return what decides about a scene's artifacts besides the variant."""
+        return self.scopes(row), row.features is not None
+
+    def _identity(self, artifact: str, variant: str, scopes: tuple[str, ...], is_imported: bool) -> Identity:
+        """Return what an artifact of a variant is made from, directly and through its inputs."""
+        settings = self.stages_of(variant, scopes)
+        stages: dict[str, Stage[..., Any]] = {}
+        waiting = [artifact]
+        while waiting:
+            kinds = kinds_of(waiting.pop())
+            stage = _first_kind(kinds, Facts(settings, is_imported)) if kinds else None
+            if stage is not None and stage.scope == "variant" and stage.name not in stages:
+                stages[stage.name] = stage
+                waiting += stage.inputs
+        sections = {name for stage in stages.values() for name in stage.sections.values()}
+        values = {name: getattr(settings, name) for name in sorted(sections)}
+        is_random = any(section.is_random for section in values.values())
+        seed = self.run.seed_of(variant) if is_random else None
+        return Identity(tuple(sorted(stages)), tuple(values.items()), seed)
 
     def scopes(self, row: SceneRow) -> tuple[str, ...]:
         """Return the existing keys of `overrides` that apply to a scene, the more general key first."""
         return tuple(scope for scope in (row.group, row.name) if scope in self.run.overrides)
 
-    def masks_stage(self, job: VariantJob) -> str:
-        """Return the masks stage; imported masks, key views and the diagnostic have their own stages."""
-        masks = self.stages(job).masks
-        if masks.segmenter == "truth-perturbed":
-            return "truth_masks"
-        if self.row(job).features:
-            return "langsplat"
-        if masks.key_views < 1:
-            return "key_masks"
-        return "guided_masks" if masks.prompts == "guided" and self.first_answer(job) else "masks"
+    def kind(self, artifact: str, job: VariantJob) -> Stage[..., Any]:
+        """Return the stage that makes an artifact of a job's variant."""
+        row = self.row(job)
+        facts = Facts(self.stages(job), row.features is not None, self.first_answer(job))
+        return _first_kind(kinds_of(artifact), facts)
 
-    def key_gaussians(self, job: VariantJob) -> list[str]:
-        """Return the input of `masks`: the Gaussians that key views or projected prompts need, if any."""
-        needed = self.masks_stage(job) in ("key_masks", "guided_masks")
-        return [self.path(job, "gaussians.ply")] if needed else []
+    def jobs_of(self, name: str) -> str:
+        """Return a pattern of the wildcard `dataset` of the jobs for which this stage makes its artifact.
 
-    def key_parts(self, job: VariantJob, stage: str) -> list[str]:
-        """Return the input of `masks`: masks or semantic tree of the key views, if they guide the prompts."""
-        is_guided = self.masks_stage(job) == "guided_masks"
-        return [self.shared(stage, stage)(of_variant(job, KEY_VIEWS))] if is_guided else []
+        It looks ahead to the scene and the variant, because which stage it is depends on both.
+        """
+        kinds, scenes = kinds_of(stage_of(name).artifact), dict[tuple[str, ...], list[str]]()
+        variants_of = functools.cache(functools.partial(self._variants_of, name, kinds))
+        for row in self.rows:
+            variants = variants_of(*self._situation(row), self.first_answer(of_variant(row, "default")))
+            scenes.setdefault(variants, []).append(row.name)
+        patterns = [
+            f"({any_of(names) if len(scenes) > 1 else '[^/]+/[^/]+'})/({any_of(variants)})/"
+            for variants, names in scenes.items()
+        ]
+        return f"(?={'|'.join(patterns)})[^/]+"
+
+    def _variants_of(
+        self,
+        name: str,
+        kinds: list[Stage[..., Any]],
+        scopes: tuple[str, ...],
+        is_imported: bool,
+        is_refined: bool,
+    ) -> tuple[str, ...]:
+        facts = {
+            variant: Facts(self.stages_of(variant, scopes), is_imported, is_refined and variant == "default")
+            for variant in self.run.every_variant()
+        }
+        return tuple(variant for variant, known in facts.items() if _first_kind(kinds, known).name == name)
 
     def first_answer(self, job: VariantJob) -> bool:
         """Return whether key views answer queries before all photographs have masks."""
@@ -248,7 +395,7 @@ class Plan:
             return False
         model = read_model(Path(masks.model)) if masks.segmenter == "sam" else None
         is_slow = model is not None and not model.embedded
-        return is_slow and len(self.data.image_files(job)) >= LEAST_PHOTOGRAPHS
+        return is_slow and len(self.data.image_files(job)) >= MIN_PHOTOGRAPHS
 
     def masks_priority(self, job: VariantJob) -> int:
         """Return the priority of `masks`: lower if key views come first, or if cached masks get other levels.
@@ -258,70 +405,30 @@ class Plan:
         """
         return 20 if self.first_answer(job) or self.stages(job).masks.levels == "tree" else 30
 
-    def masks_truth(self, job: VariantJob) -> list[str]:
-        """Return the input of `masks`: the diagnostic's ground-truth labels; SettingsError if none exist."""
-        if self.masks_stage(job) != "truth_masks":
-            return []
-        row = self.row(job)
-        if not row.world:
-            raise SettingsError(
-                f"{row.name}, variant {job.variant}: masks.segmenter truth-perturbed needs "
-                "ground-truth labels, which only synthetic scenes have",
-                fix="choose another segmenter, or run the variant on synthetic scenes only",
-            )
-        return self.data.truth(job)
-
-    def masks_option(self, job: VariantJob, input: Any) -> str:
-        """Return the options of `masks` for imported masks, key views or the diagnostic segmenter."""
-        if self.masks_stage(job) == "langsplat":
-            return options_of({"features": self.row(job).features})
-        faults = self.stages(job).perturb.model_dump_json() if input.truth else ""
-        key = {"gaussians": input.gaussians, "key-masks": input.key_masks, "semantic-tree": input.key_tree}
-        return options_of({**key, "truth": input.truth, "perturb": faults})
-
     def crops_tree(self, job: VariantJob) -> list[str]:
         """Return the input of `clip`: the semantic tree that selects crops; empty to embed all masks."""
-        by_node = self.stages(job).clip.crops == "nodes" and not self.row(job).features
-        return [self.shared("semantic_tree", "semantic_tree")(job)] if by_node else []
+        by_node = self.stages(job).clip.crops == "nodes"
+        return [self.shared_path("semantic_tree", job)] if by_node else []
 
-    def crops_tree_option(self, job: VariantJob, input: Any) -> str:
-        """Return the option of `clip` for `crops_tree`, or for imported vectors."""
-        return options_of({"semantic-tree": input.semantic_tree, "features": self.row(job).features})
+    def rendered(self, artifact: str) -> Callable[[VariantJob], list[str]]:
+        """Return the input function of `field` for an artifact that only the literal trainer reads."""
 
-    def tree_stage(self, job: VariantJob) -> str:
-        """Return the stage of the semantic tree: linked masks, or clustered features."""
-        return "feature_tree" if self.stages(job).semantic_tree.evidence == "features" else "semantic_tree"
+        def paths(job: VariantJob) -> list[str]:
+            is_literal = self.stages(job).field.trainer == "literal"
+            return [self.shared_path(artifact, job)] if is_literal else []
 
-    def tree_parents(self, job: VariantJob) -> list[str]:
-        """Return the input of `semantic_tree`: the coverage trees, if features are clustered."""
-        by_features = self.tree_stage(job) == "feature_tree"
-        return [self.shared("coverage_tree", "coverage_tree")(job)] if by_features else []
-
-    def tree_option(self, job: VariantJob, input: Any) -> str:
-        """Return the options of `semantic-tree` for `tree_parents`."""
-        if not input.coverage_tree:
-            return ""
-        field = self.settings("field")(job)
-        seed = str(self.seed(job))
-        return options_of({"coverage-tree": input.coverage_tree, "field-settings": field, "seed": seed})
-
-    def rendered(self, job: VariantJob) -> list[str]:
-        """Return the input of `field`: scene, Gaussians and masks, if the literal trainer renders them."""
-        if self.stages(job).field.trainer != "literal":
-            return []
-        return [self.path(job, "scene"), self.path(job, "gaussians.ply"), self.shared("masks", "masks")(job)]
+        return paths
 
     def first_field(self, job: VariantJob) -> list[str]:
         """Return the input of `field`: LangSplat's initial field; SettingsError if no variant computes it."""
-        stages, scopes = self.stages(job), self.scopes(self.row(job))
-        if stages.field.start != "langsplat":
+        if self.stages(job).field.start != "langsplat":
             return []
-        seed = self.run.seed_of(job.variant)
+        situation, seed = self._situation(self.row(job)), self.run.seed_of(job.variant)
+        code = self.identity("autoencoder", job.variant, *situation)
         for name in self.run.every_variant():
-            other = self.stages_of(name, scopes)
-            if other.method.name != "langsplat" or self.run.seed_of(name) != seed:
-                continue
-            if all(getattr(other, part) == getattr(stages, part) for part in stages.upstream("autoencoder")):
+            method = self.stages_of(name, situation[0]).method.name
+            is_first = method == "langsplat" and self.run.seed_of(name) == seed
+            if is_first and self.identity("autoencoder", name, *situation) == code:
                 return [self.path(job, name, "field.safetensors")]
         raise SettingsError(
             f"{job.dataset}/{job.scene}, variant {job.variant}: field.start is langsplat, but no variant has "
@@ -329,30 +436,45 @@ class Plan:
             fix="add such a variant, or change field.start",
         )
 
-    def field_option(self, job: VariantJob, input: Any) -> str:
-        """Return the options of `field` for `rendered` and `first_field`."""
-        rendered = dict(zip(("scene", "gaussians", "masks"), input.rendered, strict=False))
-        return options_of({**rendered, "start": input.start})
-
-    def field_seed(self, job: VariantJob) -> int:
-        """Return a field's seed, or 0 if the field is deterministic, so that other seeds do not rerun it."""
-        return self.seed(job) if self.stages(job).field.is_random else 0
-
-    def clip_stage(self, job: VariantJob) -> str:
-        """Return the stage that computes or imports the CLIP vectors."""
-        return "langsplat" if self.row(job).features else "clip"
-
     def baseline(self, job: VariantJob) -> tuple[str, ...]:
         return (METHODS.places[self.stages(job).method.name],)
 
-    def names(self, _: object) -> str:
+    def names(self, *_: object) -> str:
         """Return each variant's name in tables and figures, as JSON; Snakemake would expand plain text."""
-        return inert(json.dumps(dict(self.run.labels)))
+        return escape_json_for_report(json.dumps(dict(self.run.labels)))
 
-    def queries(self, job: Job) -> str:
+    def queries(self, job: Job, *_: object) -> str:
         """Return the queries for the panel of a scene without labels on images, as JSON."""
         of_dataset = self.run.queries.get(job.dataset, ())
-        return inert(json.dumps(self.run.queries.get(f"{job.dataset}/{job.scene}", of_dataset)))
+        queries = self.run.queries.get(f"{job.dataset}/{job.scene}", of_dataset)
+        return escape_json_for_report(json.dumps(queries))
+
+
+def _first_kind(kinds: list[Stage[..., Any]], facts: Facts) -> Stage[..., Any]:
+    return next(stage for stage in kinds if stage.when is None or stage.when(facts))
+
+
+def require_variant_sections(run: RunSettings) -> None:
+    """Raise SettingsError for a variant that changes a section of the stages that all variants share."""
+    names = {SCORED}
+    artifacts = [SCORED]
+    while artifacts:
+        stages = [stage for stage in kinds_of(artifacts.pop()) if stage.scope == "variant"]
+        inputs = {name for stage in stages for name in stage.inputs} - names
+        names |= inputs
+        artifacts += inputs
+    scored = [
+        stage for stage in all_stages().values() if stage.artifact in names and stage.scope == "variant"
+    ]
+    sections = {section for stage in scored for section in stage.sections.values()}
+    for variant, changed in run.variants.items():
+        for section in changed:
+            if section not in sections:
+                raise SettingsError(
+                    f"variants.{variant}.{section}: variants share this section and cannot change it",
+                    expected=f"one of {', '.join(sorted(sections))}",
+                    fix="put it under overrides for a group or a scene, or in a separate configuration",
+                )
 
 
 def without_scene(run: RunSettings, rows: Iterable[SceneRow]) -> list[str]:
@@ -381,7 +503,7 @@ def without_scene(run: RunSettings, rows: Iterable[SceneRow]) -> list[str]:
     return lines
 
 
-def some(names: list[str]) -> str:
+def shorten_list(names: list[str]) -> str:
     """Return the first three names, and the number of remaining names."""
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     return ", ".join(names[:3]) + more

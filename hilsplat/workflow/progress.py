@@ -23,6 +23,7 @@ from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import KILLED, KILLED_FIX, visible
 from hilsplat.base.progress import last_progress, warnings_in
 from hilsplat.scene.finished import KEY_VIEWS, refining
+from hilsplat.stages import all_stages
 from hilsplat.workflow.resources import START_S, JobResources
 from hilsplat.workflow.scene_data import Job
 
@@ -32,17 +33,6 @@ REPLACED = frozenset({"progress", "job_started", "workflow_started", "resources_
 SELECTING = "Select jobs to execute..."  # message without an event; it is not printed
 
 TARGETS = ("all", "everything", "tables", "total")  # entries of the job counts that are not jobs
-
-LOOPS = {
-    "world": "rendered views",
-    "gaussians": "fit steps",
-    "masks": "masks of views",
-    "clip": "CLIP of views",
-    "contributions": "contributions of views",
-    "evaluate": "views scored",
-    "comparison": "methods compared",
-}
-"""Rule -> the loop (`base.progress.track`) that takes almost all of the rule's time."""
 
 SIGKILL = ("died with <Signals.SIGKILL", "exit status 137")
 """How Snakemake reports a job that was killed."""
@@ -69,6 +59,12 @@ class RunningJob:
         variant = "" if places[2] == "default" else places[2]
         table = self.wildcards.get("table", self.wildcards.get("sweep", ""))
         return " ".join(filter(None, [scene, variant, self.rule.replace("_", " "), table]))
+
+    @property
+    def loop(self) -> str:
+        """The loop that takes almost all of the job's time."""
+        stage = all_stages().get(self.rule)
+        return stage.loop if stage else ""
 
     def progress(self) -> tuple[str, int, int] | None:
         """Return the loop, items done and total items from the log, or None outside a loop."""
@@ -184,7 +180,7 @@ class RunProgress:
         progress = job.progress()
         if progress is None:
             return job.name
-        loop = "" if progress[0] == LOOPS.get(job.rule) else f": {progress[0]}"
+        loop = "" if progress[0] == job.loop else f": {progress[0]}"
         return f"{job.name}{loop} {progress[1]} of {progress[2]}"
 
     def seconds_left(self) -> float:
@@ -197,7 +193,7 @@ class RunProgress:
     def _left(self, job: RunningJob) -> float:
         """Return a running job's remaining seconds, from its progress once it is past `STARTED`."""
         elapsed, progress = self.clock() - job.start_s, job.progress()
-        if progress and progress[1] > STARTED * progress[2] and progress[0] == LOOPS.get(job.rule):
+        if progress and progress[1] > STARTED * progress[2] and progress[0] == job.loop:
             return elapsed * (progress[2] / progress[1] - 1)
         return max(estimates.seconds(job.rule) / job.threads - elapsed, 0.1 * elapsed)
 

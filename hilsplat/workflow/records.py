@@ -4,112 +4,39 @@ Snakemake compares times and its own metadata. It does not detect a file that wa
 an unfinished output of a killed job, and it detects nothing if its metadata is lost.
 """
 
+import json
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from hilsplat.base.artifacts import provenance_path, run_command, sha256_of_path, was_interrupted
 from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.base.progress import track
 from hilsplat.base.provenance import Provenance, files_of, read_provenance, sizes_of
-from hilsplat.datasets.sources import is_exported
-from hilsplat.methods.registry import OURS
 from hilsplat.models.store import model_digest
+from hilsplat.stages import all_stages
 from hilsplat.workflow.plan import Plan
-from hilsplat.workflow.scene_data import of_variant
-from hilsplat.workflow.stages import stage_code
-from hilsplat.workflow.targets import tables
-
-IMPORTED = "langsplat"
-"""Stage of imported artifacts, which replace a stage's output; no settings of the plan apply to them."""
-
-SHARED = ("masks", "coverage_tree", "clip", "contributions", "semantic_tree", "autoencoder", "field")
-"""Stages whose outputs variants share."""
+from hilsplat.workflow.scene_data import VariantJob, of_variant
 
 WHOLE, STALE, DAMAGED = "whole", "stale", "damaged"
 
 
-@dataclass(frozen=True)
-class Expected:
-    """How a plan makes an artifact.
-
-    Attributes:
-        output: an output declared by the rule, if the rule does not declare the artifact itself.
-        seed: seed expected in the provenance; None if the artifact is deterministic.
-        plugins: readers or baselines that are part of the code digest.
-    """
-
-    stage: str
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    seed: int | None = None
-    plugins: tuple[str, ...] = ()
-    output: str = ""
-
-
-def expected_artifacts(plan: Plan) -> dict[str, Expected]:
-    """Map the path of each artifact that the run can write to how the plan makes it."""
-    found: dict[str, Expected] = {}
-    for row in plan.scenes:
-        readers = plan.data.label_readers(row)
-
-        def add(name: str, stage: str, job: Any, **how: Any) -> None:
-            variant = [job.variant] if hasattr(job, "variant") else []
-            how.setdefault("settings", plan.values(stage, job))
-            found.setdefault(plan.path(job, *variant, name), Expected(stage, **how))
-
-        if row.world:
-            add("world", "world", row, output=plan.path(row, "world/images"))
-        if is_exported(row.source):
-            add("source", "source", row, plugins=plan.data.source_reader(row))
-        add("scene", "poses", row, seed=plan.run.seed)
-        add("gaussians.ply", "gaussians", row, seed=plan.run.seed)
-        for variant in plan.run.variant_names():
-            own = of_variant(row, variant)
-            for stage in SHARED:
-                job = of_variant(row, plan.shared_variant(stage, own))
-                settings, seed = plan.stages(job), plan.seed(job)
-                if stage == "masks" and plan.masks_stage(job) == "truth_masks":
-                    both = {name: plan.values(name, job) for name in ("masks", "perturb")}
-                    add("masks", "truth_masks", job, seed=settings.perturb.seed, settings=both)
-                elif stage == "masks":
-                    add("masks", plan.masks_stage(job), job, settings=plan.values("masks", job))
-                elif stage == "field" and settings.method.name != OURS:
-                    add("field.safetensors", "method", job, seed=seed, plugins=plan.baseline(job))
-                elif stage == "field":
-                    add("field.safetensors", "field", job, seed=seed if settings.field.is_random else None)
-                elif stage == "semantic_tree" and plan.tree_stage(job) == "feature_tree":
-                    both = {name: plan.values(name, job) for name in ("semantic_tree", "field")}
-                    add("semantic_tree", "feature_tree", job, seed=seed, settings=both)
-                else:
-                    add(stage, stage, job, seed=seed if stage == "autoencoder" else None)
-            add("scores.csv", "evaluate", own, plugins=readers)
-        words = {name: plan.values(name, row) for name in ("query", "evaluate")}
-        found[plan.path(row, "default/names")] = Expected("names", words)
-        drawn = {name: plan.values(name, row) for name in ("figures", "evaluate")}
-        figures = f"{plan.run.results}/figures/{row.name}"
-        found[f"{figures}/panel.png"] = Expected("figures", drawn, None, readers)
-        found[f"{figures}/comparison.png"] = Expected("comparison", drawn, None, readers)
-        found[f"{figures}/masks.png"] = Expected("mask_truth")
-    return found | {table: Expected("table") for table in tables(plan)}
+def records_in(results: Path) -> list[Path]:
+    """Return the artifacts in a results folder that have provenance, sorted."""
+    paths = sorted(path for path in results.rglob("*.provenance.json") if ".cache" not in path.parts)
+    return [path.with_name(path.name.removesuffix(".provenance.json")) for path in paths]
 
 
 def outdated(plan: Plan, *, every_byte: bool = False) -> dict[str, str]:
-    """Map each existing output that must be rebuilt to the reason.
+    """Map each artifact of the run that must be rebuilt to the reason.
 
-    Without `every_byte`, contents are compared only if a job did not finish or a file is newer than its
-    record; otherwise, sizes are compared.
+    Snakemake finds changed settings, code and inputs, unless its own records were lost. It does not find
+    damage. Without `every_byte`, contents are compared only if a job did not finish or a file is newer than
+    its record; otherwise, sizes are compared.
     """
-    expected = expected_artifacts(plan)
-    records = Records(plan.results, every_byte=every_byte)
-    found = {}
-    for path, how in expected.items():
-        if provenance_path(Path(path)).is_file() or Path(how.output or path).exists():
-            state, reason = records.state(Path(path), how)
-            if state != WHOLE:
-                found[how.output or path] = reason
-    return found
+    records = Records(plan.results, plan, every_byte=every_byte)
+    states = {str(artifact): records.state(artifact) for artifact in records_in(plan.results)}
+    return {path: reason for path, (state, reason) in states.items() if state != WHOLE}
 
 
 def verify(results: Path) -> tuple[str, bool]:
@@ -125,21 +52,20 @@ def verify(results: Path) -> tuple[str, bool]:
         ArtifactError: the folder contains no artifacts.
     """
     results = Path(results)
-    paths = sorted(path for path in results.rglob("*.provenance.json") if ".cache" not in path.parts)
-    if not paths:
+    artifacts = records_in(results)
+    if not artifacts:
         raise ArtifactError(
             f"{results} contains no artifacts", expected="a results folder with *.provenance.json files"
         )
     counts, lines, records = Counter[str](), [], Records(results, every_byte=True)
-    for path in track(paths, "artifacts read"):
-        artifact = path.with_name(path.name.removesuffix(".provenance.json"))
+    for artifact in track(artifacts, "artifacts read"):
         state, reason = records.state(artifact)
         counts[state] += 1
         if state != WHOLE:
             lines.append(f"{state:<8} {artifact}: {reason}")
     states = ", ".join(f"{counts[state]} {state}" for state in (WHOLE, STALE, DAMAGED) if counts[state])
-    lines.append(f"{len(paths)} artifacts in {results}: {states}")
-    is_whole = counts[WHOLE] == len(paths)
+    lines.append(f"{len(artifacts)} artifacts in {results}: {states}")
+    is_whole = counts[WHOLE] == len(artifacts)
     if not is_whole:
         lines.append(f"to rebuild them, in the project that made them: {run_command(results, '--verify')}")
     return "\n".join(lines), is_whole
@@ -150,18 +76,19 @@ class Records:
 
     Args:
         results: results folder; provenance refers to it as `results/...`, even if the folder was moved.
+        plan: the run that settings and seeds must equal; None to compare only code and inputs.
         every_byte: compare all contents; otherwise, those of files newer than their record.
     """
 
-    def __init__(self, results: Path, *, every_byte: bool) -> None:
-        self.results = results
+    def __init__(self, results: Path, plan: Plan | None = None, *, every_byte: bool) -> None:
+        self.results, self.plan = results, plan
+        self._rows = {(row.dataset, row.scene): row for row in plan.scenes} if plan else {}
+        self._variants = plan.run.every_variant() if plan else []
         self.every_byte = every_byte
         self._digests: dict[Path, str | None] = {}
 
-    def state(self, artifact: Path, expected: Expected | None = None) -> tuple[str, str]:
-        """Return an artifact's state and, if it is not whole, the reason.
-
-        Without `expected`, only code and inputs are compared."""
+    def state(self, artifact: Path) -> tuple[str, str]:
+        """Return an artifact's state and, if it is not whole, the reason."""
         try:
             record = read_provenance(artifact)
         except ArtifactError:
@@ -170,7 +97,7 @@ class Records:
             return DAMAGED, "it has no provenance"
         if damage := self._damage(artifact, record):
             return DAMAGED, damage
-        reason = next(self._differences(record, expected), "")
+        reason = next(self._differences(artifact, record), "")
         return (STALE if reason else WHOLE), reason
 
     def _damage(self, artifact: Path, record: Provenance) -> str | None:
@@ -192,23 +119,27 @@ class Records:
                 return f"{path.name} was changed after it was written"
         return None
 
-    def _differences(self, record: Provenance, expected: Expected | None) -> Iterator[str]:
+    def _differences(self, artifact: Path, record: Provenance) -> Iterator[str]:
         """Yield differences between an artifact's provenance and the plan, and changes of its inputs."""
-        stage, plugins = record.stage, record.plugins
-        if expected is not None and stage != IMPORTED:
-            if stage != expected.stage:
-                yield f"it was made by stage {stage}, not {expected.stage}"
-            then, now = record.settings, expected.settings
-            for name in sorted(then.keys() | now.keys()):
-                made, configured = then.get(name), now.get(name)
-                if made != configured:
-                    yield f"it was made with {name} {made!r}, but the configuration has {configured!r}"
-            if record.seed != expected.seed:
-                yield f"it was made with seed {record.seed}, but the configuration has {expected.seed}"
-            stage, plugins = expected.stage, expected.plugins
+        stage = all_stages().get(record.stage)
+        if stage is None:
+            yield f"this version has no stage {record.stage}"
+            return
+        job = self._job_of(artifact)
+        if self.plan is not None and job is not None:
+            kind = self.plan.kind(stage.artifact, job).name
+            if kind != stage.name:
+                yield f"it was made by stage {stage.name}, not {kind}"
+            for section in stage.sections.values():
+                now = json.loads(self.plan.settings(section, job))
+                if record.settings.get(section) != now:
+                    yield f"it was made with {section} {record.settings.get(section)!r}, not {now!r}"
+            seed = self.plan.seed(stage, job) if "seed" in stage.hints else None
+            if record.seed != seed:
+                yield f"it was made with seed {record.seed}, not {seed}"
         try:
-            code = stage_code(stage, plugins)
-        except HilsplatError:  # this version does not have the stage or reader
+            code = stage.code_digest(record.plugins)
+        except HilsplatError:  # this version does not have the reader
             code = ""
         if code != record.code:
             yield "it was made by different code"
@@ -221,6 +152,13 @@ class Records:
                 known = self._digest(path) if self.every_byte else self._known_digest(name, path)
                 if known != digest and (known is not None or (self.every_byte and inside)):
                     yield f"its input {name} {'is missing' if known is None else 'has changed'}: {path}"
+
+    def _job_of(self, artifact: Path) -> VariantJob | None:
+        """Return the job of an artifact that belongs to a scene of the plan."""
+        parts = artifact.relative_to(self.results).parts
+        dataset, scene, variant, *_ = (*(parts[1:] if parts[0] == "figures" else parts), "", "", "")
+        row = self._rows.get((dataset, scene))
+        return of_variant(row, variant if variant in self._variants else "default") if row else None
 
     def _digest(self, path: Path) -> str | None:
         """Return the digest of a file or folder, or None if it does not exist or cannot be read."""

@@ -22,16 +22,19 @@ from hilsplat.base.errors import ImageError, ModelError
 from hilsplat.base.images import opened_image
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.provenance import version_of
+from hilsplat.datasets.generators import GENERATORS
 from hilsplat.models.store import model_path, read_model
 from hilsplat.scene.layouts import vertex_count
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.settings import MasksSettings
+from hilsplat.stages import all_stages, family_of, stage_of
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.scene_data import Job
 
 with Path(__file__).with_suffix(".tsv").open(encoding="utf-8") as _stream:
     _rows = list(csv.DictReader(_stream, delimiter="\t"))
-COSTS = {row.pop("rule"): {name: float(value) for name, value in row.items()} for row in _rows}
+COSTS = {row.pop("stage"): {name: float(value) for name, value in row.items()} for row in _rows}
+"""Stage -> its terms; stages without a row of their own cost what the main stage of their artifact costs."""
 
 MP_PER_THREAD = 2.0  # megapixels of all views per thread
 
@@ -71,6 +74,15 @@ UNTRAINED = ("lifted", "occam", "dr_splat")  # baselines without training
 UNKNOWN_MP = 0.5  # megapixels assumed per view if no image header can be read before the run
 
 
+def cost_of(name: str) -> dict[str, float]:
+    """Return the terms of a stage's cost; those of a rule that is no stage are 0."""
+    stage = all_stages().get(name)
+    return COSTS.get(name) or (COSTS.get(family_of(stage)) if stage else None) or OTHER
+
+
+OTHER = {"base": 500.0} | {name: 0.0 for name in next(iter(COSTS.values())) if name != "base"}
+
+
 class Size(NamedTuple):
     """Size of a scene; `view_mp` is the number of megapixels of one view."""
 
@@ -103,11 +115,20 @@ class JobResources:
         """Return the number of threads for a rule with many short jobs per scene, which run in parallel."""
         return int(min(self.threads(wildcards), self._per_variant))
 
+    def of(self, name: str) -> dict[str, Callable[..., int]]:
+        """Return the resources of a stage's rule."""
+        stage = stage_of(name)
+        resources = {"mem_mb": self.memory_mb(name), "runtime": self.minutes(name)}
+        sections = [type(self.plan.defaults[section]) for section in stage.sections.values()]
+        if any("device" in section.model_fields or "model" in section.model_fields for section in sections):
+            resources["gpu"] = self.gpus(family_of(stage))
+        return resources
+
     def memory_mb(self, rule: str) -> Callable[..., int]:
         """Return the function for the resource `mem_mb` of a rule."""
 
         def needed(wildcards: Any, threads: int, attempt: int) -> int:
-            cost = COSTS[rule]
+            cost = cost_of(rule)
             mb = cost["base"]
             if hasattr(wildcards, "scene"):
                 row = self.plan.row(wildcards)
@@ -145,7 +166,7 @@ class JobResources:
 
     def disk_mb(self, rule: str, job: Job) -> float:
         """Return the megabytes that a scene's job writes, including caches."""
-        row, cost = self.plan.row(job), COSTS.get(rule, {})
+        row, cost = self.plan.row(job), cost_of(rule)
         views, view_mp = self.size(row)
         of_gaussians = cost.get("disk_thousand", 0.0) * self.gaussians(row) / 1000
         if rule in ("field", "method"):
@@ -184,7 +205,7 @@ class JobResources:
             return LITERAL_S_PER_MP * len(LEVELS) * stages.field.iterations * view_mp
         if rule == "autoencoder" and stages.autoencoder.code == "network":
             return NETWORK_S
-        return COSTS.get(rule, {}).get("core_s_per_mp", 0.0) * views * view_mp
+        return cost_of(rule).get("core_s_per_mp", 0.0) * views * view_mp
 
     def _size(self, row: SceneRow) -> Size:
         """Return the size of a scene from its cameras, or from its settings or image headers."""
@@ -194,8 +215,8 @@ class JobResources:
             return Size(len(sizes), float(sizes.prod(axis=1).mean()) / 1e6)
         except (OSError, ValueError, KeyError):  # the poses stage has not written the file yet
             stages = self.plan.stages(row)
-        if row.world:
-            return Size(stages.world.views, stages.world.image_px**2 / 1e6)
+        if row.generated:
+            return Size(*GENERATORS[row.generated.generator].size(stages))
         files = self.plan.data.image_files(row)
         images = self.plan.data.source_files(row) if isinstance(files, str) else files
         return Size(len(images), _first_mp(images, stages.poses.max_side_px))

@@ -6,8 +6,7 @@ wildcards of a rule, or a row of the sheet. Only evaluation and figures read lab
 
 import functools
 import os
-import shlex
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Protocol, runtime_checkable
@@ -43,14 +42,6 @@ def of_variant(job: Job, variant: str) -> VariantJob:
     return SimpleNamespace(dataset=job.dataset, scene=job.scene, variant=variant)
 
 
-def options_of(named: Mapping[str, Any]) -> str:
-    """Return quoted command-line options; omit options with an empty value.
-
-    Paths are taken from a job's input, because a Snakemake module may have prefixed them.
-    """
-    return " ".join(f"--{name} {shlex.quote(str(value))}" for name, value in named.items() if value)
-
-
 def portable(path: Path | None) -> str:
     """Return a path, relative if it is in the working folder, so that moving a project reruns nothing."""
     return os.path.relpath(path) if path and path.is_relative_to(Path.cwd()) else str(path or "")
@@ -71,16 +62,16 @@ class SceneData:
     def row(self, job: Job) -> SceneRow:
         return self._row_of[job.dataset, job.scene]
 
-    def images(self, job: Job, input: Sequence[str]) -> str:
+    def images(self, job: Job, input: Sequence[str], _: object) -> str:
         """Return the parameter of `poses`: the image folder."""
         row = self.row(job)
-        return input[0] if row.world or is_exported(row.source) else portable(row.folder)
+        return input[0] if row.generated or is_exported(row.source) else portable(row.folder)
 
     def image_files(self, job: Job) -> str | list[str]:
         """Return the input of `poses`: a folder that a rule writes, or the files used in a source folder."""
         row = self.row(job)
-        if row.world:
-            return self.path(job, "world/images")
+        if row.generated:
+            return self.path(job, row.generated.generator, "images")
         return self.path(job, "source") if is_exported(row.source) else self._folder_files(row)
 
     def content(self, files: Callable[[Any], str | list[str]]) -> Callable[[Job], str]:
@@ -93,15 +84,21 @@ class SceneData:
 
         return digest
 
-    def poses_option(self, job: Job) -> str:
-        row = self.row(job)
-        return "--render" if row.world else options_of({"poses": portable(row.poses)})
+    def is_render(self, job: Job, *_: object) -> bool:
+        return self.row(job).generated is not None
+
+    def poses(self, job: Job, *_: object) -> str:
+        """Return the option of `poses`: the file of known poses, if the sheet names one."""
+        return portable(self.row(job).poses)
+
+    def unit(self, job: Job, *_: object) -> str:
+        return self.row(job).unit
 
     def require_no_braces(self, row: SceneRow) -> None:
         """Raise SettingsError for file names with braces, which Snakemake interprets as wildcards."""
         files = self.image_files(row) if row.folder is not None else []
         files = [files] if isinstance(files, str) else files
-        for path in [*files, *self.existing_gaussians(row), *self.features(row)]:
+        for path in [*files, *self.gaussians_files(row), *self.features(row)]:
             if "{" in path or "}" in path:
                 raise SettingsError(
                     f"the workflow cannot read {path} of {row.name}: its name contains braces",
@@ -112,44 +109,49 @@ class SceneData:
         """Return the input of `source`: a data set's files that contain the images and poses."""
         return [portable(path) for path in image_files(self.row(job).source, self.data_root)]
 
-    def source_name(self, job: Job) -> str:
+    def source_name(self, job: Job, *_: object) -> str:
         return self.row(job).source.removeprefix(DATA_PREFIX)
 
     def source_reader(self, job: Job) -> tuple[str, ...]:
         """Return the reader of the data set from which a scene's images are exported."""
         return readers_of([self.source_name(job)])
 
-    def existing_gaussians(self, job: Job) -> list[str]:
-        """Return the input of `gaussians`: a PLY that replaces the fit, and its coordinate files, if any."""
-        ply = self.row(job).gaussians
-        if ply is None:
-            return []
-        beside = ply.with_suffix(".json")
-        described = [beside] if beside.is_file() else self._nerfstudio(job).values()
-        return [portable(path) for path in (ply, *described)]
+    def gaussians(self, name: str) -> Callable[[Job], list[str]]:
+        """Return the input function of `gaussians` for a file that replaces the fit (`_gaussians`)."""
+        return lambda job: [self._gaussians(job)[name]] if name in self._gaussians(job) else []
 
-    def existing_gaussians_option(self, job: Job) -> str:
-        named = {"existing": self.row(job).gaussians, **self._nerfstudio(job)}
-        return options_of({name: portable(path) for name, path in named.items()})
+    def gaussians_files(self, job: Job) -> list[str]:
+        """Return the files that replace the fit, and those that describe their coordinates."""
+        return [*self._gaussians(job).values()]
 
-    def _nerfstudio(self, job: Job) -> dict[str, Path]:
-        """Return files that relate the coordinates of nerfstudio's PLY to those of the poses, by option."""
+    def _gaussians(self, job: Job) -> dict[str, str]:
+        """Return the PLY that replaces the fit, and files that relate its coordinates to those of the poses.
+
+        These are a JSON file of ours beside it, or nerfstudio's.
+        """
         row = self.row(job)
-        if row.gaussians is None or row.folder is None:
+        if row.gaussians is None:
             return {}
-        if (dataparser := dataparser_of(row.gaussians, row.folder)) is None:
-            return {}
-        transforms = transforms_of(row.folder, row.poses)
-        return {"dataparser": dataparser, **({"transforms": transforms} if transforms else {})}
+        files, beside = {"existing": row.gaussians}, row.gaussians.with_suffix(".json")
+        if beside.is_file():
+            files["beside"] = beside
+        elif row.folder is not None and (dataparser := dataparser_of(row.gaussians, row.folder)) is not None:
+            files["dataparser"] = dataparser
+            if transforms := transforms_of(row.folder, row.poses):
+                files["transforms"] = transforms
+        return {name: portable(path) for name, path in files.items()}
 
     def features(self, job: Job) -> list[str]:
-        """Return the input of `masks` and `clip`: LangSplat's files, which replace SAM and CLIP, if any."""
+        """Return LangSplat's files, which replace SAM and CLIP, if any."""
         folder = self.row(job).features
         return sorted(portable(path) for path in folder.glob("*_[sf].npy")) if folder is not None else []
 
+    def features_folder(self, job: Job, *_: object) -> str:
+        return portable(self.row(job).features)
+
     def labels(self, row: SceneRow) -> tuple[str, ...]:
         """Return the labels of a scene, as `data set/scene`: published labels and your own annotations."""
-        return () if row.world else self._labels(row)
+        return () if row.generated else self._labels(row)
 
     def label_readers(self, job: Job) -> tuple[str, ...]:
         return readers_of(self.labels(self.row(job)))
@@ -162,27 +164,35 @@ class SceneData:
         return [portable(path.resolve()) for path in found]
 
     def truth(self, job: Job) -> list[str]:
-        """Return the input that contains a synthetic scene's annotations; empty for other scenes."""
-        return [self.path(job, "world/truth")] if self.row(job).world else []
+        """Return the input that contains a generated scene's annotations; empty for other scenes."""
+        generated = self.row(job).generated
+        return [self.path(job, generated.generator, "truth")] if generated else []
 
-    def truth_or_labels(self, job: Job) -> list[str]:
-        """Return the input of `evaluate`: a synthetic scene's annotations, or another scene's label files."""
-        return self.truth(job) or self.label_files(job)
+    def required_truth(self, job: Job) -> list[str]:
+        """Return a generated scene's annotations; raise SettingsError for other scenes."""
+        if not self.truth(job):
+            raise SettingsError(
+                f"{job.dataset}/{job.scene}: masks.segmenter truth-perturbed needs ground-truth labels, "
+                "which only generated scenes have",
+                fix="choose another segmenter, or run the variant on generated scenes only",
+            )
+        return self.truth(job)
 
-    def truth_option(self, job: Job, input: Any) -> str:
-        """Return the options of `evaluate`: the ground truth or labels that a scene is scored against."""
+    def name(self, job: Job, *_: object) -> str:
+        return self.row(job).name
+
+    def scene_name(self, job: Job, *_: object) -> str:
+        return job.scene
+
+    def generated_source(self, job: Job, *_: object) -> str:
         row = self.row(job)
-        if row.world:
-            return options_of({"truth": input.truth, "kind": row.world[0]})
-        options = [options_of({"labels": labels}) for labels in self.labels(row)]
-        return " ".join([*options, options_of({"data-root": Path(self.data_root)})])
+        return row.source if row.generated else ""
 
-    def figure_truth_option(self, job: Job, input: Any) -> str:
-        """Return the options of `figures`: the ground truth or labels for queries and outlines, if any."""
-        row = self.row(job)
-        if row.world:
-            return options_of({"truth": input.truth})
-        on_images = [labels for labels in self.labels(row) if not is_exported(f"{DATA_PREFIX}{labels}")]
-        if not on_images:
-            return ""
-        return options_of({"labels": on_images[-1], "data-root": Path(self.data_root)})
+    def label_names(self, job: Job, *_: object) -> tuple[str, ...]:
+        """Return the labels that a scene is scored against."""
+        return self.labels(self.row(job))
+
+    def figure_labels(self, job: Job, *_: object) -> str:
+        """Return the labels for queries and outlines in figures, which must be on images, if any."""
+        labels = [name for name in self.labels(self.row(job)) if not is_exported(f"{DATA_PREFIX}{name}")]
+        return labels[-1] if labels else ""

@@ -1,16 +1,46 @@
 """Targets of a run: tables, their scores, and pictures."""
 
-import shlex
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+from hilsplat.datasets.generators import GENERATORS
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.datasets.sources import published
 from hilsplat.evaluate.scores import score_summary
 from hilsplat.evaluate.tables.build import TABLES
-from hilsplat.scene.finished import KEY_VIEWS
 from hilsplat.scene.sheet import SceneRow
-from hilsplat.workflow.plan import Plan, some
+from hilsplat.workflow.plan import Plan, shorten_list
 from hilsplat.workflow.scene_data import of_variant
+
+PICTURES = {
+    "panel": "queries",
+    "registration": "camera poses",
+    "fit": "3D Gaussians",
+    "masks": "masks against the truth",
+    "comparison": "queries by method",
+    "views": "one query in several views",
+    "features": "features at three levels",
+}
+"""Picture of a scene -> its title in the report."""
+
+
+def table_name(wildcards: Any, *_: object) -> str:
+    return str(wildcards.table)
+
+
+def sweep_name(wildcards: Any, *_: object) -> str:
+    return str(wildcards.sweep)
+
+
+def scores_of(plan: Plan, name: str) -> Callable[[Any], list[str]]:
+    """Return the input function of `table` for the files `name` of its scenes and variants."""
+    return lambda wildcards: scores(plan, wildcards.table, name)
+
+
+def absent_of(plan: Plan) -> Callable[..., list[str]]:
+    """Return the option of `table` that lists what was not measured."""
+    return lambda wildcards, *_: absent(plan, wildcards.table)
 
 
 def scores(plan: Plan, table: str, name: str = "scores.csv") -> list[str]:
@@ -27,8 +57,8 @@ def scores(plan: Plan, table: str, name: str = "scores.csv") -> list[str]:
     ]
 
 
-def absent_options(plan: Plan, table: str) -> str:
-    """Return the options that list the unmeasured scenes of a table's data sets."""
+def absent(plan: Plan, table: str) -> list[str]:
+    """Return a sentence about each of a table's data sets that has unmeasured scenes."""
     by_dataset: dict[str, list[tuple[str, str]]] = {}
     for row in plan.rows:
         reason = plan.data.absence(row)
@@ -43,14 +73,14 @@ def absent_options(plan: Plan, table: str) -> str:
     for dataset, scenes in by_dataset.items():
         reasons = {reason for _, reason in scenes}
         others = "" if len(reasons) == 1 else " The other scenes cannot be read either."
-        listed = some([scene for scene, _ in scenes])
+        listed = shorten_list([scene for scene, _ in scenes])
         sentences.append(f"{dataset} ({listed}): {scenes[0][1]}.{others}")
-    return " ".join(f"--absent {shlex.quote(sentence)}" for sentence in sentences)
+    return sentences
 
 
 def labelled(plan: Plan) -> list[SceneRow]:
     """Return the scenes with annotations or labels, which can be scored."""
-    return [row for row in plan.scenes if row.world or plan.data.labels(row)]
+    return [row for row in plan.scenes if row.generated or plan.data.labels(row)]
 
 
 def annotated(plan: Plan) -> list[SceneRow]:
@@ -59,9 +89,9 @@ def annotated(plan: Plan) -> list[SceneRow]:
 
 
 def data_of(row: SceneRow) -> str:
-    """Return the name of a scene's data in tables: its kind of synthetic scene, or its published data set."""
-    if row.world:
-        return row.world[0]
+    """Return the name of a scene's data in tables: its kind of generated scene, or its published data set."""
+    if row.generated:
+        return row.generated.kind
     place = published(row.source)
     return place[0] if place else ""
 
@@ -87,7 +117,7 @@ def default(plan: Plan) -> list[str]:
         if getattr(plan.run, TABLES[name].variants)
     ]
     early = [row for row in plan.scenes if plan.first_answer(of_variant(row, "default"))]
-    answers = [plan.shared("clip", "clip")(of_variant(row, KEY_VIEWS)) for row in early]
+    answers = [plan.of_key_views("clip")(row) for row in early]
     scores = [path for row in annotated(plan) for path in own_scores(plan, row).values()]
     has_tables = len(labelled(plan)) > len(annotated(plan))
     return [*figures(plan), *answers, *scores, *(tables(plan) + plots if has_tables else [])]
@@ -123,7 +153,8 @@ def figures(plan: Plan) -> list[str]:
     found = []
     for row in plan.scenes:
         compared = not plan.run.sweep_scenes or row.scene in plan.run.sweep_scenes
-        pictures = ["panel", *(["masks"] if row.world else []), *(["comparison"] if compared else [])]
+        generated = GENERATORS[row.generated.generator].pictures if row.generated else ()
+        pictures = ["panel", *generated, *(["comparison"] if compared else [])]
         found += [f"{plan.run.results}/figures/{row.name}/{picture}.png" for picture in pictures]
         found.append(plan.path(row, "default/names"))
     return found

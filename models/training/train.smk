@@ -1,3 +1,8 @@
+from pathlib import Path
+
+from hilsplat.base.artifacts import sha256_of_bytes
+
+
 # The small models of the synthetic world. A default run does not train them, because the repository contains them.
 rule train_models:
     output:
@@ -6,11 +11,10 @@ rule train_models:
     log:
         "<results>/models/train.log",
     conda:
-        ENVIRONMENT
+        "../../workflow/envs/hilsplat.yaml"
     threads: 64  # Snakemake lowers this to the number of cores
     resources:
-        mem_mb=RESOURCES.memory_mb("train_models"),
-        runtime=RESOURCES.minutes("train_models"),
+        mem_mb=8700,
     params:
         checkout=str(INSTALLED),
         seed=PLAN.run.seed,

@@ -1,0 +1,43 @@
+"""What commands share: groups, options, the log, and printing."""
+
+import logging
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilsplat.base.errors import visible
+from hilsplat.base.progress import LOG_FORMAT, LogFormatter
+
+app = typer.Typer(
+    help="Turn photographs into a 3D Gaussian scene that answers text queries at three semantic levels.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+models_app = typer.Typer(help="Get, list, check and split models (SAM, CLIP).", no_args_is_help=True)
+datasets_app = typer.Typer(help="List, check and export published data sets.", no_args_is_help=True)
+cache_app = typer.Typer(help="Show or prune the caches of a results folder.", invoke_without_command=True)
+app.add_typer(models_app, name="models")
+app.add_typer(datasets_app, name="datasets")
+app.add_typer(cache_app, name="cache")
+
+Results = Annotated[Path, typer.Option(help="results folder")]
+
+
+def start_logging(*, timestamps: bool = False) -> None:
+    """Send log records to stderr; `timestamps` adds time, level and logger unless stderr is a terminal."""
+    root = logging.getLogger()
+    root.setLevel(logging.INFO)
+    root.handlers.clear()
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(LogFormatter(LOG_FORMAT if timestamps and not sys.stderr.isatty() else None))
+    root.addHandler(handler)
+    for noisy in ("matplotlib", "numba", "PIL", "fontTools", "urllib3"):
+        logging.getLogger(noisy).setLevel(logging.WARNING)
+
+
+def echo(text: object) -> None:
+    """Print to stdout; commands print nothing in any other way, because texts from files may be hostile."""
+    typer.echo(visible(text))  # noqa: TID251

@@ -1,0 +1,72 @@
+"""Generators: plugins whose rules make scenes with exact annotations, such as the synthetic world.
+
+The source of such a scene is `<generator>:<kind>:<seed>`. The rule writes `<generator>/images`, which the
+stages read, and `<generator>/truth`, which only evaluation and figures read.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from hilsplat.base.errors import SceneError
+from hilsplat.base.plugins import Plugins, entry_points
+from hilsplat.datasets.points.labelled_points import LabelledPoints
+from hilsplat.scene.cameras import Cameras
+from hilsplat.scene.sheet import Generated, generated_of
+
+GENERATORS: Plugins["Generator"] = entry_points("hilsplat.generators")
+
+
+class Truth(Protocol):
+    """Ground truth of a generated scene; the folder has annotations in the format of `datasets.hierarchy`."""
+
+    @property
+    def folder(self) -> Path: ...
+
+    def points(self) -> dict[str, LabelledPoints]:
+        """Return the labelled points for each labelling, in the frame of `cameras`; SceneError if none."""
+
+    def cameras(self) -> Cameras:
+        """Return the true cameras."""
+
+    def consistency(self, selections: Any, truths: Any, masks: Any, settings: Any) -> Iterator[tuple]:
+        """Yield pairs of a view's name and a row of scores: how well answers agree between views."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of generated scene: the protocols that score it (`evaluate.protocols.cards`)."""
+
+    protocols: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Generator:
+    """A generator.
+
+    Attributes:
+        size: returns the number of views and the megapixels of one, given all settings.
+        open: reads the ground truth in a folder, given the kind.
+        pictures: names of pictures in a scene's folder of figures that the plugin's rules draw.
+    """
+
+    name: str
+    kinds: Mapping[str, Kind]
+    size: Callable[[Any], tuple[int, float]]
+    open: Callable[[Path, str], Truth]
+    pictures: tuple[str, ...] = ()
+
+
+def generator_of(source: str) -> tuple[Generator, Generated]:
+    """Return the generator named in a source, and the source's parts; raise SceneError if it is unknown."""
+    generated = generated_of(source)
+    generator = GENERATORS[generated.generator] if generated else None
+    if generated is None or generator is None or generated.kind not in generator.kinds:
+        kinds = [f"{name}:{kind}:<seed>" for name, found in GENERATORS.items() for kind in found.kinds]
+        raise SceneError(
+            f"{source!r} does not name a generated scene",
+            expected=f"one of {', '.join(kinds)}",
+            fix="correct the source in the scene sheet, or install its plugin",
+        )
+    return generator, generated

@@ -1,0 +1,642 @@
+"""The pipeline on one page: every stage in the order of the data flow.
+
+A stage's parameters are its inputs (paths of artifacts, named like these), settings and options; `out` is its
+output. Where several stages can make one artifact, `when` decides, and the first match counts. To add a
+stage, write its function in a module, a definition here, and a rule (docs/extending.md).
+
+Stages of plugins, such as those of the synthetic world, come from entry points of the group
+`hilsplat.stages`. Modules of stages are imported when a stage runs.
+"""
+
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hilsplat import settings as of
+from hilsplat.base.artifacts import provenance_path
+from hilsplat.base.errors import HilsplatError
+from hilsplat.base.plugins import entry_points
+from hilsplat.models.store import AUTO
+from hilsplat.stage import (
+    DEFAULT_CACHE,
+    Cache,
+    DataRoot,
+    Memory,
+    PathIn,
+    PathOut,
+    Reads,
+    Registry,
+    Role,
+    Seed,
+    Stage,
+    Threads,
+)
+
+OptionalPath = Annotated[Path | None, typer.Option(show_default=False), Role.INPUT]
+Report = Annotated[Path, typer.Option(help="folder for the fit's report"), Role.OUTPUT]
+Truth = Annotated[Path | None, typer.Option(help="annotations of a generated scene"), Role.INPUT]
+Source = Annotated[str, typer.Option(help="source of a generated scene, such as world:tabletop:201")]
+LabelledScene = Annotated[str, typer.Option(help="labelled scene, such as lerf_ovs/figurines")]
+LabelSets = Annotated[list[str] | None, typer.Option(help="labels, such as lerf_ovs/figurines")]
+Queries = Annotated[list[str], typer.Option(help="JSON list of queries, if there are no labels"), Role.JSON]
+Names = Annotated[dict[str, str], typer.Option(help="JSON: variant -> its name in tables"), Role.JSON]
+POSES_HELP = "COLMAP model or transforms.json, or its folder; none: compute poses; default: use any found"
+
+PIPELINE = Registry()
+stage = PIPELINE.stage
+
+
+# ---- photographs to Gaussians --------------------------------------------------------------------
+
+
+def _source_files(arguments: Mapping[str, Any]) -> Reads:
+    from hilsplat.datasets.registry import readers_of
+    from hilsplat.datasets.sources import DATA_PREFIX, image_files
+
+    files = image_files(f"{DATA_PREFIX}{arguments['name']}", str(arguments["data_root"]))
+    return Reads({"files": files}, readers_of([arguments["name"]]))
+
+
+@stage(command="datasets export", scope="scene", reads=_source_files)
+def source(
+    name: Annotated[str, typer.Argument(help="scene with labelled points, such as scannet/scene0000_00")],
+    data_root: DataRoot,
+    out: PathOut,
+) -> None:
+    """Write the images and poses of a scene to a folder that the poses command can import."""
+    from hilsplat.datasets.sources import export_images
+
+    export_images(name, data_root, out)
+
+
+def _photographs(arguments: Mapping[str, Any]) -> Reads:
+    """Return the files that are read, because a folder of photographs may contain anything else."""
+    from hilsplat.datasets.sources import photo_files
+
+    images, named = arguments["images"], arguments["poses"]
+    is_artifact = any(provenance_path(path).is_file() for path in (images, images.parent))
+    return Reads({"images": photo_files(images, named)} if images.is_dir() and not is_artifact else {})
+
+
+@stage(artifact="scene", scope="scene", reads=_photographs)
+def poses(
+    images: PathIn,
+    out: PathOut,
+    settings: of.PosesSettings,
+    name: Annotated[str, typer.Option(help="name of the scene in messages, as dataset/scene")] = "scene",
+    unit: Annotated[str, typer.Option(help="unit of length: metre or arbitrary")] = "arbitrary",
+    render: Annotated[bool, typer.Option(help="treat the images as renders with an ideal lens")] = False,
+    poses: Annotated[Path | None, typer.Option(help=POSES_HELP)] = None,
+    seed: Seed = 0,
+    threads: Threads = 1,
+) -> None:
+    """Compute the camera poses of photographs, or import a COLMAP model or transforms.json."""
+    from hilsplat.scene.poses import run_poses
+
+    run_poses(images, out, name, unit, render, settings, seed, threads, poses)
+
+
+@stage(file="gaussians.ply", scope="scene", loop="fit steps", beside=lambda out: (out.with_suffix(".json"),))
+def gaussians(
+    scene: PathIn,
+    out: PathOut,
+    report: Report,
+    settings: of.GaussiansSettings,
+    existing: Annotated[
+        Path | None, typer.Option(help="3DGS PLY, in the source's coordinates"), Role.INPUT
+    ] = None,
+    dataparser: Annotated[
+        Path | None,
+        typer.Option(help="dataparser_transforms.json, for a PLY in nerfstudio's coordinates"),
+        Role.INPUT,
+    ] = None,
+    transforms: Annotated[
+        Path | None, typer.Option(help="transforms.json, for --dataparser"), Role.INPUT
+    ] = None,
+    cache: Cache = DEFAULT_CACHE,
+    seed: Seed = 0,
+    threads: Threads = 1,
+) -> None:
+    """Fit 3D Gaussians to the training views, or use your own; a JSON file records their coordinates."""
+    from hilsplat.splat.fit import run_gaussians
+
+    run_gaussians(scene, out, report, cache, settings, seed, threads, existing, dataparser, transforms)
+
+
+# ---- masks, and their trees in each view ---------------------------------------------------------
+
+
+@stage(artifact="masks", when=lambda scene: scene.is_imported)
+def imported_masks(scene: PathIn, features: PathIn, out: PathOut) -> None:
+    """Import LangSplat's masks, a folder of _s.npy and _f.npy files."""
+    from hilsplat.embed.langsplat_files import read_masks
+
+    read_masks(scene, features, out)
+
+
+@stage(artifact="masks", loop="masks of views", when=lambda scene: scene.settings.masks.key_views < 1)
+def key_masks(
+    scene: PathIn,
+    gaussians: PathIn,
+    out: PathOut,
+    settings: of.MasksSettings,
+    cache: Cache = DEFAULT_CACHE,
+    threads: Threads = 1,
+    memory: Memory = None,
+) -> None:
+    """Segment the key views, which together see every Gaussian often enough."""
+    from hilsplat.contributions.key_views import run_key_masks
+
+    run_key_masks(scene, gaussians, out, cache, settings, threads, memory)
+
+
+@stage(
+    artifact="masks",
+    loop="masks of views",
+    when=lambda scene: scene.is_refined and scene.settings.masks.prompts == "guided",
+)
+def guided_masks(
+    scene: PathIn,
+    gaussians: PathIn,
+    key_masks: PathIn,
+    key_tree: PathIn,
+    out: PathOut,
+    settings: of.MasksSettings,
+    cache: Cache = DEFAULT_CACHE,
+    threads: Threads = 1,
+    memory: Memory = None,
+) -> None:
+    """Segment the other views with prompts that the masks and the tree of the key views suggest."""
+    from hilsplat.semantic_tree.guided_masks import run_guided_masks
+
+    run_guided_masks(scene, gaussians, key_masks, key_tree, out, cache, settings, threads, memory)
+
+
+@stage(loop="masks of views")
+def masks(
+    scene: PathIn,
+    out: PathOut,
+    settings: of.MasksSettings,
+    cache: Cache = DEFAULT_CACHE,
+    threads: Threads = 1,
+    memory: Memory = None,
+) -> None:
+    """Segment each training view at three levels."""
+    from hilsplat.segment.stage import run_masks
+
+    run_masks(scene, out, cache, settings, threads, memory)
+
+
+@stage()
+def coverage_tree(masks: PathIn, out: PathOut, settings: of.CoverageTreeSettings) -> None:
+    """Compute each view's coverage tree: the parent of each mask."""
+    from hilsplat.segment.coverage import run_coverage_tree
+
+    run_coverage_tree(masks, out, settings)
+
+
+# ---- the tree of nodes in 3D, and its vectors ----------------------------------------------------
+
+
+@stage(loop="contributions of views")
+def contributions(
+    scene: PathIn,
+    gaussians: PathIn,
+    masks: PathIn,
+    out: PathOut,
+    settings: of.ContributionsSettings,
+    cache: Cache = DEFAULT_CACHE,
+    threads: Threads = 1,
+) -> None:
+    """Compute the weight of each Gaussian in each mask, in one pass over the views."""
+    from hilsplat.contributions.stage import run_contributions
+
+    run_contributions(scene, gaussians, masks, out, cache, settings, threads)
+
+
+@stage(artifact="semantic_tree", when=lambda scene: scene.settings.semantic_tree.evidence == "features")
+def feature_tree(
+    contributions: PathIn,
+    masks: PathIn,
+    coverage_tree: PathIn,
+    out: PathOut,
+    settings: of.SemanticTreeSettings,
+    field_settings: of.FieldSettings,
+    seed: Seed = 0,
+    threads: Threads = 1,
+) -> None:
+    """Compute nodes at three levels, by clustering Gaussians by features."""
+    from hilsplat.methods.feature_tree import run_feature_tree
+
+    run_feature_tree(contributions, masks, coverage_tree, out, settings, field_settings, seed, threads)
+
+
+@stage()
+def semantic_tree(
+    contributions: PathIn,
+    masks: PathIn,
+    out: PathOut,
+    settings: of.SemanticTreeSettings,
+    threads: Threads = 1,
+) -> None:
+    """Compute nodes at three levels, by linking masks across views."""
+    from hilsplat.semantic_tree.build import run_semantic_tree
+
+    run_semantic_tree(contributions, masks, out, settings, threads)
+
+
+@stage(artifact="clip", when=lambda scene: scene.is_imported)
+def imported_clip(
+    scene: PathIn, masks: PathIn, features: PathIn, out: PathOut, settings: of.ClipSettings
+) -> None:
+    """Import LangSplat's CLIP vectors, a folder of _s.npy and _f.npy files."""
+    from hilsplat.embed.langsplat_files import read_clip
+
+    read_clip(scene, features, out, settings)
+
+
+@stage(loop="CLIP of views")
+def clip(
+    scene: PathIn,
+    masks: PathIn,
+    out: PathOut,
+    settings: of.ClipSettings,
+    semantic_tree: Annotated[
+        Path | None,
+        typer.Option(help="tree whose nodes select the crops; default: embed every mask"),
+        Role.INPUT,
+    ] = None,
+    cache: Cache = DEFAULT_CACHE,
+    threads: Threads = 1,
+    memory: Memory = None,
+) -> None:
+    """Embed the best crops of each node, or every mask, with CLIP."""
+    from hilsplat.embed.stage import run_clip
+
+    run_clip(scene, masks, semantic_tree, out, cache, settings, threads, memory)
+
+
+def _vocabulary(arguments: Mapping[str, Any]) -> Reads:
+    named = arguments["settings"].vocabulary
+    return Reads({} if named == AUTO else {"vocabulary": Path(named)})
+
+
+@stage(reads=_vocabulary)
+def names(
+    semantic_tree: PathIn,
+    clip: PathIn,
+    out: PathOut,
+    settings: of.QuerySettings,
+    evaluate: of.EvaluateSettings,
+    cache: Cache = DEFAULT_CACHE,
+) -> None:
+    """Name the nodes of a semantic tree from a vocabulary."""
+    from hilsplat.query.node_names import run_names
+
+    run_names(semantic_tree, clip, out, cache, settings, evaluate)
+
+
+# ---- the language field --------------------------------------------------------------------------
+
+
+@stage()
+def autoencoder(
+    clip: PathIn,
+    semantic_tree: PathIn,
+    contributions: PathIn,
+    out: PathOut,
+    settings: of.AutoencoderSettings,
+    seed: Seed = 0,
+) -> None:
+    """Fit the compression of a scene's CLIP vectors (PCA or autoencoder), and encode the masks."""
+    from hilsplat.field.autoencoder import run_autoencoder
+
+    run_autoencoder(clip, semantic_tree, contributions, out, settings, seed)
+
+
+def _baseline(arguments: Mapping[str, Any]) -> Reads:
+    from hilsplat.methods.registry import METHODS
+
+    name = arguments["settings"].name
+    return Reads(plugins=(METHODS.places[name],) if name in METHODS else ())
+
+
+@stage(
+    artifact="field",
+    file="field.safetensors",
+    when=lambda scene: scene.settings.method.name != of.MethodSettings().name,
+    reads=_baseline,
+)
+def method(
+    scene: PathIn,
+    gaussians: PathIn,
+    masks: PathIn,
+    contributions: PathIn,
+    autoencoder: PathIn,
+    out: PathOut,
+    settings: of.MethodSettings,
+    seed: Seed = 0,
+    threads: Threads = 1,
+) -> None:
+    """Compute the language field with the baseline selected in the settings."""
+    from hilsplat.methods.method import MethodInputs, run_method
+
+    run_method(
+        MethodInputs(scene, gaussians, masks, contributions, autoencoder, threads), out, settings, seed
+    )
+
+
+@stage(file="field.safetensors")
+def field(
+    contributions: PathIn,
+    coverage_tree: PathIn,
+    autoencoder: PathIn,
+    out: PathOut,
+    settings: of.FieldSettings,
+    scene: Annotated[Path | None, typer.Option(help="posed scene, for trainer: literal"), Role.INPUT] = None,
+    gaussians: Annotated[Path | None, typer.Option(help="3DGS PLY, for trainer: literal"), Role.INPUT] = None,
+    masks: Annotated[
+        Path | None, typer.Option(help="masks of the views, for trainer: literal"), Role.INPUT
+    ] = None,
+    start: Annotated[
+        Path | None, typer.Option(help="initial field, for start: langsplat"), Role.INPUT
+    ] = None,
+    seed: Seed = 0,
+    threads: Threads = 1,
+) -> None:
+    """Solve for the language field: regression, L_h, L_ins and L_part over three levels."""
+    from hilsplat.field.field import run_field
+
+    rendered = (scene, gaussians, masks) if scene and gaussians and masks else None
+    run_field(contributions, coverage_tree, autoencoder, out, settings, threads, seed, rendered, start)
+
+
+# ---- evaluation, the only stages that read annotations -------------------------------------------
+
+
+def _labels(arguments: Mapping[str, Any]) -> Reads:
+    from hilsplat.datasets.registry import readers_of
+    from hilsplat.datasets.sources import label_files
+
+    labels = arguments["labels"] or ()
+    named = [labels] if isinstance(labels, str) else list(labels)
+    files = {f"labels {name}": label_files(name, str(arguments["data_root"])) for name in named}
+    return Reads(files, readers_of(named))
+
+
+@stage(
+    loop="views scored",
+    reads=_labels,
+    beside=lambda out: (out.with_name("times.csv"), out.with_name("instances.npz")),
+)
+def evaluate(
+    scene: PathIn,
+    gaussians: PathIn,
+    semantic_tree: PathIn,
+    field: PathIn,
+    autoencoder: PathIn,
+    clip: PathIn,
+    masks: PathIn,
+    out: PathOut,
+    settings: of.EvaluateSettings,
+    dataset: Annotated[str, typer.Option(help="data set to record in the scores")],
+    name: Annotated[str, typer.Option(help="scene to record in the scores")],
+    variant: Annotated[str, typer.Option(help="variant to record in the scores")] = "default",
+    truth: Truth = None,
+    source: Source = "",
+    labels: LabelSets = None,
+    data_root: DataRoot = Path(),
+    threads: Threads = 1,
+) -> None:
+    """Query every annotated text in every test view, or every labelled view, and score the answers."""
+    from hilsplat.evaluate.stage import run_evaluate
+    from hilsplat.scene.finished import SceneParts
+
+    run_evaluate(
+        SceneParts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks),
+        out,
+        settings,
+        dataset=dataset,
+        scene=name,
+        variant=variant,
+        truth=truth,
+        source=source,
+        labels=labels or (),
+        data_root=data_root,
+        threads=threads,
+    )
+
+
+@stage(scope="run", reads=_labels)
+def evaluate_files(
+    predictions: Annotated[
+        Path, typer.Argument(help="folder of masks or point labels from any program"), Role.INPUT
+    ],
+    out: PathOut,
+    method: Annotated[str, typer.Option(help="name of the program, for the tables")],
+    labels: LabelledScene = "",
+    data_root: DataRoot = Path(),
+    truth: Truth = None,
+    scene: Annotated[
+        Path | None, typer.Option(help="generated scene that lists the test views"), Role.INPUT
+    ] = None,
+    source: Source = "",
+    dataset: Annotated[str, typer.Option(help="data set to record for a generated scene")] = "synthetic",
+    name: Annotated[str, typer.Option(help="name to record for a generated scene")] = "",
+    min_region_px: Annotated[
+        int | None, typer.Option(min=1, help="minimum area of a scored region in a generated scene")
+    ] = None,
+) -> None:
+    """Score masks or point labels written by any program, under the same protocols."""
+    from hilsplat.evaluate.files_stage import run_evaluate_files
+
+    run_evaluate_files(
+        predictions,
+        out,
+        method=method,
+        labels=labels,
+        data_root=data_root,
+        truth=truth,
+        scene=scene,
+        source=source,
+        dataset=dataset,
+        name=name,
+        min_region_px=min_region_px,
+    )
+
+
+@stage(command="", reads=_labels)
+def label_fits(
+    scene: PathIn,
+    gaussians: PathIn,
+    masks: PathIn,
+    semantic_tree: PathIn,
+    out: PathOut,
+    labels: LabelledScene,
+    data_root: DataRoot = Path(),
+    threads: Threads = 2,
+) -> str:
+    """Measure how well masks and nodes fit annotated regions, by level and without queries."""
+    from hilsplat.evaluate.label_fits import run_label_fits
+
+    return run_label_fits(scene.parent, masks.parent.name, labels, data_root, out, threads)
+
+
+# ---- tables and pictures -------------------------------------------------------------------------
+
+
+@stage(scope="run", beside=lambda out: tuple(out.with_suffix(end) for end in (".md", ".tex", ".html")))
+def table(
+    name: Annotated[str, typer.Argument(help="table: hierarchy, lerf, ablation, ... (docs/tables.md)")],
+    published: PathIn,
+    out: Annotated[
+        Path, typer.Option(help="CSV to write, with .md, .tex and .html files beside it"), Role.OUTPUT
+    ],
+    labels: Names,
+    scores: Annotated[
+        list[Path] | None, typer.Argument(help="scores.csv of each scene and variant"), Role.INPUT
+    ] = None,
+    absent: Annotated[list[str] | None, typer.Option(help="an entry that was not measured, and why")] = None,
+) -> None:
+    """Build one table of the paper, with reported, measured and stand-in rows."""
+    from hilsplat.evaluate.tables.build import run_table
+
+    run_table(name, scores or [], published, labels, out, absent or [])
+
+
+@stage(
+    scope="scene",
+    reads=_labels,
+    beside=lambda out: (out.with_name("registration.png"), out.with_name("fit.png")),
+)
+def figures(
+    scene: PathIn,
+    gaussians: PathIn,
+    fit: Annotated[Path, typer.Option(help="folder of the fit's report"), Role.INPUT],
+    masks: PathIn,
+    clip: PathIn,
+    semantic_tree: PathIn,
+    field: PathIn,
+    autoencoder: PathIn,
+    out: Annotated[
+        Path,
+        typer.Option(help="PNG to write, with registration.png and fit.png beside it"),
+        Role.OUTPUT,
+    ],
+    settings: of.FiguresSettings,
+    evaluate: of.EvaluateSettings,
+    queries: Queries,
+    truth: Truth = None,
+    labels: LabelledScene = "",
+    data_root: DataRoot = Path(),
+    threads: Threads = 1,
+) -> None:
+    """Draw the panel of a scene: photograph, masks, field, relevancy, answers, ground truth."""
+    from hilsplat.evaluate.figures.panel import run_figures
+    from hilsplat.scene.finished import SceneParts
+
+    run_figures(
+        SceneParts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks),
+        out,
+        settings,
+        evaluate,
+        fit=fit,
+        truth=truth,
+        labels=labels,
+        data_root=data_root,
+        queries=queries,
+        threads=threads,
+    )
+
+
+@stage(
+    scope="scene",
+    loop="methods compared",
+    reads=_labels,
+    beside=lambda out: (out.with_name("views.png"), out.with_name("features.png")),
+)
+def comparison(
+    folder: Annotated[Path, typer.Option(help="finished scene, results/<dataset>/<scene>")],
+    scores: Annotated[list[Path], typer.Option(help="scores.csv of each variant to compare"), Role.INPUT],
+    out: Annotated[
+        Path,
+        typer.Option(help="PNG to write, with views.png, features.png and PDFs beside it"),
+        Role.OUTPUT,
+    ],
+    names: Names,
+    settings: of.FiguresSettings,
+    evaluate: of.EvaluateSettings,
+    queries: Queries,
+    truth: Truth = None,
+    labels: LabelledScene = "",
+    data_root: DataRoot = Path(),
+    threads: Threads = 1,
+) -> None:
+    """Draw a comparison of variants: queries by method, one query in four views, features at three levels."""
+    from hilsplat.evaluate.figures.comparison import run_comparison
+
+    run_comparison(
+        folder,
+        [path.parent.name for path in scores],
+        names,
+        out,
+        settings,
+        evaluate,
+        truth=truth,
+        labels=labels,
+        data_root=data_root,
+        queries=queries,
+        threads=threads,
+    )
+
+
+@stage(scope="run")
+def sweep_plot(
+    name: Annotated[str, typer.Argument(help="theta or omega")],
+    table: Annotated[Path, typer.Option(help="CSV of the table"), Role.INPUT],
+    out: Annotated[Path, typer.Option(help="PNG to write, with a PDF beside it"), Role.OUTPUT],
+) -> None:
+    """Plot a sweep from its table: the paper's curves and ours."""
+    from hilsplat.evaluate.figures.sweep_plot import run_sweep_plot
+
+    run_sweep_plot(name, table, out)
+
+
+@stage(scope="run", beside=lambda out: (out.with_suffix(".md"),))
+def efficiency(
+    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    out: Annotated[Path, typer.Option(help="CSV, with .md beside it"), Role.OUTPUT] = Path(
+        "results/efficiency.csv"
+    ),
+) -> str:
+    """Print the time of each stage, from the benchmark files of a run."""
+    from hilsplat.evaluate.tables.costs import run_efficiency
+
+    return run_efficiency(results, out)
+
+
+def kinds_of(artifact: str) -> list[Stage[..., Any]]:
+    """Return the stages that can make an artifact, in the order in which their conditions count."""
+    return [stage for stage in all_stages().values() if stage.artifact == artifact]
+
+
+def family_of(stage: Stage[..., Any]) -> str:
+    """Return the name of the stage that makes an artifact if no condition of others holds."""
+    return kinds_of(stage.artifact)[-1].name
+
+
+@cache
+def all_stages() -> dict[str, Stage[..., Any]]:
+    """Return the stages of plugins and of this module, by name."""
+    plugins = [registry.stages for registry in entry_points("hilsplat.stages").values()]
+    return {name: stage for stages in (*plugins, PIPELINE.stages) for name, stage in stages.items()}
+
+
+def stage_of(name: str) -> Stage[..., Any]:
+    """Return a stage by name; raise HilsplatError if there is none."""
+    if name not in all_stages():
+        raise HilsplatError(f"unknown stage {name!r}", expected=f"one of {', '.join(all_stages())}")
+    return all_stages()[name]

@@ -1,0 +1,78 @@
+"""Commands of the synthetic world that are not stages."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilsplat.base.errors import visible
+from hilsplat.stage import Threads
+from hilsplat_world.stages import consistency, mask_truth, tree_truth
+
+app = typer.Typer(help="Make and inspect scenes of the synthetic world.", no_args_is_help=True)
+
+
+SceneWithMasks = Annotated[str, typer.Argument(help="synthetic scene that has masks, as dataset/scene")]
+MeasuredVariant = Annotated[str, typer.Option(help="variant that is measured")]
+Results = Annotated[Path, typer.Option(help="results folder")]
+
+
+def echo(text: str) -> None:
+    typer.echo(visible(text))  # noqa: TID251
+
+
+@app.command("show")
+def show(
+    scene: Annotated[str, typer.Argument(help="finished synthetic scene, as dataset/scene")],
+    results: Results = Path("results"),
+) -> None:
+    """Write a contact sheet to world.png: views, labels by level, and the tree with its texts."""
+    from hilsplat_world.pictures import show_world
+
+    target = results / scene / "world.png"
+    show_world(results / scene / "world", target)
+    echo(f"wrote {target}")
+
+
+@app.command("inconsistency")
+def inconsistency(
+    scene: SceneWithMasks, variant: MeasuredVariant = "default", results: Results = Path("results")
+) -> None:
+    """Measure, using exact geometry, how often a surface point has different masks in neighbouring views.
+
+    Writes consistency.csv beside the masks.
+    """
+    folder = results / scene
+    echo(
+        consistency(folder / "world/truth", folder / variant / "masks", folder / variant / "consistency.csv")
+    )
+
+
+@app.command("masks")
+def masks(
+    scene: SceneWithMasks,
+    variant: MeasuredVariant = "default",
+    results: Results = Path("results"),
+    out: Annotated[Path | None, typer.Option(help="PNG, CSV and PDF; default: beside the masks")] = None,
+) -> None:
+    """Compare masks with ground-truth regions at each level, and draw the errors."""
+    folder = results / scene
+    target = out or folder / variant / "masks_truth.png"
+    echo(mask_truth(folder / "scene", folder / "world/truth", folder / variant / "masks", target))
+
+
+@app.command("semantic-tree")
+def semantic_tree(
+    scene: Annotated[str, typer.Argument(help="synthetic scene that has a tree, as dataset/scene")],
+    variant: MeasuredVariant = "default",
+    results: Results = Path("results"),
+    threads: Threads = 2,
+) -> None:
+    """Compare the 3D semantic tree with the ground-truth nodes: matches, purity, parents.
+
+    Writes tree_truth.csv beside the tree.
+    """
+    folder, tree = results / scene, results / scene / variant / "semantic_tree"
+    target = tree.with_name("tree_truth.csv")
+    ply, truth = folder / "gaussians.ply", folder / "world/truth"
+    echo(tree_truth(folder / "scene", ply, truth, tree, target, threads))
