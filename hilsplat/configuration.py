@@ -6,7 +6,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, ValidationError, create_model, field_validator
@@ -43,7 +43,7 @@ class CoreSettings(Section):
     query: settings.QuerySettings = settings.QuerySettings()
     figures: settings.FiguresSettings = settings.FiguresSettings()
 
-    def with_models(self) -> Self:
+    def with_models(self) -> "CoreSettings":
         """Return all sections after resolving values that depend on others: models, crops, theta."""
         clip, masks = with_models(self.clip), with_models(self.masks)
         if masks.levels == "tree" and masks.theta is None:

@@ -388,6 +388,7 @@ def _labels(arguments: Mapping[str, Any]) -> Reads:
 
 
 @stage(
+    file="scores.csv",
     loop="views scored",
     reads=_labels,
     beside=lambda out: (out.with_name("times.csv"), out.with_name("instances.npz")),

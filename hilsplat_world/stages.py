@@ -15,7 +15,7 @@ stage = PIPELINE.stage
 NEIGHBOURS = 2  # number of nearest views that each view is compared with
 
 
-@stage(command="world make", scope="scene", loop="rendered views")
+@stage(file="world/images", command="world make", scope="scene", loop="rendered views")
 def world(
     source: Annotated[str, typer.Option(help="scene to make, as world:KIND:SEED")],
     out: Annotated[Path, typer.Option(help="folder of images"), Role.OUTPUT],

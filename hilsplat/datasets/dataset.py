@@ -33,6 +33,8 @@ class Dataset:
         protocols: keys in `evaluate.protocols.cards`, in addition to the protocols for all image labels.
         label_places: function that returns glob patterns for a scene's labels, which only evaluation reads.
         folder: the data set's folder below `data_root`, if it differs from the name.
+        tables: names of the tables that show its scores (`evaluate.tables`).
+        images_of: data set whose images it labels, if it has none of its own.
     """
 
     name: str
@@ -48,6 +50,8 @@ class Dataset:
     protocols: tuple[str, ...] = ()
     label_places: Callable[[str], tuple[str, ...]] = lambda scene: ()
     folder: str = ""
+    tables: tuple[str, ...] = ()
+    images_of: str = ""
 
     def root(self, data_root: Path | str) -> Path:
         """Return the data set's folder, to which all its paths are relative."""

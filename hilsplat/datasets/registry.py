@@ -1,6 +1,7 @@
 """The supported data sets by name, and the output of `hilsplat datasets`.
 
 A reader's module describes its data set in a constant (see `dataset.Dataset`); one line here registers it.
+Packages of others register theirs as entry points of the group `hilsplat.datasets` (docs/extending.md).
 """
 
 from collections.abc import Collection, Sequence
@@ -8,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from hilsplat.base.errors import HilsplatError, SceneError
-from hilsplat.base.plugins import Plugins
+from hilsplat.base.plugins import Plugins, entry_points
 from hilsplat.datasets.dataset import Dataset
 
 if TYPE_CHECKING:  # imports OpenCV and SciPy, which workflow start-up and tables don't need
@@ -27,6 +28,7 @@ DATASETS: Plugins[Dataset] = Plugins(
         "scannet200": "hilsplat.datasets.points.scannet:SCANNET200_DATASET",
         "replica": "hilsplat.datasets.points.replica:DATASET",
         "waymo": "hilsplat.datasets.waymo.reader:DATASET",
+        **entry_points("hilsplat.datasets").places,
     }
 )
 """Supported data sets in the order of the paper's tables."""

@@ -18,10 +18,8 @@ from hilsplat.scene.sheet import DATA_PREFIX
 
 logger = logging.getLogger(__name__)
 
-LABELS_ON = {"lerf_ovs": "hi_lerf", "3d_ovs": "hi_3dovs"}
-"""Data set -> a second data set that labels the same images at several levels."""
-
-LEVELLED = tuple(LABELS_ON.values())
+LEVELLED = ("hi_lerf", "hi_3dovs")
+"""Data sets whose labels have levels."""
 
 UNUSED = (*TRAINED, "label", "segmentations", "test_mask")
 """Folders beside photographs whose images `poses` doesn't read: trained output, and labels of data sets."""
@@ -77,12 +75,9 @@ def label_sets(source: str, data_root: str, row: str) -> tuple[str, ...]:
     if place is None or absence(source, data_root) is not None:
         return own
     name, scene = place
-    found = (f"{name}/{scene}", *own)
-    if name in LABELS_ON:
-        other = dataset_of(LABELS_ON[name])
-        if not other.missing(other.root(data_root), scene):
-            found = (*found, f"{other.name}/{scene}")
-    return found
+    others = [dataset for dataset in DATASETS.values() if dataset.images_of == name]
+    more = [dataset.name for dataset in others if not dataset.missing(dataset.root(data_root), scene)]
+    return (f"{name}/{scene}", *own, *(f"{other}/{scene}" for other in more))
 
 
 def label_files(labels: str, data_root: str) -> tuple[Path, ...]:

@@ -3,6 +3,7 @@
 The workflow imports this module at start-up, so it does not import slow modules at the top level.
 """
 
+import difflib
 import re
 from collections import Counter
 from collections.abc import Collection, Sequence
@@ -22,19 +23,9 @@ COLUMNS = ("dataset", "scene", "group", "source", "unit")
 OPTIONAL_COLUMNS = ("gaussians", "features", "poses")
 NOTHING = ("", "-")
 """Values that mark an optional cell as empty."""
-GROUPS = (
-    "benchmark",
-    "development",
-    "dense",
-    "ci",
-    "photos",
-    "lerf",
-    "lerf_mask",
-    "3d_ovs",
-    "scannet",
-    "replica",
-    "waymo",
-)
+GROUPS = ("benchmark", "development", "dense", "ci", "photos")
+"""Groups of the installed sheet, besides those of data sets; a sheet may have more."""
+
 UNITS = ("metre", "arbitrary")
 PHOTOS = "photos"
 """Data set and group of your own photographs."""
@@ -69,7 +60,7 @@ class SceneRow:
 
     Attributes:
         dataset: first part of the scene's path under `results/`; `scene` is the second.
-        group: one of `GROUPS`.
+        group: scenes that are run together; a run names its groups.
         source: `<generator>:<kind>:<seed>`, `data:<folder below data_root>`, or a folder.
         unit: unit of the source's lengths, "metre" or "arbitrary".
         folder: the source folder; None for a generated scene.
@@ -229,15 +220,18 @@ def _row(
         cell = cells.get(column, "")
         return None if cell in NOTHING else _resolved(path, cell, data_root)
 
-    for column in ("dataset", "scene"):
+    for column in ("dataset", "scene", "group"):
         if problem := name_problem(cells[column]):
             fix = "choose a different name, such as my-desk_2"
             bad = f"{cells[column]!r} is not a valid name"
             raise fault(column, bad, expected=NAME_RULE, found=problem, fix=fix)
-    for column, allowed in (("group", GROUPS), ("unit", UNITS)):
-        if cells[column] not in allowed:
-            expected, fix = f"one of {', '.join(allowed)}", f"correct column {column} of that line"
-            raise fault(column, f"{cells[column]!r} is unknown", expected=expected, fix=fix)
+    if cells["unit"] not in UNITS:
+        expected, fix = f"one of {', '.join(UNITS)}", "correct column unit of that line"
+        raise fault("unit", f"{cells['unit']!r} is unknown", expected=expected, fix=fix)
+    near = difflib.get_close_matches(cells["group"], GROUPS, n=1, cutoff=0.8)
+    if near and cells["group"] not in GROUPS:
+        expected, fix = f"did you mean {near[0]!r}?", "correct the group, or choose a more different name"
+        raise fault("group", f"{cells['group']!r} is unknown", expected=expected, fix=fix)
     source, folder = cells["source"], None
     is_checked = checked_groups is None or cells["group"] in checked_groups
     if not source:

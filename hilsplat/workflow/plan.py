@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.files import INSTALLED, project_path
 from hilsplat.configuration import SECTIONS, RunSettings, StageSettings, parse_run, require_known
+from hilsplat.datasets.registry import DATASETS
 from hilsplat.datasets.sources import unlisted
 from hilsplat.methods.registry import METHODS, require_method
 from hilsplat.models.store import AUTO, model_digest, model_path, read_model
@@ -308,6 +309,16 @@ class Plan:
         variant = [self.shared_variant(artifact, job)] if stage.scope == "variant" else []
         return self.path(job, *variant, stage.file)
 
+    def artifacts(self, row: SceneRow) -> list[Path]:
+        """Return the paths at which the stages of a scene may write their artifacts."""
+        files = [(stage.scope, stage.file) for stage in all_stages().values()]
+        of_scene = [self.path(row, file) for scope, file in files if scope == "scene"]
+        variants = self.run.every_variant()
+        of_variants = [
+            self.path(row, name, file) for name in variants for scope, file in files if scope == "variant"
+        ]
+        return [Path(path) for path in dict.fromkeys(of_scene + of_variants)]
+
     def compared_scores(self, job: Job) -> list[str]:
         """Return the input of `comparison`: the scores of each variant in the main tables."""
         return [self.path(main, main.variant, "scores.csv") for main in self._main_jobs(job)]
@@ -482,14 +493,15 @@ def without_scene(run: RunSettings, rows: Iterable[SceneRow]) -> list[str]:
 
     SettingsError is raised if a name is probably misspelt, or is not that of a known group or data set.
     """
-    require_known("groups", run.groups, GROUPS)
+    groups = list(dict.fromkeys((*GROUPS, *(row.group for row in rows), *DATASETS)))
+    require_known("groups", run.groups, groups)
     datasets = {row.dataset for row in rows} | {PHOTOS}
     scenes = [row.name for row in rows]
     # Settings of a scene that was removed from the sheet may stay in the configuration.
     named = [key for key in (*run.overrides, *run.queries) if "/" in key]
     gone = [key for key in named if key.partition("/")[0] in datasets]
-    require_known("overrides", run.overrides, [*GROUPS, *scenes, *gone])
-    require_known("queries", run.queries, [*sorted({*datasets, *GROUPS}), *scenes, *gone])
+    require_known("overrides", run.overrides, [*groups, *scenes, *gone])
+    require_known("queries", run.queries, [*sorted({*datasets, *groups}), *scenes, *gone])
     known = {
         **dict.fromkeys(gone, ("overrides or queries", scenes)),
         **dict.fromkeys(run.sweep_scenes, ("sweep_scenes", [row.scene for row in rows])),

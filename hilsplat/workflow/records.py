@@ -34,8 +34,9 @@ def outdated(plan: Plan, *, every_byte: bool = False) -> dict[str, str]:
     damage. Without `every_byte`, contents are compared only if a job did not finish or a file is newer than
     its record; otherwise, sizes are compared.
     """
-    records = Records(plan.results, plan, every_byte=every_byte)
-    states = {str(artifact): records.state(artifact) for artifact in records_in(plan.results)}
+    records, artifacts = Records(plan.results, plan, every_byte=every_byte), records_in(plan.results)
+    declared = [path for row in plan.scenes for path in plan.artifacts(row) if path.exists()]
+    states = {str(path): records.state(path) for path in dict.fromkeys([*artifacts, *declared])}
     return {path: reason for path, (state, reason) in states.items() if state != WHOLE}
 
 

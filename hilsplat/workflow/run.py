@@ -1,7 +1,7 @@
 """`hilsplat run`: Snakemake with checks, and with options that users would otherwise type.
 
-It recovers from a killed run, rebuilds artifacts that don't match their provenance, and starts Snakemake in
-this process. Plain `snakemake --cores 2` produces the same bytes.
+It recovers from a killed run, rebuilds artifacts that don't match their provenance, and starts Snakemake.
+Plain `snakemake --cores 2` produces the same bytes.
 """
 
 import argparse
@@ -9,12 +9,12 @@ import difflib
 import json
 import logging
 import os
-import runpy
+import re
 import secrets
+import signal
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from io import TextIOWrapper
@@ -26,7 +26,7 @@ import yaml
 from hilsplat.base.artifacts import RUN, write_json, write_text
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.base.files import INSTALLED, project_path
-from hilsplat.base.processes import PARENT, lock, remove_leftovers
+from hilsplat.base.processes import PARENT, end_with_workflow, lock, remove_leftovers
 from hilsplat.base.removal import delete
 from hilsplat.configuration import CONFIG, first_unusable, merged_config, parse_run
 from hilsplat.scene.sheet import DEFAULT_SHEET, SceneRow, read_sheet
@@ -50,8 +50,7 @@ ELSEWHERE = ("--executor", "-e", "--profile", "--workflow-profile")
 """Snakemake options that may set cores and threads; if one is given, they are not set here."""
 
 
-_marks: list[TextIOWrapper] = []  # the marker of this process's run, if one is in progress
-_locks: list[TextIOWrapper] = []  # its lock on the results folder
+_held: list[TextIOWrapper] = []  # the lock on the results and the marker of this process's run, if any
 
 
 def prepare_process() -> TextIOWrapper | None:
@@ -61,6 +60,7 @@ def prepare_process() -> TextIOWrapper | None:
     Snakemake. The lock is shared and is taken before Snakemake's own locks, which record no owner. If no
     process holds our lock, Snakemake's locks are left over from a dead run.
     """
+    end_with_workflow()  # `hilsplat run` may have started this process
     os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
     os.environ[PARENT] = str(os.getpid())
     os.environ["PYTHONSAFEPATH"] = "1"  # jobs must not import modules from the working folder
@@ -71,25 +71,17 @@ def prepare_process() -> TextIOWrapper | None:
     return None
 
 
-def lock_results(results: Path) -> None:
-    """Lock a results folder, which several working folders may share, until this process's run ends."""
-    if _locks:  # `hilsplat run` and the Snakefile share a process
-        return
-    try:
-        _locks.append(_locked(results / ".run.lock", wait=False))
-    except BlockingIOError as error:
-        fix = "let it finish, or stop it"
-        raise HilsplatError(f"another hilsplat run has locked {results}", fix=fix) from error
-
-
 def mark_run(results: Path) -> None:
-    """Lock the results and a marker of this process's run; a killed run leaves the marker unlocked."""
-    lock_results(results)
-    if not _marks:
-        stream = _locked(STATE / f"run-{secrets.token_hex(4)}")
-        stream.write(socket.gethostname())
-        stream.flush()
-        _marks.append(stream)
+    """Lock the results, which several folders may share, and a marker; a killed run leaves it unlocked.
+
+    Raises:
+        HilsplatError: another run writes to these results.
+    """
+    _held.append(_locked_results(results))
+    marker = _locked(STATE / f"run-{secrets.token_hex(4)}")
+    marker.write(socket.gethostname())
+    marker.flush()
+    _held.append(marker)
 
 
 def record_run(results: Path, configs: Sequence[Path], overrides: Mapping[str, Any]) -> None:
@@ -100,20 +92,21 @@ def record_run(results: Path, configs: Sequence[Path], overrides: Mapping[str, A
 
 
 def unmark_run() -> None:
-    """Remove the marker of this process's run, and cancel the timers that Snakemake leaves running.
-
-    Snakemake's rate limit starts a timer after each scheduling step; the process would wait for every timer.
-    """
-    timers = (thread for thread in threading.enumerate() if isinstance(thread, threading.Timer))
-    for timer in timers:
-        if str(getattr(timer.function, "__module__", "")).startswith("snakemake"):
-            timer.cancel()
-    while _marks:
-        stream = _marks.pop()
-        delete(Path(stream.name), MARKER)
+    """Remove the marker of this process's run, and unlock the results."""
+    while _held:
+        stream = _held.pop()
+        if re.fullmatch(MARKER, Path(stream.name).name):
+            delete(Path(stream.name), MARKER)
         stream.close()
-    while _locks:
-        _locks.pop().close()
+
+
+def _locked_results(results: Path) -> TextIOWrapper:
+    """Lock a results folder until the returned file is closed; HilsplatError if another run holds it."""
+    try:
+        return _locked(results / ".run.lock", wait=False)
+    except BlockingIOError as error:
+        fix = "let it finish, or stop it"
+        raise HilsplatError(f"another hilsplat run has locked {results}", fix=fix) from error
 
 
 def _locked(path: Path, *, shared: bool = False, wait: bool = True) -> TextIOWrapper:
@@ -192,20 +185,17 @@ def run(
             raise HilsplatError(f"{place} cannot be written, but Snakemake keeps its state there", fix=fix)
     if _has(others, "-n", "--dry-run", "--dryrun"):
         return _start(command, plan, targets, scenes, every_byte)
-    lock_results(plan.results)
-    try:
+    with _locked_results(plan.results):
         _recover(command, plan.results)
-        if not _has(others, *ELSEWHERE):
-            cores = int(given.cores) if given.cores and given.cores.isdigit() else 0
-            for line in forecasts(plan, cores or _all_cores()):
-                logger.info("%s", line)
-        mark_run(plan.results)
-        status = _start(command, plan, targets, scenes, every_byte)
-        if status != 0:
+    if not _has(others, *ELSEWHERE):
+        cores = int(given.cores) if given.cores and given.cores.isdigit() else 0
+        for line in forecasts(plan, cores or _all_cores()):
+            logger.info("%s", line)
+    status = _start(command, plan, targets, scenes, every_byte)
+    if status != 0:
+        with suppress(HilsplatError), _locked_results(plan.results):
             remove_leftovers(plan.results)  # left by killed jobs
-        return status
-    finally:
-        unmark_run()
+    return status
 
 
 def _require_known(targets: Sequence[str], rows: Sequence[SceneRow], sheet: str) -> None:
@@ -223,7 +213,7 @@ def _require_known(targets: Sequence[str], rows: Sequence[SceneRow], sheet: str)
 def _start(
     command: list[str], plan: Plan, targets: Sequence[str], scenes: Sequence[str], every_byte: bool
 ) -> int:
-    """Start Snakemake in this process, and rebuild artifacts that don't match their provenance."""
+    """Start Snakemake, and rebuild artifacts that don't match their provenance."""
     files = [target for target in targets if target not in scenes]
     ending = ["--", *files] if files else []
     wrong = outdated(plan, every_byte=every_byte)
@@ -233,13 +223,27 @@ def _start(
         wrong = {output: reason for output, reason in wrong.items() if output in needed}
     for output, reason in wrong.items():
         logger.warning("rebuilding %s: %s", output, reason)
-    logging.getLogger().handlers.clear()  # otherwise Snakemake's records would be printed twice
-    sys.argv = [*command, *(["--forcerun", *wrong] if wrong else []), *ending]
+    forced = ["--forcerun", *wrong] if wrong else []
+    return _run([sys.executable, "-P", "-m", *command, *forced, *ending])
+
+
+def _run(command: Sequence[str]) -> int:
+    """Run a command that ends with this process, pass signals on to it, and return its exit status."""
+    child = subprocess.Popen(command, env={**os.environ, PARENT: str(os.getpid())})
+    forwarded = [signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
+    is_interactive = sys.stdin is not None and sys.stdin.isatty()  # then, Ctrl-C reaches both processes
+    handlers = {
+        number: signal.signal(number, lambda received, _: child.send_signal(received))
+        for number in (*forwarded, signal.SIGINT)
+    }
+    if is_interactive:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        runpy.run_module("snakemake", run_name="__main__", alter_sys=True)
-    except SystemExit as end:
-        return end.code if isinstance(end.code, int) else int(bool(end.code))
-    return 0
+        status = child.wait()
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    return status if status >= 0 else 128 - status
 
 
 def _snakemake(command: Sequence[str], *words: str) -> subprocess.CompletedProcess[str]:

@@ -31,7 +31,7 @@ def disk(project: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         pytest.skip(f"no small disk: {error}")
     if mounted.returncode:
         pytest.skip(f"no small disk: {mounted.stderr.strip()}")
-    monkeypatch.setattr("hilsplat.cli.stage.MIN_FREE_MIB", 0.0)
+    monkeypatch.setattr("hilsplat.stage.MIN_FREE_MIB", 0.0)
     try:
         yield place
     finally:

@@ -192,6 +192,7 @@ def _dataset(name: str, title: str, frame: str) -> Dataset:
         required=lambda scene: (f"label/{scene}", f"../{images}/{scene}/images"),
         open=partial(open_hi, name),
         label_places=lambda scene: (f"label/{scene}/*.json",),
+        images_of=images,
     )
 
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,10 +11,10 @@ import pytest
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.configuration import merged_config, parse_run
 from hilsplat.scene.sheet import read_sheet
+from hilsplat.stages import stage_of
 from hilsplat.workflow import targets
 from hilsplat.workflow.models import models_of_photographs
 from hilsplat.workflow.plan import Plan, without_scene
-from hilsplat.workflow.records import expected_artifacts
 from tests.conftest import PROJECT
 from tests.unit.models.test_store import write_model
 from tests.unit.workflow.plans import BENCHMARK, Job, plan_of
@@ -49,15 +50,14 @@ def test_scenes_of_the_groups_are_run_and_missing_data_is_named(tmp_path):
     found = plan(tmp_path, groups=["benchmark", "lerf"])
     assert [row.name for row in found.scenes] == ["synthetic/one", "synthetic/two", "rooms/room"]
     assert found.absent == {"lerf/figurines": "data_root is not set"}
-    options = targets.absent_options(found, "lerf")
-    assert options == "--absent 'lerf (figurines): data_root is not set.'"
-    assert targets.absent_options(found, "replica") == ""
+    assert targets.absent(found, "lerf") == ["lerf (figurines): data_root is not set."]
+    assert targets.absent(found, "replica") == []
 
 
 def test_segments_of_waymo_are_run_without_a_row(tmp_path):
     groups = ["benchmark", "waymo"]
     none = plan(tmp_path, groups=groups, data_root=str(tmp_path))
-    assert f"waymo: no labelled segment was found in {tmp_path}." in targets.absent_options(none, "waymo")
+    assert f"waymo: no labelled segment was found in {tmp_path}." in targets.absent(none, "waymo")
     file = tmp_path / "waymo/validation/lidar_segmentation/one.parquet"
     file.parent.mkdir(parents=True)
     file.touch()
@@ -87,8 +87,8 @@ def test_photographs_that_you_annotated_are_scored_without_replacing_the_tables(
     found = plan(tmp_path, groups=["photos"], data_root=str(tmp_path))
     job = Job("photos", "desk")
     assert targets.default(found) == [*alone, "results/photos/desk/default/scores.csv"]
-    assert found.data.truth_or_labels(job) == [str(file)] and str(file) not in found.data.image_files(job)
-    assert f"--labels annotated/photos/desk --data-root {tmp_path}" in found.data.truth_option(job, None)
+    assert found.data.label_files(job) == [str(file)] and str(file) not in found.data.image_files(job)
+    assert found.data.label_names(job) == ("annotated/photos/desk",)
     assert found.data.label_readers(job) == ("hilsplat.datasets.images.hi:ANNOTATED",)
     both = plan(tmp_path, groups=["photos", "benchmark"], data_root=str(tmp_path))
     assert "results/tables/lerf.csv" in targets.default(both)
@@ -117,7 +117,7 @@ def test_photographs_that_you_annotated_are_scored_without_replacing_the_tables(
 )
 def test_a_variant_shares_stages_up_to_the_first_that_it_changes(tmp_path, stage, variant, owner):
     found = plan(tmp_path, seeds=2)
-    assert found.shared(stage, "file")(Job(variant=variant)) == f"results/synthetic/one/{owner}/file"
+    assert found.shared_variant(stage, Job(variant=variant)) == owner
 
 
 def test_shared_files_keep_their_path_when_the_tables_change(tmp_path):
@@ -125,17 +125,16 @@ def test_shared_files_keep_their_path_when_the_tables_change(tmp_path):
     found = plan(tmp_path, main_variants=["langsplat"], variants=variants)
     job = Job(variant="langsplat")
     code = "results/synthetic/one/network/autoencoder"
-    assert found.shared("autoencoder", "autoencoder")(job) == code
-    outputs = list(expected_artifacts(found))
-    assert outputs.count(code) == 1 and re.fullmatch(found.variants(), "network")
-    assert "results/synthetic/one/network/scores.csv" not in outputs
+    assert found.shared("autoencoder")["autoencoder"](job) == code
+    assert Path(code) in found.artifacts(found.row(job))
+    assert "results/synthetic/one/network/scores.csv" not in targets.default(found)
 
 
 def test_levels_by_the_tree_take_the_theta_of_the_tree(tmp_path):
     by_tree = {"masks": {"levels": "tree"}, "coverage_tree": {"theta": 0.7}}
     found = plan(tmp_path, variants={**VARIANTS, "levels": by_tree}, main_variants=["default"])
     for name, theta in (("default", None), ("theta", None), ("levels", 0.7)):
-        assert json.loads(found.settings("masks")(Job(variant=name)))["theta"] == theta
+        assert json.loads(found.settings("masks", Job(variant=name)))["theta"] == theta
     assert found.shared_variant("masks", Job(variant="levels")) == "levels"
     assert found.masks_priority(Job(variant="levels")) < found.masks_priority(Job())  # cached by then
 
@@ -151,29 +150,31 @@ def test_inputs_of_the_literal_trainer_and_of_a_field_that_continues_langsplats(
     found = plan(tmp_path, variants=variants, main_variants=["default"], seeds=2)
     on, literal = (Job(variant=name) for name in ("on.seed1", "literal"))
     first = found.first_field(on)
-    assert first == ["results/synthetic/one/langsplat.seed1/field.safetensors"] and found.rendered(on) == []
-    assert found.field_option(on, SimpleNamespace(rendered=[], start=first[0])) == f"--start {first[0]}"
-    rendered = found.rendered(literal)
-    assert found.first_field(literal) == [] and rendered[2] == "results/synthetic/one/default/masks"
-    option = found.field_option(literal, SimpleNamespace(rendered=rendered, start=[]))
-    assert option.split()[::2] == ["--scene", "--gaussians", "--masks"]
-    assert (found.field_seed(on), found.field_seed(Job())) == (1, 0)
+    assert first == ["results/synthetic/one/langsplat.seed1/field.safetensors"]
+    assert found.rendered("masks")(on) == found.first_field(literal) == []
+    rendered = [path for name in ("scene", "gaussians", "masks") for path in found.rendered(name)(literal)]
+    assert [path.removeprefix("results/synthetic/one/") for path in rendered] == [
+        *("scene", "gaussians.ply", "default/masks")
+    ]
+    field = stage_of("field")
+    assert (found.seed(field, on), found.seed(field, Job())) == (1, 0)
     with pytest.raises(SettingsError, match=r"no variant has method\.name langsplat with the same"):
         found.first_field(Job(variant="alone"))
 
 
 def test_an_override_of_one_scene_changes_what_it_shares(tmp_path):
     found = plan(tmp_path, overrides={"synthetic/two": {"coverage_tree": {"theta": 0.6}}})
-    shared = found.shared("field", "f")
+    shared = found.shared("field")["field"]
     assert shared(Job(variant="theta")).split("/")[3] == "theta"
     assert shared(Job("synthetic", "two", "theta")).split("/")[3] == "default"
-    assert json.loads(found.settings("coverage_tree")(Job("synthetic", "two")))["theta"] == 0.6
+    assert json.loads(found.settings("coverage_tree", Job("synthetic", "two")))["theta"] == 0.6
 
 
 def test_a_comparison_reads_each_shared_artifact_once(tmp_path):
     found, job = plan(tmp_path, main_variants=["default", "theta", "network"]), Job()
-    assert found.compared("masks", "masks")(job) == ["results/synthetic/one/default/masks"]
-    assert variants_in(found.compared("field", "f")(job)) == ["default", "theta", "network"]
+    compared = found.compared("masks", "field")
+    assert compared["masks"](job) == ["results/synthetic/one/default/masks"]
+    assert variants_in(compared["field"](job)) == ["default", "theta", "network"]
     assert variants_in(found.compared_scores(job)) == ["default", "theta", "network"]
 
 
@@ -181,23 +182,26 @@ def test_variants_differ_in_the_method_of_the_field_and_in_the_crops(tmp_path):
     found = plan(tmp_path)
     assert found.crops_tree(Job()) == ["results/synthetic/one/default/semantic_tree"]
     assert found.crops_tree(Job(variant="own")) == [], "every mask is embedded"
-    assert found.variants(by_baseline=True) == "lifted"
-    assert found.variants(by_baseline=False) == "default|network|omega|own|theta|truth"
+    for name, is_ours in (("lifted", False), ("omega", True)):
+        path = f"synthetic/one/{name}/field.safetensors"
+        assert bool(re.match(found.jobs_of("field"), path)) == is_ours
+        assert bool(re.match(found.jobs_of("method"), path)) == (not is_ours)
     assert found.baseline(Job(variant="lifted")) == ("hilsplat.methods.lifted:fit",)
 
 
-def test_true_labels_are_inputs_of_masks_only_for_the_diagnostic_segmenter(tmp_path):
+def test_true_labels_make_masks_only_for_the_diagnostic_segmenter(tmp_path):
     found = plan(tmp_path)
     truth = Job(variant="truth")
-    assert found.masks_truth(Job()) == [] and found.masks_stage(truth) == "truth_masks"
-    assert found.masks_truth(truth) == ["results/synthetic/one/world/truth"]
-    inputs = SimpleNamespace(
-        truth="inner/results/synthetic/one/world/truth", gaussians=[], key_masks=[], key_tree=[]
+    assert found.kind("masks", Job()).name == "masks" and found.kind("masks", truth).name == "truth_masks"
+    assert found.data.required_truth(truth) == ["results/synthetic/one/world/truth"]
+    inputs = SimpleNamespace(scene="inner/scene", truth="inner/results/synthetic/one/world/truth")
+    command = found.params("truth_masks")["command"](
+        truth, inputs, ["inner/results/synthetic/one/truth/masks"]
     )
-    option = found.masks_option(truth, inputs)
-    assert option.startswith("--truth inner/results/synthetic/one/world/truth --perturb '{")
-    with pytest.raises(SettingsError, match="photos/desk, variant truth: masks"):
-        found.masks_truth(Job("photos", "desk", "truth"))
+    words = "world perturb --scene inner/scene --truth inner/results/synthetic/one/world/truth --settings '{"
+    assert command.startswith(words) and " --perturb '{" in command
+    with pytest.raises(SettingsError, match="photos/desk: masks"):
+        found.data.required_truth(Job("photos", "desk", "truth"))
 
 
 def test_key_views_are_embedded_before_a_full_size_sam_segments_the_others(tmp_path, monkeypatch):
@@ -215,16 +219,15 @@ def test_key_views_are_embedded_before_a_full_size_sam_segments_the_others(tmp_p
     assert not found.first_answer(key) and not found.first_answer(one)
     assert found.masks_priority(desk) < found.masks_priority(key)
     assert "results/photos/desk/key-views/clip" in targets.default(found)
-    assert found.masks_stage(key) == "key_masks" and found.masks_stage(desk) == "masks"
-    assert found.key_gaussians(key) == ["results/photos/desk/gaussians.ply"]
-    assert found.key_gaussians(desk) == []
-    inputs = SimpleNamespace(gaussians="inner/gaussians.ply", key_masks=[], key_tree=[], truth=[])
-    assert found.masks_option(key, inputs) == "--gaussians inner/gaussians.ply"
+    assert found.kind("masks", key).name == "key_masks" and found.kind("masks", desk).name == "masks"
     guided = plan(tmp_path, **config, masks={"prompts": "guided"})
-    assert guided.masks_stage(desk) == "guided_masks" and guided.masks_stage(one) == "masks"
-    assert guided.key_parts(desk, "masks") == ["results/photos/desk/key-views/masks"]
-    assert guided.key_parts(desk, "semantic_tree") == ["results/photos/desk/key-views/semantic_tree"]
-    assert guided.key_parts(one, "masks") == found.key_parts(desk, "masks") == []
+    assert guided.kind("masks", desk).name == "guided_masks"
+    assert guided.kind("masks", one).name == "masks"
+    assert guided.shared_variant("masks", Job("photos", "desk", "paper")) == "default"
+    for name, path in (("guided_masks", "photos/desk/default/"), ("key_masks", "photos/desk/key-views/")):
+        assert re.match(guided.jobs_of(name), path) and not re.match(guided.jobs_of("masks"), path)
+        assert not re.match(guided.jobs_of(name), "synthetic/one/default/")
+    assert guided.of_key_views("masks")(desk) == "results/photos/desk/key-views/masks"
     assert not plan(tmp_path, **(config | {"variants": {}})).first_answer(desk)
 
 
@@ -235,9 +238,9 @@ def test_each_photograph_is_an_input_and_hidden_files_are_not(tmp_path):
     found = plan(tmp_path, groups=["photos"])
     files = found.data.image_files(Job("photos", "desk"))
     assert [Path(file).name for file in files] == ["0.jpg", "1.jpg"]
-    assert found.data.poses_option(Job("photos", "desk")) == ""
+    assert not found.data.is_render(Job("photos", "desk")) and not found.data.poses(Job("photos", "desk"))
     assert found.data.image_files(Job()) == "results/synthetic/one/world/images"
-    assert found.data.poses_option(Job()) == "--render"
+    assert found.data.is_render(Job())
 
 
 def test_labels_of_a_published_scene_determine_reader_and_options(tmp_path):
@@ -247,12 +250,12 @@ def test_labels_of_a_published_scene_determine_reader_and_options(tmp_path):
     found = plan(tmp_path, groups=["lerf"], data_root=str(tmp_path))
     job = Job("lerf", "figurines")
     assert found.data.label_readers(job) == ("hilsplat.datasets.images.lerf_ovs:DATASET",)
-    assert [Path(file).name for file in found.data.truth_or_labels(job)] == ["frame_1.json"]
-    assert found.data.truth_option(job, None) == f"--labels lerf_ovs/figurines --data-root {tmp_path}"
-    inputs = SimpleNamespace(truth="results/rooms/room/world/truth")
-    option = found.data.truth_option(Job("rooms", "room"), inputs)
-    assert option == "--truth results/rooms/room/world/truth --kind room"
-    assert found.data.label_readers(Job("rooms", "room")) == ()
+    assert [Path(file).name for file in found.data.label_files(job)] == ["frame_1.json"]
+    assert found.data.label_names(job) == ("lerf_ovs/figurines",) and found.data.truth(job) == []
+    room = Job("rooms", "room")
+    assert found.data.truth(room) == ["results/rooms/room/world/truth"]
+    assert found.data.generated_source(room) == "world:room:1"
+    assert found.data.label_names(room) == found.data.label_readers(room) == ()
 
 
 def test_tables_have_their_own_scenes_and_variants(tmp_path):
@@ -333,14 +336,11 @@ def test_a_run_names_its_models_and_warns_if_answers_are_meaningless(tmp_path, m
         assert models_of_photographs(file, "desk") == [line]
 
 
-READY = {"params.truth", "params.option", "params.existing", "params.absent", "params.poses"}
-READY |= {"resources.mem_mib", "threads"}
-"""Unquoted parts of commands: options that the plan has quoted, and numbers."""
-
-
-def test_every_rule_quotes_what_it_puts_into_a_command(project):
-    rules = sorted((project / "rules").glob("*.smk"))
-    commands = [part.split("\nrule ")[0] for path in rules for part in path.read_text().split("shell:")[1:]]
-    assert len(commands) > 15
-    placed = [place for command in commands for place in re.findall(r"{([^}]*)}", command)]
-    assert {place for place in placed if not place.endswith(":q")} <= READY
+def test_commands_quote_what_they_contain(tmp_path):
+    found = plan(tmp_path, query={"vocabulary": "it's; rm -rf.txt"})
+    inputs = SimpleNamespace(semantic_tree="a b", clip="$(c)")
+    command = found.params("names")["command"](Job(), inputs, ["results/synthetic/one/default/names"])
+    words = shlex.split(command)
+    assert words[:5] == ["names", "--semantic-tree", "a b", "--clip", "$(c)"]
+    assert json.loads(words[words.index("--settings") + 1])["vocabulary"] == "it's; rm -rf.txt"
+    assert words[words.index("--cache") + 1] == "results/.cache"
