@@ -40,47 +40,19 @@ report: "workflow/report/overview.rst"
 LOCK = prepare_process()
 
 
-def own_cores():
-    """Return this machine's cores if it runs the jobs, or None on a cluster, where --jobs applies instead."""
-    try:
-        cores = workflow.cores
-    except WorkflowError:
-        return None
-    if cores < 1:
-        raise WorkflowError("with --cores 0, no job can start; expected at least 1")
-    return cores
-
-
-def given(files):
-    """Return an input function for files outside the results, whose paths get no prefix from a module."""
-
-    def paths(wildcards):
-        names = files(wildcards)
-        return names if isinstance(names, str) else [local(name) for name in names]
-
-    return paths
-
-
-def picture(path, category, name, **labels):
-    """Return a picture or table for the report."""
-    caption = INSTALLED / "workflow/report" / f"{name}.rst"
-    return report(path, caption=str(caption), category=category, **labels)
-
-
-def scene_picture(name):
-    path = f"<results>/figures/{{dataset}}/{{scene}}/{name}.png"
-    labels = {"figure": targets.PICTURES[name]}
-    return picture(path, "Scenes", name, subcategory="{dataset}/{scene}", labels=labels)
-
-
+# This machine's cores if it runs the jobs, or None on a cluster, where --jobs applies instead.
+CORES = workflow.resource_settings.cores
+if CORES == 0:
+    raise WorkflowError("with --cores 0, no job can start; expected at least 1")
 try:
     PLAN = Plan(
         merged_config([], config)
     )  # a module's `config:` replaces the configfile
-    PLAN.require_usable(devices=own_cores() is not None)
+    PLAN.require_usable(devices=CORES is not None)
 except HilsplatError as error:  # users can fix these errors without a traceback
     raise WorkflowError(str(error)) from None
-RESOURCES = JobResources(PLAN, own_cores())
+RESOURCES = JobResources(PLAN, CORES)
+LABELS = {"files": PLAN.data.label_files, "plugins": PLAN.data.label_readers}
 
 
 pathvars:
@@ -98,13 +70,14 @@ rule stage:
     log:
         "<results>/logs/stage.log",
     conda:
-        "workflow/envs/hilsplat.yaml"
+        str(INSTALLED / "workflow/envs/hilsplat.yaml")
     threads: RESOURCES.threads
     shell:
         "python -m hilsplat --log {log:q} {params.command} --threads {threads}"
-        " --memory {resources.mem_mib} --out {output[0]:q}"
+        " --memory {resources.mem_mib} --out {output.out:q}"
 
 
+include: "rules/common.smk"
 include: "rules/scene.smk"
 include: "rules/splat.smk"
 include: "rules/segment.smk"

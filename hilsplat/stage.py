@@ -144,6 +144,16 @@ class Stage(Generic[P, R]):
         return self._with(Role.JSON)
 
     @cached_property
+    def arguments(self) -> list[str]:
+        """Names of the parameters that commands take without an option's name."""
+        argument = type(typer.Argument())
+        return [
+            name
+            for name, hint in self.hints.items()
+            if any(isinstance(value, argument) for value in metadata_of(hint))
+        ]
+
+    @cached_property
     def sections(self) -> dict[str, str]:
         """Section of the settings of each parameter that is one."""
         classes = {

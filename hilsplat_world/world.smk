@@ -1,7 +1,7 @@
 # Synthetic scenes: images for the stages, ground truth for evaluation, figures and the diagnostic segmenter.
 use rule stage as world with:
     output:
-        images=directory("<results>/{dataset}/{scene}/world/images"),
+        out=directory("<results>/{dataset}/{scene}/world/images"),
         truth=directory("<results>/{dataset}/{scene}/world/truth"),
     log:
         PLAN.log("world"),
@@ -30,7 +30,7 @@ use rule stage as mask_truth with:
         truth=PLAN.data.truth,
         masks="<results>/{dataset}/{scene}/default/masks",
     output:
-        picture=scene_picture("masks"),
+        out=scene_picture("masks"),
         table="<results>/figures/{dataset}/{scene}/masks.csv",
     log:
         PLAN.log("mask_truth"),

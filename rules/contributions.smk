@@ -5,7 +5,7 @@ use rule stage as contributions with:
         scene="<results>/{dataset}/{scene}/scene",
         gaussians="<results>/{dataset}/{scene}/gaussians.ply",
     output:
-        directory("<results>/{dataset}/{scene}/{variant}/contributions"),
+        out=directory("<results>/{dataset}/{scene}/{variant}/contributions"),
     log:
         PLAN.log("contributions"),
     benchmark:

@@ -5,7 +5,7 @@ use rule stage as clip with:
         scene="<results>/{dataset}/{scene}/scene",
         semantic_tree=PLAN.crops_tree,  # empty if every mask is embedded
     output:
-        directory("<results>/{dataset}/{scene}/{variant}/clip"),
+        out=directory("<results>/{dataset}/{scene}/{variant}/clip"),
     log:
         PLAN.log("clip"),
     benchmark:
@@ -39,7 +39,7 @@ use rule stage as names with:
         **PLAN.shared("semantic_tree", "clip"),
         vocabulary=given(PLAN.vocabulary),  # empty, unless you supply a file
     output:
-        directory("<results>/{dataset}/{scene}/{variant}/names"),
+        out=directory("<results>/{dataset}/{scene}/{variant}/names"),
     log:
         PLAN.log("names"),
     benchmark:

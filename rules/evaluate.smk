@@ -7,7 +7,7 @@ use rule stage as evaluate with:
         truth=PLAN.data.truth,  # empty, except for a generated scene
         labels=given(PLAN.data.label_files),
     output:
-        scores="<results>/{dataset}/{scene}/{variant}/scores.csv",
+        out="<results>/{dataset}/{scene}/{variant}/scores.csv",
         times="<results>/{dataset}/{scene}/{variant}/times.csv",
         instances="<results>/{dataset}/{scene}/{variant}/instances.npz",
     log:
@@ -21,8 +21,7 @@ use rule stage as evaluate with:
     params:
         **PLAN.params(
             "evaluate",
-            files=PLAN.data.label_files,
-            plugins=PLAN.data.label_readers,
+            **LABELS,
             name=PLAN.data.scene_name,
         ),
 
@@ -34,7 +33,7 @@ use rule stage as table with:
         instances=targets.scores_of(PLAN, "instances.npz"),
         published=lambda wildcards: str(published_values(wildcards.table)),
     output:
-        csv="<results>/tables/{table}.csv",
+        out="<results>/tables/{table}.csv",
         md="<results>/tables/{table}.md",
         tex="<results>/tables/{table}.tex",
         html=picture("<results>/tables/{table}.html", "Tables", "table"),
@@ -65,7 +64,7 @@ use rule stage as efficiency with:
     input:
         targets.default(PLAN),
     output:
-        csv="<results>/efficiency.csv",
+        out="<results>/efficiency.csv",
         md="<results>/efficiency.md",
     log:
         PLAN.log("efficiency"),

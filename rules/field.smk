@@ -3,7 +3,7 @@ use rule stage as autoencoder with:
     input:
         **PLAN.shared("clip", "semantic_tree", "contributions"),
     output:
-        directory("<results>/{dataset}/{scene}/{variant}/autoencoder"),
+        out=directory("<results>/{dataset}/{scene}/{variant}/autoencoder"),
     log:
         PLAN.log("autoencoder"),
     benchmark:
@@ -24,7 +24,7 @@ use rule stage as field with:
         masks=PLAN.rendered("masks"),
         start=PLAN.first_field,  # empty, except for start: langsplat
     output:
-        "<results>/{dataset}/{scene}/{variant}/field.safetensors",
+        out="<results>/{dataset}/{scene}/{variant}/field.safetensors",
     log:
         PLAN.log("field"),
     benchmark:
@@ -45,7 +45,7 @@ use rule stage as method with:
         scene="<results>/{dataset}/{scene}/scene",
         gaussians="<results>/{dataset}/{scene}/gaussians.ply",
     output:
-        "<results>/{dataset}/{scene}/{variant}/field.safetensors",
+        out="<results>/{dataset}/{scene}/{variant}/field.safetensors",
     log:
         PLAN.log("method"),
     benchmark:

@@ -1,18 +1,14 @@
 # Pictures per scene and the report.
 use rule stage as figures with:
     input:
+        **PLAN.of_default(*PARTS),
         scene="<results>/{dataset}/{scene}/scene",
         fit="<results>/{dataset}/{scene}/gaussians",
         truth=PLAN.data.truth,
         labels=given(PLAN.data.label_files),
         gaussians="<results>/{dataset}/{scene}/gaussians.ply",
-        masks="<results>/{dataset}/{scene}/default/masks",
-        clip="<results>/{dataset}/{scene}/default/clip",
-        semantic_tree="<results>/{dataset}/{scene}/default/semantic_tree",
-        field="<results>/{dataset}/{scene}/default/field.safetensors",
-        autoencoder="<results>/{dataset}/{scene}/default/autoencoder",
     output:
-        panel=scene_picture("panel"),
+        out=scene_picture("panel"),
         registration=scene_picture("registration"),
         fit=scene_picture("fit"),
     log:
@@ -23,12 +19,7 @@ use rule stage as figures with:
     resources:
         **RESOURCES.of("figures"),
     params:
-        **PLAN.params(
-            "figures",
-            files=PLAN.data.label_files,
-            plugins=PLAN.data.label_readers,
-            labels=PLAN.data.figure_labels,
-        ),
+        **PLAN.params("figures", **LABELS, labels=PLAN.data.figure_labels),
 
 
 use rule stage as comparison with:
@@ -40,7 +31,7 @@ use rule stage as comparison with:
         gaussians="<results>/{dataset}/{scene}/gaussians.ply",
         scores=PLAN.compared_scores,  # their provenance records the settings of the queries
     output:
-        methods=scene_picture("comparison"),
+        out=scene_picture("comparison"),
         views=scene_picture("views"),
         features=scene_picture("features"),
     log:
@@ -51,19 +42,14 @@ use rule stage as comparison with:
     resources:
         **RESOURCES.of("comparison"),
     params:
-        **PLAN.params(
-            "comparison",
-            files=PLAN.data.label_files,
-            plugins=PLAN.data.label_readers,
-            labels=PLAN.data.figure_labels,
-        ),
+        **PLAN.params("comparison", **LABELS, labels=PLAN.data.figure_labels),
 
 
 use rule stage as sweep_plot with:
     input:
         table="<results>/tables/{sweep}.csv",
     output:
-        plot=picture("<results>/figures/sweep-{sweep}.png", "Sweeps", "sweep"),
+        out=picture("<results>/figures/sweep-{sweep}.png", "Sweeps", "sweep"),
     log:
         PLAN.log("sweep_plot", "-{sweep}"),
     benchmark:

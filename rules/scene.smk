@@ -3,7 +3,7 @@ use rule stage as source with:
     input:
         given(PLAN.data.source_files),
     output:
-        directory("<results>/{dataset}/{scene}/source"),
+        out=directory("<results>/{dataset}/{scene}/source"),
     log:
         PLAN.log("source"),
     benchmark:
@@ -25,7 +25,7 @@ use rule stage as poses with:
     input:
         given(PLAN.data.image_files),
     output:
-        directory("<results>/{dataset}/{scene}/scene"),
+        out=directory("<results>/{dataset}/{scene}/scene"),
     log:
         PLAN.log("poses"),
     benchmark:

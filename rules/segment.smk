@@ -3,7 +3,7 @@ use rule stage as masks with:
     input:
         scene="<results>/{dataset}/{scene}/scene",
     output:
-        directory("<results>/{dataset}/{scene}/{variant}/masks"),
+        out=directory("<results>/{dataset}/{scene}/{variant}/masks"),
     log:
         PLAN.log("masks"),
     benchmark:
@@ -57,7 +57,7 @@ use rule stage as coverage_tree with:
     input:
         **PLAN.shared("masks"),
     output:
-        directory("<results>/{dataset}/{scene}/{variant}/coverage_tree"),
+        out=directory("<results>/{dataset}/{scene}/{variant}/coverage_tree"),
     log:
         PLAN.log("coverage_tree"),
     benchmark:

@@ -3,7 +3,7 @@ use rule stage as semantic_tree with:
     input:
         **PLAN.shared("contributions", "masks"),
     output:
-        directory("<results>/{dataset}/{scene}/{variant}/semantic_tree"),
+        out=directory("<results>/{dataset}/{scene}/{variant}/semantic_tree"),
     log:
         PLAN.log("semantic_tree"),
     benchmark:

@@ -7,7 +7,7 @@ use rule stage as gaussians with:
         dataparser=given(PLAN.data.gaussians("dataparser")),
         transforms=given(PLAN.data.gaussians("transforms")),
     output:
-        ply="<results>/{dataset}/{scene}/gaussians.ply",
+        out="<results>/{dataset}/{scene}/gaussians.ply",
         coordinates="<results>/{dataset}/{scene}/gaussians.json",
         report=directory("<results>/{dataset}/{scene}/gaussians"),
     log:

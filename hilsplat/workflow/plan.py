@@ -62,13 +62,14 @@ def escape_json_for_report(text: str) -> str:
     return text.replace("<", "\\u003c")
 
 
-def options_of(name: str, value: Any) -> list[str]:
-    """Return an option of a command line for each value; none for an empty value."""
-    option = f"--{name.replace('_', '-')}"
+def words_of(name: str, value: Any, *, is_argument: bool) -> list[str]:
+    """Return an option or argument of a command line for each value; none for an empty value."""
+    option = [] if is_argument else [f"--{name.replace('_', '-')}"]
     if value is True:
-        return [option]
+        return option
     values = value if isinstance(value, list | tuple) else [value]
-    return [f"{option} {shlex.quote(str(item))}" for item in values if item not in ("", None, False)]
+    words = [[*option, shlex.quote(str(item))] for item in values if item not in ("", None, False)]
+    return [" ".join(pair) for pair in words]
 
 
 class Plan:
@@ -127,7 +128,7 @@ class Plan:
             "names": self.names,
             "queries": self.queries,
             "folder": lambda job, input, _: str(Path(input.gaussians).parent),
-            "results": lambda job, _, output: str(Path(output[0]).parent),
+            "results": lambda job, _, output: str(Path(output.out).parent),
         }
         self._json = functools.cache(lambda section, *which: self._section(section, *which).model_dump_json())
         self.identity = functools.cache(self._identity)
@@ -220,7 +221,7 @@ class Plan:
         def command(wildcards: Any, input: Any, output: Any) -> str:
             words = [stage.command]
             for option, value in self._options(stage, wildcards, input, output, options).items():
-                words += options_of(option, value)
+                words += words_of(option, value, is_argument=option in stage.arguments)
             return " ".join(words)
 
         params: dict[str, Any] = {
@@ -251,7 +252,7 @@ class Plan:
             elif name == "seed":
                 values[name] = str(self.seed(stage, job))
             elif name == "cache":  # in the results folder, whose path a module may prefix
-                values[name] = str(Path(output[0]).parents[depth] / ".cache")
+                values[name] = str(Path(output.out).parents[depth] / ".cache")
         return values
 
     def vocabulary(self, job: Job) -> list[str]:
@@ -298,6 +299,11 @@ class Plan:
             return list(dict.fromkeys(self.shared_path(name, main) for main in self._main_jobs(job)))
 
         return {name: functools.partial(paths, name) for name in artifacts}
+
+    def of_default(self, *artifacts: str) -> dict[str, str]:
+        """Return patterns of the artifacts of the variant `default`, which shares those of no other."""
+        files = {name: kinds_of(name)[-1].file for name in artifacts}
+        return {name: f"<results>/{{dataset}}/{{scene}}/default/{file}" for name, file in files.items()}
 
     def of_key_views(self, artifact: str) -> Callable[[Job], str]:
         """Return the input function for an artifact of the key views."""

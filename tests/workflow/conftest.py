@@ -14,8 +14,8 @@ import pytest
 
 MODELS = ("models/sam-tiny", "models/clip-tiny")
 """The only models of the checkout that tests use."""
-PLUGIN = "snakemake_logger_plugin_hilsplat"
-PARTS = ("Snakefile", "rules", "workflow", "profiles", "config", "hilsplat", PLUGIN, *MODELS)
+PACKAGES = ("cpusplat", "hilsplat", "hilsplat_world", "snakemake_logger_plugin_hilsplat")
+PARTS = ("Snakefile", "rules", "workflow", "profiles", "config", *PACKAGES, *MODELS)
 SCENE = Path("results/synthetic/tiny")
 UNFINISHED = shutil.ignore_patterns("*.pyc", "*.pyc.*", "*.tmp.*")
 """Files of Python and numba that other tests may be writing; they are renamed once complete."""
