@@ -21,7 +21,7 @@ import typer
 
 from hilsplat.base.artifacts import output_lock, provenance_path, require_free_space, was_interrupted
 from hilsplat.base.cache import writable
-from hilsplat.base.code import code_digest
+from hilsplat.base.code import code_digest, modules_of
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.provenance import Inputs, require_replaceable, write_provenance
 from hilsplat.base.removal import delete
@@ -134,6 +134,12 @@ class Stage(Generic[P, R]):
         return self._with(Role.INPUT)
 
     @cached_property
+    def needs(self) -> list[str]:
+        """Names of the inputs that are not optional."""
+        parameters = inspect.signature(self.function).parameters
+        return [name for name in self.inputs if parameters[name].default is inspect.Parameter.empty]
+
+    @cached_property
     def outputs(self) -> list[str]:
         """Names of the parameters that are paths of outputs, `out` first."""
         return sorted(self._with(Role.OUTPUT), key=lambda name: name != "out")
@@ -164,12 +170,20 @@ class Stage(Generic[P, R]):
         names = {cls: section for section, cls in SECTIONS.items()}
         return {name: names[cls] for name, cls in classes.items()}
 
+    def modules(self) -> list[str]:
+        """Return the modules that the function imports, directly or not."""
+        return modules_of(*self._imports)
+
     def code_digest(self, plugins: Sequence[str] = ()) -> str:
-        """Return the digest of the modules that the function imports, and of the plugins that a call uses."""
+        """Return the digest of the function, its modules, and the plugins that a call uses."""
         code = inspect.unwrap(self.function).__code__
-        modules = [step.argval for step in dis.get_instructions(code) if step.opname == "IMPORT_NAME"]
-        own = repr((code.co_code, code.co_names))
-        return hashlib.sha256(f"{own} {code_digest(*modules, *plugins)}".encode()).hexdigest()[:16]
+        text = repr((code.co_code, code.co_names, code_digest(*self._imports, *plugins)))
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    @property
+    def _imports(self) -> list[str]:
+        steps = dis.get_instructions(inspect.unwrap(self.function).__code__)
+        return [step.argval for step in steps if step.opname == "IMPORT_NAME"]
 
 
 @dataclass

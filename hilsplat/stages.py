@@ -8,6 +8,7 @@ Stages of plugins, such as those of the synthetic world, come from entry points 
 `hilsplat.stages`. Modules of stages are imported when a stage runs.
 """
 
+import sys
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -641,3 +642,13 @@ def stage_of(name: str) -> Stage[..., Any]:
     if name not in all_stages():
         raise HilsplatError(f"unknown stage {name!r}", expected=f"one of {', '.join(all_stages())}")
     return all_stages()[name]
+
+
+def stages_of_file(path: Path) -> list[str]:
+    """Return the stages that run again after an edit of a file: those that import its module."""
+    module = ".".join(path.with_suffix("").parts)
+    return [stage.name for stage in all_stages().values() if module in stage.modules()]
+
+
+if __name__ == "__main__":
+    print(*stages_of_file(Path(sys.argv[1])), sep="\n")  # noqa: T201

@@ -1,7 +1,7 @@
 # Weights of each Gaussian in each mask, from one pass over the views.
 use rule stage as contributions with:
     input:
-        **PLAN.shared("masks"),
+        **PLAN.inputs("contributions"),
         scene="<results>/{dataset}/{scene}/scene",
         gaussians="<results>/{dataset}/{scene}/gaussians.ply",
     output:

@@ -1,7 +1,7 @@
 # CLIP vectors of the crops that show each node best, or of every mask; names of nodes from a vocabulary.
 use rule stage as clip with:
     input:
-        **PLAN.shared("masks"),
+        **PLAN.inputs("clip"),
         scene="<results>/{dataset}/{scene}/scene",
         semantic_tree=PLAN.crops_tree,  # empty if every mask is embedded
     output:
@@ -21,7 +21,7 @@ use rule stage as clip with:
 
 use rule clip as imported_clip with:
     input:
-        **PLAN.shared("masks"),
+        **PLAN.inputs("imported_clip"),
         scene="<results>/{dataset}/{scene}/scene",
         files=given(PLAN.data.features),
     wildcard_constraints:
@@ -36,7 +36,7 @@ use rule clip as imported_clip with:
 
 use rule stage as names with:
     input:
-        **PLAN.shared("semantic_tree", "clip"),
+        **PLAN.inputs("names"),
         vocabulary=given(PLAN.vocabulary),  # empty, unless you supply a file
     output:
         out=directory("<results>/{dataset}/{scene}/{variant}/names"),

@@ -1,7 +1,7 @@
 # Scores and tables. Only evaluation and figures read the labels of data sets.
 use rule stage as evaluate with:
     input:
-        **PLAN.shared(*PARTS),
+        **PLAN.inputs("evaluate"),
         scene="<results>/{dataset}/{scene}/scene",
         gaussians="<results>/{dataset}/{scene}/gaussians.ply",
         truth=PLAN.data.truth,  # empty, except for a generated scene

@@ -1,7 +1,7 @@
 # The autoencoder of the scene's CLIP vectors, and the language field: ours, or that of a baseline.
 use rule stage as autoencoder with:
     input:
-        **PLAN.shared("clip", "semantic_tree", "contributions"),
+        **PLAN.inputs("autoencoder"),
     output:
         out=directory("<results>/{dataset}/{scene}/{variant}/autoencoder"),
     log:
@@ -18,7 +18,7 @@ use rule stage as autoencoder with:
 
 use rule stage as field with:
     input:
-        **PLAN.shared("contributions", "coverage_tree", "autoencoder"),
+        **PLAN.inputs("field"),
         scene=PLAN.rendered("scene"),  # empty, except for trainer: literal
         gaussians=PLAN.rendered("gaussians"),
         masks=PLAN.rendered("masks"),
@@ -41,7 +41,7 @@ use rule stage as field with:
 
 use rule stage as method with:
     input:
-        **PLAN.shared("masks", "contributions", "autoencoder"),
+        **PLAN.inputs("method"),
         scene="<results>/{dataset}/{scene}/scene",
         gaussians="<results>/{dataset}/{scene}/gaussians.ply",
     output:

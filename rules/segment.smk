@@ -55,7 +55,7 @@ use rule masks as imported_masks with:
 
 use rule stage as coverage_tree with:
     input:
-        **PLAN.shared("masks"),
+        **PLAN.inputs("coverage_tree"),
     output:
         out=directory("<results>/{dataset}/{scene}/{variant}/coverage_tree"),
     log:

@@ -1,7 +1,7 @@
 # A tree of nodes in 3D: masks linked across views, or Gaussians clustered by features.
 use rule stage as semantic_tree with:
     input:
-        **PLAN.shared("contributions", "masks"),
+        **PLAN.inputs("semantic_tree"),
     output:
         out=directory("<results>/{dataset}/{scene}/{variant}/semantic_tree"),
     log:
@@ -19,7 +19,7 @@ use rule stage as semantic_tree with:
 
 use rule semantic_tree as feature_tree with:
     input:
-        **PLAN.shared("contributions", "masks", "coverage_tree"),
+        **PLAN.inputs("feature_tree"),
     wildcard_constraints:
         dataset=PLAN.jobs_of("feature_tree"),
     params:

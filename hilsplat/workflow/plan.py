@@ -285,12 +285,12 @@ class Plan:
             if line
         ]
 
-    def shared(self, *artifacts: str) -> dict[str, Callable[[VariantJob], str]]:
-        """Return input functions for artifacts, each of the first variant whose artifact is the same.
-
-        Variants that are in no table are included, so that shared files do not move when tables change.
-        """
-        return {name: functools.partial(self.shared_path, name) for name in artifacts}
+    def inputs(self, name: str) -> dict[str, Callable[[VariantJob], str]]:
+        """Return input functions for the artifacts of a variant that a stage needs (`shared_path`)."""
+        stage = stage_of(name)
+        kinds = {artifact: kinds_of(artifact) for artifact in stage.needs}
+        names = [artifact for artifact, found in kinds.items() if found and found[-1].scope == "variant"]
+        return {artifact: functools.partial(self.shared_path, artifact) for artifact in names}
 
     def compared(self, *artifacts: str) -> dict[str, Callable[[Job], list[str]]]:
         """Return input functions for the artifacts of all variants in the main tables."""
@@ -310,7 +310,10 @@ class Plan:
         return lambda job: self.shared_path(artifact, of_variant(job, KEY_VIEWS))
 
     def shared_path(self, artifact: str, job: VariantJob) -> str:
-        """Return the path of an artifact, of the first variant whose artifact is the same."""
+        """Return the path of an artifact, of the first variant whose artifact is the same.
+
+        Variants that are in no table are included, so that shared files do not move when tables change.
+        """
         stage = kinds_of(artifact)[-1]
         variant = [self.shared_variant(artifact, job)] if stage.scope == "variant" else []
         return self.path(job, *variant, stage.file)

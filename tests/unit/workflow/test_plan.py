@@ -1,5 +1,6 @@
 """Inputs, parameters and targets that the rules take from the plan of a run."""
 
+import functools
 import json
 import re
 import shlex
@@ -125,7 +126,7 @@ def test_shared_files_keep_their_path_when_the_tables_change(tmp_path):
     found = plan(tmp_path, main_variants=["langsplat"], variants=variants)
     job = Job(variant="langsplat")
     code = "results/synthetic/one/network/autoencoder"
-    assert found.shared("autoencoder")["autoencoder"](job) == code
+    assert found.shared_path("autoencoder", job) == code
     assert Path(code) in found.artifacts(found.row(job))
     assert "results/synthetic/one/network/scores.csv" not in targets.default(found)
 
@@ -164,7 +165,7 @@ def test_inputs_of_the_literal_trainer_and_of_a_field_that_continues_langsplats(
 
 def test_an_override_of_one_scene_changes_what_it_shares(tmp_path):
     found = plan(tmp_path, overrides={"synthetic/two": {"coverage_tree": {"theta": 0.6}}})
-    shared = found.shared("field")["field"]
+    shared = functools.partial(found.shared_path, "field")
     assert shared(Job(variant="theta")).split("/")[3] == "theta"
     assert shared(Job("synthetic", "two", "theta")).split("/")[3] == "default"
     assert json.loads(found.settings("coverage_tree", Job("synthetic", "two")))["theta"] == 0.6
