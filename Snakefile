@@ -52,6 +52,9 @@ try:
 except HilsplatError as error:  # users can fix these errors without a traceback
     raise WorkflowError(str(error)) from None
 RESOURCES = JobResources(PLAN, CORES)
+estimates.resources = RESOURCES
+for name, reason in PLAN.absent.items():
+    logger.warning(f"{name} is skipped: {reason}")
 LABELS = {"files": PLAN.data.label_files, "plugins": PLAN.data.label_readers}
 
 
@@ -116,9 +119,6 @@ onstart:
         workflow.config_settings.configfiles,
         workflow.config_settings.config,
     )
-    estimates.resources = RESOURCES
-    for name, reason in PLAN.absent.items():
-        logger.warning(f"{name} is skipped: {reason}")
     for line in PLAN.ignored:
         logger.warning(line)
     for line in PLAN.model_lines():

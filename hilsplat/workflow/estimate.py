@@ -14,7 +14,7 @@ from hilsplat.scene.finished import KEY_VIEWS
 from hilsplat.scene.sheet import PHOTOS, SceneRow
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.progress import duration
-from hilsplat.workflow.resources import GUIDED, NODES, PICTURE_S, START_S, JobResources
+from hilsplat.workflow.resources import GUIDED, NODES, PICTURE_S, START_S, JobResources, cost_name
 from hilsplat.workflow.scene_data import of_variant
 
 GPU_GAIN = {"gaussians": 4, "masks": 27, "clip": 60}
@@ -50,7 +50,7 @@ class RunEstimate:
         self._jobs = defaultdict[str, list[JobEstimate]](list)
 
     def add(self, rule: str, wildcards: Mapping[str, str], memory_mb: int) -> None:
-        gain = GPU_GAIN.get(rule, 0)
+        gain = GPU_GAIN.get(cost_name(rule), 0)
         if "scene" not in wildcards:
             self._jobs[OTHERS].append(JobEstimate("", 0.0, memory_mb, START_S, gain))
             return

@@ -34,7 +34,7 @@ from hilsplat.workflow.scene_data import Job
 with Path(__file__).with_suffix(".tsv").open(encoding="utf-8") as _stream:
     _rows = list(csv.DictReader(_stream, delimiter="\t"))
 COSTS = {row.pop("stage"): {name: float(value) for name, value in row.items()} for row in _rows}
-"""Stage -> its terms; stages without a row of their own cost what the main stage of their artifact costs."""
+"""Stage -> its terms (`cost_name`)."""
 
 MP_PER_THREAD = 2.0  # megapixels of all views per thread
 
@@ -74,13 +74,14 @@ UNTRAINED = ("lifted", "occam", "dr_splat")  # baselines without training
 UNKNOWN_MP = 0.5  # megapixels assumed per view if no image header can be read before the run
 
 
-def cost_of(name: str) -> dict[str, float]:
-    """Return the terms of a stage's cost; those of a rule that is no stage are 0."""
-    stage = all_stages().get(name)
-    return COSTS.get(name) or (COSTS.get(family_of(stage)) if stage else None) or OTHER
-
-
 OTHER = {"base": 500.0} | {name: 0.0 for name in next(iter(COSTS.values())) if name != "base"}
+"""Cost of rules that are not listed: those without a scene."""
+
+
+def cost_name(rule: str) -> str:
+    """Return the listed stage whose cost a rule has: its own, or the main stage of its artifact."""
+    stage = all_stages().get(rule)
+    return rule if rule in COSTS or stage is None else family_of(stage)
 
 
 class Size(NamedTuple):
@@ -128,14 +129,14 @@ class JobResources:
         """Return the function for the resource `mem_mb` of a rule."""
 
         def needed(wildcards: Any, threads: int, attempt: int) -> int:
-            cost = cost_of(rule)
+            cost = COSTS.get(cost_name(rule), OTHER)
             mb = cost["base"]
             if hasattr(wildcards, "scene"):
                 row = self.plan.row(wildcards)
                 (views, view_mp), thousand = self.size(row), self.gaussians(row) / 1000
                 mb += (cost["mp"] * views + cost["view_mp"] + cost["thread_mp"] * threads) * view_mp
                 mb += min(cost["cap"], cost["capped_mp"] * views * view_mp) + cost["thousand"] * thousand
-                mb = max(mb, self._model_mb(rule, wildcards, threads))
+                mb = max(mb, self._model_mb(cost_name(rule), wildcards, threads))
                 if rule == "comparison":
                     mb += len(self.plan.run.main_variants) * (COMPARED_MB[0] + COMPARED_MB[1] * thousand)
             return math.ceil((mb + RUNNER_MB) / 100) * 100 * 2 ** (attempt - 1)
@@ -166,16 +167,16 @@ class JobResources:
 
     def disk_mb(self, rule: str, job: Job) -> float:
         """Return the megabytes that a scene's job writes, including caches."""
-        row, cost = self.plan.row(job), cost_of(rule)
+        row, cost = self.plan.row(job), COSTS.get(cost_name(rule), OTHER)
         views, view_mp = self.size(row)
-        of_gaussians = cost.get("disk_thousand", 0.0) * self.gaussians(row) / 1000
+        of_gaussians = cost["disk_thousand"] * self.gaussians(row) / 1000
         if rule in ("field", "method"):
             of_gaussians *= self.plan.stages(job).autoencoder.latent
-        return cost.get("disk_mp", 0.0) * views * view_mp + of_gaussians
+        return cost["disk_mp"] * views * view_mp + of_gaussians
 
     def core_seconds(self, rule: str, job: Job) -> float:
         """Return the estimated core seconds of a scene's job."""
-        return START_S + self._seconds(rule, *self.plan.which(job), self.size(self.plan.row(job)))
+        return START_S + self._seconds(cost_name(rule), *self.plan.which(job), self.size(self.plan.row(job)))
 
     def _estimate(self, rule: str, variant: str, scopes: tuple[str, ...], size: Size) -> float:
         stages = self.plan.stages_of(variant, scopes)
@@ -205,7 +206,7 @@ class JobResources:
             return LITERAL_S_PER_MP * len(LEVELS) * stages.field.iterations * view_mp
         if rule == "autoencoder" and stages.autoencoder.code == "network":
             return NETWORK_S
-        return cost_of(rule).get("core_s_per_mp", 0.0) * views * view_mp
+        return COSTS.get(rule, OTHER)["core_s_per_mp"] * views * view_mp
 
     def _size(self, row: SceneRow) -> Size:
         """Return the size of a scene from its cameras, or from its settings or image headers."""
