@@ -172,16 +172,17 @@ class Stage(Generic[P, R]):
 
     def modules(self) -> list[str]:
         """Return the modules that the function imports, directly or not."""
-        return modules_of(*self._imports)
+        return modules_of(*self.imports)
 
     def code_digest(self, plugins: Sequence[str] = ()) -> str:
         """Return the digest of the function, its modules, and the plugins that a call uses."""
         code = inspect.unwrap(self.function).__code__
-        text = repr((code.co_code, code.co_names, code_digest(*self._imports, *plugins)))
+        text = repr((code.co_code, code.co_names, code_digest(*self.imports, *plugins)))
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @property
-    def _imports(self) -> list[str]:
+    def imports(self) -> list[str]:
+        """Names of the modules that the function itself imports."""
         steps = dis.get_instructions(inspect.unwrap(self.function).__code__)
         return [step.argval for step in steps if step.opname == "IMPORT_NAME"]
 

@@ -340,7 +340,9 @@ def test_a_run_names_its_models_and_warns_if_answers_are_meaningless(tmp_path, m
 def test_commands_quote_what_they_contain(tmp_path):
     found = plan(tmp_path, query={"vocabulary": "it's; rm -rf.txt"})
     inputs = SimpleNamespace(semantic_tree="a b", clip="$(c)")
-    command = found.params("names")["command"](Job(), inputs, SimpleNamespace(out="results/synthetic/one/default/names"))
+    command = found.params("names")["command"](
+        Job(), inputs, SimpleNamespace(out="results/synthetic/one/default/names")
+    )
     words = shlex.split(command)
     assert words[:5] == ["names", "--semantic-tree", "a b", "--clip", "$(c)"]
     assert json.loads(words[words.index("--settings") + 1])["vocabulary"] == "it's; rm -rf.txt"

@@ -12,10 +12,10 @@ import pytest
 
 from hilsplat.base.artifacts import write_index
 from hilsplat.base.progress import LOG_FORMAT
+from hilsplat.stages import all_stages
 from hilsplat.workflow import progress
-from hilsplat.workflow.progress import LOOPS, Estimates, ProgressDisplay, RunProgress, duration
+from hilsplat.workflow.progress import Estimates, ProgressDisplay, RunProgress, duration
 from hilsplat.workflow.resources import JobResources
-from hilsplat.workflow.stages import STAGES
 from tests.unit.workflow.plans import BENCHMARK, plan_of
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -240,13 +240,12 @@ def test_a_long_last_job_is_not_divided_among_the_cores(screen, run):
     assert run.seconds_left() == 600
 
 
-@pytest.mark.parametrize("rule", LOOPS)
-def test_the_loop_of_a_rule_is_one_that_its_stage_runs(rule):
-    module = STAGES[rule].partition(":")[0]
-    tree = ast.parse((ROOT / f"{module.replace('.', '/')}.py").read_text())
-    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
-    texts = [each.args[1] for each in calls if getattr(each.func, "id", "") == "track"]
-    assert LOOPS[rule] in {text.value for text in texts if isinstance(text, ast.Constant)}
+@pytest.mark.parametrize("stage", [stage for stage in all_stages().values() if stage.loop], ids=str)
+def test_the_loop_of_a_stage_is_one_that_it_runs(stage):
+    trees = [ast.parse((ROOT / f"{module.replace('.', '/')}.py").read_text()) for module in stage.imports]
+    calls = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    texts = [call.args[1] for call in calls if getattr(call.func, "id", "") == "track"]
+    assert stage.loop in {text.value for text in texts if isinstance(text, ast.Constant)}
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,28 +11,27 @@ from hilsplat.base.artifacts import lock_path, output_lock, provenance_path, wri
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.provenance import Inputs, write_provenance
 from hilsplat.models.store import model_digest
-from hilsplat.workflow.records import Expected, Records, expected_artifacts, outdated, verify
-from hilsplat.workflow.stages import stage_code
-from tests.unit.workflow.plans import BENCHMARK, plan_of
+from hilsplat.stages import stage_of
+from hilsplat.workflow.records import outdated, verify
+from tests.unit.workflow.plans import BENCHMARK, Job, plan_of
 
-MASKS = Path("results/d/s/default/masks")
-TREE = Path("results/d/s/default/coverage_tree")
-EXPECTED = {MASKS: Expected("masks"), TREE: Expected("coverage_tree", {"theta": 0.9}, 7)}
+FOLDER = Path("results/synthetic/one/default")
+MASKS, TREE = FOLDER / "masks", FOLDER / "coverage_tree"
 
 
-def write(artifact: Path, text: str = "one", stage: str = "", **inputs: Path) -> None:
+def write(artifact: Path, text: str = "one", **inputs: Path) -> None:
     """Write an artifact and its record as the plan makes it."""
-    expected = EXPECTED[artifact]
+    plan, stage = plan_of(Path(), BENCHMARK[:1]), stage_of(artifact.name)
     for name in ("a.npz", "b.npz"):
         artifact.mkdir(parents=True, exist_ok=True)
         (artifact / name).write_text(text)
     write_provenance(
         artifact,
-        stage=stage or expected.stage,
-        code=stage_code(stage or expected.stage),
+        stage=stage.name,
+        code=stage.code_digest(),
         command=["hilsplat"],
-        settings=expected.settings,
-        seed=expected.seed,
+        settings={name: json.loads(plan.settings(name, Job())) for name in stage.sections.values()},
+        seed=None,
         inputs=Inputs("masks", inputs),
     )
 
@@ -49,23 +47,27 @@ def results(tmp_path, monkeypatch) -> Path:
     return Path("results")
 
 
-def problems(expected: dict[Path, Expected] | None = None, *, every_byte: bool = False) -> dict[str, str]:
-    records = Records(Path("results"), every_byte=every_byte)
-    found = {path.name: records.state(path, how)[1] for path, how in (expected or EXPECTED).items()}
-    return {name: reason for name, reason in found.items() if reason}
+def problems(*, every_byte: bool = False, **config: object) -> dict[str, str]:
+    plan = plan_of(Path(), BENCHMARK[:1], **config)
+    found = outdated(plan, every_byte=every_byte)
+    return {Path(path).name: reason for path, reason in found.items()}
 
 
 @pytest.mark.parametrize(
-    ("change", "reason"),
+    ("config", "reasons"),
     [
-        ({"settings": {"theta": 0.6}}, "made with theta 0.9, but the configuration has 0.6"),
-        ({"settings": {"theta": 0.9, "new": 1}}, "made with new None"),
-        ({"seed": 8}, "made with seed 7, but the configuration has 8"),
-        ({"stage": "clip"}, "it was made by stage coverage_tree, not clip"),
+        (
+            {"coverage_tree": {"theta": 0.6}},
+            {"coverage_tree": "it was made with coverage_tree {'theta': 0.9}"},
+        ),
+        ({"masks": {"segmenter": "truth-perturbed"}}, {"masks": "by stage masks, not truth_masks"}),
+        ({"evaluate": {"ancestors": 0.3}}, {}),
     ],
 )
-def test_other_settings_are_found(results, change, reason):
-    assert reason in problems({TREE: replace(EXPECTED[TREE], **change)})["coverage_tree"]
+def test_other_settings_are_found(results, config, reasons):
+    found = problems(**config)
+    assert found.keys() == reasons.keys()
+    assert all(reason in found[name] for name, reason in reasons.items())
 
 
 def test_missing_and_cut_files_are_found(results):
@@ -125,14 +127,6 @@ def test_a_flipped_bit_in_a_record_is_found(results, place):
     assert problems(every_byte=True) == {"coverage_tree": "its provenance is damaged"}
 
 
-def test_imported_artifacts_are_not_compared_with_settings(results):
-    write(MASKS, stage="langsplat")
-    write(TREE, masks=MASKS)
-    assert problems({MASKS: replace(EXPECTED[MASKS], settings={"model": "x"}), TREE: EXPECTED[TREE]}) == {}
-    (MASKS / "a.npz").unlink()
-    assert problems() == {"masks": "a.npz is missing from masks"}
-
-
 def test_lists_of_input_files_may_be_empty_and_are_compared_file_by_file(results):
     labels = [Path("photos/1.jpg").resolve()]
     write(MASKS, none=(), labels=labels)
@@ -153,24 +147,10 @@ def test_another_model_in_the_same_folder_is_found(results):
     assert problems() == {"masks": "its input model has changed: models/m"}
 
 
-def test_a_plan_expects_what_its_rules_write(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    variants = {
-        "lifted": {"method": {"name": "lifted"}},
-        "truth": {"masks": {"segmenter": "truth-perturbed"}},
-    }
-    plan = plan_of(tmp_path, BENCHMARK[:1], variants=variants)
-    found = expected_artifacts(plan)
-    folder = "results/synthetic/one"
-    assert found[f"{folder}/world"].output == f"{folder}/world/images"
-    assert found[f"{folder}/lifted/field.safetensors"].stage == "method"
-    assert found[f"{folder}/lifted/field.safetensors"].plugins == ("hilsplat.methods.lifted:fit",)
-    assert set(found[f"{folder}/truth/masks"].settings) == {"masks", "perturb"}
-    assert f"{folder}/lifted/masks" not in found, "it shares those of the default variant"
-    assert "results/tables/lerf.csv" in found
-    assert outdated(plan) == {}, "nothing has been made"
-    Path(folder, "default/masks").mkdir(parents=True)
-    assert outdated(plan) == {f"{folder}/default/masks": "it has no provenance"}
+def test_an_artifact_without_a_record_is_found(results):
+    assert problems() == {}
+    (FOLDER / "semantic_tree").mkdir()
+    assert problems() == {"semantic_tree": "it has no provenance"}
 
 
 def test_a_moved_folder_is_still_whole(results, tmp_path):

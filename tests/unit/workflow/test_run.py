@@ -1,6 +1,7 @@
 """`hilsplat run` before Snakemake starts: locks, recovery, options."""
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -40,13 +41,12 @@ def started(monkeypatch) -> list[list[str]]:
     """Snakemake command lines that would start."""
     found: list[list[str]] = []
 
-    def start(*args: object, **kwargs: object) -> None:
-        found.append(list(sys.argv))
-        raise SystemExit(3)
+    def start(command: list[str]) -> int:
+        found.append(command)
+        return 3
 
-    monkeypatch.setattr(runs.runpy, "run_module", start)
+    monkeypatch.setattr(runs, "_run", start)
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(4)), raising=False)
-    monkeypatch.setattr(sys, "argv", ["hilsplat"])
     return found
 
 
@@ -71,6 +71,7 @@ def test_a_run_takes_the_cores_of_the_machine_and_a_cluster_sets_its_own(folder,
     assert runs.run([], [], []) == 3, "Snakemake's exit status"
     runs.run([], [], ["--workflow-profile", "profiles/slurm"])
     here, cluster = started
+    assert here[:4] == [sys.executable, "-P", "-m", "snakemake"]
     assert value(here, "--cores") == "4" and "--cores" not in cluster
 
 
@@ -117,6 +118,12 @@ def test_a_second_run_with_the_same_results_is_refused(folder, started, tmp_path
     assert runs.run([], [], ["-n"]) == 3, "a dry run needs no lock"
     lock.close()
     assert runs.run([], [], []) == 3
+
+
+def test_a_signal_reaches_the_workflow_and_its_status_comes_back(folder):
+    code = "import os, signal; os.kill(os.getppid(), signal.SIGTERM); signal.pause()"
+    assert runs._run([sys.executable, "-c", code]) == 128 + signal.SIGTERM
+    assert runs._run([sys.executable, "-c", "raise SystemExit(5)"]) == 5
 
 
 def test_the_locks_of_a_dead_run_are_removed_once(folder, started, unlocked):
