@@ -93,7 +93,7 @@ class File(Message):
     text: str
 
 
-class Given(Message):
+class Files(Message):
     """Annotation files."""
 
     files: Annotated[list[File], Field(min_length=1, max_length=5000)]
@@ -165,14 +165,14 @@ class Annotator:
         routes = [
             *self.pages.routes(),
             *self.thread.routes(),
-            Route("/api/labels", get(_all_labels)),
+            get("/api/labels", _all_labels),
             Route("/api/labels/{number:int}", self._save, methods=["PUT"]),
-            Route("/api/shape", post(Shape, _shape), methods=["POST"]),
-            Route("/api/at", post(At, _at, self.drawing), methods=["POST"]),
-            Route("/api/segment", post(Segment, _segment, self.drawing), methods=["POST"]),
-            Route("/api/carry", post(Carry, _carry, self.drawing), methods=["POST"]),
-            Route("/api/import", post(Given, _import), methods=["POST"]),
-            Route("/api/export/{kind}", get(_export)),
+            post("/api/shape", Shape, _shape),
+            post("/api/at", At, _at, self.drawing),
+            post("/api/segment", Segment, _segment, self.drawing),
+            post("/api/carry", Carry, _carry, self.drawing),
+            post("/api/import", Files, _import),
+            get("/api/export/{kind}", _export),
         ]
         return guarded(routes, token, MAX_BODY_BYTES)
 
@@ -241,7 +241,7 @@ def _carry(opened: OpenedScene, asked: Carry) -> list[dict[str, Any]]:
     return [{**label.model_dump(), "polygons": polygons, "origin": "proposed"} for label, polygons in found]
 
 
-def _import(opened: OpenedScene, asked: Given) -> dict[str, Any]:
+def _import(opened: OpenedScene, asked: Files) -> dict[str, Any]:
     """Merge the annotations with those in files, and return them by view number; nothing is written.
 
     A file that cannot be used is noted; a single one is refused.

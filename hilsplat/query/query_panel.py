@@ -63,11 +63,11 @@ def query_panel(
         page.write(line, page.width_px / 2, (number + 0.5) * HEADING_PX, size=12.0, bold=True)
     for row, view in enumerate(views):
         top = upper_px - (len(views) - row) * row_px
-        image, mask = scene.image(view), scene.node_masks(view, hits.ids)
+        image, mask = scene.views.image(view), scene.views.node_masks(view, hits.ids)
         if answerer == "tree":
             relevancy = scene.node_relevancy_map([last], view)[0]
         else:
-            relevancy = scene.field_relevancy([last], view, exact=False)[0]
+            relevancy = scene.field.relevancy([last], view, exact=False)[0]
         low, high = float(relevancy.min()), float(relevancy.max())
         pictures = [(image, view), (paint_answer(image, mask), f"answer: {mask.mean():.1%} of the view")]
         for each in LEVELS:
@@ -79,7 +79,7 @@ def query_panel(
             bold = column == 2 + hits.level.index
             page.show(picture, name, LEFT_PX + column * (CELL_PX + GAP_PX), top, row_px, bold)
     selected = np.zeros(len(scene.gaussians), np.bool_)
-    selected[scene.gaussians_of(hits.ids)] = True
+    selected[scene.views.gaussians_of(hits.ids)] = True
     title = f"from above: {np.count_nonzero(selected)} of {len(selected)} Gaussians; triangles are cameras"
     below = (MAP_PX - TITLE_PX - GAP_PX) / page.height_px
     axes = page.figure.add_axes((0.02, GAP_PX / page.height_px, 0.96, below))

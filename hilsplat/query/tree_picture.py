@@ -137,16 +137,16 @@ def crop(
     """
     tree = scene.tree
     view = tree.view_names[int(tree.view_area_px[node].argmax())]
-    camera, photograph = scene.scene.cameras[view], scene.image(view)
-    rows = scene.gaussians_of([node])
+    camera, photograph = scene.scene.cameras[view], scene.views.image(view)
+    rows = scene.views.gaussians_of([node])
     x, y, side = _square_around(scene.gaussians.means[rows], camera)
     shift = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]])
     scale = np.diag([side_px / side, side_px / side, 1.0])
     inside = Camera("crop", camera.cam_from_world, scale @ shift @ camera.K, (side_px, side_px))
     member = np.zeros((len(scene.gaussians), 1), np.float32)
     member[rows] = 1
-    drawn = project_gaussians(scene.gaussians, inside, 0, scene.threads)
-    shares, alpha = blend_forward(drawn, member, scene.threads)
+    drawn = project_gaussians(scene.gaussians, inside, 0, scene.views.threads)
+    shares, alpha = blend_forward(drawn, member, scene.views.threads)
     is_node = shares[..., 0] > 0.5 * np.maximum(alpha, LEAST_ALPHA)
     pixels = resampled(photograph, x, y, side, side_px, ground)
     around = pixels * dimmed + (1 - dimmed) * ground

@@ -35,7 +35,7 @@ def labelled(
 
     A Gaussian in several groups is assigned to the one with the fewest Gaussians.
     """
-    members = [scene.gaussians_of(group.nodes) for group in groups]
+    members = [scene.views.gaussians_of(group.nodes) for group in groups]
     label = np.zeros(len(scene.gaussians), np.int32)
     for number in sorted(range(len(groups)), key=lambda number: -len(members[number])):
         label[members[number]] = number + 1
@@ -58,14 +58,15 @@ def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
     Groups are the COCO categories; a node in several groups has one annotation per group.
     """
     nodes = sorted({node for group in groups for node in group.nodes})
-    yield 0, len(scene.views)
+    views = scene.views.names
+    yield 0, len(views)
     held = io.BytesIO()
     description = f"{scene.scene.name}: masks of nodes, by hilsplat"
-    coco = coco_content(description, scene.views, scene.scene.cameras, [group.name for group in groups])
+    coco = coco_content(description, views, scene.scene.cameras, [group.name for group in groups])
     with zipfile.ZipFile(held, "w", zipfile.ZIP_DEFLATED) as archive:
-        for number, view in enumerate(scene.views):
+        for number, view in enumerate(views):
             for node in nodes:
-                mask = scene.node_masks(view, [node])
+                mask = scene.views.node_masks(view, [node])
                 if not mask.any():
                     continue
                 png = io.BytesIO()
@@ -77,7 +78,7 @@ def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
                     if node in group.nodes:
                         found = {"id": len(coco["annotations"]) + 1, "category_id": category}
                         coco["annotations"].append({**found, **described})
-            yield number + 1, len(scene.views)
+            yield number + 1, len(views)
         archive.writestr("coco.json", json.dumps(coco, ensure_ascii=False))
     return held.getvalue()
 

@@ -35,14 +35,14 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
     scene = shown.answering(asked.variant)
     questions = [*asked.kept, *([asked.last] if asked.last else [])]
     with shown.unchanged():
-        photos = [encoded(resize_to_fit(scene.image(view), PHOTO_PX), quality=75) for view in scene.views]
+        images = [resize_to_fit(scene.views.image(view), PHOTO_PX) for view in scene.views.names]
     described: dict[str, Any] = {
         "scene": {**shown.described(), "variants": [asked.variant], "chunk": len(shown.gaussians)},
         "variant": shown.described_variant(asked.variant),
         "asked": [question.model_dump(exclude_none=True) for question in questions],
         "answers": [payload.answer(scene, question) for question in questions],
         "kept": len(asked.kept),
-        "photos": [_text(photo) for photo in photos],
+        "photos": [_text(encoded(image, quality=75)) for image in images],
         "opening": asked.start,
         "crops": {},
     }

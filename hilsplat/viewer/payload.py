@@ -193,7 +193,7 @@ def _answer(scene: LanguageScene, text: str, hits: Sequence[Hit], relevancy: np.
             "level": hit.level.label,
             "score": round(hit.score, 4),
             "name": hit.name,
-            "best_views": [scene.views.index(view) for view in hit.best_views],
+            "best_views": [scene.views.names.index(view) for view in hit.best_views],
         }
         for hit in hits
     ]

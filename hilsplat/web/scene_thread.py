@@ -6,9 +6,10 @@ release the GIL, so the server stays responsive. The annotator's proposals have 
 
 import asyncio
 import secrets
-from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -90,9 +91,8 @@ def _state_of(part: Path) -> tuple[int, int, int] | None:
 
 
 Shown = TypeVar("Shown", bound=ShownScene)
-Made = TypeVar("Made")
+Result = TypeVar("Result")
 Sent = TypeVar("Sent", bound=BaseModel)
-Handler = Callable[[Request], Awaitable[Response]]
 
 
 class SceneThread(Generic[Shown]):
@@ -106,36 +106,49 @@ class SceneThread(Generic[Shown]):
     def routes(self) -> list[Route]:
         """Return the routes that both pages have."""
         return [
-            Route("/api/scene", self._opened_anew),
-            Route("/api/changes", self._changes),
-            Route("/api/photo/{number:int}", self.get(_photo, behind=True)),
-            Route("/api/thumb/{number:int}", self.get(_thumb, behind=True)),
+            self.get("/api/scene", self._reopened),
+            self.get("/api/changes", lambda shown, path: shown.news()),
+            self.get("/api/photo/{number:int}", _photo, behind=True),
+            self.get("/api/thumb/{number:int}", _thumb, behind=True),
         ]
 
-    def get(self, work: Callable[[Shown, Mapping[str, Any]], Any], *, behind: bool = False) -> Handler:
-        """Return a handler that sends the result of `work` for the scene and the path's parameters."""
+    def get(
+        self, path: str, work: Callable[[Shown, Mapping[str, Any]], Any], *, behind: bool = False
+    ) -> Route:
+        """Return a route that sends the result of `work` for the scene and the path's parameters."""
+        return Route(path, partial(self._get, work=work, behind=behind))
+
+    async def _get(
+        self, request: Request, *, work: Callable[[Shown, Mapping[str, Any]], Any], behind: bool
+    ) -> Response:
         do = self.do_behind if behind else self.do
-
-        async def handle(request: Request) -> Response:
-            return answer(await do(request, lambda shown: work(shown, request.path_params)))
-
-        return handle
+        return answer(await do(request, lambda shown: work(shown, request.path_params)))
 
     def post(
-        self, kind: type[Sent], work: Callable[[Shown, Sent], Any], worker: ThreadPoolExecutor | None = None
-    ) -> Handler:
-        """Return a handler that sends the result of `work`, called with the scene and the validated body.
+        self,
+        path: str,
+        kind: type[Sent],
+        work: Callable[[Shown, Sent], Any],
+        worker: ThreadPoolExecutor | None = None,
+    ) -> Route:
+        """Return a route that sends the result of `work`, called with the scene and the validated body.
 
         `worker`, if given, replaces the scene thread; `work` must then have its own caches.
         """
+        return Route(path, partial(self._post, kind=kind, work=work, worker=worker), methods=["POST"])
 
-        async def handle(request: Request) -> Response:
-            asked = await read(request, kind)
-            return answer(await self.do(request, lambda shown: work(shown, asked), worker))
+    async def _post(
+        self,
+        request: Request,
+        *,
+        kind: type[Sent],
+        work: Callable[[Shown, Sent], Any],
+        worker: ThreadPoolExecutor | None,
+    ) -> Response:
+        asked = await read(request, kind)
+        return answer(await self.do(request, lambda shown: work(shown, asked), worker))
 
-        return handle
-
-    async def do_behind(self, request: Request, work: Callable[[Shown], Made]) -> Made:
+    async def do_behind(self, request: Request, work: Callable[[Shown], Result]) -> Result:
         """Run `work` like `do`, but only one such call at a time, so that other requests need not wait long.
 
         When the page opens, the outline requests a hundred crops; other requests wait for at most one crop.
@@ -144,8 +157,8 @@ class SceneThread(Generic[Shown]):
             return await self.do(request, work)
 
     async def do(
-        self, request: Request, work: Callable[[Shown], Made], worker: ThreadPoolExecutor | None = None
-    ) -> Made:
+        self, request: Request, work: Callable[[Shown], Result], worker: ThreadPoolExecutor | None = None
+    ) -> Result:
         """Run `work` on the scene thread (or `worker`) if the page shows the current state of the scene.
 
         A page sends, as `of`, the state with which it was loaded, so that its cameras, nodes and Gaussians
@@ -156,7 +169,7 @@ class SceneThread(Generic[Shown]):
         """
         state = request.query_params.get("of")
 
-        def run() -> Made:
+        def run() -> Result:
             shown = self.shown
             if state not in (None, shown.state):
                 raise StaleSceneError("the scene has changed since this page was loaded", fix="reload it")
@@ -164,33 +177,27 @@ class SceneThread(Generic[Shown]):
 
         return await self.run(run, worker)
 
-    async def run(self, work: Callable[[], Made], worker: ThreadPoolExecutor | None = None) -> Made:
+    async def run(self, work: Callable[[], Result], worker: ThreadPoolExecutor | None = None) -> Result:
         """Run `work` on the scene thread (or `worker`), regardless of the scene's state."""
         return await asyncio.get_running_loop().run_in_executor(worker or self.worker, work)
 
-    async def _opened_anew(self, request: Request) -> Response:
-        """Send a newly opened page the scene's description; if the scene has changed, reopen it first."""
-
-        def run() -> dict[str, Any]:
-            if self.shown.changed():
-                self.shown = self.shown.opened_again()
-            return self.shown.described()
-
-        return answer(await self.run(run))
-
-    async def _changes(self, request: Request) -> Response:
-        return answer(await self.run(lambda: self.shown.news()))
+    def _reopened(self, shown: Shown, path: Mapping[str, Any]) -> dict[str, Any]:
+        """Describe the scene: views, Gaussians, variants; if it has changed, it is reopened."""
+        if shown.changed():
+            self.shown = shown.opened_again()
+        return self.shown.described()
 
 
-def _photo(shown: ShownScene, of: Mapping[str, Any]) -> Response:
-    path = shown.scene.image_path(view_name(shown.scene, of["number"]))
-    kind = "image/png" if path.suffix.lower() == ".png" else "image/jpeg"
+def _photo(shown: ShownScene, path: Mapping[str, Any]) -> Response:
+    """Return an undistorted photograph."""
+    file = shown.scene.image_path(view_name(shown.scene, path["number"]))
+    kind = "image/png" if file.suffix.lower() == ".png" else "image/jpeg"
     with shown.unchanged(*shown.photographs):
-        return plain(path.read_bytes(), kind, cached=True)
+        return plain(file.read_bytes(), kind, cached=True)
 
 
-def _thumb(shown: ShownScene, of: Mapping[str, Any]) -> Response:
-    view = view_name(shown.scene, of["number"])
+def _thumb(shown: ShownScene, path: Mapping[str, Any]) -> Response:
+    view = view_name(shown.scene, path["number"])
     with shown.unchanged(*shown.photographs):
         small = resize_to_fit(shown.scene.image(view), THUMB_PX)
     return plain(encoded(small), "image/jpeg", cached=True)
