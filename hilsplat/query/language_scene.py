@@ -59,7 +59,7 @@ class LanguageScene:
 
     views: SceneViews
     clip: ClipModel
-    settings: EvaluateSettings = EvaluateSettings()
+    settings: EvaluateSettings
     decoded_field: FieldAnswers | None = None
     names: NodeNames = dataclasses.field(default_factory=NodeNames)
     naming: NodeNaming | None = None

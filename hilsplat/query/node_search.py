@@ -126,11 +126,11 @@ def search(
         return NodeHits(chosen, value[chosen], "flat", (TextAnswer(path[0], level, best, *anywhere),))
     ways = [way for way in combinations(LEVELS, len(path)) if level in (None, way[-1])]
     if not ways:
-        levels = LEVELS if level is None else LEVELS[: level.index + 1]
+        labels = [known.label for known in LEVELS if level is None or known <= level]
         at_level = "" if level is None else f" at level {level.label}"
         raise SettingsError(
             f"the path {' > '.join(path)!r} cannot be searched{at_level}",
-            expected=f"1 to {len(levels)} texts, coarse to fine: {' > '.join(level.label for level in levels)}",
+            expected=f"1 to {len(labels)} texts, coarse to fine: {' > '.join(labels)}",
             found=f"{len(path)}",
             fix="name the object, then its part, then a part of that part",
         )

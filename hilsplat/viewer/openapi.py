@@ -1,4 +1,4 @@
-"""OpenAPI description of the requests that scripts can send, from the routes; docs/viewer.md has an example."""
+"""OpenAPI description of the requests that scripts can send, derived from the routes (docs/viewer.md)."""
 
 import inspect
 from collections.abc import Sequence

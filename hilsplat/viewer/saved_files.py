@@ -5,11 +5,12 @@ only arrays, so they have their own thread. The response contains lines of JSON,
 `{"made": 3, "of": 120}` after each step, `{"bytes": 12345}` before the file, or `{"error": "..."}`.
 """
 
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
+from pydantic import BaseModel
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
@@ -20,7 +21,7 @@ from hilsplat.splat.gaussians import morton_order
 from hilsplat.viewer import exports, payload, wire
 from hilsplat.viewer.html_page import html_page
 from hilsplat.viewer.viewer_scene import ViewerScene
-from hilsplat.web.scene_thread import SceneThread, Sent
+from hilsplat.web.scene_thread import SceneThread, Work
 from hilsplat.web.server import as_json, read
 
 
@@ -44,11 +45,7 @@ class SavedFiles:
         ]
 
     def _slow(
-        self,
-        path: str,
-        kind: type[Sent],
-        begin: Callable[[ViewerScene, Sent], exports.Steps],
-        worker: ThreadPoolExecutor | None = None,
+        self, path: str, kind: type[BaseModel], begin: Work, worker: ThreadPoolExecutor | None = None
     ) -> Route:
         """Return the route of a file; `begin` runs on the scene thread, later steps on a worker."""
         return Route(path, partial(self._in_steps, kind=kind, begin=begin, worker=worker), methods=["POST"])
@@ -57,8 +54,8 @@ class SavedFiles:
         self,
         request: Request,
         *,
-        kind: type[Sent],
-        begin: Callable[[ViewerScene, Sent], exports.Steps],
+        kind: type[BaseModel],
+        begin: Work,
         worker: ThreadPoolExecutor | None,
     ) -> Response:
         asked = await read(request, kind)

@@ -8,7 +8,7 @@ import asyncio
 import secrets
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -48,7 +48,7 @@ class ShownScene:
             self._seen.setdefault(part, _state_of(part))
 
     def changed(self, *parts: Path) -> list[str]:
-        """Return the names of the given parts (default: all) that were rewritten or deleted after `note`."""
+        """Return the names of the given parts (default: all) that were rewritten or deleted since `note`."""
         return sorted({part.name for part in parts or self._seen if _state_of(part) != self._seen[part]})
 
     @contextmanager
@@ -92,7 +92,8 @@ def _state_of(part: Path) -> tuple[int, int, int] | None:
 
 Shown = TypeVar("Shown", bound=ShownScene)
 Result = TypeVar("Result")
-Sent = TypeVar("Sent", bound=BaseModel)
+Work = Callable[[Any, Any], Any]
+"""Function of the scene, and of a path's parameters or a validated body."""
 
 
 class SceneThread(Generic[Shown]):
@@ -112,49 +113,35 @@ class SceneThread(Generic[Shown]):
             self.get("/api/thumb/{number:int}", _thumb, behind=True),
         ]
 
-    def get(
-        self, path: str, work: Callable[[Shown, Mapping[str, Any]], Any], *, behind: bool = False
-    ) -> Route:
-        """Return a route that sends the result of `work` for the scene and the path's parameters."""
-        return Route(path, partial(self._get, work=work, behind=behind))
+    def get(self, path: str, work: Work, *, behind: bool = False) -> Route:
+        """Return a route that sends the result of `work`, called with the scene and the path's parameters.
 
-    async def _get(
-        self, request: Request, *, work: Callable[[Shown, Mapping[str, Any]], Any], behind: bool
-    ) -> Response:
-        do = self.do_behind if behind else self.do
-        return answer(await do(request, lambda shown: work(shown, request.path_params)))
+        Only one request with `behind` runs at a time, so that other requests need not wait long: when the
+        page opens, the outline requests a hundred crops, and other requests wait for at most one.
+        """
+        return Route(path, partial(self._send, work=work, behind=behind))
 
     def post(
-        self,
-        path: str,
-        kind: type[Sent],
-        work: Callable[[Shown, Sent], Any],
-        worker: ThreadPoolExecutor | None = None,
+        self, path: str, kind: type[BaseModel], work: Work, worker: ThreadPoolExecutor | None = None
     ) -> Route:
         """Return a route that sends the result of `work`, called with the scene and the validated body.
 
         `worker`, if given, replaces the scene thread; `work` must then have its own caches.
         """
-        return Route(path, partial(self._post, kind=kind, work=work, worker=worker), methods=["POST"])
+        return Route(path, partial(self._send, work=work, kind=kind, worker=worker), methods=["POST"])
 
-    async def _post(
+    async def _send(
         self,
         request: Request,
         *,
-        kind: type[Sent],
-        work: Callable[[Shown, Sent], Any],
-        worker: ThreadPoolExecutor | None,
+        work: Work,
+        kind: type[BaseModel] | None = None,
+        worker: ThreadPoolExecutor | None = None,
+        behind: bool = False,
     ) -> Response:
-        asked = await read(request, kind)
-        return answer(await self.do(request, lambda shown: work(shown, asked), worker))
-
-    async def do_behind(self, request: Request, work: Callable[[Shown], Result]) -> Result:
-        """Run `work` like `do`, but only one such call at a time, so that other requests need not wait long.
-
-        When the page opens, the outline requests a hundred crops; other requests wait for at most one crop.
-        """
-        async with self.behind:
-            return await self.do(request, work)
+        asked = request.path_params if kind is None else await read(request, kind)
+        async with self.behind if behind else nullcontext():
+            return answer(await self.do(request, lambda shown: work(shown, asked), worker))
 
     async def do(
         self, request: Request, work: Callable[[Shown], Result], worker: ThreadPoolExecutor | None = None

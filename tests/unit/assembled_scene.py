@@ -46,9 +46,10 @@ def assembled(
     weights: Callable[[str], sp.csr_matrix],
     embed: Callable[[list[str]], np.ndarray],
     field: tuple[LanguageField, Code] | None = None,
-    settings: EvaluateSettings = EvaluateSettings(),
+    settings: EvaluateSettings | None = None,
     threads: int = 1,
 ) -> LanguageScene:
+    settings = settings or EvaluateSettings()
     views, clip = GivenViews(scene, gaussians, tree, threads, weights=weights), GivenClip(embed)
     return LanguageScene(
         views, clip, settings, FieldAnswers(views, *field, clip, settings) if field else None

@@ -285,8 +285,8 @@ def test_a_query_waits_for_at_most_one_crop(shown):
     request = Request({"type": "http", "query_string": b""})
 
     async def ask_among_crops() -> None:
-        crops = [thread.do_behind(request, lambda _, n=n: order.append(n)) for n in range(6)]
-        tasks = [asyncio.create_task(crop) for crop in crops]
+        crops = [thread.get("/", lambda *_, n=n: order.append(n), behind=True) for n in range(6)]
+        tasks = [asyncio.create_task(crop.endpoint(request)) for crop in crops]
         for _ in range(3):  # until the first crop is with the thread, and the others wait for it
             await asyncio.sleep(0)
         await thread.do(request, lambda _: order.append("question"))
