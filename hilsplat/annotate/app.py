@@ -230,15 +230,15 @@ def _at(opened: OpenedScene, asked: At) -> list[dict[str, Any]]:
 def _segment(opened: OpenedScene, asked: Segment) -> list[dict[str, Any]]:
     with opened.unchanged(*opened.photographs):
         view = view_name(opened.scene, asked.view)
-        return [vars(found) for found in opened.clicks.outlines(view, asked.clicks, asked.box)]
+        return [vars(proposal) for proposal in opened.clicks.outlines(view, asked.clicks, asked.box)]
 
 
 def _carry(opened: OpenedScene, asked: Carry) -> list[dict[str, Any]]:
     """Return objects of other views, transferred to a view, as proposals; nothing is written."""
     with opened.unchanged():
         view = view_name(opened.scene, asked.view)
-        found = opened.proposals.carried(opened.known(), asked.ids, view)
-    return [{**label.model_dump(), "polygons": polygons, "origin": "proposed"} for label, polygons in found]
+        carried = opened.proposals.carried(opened.known(), asked.ids, view)
+    return [{**label.model_dump(), "polygons": polygons, "origin": "proposed"} for label, polygons in carried]
 
 
 def _import(opened: OpenedScene, asked: Files) -> dict[str, Any]:
@@ -255,9 +255,10 @@ def _import(opened: OpenedScene, asked: Files) -> dict[str, Any]:
                 raise
             notes.append(first_line(error))
     sizes_hw = {view: cameras[view].size_hw for view in cameras.names}
-    found, added, known = merged(opened.known(), files, sizes_hw)
+    changed, added, known = merged(opened.known(), files, sizes_hw)
     views = {
-        cameras.names.index(view): [label.model_dump() for label in labels] for view, labels in found.items()
+        cameras.names.index(view): [label.model_dump() for label in labels]
+        for view, labels in changed.items()
     }
     return {"views": views, "added": added, "known": known, "notes": notes}
 

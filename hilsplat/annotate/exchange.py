@@ -125,9 +125,8 @@ def _isat(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
 def _labelme(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
     shapes = []
     for label in labels:
-        own = label.model_dump(include=OURS)
-        about = {"group_id": label.id, "shape_type": "polygon", "flags": {}, **own}
-        shapes += [{"label": label.text, "points": ring, **about} for ring in label.polygons]
+        keys = {"group_id": label.id, "shape_type": "polygon", "flags": {}, **label.model_dump(include=OURS)}
+        shapes += [{"label": label.text, "points": ring, **keys} for ring in label.polygons]
     image = {"imagePath": view, "imageData": None, "imageHeight": size_hw[0], "imageWidth": size_hw[1]}
     return json.dumps({"version": "5.5.0", "flags": {}, "shapes": shapes, **image}, ensure_ascii=False)
 
@@ -239,10 +238,10 @@ def _joined(name: str, pieces: Sequence[Piece], errors: list[HilsplatError]) -> 
     for row, piece in enumerate(pieces):
         key = row if piece.number is None else repr((piece.text, piece.number))
         things.setdefault(key, []).append(piece)
-    own = [same[0].number for same in things.values()]
-    is_id = all(type(number) is int and number > 0 for number in own) and len(set(own)) == len(own)
+    ids = [same[0].number for same in things.values()]
+    is_id = all(type(number) is int and number > 0 for number in ids) and len(set(ids)) == len(ids)
     labels = []
-    for number, same in zip(own if is_id else range(1, 1 + len(own)), things.values(), strict=True):
+    for number, same in zip(ids if is_id else range(1, 1 + len(ids)), things.values(), strict=True):
         keys = same[0].keys
         try:
             label = Label.read(
@@ -353,9 +352,9 @@ def _coco_reader(name: str, content: Mapping[str, Any], cameras: Cameras) -> Rea
 def _by_id(rows: Sequence[Any]) -> dict[str, dict[str, Any]]:
     """Return rows by id; an id that different rows have is omitted."""
     rows = [row for row in rows if isinstance(row, dict)]
-    found = {repr(row.get("id")): row for row in rows}
-    twice = {number for row in rows if found[number := repr(row.get("id"))] != row}
-    return {number: row for number, row in found.items() if number not in twice}
+    by_id = {repr(row.get("id")): row for row in rows}
+    twice = {number for row in rows if by_id[number := repr(row.get("id"))] != row}
+    return {number: row for number, row in by_id.items() if number not in twice}
 
 
 def _coco_mask(where: str, region: Any, image: Mapping[str, Any], camera: Camera) -> Bool[np.ndarray, "H W"]:
@@ -437,8 +436,8 @@ def merged(
     things = {label.id: _kind(label) for labels in views.values() for label in labels}
     changed: set[str] = set()
     added = same = 0
-    for found in files:
-        for view, labels in found.items():
+    for file in files:
+        for view, labels in file.items():
             here = views.setdefault(view, [])
             number_of: dict[tuple[int, int], int] = {}  # of an id in the file and its level
             for label in sorted(labels, key=lambda label: label.level):

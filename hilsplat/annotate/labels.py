@@ -97,7 +97,7 @@ def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[La
     twice = [number for number, count in Counter(label.id for label in labels).items() if count > 1]
     if twice:
         raise SettingsError(f"id {twice[0]} occurs twice", fix="reload the page")
-    own = {label.id: label for label in labels}
+    by_number = {label.id: label for label in labels}
     masks: dict[int, np.ndarray] = {}
     cut: dict[int, Label] = {}
     for label in sorted(labels, key=lambda label: label.level):
@@ -107,7 +107,7 @@ def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[La
         cut[label.id] = label
         if label.parent is None:
             continue
-        parent = own.get(label.parent)
+        parent = by_number.get(label.parent)
         if parent is None or parent.level != label.level - 1:
             missing = "no such thing in this photograph"
             raise SettingsError(

@@ -80,9 +80,9 @@ class FieldAnswers:
         """Return each Gaussian's field relevancy at a level or its maximum over levels; 0 without latents."""
         features, vector = self.language.features, self.clip.embed_texts(list(path_of(text)[-1:]))
         out = np.zeros(len(features), np.float32)
-        for own in LEVELS:
-            if level in ("auto", own.label):
-                latents = features[:, own.index]
+        for searched in LEVELS:
+            if level in ("auto", searched.label):
+                latents = features[:, searched.index]
                 has_latent = (latents != 0).any(axis=1)
                 relevancy = self._latent_relevancy.exact(latents[has_latent], vector)[0]
                 out[has_latent] = np.maximum(out[has_latent], relevancy)

@@ -49,10 +49,10 @@ def query_panel(
     `note` is appended to the title, and doubts are written below. The relevancy is that of `answerer`.
     """
     last = path_of(text)[-1]
-    found = f"{counted(len(hits.ids), 'node')} at level {hits.level.label}"
+    count = f"{counted(len(hits.ids), 'node')} at level {hits.level.label}"
     names = list(dict.fromkeys(scene.name_of(int(node)) or "?" for node in hits.ids))
     called = f" ({', '.join([*names[:NAMED], *(['…'] if names[NAMED:] else [])])})" if names else ""
-    title = f"“{text}” in {scene.scene.name}: {found}{called}{note}"
+    title = f"“{text}” in {scene.scene.name}: {count}{called}{note}"
     caution = wrap(scene.caution_about(text), TITLE_LETTERS)
     heading = [*wrap(title, TITLE_LETTERS), *caution, *map(str, doubts_of(hits))]
     height, width = scene.scene.cameras[views[0]].size_hw
@@ -70,10 +70,10 @@ def query_panel(
             relevancy = scene.field.relevancy([last], view, exact=False)[0]
         low, high = float(relevancy.min()), float(relevancy.max())
         pictures = [(image, view), (paint_answer(image, mask), f"answer: {mask.mean():.1%} of the view")]
-        for each in LEVELS:
-            own = relevancy[each.index]
-            name = f"relevancy, {each.label}: {float(own.max()):.2f}"
-            pictures.append((paint_relevancy(image, own, low, high), name))
+        for level in LEVELS:
+            at_level = relevancy[level.index]
+            name = f"relevancy, {level.label}: {float(at_level.max()):.2f}"
+            pictures.append((paint_relevancy(image, at_level, low, high), name))
         page.write(f"{scene.scene.split[view]} view", LEFT_PX / 2, top + row_px / 2, rotation=90.0)
         for column, (picture, name) in enumerate(pictures):
             bold = column == 2 + hits.level.index

@@ -88,10 +88,10 @@ def crossing(cameras: Cameras) -> Float64[np.ndarray, " 3"]:
     spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()) or 1.0
     guess = (centres + spread * ahead).mean(axis=0)
     pull = 1e-3 * len(centres)
-    found = np.linalg.solve(
+    focus = np.linalg.solve(
         across.sum(axis=0) + pull * np.eye(3), np.einsum("vij,vj->i", across, centres) + pull * guess
     )
-    return found if (found - centres[0]) @ ahead[0] > 0 else guess
+    return focus if (focus - centres[0]) @ ahead[0] > 0 else guess
 
 
 def described_nodes(scene: LanguageScene) -> dict[str, Any]:

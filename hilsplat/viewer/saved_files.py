@@ -122,9 +122,9 @@ def _step(steps: exports.Steps) -> tuple[int, int] | bytes:
     """Run the next step; return the progress, or the finished file."""
     try:
         return next(steps)
-    except StopIteration as made:
-        data: bytes = made.value
-        return data
+    except StopIteration as finished:
+        file: bytes = finished.value
+        return file
 
 
 def _line(**values: int | str) -> bytes:

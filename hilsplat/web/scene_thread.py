@@ -84,10 +84,10 @@ class ShownScene:
 
 def _state_of(part: Path) -> tuple[int, int, int] | None:
     try:
-        found = (part / INDEX if part.is_dir() else part).stat()
+        file = (part / INDEX if part.is_dir() else part).stat()
     except OSError:
         return None
-    return found.st_ino, found.st_size, found.st_mtime_ns
+    return file.st_ino, file.st_size, file.st_mtime_ns
 
 
 Shown = TypeVar("Shown", bound=ShownScene)
