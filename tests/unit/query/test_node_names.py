@@ -132,7 +132,7 @@ def test_a_text_that_words_for_absent_things_match_as_well_is_doubted(desk):
     scene = hilsplat.open_scene(desk)
     blue, white = np.array([[0, 0, 1.0]], np.float32), np.full((1, 3), 3**-0.5, np.float32)
     rivals = np.concatenate([np.repeat(blue, 30, axis=0), np.repeat(white, 70, axis=0)])
-    scene = replace(scene, naming=replace(scene.naming, rivals=rivals), _by_chance={})
+    scene = replace(scene, naming=replace(scene.naming, rivals=rivals), _rival_margins={})
     (doubt,) = scene.query("book", "whole")[0].doubts  # a third of the words finds the book as well
     assert doubt.chance == pytest.approx(31 / 101)
     assert str(doubt) == "'book' may not be in the scene: 31% of words for absent things score as high"
