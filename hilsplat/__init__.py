@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Doubt", "HilsplatError", "Hit", "LanguageScene", "Level", "open_scene", "show"]
 
-MODULES = {
+_MODULES = {
     "HilsplatError": "hilsplat.base.errors",
     "Level": "hilsplat.base.levels",
     "Doubt": "hilsplat.query.hits",
@@ -35,6 +35,6 @@ MODULES = {
 
 def __getattr__(name: str) -> Any:
     """Load a public name on first use."""
-    if name not in MODULES:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(MODULES[name]), name)
+    return getattr(import_module(_MODULES[name]), name)

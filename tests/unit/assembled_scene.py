@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -28,9 +29,9 @@ class GivenViews(SceneViews):
 
 
 class GivenClip(ClipModel):
-    def __init__(self, embed: Callable[[list[str]], np.ndarray]) -> None:
+    def __init__(self, embed: Callable[[list[str]], np.ndarray], world_only: bool = False) -> None:
         self.embed = embed
-        self.model: Any = SimpleNamespace(config={})
+        self.model: Any = SimpleNamespace(config={"world_only": world_only}, folder=Path("models/clip-tiny"))
 
     def embed_texts(self, texts: list[str]) -> np.ndarray:
         return self.embed(texts)
