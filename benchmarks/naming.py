@@ -51,7 +51,7 @@ class Naming:
 
 def measure(folder: Path, levels: dict[Level, Naming], missed: Counts) -> None:
     """Add the counts of a scene; `missed` counts absent texts that were not doubted."""
-    scene = hilsplat.open(folder)
+    scene = hilsplat.open_scene(folder)
     assert scene.naming is not None, f"{folder} has no names: hilsplat run {folder}/default/names"
     rows = read_json(folder / "default/names/names.json")
     truth = HierarchyAnnotations.load(folder / "world/truth")

@@ -28,16 +28,17 @@ class Answers:
         rng = np.random.default_rng(0)
         self.regions = dict(zip(texts, regions, strict=True))
         noise = rng.uniform(0, 0.4, (len(LEVELS), *SIZE_HW)).astype(np.float32)
+        self.views, self.field = self, self
         self.maps = {text: noise + np.float32(0.6) * region for text, region in self.regions.items()}
 
-    def field_relevancy(self, texts, view):
+    def relevancy(self, texts, view):
         return np.stack([self.maps[text] for text in texts])
 
-    def field_cosine(self, texts, view, pixels):
+    def cosine(self, texts, view, pixels):
         return np.stack([self.maps[text].reshape(len(LEVELS), -1)[:, pixels] for text in texts])
 
-    node_relevancy_map = field_relevancy
-    node_cosine = field_cosine
+    node_relevancy_map = relevancy
+    node_cosine = cosine
 
     def select(self, path, *, level=None, view=None):
         return SimpleNamespace(ids=np.array([list(self.regions).index(path[-1])]), level=level)

@@ -30,6 +30,7 @@ from hilsplat.semantic_tree.linkage import pooled_linkage
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import AutoencoderSettings
 from hilsplat.splat.rasterise.api import pixel_weights
+from tests.unit.assembled_scene import assembled
 
 SIZE_HW = (728, 986)
 BLOCKS = ((6, 8), (12, 16), (24, 32))  # rows and columns of nodes at each level: 48, 192 and 768 nodes
@@ -101,16 +102,8 @@ def open_scene(code_name: str, threads: int = 1) -> LanguageScene:
     def encode(texts: list[str]) -> np.ndarray:
         return unit(np.stack([np.random.default_rng(len(t)).normal(size=CHANNELS) for t in texts]) + kinds[7])
 
-    opened = LanguageScene(
-        scene,
-        gaussians,
-        tree,
-        lambda view: weights,
-        LanguageField(features, "", ""),
-        code,
-        encode,
-        threads=threads,
-    )
+    field = LanguageField(features, "", ""), code
+    opened = assembled(scene, gaussians, tree, lambda view: weights, encode, field, threads=threads)
     opened.node_relevancy_map(["mug handle"], VIEW)
     return opened
 
@@ -134,7 +127,7 @@ def test_mask_of_an_answer(benchmark):
     scene = open_scene("network")
     ids = scene.select("mug handle", level="subpart", threshold=0.5).ids
     benchmark.extra_info |= {"case": MASK, "count": SIZE_HW[0] * SIZE_HW[1], "of": "px"}
-    assert benchmark(lambda: scene.node_masks(VIEW, ids)).shape == SIZE_HW
+    assert benchmark(lambda: scene.views.node_masks(VIEW, ids)).shape == SIZE_HW
 
 
 @one_thread
@@ -149,15 +142,15 @@ def test_relevancy_of_nodes_in_a_view(benchmark):
 def test_query_on_the_field(benchmark, code):
     scene = open_scene(code)
     benchmark.extra_info |= {"case": field_case(code), "count": 3 * SIZE_HW[0] * SIZE_HW[1], "of": "px"}
-    scene.field_relevancy(["mug handle"], VIEW, exact=False)  # renders and decodes once per view
-    assert benchmark(lambda: scene.field_relevancy(["mug handle"], VIEW, exact=False)).max() > 0
+    scene.field.relevancy(["mug handle"], VIEW, exact=False)  # renders and decodes once per view
+    assert benchmark(lambda: scene.field.relevancy(["mug handle"], VIEW, exact=False)).max() > 0
 
 
 @pytest.mark.benchmark(timer=time.process_time, min_rounds=3, max_time=1.5)
 def test_relevancy_that_decodes_every_pixel(benchmark):
     scene, count = open_scene("network"), 3 * SIZE_HW[0] * SIZE_HW[1]
     benchmark.extra_info |= {"case": "exact relevancy, 986x728: network, d=3", "count": count, "of": "px"}
-    assert benchmark(lambda: scene.field_relevancy(["mug handle"], VIEW)).max() > 0
+    assert benchmark(lambda: scene.field.relevancy(["mug handle"], VIEW)).max() > 0
 
 
 @pytest.mark.benchmark(min_rounds=5, max_time=1.5)
@@ -166,8 +159,8 @@ def test_query_on_the_field_by_two_threads(benchmark, code):
     scene = open_scene(code, threads=2)
     case = f"{field_case(code)}, 2 threads"
     benchmark.extra_info |= {"case": case, "count": 3 * SIZE_HW[0] * SIZE_HW[1], "of": "px"}
-    scene.field_relevancy(["mug handle"], VIEW, exact=False)
-    assert benchmark(lambda: scene.field_relevancy(["mug handle"], VIEW, exact=False)).max() > 0
+    scene.field.relevancy(["mug handle"], VIEW, exact=False)
+    assert benchmark(lambda: scene.field.relevancy(["mug handle"], VIEW, exact=False)).max() > 0
 
 
 @one_thread

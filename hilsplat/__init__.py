@@ -2,7 +2,7 @@
 
     import hilsplat
 
-    scene = hilsplat.open("results/photos/desk")
+    scene = hilsplat.open_scene("results/photos/desk")
     for hit in scene.query("mug > handle"):
         print(hit.score, hit.level.label, hit.gaussians)
 
@@ -10,33 +10,31 @@ The names in `__all__` are the public interface (docs/python.md); everything els
 package loads no large library.
 """
 
-from pathlib import Path
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hilsplat.base.errors import HilsplatError
     from hilsplat.base.levels import Level
     from hilsplat.query.hits import Doubt, Hit
-    from hilsplat.query.language_scene import LanguageScene
+    from hilsplat.query.language_scene import LanguageScene, open_scene
+    from hilsplat.viewer.app import show
 
-__all__ = ["Doubt", "HilsplatError", "Hit", "LanguageScene", "Level", "open"]
+__all__ = ["Doubt", "HilsplatError", "Hit", "LanguageScene", "Level", "open_scene", "show"]
 
-
-def open(folder: Path | str, variant: str = "default", *, threads: int = 1) -> "LanguageScene":
-    """Open a finished scene, `results/<dataset>/<scene>` or a copy of it: see `LanguageScene.open`."""
-    from hilsplat.query.language_scene import LanguageScene
-
-    return LanguageScene.open(folder, variant, threads=threads)
+_MODULES = {
+    "HilsplatError": "hilsplat.base.errors",
+    "Level": "hilsplat.base.levels",
+    "Doubt": "hilsplat.query.hits",
+    "Hit": "hilsplat.query.hits",
+    "LanguageScene": "hilsplat.query.language_scene",
+    "open_scene": "hilsplat.query.language_scene",
+    "show": "hilsplat.viewer.app",
+}
 
 
 def __getattr__(name: str) -> Any:
-    """Load a public type on first use."""
-    if name in ("HilsplatError", "Level"):
-        from hilsplat.base import errors, levels
-
-        return errors.HilsplatError if name == "HilsplatError" else levels.Level
-    if name in ("Doubt", "Hit", "LanguageScene"):
-        from hilsplat.query import hits, language_scene
-
-        return getattr(language_scene if name == "LanguageScene" else hits, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    """Load a public name on first use."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_MODULES[name]), name)

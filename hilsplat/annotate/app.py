@@ -93,7 +93,7 @@ class File(Message):
     text: str
 
 
-class Given(Message):
+class Files(Message):
     """Annotation files."""
 
     files: Annotated[list[File], Field(min_length=1, max_length=5000)]
@@ -165,14 +165,14 @@ class Annotator:
         routes = [
             *self.pages.routes(),
             *self.thread.routes(),
-            Route("/api/labels", get(_all_labels)),
+            get("/api/labels", _all_labels),
             Route("/api/labels/{number:int}", self._save, methods=["PUT"]),
-            Route("/api/shape", post(Shape, _shape), methods=["POST"]),
-            Route("/api/at", post(At, _at, self.drawing), methods=["POST"]),
-            Route("/api/segment", post(Segment, _segment, self.drawing), methods=["POST"]),
-            Route("/api/carry", post(Carry, _carry, self.drawing), methods=["POST"]),
-            Route("/api/import", post(Given, _import), methods=["POST"]),
-            Route("/api/export/{kind}", get(_export)),
+            post("/api/shape", Shape, _shape),
+            post("/api/at", At, _at, self.drawing),
+            post("/api/segment", Segment, _segment, self.drawing),
+            post("/api/carry", Carry, _carry, self.drawing),
+            post("/api/import", Files, _import),
+            get("/api/export/{kind}", _export),
         ]
         return guarded(routes, token, MAX_BODY_BYTES)
 
@@ -230,18 +230,18 @@ def _at(opened: OpenedScene, asked: At) -> list[dict[str, Any]]:
 def _segment(opened: OpenedScene, asked: Segment) -> list[dict[str, Any]]:
     with opened.unchanged(*opened.photographs):
         view = view_name(opened.scene, asked.view)
-        return [vars(found) for found in opened.clicks.outlines(view, asked.clicks, asked.box)]
+        return [vars(proposal) for proposal in opened.clicks.outlines(view, asked.clicks, asked.box)]
 
 
 def _carry(opened: OpenedScene, asked: Carry) -> list[dict[str, Any]]:
     """Return objects of other views, transferred to a view, as proposals; nothing is written."""
     with opened.unchanged():
         view = view_name(opened.scene, asked.view)
-        found = opened.proposals.carried(opened.known(), asked.ids, view)
-    return [{**label.model_dump(), "polygons": polygons, "origin": "proposed"} for label, polygons in found]
+        carried = opened.proposals.carried(opened.known(), asked.ids, view)
+    return [{**label.model_dump(), "polygons": polygons, "origin": "proposed"} for label, polygons in carried]
 
 
-def _import(opened: OpenedScene, asked: Given) -> dict[str, Any]:
+def _import(opened: OpenedScene, asked: Files) -> dict[str, Any]:
     """Merge the annotations with those in files, and return them by view number; nothing is written.
 
     A file that cannot be used is noted; a single one is refused.
@@ -255,9 +255,10 @@ def _import(opened: OpenedScene, asked: Given) -> dict[str, Any]:
                 raise
             notes.append(first_line(error))
     sizes_hw = {view: cameras[view].size_hw for view in cameras.names}
-    found, added, known = merged(opened.known(), files, sizes_hw)
+    changed, added, known = merged(opened.known(), files, sizes_hw)
     views = {
-        cameras.names.index(view): [label.model_dump() for label in labels] for view, labels in found.items()
+        cameras.names.index(view): [label.model_dump() for label in labels]
+        for view, labels in changed.items()
     }
     return {"views": views, "added": added, "known": known, "notes": notes}
 

@@ -42,11 +42,11 @@ def exported(kind: Kind, known: Mapping[str, Sequence[Label]], cameras: Cameras)
     if kind == "coco":
         return json.dumps(_coco(known, cameras), ensure_ascii=False).encode()
     write = {"hilsplat": as_file, "isat": _isat, "labelme": _labelme}[kind]
-    held = io.BytesIO()
-    with zipfile.ZipFile(held, "w", zipfile.ZIP_DEFLATED) as archive:
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
         for view, labels in known.items():
             archive.writestr(f"{Path(view).stem}.json", write(view, cameras[view].size_hw, labels))
-    return held.getvalue()
+    return content.getvalue()
 
 
 def export_labels(scene: Scene, folder: Path, data_root: Path, out: Path) -> int:
@@ -82,10 +82,8 @@ def export_labels(scene: Scene, folder: Path, data_root: Path, out: Path) -> int
 
 def labels_of_truth(truth: HierarchyAnnotations, views: Sequence[str]) -> dict[str, list[Label]]:
     """Return a synthetic scene's ground-truth labels as annotations, for views that have labels."""
-    known: dict[str, list[Label]] = {}
-    for view in views:
-        nodes = [truth.nodes[number] for number in truth.views.get(view, ())]
-        labels = [
+    return {
+        view: [
             Label(
                 id=node.id + 1,
                 level=node.level,
@@ -94,11 +92,11 @@ def labels_of_truth(truth: HierarchyAnnotations, views: Sequence[str]) -> dict[s
                 polygons=traced(truth.mask(view, [node.id])),
                 origin="accepted",
             )
-            for node in nodes
+            for node in (truth.nodes[number] for number in truth.views[view])
         ]
-        if labels:
-            known[view] = labels
-    return known
+        for view in views
+        if truth.views.get(view)
+    }
 
 
 def _isat(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
@@ -127,9 +125,8 @@ def _isat(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
 def _labelme(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
     shapes = []
     for label in labels:
-        own = label.model_dump(include=OURS)
-        about = {"group_id": label.id, "shape_type": "polygon", "flags": {}, **own}
-        shapes += [{"label": label.text, "points": ring, **about} for ring in label.polygons]
+        keys = {"group_id": label.id, "shape_type": "polygon", "flags": {}, **label.model_dump(include=OURS)}
+        shapes += [{"label": label.text, "points": ring, **keys} for ring in label.polygons]
     image = {"imagePath": view, "imageData": None, "imageHeight": size_hw[0], "imageWidth": size_hw[1]}
     return json.dumps({"version": "5.5.0", "flags": {}, "shapes": shapes, **image}, ensure_ascii=False)
 
@@ -154,7 +151,7 @@ def _coco(known: Mapping[str, Sequence[Label]], cameras: Cameras) -> dict[str, A
 # -- import ---------------------------------------------------------------------------------------
 
 
-MOST_INVALID = 0.5
+MAX_INVALID = 0.5
 """Maximum share of invalid annotations in a file; if it is exceeded, the file is probably misread."""
 
 SLACK = 0.25
@@ -188,19 +185,19 @@ def imported(
         notes: if annotations are left out, a sentence with their number and the reasons is appended.
 
     Raises:
-        HilsplatError: the format is unknown, the photograph is not in the scene, more than `MOST_INVALID` of
+        HilsplatError: the format is unknown, the photograph is not in the scene, more than `MAX_INVALID` of
             the annotations are invalid, or none can be used.
     """
     readers = {"shapes": _labelme_reader, "annotations": _coco_reader, "objects": _isat_reader}
     with foreign(name, expected="a complete JSON file"):
         content = parse_json(text)
-        given = content if isinstance(content, dict) else {}
-        kind = next((key for key in readers if isinstance(given.get(key), list)), None)
+        keys = content if isinstance(content, dict) else {}
+        kind = next((key for key in readers if isinstance(keys.get(key), list)), None)
         if kind is None:
             raise SceneError(
                 f"{name} has an unknown format",
                 expected="the key 'objects' (ISAT, hilsplat), 'shapes' (labelme) or 'annotations' (COCO)",
-                found=f"keys {', '.join(given)}" if given else type(content).__name__,
+                found=f"keys {', '.join(keys)}" if keys else type(content).__name__,
                 fix="export the annotations as COCO",
             )
         read = readers[kind](name, content, cameras)
@@ -220,19 +217,19 @@ def imported(
             pieces.setdefault(piece.view, []).append(piece)
         else:
             left["without pixels in the view"] += 1
-    found = {view: labels for view, same in pieces.items() if (labels := _joined(name, same, errors))}
+    labels = {view: joined for view, same in pieces.items() if (joined := _joined(name, same, errors))}
     total = len(content[kind])
-    if len(errors) > MOST_INVALID * total or (errors and not found):
+    if len(errors) > MAX_INVALID * total or (errors and not labels):
         errors[0].add_line("invalid", f"{len(errors)} of {total} annotations in {name}")
         raise errors[0]
     if errors:
         left[f"invalid ({first_line(errors[0])})"] = len(errors)
     reasons = "; ".join(f"{count} {reason}" for reason, count in left.items())
-    if left and not found:
+    if left and not labels:
         raise SceneError(f"{name} has no annotation for this scene", found=f"annotations: {reasons}")
     if left and notes is not None:
         notes.append(f"{name}: {left.total()} of {total} annotations are left out: {reasons}")
-    return found
+    return labels
 
 
 def _joined(name: str, pieces: Sequence[Piece], errors: list[HilsplatError]) -> list[Label]:
@@ -241,10 +238,10 @@ def _joined(name: str, pieces: Sequence[Piece], errors: list[HilsplatError]) -> 
     for row, piece in enumerate(pieces):
         key = row if piece.number is None else repr((piece.text, piece.number))
         things.setdefault(key, []).append(piece)
-    own = [same[0].number for same in things.values()]
-    is_id = all(type(number) is int and number > 0 for number in own) and len(set(own)) == len(own)
+    ids = [same[0].number for same in things.values()]
+    is_id = all(type(number) is int and number > 0 for number in ids) and len(set(ids)) == len(ids)
     labels = []
-    for number, same in zip(own if is_id else range(1, 1 + len(own)), things.values(), strict=True):
+    for number, same in zip(ids if is_id else range(1, 1 + len(ids)), things.values(), strict=True):
         keys = same[0].keys
         try:
             label = Label.read(
@@ -328,7 +325,7 @@ def _labelme_mask(
 
 def _coco_reader(name: str, content: Mapping[str, Any], cameras: Cameras) -> Reader:
     images, categories = _by_id(content["images"]), _by_id(content["categories"])
-    used = {repr(each.get("image_id")) for each in content["annotations"] if isinstance(each, dict)}
+    used = {repr(entry.get("image_id")) for entry in content["annotations"] if isinstance(entry, dict)}
     files = {str(image.get("file_name")) for number, image in images.items() if number in used}
     views = match_names(files, cameras.names)
     num_files = Counter(views.values())
@@ -355,9 +352,9 @@ def _coco_reader(name: str, content: Mapping[str, Any], cameras: Cameras) -> Rea
 def _by_id(rows: Sequence[Any]) -> dict[str, dict[str, Any]]:
     """Return rows by id; an id that different rows have is omitted."""
     rows = [row for row in rows if isinstance(row, dict)]
-    found = {repr(row.get("id")): row for row in rows}
-    twice = {number for row in rows if found[number := repr(row.get("id"))] != row}
-    return {number: row for number, row in found.items() if number not in twice}
+    by_id = {repr(row.get("id")): row for row in rows}
+    twice = {number for row in rows if by_id[number := repr(row.get("id"))] != row}
+    return {number: row for number, row in by_id.items() if number not in twice}
 
 
 def _coco_mask(where: str, region: Any, image: Mapping[str, Any], camera: Camera) -> Bool[np.ndarray, "H W"]:
@@ -439,8 +436,8 @@ def merged(
     things = {label.id: _kind(label) for labels in views.values() for label in labels}
     changed: set[str] = set()
     added = same = 0
-    for found in files:
-        for view, labels in found.items():
+    for file in files:
+        for view, labels in file.items():
             here = views.setdefault(view, [])
             number_of: dict[tuple[int, int], int] = {}  # of an id in the file and its level
             for label in sorted(labels, key=lambda label: label.level):

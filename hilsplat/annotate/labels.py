@@ -19,7 +19,7 @@ from hilsplat.base.errors import SceneError, SettingsError
 from hilsplat.base.levels import Level
 from hilsplat.base.removal import delete
 from hilsplat.datasets.images.hi import by_id, parents_of
-from hilsplat.datasets.images.isat import IsatFile, Polygon, fill_polygons, read_isat, trace_polygons
+from hilsplat.datasets.images.isat import Polygon, fill_polygons, read_isat, trace_polygons
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.scene.placement import placed
 from hilsplat.web.file_changes import replacing, version_of
@@ -97,7 +97,7 @@ def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[La
     twice = [number for number, count in Counter(label.id for label in labels).items() if count > 1]
     if twice:
         raise SettingsError(f"id {twice[0]} occurs twice", fix="reload the page")
-    own = {label.id: label for label in labels}
+    by_number = {label.id: label for label in labels}
     masks: dict[int, np.ndarray] = {}
     cut: dict[int, Label] = {}
     for label in sorted(labels, key=lambda label: label.level):
@@ -107,7 +107,7 @@ def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[La
         cut[label.id] = label
         if label.parent is None:
             continue
-        parent = own.get(label.parent)
+        parent = by_number.get(label.parent)
         if parent is None or parent.level != label.level - 1:
             missing = "no such thing in this photograph"
             raise SettingsError(
@@ -132,58 +132,44 @@ def label_path(folder: Path, view: str) -> Path:
     return Path(folder) / f"{Path(view).stem}.json"
 
 
-def read_labels(path: Path, size_hw: tuple[int, int], camera: Camera | None = None) -> list[Label]:
+def read_labels(path: Path, camera: Camera | None = None) -> list[Label]:
     """Read the annotations of a view; empty if there is no file.
 
     With the view's camera, labels drawn on its photograph or on a scaled copy are transferred to the view;
     labels outside the view are left out.
 
     Raises:
-        SceneError: the file is invalid, or was drawn on an image of a different size.
-        MisalignedArtifactError: its size fits neither the camera nor the photograph.
+        SceneError: the file, an id or a level is invalid.
+        MisalignedArtifactError: the file's image size fits neither the camera nor the photograph.
     """
     if not path.is_file():
         return []
-    found = read_isat(path)
-    if found.size_hw != tuple(size_hw) and camera is None:
-        raise SceneError(
-            f"label file {path} does not match the size of its photograph",
-            expected=f"{size_hw[1]} x {size_hw[0]} px (width x height)",
-            found=f"{found.size_hw[1]} x {found.size_hw[0]} px",
-            fix="annotate the scene on which the labels were drawn, or move the file elsewhere",
-        )
-    labels, where = labels_of(found), f"label file {path}"
-    if camera is None:
-        return labels
-    rings = [placed_rings(label.polygons, found.size_hw, camera, where) for label in labels]
-    moved = zip(labels, rings, strict=True)
-    return [label.model_copy(update={"polygons": polygons}) for label, polygons in moved if polygons]
+    stored = read_isat(path)
+    objects = by_id(stored)
+    parents = parents_of(stored, objects, [])
+    labels = []
+    for number, thing in objects.items():
+        polygons = [whole_pixels(polygon) for polygon in thing.polygons]
+        if camera is not None:
+            polygons = placed_rings(polygons, stored.size_hw, camera, f"label file {path}")
+        if polygons:
+            label = Label.read(
+                str(path),
+                id=number,
+                level=thing.keys["level"],
+                parent=parents[number],
+                text=thing.category,
+                polygons=polygons,
+                origin=thing.keys.get("origin", "drawn"),
+            )
+            labels.append(label)
+    return labels
 
 
 def known_labels(folder: Path, cameras: Cameras, views: Sequence[str]) -> dict[str, list[Label]]:
     """Return the annotations of all annotated views; for errors, see `read_labels`."""
-    found = {
-        view: read_labels(label_path(folder, view), cameras[view].size_hw, cameras[view]) for view in views
-    }
-    return {view: labels for view, labels in found.items() if labels}
-
-
-def labels_of(found: IsatFile) -> list[Label]:
-    """Return the objects in a file of our format as labels; raise SceneError if an id or level is invalid."""
-    objects = by_id(found)
-    parents = parents_of(found, objects, [])
-    return [
-        Label.read(
-            str(found.path),
-            id=number,
-            level=thing.keys["level"],
-            parent=parents[number],
-            text=thing.category,
-            polygons=[whole_pixels(polygon) for polygon in thing.polygons],
-            origin=thing.keys.get("origin", "drawn"),
-        )
-        for number, thing in objects.items()
-    ]
+    labels = {view: read_labels(label_path(folder, view), cameras[view]) for view in views}
+    return {view: of_view for view, of_view in labels.items() if of_view}
 
 
 def whole_pixels(points: Polygon) -> list[tuple[int, int]]:

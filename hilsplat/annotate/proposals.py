@@ -29,21 +29,21 @@ from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 
-LEAST_PX = 20
+MIN_PX = 20
 """Minimum area of a proposal; smaller proposals are noise."""
-LEAST_SHARE = 0.05
+MIN_SHARE = 0.05
 """Minimum area of a proposal's pieces and holes, relative to the proposal; smaller ones are noise."""
 SMOOTH_PX = 1.0
 """Maximum deviation of a proposal's outline from its pixels, px; simple outlines are easier to correct."""
-MOST_MASKS = 6
-LEAST_SEEN = 0.25
+MAX_MASKS = 6
+MIN_SEEN = 0.25
 """Minimum weight, in a pixel, of Gaussians visible in annotated views, when transferring objects."""
 VIEWS_MIB = 512.0
-KEPT_VIEWS = 3
+CACHED_VIEWS = 3
 """Number of photographs whose SAM features are cached: 4 MB each for ViT-B, up to 40 MB for SAM 2."""
 BOX_GRID = 4
 """Number of prompt points along each side of a box; not all SAM exports accept boxes as prompts."""
-OFFERED = 3
+MAX_OUTLINES = 3
 SAME_IOU = 0.9
 """Minimum IoU of two masks that count as the same mask."""
 
@@ -70,7 +70,7 @@ class Proposals:
         has_tree = self.gaussians is not None and (semantic_tree / "index.json").is_file()
         self.tree: SemanticTree | None = SemanticTree.load(semantic_tree) if has_tree else None
         self.names: Mapping[int, str] = read_names(folder, semantic_tree).of_node if has_tree else {}
-        self._kept = ViewStore(VIEWS_MIB)
+        self.cache = ViewStore(VIEWS_MIB)
 
     @property
     def of(self) -> str:
@@ -94,14 +94,14 @@ class Proposals:
         assert self.tree is not None
         weights, size_hw = self._weights(view), self.scene.cameras[view].size_hw
         row = weights[pixel]
-        found = []
+        regions = []
         for level in LEVELS:
             nodes = self.tree.node_of_gaussian[:, level.index]
             node, _ = heaviest_node(nodes[row.indices], row.data)
             if node != NONE:
                 mask = weights @ (nodes == node).astype(np.float32) > 0.5
-                found.append((f"node {node}", self.names.get(node, ""), level, mask.reshape(size_hw)))
-        return _proposals(found)
+                regions.append((f"node {node}", self.names.get(node, ""), level, mask.reshape(size_hw)))
+        return _proposals(regions)
 
     def _masks_at(self, view: str, x: int, y: int) -> list[Proposal]:
         path = self.masks / f"{view}.npz"  # test views have no masks
@@ -110,8 +110,8 @@ class Proposals:
         masks = HierarchicalMasks.load(path)
         dense = masks.dense()
         rows = [int(row) for row in np.argsort(-masks.area_px, kind="stable") if dense[row, y, x]]
-        level = masks.level.tolist()
-        return _proposals([(f"mask {row}", "", Level(level[row]), dense[row]) for row in rows[-MOST_MASKS:]])
+        levels = masks.level.tolist()
+        return _proposals([(f"mask {row}", "", Level(levels[row]), dense[row]) for row in rows[-MAX_MASKS:]])
 
     # -- from other views -------------------------------------------------------------------------
 
@@ -139,72 +139,71 @@ class Proposals:
             )
         size_hw = self.scene.cameras[view].size_hw
         masks = {label.id: label.mask(size_hw) for label in known.get(view, ())}
-        evidence: dict[int, list[tuple[str, Label]]] = {}
+        labels_of: dict[int, dict[str, Label]] = {}
         for other, labels in known.items():
             for label in labels:
                 if other != view and label.id in ids and label.origin != "proposed":
-                    evidence.setdefault(label.id, []).append((other, label))
-        weights, found = self._weights(view), []
-        for number, shown in sorted(evidence.items(), key=lambda item: item[1][0][1].level):
-            label = shown[0][1]
-            if number in masks or (label.parent is not None and label.parent not in masks):
+                    labels_of.setdefault(label.id, {})[other] = label
+        weights, transferred = self._weights(view), []
+        for annotated in sorted(labels_of.values(), key=lambda of_view: next(iter(of_view.values())).level):
+            label = next(iter(annotated.values()))
+            if label.id in masks or (label.parent is not None and label.parent not in masks):
                 continue
-            belongs, seen = self._members(shown)
-            part, all_seen = weights @ belongs, weights @ seen
-            mask = ((part > 0.5 * all_seen) & (all_seen > LEAST_SEEN)).reshape(size_hw)
+            is_member, is_seen = self._members(annotated)
+            part, seen = weights @ is_member, weights @ is_seen
+            mask = ((part > 0.5 * seen) & (seen > MIN_SEEN)).reshape(size_hw)
             inside = True if label.parent is None else masks[label.parent]
             mask = cleaned(mask & inside) & inside
             if mask.any():
-                masks[number] = mask
-                found.append((label, traced(mask)))
-        return found
+                masks[label.id] = mask
+                transferred.append((label, traced(mask)))
+        return transferred
 
-    def _members(self, shown: Sequence[tuple[str, Label]]) -> tuple[np.ndarray, np.ndarray]:
-        """Return, as 0 or 1, whether each Gaussian belongs to an object and whether given views show it."""
+    def _members(self, annotated: Mapping[str, Label]) -> tuple[np.ndarray, np.ndarray]:
+        """Return, as 0 or 1, whether each Gaussian belongs to an object and whether its views show it."""
         assert self.gaussians is not None
         inside = np.zeros(len(self.gaussians), np.float64)
         total = np.zeros(len(self.gaussians), np.float64)
-        for view, label in shown:
+        for view, label in annotated.items():
             weights = self._weights(view)
             inside += weights.T @ label.mask(self.scene.cameras[view].size_hw).ravel().astype(np.float32)
-            total += self._seen(view)
-        seen = total > 0
-        return (inside > 0.5 * total).astype(np.float32), seen.astype(np.float32)
-
-    def _seen(self, view: str) -> np.ndarray:
-        """Return the visible mass of each Gaussian in a view, px."""
-        weights = self._weights(view)
-        return self._kept.get(("seen", view), lambda: np.asarray(weights.sum(axis=0)).ravel())
+            total += self.cache.get(("mass", view), partial(_visible_mass, weights))
+        return (inside > 0.5 * total).astype(np.float32), (total > 0).astype(np.float32)
 
     def _weights(self, view: str) -> sp.csr_matrix:
         assert self.gaussians is not None
-        least = self.tree.min_weight if self.tree is not None else 0.0
+        min_weight = self.tree.min_weight if self.tree is not None else 0.0
         camera, threads = self.scene.cameras[view], self.threads
-        draw = partial(pixel_weights, self.gaussians, camera, min_weight=least, threads=threads)
-        return self._kept.get(("weights", view), lambda: normalised_weights(draw()))
+        draw = partial(pixel_weights, self.gaussians, camera, min_weight=min_weight, threads=threads)
+        return self.cache.get(("weights", view), lambda: normalised_weights(draw()))
 
 
-def _proposals(found: Sequence[tuple[str, str, Level, np.ndarray]]) -> list[Proposal]:
+def _visible_mass(weights: sp.csr_matrix) -> np.ndarray:
+    """Return the visible mass of each Gaussian, px."""
+    return np.asarray(weights.sum(axis=0)).ravel()
+
+
+def _proposals(regions: Sequence[tuple[str, str, Level, np.ndarray]]) -> list[Proposal]:
     """Return the distinct proposals that are not empty after cleaning."""
-    kept: list[Proposal] = []
-    for what, text, level, mask in found:
+    proposals: list[Proposal] = []
+    for what, text, level, mask in regions:
         if (mask := cleaned(mask)).any():
             polygons = traced(mask)
-            if not any(polygons == other.polygons for other in kept):
-                kept.append(Proposal(what, text, int(level), polygons))
-    return kept
+            if all(polygons != other.polygons for other in proposals):
+                proposals.append(Proposal(what, text, int(level), polygons))
+    return proposals
 
 
 def cleaned(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
     """Remove specks and pinholes from a mask and smooth its outline; empty if only small pieces remain."""
-    least = max(LEAST_PX, LEAST_SHARE * np.count_nonzero(mask))
+    min_area_px = max(MIN_PX, MIN_SHARE * np.count_nonzero(mask))
     contours, ranks = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
     canvas = np.zeros(mask.shape, np.uint8)
     if not contours:
         return canvas.astype(bool)
     by_area = sorted(zip(contours, ranks[0], strict=True), key=lambda pair: -cv2.contourArea(pair[0]))
     for contour, rank in by_area:  # from outside to inside, so that smaller pieces inside a hole are kept
-        if cv2.contourArea(contour) >= least:
+        if cv2.contourArea(contour) >= min_area_px:
             cv2.fillPoly(canvas, [cv2.approxPolyDP(contour, SMOOTH_PX, True)], int(rank[3] < 0))
     return canvas.astype(bool)
 
@@ -219,7 +218,7 @@ class Clicks:
         self.scene = scene
         index = read_index(masks) if (masks / "index.json").is_file() else {}
         self.folder: str = index.get("model") or "" if index.get("segmenter") == "sam" else ""
-        self.encoded = lru_cache(KEPT_VIEWS)(lambda view: self.model.encode(scene.image(view)))
+        self.encoded = lru_cache(CACHED_VIEWS)(lambda view: self.model.encode(scene.image(view)))
 
     @property
     def name(self) -> str:
@@ -252,7 +251,7 @@ class Clicks:
         """
         height, width = self.scene.cameras[view].size_hw
         points = np.array([[x + 0.5, y + 0.5] for x, y, _ in clicks]).reshape(-1, 2)
-        inside = np.array([each for *_, each in clicks], np.bool_)
+        inside = np.array([is_inside for *_, is_inside in clicks], np.bool_)
         corners = np.array(box if box else (0, 0, 0, 0))
         if not (inside.any() or box) or (points < 0).any() or (points > (width, height)).any():
             raise SettingsError(
@@ -261,31 +260,31 @@ class Clicks:
             )
         encoded = self.encoded(view)
         sides = corners[2:] + 1 - corners[:2]
-        asked = points[inside] if clicks else corners[:2] + point_grid(BOX_GRID) * sides
-        iou, logits = self.model.decode(encoded, asked)
+        prompts = points[inside] if clicks else corners[:2] + point_grid(BOX_GRID) * sides
+        iou, logits = self.model.decode(encoded, prompts)
         iou, logits = iou.reshape(-1), logits.reshape(-1, *logits.shape[2:])
         if len(clicks) > 1:  # also decode all clicks as one prompt
             more_iou, more = self.model.decode_clicks(encoded, points, inside)
             iou, logits = np.concatenate([more_iou, iou]), np.concatenate([more, logits])
         masks = enlarged(logits, encoded.frame)
         columns, rows = points.astype(np.int64).T if clicks else (np.zeros(0, np.int64),) * 2
-        right = (masks[:, rows, columns] == inside).sum(axis=1)
+        satisfied = (masks[:, rows, columns] == inside).sum(axis=1)
         fits = iou
         if box:
-            found = np.array([cv2.boundingRect(mask.astype(np.uint8)) for mask in masks])
-            boxes = np.concatenate([found[:, :2], found[:, :2] + found[:, 2:]], axis=1)
+            bounds = np.array([cv2.boundingRect(mask.astype(np.uint8)) for mask in masks])
+            boxes = np.concatenate([bounds[:, :2], bounds[:, :2] + bounds[:, 2:]], axis=1)
             fits = iou * box_iou(boxes, corners[None] + (0, 0, 1, 1))[:, 0]
-        kept: dict[int, Level] = {}  # the coarsest level among masks that count as the same
-        for row in np.lexsort((-fits, -right)).tolist():
+        level_of: dict[int, Level] = {}  # the coarsest level among masks that count as the same
+        for row in np.lexsort((-fits, -satisfied)).tolist():
             level = HEADS[row % len(HEADS)]
-            same = [other for other in kept if _iou(masks[row], masks[other]) >= SAME_IOU]
+            same = [other for other in level_of if _iou(masks[row], masks[other]) >= SAME_IOU]
             for other in same:
-                kept[other] = min(kept[other], level)
-            if not same and len(kept) < OFFERED:
-                kept[row] = level
+                level_of[other] = min(level_of[other], level)
+            if not same and len(level_of) < MAX_OUTLINES:
+                level_of[row] = level
         return [
             Proposal(f"by {self.name}", "", int(level), traced(mask))
-            for row, level in kept.items()
+            for row, level in level_of.items()
             if (mask := cleaned(masks[row])).any()
         ]
 

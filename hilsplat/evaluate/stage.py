@@ -109,7 +109,7 @@ def run_evaluate(
                     if not seconds and of_view.categories:
                         texts = [query.text for query in of_view.categories[:TIMED_TEXTS]]
                         seconds = time_queries(answers, view, texts, settings)
-                    answers.forget(view)  # reusing the freed memory avoids clearing new pages
+                    answers.views.cache.forget(view)  # reusing the freed memory avoids clearing new pages
                 is_checked = bool(truths) and settings.view_consistency
                 if is_checked and not isinstance(known, LabelledScene | PointScene):
                     for view, row in known.consistency(selections, truths, kept, settings):
@@ -202,15 +202,15 @@ def time_queries(
     rule = rule_of(settings)
 
     def by_field(text: str) -> object:
-        relevancy = answers.field_relevancy([text], view, exact=False)[0]
+        relevancy = answers.field.relevancy([text], view, exact=False)[0]
         return relevancy_mask(SmoothedRelevancy.of(relevancy, rule), None, rule)
 
     def by_tree(text: str) -> object:
-        return answers.node_masks(view, answers.select((text,), view=view).ids)
+        return answers.views.node_masks(view, answers.select((text,), view=view).ids)
 
     start = time.perf_counter()
-    answers.encode_texts([texts[0]])
-    answers.pixel_weights(view)
+    answers.clip.embed_texts([texts[0]])
+    answers.views.pixel_weights(view)
     shared_s = time.perf_counter() - start
     seconds: dict[str, float] = {}
     for method, query in (("field", by_field), ("tree", by_tree)):

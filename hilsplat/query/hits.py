@@ -66,12 +66,12 @@ class Hit:
     route: str
     doubts: tuple[Doubt, ...]
     name: str
-    _scene: SceneViews = field(repr=False, compare=False)
+    _views: SceneViews = field(repr=False, compare=False)
 
     @property
     def gaussians(self) -> Int64[np.ndarray, " g"]:
         """Rows of the node's Gaussians in `gaussians.ply`."""
-        return self._scene.gaussians_of([self.node])
+        return self._views.gaussians_of([self.node])
 
     def mask(self, view: str) -> Bool[np.ndarray, "H W"]:
         """Return the pixels of a view in which the node's Gaussians have more than half of the weight.
@@ -79,17 +79,17 @@ class Hit:
         Raises:
             SettingsError: the scene has no such view.
         """
-        return self._scene.node_masks(view, [self.node])
+        return self._views.node_masks(view, [self.node])
 
 
-def doubts_of(found: NodeHits) -> tuple[Doubt, ...]:
+def doubts_of(hits: NodeHits) -> tuple[Doubt, ...]:
     """Return a doubt for each query text that may match nothing in the scene."""
     doubts = []
-    for each in found.texts:
-        likely = each.chance is not None and each.chance > LIKELY_CHANCE
-        if each.unknown or each.margin <= 0 or likely:
-            level = each.level if each.anywhere > 0 else None
-            doubts.append(Doubt(each.text, level, each.chance if likely else None, each.unknown))
+    for text in hits.texts:
+        is_likely = text.chance is not None and text.chance > LIKELY_CHANCE
+        if text.unknown or text.margin <= 0 or is_likely:
+            level = text.level if text.anywhere > 0 else None
+            doubts.append(Doubt(text.text, level, text.chance if is_likely else None, text.unknown))
     return tuple(doubts)
 
 

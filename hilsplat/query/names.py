@@ -18,15 +18,15 @@ from hilsplat.base.levels import PATH_SEPARATOR, plain_text
 from hilsplat.web.file_changes import NO_FILE, replacing, version_of
 
 FILE = "names.json"
-LONGEST = 80
+MAX_NAME = 80
 """Maximum number of characters in a name."""
-NAME_RULE = f"at most {LONGEST} printable characters, without the separator {PATH_SEPARATOR!r}"
+NAME_RULE = f"at most {MAX_NAME} printable characters, without the separator {PATH_SEPARATOR!r}"
 
 
 def checked_name(name: str) -> str:
     """Return a name from a user or a file with single spaces; raise ValueError if it breaks `NAME_RULE`."""
     name = " ".join(name.split())
-    if len(name) > LONGEST or PATH_SEPARATOR in name or not name.isprintable():
+    if len(name) > MAX_NAME or PATH_SEPARATOR in name or not name.isprintable():
         raise ValueError(f"{name!r} is not a valid name")
     return name
 
@@ -56,16 +56,16 @@ def read_names(folder: Path, semantic_tree: Path) -> NodeNames:
     """
     path = Path(folder) / FILE
     version = version_of(path)  # before the names: if these change in between, they cannot be replaced
-    kept = _kept(path).trees.get(tree_digest(semantic_tree), {})
-    num_nodes = len(read_npz(Path(semantic_tree) / "tree.npz")["level"]) if kept else 0
-    if beyond := [node for node in kept if node >= num_nodes]:
+    names = _stored(path).trees.get(tree_digest(semantic_tree), {})
+    num_nodes = len(read_npz(Path(semantic_tree) / "tree.npz")["level"]) if names else 0
+    if beyond := [node for node in names if node >= num_nodes]:
         raise ArtifactError(
             f"{path} contains names of nodes that do not exist",
             expected=f"rows 0 to {num_nodes - 1}",
             found=", ".join(map(str, beyond[:5])),
             fix="correct the file, or move it elsewhere to start without names",
         )
-    return NodeNames(MappingProxyType(kept), version)
+    return NodeNames(MappingProxyType(names), version)
 
 
 def write_names(
@@ -81,13 +81,13 @@ def write_names(
     if beyond := [node for node in names if not 0 <= node < num_nodes]:
         raise SettingsError(f"node {beyond[0]} does not exist", expected=f"0 to {num_nodes - 1}")
     try:
-        given = {node: checked_name(name) for node, name in names.items()}
+        checked = {node: checked_name(name) for node, name in sorted(names.items())}
     except ValueError as error:
         raise SettingsError(str(error), expected=NAME_RULE) from error
     with replacing(path, version, f"the names in {path}") as path:
-        found = _kept(path)
-        found.trees[tree_digest(semantic_tree)] = {node: name for node, name in sorted(given.items()) if name}
-        write_json(path, found.model_dump(mode="json"))
+        stored = _stored(path)
+        stored.trees[tree_digest(semantic_tree)] = {node: name for node, name in checked.items() if name}
+        write_json(path, stored.model_dump(mode="json"))
     return read_names(folder, semantic_tree)
 
 
@@ -100,7 +100,7 @@ class NamesFile(BaseModel):
     trees: dict[str, dict[NonNegativeInt, Annotated[str, AfterValidator(checked_name)]]]
 
 
-def _kept(path: Path) -> NamesFile:
+def _stored(path: Path) -> NamesFile:
     if not path.is_file():
         return NamesFile(format="hilsplat-names-1", trees={})
     try:

@@ -42,7 +42,7 @@ STANDS_OUT = 0.5
 """Minimum lead of a name's margin over that of the fifth-nearest text (nearer texts include synonyms), in
 standard deviations of the vocabulary's margins. Chosen on development scenes (docs/experiments.md)."""
 
-FEWEST_ABSENT = 100
+MIN_ABSENT = 100
 """Minimum number of known words for absent objects. If there are fewer, they are replaced by the vocabulary
 words that are not the nearest word of any node. If these are too few as well, chance is not estimated."""
 
@@ -75,27 +75,27 @@ class Vocabulary:
             raise SettingsError(
                 f"the vocabulary {path} cannot be read: {error}", expected="a UTF-8 text file"
             ) from error
-        found: dict[str, dict[str, None]] = {section: {} for section in SECTIONS}
+        texts: dict[str, dict[str, None]] = {section: {} for section in SECTIONS}
         section = SECTIONS[0]
         for number, line in enumerate(lines, 1):
             text = line.partition("#")[0].strip()
             if text.startswith("["):
                 section = text.strip("[]").strip().lower()
-                if section not in found:
+                if section not in texts:
                     raise SettingsError(
                         f"line {number} of the vocabulary {path} has an unknown section",
-                        expected=", ".join(f"[{each}]" for each in SECTIONS),
+                        expected=", ".join(f"[{known}]" for known in SECTIONS),
                         found=text,
                     )
             else:
                 try:
-                    names = (checked_name(each) for each in text.split(","))
-                    found[section] |= dict.fromkeys(name for name in names if name)
+                    names = map(checked_name, text.split(","))
+                    texts[section] |= dict.fromkeys(name for name in names if name)
                 except ValueError as error:
                     raise SettingsError(f"line {number} of {path}: {error}", expected=NAME_RULE) from error
-        if not (found["things"] or found["parts"] or found["surfaces"]):
+        if not (texts["things"] or texts["parts"] or texts["surfaces"]):
             raise SettingsError(f"the vocabulary {path} contains no texts", expected="one text per line")
-        return Vocabulary(**{section: tuple(texts) for section, texts in found.items()})
+        return Vocabulary(**{section: tuple(of_section) for section, of_section in texts.items()})
 
 
 @dataclass(frozen=True)
@@ -127,20 +127,18 @@ class NodeNaming:
             return None
         rows = read_json(sealed(folder, "names.json"))
         try:
-            found = NodeNaming(
-                tuple(checked_name(str(row["name"])) for row in rows),
-                tuple(bool(row["surface"]) for row in rows),
-                read_npy(sealed(folder, "rivals.npy")).astype(np.float32),
-            )
-            if len(rows) != index["nodes"] or found.rivals.ndim != 2:
-                raise ValueError(f"{len(rows)} names, rivals of shape {found.rivals.shape}")
+            names = tuple(checked_name(str(row["name"])) for row in rows)
+            surfaces = tuple(bool(row["surface"]) for row in rows)
+            rivals = read_npy(sealed(folder, "rivals.npy")).astype(np.float32)
+            if len(rows) != index["nodes"] or rivals.ndim != 2:
+                raise ValueError(f"{len(rows)} names, rivals of shape {rivals.shape}")
         except (TypeError, KeyError, ValueError) as error:
             raise ArtifactError(
                 f"{folder / 'names.json'} or rivals.npy is damaged: {error!r}",
                 expected=f"{index['nodes']} names, and vectors (W, C)",
                 fix=remake(folder),
             ) from error
-        return found
+        return NodeNaming(names, surfaces, rivals)
 
 
 def run_names(
@@ -163,9 +161,10 @@ def run_names(
     """
     tree = SemanticTree.load(semantic_tree, clip_folder)
     model = open_clip_of(clip_folder, evaluate.template)
-    own = model.model.folder / VOCABULARY
-    automatic = own if own.is_file() else COMMON
-    path = automatic if settings.vocabulary == AUTO else Path(settings.vocabulary)
+    path = Path(settings.vocabulary)
+    if settings.vocabulary == AUTO:
+        of_model = model.model.folder / VOCABULARY
+        path = of_model if of_model.is_file() else COMMON
     vocabulary = Vocabulary.read(path)
     absent = vocabulary.absent or Vocabulary.read(COMMON).absent
     with stage_log("names", Path(out).parent.parent.name) as counts, atomic_folder(out) as folder:
@@ -178,10 +177,10 @@ def run_names(
             return np.array([vectors[word] for word in words], np.float32).reshape(-1, tree.clip.shape[1])
 
         margin = margins(tree.clip, of(texts), of(evaluate.canonical)).T
-        if len(known) < FEWEST_ABSENT:
+        if len(known) < MIN_ABSENT:
             nearest = set(margin.argmax(axis=1).tolist())
             known = [text for row, text in enumerate(texts) if row not in nearest]
-        rivals = known if len(known) >= FEWEST_ABSENT else []
+        rivals = known if len(known) >= MIN_ABSENT else []
         rows = named(tree, vocabulary, margin)
         write_json(folder / "names.json", rows)
         write_npy(folder / "rivals.npy", of(rivals).astype(np.float16))
@@ -230,16 +229,16 @@ def named(
     kinds = np.array([kind for kind, group in groups.items() for _ in group])
     rows: list[dict[str, Any]] = []
     for node, level in enumerate(tree.level.tolist()):
-        may = np.flatnonzero(kinds != ("part" if level == Level.WHOLE else "surface"))
-        own = margin[node, may]
-        order = np.argsort(-own, kind="stable")[:CANDIDATES]
-        best = own.max(initial=0.0)
-        fits = best > 0 and best - own[order[-1]] >= STANDS_OUT * own.std()
+        columns = np.flatnonzero(kinds != ("part" if level == Level.WHOLE else "surface"))
+        margins_of_node = margin[node, columns]
+        order = np.argsort(-margins_of_node, kind="stable")[:CANDIDATES]
+        nearest, best = columns[order], margins_of_node.max(initial=0.0)
+        fits = best > 0 and best - margins_of_node[order[-1]] >= STANDS_OUT * margins_of_node.std()
         rows.append(
             {
-                "name": words[may[order[0]]] if fits else "",
-                "surface": bool(fits and kinds[may[order[0]]] == "surface"),
-                "candidates": [[words[may[row]], round(float(own[row]), 4)] for row in order],
+                "name": words[nearest[0]] if fits else "",
+                "surface": bool(fits and kinds[nearest[0]] == "surface"),
+                "candidates": [[words[word], round(float(margin[node, word]), 4)] for word in nearest],
             }
         )
     for level in LEVELS[1:]:  # a part does not get the name of its parent

@@ -82,8 +82,8 @@ def search(
     *,
     threshold: float,
     ancestors: float,
+    visible: Bool[np.ndarray, " n"],
     level: Level | None = None,
-    shown: Bool[np.ndarray, " n"] | None = None,
 ) -> NodeHits:
     """Find the nodes that answer a text, or the last text of a path such as ("bear", "head", "nose").
 
@@ -96,50 +96,49 @@ def search(
     If a path has fewer texts than there are levels, its levels are ambiguous: the handle of a mug may be a
     part or a subpart, and the head of ("head", "nose") is not a whole. All combinations of levels are
     therefore searched. Combinations whose best answer has an ancestor for every text are preferred; among
-    these, the largest sum of margins wins. Ancestors need not be shown; they compete with nodes that are
-    shown or have a shown descendant.
+    these, the largest sum of margins wins. Ancestors need not be visible; they compete with nodes that are
+    visible or have a visible descendant.
 
     Args:
         margin: cosine margin of every node for each text.
         vectors: unit vectors of every node, which determine which nodes look alike.
-        threshold: answers are below the best shown node by at most (1 - threshold) times the range of the
+        threshold: answers are below the best visible node by at most (1 - threshold) times the range of the
             level's values, or by `ALIKE_REACH` times that distance if they look like the best.
         ancestors: fraction of the ancestors' mean margin that is added to a node's own margin; ignored for a
             path of several texts, which itself specifies the ancestors.
+        visible: which nodes are allowed as answers.
         level: level of the last text; None chooses it automatically.
-        shown: which nodes are allowed as answers; None allows all.
 
     Raises:
         SettingsError: the path has more texts than levels from whole to the level of its last text.
     """
     margin = margin.astype(np.float64)
-    anywhere = (margin if shown is None else margin[:, shown]).max(axis=1, initial=-np.inf).tolist()
+    anywhere = margin[:, visible].max(axis=1, initial=-np.inf).tolist()
     if len(path) == 1:
         (own,) = margin
-        level = automatic_level(tree, own, shown) if level is None else level
+        level = automatic_level(tree, own, visible) if level is None else level
         nodes = tree.nodes_of(level)
-        may = nodes if shown is None else nodes[shown[nodes]]
+        candidates = nodes[visible[nodes]]
         value = own + ancestors * ancestor_margins(tree, own)
         spread = np.ptp(value[nodes]) if len(nodes) else 0.0
-        chosen = _near_best(value, may, vectors, (1 - threshold) * spread)
-        best = own[may].max(initial=-np.inf)
-        return NodeHits(chosen, value[chosen], "flat", (TextAnswer(path[0], level, float(best), *anywhere),))
+        chosen = _near_best(value, candidates, vectors, (1 - threshold) * spread)
+        best = float(own[candidates].max(initial=-np.inf))
+        return NodeHits(chosen, value[chosen], "flat", (TextAnswer(path[0], level, best, *anywhere),))
     ways = [way for way in combinations(LEVELS, len(path)) if level in (None, way[-1])]
     if not ways:
-        levels = LEVELS if level is None else LEVELS[: level.index + 1]
+        labels = [known.label for known in LEVELS if level is None or known <= level]
+        at_level = "" if level is None else f" at level {level.label}"
         raise SettingsError(
-            f"the path {' > '.join(path)!r} cannot be searched"
-            + ("" if level is None else f" at level {level.label}"),
-            expected=f"1 to {len(levels)} texts, coarse to fine: {' > '.join(each.label for each in levels)}",
+            f"the path {' > '.join(path)!r} cannot be searched{at_level}",
+            expected=f"1 to {len(labels)} texts, coarse to fine: {' > '.join(labels)}",
             found=f"{len(path)}",
             fix="name the object, then its part, then a part of that part",
         )
-    containing, found = tree.ancestors(), []
-    for way in ways:
-        complete, total, margins, hits = _search_way(tree, margin, containing, vectors, way, threshold, shown)
-        texts = tuple(map(TextAnswer, path, way, margins, anywhere))
-        found.append((complete, total, replace(hits, texts=texts)))
-    return max(found, key=lambda each: each[:2])[2]
+    containing = tree.ancestors()
+    results = [_search_way(tree, margin, containing, vectors, way, threshold, visible) for way in ways]
+    best_row = max(range(len(ways)), key=lambda row: results[row][:2])
+    _, _, margins, hits = results[best_row]
+    return replace(hits, texts=tuple(map(TextAnswer, path, ways[best_row], margins, anywhere)))
 
 
 def _near_best(
@@ -156,10 +155,10 @@ def _near_best(
         return np.zeros(0, np.int64)
     own = value[candidates]
     below = own.max() - own
-    alike = vectors[candidates] @ vectors[candidates[own.argmax()]] >= ALIKE
-    kept = below <= np.where(alike, ALIKE_REACH, 1.0) * reach
-    chosen = candidates[kept]
-    return chosen[np.lexsort((chosen, below[kept]))].astype(np.int64)
+    is_alike = vectors[candidates] @ vectors[candidates[own.argmax()]] >= ALIKE
+    is_near = below <= np.where(is_alike, ALIKE_REACH, 1.0) * reach
+    chosen = candidates[is_near]
+    return chosen[np.lexsort((chosen, below[is_near]))].astype(np.int64)
 
 
 def ancestor_margins(tree: SemanticTree, margin: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
@@ -177,19 +176,18 @@ def ancestor_margins(tree: SemanticTree, margin: Float64[np.ndarray, " n"]) -> F
 
 
 def automatic_level(
-    tree: SemanticTree, margin: Float64[np.ndarray, " n"], shown: Bool[np.ndarray, " n"] | None = None
+    tree: SemanticTree, margin: Float64[np.ndarray, " n"], visible: Bool[np.ndarray, " n"]
 ) -> Level:
-    """Return the level of the node that best matches a text; the coarsest level wins ties.
+    """Return the level of the visible node that best matches a text; the coarsest level wins ties.
 
     This is LangSplat's rule, applied to nodes instead of pixels. A node's vector is an average over views,
     and a level has tens of nodes, so noise does not favour the finest level, as it does for a maximum over
     100,000 pixels. docs/experiments.md ("Query") compares it with other rules.
     """
-    levels = tree.level if shown is None else tree.level[shown]
-    own = margin if shown is None else margin[shown]
-    if not len(levels):
+    if not visible.any():
         return Level.WHOLE
-    return Level(int(levels[own == own.max()].min()))
+    levels, margin = tree.level[visible], margin[visible]
+    return Level(int(levels[margin == margin.max()].min()))
 
 
 def _search_way(
@@ -199,7 +197,7 @@ def _search_way(
     vectors: Float32[np.ndarray, "n C"],
     levels: tuple[Level, ...],
     threshold: float,
-    shown: Bool[np.ndarray, " n"] | None,
+    visible: Bool[np.ndarray, " n"],
 ) -> tuple[bool, float, list[float], NodeHits]:
     """Search the last level for the last text, and each earlier level's ancestors for the earlier text.
 
@@ -209,15 +207,14 @@ def _search_way(
         competed for each text; and the answers, with `texts` unset.
     """
     nodes, last = tree.nodes_of(levels[-1]), margin[-1]
-    may = nodes if shown is None else nodes[shown[nodes]]
+    candidates = nodes[visible[nodes]]
     value, total = last.copy(), last.copy()
     likely = np.ones(len(tree), np.bool_)
     margins = []
     for text, (of_text, level) in enumerate(zip(margin[:-1], levels[:-1], strict=True)):
         holder, of_level = ancestors[:, level.index], tree.nodes_of(level)
-        rivals = of_level
-        if shown is not None:  # an ancestor may be hidden behind a descendant
-            rivals = of_level[shown[of_level] | np.isin(of_level, holder[may])]
+        # an ancestor may be hidden behind a descendant
+        rivals = of_level[visible[of_level] | np.isin(of_level, holder[candidates])]
         margins.append(float(of_text[rivals].max(initial=-np.inf)))
         best = margins[-1] if len(rivals) else 0.0
         # Without 0, the margin of a tie, the range of a single object or of several that all match the text
@@ -228,12 +225,12 @@ def _search_way(
         total += best - below
         if text == 0:
             likely = below <= PLAUSIBLE * spread
-    margins.append(float(last[may].max(initial=-np.inf)))
-    if not len(may):
-        return False, -np.inf, margins, NodeHits(may, value[may], "fallback", ())
-    inside = bool(likely[may].any())
+    margins.append(float(last[candidates].max(initial=-np.inf)))
+    if not len(candidates):
+        return False, -np.inf, margins, NodeHits(candidates, value[candidates], "fallback", ())
+    inside = bool(likely[candidates].any())
     reach = (1 - threshold) * np.ptp(last[nodes])
-    chosen = _near_best(value, may[likely[may]] if inside else may, vectors, reach)
+    chosen = _near_best(value, candidates[likely[candidates]] if inside else candidates, vectors, reach)
     holders = ancestors[chosen[0], [level.index for level in levels[:-1]]]
     complete = inside and bool((holders != NONE).all())
     route = "descendant"

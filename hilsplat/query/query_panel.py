@@ -49,10 +49,10 @@ def query_panel(
     `note` is appended to the title, and doubts are written below. The relevancy is that of `answerer`.
     """
     last = path_of(text)[-1]
-    found = f"{counted(len(hits.ids), 'node')} at level {hits.level.label}"
+    count = f"{counted(len(hits.ids), 'node')} at level {hits.level.label}"
     names = list(dict.fromkeys(scene.name_of(int(node)) or "?" for node in hits.ids))
     called = f" ({', '.join([*names[:NAMED], *(['…'] if names[NAMED:] else [])])})" if names else ""
-    title = f"“{text}” in {scene.scene.name}: {found}{called}{note}"
+    title = f"“{text}” in {scene.scene.name}: {count}{called}{note}"
     caution = wrap(scene.caution_about(text), TITLE_LETTERS)
     heading = [*wrap(title, TITLE_LETTERS), *caution, *map(str, doubts_of(hits))]
     height, width = scene.scene.cameras[views[0]].size_hw
@@ -63,23 +63,23 @@ def query_panel(
         page.write(line, page.width_px / 2, (number + 0.5) * HEADING_PX, size=12.0, bold=True)
     for row, view in enumerate(views):
         top = upper_px - (len(views) - row) * row_px
-        image, mask = scene.image(view), scene.node_masks(view, hits.ids)
+        image, mask = scene.views.image(view), scene.views.node_masks(view, hits.ids)
         if answerer == "tree":
             relevancy = scene.node_relevancy_map([last], view)[0]
         else:
-            relevancy = scene.field_relevancy([last], view, exact=False)[0]
+            relevancy = scene.field.relevancy([last], view, exact=False)[0]
         low, high = float(relevancy.min()), float(relevancy.max())
         pictures = [(image, view), (paint_answer(image, mask), f"answer: {mask.mean():.1%} of the view")]
-        for each in LEVELS:
-            own = relevancy[each.index]
-            name = f"relevancy, {each.label}: {float(own.max()):.2f}"
-            pictures.append((paint_relevancy(image, own, low, high), name))
+        for level in LEVELS:
+            at_level = relevancy[level.index]
+            name = f"relevancy, {level.label}: {float(at_level.max()):.2f}"
+            pictures.append((paint_relevancy(image, at_level, low, high), name))
         page.write(f"{scene.scene.split[view]} view", LEFT_PX / 2, top + row_px / 2, rotation=90.0)
         for column, (picture, name) in enumerate(pictures):
             bold = column == 2 + hits.level.index
             page.show(picture, name, LEFT_PX + column * (CELL_PX + GAP_PX), top, row_px, bold)
     selected = np.zeros(len(scene.gaussians), np.bool_)
-    selected[scene.gaussians_of(hits.ids)] = True
+    selected[scene.views.gaussians_of(hits.ids)] = True
     title = f"from above: {np.count_nonzero(selected)} of {len(selected)} Gaussians; triangles are cameras"
     below = (MAP_PX - TITLE_PX - GAP_PX) / page.height_px
     axes = page.figure.add_axes((0.02, GAP_PX / page.height_px, 0.96, below))

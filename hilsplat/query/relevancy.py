@@ -43,13 +43,13 @@ def margins(
     At margin 0, an embedding is as close to the text as to the nearest canonical phrase. Embeddings are
     compared by margins because relevancies saturate. All vectors have unit length.
     """
-    found = np.empty((len(texts), len(embeddings)), np.float32)
-    every = np.concatenate([texts, canonical])  # one product takes less time than two
+    out = np.empty((len(texts), len(embeddings)), np.float32)
+    vectors = np.concatenate([texts, canonical])  # one product takes less time than two
     for start in range(0, len(embeddings), ROWS_AT_A_TIME):
-        cosines = every @ embeddings[start : start + ROWS_AT_A_TIME].T
+        cosines = vectors @ embeddings[start : start + ROWS_AT_A_TIME].T
         generic = cosines[len(texts) :].max(axis=0)
-        found[:, start : start + ROWS_AT_A_TIME] = cosines[: len(texts)] - generic
-    return found
+        out[:, start : start + ROWS_AT_A_TIME] = cosines[: len(texts)] - generic
+    return out
 
 
 def relevancy_of_margins(margin: Float[np.ndarray, "*n"], scale: float) -> Float[np.ndarray, "*n"]:
@@ -149,7 +149,7 @@ class LatentRelevancy:
         if view.directions is None:
             assert isinstance(self._code, LinearCode)  # `prepare` made the view
             terms = [self._code.cosine_terms(text[None])[:2] for text in texts]
-            offsets, slopes = (np.concatenate(each).astype(np.float32) for each in zip(*terms, strict=True))
+            offsets, slopes = (np.concatenate(term).astype(np.float32) for term in zip(*terms, strict=True))
         else:
             offsets = np.zeros(len(texts), np.float32)
             slopes = np.stack([view.directions @ text / STEPS for text in texts]).astype(np.float32)
@@ -209,8 +209,8 @@ class LatentRelevancy:
             along = directions @ vectors.T
             coordinates[:, span] = np.rint(along * STEPS)
             # 1 minus the sum of squared coordinates is too imprecise: its error, 1e-7, is the square of 3e-4.
-            rest = vectors - along.T @ directions
-            lost[span] = np.sqrt(np.einsum("pc,pc->p", rest, rest))
+            outside = vectors - along.T @ directions
+            lost[span] = np.sqrt(np.einsum("pc,pc->p", outside, outside))
 
         self._in_parts(decode, len(latents), CHUNK_ROWS)
         return coordinates, generic, lost
@@ -223,14 +223,10 @@ class LatentRelevancy:
 def lost_for_error(scale: float, channels: int) -> float:
     """Return the largest loss at which every relevancy error is at most `ERROR`.
 
-    Relevancy is 1 / (1 + exp(-s (e.q - g))) with a unit text q. The nearest phrase's g is computed from the
-    full vector, so only e.q has an error: at most |q| = 1 times the distance of e from its stored form. This
-    distance is the loss outside the directions plus the rounding of at most C coordinates,
-    sqrt(C) / (2 `STEPS`). The slope is at most s / 4, where text and phrase tie. The directions may thus lose
-
-        4 `ERROR` / s - sqrt(C) / (2 `STEPS`),
-
-    which is 4.5e-4 with s = 10 and C = 512.
+    Relevancy is 1 / (1 + exp(-s (e.q - g))) with a unit text q. Only e.q has an error: at most the distance
+    of e from its stored form, which is the loss outside the directions plus the rounding of C coordinates,
+    sqrt(C) / (2 `STEPS`). The slope is at most s / 4. The directions may thus lose
+    4 `ERROR` / s - sqrt(C) / (2 `STEPS`), which is 4.5e-4 with s = 10 and C = 512.
 
     Departs: the result is at least `RESIDUAL`. At s >= 20 (C = 512), 16 bits are too few for `ERROR`, and the
     relevancy error can reach s / 4 times the sum of `RESIDUAL` and rounding.

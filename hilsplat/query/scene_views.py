@@ -12,12 +12,13 @@ from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64, UInt8
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.contributions.compositing import normalised_weights
-from hilsplat.scene.cameras import Camera, Cameras
+from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import SemanticTree, ViewNodes
 from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.rasterise.api import pixel_weights
 
-MIN_SHOWN_SHARE = 1e-4
+MIN_VISIBLE_SHARE = 1e-4
 """Minimum share of a view's pixels that a visible node covers; 14 px of 384 x 384 are too few."""
 
 VIEW_CACHE_MIB = 1024.0
@@ -26,10 +27,14 @@ Nodes = Sequence[int] | Int64[np.ndarray, " n"]
 
 
 class Opened:
-    """Artifacts of a scene's variants, which share most; `get(how, *of)` opens or hashes each only once."""
+    """Artifacts of a scene's variants, which share most; `get(how, *of)` opens or hashes each only once.
 
-    def __init__(self) -> None:
+    `max_mib` limits the cached results per view of each variant.
+    """
+
+    def __init__(self, max_mib: float = VIEW_CACHE_MIB) -> None:
         self.get: Callable[..., Any] = cache(lambda how, *of: how(*of))
+        self.max_mib = max_mib
 
 
 class ViewStore:
@@ -37,23 +42,23 @@ class ViewStore:
 
     def __init__(self, max_mib: float = VIEW_CACHE_MIB) -> None:
         self._max_bytes = max_mib * 2**20
-        self._kept: dict[tuple, tuple[Any, int]] = {}
+        self._values: dict[tuple, tuple[Any, int]] = {}
 
     def get(self, key: tuple, compute: Callable[[], Any]) -> Any:
         """Return the cached value, or compute and cache it; the second item of a key is the view."""
-        if key in self._kept:
-            self._kept[key] = self._kept.pop(key)
-            return self._kept[key][0]
+        if key in self._values:
+            self._values[key] = self._values.pop(key)
+            return self._values[key][0]
         value = compute()
-        self._kept[key] = (value, _nbytes(value))
-        while len(self._kept) > 1 and sum(nbytes for _, nbytes in self._kept.values()) > self._max_bytes:
-            self._kept.pop(next(iter(self._kept)))
+        self._values[key] = (value, _nbytes(value))
+        while len(self._values) > 1 and sum(nbytes for _, nbytes in self._values.values()) > self._max_bytes:
+            self._values.pop(next(iter(self._values)))
         return value
 
     def forget(self, view: str) -> None:
         """Drop the results of a view."""
-        for key in [key for key in self._kept if key[1] == view]:
-            del self._kept[key]
+        for key in [key for key in self._values if key[1] == view]:
+            del self._values[key]
 
 
 def _nbytes(value: Any) -> int:
@@ -67,68 +72,66 @@ def _nbytes(value: Any) -> int:
 
 @dataclass(frozen=True)
 class SceneViews:
-    """The views of a scene with a semantic tree.
-
-    `pixel_weights` returns a view's weight matrix W (pixels x Gaussians).
-    """
+    """The views of a scene, with the Gaussians and nodes that they show; results are cached per view."""
 
     scene: Scene
     gaussians: Gaussians
     tree: SemanticTree
-    pixel_weights: Callable[[str], sp.csr_matrix]
-    _views: ViewStore = field(default_factory=ViewStore, repr=False, kw_only=True)
+    threads: int = 1
+    cache: ViewStore = field(default_factory=ViewStore, repr=False, compare=False)
 
     @property
-    def views(self) -> tuple[str, ...]:
+    def names(self) -> tuple[str, ...]:
         """Names of all views, in camera order."""
         return self.scene.cameras.names
 
-    def camera(self, view: str) -> Camera:
-        """Return the camera of a view; raise SettingsError if the scene has no such view."""
-        if view not in self.views:
+    def size_hw(self, view: str) -> tuple[int, int]:
+        """Return the image size of a view; raise SettingsError if the scene has no such view."""
+        if view not in self.names:
             raise SettingsError(
                 f"{self.scene.name} has no view {view!r}",
-                expected=f"one of {', '.join(self.views[:3])}, ... ({len(self.views)} views)",
+                expected=f"one of {', '.join(self.names[:3])}, ... ({len(self.names)} views)",
                 found=view,
             )
-        return self.scene.cameras[view]
+        return self.scene.cameras[view].size_hw
 
     def image(self, view: str) -> UInt8[np.ndarray, "H W 3"]:
         """Return a view's undistorted photograph, a cached read-only array: copy it to change pixels."""
-        self.camera(view)
+        self.size_hw(view)
 
         def read() -> np.ndarray:
             pixels = self.scene.image(view)
             pixels.setflags(write=False)
             return pixels
 
-        return self._views.get(("image", view), read)
+        return self.cache.get(("image", view), read)
 
-    def forget(self, view: str) -> None:
-        """Free the cached results of a view; later queries recompute them."""
-        self._views.forget(view)
+    def pixel_weights(self, view: str) -> sp.csr_matrix:
+        """Render a view's weight matrix W (pixels x Gaussians)."""
+        camera, min_weight = self.scene.cameras[view], self.tree.min_weight
+        return pixel_weights(self.gaussians, camera, min_weight=min_weight, threads=self.threads)
 
     def view_weights(self, view: str) -> sp.csr_matrix:
         """Return W with rows divided by alpha; rows with an alpha below 0.5 are empty."""
-        return self._views.get(("weights", view), lambda: normalised_weights(self.pixel_weights(view)))
+        return self.cache.get(("weights", view), lambda: normalised_weights(self.pixel_weights(view)))
 
     def view_nodes(self, view: str, level: Level) -> ViewNodes:
         """Return the nodes of a level in each pixel of a view."""
-        return self._views.get(
+        return self.cache.get(
             ("nodes", view, level),
             lambda: ViewNodes.of(self.view_weights(view), self.tree.node_of_gaussian[:, level.index]),
         )
 
-    def nodes_shown(self, view: str) -> Bool[np.ndarray, " n"]:
-        """Return whether each node's mask covers at least `MIN_SHOWN_SHARE` of a view."""
-        height, width = self.camera(view).size_hw
+    def visible_nodes(self, view: str) -> Bool[np.ndarray, " n"]:
+        """Return whether each node's mask covers at least `MIN_VISIBLE_SHARE` of a view."""
+        height, width = self.size_hw(view)
 
         def measure() -> np.ndarray:
             num = len(self.tree)
             area_px = np.sum([self.view_nodes(view, level).area_px(num) for level in LEVELS], axis=0)
-            return np.asarray(area_px >= MIN_SHOWN_SHARE * height * width)
+            return np.asarray(area_px >= MIN_VISIBLE_SHARE * height * width)
 
-        return self._views.get(("shown", view), measure)
+        return self.cache.get(("visible", view), measure)
 
     def gaussians_of(self, ids: Nodes) -> Int64[np.ndarray, " g"]:
         """Return the rows of `gaussians.ply` that belong to any of the nodes."""
@@ -137,14 +140,13 @@ class SceneViews:
     def node_masks(self, view: str, ids: Nodes) -> Bool[np.ndarray, "H W"]:
         """Return the pixels in which the nodes' Gaussians have more than half of the total weight."""
         ids = np.asarray(ids, np.int64)
-        size_hw = self.camera(view).size_hw
+        size_hw = self.size_hw(view)
         if not len(ids):
             return np.zeros(size_hw, np.bool_)
         levels = np.unique(self.tree.level[ids])
         if len(levels) == 1:
-            chosen = np.zeros(len(self.tree), np.bool_)
-            chosen[ids] = True
-            return self.view_nodes(view, Level(int(levels[0]))).mask(chosen).reshape(size_hw)
+            is_chosen = np.isin(np.arange(len(self.tree)), ids)
+            return self.view_nodes(view, Level(int(levels[0]))).mask(is_chosen).reshape(size_hw)
         member = np.zeros(len(self.tree.node_of_gaussian), np.float32)
         member[self.gaussians_of(ids)] = 1
         return (self.view_weights(view) @ member > 0.5).reshape(size_hw)
@@ -155,15 +157,15 @@ class SceneViews:
         Gaussians without a node have the lowest node score of the level. Uncovered pixels get the covered
         pixels' lowest value, so that they are never selected and do not extend the range.
         """
-        height, width = self.camera(view).size_hw
+        height, width = self.size_hw(view)
         maps = np.zeros((len(scores), len(LEVELS), height * width), np.float32)
         for level in LEVELS:
             nodes = self.tree.nodes_of(level)
             if not len(nodes):
                 continue
-            shown = self.view_nodes(view, level)
+            in_view = self.view_nodes(view, level)
             for row, values in enumerate(scores):
-                shown.blend(values, float(values[nodes].min()), maps[row, level.index])
+                in_view.blend(values, float(values[nodes].min()), maps[row, level.index])
         return maps.reshape(len(scores), len(LEVELS), height, width)
 
 

@@ -31,7 +31,7 @@ COLUMNS = 18
 
 BACKGROUND = 250.0
 CROP_MARGIN = 0.15
-LEAST_ALPHA = 0.1
+MIN_ALPHA = 0.1
 """Minimum alpha assumed in deciding whether a crop's pixel shows the node; enlarged Gaussians leave gaps."""
 
 LINE = (150, 150, 150)
@@ -40,16 +40,13 @@ TEXT_PX = 12
 
 
 def export_tree(folder: Path, variant: str, out: Path, threads: int) -> str:
-    """Write `tree.json`, `tree.ply` (a node per Gaussian and level) and `tree.png` for a finished scene.
-
-    Return a human-readable summary.
-    """
-    found = FinishedScene.locate(folder, variant)
-    scene = LanguageScene.of(found, threads=threads)
+    """Write `tree.json`, `tree.ply` (a node per Gaussian and level) and `tree.png`; return a summary."""
+    finished = FinishedScene.locate(folder, variant)
+    scene = LanguageScene.of(finished, threads=threads)
     nodes = [{**node, "name": scene.name_of(row)} for row, node in enumerate(readable_nodes(scene.tree))]
     with atomic_folder(out) as temporary:
         write_json(temporary / "tree.json", {"scene": scene.scene.name, "nodes": nodes})
-        write_tree_ply(found.parts.gaussians, scene.tree, temporary / "tree.ply")
+        write_tree_ply(finished.parts.gaussians, scene.tree, temporary / "tree.ply")
         write_png(temporary / "tree.png", tree_picture(scene))
     counts = ", ".join(f"{len(scene.tree.nodes_of(level))} {level.label}" for level in LEVELS)
     return f"wrote tree.json, tree.ply and tree.png to {out} ({counts})"
@@ -120,10 +117,9 @@ def _labelled(
     picture = Image.fromarray(canvas)
     draw = ImageDraw.Draw(picture)
     for text, x, y in labels:
-        shown = text
-        while draw.textlength(shown, font) > CELL_PX + GAP_PX // 2:
-            shown = shown.rstrip("…")[:-1] + "…"
-        draw.text((x, y), shown, TEXT, font, anchor="mm")
+        while draw.textlength(text, font) > CELL_PX + GAP_PX // 2:
+            text = text.rstrip("…")[:-1] + "…"
+        draw.text((x, y), text, TEXT, font, anchor="mm")
     return np.asarray(picture)
 
 
@@ -137,17 +133,17 @@ def crop(
     """
     tree = scene.tree
     view = tree.view_names[int(tree.view_area_px[node].argmax())]
-    camera, photograph = scene.scene.cameras[view], scene.image(view)
-    rows = scene.gaussians_of([node])
+    camera, photograph = scene.scene.cameras[view], scene.views.image(view)
+    rows = scene.views.gaussians_of([node])
     x, y, side = _square_around(scene.gaussians.means[rows], camera)
     shift = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]])
     scale = np.diag([side_px / side, side_px / side, 1.0])
     inside = Camera("crop", camera.cam_from_world, scale @ shift @ camera.K, (side_px, side_px))
     member = np.zeros((len(scene.gaussians), 1), np.float32)
     member[rows] = 1
-    drawn = project_gaussians(scene.gaussians, inside, 0, scene.threads)
-    shares, alpha = blend_forward(drawn, member, scene.threads)
-    is_node = shares[..., 0] > 0.5 * np.maximum(alpha, LEAST_ALPHA)
+    drawn = project_gaussians(scene.gaussians, inside, 0, scene.views.threads)
+    shares, alpha = blend_forward(drawn, member, scene.views.threads)
+    is_node = shares[..., 0] > 0.5 * np.maximum(alpha, MIN_ALPHA)
     pixels = resampled(photograph, x, y, side, side_px, ground)
     around = pixels * dimmed + (1 - dimmed) * ground
     return np.where(is_node[..., None], pixels, around.astype(np.uint8))
@@ -174,8 +170,8 @@ def _square_around(points: np.ndarray, camera: Camera) -> tuple[float, float, fl
     height, width = camera.size_hw
     if not len(local):
         return 0.0, 0.0, float(max(height, width))
-    places = local @ camera.K.T
-    xy = places[:, :2] / places[:, 2:]
+    projected = local @ camera.K.T
+    xy = projected[:, :2] / projected[:, 2:]
     low, high = np.percentile(xy, (3, 97), axis=0)
     low, high = np.clip(low, 0, (width, height)), np.clip(high, 0, (width, height))
     side = float((high - low).max()) * (1 + 2 * CROP_MARGIN) + 4

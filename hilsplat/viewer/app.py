@@ -20,7 +20,6 @@ from hilsplat.base.errors import ImageError, SettingsError
 from hilsplat.base.images import read_image
 from hilsplat.query.names import write_names
 from hilsplat.query.tree_picture import crop
-from hilsplat.scene.finished import FinishedScene
 from hilsplat.viewer import payload, wire
 from hilsplat.viewer.frames import painted, pick
 from hilsplat.viewer.openapi import description
@@ -56,29 +55,28 @@ class Viewer:
         routes = [
             *self.pages.routes(),
             *self.thread.routes(),
-            Route("/openapi.json", get(lambda shown, of: description())),
-            Route("/api/variant/{variant}", get(lambda shown, of: shown.described_variant(of["variant"]))),
+            get("/api/variant/{variant}", _variant),
             Route("/api/splats/{chunk:int}", self._splats),
-            Route("/api/nodes/{variant}", get(_nodes)),
-            Route("/api/crop/{variant}/{node:int}", get(_crop, behind=True)),
-            Route("/api/query", post(wire.Query, _query), methods=["POST"]),
-            Route("/api/like", post(wire.Like, _like), methods=["POST"]),
-            Route("/api/field", post(wire.FieldRelevancy, _field), methods=["POST"]),
-            Route("/api/pick", post(wire.Pick, _picked), methods=["POST"]),
-            Route("/api/frame", post(wire.Frame, _frame), methods=["POST"]),
+            get("/api/nodes/{variant}", _nodes),
+            get("/api/crop/{variant}/{node:int}", _crop, behind=True),
+            post("/api/query", wire.Query, _query),
+            post("/api/like", wire.Like, _like),
+            post("/api/field", wire.FieldRelevancy, _field),
+            post("/api/pick", wire.Pick, _pick),
+            post("/api/frame", wire.Frame, _frame),
             Route("/api/names", self._names, methods=["PUT"]),
             *SavedFiles(self.thread, self.pages.static).routes(),
         ]
+        routes.append(Route("/openapi.json", lambda request: answer(description(routes))))
         return guarded(routes, token, embedded=embedded)
 
     async def _splats(self, request: Request) -> Response:
         """Send a chunk of the Gaussians as SPZ."""
-        chunk = request.path_params["chunk"]
         tag = f'"{await self.thread.do(request, lambda shown: shown.splats_tag)}"'
         if request.headers.get("if-none-match") == tag:
             return Response(status_code=304, headers={"etag": tag})
-        data = await self.thread.do(request, lambda shown: shown.chunk(chunk))
-        return Response(data, headers={"etag": tag, "cache-control": "no-cache"})
+        chunk = await self.thread.do(request, lambda shown: shown.chunk(request.path_params["chunk"]))
+        return Response(chunk, headers={"etag": tag, "cache-control": "no-cache"})
 
     async def _names(self, request: Request) -> Response:
         """Replace the names of a tree's nodes; the `If-Match` header is the version that the page read."""
@@ -95,22 +93,30 @@ class Viewer:
         return answer(await self.thread.do(request, write))
 
 
-def _nodes(shown: ViewerScene, of: Mapping[str, Any]) -> bytes:
-    return payload.packed_nodes(shown.answering(of["variant"]).tree, shown.order)
+def _variant(shown: ViewerScene, path: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the nodes of a variant's semantic tree, in row order."""
+    return shown.described_variant(path["variant"])
 
 
-def _crop(shown: ViewerScene, of: Mapping[str, Any]) -> Response:
-    scene = shown.answering(of["variant"])
-    node = scene.existing_node(of["node"])
+def _nodes(shown: ViewerScene, path: Mapping[str, Any]) -> bytes:
+    return payload.packed_nodes(shown.answering(path["variant"]).tree, shown.order)
+
+
+def _crop(shown: ViewerScene, path: Mapping[str, Any]) -> Response:
+    """Return a node in the photograph in which it is largest."""
+    scene = shown.answering(path["variant"])
+    node = scene.existing_node(path["node"])
     with shown.unchanged():
         return plain(encoded(crop(scene, node)), "image/jpeg", cached=True)
 
 
 def _query(shown: ViewerScene, asked: wire.Query) -> payload.Answer:
+    """Return the answers to a text or a path."""
     return payload.answer(shown.answering(asked.variant), asked, asked.answerer)
 
 
 def _like(shown: ViewerScene, asked: wire.Like) -> payload.Answer:
+    """Return nodes similar to a node or a picture."""
     scene = shown.answering(asked.variant)
     if asked.node is not None:
         hits = scene.like_node(asked.node, limit=payload.LISTED)
@@ -121,19 +127,21 @@ def _like(shown: ViewerScene, asked: wire.Like) -> payload.Answer:
 
 
 def _field(shown: ViewerScene, asked: wire.FieldRelevancy) -> bytes:
-    """Return each Gaussian's field relevancy as one byte."""
-    found = shown.field_relevancy(asked.variant, asked.text, asked.level)
-    return (found[shown.order] if asked.order == "page" else found).tobytes()
+    """Return each Gaussian's field relevancy, in 1/255."""
+    relevancy = shown.field_relevancy(asked.variant, asked.text, asked.level)
+    return (relevancy[shown.order] if asked.order == "page" else relevancy).tobytes()
 
 
-def _picked(shown: ViewerScene, asked: wire.Pick) -> dict[str, Any]:
-    has = asked.variant in shown.variants
-    of_gaussian = shown.answering(asked.variant).tree.node_of_gaussian if has else None
-    found = pick(shown.gaussians, of_gaussian, asked.camera.camera(), asked.x, asked.y, shown.threads)
-    return found or {"nodes": [], "alpha": 0}
+def _pick(shown: ViewerScene, asked: wire.Pick) -> dict[str, Any]:
+    """Return the nodes at a pixel of a camera, with their shares."""
+    has_tree = asked.variant in shown.variants
+    of_gaussian = shown.answering(asked.variant).tree.node_of_gaussian if has_tree else None
+    picked = pick(shown.gaussians, of_gaussian, asked.camera.camera(), asked.x, asked.y, shown.threads)
+    return picked or {"nodes": [], "alpha": 0}
 
 
 def _frame(shown: ViewerScene, asked: wire.Frame) -> Response:
+    """Return a picture of the scene."""
     paint = shown.paint(asked.variant, asked.style)
     pixels = painted(shown.gaussians, asked.camera.camera(), paint, shown.threads)
     return plain(encoded(pixels, asked.image, asked.quality), f"image/{asked.image}")
@@ -159,15 +167,13 @@ def run_view(
 
 
 class EmbeddedViewer:
-    """A notebook frame with the page of a scene; for its arguments, see `LanguageScene.show`."""
+    """A notebook frame with the page of a scene."""
 
-    def __init__(self, found: FinishedScene, *, text: str, height: int, proxy: str, threads: int) -> None:
-        self.token, self.height, self.proxy, self.text = secrets.token_urlsafe(24), height, proxy, text
-        self.viewer = Viewer(ViewerScene(found.folder, found.variant, threads))
+    def __init__(self, viewer: Viewer, text: str, height: int, proxy: str) -> None:
+        self.token, self.text, self.height, self.proxy = secrets.token_urlsafe(24), text, height, proxy
         listening = listening_at(0)
         self.port: int = listening.getsockname()[1]
-        app = self.viewer.app(self.token, embedded=True)
-        self.server = uvicorn.Server(configured(app))
+        self.server = uvicorn.Server(configured(viewer.app(self.token, embedded=True)))
         self.thread = threading.Thread(
             target=self.server.run, kwargs={"sockets": [listening]}, daemon=True, name="hilsplat viewer"
         )
@@ -177,8 +183,8 @@ class EmbeddedViewer:
     def address(self) -> str:
         """Address of the page; anyone who has the address can see the scene until the server stops."""
         base = self.proxy.format(port=self.port) if self.proxy else f"http://127.0.0.1:{self.port}/"
-        asked = f"#{urlencode({'q': self.text})}" if self.text else ""
-        return f"{base}?{urlencode({'token': self.token, 'embedded': 1})}{asked}"
+        query = f"#{urlencode({'q': self.text})}" if self.text else ""
+        return f"{base}?{urlencode({'token': self.token, 'embedded': 1})}{query}"
 
     def _repr_html_(self) -> str:
         return (
@@ -190,3 +196,25 @@ class EmbeddedViewer:
         """Stop the server."""
         self.server.should_exit = True
         self.thread.join(timeout=10)
+
+
+def show(
+    folder: Path | str,
+    text: str = "",
+    *,
+    variant: str = "default",
+    height: int = 640,
+    proxy: str = "",
+    threads: int = 1,
+) -> EmbeddedViewer:
+    """Show a scene in a notebook: the page of `hilsplat view` in a frame, served by this process.
+
+    For the scene's folder and errors, see `ViewerScene`.
+
+    Args:
+        text: query to run when the page opens.
+        height: height of the frame, px.
+        proxy: address containing `{port}` through which browsers on other machines reach a port of this
+            machine, such as "/user/me/proxy/{port}/" on a JupyterHub.
+    """
+    return EmbeddedViewer(Viewer(ViewerScene(Path(folder), variant, threads)), text, height, proxy)

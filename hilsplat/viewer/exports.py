@@ -35,7 +35,7 @@ def labelled(
 
     A Gaussian in several groups is assigned to the one with the fewest Gaussians.
     """
-    members = [scene.gaussians_of(group.nodes) for group in groups]
+    members = [scene.views.gaussians_of(group.nodes) for group in groups]
     label = np.zeros(len(scene.gaussians), np.int32)
     for number in sorted(range(len(groups)), key=lambda number: -len(members[number])):
         label[members[number]] = number + 1
@@ -58,28 +58,29 @@ def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
     Groups are the COCO categories; a node in several groups has one annotation per group.
     """
     nodes = sorted({node for group in groups for node in group.nodes})
-    yield 0, len(scene.views)
-    held = io.BytesIO()
+    views = scene.views.names
+    yield 0, len(views)
+    content = io.BytesIO()
     description = f"{scene.scene.name}: masks of nodes, by hilsplat"
-    coco = coco_content(description, scene.views, scene.scene.cameras, [group.name for group in groups])
-    with zipfile.ZipFile(held, "w", zipfile.ZIP_DEFLATED) as archive:
-        for number, view in enumerate(scene.views):
+    coco = coco_content(description, views, scene.scene.cameras, [group.name for group in groups])
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        for number, view in enumerate(views):
             for node in nodes:
-                mask = scene.node_masks(view, [node])
+                mask = scene.views.node_masks(view, [node])
                 if not mask.any():
                     continue
                 png = io.BytesIO()
                 Image.fromarray(mask).save(png, format="PNG")
                 name = f"masks/{Path(view).stem}/{node}.png"
                 archive.writestr(name, png.getvalue(), compress_type=zipfile.ZIP_STORED)
-                described = {"image_id": number, "node": node, **coco_region(mask)}
+                region = {"image_id": number, "node": node, **coco_region(mask)}
                 for category, group in enumerate(groups, 1):
                     if node in group.nodes:
-                        found = {"id": len(coco["annotations"]) + 1, "category_id": category}
-                        coco["annotations"].append({**found, **described})
-            yield number + 1, len(scene.views)
+                        ids = {"id": len(coco["annotations"]) + 1, "category_id": category}
+                        coco["annotations"].append({**ids, **region})
+            yield number + 1, len(views)
         archive.writestr("coco.json", json.dumps(coco, ensure_ascii=False))
-    return held.getvalue()
+    return content.getvalue()
 
 
 def flight(asked: Film, scene: Scene) -> list[Camera]:
@@ -108,8 +109,8 @@ def film(
     with TemporaryDirectory() as folder:
         out = Path(folder) / f"film.{kind}"
         encoded = encoded_film(out, pictures, FRAMES_PER_S) if kind == "mp4" else encoded_gif(out, pictures)
-        for made, _ in enumerate(encoded, 1):
-            yield made, len(used)
+        for done, _ in enumerate(encoded, 1):
+            yield done, len(used)
         return out.read_bytes()
 
 
@@ -119,15 +120,15 @@ def encoded_gif(path: Path, frames: Iterable[np.ndarray]) -> Iterator[None]:
     Dithering is off: on a synthetic table (128 colours) it lowered the quality from 41 dB to 35 dB, increased
     the size from 2.5 MB to 3.6 MB, and scattered dots over the answer.
     """
-    kept = []
+    film = []
     for frame in frames:
-        kept.append(frame)
+        film.append(frame)
         yield
-    some = min(len(kept), 8)
-    sheet = np.concatenate([kept[number * len(kept) // some] for number in range(some)])
+    samples = min(len(film), 8)
+    sheet = np.concatenate([film[number * len(film) // samples] for number in range(samples)])
     palette = Image.fromarray(sheet).quantize(256)
     first, *others = [
-        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in kept
+        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in film
     ]
     duration_ms = round(1000 * STEP["gif"] / FRAMES_PER_S)
     first.save(path, save_all=True, append_images=others, duration=duration_ms, loop=0, optimize=False)

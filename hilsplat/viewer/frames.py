@@ -54,12 +54,12 @@ class Paint:
             share = np.full(len(relevancy), 0.8, np.float32)
             return Paint(rows_of(style.ramp, 3, 256)[relevancy].astype(np.float32) / 255, share, "plain")
         table = rows_of(style.table, 4, num_nodes + 1).astype(np.float32) / 255
-        found = np.zeros((len(node_of_gaussian), 4), np.float32)
+        colours = np.zeros((len(node_of_gaussian), 4), np.float32)
         for level in range(3):  # coarse to fine, so that finer levels override coarser ones
             if style.use[level]:
-                own = table[node_of_gaussian[:, level] + 1]
-                found = np.where(own[:, 3:] > 0, own, found)
-        return Paint(found[:, :3], np.ascontiguousarray(found[:, 3]), style.mode)
+                of_level = table[node_of_gaussian[:, level] + 1]
+                colours = np.where(of_level[:, 3:] > 0, of_level, colours)
+        return Paint(colours[:, :3], np.ascontiguousarray(colours[:, 3]), style.mode)
 
 
 def painted(
@@ -101,13 +101,13 @@ def weights_at(
     mean_x, mean_y, a, b, c, peak, depth, _ = view.geometry[rows, :8].astype(np.float64).T
     dx, dy = mean_x - (x + 0.5), mean_y - (y + 0.5)
     alpha = np.exp2(peak - (a * dx * dx + b * dx * dy + c * dy * dy))
-    kept = np.flatnonzero(alpha >= MIN_ALPHA)
-    kept = kept[np.lexsort((rows[kept], depth[kept]))]
-    alpha = np.minimum(alpha[kept], MAX_ALPHA)
-    left = np.cumprod(1 - alpha)
-    seen = left >= MIN_TRANSMITTANCE
-    before = np.concatenate([[1.0], left[:-1]]) if len(left) else left
-    return rows[kept[seen]], (alpha * before)[seen]
+    blended = np.flatnonzero(alpha >= MIN_ALPHA)
+    blended = blended[np.lexsort((rows[blended], depth[blended]))]
+    alpha = np.minimum(alpha[blended], MAX_ALPHA)
+    after = np.cumprod(1 - alpha)
+    is_seen = after >= MIN_TRANSMITTANCE
+    before = np.append(1.0, after)[:-1]
+    return rows[blended[is_seen]], (alpha * before)[is_seen]
 
 
 def pick(

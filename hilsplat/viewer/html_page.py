@@ -35,14 +35,14 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
     scene = shown.answering(asked.variant)
     questions = [*asked.kept, *([asked.last] if asked.last else [])]
     with shown.unchanged():
-        photos = [encoded(resize_to_fit(scene.image(view), PHOTO_PX), quality=75) for view in scene.views]
+        images = [resize_to_fit(scene.views.image(view), PHOTO_PX) for view in scene.views.names]
     described: dict[str, Any] = {
         "scene": {**shown.described(), "variants": [asked.variant], "chunk": len(shown.gaussians)},
         "variant": shown.described_variant(asked.variant),
         "asked": [question.model_dump(exclude_none=True) for question in questions],
         "answers": [payload.answer(scene, question) for question in questions],
         "kept": len(asked.kept),
-        "photos": [_text(photo) for photo in photos],
+        "photos": [_text(encoded(image, quality=75)) for image in images],
         "opening": asked.start,
         "crops": {},
     }
@@ -51,10 +51,10 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
         wholes = {int(node) for node in nodes if scene.tree.level[node] == 1}
         nodes = sorted(wholes | {hit["node"] for answer in described["answers"] for hit in answer["hits"]})
     yield 0, len(nodes)
-    for made, node in enumerate(nodes):
+    for done, node in enumerate(nodes, 1):
         with shown.unchanged():
             described["crops"][node] = _text(encoded(crop(scene, node)))
-        yield made + 1, len(nodes)
+        yield done, len(nodes)
     # Data URLs have no relative paths, so the scripts import each other by name.
     scripts = {
         name: re.sub(r'from "\./', 'from "hilsplat/', text.decode())
@@ -73,7 +73,7 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
         "splats": _text(shown.spz(shown.order)),
         "nodes": _text(payload.packed_nodes(scene.tree, shown.order)),
     }
-    held = "\n".join(
+    data = "\n".join(
         f'<script type="text/plain" id="{name}">{_inert(text)}</script>' for name, text in parts.items()
     )
     page = static["index.html"].decode()
@@ -84,7 +84,7 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
     )
     page = re.sub(r'<link rel="stylesheet"[^>]*>', lambda _: head, page)
     page = re.sub(r'<script type="module"[^>]*></script>\n', "", page)
-    last = f'{held}\n<script type="module">import "hilsplat/main.js";</script>\n</body>'
+    last = f'{data}\n<script type="module">import "hilsplat/main.js";</script>\n</body>'
     return page.replace("</body>", last).encode()
 
 

@@ -1,68 +1,60 @@
-"""OpenAPI description of the requests that scripts can send; docs/viewer.md has an example."""
+"""OpenAPI description of the requests that scripts can send, derived from the routes (docs/viewer.md)."""
 
-from functools import cache
+import inspect
+from collections.abc import Sequence
 from typing import Any
 
-from pydantic import BaseModel, TypeAdapter
+from pydantic import TypeAdapter
+from starlette.convertors import IntegerConvertor
+from starlette.responses import Response
+from starlette.routing import Route
 
-from hilsplat.viewer import wire
 from hilsplat.viewer.payload import Answer
 
-IMAGE = "image/jpeg"
 JSON = "application/json"
-BYTES = "application/octet-stream"
-
-SENT: tuple[tuple[str, str, str, type[BaseModel] | None, str], ...] = (
-    ("get", "/api/scene", "Views with their cameras, number of Gaussians, queryable variants", None, JSON),
-    ("get", "/api/variant/{variant}", "The nodes of a variant's semantic tree, in row order", None, JSON),
-    ("get", "/api/photo/{number}", "An undistorted photograph", None, IMAGE),
-    ("get", "/api/crop/{variant}/{node}", "A node in the photograph in which it is largest", None, IMAGE),
-    ("post", "/api/query", "Answers to a text or a path", wire.Query, JSON),
-    ("post", "/api/like", "Nodes similar to a node or a picture", wire.Like, JSON),
-    ("post", "/api/pick", "The nodes at a pixel of a camera, with their shares", wire.Pick, JSON),
-    ("post", "/api/frame", "A picture of the scene", wire.Frame, IMAGE),
-    ("post", "/api/field", "Every Gaussian's field relevancy, in 1/255", wire.FieldRelevancy, BYTES),
-    ("post", "/api/export/ply", "The Gaussians of nodes as a 3DGS PLY, with labels", wire.Selection, BYTES),
-    ("post", "/api/export/spz", "The Gaussians of nodes as SPZ", wire.Selection, BYTES),
-    ("post", "/api/export/boxes", "Boxes of nodes", wire.Selection, JSON),
-)
-"""Method, path, summary, request model, and content type of the response."""
-
-ANSWERS = ("/api/query", "/api/like")
+CONTENT = {bytes: "application/octet-stream", Response: "image/jpeg"}
+"""Content type of each type that a request's function returns; other types are sent as JSON."""
 
 
-@cache
-def description() -> dict[str, Any]:
-    """Return the OpenAPI 3.1 description."""
+def description(routes: Sequence[Route]) -> dict[str, Any]:
+    """Return the OpenAPI 3.1 description of the routes from `SceneThread` whose function has a docstring."""
     schemas: dict[str, Any] = {}
 
     def schema_of(kind: Any) -> dict[str, Any]:
-        made = TypeAdapter(kind).json_schema(ref_template="#/components/schemas/{model}")
-        schemas.update(made.pop("$defs", {}))
-        schemas[kind.__name__] = made
-        return {"$ref": f"#/components/schemas/{kind.__name__}"}
+        schema = TypeAdapter(kind).json_schema(ref_template="#/components/schemas/{model}")
+        schemas.update(schema.pop("$defs", {}))
+        schemas[kind.__name__] = schema
+        return {"schema": {"$ref": f"#/components/schemas/{kind.__name__}"}}
 
     paths: dict[str, Any] = {}
-    for method, path, summary, sent, given in SENT:
-        names = [part.strip("{}") for part in path.split("/") if part.startswith("{")]
-        kinds = {name: "string" if name == "variant" else "integer" for name in names}
-        content = {"schema": schema_of(Answer)} if path in ANSWERS else {}
-        body = {}
-        if sent:
-            body = {"requestBody": {"required": True, "content": {JSON: {"schema": schema_of(sent)}}}}
-        paths.setdefault(path, {})[method] = {
-            "summary": summary,
-            "parameters": [
-                {"name": name, "in": "path", "required": True, "schema": {"type": kind}}
-                for name, kind in kinds.items()
-            ],
-            **body,
-            "responses": {
-                "200": {"description": summary, "content": {given: content}},
-                "400": {"description": "the request is malformed: {error}"},
-                "403": {"description": "the cookie, the host or the origin is missing or wrong"},
-                "422": {"description": "the request cannot be fulfilled: {error}"},
-            },
+    for route in routes:
+        options = getattr(route.endpoint, "keywords", {})
+        work, kind = options.get("work"), options.get("kind")
+        summary = (inspect.getdoc(work) or "").partition("\n")[0].rstrip(".")
+        if work is None or not summary:
+            continue
+        returned = inspect.signature(work).return_annotation
+        content = {CONTENT.get(returned, JSON): schema_of(Answer) if returned is Answer else {}}
+        body = {"requestBody": {"required": True, "content": {JSON: schema_of(kind)}}} if kind else {}
+        parameters = {
+            name: "integer" if isinstance(convertor, IntegerConvertor) else "string"
+            for name, convertor in route.param_convertors.items()
+        }
+        paths[route.path_format] = {
+            "post" if kind else "get": {
+                "summary": summary,
+                "parameters": [
+                    {"name": name, "in": "path", "required": True, "schema": {"type": parameter}}
+                    for name, parameter in parameters.items()
+                ],
+                **body,
+                "responses": {
+                    "200": {"description": summary, "content": content},
+                    "400": {"description": "the request is malformed: {error}"},
+                    "403": {"description": "the cookie, the host or the origin is missing or wrong"},
+                    "422": {"description": "the request cannot be fulfilled: {error}"},
+                },
+            }
         }
     return {
         "openapi": "3.1.0",

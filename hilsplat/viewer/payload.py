@@ -88,10 +88,10 @@ def crossing(cameras: Cameras) -> Float64[np.ndarray, " 3"]:
     spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()) or 1.0
     guess = (centres + spread * ahead).mean(axis=0)
     pull = 1e-3 * len(centres)
-    found = np.linalg.solve(
+    focus = np.linalg.solve(
         across.sum(axis=0) + pull * np.eye(3), np.einsum("vij,vj->i", across, centres) + pull * guess
     )
-    return found if (found - centres[0]) @ ahead[0] > 0 else guess
+    return focus if (focus - centres[0]) @ ahead[0] > 0 else guess
 
 
 def described_nodes(scene: LanguageScene) -> dict[str, Any]:
@@ -161,19 +161,17 @@ def answer(scene: LanguageScene, asked: Question, answerer: str = "tree") -> Ans
     """
     begin = time.perf_counter()
     view = None if asked.view is None else view_name(scene.scene, asked.view)
-    found = scene.select(
+    nodes = scene.select(
         asked.text, level=asked.level, answerer=answerer, view=view, threshold=asked.threshold
     )
-    hits, path = scene.hits_of(found, LISTED), path_of(asked.text)
-    relevancy = scene.node_relevancy([path[-1]], answerer)[0]
-    made = _answer(scene, asked.text, hits, relevancy)
+    relevancy = scene.node_relevancy(path_of(asked.text)[-1:], answerer)[0]
     return {
-        **made,
-        "level": found.level.label,
-        "total": len(found.ids),
-        "doubts": [str(doubt) for doubt in doubts_of(found)],
+        **_answer(scene, asked.text, scene.hits_of(nodes, LISTED), relevancy),
+        "level": nodes.level.label,
+        "total": len(nodes.ids),
+        "doubts": [str(doubt) for doubt in doubts_of(nodes)],
         "caution": scene.caution_about(asked.text),
-        "route": found.route,
+        "route": nodes.route,
         "ms": round(1e3 * (time.perf_counter() - begin), 2),
     }
 
@@ -187,20 +185,19 @@ def alike(scene: LanguageScene, hits: Sequence[Hit], what: str, also: Sequence[i
 
 
 def _answer(scene: LanguageScene, text: str, hits: Sequence[Hit], relevancy: np.ndarray) -> Answer:
-    found: list[FoundNode] = [
-        {
-            "node": hit.node,
-            "level": hit.level.label,
-            "score": round(hit.score, 4),
-            "name": hit.name,
-            "best_views": [scene.views.index(view) for view in hit.best_views],
-        }
-        for hit in hits
-    ]
     return {
         "text": text,
         "level": hits[0].level.label if hits else "",
-        "hits": found,
+        "hits": [
+            {
+                "node": hit.node,
+                "level": hit.level.label,
+                "score": round(hit.score, 4),
+                "name": hit.name,
+                "best_views": [scene.views.names.index(view) for view in hit.best_views],
+            }
+            for hit in hits
+        ],
         "total": len(hits),
         "relevancy": np.round(relevancy, 4).tolist(),
         "doubts": [],

@@ -5,11 +5,12 @@ only arrays, so they have their own thread. The response contains lines of JSON,
 `{"made": 3, "of": 120}` after each step, `{"bytes": 12345}` before the file, or `{"error": "..."}`.
 """
 
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
+from pydantic import BaseModel
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
@@ -20,7 +21,7 @@ from hilsplat.splat.gaussians import morton_order
 from hilsplat.viewer import exports, payload, wire
 from hilsplat.viewer.html_page import html_page
 from hilsplat.viewer.viewer_scene import ViewerScene
-from hilsplat.web.scene_thread import SceneThread
+from hilsplat.web.scene_thread import SceneThread, Work
 from hilsplat.web.server import as_json, read
 
 
@@ -35,41 +36,32 @@ class SavedFiles:
         """Return the routes of all files."""
         post = self.thread.post
         return [
-            Route("/api/export/ply", post(wire.Selection, _ply), methods=["POST"]),
-            Route("/api/export/spz", post(wire.Selection, _spz), methods=["POST"]),
-            Route("/api/export/boxes", post(wire.Selection, _boxes), methods=["POST"]),
-            Route("/api/export/masks", self._masks, methods=["POST"]),
-            Route("/api/export/film", self._film, methods=["POST"]),
-            Route("/api/export/page", self._page, methods=["POST"]),
+            post("/api/export/ply", wire.Selection, _ply),
+            post("/api/export/spz", wire.Selection, _spz),
+            post("/api/export/boxes", wire.Selection, _boxes),
+            self._slow("/api/export/masks", wire.Selection, _masks),
+            self._slow("/api/export/film", wire.Film, _film, self.films),
+            self._slow("/api/export/page", wire.Page, partial(html_page, static=self.static)),
         ]
 
-    async def _masks(self, request: Request) -> Response:
-        asked = await read(request, wire.Selection)
-        return await self._in_steps(request, lambda shown: exports.masks_zip(*_selected(shown, asked)))
-
-    async def _page(self, request: Request) -> Response:
-        asked = await read(request, wire.Page)
-        return await self._in_steps(request, lambda shown: html_page(shown, asked, self.static))
-
-    async def _film(self, request: Request) -> Response:
-        asked = await read(request, wire.Film)
-
-        def begin(shown: ViewerScene) -> exports.Steps:
-            cameras, paint = exports.flight(asked, shown.scene), shown.paint(asked.variant, asked.style)
-            return exports.film(shown.gaussians, cameras, paint, kind=asked.format, threads=shown.threads)
-
-        return await self._in_steps(request, begin, self.films)
+    def _slow(
+        self, path: str, kind: type[BaseModel], begin: Work, worker: ThreadPoolExecutor | None = None
+    ) -> Route:
+        """Return the route of a file; `begin` runs on the scene thread, later steps on a worker."""
+        return Route(path, partial(self._in_steps, kind=kind, begin=begin, worker=worker), methods=["POST"])
 
     async def _in_steps(
         self,
         request: Request,
-        begin: Callable[[ViewerScene], exports.Steps],
-        worker: ThreadPoolExecutor | None = None,
+        *,
+        kind: type[BaseModel],
+        begin: Work,
+        worker: ThreadPoolExecutor | None,
     ) -> Response:
-        """Return the response for a file; `begin` runs on the scene thread, later steps on a worker."""
+        asked = await read(request, kind)
 
         def first(shown: ViewerScene) -> tuple[exports.Steps, tuple[int, int]]:
-            steps = begin(shown)
+            steps = begin(shown, asked)
             return steps, next(steps)  # raises errors before the response starts
 
         begun = await self.thread.do(request, first)
@@ -78,31 +70,43 @@ class SavedFiles:
     async def _stepped(
         self, steps: exports.Steps, first: tuple[int, int], worker: ThreadPoolExecutor | None
     ) -> AsyncIterator[bytes]:
-        found: tuple[int, int] | bytes = first
-        while isinstance(found, tuple):
-            yield _line(made=found[0], of=found[1])
+        result: tuple[int, int] | bytes = first
+        while isinstance(result, tuple):
+            yield _line(made=result[0], of=result[1])
             try:
-                found = await self.thread.run(partial(_step, steps), worker)
+                result = await self.thread.run(partial(_step, steps), worker)
             except (HilsplatError, OSError) as error:  # such as a full disk
                 yield _line(error=f"the file could not be created: {error}")
                 return
-        yield _line(bytes=len(found))
-        yield found
+        yield _line(bytes=len(result))
+        yield result
 
 
 def _ply(shown: ViewerScene, asked: wire.Selection) -> bytes:
+    """Return the Gaussians of nodes as a 3DGS PLY, with labels."""
     selected = _selected(shown, asked)
     with shown.unchanged():
         return exports.selection_ply(shown.folder / "gaussians.ply", *selected)
 
 
 def _spz(shown: ViewerScene, asked: wire.Selection) -> bytes:
+    """Return the Gaussians of nodes as SPZ."""
     rows, _ = exports.labelled(*_selected(shown, asked))
     return shown.spz(rows[morton_order(shown.gaussians.means[rows])])
 
 
 def _boxes(shown: ViewerScene, asked: wire.Selection) -> dict[str, Any]:
+    """Return boxes of nodes."""
     return payload.boxes(*_selected(shown, asked))
+
+
+def _masks(shown: ViewerScene, asked: wire.Selection) -> exports.Steps:
+    return exports.masks_zip(*_selected(shown, asked))
+
+
+def _film(shown: ViewerScene, asked: wire.Film) -> exports.Steps:
+    cameras, paint = exports.flight(asked, shown.scene), shown.paint(asked.variant, asked.style)
+    return exports.film(shown.gaussians, cameras, paint, kind=asked.format, threads=shown.threads)
 
 
 def _selected(shown: ViewerScene, asked: wire.Selection) -> tuple[LanguageScene, list[wire.Group]]:
@@ -118,9 +122,9 @@ def _step(steps: exports.Steps) -> tuple[int, int] | bytes:
     """Run the next step; return the progress, or the finished file."""
     try:
         return next(steps)
-    except StopIteration as made:
-        data: bytes = made.value
-        return data
+    except StopIteration as finished:
+        file: bytes = finished.value
+        return file
 
 
 def _line(**values: int | str) -> bytes:

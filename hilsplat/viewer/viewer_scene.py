@@ -14,7 +14,7 @@ from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.names import NodeNames, tree_digest
-from hilsplat.query.scene_views import Opened, ViewStore
+from hilsplat.query.scene_views import Opened
 from hilsplat.scene.finished import FinishedScene, SceneParts, finished_variants, require_scene_folder
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.origin import masks_label
@@ -31,7 +31,7 @@ from hilsplat.web.scene_thread import ShownScene
 VIEWS_MIB = 256.0
 """Memory limit for cached per-view results, such as compositing weights."""
 
-KEPT_RELEVANCIES = 8
+CACHED_RELEVANCIES = 8
 """Number of cached field relevancies (per variant, text and level), each with one byte per Gaussian."""
 
 MAX_GAUSSIANS = 4_000_000
@@ -54,7 +54,7 @@ class ViewerScene(ShownScene):
     def __init__(self, folder: Path, variant: str = "default", threads: int = 1) -> None:
         super().__init__()
         self.folder, self.first, self.threads = Path(folder), variant, threads
-        self.opened = Opened()
+        self.opened = Opened(VIEWS_MIB)
         ply = self.folder / "gaussians.ply"
         require_scene_folder(self.folder)
         if not ply.exists():
@@ -71,8 +71,8 @@ class ViewerScene(ShownScene):
                 found=f"{len(self.gaussians)}",
                 fix="lower gaussians.max_gaussians",
             )
-        self._variants: dict[str, LanguageScene] = {}
-        self.field_relevancy = lru_cache(KEPT_RELEVANCIES)(self._field_relevancy)
+        self._variants: dict[str, tuple[SceneParts, LanguageScene]] = {}
+        self.field_relevancy = lru_cache(CACHED_RELEVANCIES)(self._field_relevancy)
         self.paint = lru_cache(1)(self._paint)
 
     def opened_again(self) -> "ViewerScene":
@@ -95,39 +95,37 @@ class ViewerScene(ShownScene):
             StaleSceneError: the variant must be opened, but a previously opened part was rewritten.
             HilsplatError: a part cannot be opened.
         """
-        before = self._variants.get(variant)
         field = self.folder / variant / "field.safetensors"
-        if before is None or (before.language is None and field.exists()):
+        _, scene = self._variants.get(variant, (None, None))
+        if scene is None or (scene.decoded_field is None and field.exists()):
             if variant not in self.variants:  # reject anything but listed names, such as paths
                 raise SettingsError(
                     f"variant {variant!r} cannot be queried here",
                     expected=", ".join(self.variants) or "none yet: the scene isn't finished",
                 )
             with self.unchanged():
-                found = FinishedScene.locate(self.folder, variant)
-                self.note(found.parts.as_inputs().values())
-                opened = LanguageScene.of(found, threads=self.threads, opened=self.opened)
-            if len(opened.tree) > payload.MAX_NODES:
-                raise ArtifactError(f"the tree of {variant} has {len(opened.tree)} nodes, too many to show")
-            self._variants[variant] = replace(opened, _views=ViewStore(VIEWS_MIB))
-        return self._variants[variant]
+                finished = FinishedScene.locate(self.folder, variant)
+                self.note(finished.parts.as_inputs().values())
+                scene = LanguageScene.of(finished, threads=self.threads, opened=self.opened)
+            if len(scene.tree) > payload.MAX_NODES:
+                raise ArtifactError(f"the tree of {variant} has {len(scene.tree)} nodes, too many to show")
+            self._variants[variant] = finished.parts, scene
+        return scene
 
     def parts(self, variant: str) -> SceneParts:
-        """Return the paths of the parts of a variant."""
-        found = self.answering(variant).finished
-        assert found is not None
-        return found.parts
+        """Return the paths of the parts of an opened variant."""
+        return self._variants[variant][0]
 
     def rename(self, semantic_tree: Path, names: NodeNames) -> None:
         """Use new names in every variant with this tree."""
-        for variant, opened in list(self._variants.items()):
+        for variant, (parts, scene) in list(self._variants.items()):
             # Don't use `answering`: reopening a variant could fail after the names are written.
-            if opened.finished and opened.finished.parts.semantic_tree.resolve() == semantic_tree.resolve():
-                self._variants[variant] = replace(opened, names=names)
+            if parts.semantic_tree.resolve() == semantic_tree.resolve():
+                self._variants[variant] = parts, replace(scene, names=names)
 
     def described(self) -> dict[str, Any]:
-        own = {"variants": self.variants, "of": self.state, "folder": self.folder.name}
-        return payload.described_scene(self.scene, self.gaussians) | own
+        state = {"variants": self.variants, "of": self.state, "folder": self.folder.name}
+        return payload.described_scene(self.scene, self.gaussians) | state
 
     def described_variant(self, variant: str) -> dict[str, Any]:
         """Describe a variant: its nodes, and the models of its masks and vectors."""
@@ -165,9 +163,9 @@ class ViewerScene(ShownScene):
             return self.opened.get(sha256_of_file, self.folder / "gaussians.ply")[:32]
 
     def _field_relevancy(self, variant: str, text: str, level: str) -> UInt8[np.ndarray, " N"]:
-        """Return `FieldScene.gaussian_relevancy`, in steps of 1/255."""
-        found = self.answering(variant).gaussian_relevancy(text, level)
-        return (np.clip(found, 0, 1) * 255 + 0.5).astype(np.uint8)
+        """Return `FieldAnswers.gaussian_relevancy`, in steps of 1/255."""
+        relevancy = self.answering(variant).field.gaussian_relevancy(text, level)
+        return (np.clip(relevancy, 0, 1) * 255 + 0.5).astype(np.uint8)
 
     def _paint(self, variant: str, style: Style) -> Paint | None:
         """Resolve a style for each Gaussian; None means the scene's own colours.

@@ -56,8 +56,8 @@ class Guard:
             await self.app(scope, receive, send)
             return
         headers = Headers(scope=scope)
-        given = QueryParams(scope["query_string"]).get("token", "")
-        has_token = hmac.compare_digest(given.encode(), self.token.encode())
+        token = QueryParams(scope["query_string"]).get("token", "")
+        has_token = hmac.compare_digest(token.encode(), self.token.encode())
         is_opening = scope["path"] == "/" and has_token and not self.embedded
         if self.embedded:
             is_known = has_token or scope["path"].startswith("/static/")
@@ -106,7 +106,7 @@ class Guard:
 
     def _has_cookie(self, text: str) -> bool:
         try:
-            found = SimpleCookie(text).get(self.cookie)
+            cookie = SimpleCookie(text).get(self.cookie)
         except CookieError:
             return False
-        return found is not None and hmac.compare_digest(found.value.encode(), self.token.encode())
+        return cookie is not None and hmac.compare_digest(cookie.value.encode(), self.token.encode())

@@ -6,9 +6,10 @@ release the GIL, so the server stays responsive. The annotator's proposals have 
 
 import asyncio
 import secrets
-from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -47,7 +48,7 @@ class ShownScene:
             self._seen.setdefault(part, _state_of(part))
 
     def changed(self, *parts: Path) -> list[str]:
-        """Return the names of the given parts (default: all) that were rewritten or deleted after `note`."""
+        """Return the names of the given parts (default: all) that were rewritten or deleted since `note`."""
         return sorted({part.name for part in parts or self._seen if _state_of(part) != self._seen[part]})
 
     @contextmanager
@@ -83,16 +84,16 @@ class ShownScene:
 
 def _state_of(part: Path) -> tuple[int, int, int] | None:
     try:
-        found = (part / INDEX if part.is_dir() else part).stat()
+        file = (part / INDEX if part.is_dir() else part).stat()
     except OSError:
         return None
-    return found.st_ino, found.st_size, found.st_mtime_ns
+    return file.st_ino, file.st_size, file.st_mtime_ns
 
 
 Shown = TypeVar("Shown", bound=ShownScene)
-Made = TypeVar("Made")
-Sent = TypeVar("Sent", bound=BaseModel)
-Handler = Callable[[Request], Awaitable[Response]]
+Result = TypeVar("Result")
+Work = Callable[[Any, Any], Any]
+"""Function of the scene, and of a path's parameters or a validated body."""
 
 
 class SceneThread(Generic[Shown]):
@@ -106,46 +107,45 @@ class SceneThread(Generic[Shown]):
     def routes(self) -> list[Route]:
         """Return the routes that both pages have."""
         return [
-            Route("/api/scene", self._opened_anew),
-            Route("/api/changes", self._changes),
-            Route("/api/photo/{number:int}", self.get(_photo, behind=True)),
-            Route("/api/thumb/{number:int}", self.get(_thumb, behind=True)),
+            self.get("/api/scene", self._reopened),
+            self.get("/api/changes", lambda shown, path: shown.news()),
+            self.get("/api/photo/{number:int}", _photo, behind=True),
+            self.get("/api/thumb/{number:int}", _thumb, behind=True),
         ]
 
-    def get(self, work: Callable[[Shown, Mapping[str, Any]], Any], *, behind: bool = False) -> Handler:
-        """Return a handler that sends the result of `work` for the scene and the path's parameters."""
-        do = self.do_behind if behind else self.do
+    def get(self, path: str, work: Work, *, behind: bool = False) -> Route:
+        """Return a route that sends the result of `work`, called with the scene and the path's parameters.
 
-        async def handle(request: Request) -> Response:
-            return answer(await do(request, lambda shown: work(shown, request.path_params)))
-
-        return handle
+        Only one request with `behind` runs at a time, so that other requests need not wait long: when the
+        page opens, the outline requests a hundred crops, and other requests wait for at most one.
+        """
+        return Route(path, partial(self._send, work=work, behind=behind))
 
     def post(
-        self, kind: type[Sent], work: Callable[[Shown, Sent], Any], worker: ThreadPoolExecutor | None = None
-    ) -> Handler:
-        """Return a handler that sends the result of `work`, called with the scene and the validated body.
+        self, path: str, kind: type[BaseModel], work: Work, worker: ThreadPoolExecutor | None = None
+    ) -> Route:
+        """Return a route that sends the result of `work`, called with the scene and the validated body.
 
         `worker`, if given, replaces the scene thread; `work` must then have its own caches.
         """
+        return Route(path, partial(self._send, work=work, kind=kind, worker=worker), methods=["POST"])
 
-        async def handle(request: Request) -> Response:
-            asked = await read(request, kind)
+    async def _send(
+        self,
+        request: Request,
+        *,
+        work: Work,
+        kind: type[BaseModel] | None = None,
+        worker: ThreadPoolExecutor | None = None,
+        behind: bool = False,
+    ) -> Response:
+        asked = request.path_params if kind is None else await read(request, kind)
+        async with self.behind if behind else nullcontext():
             return answer(await self.do(request, lambda shown: work(shown, asked), worker))
 
-        return handle
-
-    async def do_behind(self, request: Request, work: Callable[[Shown], Made]) -> Made:
-        """Run `work` like `do`, but only one such call at a time, so that other requests need not wait long.
-
-        When the page opens, the outline requests a hundred crops; other requests wait for at most one crop.
-        """
-        async with self.behind:
-            return await self.do(request, work)
-
     async def do(
-        self, request: Request, work: Callable[[Shown], Made], worker: ThreadPoolExecutor | None = None
-    ) -> Made:
+        self, request: Request, work: Callable[[Shown], Result], worker: ThreadPoolExecutor | None = None
+    ) -> Result:
         """Run `work` on the scene thread (or `worker`) if the page shows the current state of the scene.
 
         A page sends, as `of`, the state with which it was loaded, so that its cameras, nodes and Gaussians
@@ -156,7 +156,7 @@ class SceneThread(Generic[Shown]):
         """
         state = request.query_params.get("of")
 
-        def run() -> Made:
+        def run() -> Result:
             shown = self.shown
             if state not in (None, shown.state):
                 raise StaleSceneError("the scene has changed since this page was loaded", fix="reload it")
@@ -164,33 +164,27 @@ class SceneThread(Generic[Shown]):
 
         return await self.run(run, worker)
 
-    async def run(self, work: Callable[[], Made], worker: ThreadPoolExecutor | None = None) -> Made:
+    async def run(self, work: Callable[[], Result], worker: ThreadPoolExecutor | None = None) -> Result:
         """Run `work` on the scene thread (or `worker`), regardless of the scene's state."""
         return await asyncio.get_running_loop().run_in_executor(worker or self.worker, work)
 
-    async def _opened_anew(self, request: Request) -> Response:
-        """Send a newly opened page the scene's description; if the scene has changed, reopen it first."""
-
-        def run() -> dict[str, Any]:
-            if self.shown.changed():
-                self.shown = self.shown.opened_again()
-            return self.shown.described()
-
-        return answer(await self.run(run))
-
-    async def _changes(self, request: Request) -> Response:
-        return answer(await self.run(lambda: self.shown.news()))
+    def _reopened(self, shown: Shown, path: Mapping[str, Any]) -> dict[str, Any]:
+        """Describe the scene: views, Gaussians, variants; if it has changed, it is reopened."""
+        if shown.changed():
+            self.shown = shown.opened_again()
+        return self.shown.described()
 
 
-def _photo(shown: ShownScene, of: Mapping[str, Any]) -> Response:
-    path = shown.scene.image_path(view_name(shown.scene, of["number"]))
-    kind = "image/png" if path.suffix.lower() == ".png" else "image/jpeg"
+def _photo(shown: ShownScene, path: Mapping[str, Any]) -> Response:
+    """Return an undistorted photograph."""
+    file = shown.scene.image_path(view_name(shown.scene, path["number"]))
+    kind = "image/png" if file.suffix.lower() == ".png" else "image/jpeg"
     with shown.unchanged(*shown.photographs):
-        return plain(path.read_bytes(), kind, cached=True)
+        return plain(file.read_bytes(), kind, cached=True)
 
 
-def _thumb(shown: ShownScene, of: Mapping[str, Any]) -> Response:
-    view = view_name(shown.scene, of["number"])
+def _thumb(shown: ShownScene, path: Mapping[str, Any]) -> Response:
+    view = view_name(shown.scene, path["number"])
     with shown.unchanged(*shown.photographs):
         small = resize_to_fit(shown.scene.image(view), THUMB_PX)
     return plain(encoded(small), "image/jpeg", cached=True)

@@ -4,7 +4,7 @@ import json
 import secrets
 import socket
 import webbrowser
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from importlib.resources import files
 from typing import Any, TypeVar
 
@@ -25,6 +25,14 @@ from hilsplat.web.guard import MAX_BODY_BYTES, Guard
 
 TYPES = {"html": "text/html; charset=utf-8", "js": "text/javascript", "css": "text/css"}
 BYTES = "application/octet-stream"
+STATUS: dict[type, int] = {
+    StaleFileError: 412,
+    StaleSceneError: 409,
+    HilsplatError: 422,
+    ValidationError: 400,
+}
+"""HTTP status of each error that is sent to the page."""
+
 Sent = TypeVar("Sent", bound=BaseModel)
 
 
@@ -32,9 +40,9 @@ class Pages:
     """A page's HTML file, and the static files of its package and of `hilsplat.web`."""
 
     def __init__(self, page: str, package: str) -> None:
-        found = [*(files("hilsplat.web") / "static").iterdir(), *(files(package) / "static").iterdir()]
+        paths = [*(files("hilsplat.web") / "static").iterdir(), *(files(package) / "static").iterdir()]
         self.first = page
-        self.static = {each.name: each.read_bytes() for each in found if each.name.endswith(tuple(TYPES))}
+        self.static = {path.name: path.read_bytes() for path in paths if path.name.endswith(tuple(TYPES))}
 
     def routes(self) -> list[Route]:
         """Return the routes of the page and its files."""
@@ -51,13 +59,18 @@ def guarded(
     routes: list[Route], token: str, max_body: int = MAX_BODY_BYTES, *, embedded: bool = False
 ) -> Guard:
     """Return the guarded application; errors are sent as text."""
-    handlers: dict[Any, Any] = {
-        StaleFileError: _told(412),
-        StaleSceneError: _told(409),
-        HilsplatError: _told(422),
-        ValidationError: _told(400),
-    }
+    handlers: dict[Any, Any] = dict.fromkeys(STATUS, _refused)
     return Guard(Starlette(routes=routes, exception_handlers=handlers), token, max_body, embedded=embedded)
+
+
+async def _refused(request: Request, error: Exception) -> Response:
+    """Send the error's text to the page."""
+    text = str(error)
+    if isinstance(error, ValidationError):
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        text = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+    status = next(STATUS[kind] for kind in type(error).__mro__ if kind in STATUS)
+    return plain(as_json({"error": text}), "application/json", status)
 
 
 def as_json(value: Any) -> bytes:
@@ -75,31 +88,18 @@ def version_sent(request: Request) -> str:
     return request.headers.get("if-match", "").strip('"')
 
 
-def answer(made: Any) -> Response:
+def answer(content: Any) -> Response:
     """Return a response with bytes or JSON; a response is returned unchanged."""
-    if isinstance(made, Response):
-        return made
-    return plain(made, BYTES) if isinstance(made, bytes) else plain(as_json(made), "application/json")
+    if isinstance(content, Response):
+        return content
+    is_bytes = isinstance(content, bytes)
+    return plain(content, BYTES) if is_bytes else plain(as_json(content), "application/json")
 
 
 def plain(data: bytes, kind: str, status: int = 200, *, cached: bool = False) -> Response:
     """Return a response with bytes."""
     lasting = "private, max-age=3600" if cached else "no-store"
     return Response(data, status, headers={"content-type": kind, "cache-control": lasting})
-
-
-def _told(status: int) -> Callable[[Request, Exception], Awaitable[Response]]:
-    """Return a handler that sends the error's text to the page."""
-
-    async def tell(request: Request, error: Exception) -> Response:
-        if isinstance(error, ValidationError):
-            first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-            text = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-        else:
-            text = str(error)
-        return plain(as_json({"error": text}), "application/json", status)
-
-    return tell
 
 
 def view_name(scene: Scene, number: int) -> str:
@@ -113,8 +113,7 @@ def view_name(scene: Scene, number: int) -> str:
 def encoded(pixels: UInt8[np.ndarray, "H W 3"], kind: str = "jpeg", quality: int = 80) -> bytes:
     """Encode an image as JPEG or PNG."""
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if kind == "jpeg" else []
-    made, data = cv2.imencode(".jpg" if kind == "jpeg" else ".png", pixels[..., ::-1], options)
-    assert made
+    _, data = cv2.imencode(".jpg" if kind == "jpeg" else ".png", pixels[..., ::-1], options)
     return data.tobytes()
 
 
@@ -125,16 +124,16 @@ def listening_at(port: int) -> socket.socket:
         SettingsError: the port is taken.
     """
     # Without IPPROTO_TCP, asyncio doesn't turn off Nagle's algorithm, which delays responses by 40 ms.
-    made = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        made.bind(("127.0.0.1", port))
+        listening.bind(("127.0.0.1", port))
     except OSError as error:
-        made.close()
+        listening.close()
         fix = "choose a different port, or omit --port"
         raise SettingsError(f"port {port} cannot be used: {error}", fix=fix) from error
-    made.listen()  # before the address is printed, so that early connections wait instead of failing
-    return made
+    listening.listen()  # before the address is printed, so that early connections wait instead of failing
+    return listening
 
 
 def configured(app: Guard) -> uvicorn.Config:

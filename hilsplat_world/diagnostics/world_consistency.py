@@ -300,7 +300,7 @@ def measure_world_consistency(
                     value = iou(seen_a[None], seen_b[None])
                     yield a, Measured(method, query.text, level, "view_consistency", protocol, value, union)
         for view in {a, b} - {each for later in pairs[number + 1 :] for each in later}:
-            scene.forget(view)
+            scene.views.cache.forget(view)
 
 
 def spread(queries: Sequence[Query], per_level: int) -> list[Query]:
@@ -331,7 +331,7 @@ def answers_in_view(
     keys = [given_key(method, query, settings) for query in queries]
     texts = [query.text for query, key in zip(queries, keys, strict=True) if key not in stored]
     missing, rule = list(dict.fromkeys(texts)), rule_of(settings)
-    maps = dict(zip(missing, scene.field_relevancy(missing, view), strict=True)) if missing else {}
+    maps = dict(zip(missing, scene.field.relevancy(missing, view), strict=True)) if missing else {}
     return [
         stored.get(key)
         if key in stored

@@ -60,7 +60,7 @@ def serving(folder: Path, *words: str) -> Iterator[str]:
 
 @pytest.fixture
 def scene(desk):
-    return hilsplat.open(desk)
+    return hilsplat.open_scene(desk)
 
 
 @pytest.fixture(scope="session")

@@ -30,7 +30,7 @@ def saved(page) -> None:
 
 
 def kept(root: Path, view: str = "000.png") -> list[Label]:
-    return read_labels(label_path(root / "annotated/photos/desk", view), SIZE)
+    return read_labels(label_path(root / "annotated/photos/desk", view))
 
 
 def place(page, x: float, y: float) -> tuple[float, float]:

@@ -20,7 +20,7 @@ def notebook(tmp_path):
 
 
 def test_the_frame_in_a_notebook_answers_a_query(browser, desk, tmp_path, notebook):
-    shown = hilsplat.open(desk).show("mug > handle", height=420)
+    shown = hilsplat.show(desk, "mug > handle", height=420)
     try:
         (tmp_path / "notebook.html").write_text(
             f"<!doctype html><title>notebook</title><link rel=icon href=data:,>{shown._repr_html_()}"

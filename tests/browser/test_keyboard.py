@@ -2,7 +2,6 @@
 
 from hilsplat.annotate.labels import label_path, read_labels
 from hilsplat.base.artifacts import read_json
-from tests.browser.test_annotate import SIZE
 
 MOST_STEPS = 80
 
@@ -71,5 +70,5 @@ def test_naming_drawing_and_saving_in_the_annotator(annotating, desk, tmp_path):
     press(page, "Enter")
     page.locator("body[data-saved=true]").wait_for()
     path = label_path(tmp_path / "annotated/photos/desk", "000.png")
-    (label,) = read_labels(path, SIZE)
+    (label,) = read_labels(path)
     assert label.text == "mug"

@@ -121,7 +121,7 @@ def kill_annotator(project: Path, chance: random.Random) -> Iterator[str]:
     server.wait()
     last = confirmed[0]
     path = label_path(project / "annotated/photos/desk", "000.png")
-    texts = [label.text for label in read_labels(path, SIZE)] if path.is_file() else []
+    texts = [label.text for label in read_labels(path)] if path.is_file() else []
     if last >= 0 and texts not in ([f"change {last}"], [f"change {last + 1}"]):
         yield f"annotate: after a kill {path.name} holds {texts}, and change {last} was confirmed"
 

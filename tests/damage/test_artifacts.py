@@ -10,13 +10,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import hilsplat
 from hilsplat.base.artifacts import read_npz, write_index, write_npy, write_npz
 from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.contributions.rows import Contributions
 from hilsplat.embed.vectors import mask_embeddings
 from hilsplat.field.code import LanguageField, load_code, load_latents
 from hilsplat.field.field import read_parents
-from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.node_names import NodeNaming
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
@@ -220,7 +220,7 @@ def test_clip_vectors_are_of_length_one(tmp_path, fault):
 
 def test_a_query_never_answers_from_a_file_with_a_flipped_bit(desk):
     def ask() -> list[Any]:
-        opened = LanguageScene.open(desk)
+        opened = hilsplat.open_scene(desk)
         return [
             [hit.score, hit.gaussians]
             for how in ("tree", "field")

@@ -11,7 +11,7 @@ from hilsplat.annotate.labels import read_labels
 from hilsplat.query.names import read_names
 from hilsplat.scene.sheet import read_sheet
 from tests.conftest import PROJECT
-from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, WIDTH
+from tests.unit.finished_desk import NUM_VIEWS
 
 NAME = """
 import sys
@@ -41,7 +41,7 @@ while True:
     ring = [(1, 1), (15, 1), (15, 20), (1, 20)]
     label = Label(id=number, level=1, text=f"thing {number}", polygons=[ring])
     try:
-        write_labels(path, "000.png", size, [*read_labels(path, size), label], version)
+        write_labels(path, "000.png", size, [*read_labels(path), label], version)
         break
     except StaleFileError:
         pass
@@ -77,7 +77,7 @@ def test_twenty_commands_at_once_lose_nothing(own_desk: Path) -> None:
     assert all(len(list((project / row).glob("*.png"))) == NUM_VIEWS for row in rows)
     names = read_names(own_desk, own_desk / "default/semantic_tree").of_node
     assert names == {number: f"thing {number}" for number in range(3)}
-    labels = read_labels(project / "annotated/photos/desk/000.json", (HEIGHT, WIDTH + NUM_VIEWS))
+    labels = read_labels(project / "annotated/photos/desk/000.json")
     assert sorted(label.text for label in labels) == ["thing 1", "thing 2", "thing 3"]
     for folder, file in (("answers", "selection.ply"), ("exported", "point_cloud.ply")):
         assert len({path.read_bytes() for path in (project / folder).glob(f"*/{file}")}) == 1

@@ -47,7 +47,7 @@ class Answerer:
         for shown in rows:
             texts_of[shown.view].append(shown.path[-1])
         maps = {  # one call for all texts of a view, because each call decodes the view's pixels
-            view: dict(zip(texts, np.asarray(self.scene.field_relevancy(texts, view)), strict=True))
+            view: dict(zip(texts, np.asarray(self.scene.field.relevancy(texts, view)), strict=True))
             for view, texts in texts_of.items()
         }
         return [
@@ -154,7 +154,7 @@ def draw_methods(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: E
     by_query = grid.T if many else grid
     answers = [method.masks(rows, evaluate) for method in track(list(methods), "methods compared")]
     for number, (axes, row) in enumerate(zip(by_query, rows, strict=False)):
-        image = first.image(row.view)
+        image = first.views.image(row.view)
         query = f"“{row.text}” ({row.level.label})\n" if many and row.level else ""
         show(axes[0], paint_answer(image, None, row.truth), query + row.title)
         if not many:
@@ -177,7 +177,7 @@ def draw_views(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: Eva
     figure, grid = _grid(scene, len(methods) + 1, max(len(rows), 1), f"{scene.name}: {query}")
     answers = [method.masks(rows, evaluate) for method in methods]
     for column, row in enumerate(rows):
-        image = first.image(row.view)
+        image = first.views.image(row.view)
         show(grid[0][column], paint_answer(image, None, row.truth), row.view)
         for place, masks in enumerate(answers, start=1):
             picture = paint_answer(image, masks[column], row.truth)
@@ -193,13 +193,13 @@ def draw_features(methods: Sequence[Answerer], view: str) -> Figure:
     scene = methods[0].scene.scene
     figure, grid = _grid(scene, len(methods), len(LEVELS) + 1, f"{scene.name}: features at three levels")
     for axes, method in zip(grid, methods, strict=True):
-        show(axes[0], methods[0].scene.image(view), view)
+        show(axes[0], methods[0].scene.views.image(view), view)
         label_left(axes[0], method.title)
         for level in LEVELS:
             if method.method == "tree":
                 picture = node_image(method.scene, view, level)
             else:
-                picture = method.scene.field_image(view, level)
+                picture = method.scene.field.image(view, level)
             show(axes[level.index + 1], picture, level.label)
     return figure
 
@@ -209,7 +209,7 @@ def node_image(scene: LanguageScene, view: str, level: Level) -> np.ndarray:
     nodes = scene.tree.nodes_of(level)
     colours = np.zeros((len(scene.tree) + 1, 3), np.float32)  # the last row is for Gaussians without a node
     colours[nodes] = field_colours(scene.tree.clip[nodes].astype(np.float32))
-    pixels = scene.view_weights(view) @ colours[scene.tree.node_of_gaussian[:, level.index]]
+    pixels = scene.views.view_weights(view) @ colours[scene.tree.node_of_gaussian[:, level.index]]
     height, width = scene.scene.cameras[view].size_hw
     return (255 * np.clip(pixels, 0, 1)).astype(np.uint8).reshape(height, width, 3)
 

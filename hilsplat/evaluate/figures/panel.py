@@ -69,7 +69,7 @@ class Shown:
 
     def tree_mask(self, answers: LanguageScene, *, by_path: bool = False) -> Bool[np.ndarray, "H W"]:
         """Return the mask of the tree's answer in the view."""
-        return answers.node_masks(self.view, self.hits(answers, by_path=by_path).ids)
+        return answers.views.node_masks(self.view, self.hits(answers, by_path=by_path).ids)
 
 
 def run_figures(
@@ -171,17 +171,17 @@ def draw_panel(
     if rows:
         parts = list(figure.subfigures(2, 1, squeeze=False, height_ratios=[overview_in, queries_in]).flat)
     grid = parts[0].subplots(2, 4, squeeze=False)
-    image = answers.image(masked)
+    image = answers.views.image(masked)
     masks = HierarchicalMasks.load(Path(masks_folder) / f"{masked}.npz")
     show(grid[0, 0], image, f"photograph {masked} (training view)")
     label_left(grid[0, 0], f"masks: {label}")
-    show(grid[1, 0], answers.image(held_out), f"photograph {held_out} ({scene.split[held_out]} view)")
+    show(grid[1, 0], answers.views.image(held_out), f"photograph {held_out} ({scene.split[held_out]} view)")
     label_left(grid[1, 0], "language field")
     for level in LEVELS:
         count = len(masks.rows_of(level))
         above, below = grid[:, level.index + 1]
         show(above, paint_level(image, masks, level), f"{level.label}: {count} masks")
-        show(below, answers.field_image(held_out, level), f"{level.label}: field as colours")
+        show(below, answers.field.image(held_out, level), f"{level.label}: field as colours")
     if rows:
         draw_queries(parts[1], answers, rows, evaluate, columns)
     return figure
@@ -201,15 +201,15 @@ def draw_queries(
     grid = figure.subplots(len(rows), columns, squeeze=False)
     rule = rule_of(evaluate)
     for axes, row in zip(grid, track(rows, "queries drawn"), strict=True):
-        image = answers.image(row.view)
+        image = answers.views.image(row.view)
         last = row.path[-1]
-        relevancy = np.asarray(answers.field_relevancy([last], row.view))[0]
+        relevancy = np.asarray(answers.field.relevancy([last], row.view))[0]
         hits = row.hits(answers)
         level = row.level or hits.level
         smoothed = SmoothedRelevancy.of(relevancy, rule)
         field_mask = relevancy_mask(smoothed, level, rule)
         points = peak_points(smoothed.filtered, level)
-        pictures = [("tree", answers.node_masks(row.view, hits.ids))]
+        pictures = [("tree", answers.views.node_masks(row.view, hits.ids))]
         if columns == 7:
             pictures.append(("tree, path", row.tree_mask(answers, by_path=True)))
         pictures.append(("field", field_mask))

@@ -28,7 +28,7 @@ def relevancy_of(
     Raises:
         ArtifactError: a relevancy is NaN.
     """
-    render = scene.field_relevancy if method == "field" else scene.node_relevancy_map
+    render = scene.field.relevancy if method == "field" else scene.node_relevancy_map
     found = np.asarray(render(tuple(texts), view), dtype=np.float32)
     if np.isnan(found).any():
         raise ArtifactError(
@@ -81,7 +81,7 @@ class Selections:
             return np.zeros(size_hw, dtype=bool)
         masks, key = self._masks.setdefault(view, PackedMasks(size_hw)), ids.tobytes()
         if key not in masks:
-            masks.put(key, np.asarray(self.scene.node_masks(view, ids)).astype(bool))
+            masks.put(key, np.asarray(self.scene.views.node_masks(view, ids)).astype(bool))
         return masks.get(key)
 
 

@@ -104,7 +104,7 @@ class FlatProtocols:
             yield from argmax_rows(method, list(queries.values()), cosine_of, words, self.level is not None)
 
     def _cosine(self, method: str, texts: Sequence[str], pixels: Int64[np.ndarray, " P"]) -> np.ndarray:
-        render = self.scene.field_cosine if method == "field" else self.scene.node_cosine
+        render = self.scene.field.cosine if method == "field" else self.scene.node_cosine
         return np.asarray(render(tuple(texts), self.view, pixels), np.float32)
 
 

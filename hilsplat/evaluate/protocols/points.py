@@ -114,12 +114,12 @@ def classes_of_points(
 
     The cosine is that of the Gaussian's node (`method` "tree") or decoded latent ("field") at level whole.
     """
-    vectors = scene.text_vectors(texts)
+    vectors = scene.clip.embed_texts(list(texts))
     if method == "tree":
         of_node = classify(scene.tree.clip.astype(np.float32), vectors)
         node = scene.tree.node_of_gaussian[:, LEVEL.index]
         return np.append(of_node, 0)[node[gaussian]].astype(np.int32)  # node -1 means none
-    language, code = scene.trained()
+    language, code = scene.field.language, scene.field.code
     latents = language.features[gaussian, LEVEL.index]
     fitted = np.flatnonzero(latents.any(axis=1))
     labels = np.zeros(len(latents), dtype=np.int32)
@@ -134,7 +134,7 @@ def node_instances(
     """Match the nodes at level whole to the ground truth; a node's best cosine gives class and confidence."""
     tree = scene.tree
     nodes = tree.nodes_of(LEVEL)
-    cosines = tree.clip[nodes].astype(np.float32) @ scene.text_vectors(classes.texts).T
+    cosines = tree.clip[nodes].astype(np.float32) @ scene.clip.embed_texts(list(classes.texts)).T
     own = tree.node_of_gaussian[gaussian, LEVEL.index]
     class_ids = np.array(classes.ids)[cosines.argmax(axis=1)]
     return instance_scan(truth, classes, own[None] == nodes[:, None], class_ids, cosines.max(axis=1))

@@ -1,4 +1,4 @@
-"""Files of other programs: export and import, compared with pycocotools."""
+"""Files of other programs: export and import (tests/imports has each format's regions)."""
 
 import io
 import json
@@ -6,7 +6,6 @@ import zipfile
 
 import numpy as np
 import pytest
-from pycocotools import mask as coco_masks
 
 from hilsplat.annotate.exchange import exported, imported, merged
 from hilsplat.annotate.labels import Label
@@ -55,22 +54,6 @@ def test_exported_files_are_read_back_with_levels_and_parents_and_change_nothing
             np.testing.assert_array_equal(theirs.mask(SIZE), ours.mask(SIZE))
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_compressed_run_lengths_of_pycocotools_are_read(seed, cameras):
-    mask = np.random.default_rng(seed).random(SIZE) < (0.5, 0.02, 0.98)[seed % 3]
-    if seed > 2:
-        mask = np.repeat(mask[:3], 10, axis=0)
-    runs = coco_masks.encode(np.asfortranarray(mask, np.uint8))
-    region = {"image_id": 5, "category_id": 2, "segmentation": {**runs, "counts": runs["counts"].decode()}}
-    content = {
-        "images": [{"id": 5, "file_name": "photos/DSC_2.jpg", "height": 30, "width": 40}],
-        "categories": [{"id": 2, "name": "mug"}],
-        "annotations": [region],
-    }
-    (label,) = imported("coco.json", json.dumps(content), cameras)["DSC_2.png"]
-    np.testing.assert_array_equal(label.mask(SIZE), mask)
-
-
 def test_labels_of_lerf_are_imported_as_wholes_regardless_of_groups(cameras):
     square = [[2.7, 2.2], [9.9, 2.2], [9.9, 9.1], [2.7, 9.1]]
     keys = {"group": 1, "segmentation": square, "iscrowd": False}
@@ -80,17 +63,6 @@ def test_labels_of_lerf_are_imported_as_wholes_regardless_of_groups(cameras):
     found = [(label.id, label.text, label.level) for label in labels]
     assert found == [(1, "mug", 1), (2, "mug", 1), (3, "cup", 1)]
     assert labels[0].mask(SIZE).sum() == 64  # vertices are truncated, as in the published evaluation
-
-
-def test_labelme_rectangles_and_groups(cameras):
-    shapes = [
-        {"label": "mug", "points": [[2, 2], [9, 9]], "shape_type": "rectangle", "group_id": None},
-        {"label": "cup", "points": [[2, 2], [9, 2], [9, 9]], "group_id": 7},
-        {"label": "cup", "points": [[20, 2], [29, 2], [29, 9]], "group_id": 7},
-    ]
-    content = {"shapes": shapes, "imagePath": "..\\photos\\DSC_1.jpg", "imageHeight": 30, "imageWidth": 40}
-    mug, cup = imported("x.json", json.dumps(content), cameras)["DSC_1.png"]
-    assert mug.mask(SIZE).sum() == 64 and len(cup.polygons) == 2
 
 
 def shapes(shape: str, size_hw: tuple = SIZE) -> str:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hilsplat.annotate.labels import Label, cut_to_parents, read_labels, traced, write_labels
-from hilsplat.base.errors import SceneError, SettingsError
+from hilsplat.base.errors import SettingsError
 from hilsplat.datasets.images.hi import regions_of
 from hilsplat.datasets.images.isat import read_isat
 from hilsplat.web.file_changes import NO_FILE, version_of
@@ -73,7 +73,7 @@ def test_a_written_file_is_read_back_and_scored_without_proposals(tmp_path):
         label(5, 2, 1, box(10, 6, 12, 9), "rim", origin="proposed"),
     ]
     version = write_labels(path, "DSC_1.png", SIZE, given, NO_FILE)
-    assert version == version_of(path) and read_labels(path, SIZE) == given
+    assert version == version_of(path) and read_labels(path) == given
     warnings: list[str] = []
     regions = regions_of(read_isat(path), warnings)
     assert [region.path for region in regions] == [("mug",), ("mug", "Henkel „links“")]
@@ -86,10 +86,3 @@ def test_a_written_file_is_read_back_and_scored_without_proposals(tmp_path):
     path.symlink_to(shared)
     write_labels(path, "DSC_1.png", SIZE, given, NO_FILE)
     assert path.is_symlink() and shared.is_file()
-
-
-def test_a_file_of_another_size_is_refused(tmp_path):
-    path = tmp_path / "DSC_1.json"
-    write_labels(path, "DSC_1.png", SIZE, [label(1, 1, None, box(0, 0, 4, 4))], NO_FILE)
-    with pytest.raises(SceneError, match=r"expected  60 x 50 px.*\n.*40 x 30"):
-        read_labels(path, (50, 60))

@@ -45,7 +45,7 @@ def block_world(tmp_path_factory):
     """Folder of a finished scene, its annotations, and the opened scene."""
     from hilsplat.base.artifacts import write_index
     from hilsplat.field.code import Autoencoder, LanguageField
-    from hilsplat.query.language_scene import LanguageScene
+    from tests.unit.assembled_scene import assembled
     from tests.unit.evaluate.plain_tree import plain_tree
 
     class Uncoded(Autoencoder):
@@ -106,7 +106,7 @@ def block_world(tmp_path_factory):
         view_area_px=regions.sum(axis=(1, 2), dtype=np.float32)[:, None],
     )
     field = LanguageField(features, "0", "0"), Uncoded(8, 8, {})
-    answers = LanguageScene(scene, gaussians, tree, lambda view: weights, *field, encode_texts)
+    answers = assembled(scene, gaussians, tree, lambda view: weights, encode_texts, field)
     annotations = HierarchyAnnotations.load(folder / "truth")
     return SimpleNamespace(folder=folder, scene=scene, annotations=annotations, answers=answers)
 

@@ -1,4 +1,4 @@
-"""`hilsplat.open` and the commands that query a finished scene, from other folders and after a move."""
+"""`hilsplat.open_scene` and the commands that query a finished scene, from other folders and after a move."""
 
 import json
 import os
@@ -59,11 +59,15 @@ def test_importing_the_package_loads_nothing_heavy(project):
 
 
 def test_public_names_are_the_types_that_open_returns(desk):
-    scene = hilsplat.open(desk)
+    scene = hilsplat.open_scene(desk)
     (hit, *_) = scene.query("unicorn")
     made = {type(each).__name__ for each in (scene, hit, hit.level, hit.doubts[0])}
     assert made == {"LanguageScene", "Hit", "Level", "Doubt"}
-    assert {name for name in hilsplat.__all__ if getattr(hilsplat, name)} == made | {"open", "HilsplatError"}
+    assert {name for name in hilsplat.__all__ if getattr(hilsplat, name)} == made | {
+        "open_scene",
+        "show",
+        "HilsplatError",
+    }
     with pytest.raises(AttributeError, match="no attribute 'shut'"):
         hilsplat.shut  # noqa: B018
 
@@ -71,18 +75,18 @@ def test_public_names_are_the_types_that_open_returns(desk):
 def test_a_moved_results_folder_finds_its_clip_by_digest(desk, desk_project, elsewhere):
     shutil.copytree(desk_project / "results", elsewhere / "archive/outcomes")
     shutil.copytree(desk_project / "models/colours", elsewhere / "archive/models/renamed")
-    hits = hilsplat.open("archive/outcomes/photos/desk").query("mug")
-    assert hits == hilsplat.open(desk).query("mug")
+    hits = hilsplat.open_scene("archive/outcomes/photos/desk").query("mug")
+    assert hits == hilsplat.open_scene(desk).query("mug")
     shutil.rmtree("archive/models")
     shutil.copytree(desk_project / "models/colours", "models/group/renamed")  # of the working directory
-    assert hilsplat.open("archive/outcomes/photos/desk").query("mug") == hits
+    assert hilsplat.open_scene("archive/outcomes/photos/desk").query("mug") == hits
 
 
 def test_another_clip_is_refused(copied):
     described = Path("copy/models/colours/preprocessor_config.json")
     described.write_text(described.read_text().replace('"image_std": [1, 1, 1]', '"image_std": [2, 1, 1]'))
     with pytest.raises(ModelError, match="the CLIP model that embedded the masks in") as caught:
-        hilsplat.open(copied)
+        hilsplat.open_scene(copied)
     message = str(caught.value)
     assert read_index(copied / "default/clip")["model_sha256"][:12] in message
     assert re.search(r"copy/models/colours with digest [0-9a-f]{12}", message)
@@ -95,16 +99,16 @@ def test_a_missing_clip_is_reported_with_the_searched_folders(desk, elsewhere, m
     shutil.copytree(desk, elsewhere / "desk")
     (elsewhere / "models").mkdir()
     with pytest.raises(ModelError, match=rf"no CLIP model at models/colours or in {elsewhere}/models"):
-        hilsplat.open("desk")
+        hilsplat.open_scene("desk")
 
 
 def test_the_embedded_clip_warns_that_it_does_not_know_photographs(copied, caplog):
-    assert hilsplat.open(copied).caution == ""  # colours is a CLIP of its own
+    assert hilsplat.open_scene(copied).caution == ""  # colours is a CLIP of its own
     assert "meaningless" not in caplog.text
     card = Path("copy/models/colours/config.json")
     card.write_text(json.dumps({**json.loads(card.read_text()), "world_only": True}))
     change_index(copied / "default/clip", model_sha256=open_model_folder(card.parent).digest)
-    scene = hilsplat.open(copied)
+    scene = hilsplat.open_scene(copied)
     caution = scene.caution
     assert caution.startswith("colours was trained only on the synthetic world: its answers")
     assert f"photos/desk: {caution}" in caplog.text
@@ -115,7 +119,7 @@ def test_the_embedded_clip_warns_that_it_does_not_know_photographs(copied, caplo
     # the embedded models were trained on synthetic scenes
     for images, expected in ((str(copied / "scene"), caution), ("results/synthetic/x/world/images", "")):
         write_record(copied / "scene", inputs={"images": {"path": images}})
-        assert hilsplat.open(copied).caution == expected
+        assert hilsplat.open_scene(copied).caution == expected
 
 
 def test_the_example_of_the_docs_runs(desk_project, project, monkeypatch, capsys):
@@ -204,7 +208,7 @@ def test_variants_open_shared_artifacts_once(copied):
     assert first.gaussians is second.gaussians
     assert first.tree is second.tree
     assert first.scene is second.scene
-    assert first.language is not second.language
+    assert first.field.language is not second.field.language
 
 
 def test_key_views_are_queried_until_the_vectors_of_all_views_exist(desk, tmp_path, caplog):

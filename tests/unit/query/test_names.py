@@ -29,26 +29,26 @@ def nodes_by_text(scene) -> dict[str, int]:
 
 def name_nodes(desk: Path, names: dict[int, str], version: str = NO_FILE):
     tree = desk / "default/semantic_tree"
-    return write_names(desk, tree, names, len(hilsplat.open(desk).tree), version)
+    return write_names(desk, tree, names, len(hilsplat.open_scene(desk).tree), version)
 
 
 def test_a_named_node_is_the_only_answer_with_the_highest_score_and_no_doubt(desk):
-    before = hilsplat.open(desk)
+    before = hilsplat.open_scene(desk)
     (unknown, *_) = before.query("kanji guide")
     assert unknown.doubts and unknown.name == ""
     book = nodes_by_text(before)["book"]
     name_nodes(desk, {book: "Kanji  guide"})
-    (hit,) = hilsplat.open(desk).query(" kanji GUIDE ")
+    (hit,) = hilsplat.open_scene(desk).query(" kanji GUIDE ")
     assert (hit.node, hit.name, hit.doubts) == (book, "Kanji guide", ())
     assert hit.score > 0.9999
 
 
 def test_all_nodes_with_the_name_are_answers_and_a_path_looks_inside_them(desk):
-    found = nodes_by_text(hilsplat.open(desk))
+    found = nodes_by_text(hilsplat.open_scene(desk))
     first = name_nodes(desk, {found["book"]: "thing", found["mug"]: "thing"})
-    assert {hit.node for hit in hilsplat.open(desk).query("thing")} == {found["book"], found["mug"]}
+    assert {hit.node for hit in hilsplat.open_scene(desk).query("thing")} == {found["book"], found["mug"]}
     name_nodes(desk, {found["book"]: "mug", found["mug > handle"]: "grip"}, first.version)
-    scene = hilsplat.open(desk)
+    scene = hilsplat.open_scene(desk)
     (label,) = scene.query("mug > handle")  # the green label, because the book is called a mug
     assert scene.tree.parent[label.node] == found["book"]
     (grip,) = scene.query("grip")
@@ -61,13 +61,15 @@ def test_names_change_neither_other_texts_nor_evaluation(desk):
     from hilsplat.query.language_scene import LanguageScene
     from hilsplat.scene.finished import FinishedScene
 
-    before = hilsplat.open(desk)
+    before = hilsplat.open_scene(desk)
     mug = nodes_by_text(before)["mug"]
     name_nodes(desk, {mug: "book"})
     found = FinishedScene.locate(desk)
     scored = LanguageScene.from_parts(found.parts, found.evaluate_settings())
     np.testing.assert_array_equal(scored.node_margins(["book"]), before.node_margins(["book"]))
-    np.testing.assert_array_equal(hilsplat.open(desk).node_margins(["mug"]), before.node_margins(["mug"]))
+    np.testing.assert_array_equal(
+        hilsplat.open_scene(desk).node_margins(["mug"]), before.node_margins(["mug"])
+    )
 
 
 def test_names_are_replaced_only_if_the_last_version_was_read(desk):
@@ -127,12 +129,12 @@ def test_a_damaged_file_is_refused_and_kept(desk, content):
     text = json.dumps(content).replace("DIGEST", tree_digest(desk / "default/semantic_tree"))
     (desk / FILE).write_text(text)
     with pytest.raises(ArtifactError, match=r"names\.json"):
-        hilsplat.open(desk)
+        hilsplat.open_scene(desk)
     assert (desk / FILE).read_text() == text
 
 
 def test_nodes_similar_to_a_node_are_ranked_by_cosine(desk):
-    scene = hilsplat.open(desk)
+    scene = hilsplat.open_scene(desk)
     found = nodes_by_text(scene)
     likes = scene.like_node(found["mug > handle"])
     green = likes[0]

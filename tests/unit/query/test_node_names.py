@@ -80,7 +80,7 @@ def test_a_name_must_stand_out_and_differ_from_the_name_of_the_parent():
 
 
 def test_names_of_parts_include_their_whole_and_user_given_names_come_first(desk):
-    scene = hilsplat.open(desk)
+    scene = hilsplat.open_scene(desk)
     names = ("mug", "book", "handle", "", "rim")
     scene = replace(scene, naming=NodeNaming(names, (False,) * 5, np.eye(3, dtype=np.float32)))
     order = [scene.query(text)[0].node for text in ("mug", "book", "mug > handle", "mug > handle > rim")]
@@ -88,14 +88,14 @@ def test_names_of_parts_include_their_whole_and_user_given_names_come_first(desk
     assert scene.name_of(order[3]) == "rim of mug"
     tree = desk / "default/semantic_tree"
     write_names(desk, tree, {0: "pot"}, len(scene.tree), "none")
-    renamed = replace(scene, names=hilsplat.open(desk).names)
+    renamed = replace(scene, names=hilsplat.open_scene(desk).names)
     assert renamed.name_of(0) == "pot" and renamed.name_of(order[2]) == "handle of pot"
     (desk / "names.json").unlink()
 
 
 def test_answers_show_the_names_that_the_stage_wrote(desk, tmp_path):
     rows = read_json(desk / "default/names/names.json")
-    scene = hilsplat.open(desk)
+    scene = hilsplat.open_scene(desk)
     assert len(rows) == len(scene.tree) and scene.naming is not None
     (mug,) = scene.query("mug")
     assert rows[mug.node]["candidates"][0][0] == "mug"
@@ -121,7 +121,7 @@ def test_names_of_another_tree_are_not_shown_and_damaged_ones_are_refused(desk, 
 
 
 def test_a_word_missing_from_the_vocabulary_of_the_model_is_doubted(desk):
-    scene = hilsplat.open(desk)
+    scene = hilsplat.open_scene(desk)
     assert open_clip_of(desk / "default/clip").unknown_words("mug zebra, book") == ["zebra"]
     (doubt,) = scene.query("zebra")[0].doubts
     assert str(doubt) == "'zebra' may not be in the scene: the model's vocabulary lacks 'zebra'"
@@ -129,10 +129,10 @@ def test_a_word_missing_from_the_vocabulary_of_the_model_is_doubted(desk):
 
 
 def test_a_text_that_words_for_absent_things_match_as_well_is_doubted(desk):
-    scene = hilsplat.open(desk)
+    scene = hilsplat.open_scene(desk)
     blue, white = np.array([[0, 0, 1.0]], np.float32), np.full((1, 3), 3**-0.5, np.float32)
     rivals = np.concatenate([np.repeat(blue, 30, axis=0), np.repeat(white, 70, axis=0)])
-    scene = replace(scene, naming=replace(scene.naming, rivals=rivals), _by_chance={})
+    scene = replace(scene, naming=replace(scene.naming, rivals=rivals), _rival_margins={})
     (doubt,) = scene.query("book", "whole")[0].doubts  # a third of the words finds the book as well
     assert doubt.chance == pytest.approx(31 / 101)
     assert str(doubt) == "'book' may not be in the scene: 31% of words for absent things score as high"

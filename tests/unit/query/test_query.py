@@ -12,13 +12,13 @@ from hilsplat.field.code import LanguageField, load_code
 from hilsplat.field.field import run_field
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.node_search import ancestor_margins, automatic_level, search
-from hilsplat.query.scene_views import ViewStore
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import AutoencoderSettings, EvaluateSettings, FieldSettings, SemanticTreeSettings
 from tests.unit.artifact_changes import write_record
+from tests.unit.assembled_scene import assembled, with_views
 from tests.unit.evaluate.plain_tree import plain_tree
 from tests.unit.round_gaussians import round_gaussians
 from tests.unit.two_boxes_world import (
@@ -56,14 +56,13 @@ def scene(tmp_path_factory) -> LanguageScene:
         vectors.update({text: vector / np.linalg.norm(vector) for text, vector in new.items()})
         return np.stack([vectors[text] for text in texts]).astype(np.float32)
 
-    return LanguageScene(
+    return assembled(
         Scene.load(world.scene),
         round_gaussians(np.zeros((NUM_GAUSSIANS, 3))),
         SemanticTree.load(folder / "st", world.clip),
         lambda view: two_boxes_weights(int(view[:3])),
-        LanguageField.load(folder / "field.safetensors"),
-        load_code(folder / "ae"),
         encode,
+        (LanguageField.load(folder / "field.safetensors"), load_code(folder / "ae")),
     )
 
 
@@ -96,20 +95,21 @@ def test_a_threshold_keeps_the_answers_with_at_least_that_score(scene):
 def test_automatic_level_is_the_coarsest_level_of_the_best_nodes(scene):
     margin = np.full(7, -0.1)
     margin[[NODE["A top left"], NODE["A top"], NODE["A"]]] = 0.3, 0.2, 0.1
-    assert automatic_level(scene.tree, margin) == Level.SUBPART
-    shown = np.arange(7) != NODE["A top left"]
-    assert automatic_level(scene.tree, margin, shown) == Level.PART
+    assert automatic_level(scene.tree, margin, every := np.ones(7, bool)) == Level.SUBPART
+    visible = np.arange(7) != NODE["A top left"]
+    assert automatic_level(scene.tree, margin, visible) == Level.PART
     margin[NODE["A top"]] = 0.3
-    assert automatic_level(scene.tree, margin) == Level.PART
+    assert automatic_level(scene.tree, margin, every) == Level.PART
     assert automatic_level(scene.tree, margin, np.zeros(7, bool)) == Level.WHOLE
 
 
-def best_wholes(margin, threshold, vectors=None, shown=None) -> list[int]:
+def best_wholes(margin, threshold, vectors=None, visible=None) -> list[int]:
     """Answers among wholes, whose vectors are orthogonal unless given."""
     num = len(margin)
     tree = plain_tree([1] * num, [-1] * num, [[-1, -1, -1]])
     vectors = np.eye(num, dtype=np.float32) if vectors is None else vectors
-    margins, options = np.array([margin], np.float32), {"level": Level.WHOLE, "shown": shown}
+    margins = np.array([margin], np.float32)
+    options = {"level": Level.WHOLE, "visible": np.ones(num, bool) if visible is None else visible}
     return search(tree, margins, vectors, ("x",), threshold=threshold, ancestors=0.2, **options).ids.tolist()
 
 
@@ -130,9 +130,9 @@ def test_nodes_similar_to_the_best_answer_may_be_three_times_as_far_below(cosine
 
 
 def test_only_shown_nodes_are_answers_but_all_define_the_range():
-    margin, shown = [0.0, 9.4, 9.7, 10.0], np.array([True, True, True, False])
-    assert best_wholes(margin, 0.95, shown=shown) == [2, 1]  # within 0.05 of the range of all four, 10
-    assert best_wholes(margin, 0.95, shown=np.zeros(4, bool)) == []
+    margin, visible = [0.0, 9.4, 9.7, 10.0], np.array([True, True, True, False])
+    assert best_wholes(margin, 0.95, visible=visible) == [2, 1]  # within 0.05 of the range of all four, 10
+    assert best_wholes(margin, 0.95, visible=np.zeros(4, bool)) == []
 
 
 def test_parts_of_a_likely_thing_are_ranked_first(scene):
@@ -148,6 +148,7 @@ def test_parts_of_a_likely_thing_are_ranked_first(scene):
     def found(ancestors):
         margins = margin[None].astype(np.float32)
         options = {"threshold": 0.9, "ancestors": ancestors, "level": Level.SUBPART}
+        options["visible"] = np.ones(7, bool)
         return search(scene.tree, margins, scene.tree.clip, ("x",), **options)
 
     assert found(0.0).ids[0] == NODE["B corner"]
@@ -166,9 +167,10 @@ def of_path(*named):
     return every
 
 
-def search_path(tree, margin, path, threshold, level=None, shown=None):
+def search_path(tree, margin, path, threshold, level=None, visible=None):
     """Search a path of several texts."""
-    return search(tree, margin, tree.clip, path, threshold=threshold, ancestors=0.2, level=level, shown=shown)
+    options = {"level": level, "visible": np.ones(len(tree), bool) if visible is None else visible}
+    return search(tree, margin, tree.clip, path, threshold=threshold, ancestors=0.2, **options)
 
 
 def test_a_path_stays_inside_its_first_thing(scene):
@@ -219,8 +221,8 @@ def test_hidden_ancestors_do_not_compete_with_shown_ones(three_wholes):
     # B top would leave A unlikely, and B corner, which nothing holds, the answer
     margin = of_path({"A": 1.0, "B top": 4.0}, {}, {"A top left": 2.0, "B corner": 0.0})
     for hidden, found in (("B", "B corner"), ("B top", "A top left")):
-        shown = np.arange(7) != NODE[hidden]
-        hits = search_path(tree, margin, ("x", "y", "z"), 0.99, shown=shown)
+        visible = np.arange(7) != NODE[hidden]
+        hits = search_path(tree, margin, ("x", "y", "z"), 0.99, visible=visible)
         assert hits.ids.tolist() == [NODE[found]]
 
 
@@ -286,8 +288,8 @@ def test_the_field_answers_through_the_same_interface(scene):
 
 
 def test_look_ups_of_the_field_agree_with_decoding(scene):
-    exact = scene.field_relevancy(["B", "A top"], "004.png")
-    fast = scene.field_relevancy(["B", "A top"], "004.png", exact=False)
+    exact = scene.field.relevancy(["B", "A top"], "004.png")
+    fast = scene.field.relevancy(["B", "A top"], "004.png", exact=False)
     assert fast == pytest.approx(exact, abs=2e-3)  # a network with d = 4: decoded as well
 
 
@@ -320,23 +322,22 @@ def test_levels_at_which_every_ancestor_exists_are_preferred(scene):
 
 @pytest.mark.parametrize("text", ["A top left", "A > A top left"])
 def test_answers_in_a_view_are_nodes_that_it_shows(scene, text):
-    assert scene.nodes_shown("000.png").all()
-    hidden = np.arange(7) != NODE["A top left"]
-    scene._views.get(("shown", "half"), lambda: hidden)
-    named = replace(scene, scene=replace(scene.scene, cameras=replace(scene.scene.cameras, names=("half",))))
-    assert [hit.node for hit in named.query(text, "subpart", view="half")] == [NODE["B corner"]]
-    named._views.get(("shown", "none"), lambda: np.zeros(7, bool))
-    dark = replace(named, scene=replace(scene.scene, cameras=replace(scene.scene.cameras, names=("none",))))
-    assert dark.query(text, view="none") == []
+    assert scene.views.visible_nodes("000.png").all()
+    half = with_views(scene)
+    half.views.cache.get(("visible", "000.png"), lambda: np.arange(7) != NODE["A top left"])
+    assert [hit.node for hit in half.query(text, "subpart", view="000.png")] == [NODE["B corner"]]
+    dark = with_views(scene)
+    dark.views.cache.get(("visible", "000.png"), lambda: np.zeros(7, bool))
+    assert dark.query(text, view="000.png") == []
     with pytest.raises(SettingsError, match="has no view 'x'"):
         scene.query(text, view="x")
 
 
 def test_a_view_shows_the_nodes_with_a_mask_there(scene, monkeypatch):
-    monkeypatch.setattr("hilsplat.query.scene_views.MIN_SHOWN_SHARE", 8 / (HEIGHT * WIDTH))
-    shown = replace(scene, _views=ViewStore()).nodes_shown("000.png")
+    monkeypatch.setattr("hilsplat.query.scene_views.MIN_VISIBLE_SHARE", 8 / (HEIGHT * WIDTH))
+    visible = with_views(scene).views.visible_nodes("000.png")
     # B corner has 2 x 3 px, A top left 4 x 2
-    assert np.flatnonzero(~shown).tolist() == [NODE["B corner"]]
+    assert np.flatnonzero(~visible).tolist() == [NODE["B corner"]]
 
 
 def test_hits_describe_a_node_and_its_place(scene):
@@ -368,21 +369,22 @@ def test_impossible_queries_are_refused(scene, text, options, words):
 
 
 def test_node_masks_cover_their_region_in_an_unseen_view(scene):
-    mask = scene.node_masks("004.png", np.array([NODE["A bottom"]]))
+    mask = scene.views.node_masks("004.png", np.array([NODE["A bottom"]]))
     assert np.array_equal(mask, np.roll(region_mask(3), 4, axis=1))
-    both = scene.node_masks("000.png", np.array([NODE["A bottom"], NODE["A top left"]]))
+    both = scene.views.node_masks("000.png", np.array([NODE["A bottom"], NODE["A top left"]]))
     assert np.array_equal(both, region_mask(3) | region_mask(5))
 
 
-@pytest.mark.parametrize(("of", "ahead_by"), [("node_relevancy_map", 0), ("field_relevancy", 0.05)])
-def test_maps_are_high_where_the_region_is(scene, of, ahead_by):
-    maps = getattr(scene, of)(["B", "A top"], "004.png")
+@pytest.mark.parametrize(("answerer", "ahead_by"), [("tree", 0), ("field", 0.05)])
+def test_maps_are_high_where_the_region_is(scene, answerer, ahead_by):
+    relevancy = scene.node_relevancy_map if answerer == "tree" else scene.field.relevancy
+    maps = relevancy(["B", "A top"], "004.png")
     assert maps.shape == (2, 3, HEIGHT, WIDTH)
     for text, region in enumerate((1, 2)):
         own = maps[text, text]
         inside = np.roll(region_mask(region), 4, axis=1)
         assert own[inside].mean() > own[~inside].mean() + ahead_by
-        if of == "node_relevancy_map":
+        if answerer == "tree":
             assert own[inside].min() > own[~inside].max()
 
 
@@ -391,18 +393,18 @@ def thin(scene) -> LanguageScene:
     """The scene with a first pixel that shows nothing."""
     weights = two_boxes_weights(0).tolil()
     weights[0] = 0
-    return replace(scene, pixel_weights=lambda view: weights.tocsr(), _views=ViewStore())
+    return with_views(scene, weights=lambda view: weights.tocsr())
 
 
 def test_cosines_at_pixels_are_those_of_decoded_latents_and_of_nodes(thin):
     texts, pixels = ["B", "A top"], np.arange(0, HEIGHT * WIDTH, 7)
-    vectors, shares = thin.text_vectors(texts), thin.view_weights("000.png").toarray()[pixels]
-    by_field, by_node = (of(texts, "000.png", pixels) for of in (thin.field_cosine, thin.node_cosine))
+    vectors, shares = thin.clip.embed_texts(texts), thin.views.view_weights("000.png").toarray()[pixels]
+    by_field, by_node = (of(texts, "000.png", pixels) for of in (thin.field.cosine, thin.node_cosine))
     for level in LEVELS:
-        features = thin.language.features[:, level.index]
+        features = thin.field.language.features[:, level.index]
         mass = shares @ (features != 0).any(axis=1).astype(np.float32)
         latents = shares @ features / np.maximum(mass, 0.5)[:, None]
-        expected = np.where(mass > 0.5, vectors @ thin.autoencoder.decode_array(latents).T, -np.inf)
+        expected = np.where(mass > 0.5, vectors @ thin.field.code.decode_array(latents).T, -np.inf)
         assert by_field[:, level.index] == pytest.approx(expected, abs=1e-5)
         node, cosines = thin.tree.node_of_gaussian[:, level.index], vectors @ thin.tree.clip.T
         lowest = cosines[:, thin.tree.nodes_of(level)].min(axis=1, keepdims=True)
@@ -413,16 +415,17 @@ def test_cosines_at_pixels_are_those_of_decoded_latents_and_of_nodes(thin):
 
 
 def test_uncovered_pixels_get_the_lowest_relevancy(thin):
-    for maps in (thin.field_relevancy(["A"], "000.png"), thin.node_relevancy_map(["A"], "000.png")):
+    for maps in (thin.field.relevancy(["A"], "000.png"), thin.node_relevancy_map(["A"], "000.png")):
         assert maps[0, 0, 0, 0] == maps[0, 0].min()
-    assert not thin.node_masks("000.png", np.array([NODE["A"]]))[0, 0]
+    assert not thin.views.node_masks("000.png", np.array([NODE["A"]]))[0, 0]
 
 
 def test_latents_are_means_over_the_gaussians_that_have_one(scene):
-    features = scene.language.features.copy()
+    features = scene.field.language.features.copy()
     features[::7] = 0
-    thin = replace(scene, language=replace(scene.language, features=features), _views=ViewStore())
-    weights = scene.view_weights("000.png")
+    language = replace(scene.field.language, features=features)
+    thin = replace(with_views(scene).field, language=language)
+    weights = scene.views.view_weights("000.png")
     for index, (pixels, latents) in enumerate(thin.latents("000.png")):
         own = np.ascontiguousarray(features[:, index])
         share = weights @ (own != 0).any(axis=1).astype(np.float32)
@@ -433,18 +436,18 @@ def test_latents_are_means_over_the_gaussians_that_have_one(scene):
 
 def test_a_forgotten_view_is_computed_again_with_the_same_answers(scene):
     asked = []
-    weights = lambda view: asked.append(view) or scene.pixel_weights(view)  # noqa: E731
-    own = replace(scene, pixel_weights=weights, _views=ViewStore())
-    first = own.field_relevancy(["cup"], "000.png")
-    own.nodes_shown("001.png")
-    own.forget("000.png")
-    assert np.array_equal(own.field_relevancy(["cup"], "000.png"), first)
-    own.nodes_shown("001.png")
+    weights = lambda view: asked.append(view) or scene.views.pixel_weights(view)  # noqa: E731
+    own = with_views(scene, weights=weights)
+    first = own.field.relevancy(["cup"], "000.png")
+    own.views.visible_nodes("001.png")
+    own.views.cache.forget("000.png")
+    assert np.array_equal(own.field.relevancy(["cup"], "000.png"), first)
+    own.views.visible_nodes("001.png")
     assert asked == ["000.png", "001.png", "000.png"]
 
 
 def test_field_image_has_one_colour_per_region(scene):
-    image = scene.field_image("000.png", Level.WHOLE)
+    image = scene.field.image("000.png", Level.WHOLE)
     assert image.shape == (HEIGHT, WIDTH, 3)
     a, b = image[region_mask(0)].mean(axis=0), image[region_mask(1)].mean(axis=0)
     assert np.abs(a - b).max() > 50

@@ -14,6 +14,7 @@ from hilsplat.query.node_search import search
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import EvaluateSettings
+from tests.unit.assembled_scene import assembled
 from tests.unit.evaluate.builders import cameras_of
 from tests.unit.evaluate.plain_tree import plain_tree
 from tests.unit.query.test_query import near
@@ -27,8 +28,9 @@ def tree_of(levels: list[int], parents: list[int]) -> SemanticTree:
 
 def searched(tree: SemanticTree, margin: list[list[float]], *path: str, **options):
     """Search with the default settings."""
-    found = np.array(margin, np.float32)
-    return search(tree, found, tree.clip, path, **{"threshold": 0.95, "ancestors": 0.2, **options})
+    margins = np.array(margin, np.float32)
+    options = {"threshold": 0.95, "ancestors": 0.2, "visible": np.ones(len(tree), bool), **options}
+    return search(tree, margins, tree.clip, path, **options)
 
 
 @pytest.mark.parametrize(("bear", "heads_as_bear"), [(3.0, 3.0), (3.0, 0.0), (3.0, -1.0), (-3.0, 0.0)])
@@ -61,15 +63,13 @@ def three_mugs() -> LanguageScene:
     settings = EvaluateSettings(relevancy_scale=100)
     cameras, nothing = cameras_of(np.eye(4)[None], np.eye(3), (2, 2)), np.zeros((0, 3), np.float32)
     split, colours = {"000.png": "train"}, nothing.astype(np.uint8)
-    return LanguageScene(
+    return assembled(
         Scene(Path(), "toy/mugs", "metre", cameras, split, nothing, colours, np.eye(4)),
         round_gaussians(np.zeros((1, 3))),
         replace(tree, clip=vectors),
         lambda view: sp.csr_matrix((4, 1), dtype=np.float32),
-        None,
-        None,
         encode,
-        settings,
+        settings=settings,
     )
 
 
@@ -107,6 +107,6 @@ def test_doubts_consider_only_nodes_shown_in_the_view():
     tree = tree_of([1, 1, 2, 2], [-1, -1, 0, 1])
     margin = [[0.4, -0.1, 0, 0], [0, 0, 0.3, 0.3]]
     assert searched(tree, margin, "mug", "handle").texts[0].margin > 0
-    shown = np.array([False, True, False, True])
-    hits = searched(tree, margin, "mug", "handle", shown=shown)
+    visible = np.array([False, True, False, True])
+    hits = searched(tree, margin, "mug", "handle", visible=visible)
     assert hits.texts[0].margin == pytest.approx(-0.1)

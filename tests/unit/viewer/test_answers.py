@@ -83,7 +83,7 @@ def test_requests_match_their_openapi_description(client):
 
 def test_a_photograph_and_a_level_restrict_the_answers(client, scene):
     view = 2
-    hits = scene.query("mug", "part", view=scene.views[view])
+    hits = scene.query("mug", "part", view=scene.views.names[view])
     found = ask(client, "mug", level="part", view=view)["hits"]
     assert [hit["node"] for hit in found] == [hit.node for hit in hits]
     assert client.post("/api/query", json={"text": "mug", "view": 99}).status_code == 422
@@ -173,13 +173,13 @@ def test_a_saved_selection_has_the_gaussians_boxes_and_labels_of_its_groups(clie
     groups = [{"name": "mug > hëndle", "nodes": [handle.node]}, {"name": "mug", "nodes": [mug.node]}]
     sent = {"groups": groups}
     (tmp_path / "selection.ply").write_bytes(client.post("/api/export/ply", json=sent).content)
-    saved, rows = load_ply(tmp_path / "selection.ply"), scene.gaussians_of([mug.node, handle.node])
+    saved, rows = load_ply(tmp_path / "selection.ply"), scene.views.gaussians_of([mug.node, handle.node])
     np.testing.assert_array_equal(saved.means, shown.gaussians.means[rows])
     np.testing.assert_array_equal(saved.sh, shown.gaussians.sh[rows])
     labelled = PlyData.read(tmp_path / "selection.ply")
     assert labelled.comments == ["label 1: mug > h\\xebndle", "label 2: mug"]
     # the handle belongs to both: it is labelled as the smaller
-    expected = np.where(np.isin(rows, scene.gaussians_of([handle.node])), 1, 2)
+    expected = np.where(np.isin(rows, scene.views.gaussians_of([handle.node])), 1, 2)
     np.testing.assert_array_equal(labelled["vertex"]["label"], expected)
     boxes = client.post("/api/export/boxes", json=sent).json()["boxes"]
     found = [(box["group"], box["node"]) for box in boxes]
@@ -197,14 +197,14 @@ def test_saved_masks_are_those_of_the_hits_in_every_view_and_of_every_group(clie
     named = (("handle", handle), ("mug", mug), ("cup", mug))
     groups = [{"name": name, "nodes": [hit.node]} for name, hit in named]
     progress, data = in_steps(client, "masks", groups=groups)
-    assert progress == [(made, len(scene.views)) for made in range(len(scene.views) + 1)]
+    assert progress == [(made, len(scene.views.names)) for made in range(len(scene.views.names) + 1)]
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         coco = json.loads(archive.read("coco.json"))
-        assert [image["file_name"] for image in coco["images"]] == list(scene.views)
+        assert [image["file_name"] for image in coco["images"]] == list(scene.views.names)
         assert [each["name"] for each in coco["categories"]] == ["handle", "mug", "cup"]
-        assert [each["id"] for each in coco["annotations"]] == list(range(1, 1 + 3 * len(scene.views)))
+        assert [each["id"] for each in coco["annotations"]] == list(range(1, 1 + 3 * len(scene.views.names)))
         for entry in coco["annotations"]:
-            view, (_, hit) = scene.views[entry["image_id"]], named[entry["category_id"] - 1]
+            view, (_, hit) = scene.views.names[entry["image_id"]], named[entry["category_id"] - 1]
             png = Image.open(io.BytesIO(archive.read(f"masks/{Path(view).stem}/{entry['node']}.png")))
             np.testing.assert_array_equal(np.asarray(png.convert("L")) > 0, hit.mask(view))
             runs = entry["segmentation"]
@@ -285,8 +285,8 @@ def test_a_query_waits_for_at_most_one_crop(shown):
     request = Request({"type": "http", "query_string": b""})
 
     async def ask_among_crops() -> None:
-        crops = [thread.do_behind(request, lambda _, n=n: order.append(n)) for n in range(6)]
-        tasks = [asyncio.create_task(crop) for crop in crops]
+        crops = [thread.get("/", lambda *_, n=n: order.append(n), behind=True) for n in range(6)]
+        tasks = [asyncio.create_task(crop.endpoint(request)) for crop in crops]
         for _ in range(3):  # until the first crop is with the thread, and the others wait for it
             await asyncio.sleep(0)
         await thread.do(request, lambda _: order.append("question"))
@@ -311,7 +311,7 @@ def test_a_crop_shows_the_node_and_dims_the_rest(client, scene):
 
 def test_photographs_are_requested_by_number(client, scene):
     image = Image.open(io.BytesIO(client.get("/api/photo/3").content))
-    np.testing.assert_array_equal(np.asarray(image.convert("RGB")), scene.image(scene.views[3]))
+    np.testing.assert_array_equal(np.asarray(image.convert("RGB")), scene.views.image(scene.views.names[3]))
     assert client.get("/api/thumb/3").headers["content-type"] == "image/jpeg"
     assert client.get("/api/photo/99").status_code == 422
 

@@ -2,13 +2,11 @@
 
 import re
 import urllib.request
-from dataclasses import replace
 
 import pytest
 from starlette.testclient import TestClient
 
 import hilsplat
-from hilsplat.base.errors import ArtifactError
 from hilsplat.viewer.app import Viewer
 from tests.unit.finished_desk import SCENE
 from tests.unit.viewer.conftest import TOKEN
@@ -45,8 +43,7 @@ def test_the_page_has_no_absolute_paths(framed):
 
 
 def test_a_scene_is_shown_in_a_notebook(desk_project):
-    scene = hilsplat.open(desk_project / SCENE)
-    shown = scene.show("mug", height=300)
+    shown = hilsplat.show(desk_project / SCENE, "mug", height=300)
     try:
         html = shown._repr_html_()
         address = re.search(r'<iframe src="([^"]+)"', html)[1].replace("&amp;", "&")
@@ -57,12 +54,6 @@ def test_a_scene_is_shown_in_a_notebook(desk_project):
         shown.close()
     with pytest.raises(OSError):
         urllib.request.urlopen(address)
-    hub = scene.show(proxy="/user/me/proxy/{port}/")
+    hub = hilsplat.show(desk_project / SCENE, proxy="/user/me/proxy/{port}/")
     assert hub.address.startswith(f"/user/me/proxy/{hub.port}/?token=")
     hub.close()
-
-
-def test_a_scene_assembled_from_parts_cannot_be_shown(desk_project):
-    scene = replace(hilsplat.open(desk_project / SCENE), finished=None)
-    with pytest.raises(ArtifactError, match=r"hilsplat\.open"):
-        scene.show()

@@ -9,12 +9,13 @@ import pytest
 
 from hilsplat.base.artifacts import write_index
 from hilsplat.evaluate.figures.panel import annotated_rows, draw_panel, free_rows, shown_truths
-from hilsplat.models.store import meaningless
 from hilsplat.query.answer import report, views_of
 from hilsplat.query.pictures import ANSWER_RGB, TRUTH_RGB, outline, paint_answer, save_figure
 from hilsplat.query.query_panel import query_panel
 from hilsplat.settings import EvaluateSettings, FiguresSettings
+from tests.unit.assembled_scene import GivenClip
 from tests.unit.evaluate.builders import box
+from tests.unit.evaluate.conftest import encode_texts
 
 EVALUATE = EvaluateSettings()
 
@@ -60,7 +61,7 @@ def test_a_panel_of_meaningless_answers_or_true_masks_is_marked(block_world, tmp
     answers, masks = block_world.answers, block_world.folder / "masks"
     title = draw_panel(answers, masks, [], EVALUATE).get_suptitle()
     assert "\n" not in title and "true" not in title
-    doubtful = draw_panel(replace(answers, caution=meaningless("clip-tiny")), masks, [], EVALUATE)
+    doubtful = draw_panel(replace(answers, clip=GivenClip(encode_texts, True)), masks, [], EVALUATE)
     assert "answers about photographs are meaningless" in doubtful.get_suptitle().replace("\n", " ")
     shutil.copytree(masks, tmp_path / "masks")
     label = "truth-perturbed (merge 0.2)"

@@ -41,10 +41,11 @@ def maps(columns, value=0.9):
 def flat_of(cards, level=Level.WHOLE, **cosines):
     """The protocols in a scene whose cosines with texts are given as maps (3, H, W)."""
 
-    def field_cosine(texts, view, pixels):
+    def cosine(texts, view, pixels):
         return np.stack([cosines[text].reshape(3, -1)[:, pixels] for text in texts])
 
-    return FlatProtocols(SimpleNamespace(field_cosine=field_cosine), "v.png", cards, level)
+    scene = SimpleNamespace(field=SimpleNamespace(cosine=cosine))
+    return FlatProtocols(scene, "v.png", cards, level)
 
 
 def added(flat, found, text, method="field", nodes_mask=None):
@@ -199,11 +200,11 @@ def test_wood_wall_alone_is_united_with_wood_table_and_any_grey_is_true(tmp_path
     def high_in(rows):
         return np.where(box(rows, (0, 40), (40, 40)), 0.9, 0.1).astype(np.float32)[None].repeat(3, axis=0)
 
-    def field_relevancy(texts, _):
+    def relevancy(texts, _):
         asked.extend(texts)
         return high_in((20, 30))[None]
 
-    scene = SimpleNamespace(field_relevancy=field_relevancy)
+    scene = SimpleNamespace(field=SimpleNamespace(relevancy=relevancy))
     flat = FlatProtocols(scene, "v.png", [OVS_LANGSPLAT_V2, card_of("3d-ovs/langsplat")], None)
     rows = added(flat, high_in((0, 20)), query)
     found = {row.protocol.partition("@")[0]: row.value for row in rows if row.metric == "iou"}

@@ -40,12 +40,13 @@ class HandMade:
     """
 
     def __init__(self, masks, answers, relevancy=None):
-        self.masks, self.answers, self.relevancy, self.scene_wide = masks, answers, relevancy or {}, {}
+        self.masks, self.answers, self.maps, self.scene_wide = masks, answers, relevancy or {}, {}
+        self.views, self.field = self, self
 
-    def field_relevancy(self, texts, view):
-        return np.stack([self.relevancy.get(text, np.zeros((3, *SIZE), np.float32)) for text in texts])
+    def relevancy(self, texts, view):
+        return np.stack([self.maps.get(text, np.zeros((3, *SIZE), np.float32)) for text in texts])
 
-    node_relevancy_map = field_relevancy
+    node_relevancy_map = relevancy
 
     def select(self, path, *, level=None, view=None):
         answers = self.answers if view == "v.png" else self.answers | self.scene_wide
