@@ -50,7 +50,7 @@ def find_poses(
     threads: Threads = 1,
 ) -> None:
     """Compute the camera poses of photographs, or import a COLMAP model or transforms.json."""
-    from hilsplat.datasets.sources import photo_files
+    from hilsplat.scene.layouts import photo_files
 
     section = section_of("poses", settings)
     is_own = any(provenance_path(place).is_file() for place in (images, images.parent))
