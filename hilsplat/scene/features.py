@@ -91,7 +91,7 @@ def exif_focal_px(path: Path, size_hw: tuple[int, int]) -> float | None:
 
 
 def prepare_images(
-    sources: Sequence[Path], folder: Path, max_side_px: int, least_share: float = 1.0
+    sources: Sequence[Path], folder: Path, max_side_px: int, min_share: float = 1.0
 ) -> tuple[list[WorkImage], dict[Path, str]]:
     """Write each photograph to `folder` as an upright PNG with a longer side of at most `max_side_px`.
 
@@ -99,7 +99,7 @@ def prepare_images(
         the copies, and why the other photographs cannot be used.
 
     Raises:
-        ImageError: fewer than `least_share` of the files can be used; the message names all others.
+        ImageError: fewer than `min_share` of the files can be used; the message names all others.
         SceneError: two files would become the same view.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -116,7 +116,7 @@ def prepare_images(
         size_hw = (pixels.shape[0], pixels.shape[1])
         write_png(folder / view, pixels, WORK_COMPRESSION)
         images.append(WorkImage(view, source, size_hw, exif_focal_px(source, size_hw)))
-    if damaged and len(images) < least_share * len(sources):
+    if damaged and len(images) < min_share * len(sources):
         if len(damaged) == 1:
             raise ImageError(*damaged.values())
         raise ImageError(

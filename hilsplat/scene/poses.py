@@ -135,8 +135,9 @@ def _reconstruct(
     camera_model = settings.camera_model
     if camera_model == "auto":
         camera_model = "simple_pinhole" if is_render else "simple_radial"
-    least = settings.min_registered_share
-    work_images, unreadable = prepare_images(sources, work / "images", settings.max_side_px, least)
+    work_images, unreadable = prepare_images(
+        sources, work / "images", settings.max_side_px, settings.min_registered_share
+    )
     database, lenses = work / "features.db", lenses_of(work_images, camera_model, settings.single_camera)
     logger.info("%s: extracting and matching the features of %d images", name, len(work_images))
     matcher = in_own_process(find_matches, database, work / "images", lenses, settings, seed, threads)

@@ -143,11 +143,11 @@ def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
     if not isinstance(content, dict) or "source_from_scene" not in content:
         return None
     require_as_written(path, sha256_of_file(path))
-    if content.get("ply_sha256") != (found := sha256_of_file(ply)):
+    if content.get("ply_sha256") != (digest := sha256_of_file(ply)):
         raise ArtifactError(
             f"{path} was written for a different {ply.name}",
             expected=f"sha256 {content.get('ply_sha256')}",
-            found=f"sha256 {found}",
+            found=f"sha256 {digest}",
             fix="move it next to the PLY that it was written for, or remove it if the PLY is in the "
             "coordinates of the scene's source",
         )
@@ -160,7 +160,8 @@ def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
 def read_gaussians(ply: Path) -> tuple[Gaussians, list[str]]:
     """Read another program's PLY; return notes on what was changed and left out (`import_ply`)."""
     gaussians, notes, unknown = import_ply(ply, FIX)
-    notes += [f"unknown properties are not used: {', '.join(unknown)}"] if unknown else []
+    if unknown:
+        notes.append(f"unknown properties are not used: {', '.join(unknown)}")
     if len(gaussians) == 0:
         raise ArtifactError(f"{ply} contains no Gaussians", fix=FIX)
     return gaussians, notes
@@ -191,8 +192,7 @@ def import_gaussians(
     elif dataparser is not None:
         transform = transform @ source_from_dataparser(dataparser, transforms)
         moved = f"in nerfstudio's training coordinates, from {dataparser.name}"
-    said = "; ".join([moved, *notes])
-    logger.info("%s: %d Gaussians from %s, %s", scene.name, len(gaussians), ply, said)
+    logger.info("%s: %d Gaussians from %s, %s", scene.name, len(gaussians), ply, "; ".join([moved, *notes]))
     origin = {
         "kind": "imported",
         "file": ply.name,  # its folder is in the provenance record
