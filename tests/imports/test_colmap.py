@@ -1,12 +1,10 @@
 """COLMAP models as COLMAP and other programs write them."""
 
-import struct
-
 import numpy as np
 import pycolmap
 import pytest
 
-from hilsplat.base.errors import HilsplatError, SceneError
+from hilsplat.base.errors import HilsplatError
 from hilsplat.scene.importers.colmap_model import read_model
 from hilsplat.scene.importers.known_views import read_source
 from hilsplat.scene.layouts import find_known_poses
@@ -237,12 +235,3 @@ def test_rigs_whose_cameras_share_file_names_keep_every_view(tmp_path, imported)
     """COLMAP's rigs: rig0/0000.png, rig1/0000.png, ..."""
     views, *_ = imported(write(tmp_path / "in", "rig{}/0000.png"))
     world.require_right(views, {f"rig{number}_0000.png": pose for number, pose in enumerate(POSES)}, 45)
-
-
-@pytest.mark.parametrize("count", [2**40, 2**63, 7])
-def test_wrong_counts_of_binary_models_are_refused(count, tmp_path):
-    folder = write(tmp_path)
-    rewrite_as_binary(folder / "sparse/0", "{:03d}.png")
-    edit(folder, "images.bin", lambda content: struct.pack("<Q", count) + content[8:])
-    with pytest.raises(SceneError, match=r"images\.bin cannot be read"):
-        read_source(find_known_poses(folder))

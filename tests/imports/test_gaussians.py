@@ -152,6 +152,11 @@ REFUSED = {
     "view-dependent opacity": (added("opacity_rest_0"), "opacity_rest_0"),
     "another filter": (added("mip_filter"), "mip_filter"),
     "indices into a codebook": (lambda c: {**c, "scale_1": np.ones(8, np.uint8)}, "not floats: scale_1"),
+    "two harmonics": (
+        lambda c: {k: v for k, v in c.items() if k[:6] != "f_rest" or k[7:] in "01"},
+        "2 f_rest",
+    ),
+    "no numbers": (lambda c: {k: v * np.float32(np.nan) for k, v in c.items()}, "8 of 8 Gaussians contain"),
     "colours only": (lambda c: {k: v for k, v in c.items() if k[:2] != "f_"}, "f_dc_0"),
     "degree 4": (added(*(f"f_rest_{k}" for k in range(9, 72))), "72 f_rest columns"),
 }
@@ -221,28 +226,6 @@ def test_more_than_half_unusable_rows_refuse_the_file(tmp_path, bad, is_read):
 
 
 # ---- damage ------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("text", [False, True], ids=["binary", "ascii"])
-def test_damaged_files_give_finite_gaussians_or_an_error_that_names_the_file(tmp_path, text):
-    rng = np.random.default_rng(0)
-    table = {**columns(), "filter_3D": np.ones(8, np.float32)}
-    whole = write(tmp_path / "g.ply", table, text=text).read_bytes()
-    refused = 0
-    values = list(b"0123456789-+.einfa \n") if text else range(256)
-    for _ in range(200):
-        damaged = bytearray(whole)
-        for place in rng.integers(0, len(whole), rng.integers(1, 4)):
-            damaged[place] = rng.choice(values)
-        (tmp_path / "g.ply").write_bytes(damaged[: rng.integers(len(whole) * 9 // 10, 2 * len(whole))])
-        try:
-            found, *_ = import_ply(tmp_path / "g.ply", "fix")
-        except ArtifactError as error:
-            refused += 1
-            assert "g.ply" in str(error)
-        else:
-            assert all(np.isfinite(values).all() for values in vars(found).values())
-    assert 20 < refused < 180
 
 
 @pytest.mark.parametrize("content", [b"", b"ply\n", b"\x00" * 100, b"ply\nformat ascii 1.0\nend_header\n"])

@@ -75,6 +75,7 @@ def test_every_part_is_counted_and_what_is_left_out_is_named(options, tmp_path):
         labels = {"info": {"name": f"{name}.jpg", "width": WIDTH, "height": HEIGHT}, "objects": [{}, {}]}
         (folder / f"label/{name}.json").write_text(json.dumps(labels))
     (folder / "label/000.json").write_text("{")
+    (folder / "output/a/chkpnt30000.pth").touch()
     result = new(folder, tmp_path / "project", *options)
     assert result.exit_code == 0, result.output
     for line in (
@@ -88,11 +89,16 @@ def test_every_part_is_counted_and_what_is_left_out_is_named(options, tmp_path):
         f"features: {folder}/language_features: masks and vectors of 2 of 5 views",
         f"labels: 8 in 4 photographs, used for evaluation: {folder}/label",
         "  not scored, because their views have no pose: 004.json, zzz.json",
+        "skipped, because pickle files can run code: chkpnt30000.pth",
         "5 photographs in",
     ):
         assert line in result.output, result.output
     assert "left out: " in result.output and "000.json is not valid JSON" in result.output
-    assert (tmp_path / "project/config/scenes.tsv").exists() == (not options)
+    sheet = tmp_path / "project/config/scenes.tsv"
+    assert sheet.exists() == (not options)
+    for row in read_sheet(sheet) if not options else []:
+        assert row.gaussians == folder / "output/a/point_cloud/iteration_30000/point_cloud.ply"
+        assert (row.folder, row.features) == (folder, folder / "language_features")
     assert (tmp_path / "project/annotated/photos/desk/001.json").exists() == (not options)
     assert not (tmp_path / "project/annotated/photos/desk/000.json").exists()
 
@@ -167,27 +173,16 @@ def test_some_photographs_that_cannot_be_read_are_left_out(tmp_path):
 
 
 def archive_with(folder, name, suffix="zip"):
-    """An archive whose entries are named as given, which zipfile would change on Linux."""
     photographs(folder / "a")
     with zipfile.ZipFile(folder / f"a.{suffix}", "w") as archive:
         for path in (folder / "a").iterdir():
-            entry = zipfile.ZipInfo("x")
-            entry.filename = name.format(path.name)
-            archive.writestr(entry, path.read_bytes())
+            archive.write(path, name.format(path.name))
 
 
 @pytest.mark.parametrize("name", ["photos\\{}", "a\\b\\{}"])
 def test_archives_made_on_windows_are_unpacked(name, tmp_path):
     archive_with(tmp_path, name)
     assert add_scene(tmp_path / "p/scenes.tsv", "a", tmp_path / "a.zip").num_readable == 6
-
-
-@pytest.mark.parametrize("name", ["..\\{}", "C:\\a\\{}", "\\\\host\\share\\{}", "a\\..\\..\\{}", "/{}"])
-def test_archives_that_lead_outside_are_refused(name, tmp_path):
-    archive_with(tmp_path, name)
-    with pytest.raises(SceneError, match="outside the folder"):
-        add_scene(tmp_path / "p/scenes.tsv", "a", tmp_path / "a.zip")
-    assert not list((tmp_path / "p").rglob("*.jpg"))
 
 
 def test_other_programs_gaussians_without_poses_are_named_but_not_used(tmp_path):

@@ -62,10 +62,15 @@ def psnr(found, expected):
 
 
 @pytest.mark.parametrize("suffix", ["mp4", "mov", "mkv"])
-@pytest.mark.parametrize(("rotation", "turns"), [(0, 0), (90, 1), (-90, 3), (180, 2)])
 @pytest.mark.parametrize(
-    ("width", "aspect", "shown"),
-    [(144, (4, 3), 192), (144, (16, 15), 154), (128, (3, 4), 96), (128, (1, 1), 128), (64, (2, 1), 128)],
+    ("width", "aspect", "shown", "rotation", "turns"),
+    [
+        (144, (4, 3), 192, 0, 0),
+        (144, (16, 15), 154, 90, 1),
+        (128, (3, 4), 96, -90, 3),
+        (128, (1, 1), 128, 180, 2),
+        (64, (2, 1), 128, 90, 1),
+    ],
 )
 def test_frames_are_stretched_to_square_pixels(tmp_path, suffix, rotation, turns, width, aspect, shown):
     stream = {"size": (HEIGHT, width), "aspect": Fraction(*aspect), "rotation": rotation}

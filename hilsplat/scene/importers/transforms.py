@@ -105,11 +105,10 @@ def _held_out(content: Mapping[str, Any], names: list[str], notes: list[str]) ->
     """Return the frames that the file's lists of names keep from training."""
     listed: dict[str, set[str]] = {}
     for key in SPLITS:
-        value = content.get(key) or []
-        if not isinstance(value, list):
+        value = content.get(key)
+        if value is not None and not isinstance(value, list):
             notes.append(f"{key} is not a list of names, and is not used")
-            value = []
-        matches = match_names(map(str, value), names).values()
+        matches = match_names(map(str, value if isinstance(value, list) else []), names).values()
         listed[key] = {name for name in matches if name is not None}
         if num_lost := sum(name is None for name in matches):
             notes.append(f"{num_lost} names in {key} belong to no frame")
