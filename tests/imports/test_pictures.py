@@ -46,41 +46,25 @@ def half_transparent(pixels):
     return np.dstack([pixels, np.full(pixels.shape[:2], 128, np.uint8)])
 
 
-FORMS = {  # suffix, the stored picture, how it is saved, and what it must become
-    "plain": (".png", lambda px: Image.fromarray(px), {}, lambda px: px),
-    "profile": (
-        ".png",
-        lambda px: Image.fromarray(px),
-        {"icc_profile": SWAPPED},
-        lambda px: px[..., [1, 0, 2]],
-    ),
-    "16-bit grey": (
-        ".png",
-        lambda px: Image.fromarray(grey16(px)),
-        {},
-        lambda px: np.repeat((grey16(px)[..., None] / 257).round().astype(np.uint8), 3, axis=2),
-    ),
-    "alpha": (".png", lambda px: Image.fromarray(half_transparent(px)), {}, lambda px: px),
-    "profile and alpha": (
-        ".png",
-        lambda px: Image.fromarray(half_transparent(px)),
-        {"icc_profile": SWAPPED},
-        lambda px: px[..., [1, 0, 2]],
-    ),
-    "CMYK": (".tif", lambda px: Image.fromarray(px).convert("CMYK"), {}, lambda px: px),
-    "grey": (
-        ".png",
-        lambda px: Image.fromarray(px[..., 0]),
-        {},
-        lambda px: np.repeat(px[..., :1], 3, axis=2),
-    ),
+def grey(pixels):
+    return np.repeat(pixels[..., None], 3, axis=2)
+
+
+def swapped(pixels):
+    return pixels[..., [1, 0, 2]]
+
+
+FORMS = {  # suffix, what is stored, how it is saved, and what it must become (more: `test_image_formats.py`)
+    "16-bit grey": (".png", grey16, {}, lambda px: grey((grey16(px) / 257).round().astype(np.uint8))),
+    "profile and alpha": (".png", half_transparent, {"icc_profile": SWAPPED}, swapped),
     "grey with a profile of colours": (
         ".png",
-        lambda px: Image.fromarray(px[..., 0]),
+        lambda px: px[..., 0],
         {"icc_profile": SWAPPED},
-        lambda px: np.repeat(px[..., :1], 3, axis=2),
+        lambda px: grey(px[..., 0]),
     ),
-    "lossless WebP": (".webp", lambda px: Image.fromarray(px), {"lossless": True}, lambda px: px),
+    "TIFF": (".tif", lambda px: px, {}, lambda px: px),
+    "lossless WebP": (".webp", lambda px: px, {"lossless": True}, lambda px: px),
 }
 
 
@@ -91,7 +75,7 @@ def test_turned_photographs_with_known_poses_have_the_pixels_of_the_others(form,
     folder = tmp_path / "in/images"
     folder.mkdir(parents=True)
     for number, (pixels, turn) in enumerate(zip(PICTURES, (1, 6, 3, 8), strict=True)):
-        stored(pixels).save(folder / f"{number}{suffix}", exif=exif(turn), **options)
+        Image.fromarray(stored(pixels)).save(folder / f"{number}{suffix}", exif=exif(turn), **options)
     images = {f"{number}{suffix}": pose for number, pose in enumerate(POSES)}
     world.write_colmap(tmp_path / "in/sparse/0", "PINHOLE 80 80 48 36", (WIDTH, HEIGHT), images)
     views, *_ = imported(tmp_path / "in")
