@@ -95,12 +95,8 @@ def prepare_images(
 ) -> tuple[list[WorkImage], dict[Path, str]]:
     """Write each photograph to `folder` as an upright PNG with a longer side of at most `max_side_px`.
 
-    Returns:
-        the copies, and why the other photographs cannot be used.
-
-    Raises:
-        ImageError: fewer than `min_share` of the files can be used; the message names all others.
-        SceneError: two files would become the same view.
+    Return the copies, and why the other photographs cannot be used; raise ImageError if fewer than
+    `min_share` can be used.
     """
     folder.mkdir(parents=True, exist_ok=True)
     images = []

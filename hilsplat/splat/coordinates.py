@@ -107,7 +107,6 @@ def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dic
     only record of the coordinates used by our own structure from motion.
     """
     scale, rotation, translation = decompose(scene.scene_from_source)
-    registration = read_json(scene.folder / "registration.json")
     write_json(
         ply.with_suffix(".json"),
         {
@@ -118,7 +117,7 @@ def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dic
             "sh_degree": gaussians.sh_degree,
             "unit": scene.unit,
             "axes": "right-handed; cameras in OpenCV axes (x right, y down, z forward)",
-            "source": registration["poses"],
+            "source": read_json(scene.folder / "registration.json")["poses"],
             "convention": "x_scene = scene_from_source @ [x_source, 1]",
             "scene_from_source": scene.scene_from_source.tolist(),
             "source_from_scene": np.linalg.inv(scene.scene_from_source).tolist(),
@@ -131,11 +130,7 @@ def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dic
 
 
 def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
-    """Return the transform from a PLY's coordinates to its source's, or None if no JSON file contains it.
-
-    Raises:
-        ArtifactError: if the JSON file belongs to a different PLY, or its transform cannot be used.
-    """
+    """Return the transform from a PLY's coordinates to its source's, or None if no JSON file contains it."""
     path = ply.with_suffix(".json")
     if not path.is_file():
         return None
@@ -205,11 +200,7 @@ def import_gaussians(
 
 
 def write_source_ply(ply: Path, out: Path) -> int:
-    """Write a scene's Gaussians in the coordinates of the scene's source, and return their number.
-
-    Raises:
-        ArtifactError: if `ply` or the JSON file beside it is missing or damaged.
-    """
+    """Write a scene's Gaussians in the coordinates of the scene's source, and return their number."""
     source_from_scene = read_source_from_scene(ply)
     if source_from_scene is None:
         raise ArtifactError(f"{ply.with_suffix('.json')} is missing", fix=run_command(ply))

@@ -36,10 +36,6 @@ def import_poses(
 
     Images are matched to poses by name; the report lists poses without an image and images without a pose.
     Pixels are used as stored, because COLMAP ignores the EXIF orientation. The source's axes are kept.
-
-    Raises:
-        SceneError: the model or transforms file cannot be used.
-        RegistrationError: too few of the source's views have an image.
     """
     source, min_share = read_source(known), settings.min_registered_share
     source.require_most(min_share, known.files[0])

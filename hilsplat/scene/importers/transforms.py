@@ -84,10 +84,7 @@ def read_transforms(known: KnownPoses) -> Source:
         source.notes += KEYS.check([content, *frames], file)
         names = [str(frame.get("file_path", f"frame {number}")) for number, frame in enumerate(frames)]
         images, held_out = find_images(known.root, names), _held_out(content, names, source.notes)
-        is_test = file.name != known.files[0].name and file.name in (
-            "transforms_test.json",
-            "transforms_val.json",
-        )
+        is_test = file != known.files[0]
         for number, (name, frame) in enumerate(zip(names, frames, strict=True)):
             replaced = FOCAL_KEYS if FOCAL_KEYS & frame.keys() else frozenset()
             merged = {key: value for key, value in content.items() if key not in replaced} | frame
