@@ -119,6 +119,7 @@ def fisheye(fx, fy, cx, cy, k1=0.0, k2=0.0, k3=0.0, k4=0.0):
 
 
 def psnr(picture, other):
+    assert np.shape(picture) == np.shape(other)
     error = np.mean((np.asarray(picture, float) - np.asarray(other, float)) ** 2)
     return 99.0 if error == 0 else 10 * np.log10(255**2 / error)
 
