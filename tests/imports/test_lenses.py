@@ -80,6 +80,8 @@ def test_labelled_data_sets_refuse_fisheye_lenses_without_coefficients(model, tm
         ("FULL_OPENCV 120 120 72 56 -2 0 0 0 0 0 0 0", "distortion of view a.png cannot be undone"),
         ("SIMPLE_RADIAL nan 72 56 0", "lens of view a.png is not valid"),
         ("PINHOLE 120 0 72 56", "lens of view a.png is not valid"),
+        ("PINHOLE 120 inf 72 56", "lens of view a.png is not valid"),
+        ("PINHOLE 120 120 nan 56", "lens of view a.png is not valid"),
     ],
 )
 def test_lenses_that_cannot_be_undistorted_are_refused(lens, message, tmp_path, imported):

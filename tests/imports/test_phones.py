@@ -2,11 +2,16 @@
 
 import functools
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from hilsplat.base.errors import HilsplatError
+from hilsplat.photos.add import add_scene
+from hilsplat.scene.importers import phones
 from hilsplat.scene.importers.known_views import read_source
 from hilsplat.scene.layouts import find_known_poses
 from tests.imports import analytic_world as world
@@ -134,3 +139,32 @@ def test_a_quaternion_that_is_not_a_rotation_leaves_out_its_view(tmp_path):
     path.write_text(json.dumps(content))
     source = read_source(find_known_poses(folder))
     assert len(source.views) == 5 and "pose 1: the pose is not a rotation" in source.left_out["1.png"]
+
+
+def test_corrected_pictures_of_polycam_come_first_and_their_border_scales(tmp_path, imported):
+    polycam(tmp_path / "in")
+    images = polycam(tmp_path / "in", border_px=15) / "keyframes/corrected_images"
+    for path in images.iterdir():
+        Image.open(path).resize((2 * WIDTH, 2 * HEIGHT)).save(path)
+    (view, *_), *_ = imported(tmp_path / "in")
+    fx, fy, cx, cy = LENSES[0]
+    right = [[2 * fx, 0, 2 * cx - 30], [0, 2 * fy, 2 * cy - 30], [0, 0, 1]]
+    np.testing.assert_allclose(view.camera.calibration_matrix(), right)
+    assert (view.camera.width, view.camera.height) == (2 * WIDTH - 60, 2 * HEIGHT - 60)
+
+
+def test_long_recordings_are_thinned_evenly(tmp_path, monkeypatch):
+    monkeypatch.setattr(phones, "MAX_VIEWS", 4)
+    source = read_source(find_known_poses(record3d(tmp_path)))
+    assert [view.name for view in source.views] == ["0.png", "2.png", "3.png", "5.png"]
+
+
+def test_an_r3d_archive_is_unpacked_without_depth_maps(tmp_path):
+    folder = record3d(tmp_path / "in")
+    (folder / "metadata.json").rename(folder / "metadata")
+    (folder / "rgb").rename(folder / "rgbd")
+    (folder / "rgbd/0.depth").touch()
+    Path(shutil.make_archive(tmp_path / "scan", "zip", folder)).rename(tmp_path / "scan.r3d")
+    assert add_scene(tmp_path / "scenes.tsv", "scan", tmp_path / "scan.r3d").num_readable == 6
+    assert find_known_poses(tmp_path / "photos/scan").kind == "record3d"
+    assert not list((tmp_path / "photos/scan").rglob("*.depth"))

@@ -191,6 +191,10 @@ def test_names_in_another_unicode_form_are_matched(stem, name, tmp_path):
     assert all(view.image is not None for view in read_source(find_known_poses(folder)).views)
 
 
+def posed(matrix):
+    return lambda frame: frame.update(transform_matrix=matrix.tolist())
+
+
 def changed(folder, change):
     path = folder / "transforms.json"
     content = json.loads(path.read_text())
@@ -202,7 +206,9 @@ def changed(folder, change):
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda frame: frame.update(transform_matrix=[[1, 2], [3, 4]]), "the pose is not a rotation"),
+        (posed(np.ones((2, 2))), "the pose is not a rotation"),
+        (posed(np.diag([1.0, 1, -1, 1])), "the pose is not a rotation"),
+        (posed(np.diag([1.01, 1, 1, 1])), "the pose is not a rotation"),
         (lambda frame: frame.update(transform_matrix=None), "the pose is not a rotation"),
         (lambda frame: frame["transform_matrix"][0].__setitem__(3, None), "the pose is not a rotation"),
         (lambda frame: frame["transform_matrix"][0].__setitem__(3, 1e12), "coordinates up to 1e"),
@@ -230,6 +236,24 @@ def test_one_damaged_image_is_left_out_even_if_it_states_the_size(tmp_path, impo
     views, _, _, report = imported(folder)
     assert [view.view for view in views] == [*right("abdef")]
     assert "c.png cannot be read" in " ".join(report["warnings"])
+
+
+@pytest.mark.parametrize("name", ["../secret", "images/../../secret", "/etc/secret"])
+@pytest.mark.parametrize("key", ["file_path", "ply_file_path"])
+def test_files_outside_the_folder_are_refused(name, key, tmp_path):
+    def change(content):
+        (content["frames"][1] if key == "file_path" else content)[key] = name
+
+    folder = changed(write(tmp_path, PLAIN, NUMBERS, "ab"), change)
+    with pytest.raises(SceneError, match=f"a file outside it: {name}"):
+        read_source(find_known_poses(folder))
+
+
+def test_views_that_all_have_one_pose_are_refused(tmp_path):
+    folder = write(tmp_path, PLAIN, NUMBERS)
+    changed(folder, lambda content: [posed(np.eye(4))(frame) for frame in content["frames"]])
+    with pytest.raises(SceneError, match="same pose"):
+        read_source(find_known_poses(folder))
 
 
 def test_two_frames_with_one_image_are_both_left_out(tmp_path):
@@ -280,11 +304,13 @@ def test_points_that_are_not_finite_are_dropped_with_a_note(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"ply\nformat ascii 1.0\n", b"ply\r\nelement vertex 1e9\n", b"\0" * 99]
+    "content", [None, b"", b"ply\nformat ascii 1.0\n", b"ply\r\nelement vertex 1e9\n", b"\0" * 99]
 )
-def test_damaged_points_are_refused_by_name(content, tmp_path):
-    folder = write(tmp_path, PLAIN, NUMBERS)
-    (folder / "points.ply").write_bytes(content)
+def test_missing_and_damaged_points_are_refused_by_name(content, tmp_path):
+    folder = write(tmp_path, PLAIN, NUMBERS, "ab")
+    (folder / "points.ply").unlink()
+    if content is not None:
+        (folder / "points.ply").write_bytes(content)
     with pytest.raises(SceneError, match=r"points\.ply, with the points, cannot be read"):
         read_source(find_known_poses(folder))
 
