@@ -75,7 +75,7 @@ def source(
 
 def _photographs(arguments: Mapping[str, Any]) -> Reads:
     """Return the files that are read, because a folder of photographs may contain anything else."""
-    from hilsplat.datasets.sources import photo_files
+    from hilsplat.scene.layouts import photo_files
 
     images, named = arguments["images"], arguments["poses"]
     is_artifact = any(provenance_path(path).is_file() for path in (images, images.parent))

@@ -69,7 +69,6 @@ def new(
     Reports what was found, what is used, and what is likely to fail.
     """
     from hilsplat.photos.add import add_scene
-    from hilsplat.scene.sheet import PHOTOS, read_sheet
     from hilsplat.splat.coordinates import read_gaussians
     from hilsplat.workflow.models import models_of_photographs
 
@@ -88,6 +87,5 @@ def new(
         return
     following = f"  hilsplat run {name}\n  hilsplat query {name} 'bear nose'"
     echo(f"{report}\n\nadded photos/{name} to {sheet}. Next:\n{following}")
-    (row,) = (row for row in read_sheet(sheet, checked_groups=()) if row.name == f"{PHOTOS}/{name}")
-    for line in models_of_photographs(sheet.with_name("config.yaml"), name, row.features):
+    for line in models_of_photographs(sheet.with_name("config.yaml"), name, report.columns.get("features")):
         echo(line)

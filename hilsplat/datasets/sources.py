@@ -5,24 +5,17 @@ The workflow uses this module at start-up, so it reads no data and imports no he
 
 import logging
 from collections.abc import Collection
-from contextlib import suppress
 from pathlib import Path
 
-from hilsplat.base.artifacts import visible_files
 from hilsplat.base.errors import SceneError
-from hilsplat.base.files import IMAGE_SUFFIXES, list_images
 from hilsplat.base.provenance import files_of
 from hilsplat.datasets.registry import DATASETS, dataset_of, open_labels
-from hilsplat.scene.layouts import TRAINED, KnownPoses, find_known_poses, photo_folder, read_json_object
 from hilsplat.scene.sheet import DATA_PREFIX
 
 logger = logging.getLogger(__name__)
 
 LEVELLED = ("hi_lerf", "hi_3dovs")
 """Data sets whose labels have levels."""
-
-UNUSED = (*TRAINED, "label", "segmentations", "test_mask")
-"""Folders beside photographs whose images `poses` doesn't read: trained output, and labels of data sets."""
 
 
 def published(source: str) -> tuple[str, str] | None:
@@ -87,29 +80,6 @@ def label_files(labels: str, data_root: str) -> tuple[Path, ...]:
     root = dataset.root(data_root)
     files = {path for pattern in dataset.label_places(scene) for path in root.glob(pattern) if path.is_file()}
     return tuple(sorted(files))
-
-
-def photo_files(folder: Path, named: Path | None = None) -> list[Path]:
-    """Return the files in a source folder that `poses` reads: photographs, and the files of known poses.
-
-    Poses may refer to any image below the folder. Folders that hilsplat wrote and `UNUSED` ones are skipped.
-    """
-    try:
-        known = find_known_poses(folder, named)
-    except SceneError:  # `poses` reports it
-        known = KnownPoses(folder, "", (folder / "sparse",))
-    if known is None:
-        return [path for path in list_images(photo_folder(folder)) if path.is_file()]
-    below = () if known.kind in ("polycam", "record3d") else visible_files(known.root)
-    images = (path for path in below if path.suffix.lower() in IMAGE_SUFFIXES)
-    files = {path for path in images if path.relative_to(known.root).parts[0] not in UNUSED}
-    for place in known.files:
-        files.update(files_of(place))
-        if known.kind == "transforms":
-            with suppress(SceneError):
-                points = str(read_json_object(place, "").get("ply_file_path", ""))
-                files.add(place.parent / points.replace("\\", "/"))
-    return sorted(path for path in files if path.is_file())
 
 
 def image_files(source: str, data_root: str) -> tuple[Path, ...]:

@@ -14,7 +14,16 @@ from hilsplat.photos.findings import CheckPly, find_parts
 from hilsplat.photos.inspection import PhotoReport, inspect_photos
 from hilsplat.photos.intake import prepared_photographs
 from hilsplat.scene.layouts import contents, has_known_poses
-from hilsplat.scene.sheet import COLUMNS, MIN_PHOTOS, NOTHING, PHOTOS, content_lines, project_root, read_sheet
+from hilsplat.scene.sheet import (
+    COLUMNS,
+    MIN_PHOTOS,
+    NOTHING,
+    PHOTOS,
+    content_lines,
+    generated_of,
+    project_root,
+    read_sheet,
+)
 from hilsplat.settings import PosesSettings
 
 
@@ -65,34 +74,34 @@ def add_scene(
     with nullcontext(sheet) if dry_run else changing(sheet) as sheet:  # `sheet` may be a link
         _require_new(sheet, name)
         root = project_root(sheet)
-        with TemporaryDirectory() if dry_run else nullcontext(root) as place:
-            target = Path(place) / PHOTOS / name
-            with prepared_photographs(photos, target, frames) as (folder, made):
-                found = find_parts(folder, named, check_ply)
+        with TemporaryDirectory() if dry_run else nullcontext(root) as base:
+            target = Path(base) / PHOTOS / name
+            with prepared_photographs(photos, target, frames) as (folder, notes):
+                parts = find_parts(folder, named, check_ply)
                 annotated = root / "annotated" / PHOTOS / name
-                files = {} if annotated.exists() else found.labels
-                report = replace(inspect_photos(folder, poses), notes=(*made, *found.lines))
+                copied_labels = {} if annotated.exists() else parts.labels
+                report = inspect_photos(folder, poses)
+                report = replace(report, notes=(*notes, *parts.lines), columns=parts.columns)
                 _check(report, has_known_poses(folder, poses))
                 if dry_run:
                     return report
-                if files:
+                if copied_labels:
                     with atomic_folder(annotated) as copies:
-                        for path, copied in files.items():
-                            shutil.copy2(path, copies / copied)
-                with undone_on_error(annotated) if files else nullcontext():
-                    _append(sheet, name, folder, found.columns)
+                        for path, copy in copied_labels.items():
+                            shutil.copy2(path, copies / copy)
+                with undone_on_error(annotated) if copied_labels else nullcontext():
+                    _append(sheet, name, folder, parts.columns)
         return report
 
 
 def _require_new(sheet: Path, name: str) -> None:
-    rows = read_sheet(sheet, checked_groups=()) if sheet.exists() else []
-    taken = {row.name.casefold(): row for row in rows}
-    if (row := taken.get(f"{PHOTOS}/{name}".casefold())) is not None:
-        raise SceneError(
-            f"scene {row.name} is already in {sheet}",
-            found=f"source {row.source}",
-            fix="choose a different name, or remove the scene's line from the sheet first",
-        )
+    for row in read_sheet(sheet, checked_groups=()) if sheet.exists() else []:
+        if row.name.casefold() == f"{PHOTOS}/{name}".casefold():
+            raise SceneError(
+                f"scene {row.name} is already in {sheet}",
+                found=f"source {row.source}",
+                fix="choose a different name, or remove the scene's line from the sheet first",
+            )
 
 
 def _check(report: PhotoReport, have_poses: bool) -> None:
@@ -106,36 +115,36 @@ def _check(report: PhotoReport, have_poses: bool) -> None:
         )
     num_distinct = report.num_readable - sum(len(names) - 1 for names in report.duplicates)
     if num_distinct < MIN_PHOTOS and not have_poses:
-        found = [f"{num_distinct} distinct readable photographs", contents(report.folder), *unreadable]
+        distinct = f"{num_distinct} distinct readable photographs"
         raise SceneError(
             f"{report.folder} has too few photographs",
             expected=f"at least {MIN_PHOTOS} (20 or more are better)",
-            found="; ".join(found),
+            found="; ".join([distinct, contents(report.folder), *unreadable]),
             fix="add photographs of the same scene, or record a longer video while walking around it",
         )
 
 
-def _append(sheet: Path, name: str, photos: Path, extra: dict[str, Path]) -> None:
+def _append(sheet: Path, name: str, photos: Path, columns: dict[str, Path]) -> None:
     root = project_root(sheet)
-    places = {
-        what: path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
-        for what, path in {"source": photos, **extra}.items()
+    paths = {
+        column: path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
+        for column, path in {"source": photos, **columns}.items()
     }
-    for place in places.values():
-        if not place.isprintable() or place.startswith("world:"):
-            problem = f"the path {place!r} cannot be written to the scene sheet"
+    for path in paths.values():
+        if not path.isprintable() or generated_of(path) is not None:
+            problem = f"the path {path!r} cannot be written to the scene sheet"
             raise SceneError(problem, fix="rename the folder")
-    values = {"dataset": PHOTOS, "scene": name, "group": PHOTOS, "unit": "arbitrary", **places}
+    values = {"dataset": PHOTOS, "scene": name, "group": PHOTOS, "unit": "arbitrary", **paths}
     if sheet.exists():
         text = sheet.read_text(encoding="utf-8-sig")
         first = content_lines(sheet)[0][1]
         header = [cell.strip() for cell in first.split("\t")]
-        if new := [column for column in extra if column not in header]:
+        if new := [column for column in columns if column not in header]:
             header += new  # existing rows may be shorter than the header
             text = text.replace(first, "\t".join(header), 1)
         if not text.endswith("\n"):
             text += "\n"
     else:
-        header = [*COLUMNS, *extra]
+        header = [*COLUMNS, *columns]
         text = "\t".join(header) + "\n"
     write_text(sheet, text + "\t".join(values.get(column, NOTHING[1]) for column in header) + "\n")

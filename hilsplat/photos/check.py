@@ -56,7 +56,8 @@ MIN_TURN_PAIRS = 3
 FOCALS = (0.6, 0.75, 0.9, 1.1, 1.35, 1.7, 2.2, 3.0)
 """Focal lengths to try, as multiples of the picture's longer side."""
 
-NAMED = 5
+MAX_NAMED = 5
+"""Maximum number of photographs or sizes that a doubt names."""
 
 Features = tuple[Float32[np.ndarray, "_ 2"], Float32[np.ndarray, "_ 128"]]
 """SIFT positions in px and RootSIFT descriptors."""
@@ -103,7 +104,7 @@ def photo_doubts(photos: Sequence[CheckedPhoto], *, have_poses: bool) -> list[st
 def _lens_doubts(photos: Sequence[CheckedPhoto]) -> list[str]:
     sizes = sorted({tuple(sorted(photo.size_hw, reverse=True)) for photo in photos}, reverse=True)
     if len(sizes) > 1:
-        listed = ", ".join(f"{long} x {short}" for long, short in sizes[:NAMED])
+        listed = ", ".join(f"{long} x {short}" for long, short in sizes[:MAX_NAMED])
         return [
             f"the photographs have {len(sizes)} sizes ({listed}), and each size needs a separate lens "
             "model, which is hard to estimate from few photographs: use one camera, and don't crop"
@@ -152,9 +153,9 @@ def _motion_doubts(photos: Sequence[CheckedPhoto]) -> list[str]:
 
 def _listed(names: Sequence[str], photos: Sequence[CheckedPhoto]) -> str:
     """Format a list, such as "3 of 40 photographs (a.jpg, b.jpg, c.jpg) are"."""
-    more = ", ..." if len(names) > NAMED else ""
+    more = ", ..." if len(names) > MAX_NAMED else ""
     verb = "is" if len(names) == 1 else "are"
-    return f"{len(names)} of {len(photos)} photographs ({', '.join(names[:NAMED])}{more}) {verb}"
+    return f"{len(names)} of {len(photos)} photographs ({', '.join(names[:MAX_NAMED])}{more}) {verb}"
 
 
 def blur(grey: UInt8[np.ndarray, "h w"]) -> float:

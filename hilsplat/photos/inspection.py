@@ -1,7 +1,7 @@
 """Report on a folder of photographs: what can be read, and what is likely to fail."""
 
 from collections import Counter, defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -32,6 +32,7 @@ class PhotoReport:
         passed_over: number of skipped files in unsupported photograph formats, by suffix.
         doubts: likely problems and what to do about them (`check`).
         notes: how the folder was made (`intake`), and what else in it is used or left out (`findings`).
+        columns: paths of these other parts for the scene sheet, by column.
     """
 
     folder: Path
@@ -42,6 +43,7 @@ class PhotoReport:
     passed_over: dict[str, int]
     doubts: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    columns: dict[str, Path] = field(default_factory=dict)
 
     @property
     def num_readable(self) -> int:
@@ -73,8 +75,7 @@ def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
     Raises:
         SceneError: a photograph has an unusable name, or two photographs differ only in their suffix.
     """
-    where = photo_folder(folder)
-    photos = list_images(where)
+    photos = list_images(photo_folder(folder))
     view_names(photos)
     sizes: Counter[tuple[int, int]] = Counter()
     unreadable: list[tuple[str, str]] = []
@@ -82,10 +83,11 @@ def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
     num_rotated = 0
     checked: list[CheckedPhoto] = []
     for path in track(photos, "photographs checked"):
-        if not path.exists() or path.stat().st_size == 0:
-            is_link = not path.exists()
-            reason = "it is a link to a file that does not exist" if is_link else "the file is empty"
-            unreadable.append((path.name, reason))
+        if not path.exists():
+            unreadable.append((path.name, "it is a link to a file that does not exist"))
+            continue
+        if path.stat().st_size == 0:
+            unreadable.append((path.name, "the file is empty"))
             continue
         try:
             pixels = read_image(path)
@@ -103,9 +105,9 @@ def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
         by_digest[sha256_of_file(path)].append(path.name)
     copies = {name for names in by_digest.values() for name in names[1:]}
     distinct = [photo for photo in checked if photo.name not in copies]
-    suffixes = Counter(path.suffix.lower() for path in where.iterdir() if path.is_file())
+    suffixes = Counter(path.suffix.lower() for path in photo_folder(folder).iterdir() if path.is_file())
     return PhotoReport(
-        folder=where,
+        folder=photo_folder(folder),
         sizes=dict(sizes),
         unreadable=tuple(unreadable),
         num_rotated=num_rotated,

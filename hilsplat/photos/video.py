@@ -115,12 +115,11 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
                 f"{video.name} ends after {decoding.decoded_s:.1f} of {decoding.stated_s:.1f} s: only this "
                 "part is used; copy the file again if you need the rest"
             )
-    chosen = choose_frames(candidates, count)
-    if len(chosen) < count:
-        notes.append(f"{len(chosen)} of {count} requested frames selected: the others are too similar")
-    named = {f"{row:04d}.jpg": frame for row, frame in enumerate(chosen, start=1)}
+    frames = {f"{row:04d}.jpg": frame for row, frame in enumerate(choose_frames(candidates, count), start=1)}
+    if len(frames) < count:
+        notes.append(f"{len(frames)} of {count} requested frames selected: the others are too similar")
     for position, video in enumerate(videos):
-        names = {frame.number: name for name, frame in named.items() if frame.video == position}
+        names = {frame.number: name for name, frame in frames.items() if frame.video == position}
         _write_frames(video, names, folder)
     origin = {
         "videos": [{"file": video.name, "sha256": sha256_of_file(video)} for video in videos],
@@ -131,7 +130,7 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
                 "seconds": round(frame.time_s, 3),
                 "sharpness": round(frame.sharpness, 2),
             }
-            for name, frame in named.items()
+            for name, frame in frames.items()
         },
     }
     write_json(folder / "origin.json", origin)
@@ -154,13 +153,14 @@ def _opened(video: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
                 found=", ".join(stream.type for stream in container.streams) or "no stream",
                 fix="pass a file that contains video, not only cover art, in a codec that FFmpeg decodes",
             )
-        # Thumbnails have one frame or these codecs. FFmpeg's choice may only reflect the order of streams.
-        thumbnail, best = ("mjpeg", "png"), container.streams.best("video")
-        rank_of = {
-            s: (s.frames != 1, s.codec_context.name not in thumbnail, s.width * s.height, s == best)
-            for s in decodable
-        }
-        stream = max(rank_of, key=rank_of.__getitem__)
+
+        def rank(stream: VideoStream) -> tuple[bool, bool, int, bool]:
+            # Thumbnails have one frame or these codecs. FFmpeg's choice may only reflect the streams' order.
+            is_film = stream.codec_context.name not in ("mjpeg", "png")
+            is_best = stream == container.streams.best("video")
+            return stream.frames != 1, is_film, stream.width * stream.height, is_best
+
+        stream = max(decodable, key=rank)
         aspect = float(stream.sample_aspect_ratio or 1)
         if not 0.1 < aspect < 10 or stream.width * stream.height * max(aspect, 1) > MAX_FRAME_PX:
             expected = "frames of at most 8192 x 4352 px"
@@ -201,8 +201,8 @@ def _decoded(
             yield frame, time_s - start
 
 
-def _candidates(video: Path, position: int, most: int, decoding: Decoding) -> list[Frame]:
-    """Divide a video into at most `most` equal time spans; return the sharpest frame of each.
+def _candidates(video: Path, position: int, max_spans: int, decoding: Decoding) -> list[Frame]:
+    """Divide a video into at most `max_spans` equal time spans; return the sharpest frame of each.
 
     The stated duration may be wrong, or missing, as in browser recordings. If this leads to too many spans,
     they are merged in pairs, keeping the sharper frame.
@@ -217,7 +217,7 @@ def _candidates(video: Path, position: int, most: int, decoding: Decoding) -> li
         elif container.duration is not None:
             # Matroska's duration may include the time before the first frame.
             decoding.stated_s = (container.duration - max(container.start_time or 0, 0)) / av.time_base
-        span_s = max((decoding.stated_s or 0.0) / most, 1e-3)
+        span_s = max((decoding.stated_s or 0.0) / max_spans, 1e-3)
         expected = round((decoding.stated_s or 0.0) * float(stream.average_rate or USUAL_RATE)) or None
         decoded = track(_decoded(container, stream, decoding), f"frames of {video.name}", expected)
         for number, (frame, time_s) in enumerate(decoded):
@@ -228,7 +228,7 @@ def _candidates(video: Path, position: int, most: int, decoding: Decoding) -> li
             if row in best and best[row].sharpness >= score:
                 continue
             best[row] = Frame(position, number, time_s, score, _grey(frame, GREY_SIDE_PX))
-            while len(best) > most:
+            while len(best) > max_spans:
                 span_s *= 2
                 by_sharpness = sorted(best.items(), key=lambda item: (item[1].sharpness, -item[1].number))
                 best = {row // 2: candidate for row, candidate in by_sharpness}  # the sharper one is kept
@@ -266,35 +266,35 @@ def choose_frames(candidates: Sequence[Frame], count: int) -> list[Frame]:
     Of two selected frames less than `MIN_STEP` apart, only the sharper one is kept. This also removes
     frames due to hand jitter, which lengthens the path although the camera stays in place.
     """
-    kept: list[Frame] = []
-    row_of = _stretches([_step(a, b) for a, b in pairwise(candidates)], count)
-    for _, group in groupby(zip(row_of.tolist(), candidates, strict=True), key=lambda item: item[0]):
+    frames: list[Frame] = []
+    section_of = _sections([_step(a, b) for a, b in pairwise(candidates)], count)
+    for _, group in groupby(zip(section_of.tolist(), candidates, strict=True), key=lambda item: item[0]):
         best = max((frame for _, frame in group), key=lambda frame: frame.sharpness)
-        if not kept or _step(kept[-1], best) >= MIN_STEP:
-            kept.append(best)
-        elif best.sharpness > kept[-1].sharpness:
-            kept[-1] = best
-    return kept
+        if not frames or _step(frames[-1], best) >= MIN_STEP:
+            frames.append(best)
+        elif best.sharpness > frames[-1].sharpness:
+            frames[-1] = best
+    return frames
 
 
-def _stretches(steps: Sequence[float], count: int) -> Int64[np.ndarray, " N"]:
+def _sections(steps: Sequence[float], count: int) -> Int64[np.ndarray, " N"]:
     """Return the section number of each candidate, given the steps between candidates.
 
     Sections are as short as possible, but at least `MIN_STEP` long, and there are at most `count`. A step
     longer than a section cannot be divided, so it counts as one section.
     """
 
-    def rows(length: float) -> Int64[np.ndarray, " N"]:
-        way = np.concatenate([[0.0], np.cumsum(np.minimum(steps, length))])
-        return np.floor(way / length + 1e-9).astype(np.int64)
+    def sections(length: float) -> Int64[np.ndarray, " N"]:
+        path = np.concatenate([[0.0], np.cumsum(np.minimum(steps, length))])
+        return np.floor(path / length + 1e-9).astype(np.int64)
 
     short, long = MIN_STEP, max(sum(steps), MIN_STEP) * 1.01
-    if rows(short)[-1] < count:
-        return rows(short)
+    if sections(short)[-1] < count:
+        return sections(short)
     for _ in range(40):
         middle = (short + long) / 2
-        short, long = (short, middle) if rows(middle)[-1] < count else (middle, long)
-    return rows(long)
+        short, long = (short, middle) if sections(middle)[-1] < count else (middle, long)
+    return sections(long)
 
 
 def _step(one: Frame, other: Frame) -> float:
@@ -322,9 +322,9 @@ def displacement(one: UInt8[np.ndarray, "h w"], other: UInt8[np.ndarray, "h w"])
     corners = cv2.goodFeaturesToTrack(one, NUM_CORNERS, qualityLevel=0.01, minDistance=7)
     if corners is None or len(corners) < MIN_FOLLOWED:
         return 0.0
-    there, found = _followed(one, other, corners)
-    back, returned = _followed(other, one, there)
-    sound = found & returned & (np.linalg.norm(back - corners, axis=2).ravel() < 1)
+    there, is_tracked = _followed(one, other, corners)
+    back, is_returned = _followed(other, one, there)
+    sound = is_tracked & is_returned & (np.linalg.norm(back - corners, axis=2).ravel() < 1)
     if sound.sum() < MIN_FOLLOWED:
         return LOST
     moved = np.linalg.norm((there - corners)[sound].reshape(-1, 2), axis=1)
@@ -336,5 +336,5 @@ def _followed(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the positions of corners in the other picture, (n, 1, 2), and whether each was found, (n)."""
     start = np.zeros_like(corners)
-    there, found, _ = cv2.calcOpticalFlowPyrLK(one, other, corners, start, maxLevel=PYRAMID_LEVELS)
-    return np.asarray(there), np.asarray(found).ravel() > 0
+    there, status, _ = cv2.calcOpticalFlowPyrLK(one, other, corners, start, maxLevel=PYRAMID_LEVELS)
+    return np.asarray(there), np.asarray(status).ravel() > 0

@@ -31,6 +31,9 @@ BT709_FROM_BT2020: Float64[np.ndarray, "3 3"] = np.array(
 )
 """Matrix from linear BT.2020 to linear BT.709 RGB (inverse of ITU-R BT.2087)."""
 
+EXACT = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
+EXACT |= Interpolation.BITEXACT
+
 BT2020_LUMA = np.array([0.2627, 0.6780, 0.0593], dtype=np.float32)
 
 
@@ -40,16 +43,13 @@ def rgb_pixels(frame: VideoFrame, width: int | None = None) -> UInt8[np.ndarray,
     If a stream states no matrix, video players' default is used: BT.709 for 720 lines or more, else BT.601.
     HDR (PQ or HLG) is converted to linear light with BT.709 primaries and compressed highlights.
     """
-    exact = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
-    exact |= Interpolation.BITEXACT
     matrix = int(frame.colorspace)
     if matrix == UNSPECIFIED:
         matrix = BT709 if min(frame.width, frame.height) >= 720 else BT601
     is_hdr = int(frame.color_trc) in (PQ, HLG)
-    kind = "rgb48le" if is_hdr else "rgb24"
-    pixels = frame.reformat(
-        width, format=kind, src_colorspace=matrix, interpolation=exact, threads=1
-    ).to_ndarray()
+    form = "rgb48le" if is_hdr else "rgb24"
+    rgb = frame.reformat(width, format=form, src_colorspace=matrix, interpolation=EXACT, threads=1)
+    pixels = rgb.to_ndarray()
     if not is_hdr:
         return pixels
     is_hlg = int(frame.color_trc) == HLG

@@ -20,7 +20,7 @@ MIN_VIEWS_FOR_TEST = 8
 """Minimum number of views for a test split; with fewer, the fit needs all of them."""
 
 CHECKED_DIRECTIONS = 33
-MOST_SHIFT_PX = 1.0
+MAX_SHIFT_PX = 1.0
 """Directions per side at which a lens must be invertible, and the tolerance."""
 
 MIN_LEVELNESS_GAP = 3.0
@@ -46,7 +46,6 @@ Posed = tuple[list[PosedView], Points, dict[str, str], dict[str, Any]]
 
 
 def photo_of(camera: pycolmap.Camera) -> Photo:
-    """Return a camera's lens as that of a photograph."""
     return Photo(camera.model_name, tuple(camera.params.tolist()), (camera.height, camera.width))
 
 
@@ -78,11 +77,11 @@ def _require_invertible(view: PosedView, pinhole: pycolmap.Camera) -> None:
     """Raise ImageError if a lens maps several directions within the pinhole image to one pixel."""
     across = (np.linspace(0, side, CHECKED_DIRECTIONS) for side in (pinhole.width, pinhole.height))
     xy = np.stack(np.meshgrid(*across), axis=-1).reshape(-1, 2)
-    wanted = (xy - [pinhole.principal_point_x, pinhole.principal_point_y]) / pinhole.mean_focal_length()
-    seen = view.camera.img_from_cam(np.column_stack([wanted, np.ones(len(xy))]))
-    found = np.asarray(view.camera.cam_from_img(np.asarray(seen)))
-    shift_px = np.abs(found - wanted).max() * pinhole.mean_focal_length()
-    if not (shift_px < MOST_SHIFT_PX):  # also true for NaN
+    directions = (xy - [pinhole.principal_point_x, pinhole.principal_point_y]) / pinhole.mean_focal_length()
+    pixels = view.camera.img_from_cam(np.column_stack([directions, np.ones(len(xy))]))
+    inverse = np.asarray(view.camera.cam_from_img(np.asarray(pixels)))
+    shift_px = np.abs(inverse - directions).max() * pinhole.mean_focal_length()
+    if not (shift_px < MAX_SHIFT_PX):  # also true for NaN
         raise ImageError(
             f"the lens distortion of view {view.view} cannot be undone",
             expected="a lens that maps each direction in the image to another pixel",
@@ -198,8 +197,8 @@ def write_scene(
         xyz = points.astype(np.float32)
         scene = Scene(folder, name, unit, cameras, split, xyz, colours, scene_from_source)
         for view, size_hw, K in zip(cameras.names, cameras.size_hw.tolist(), cameras.K, strict=True):
-            own = {"split": split[view], "size_hw_px": size_hw, "focal_px": round(float(K[0, 0]), 3)}
-            report["views"][view] |= own
+            focal_px = round(float(K[0, 0]), 3)
+            report["views"][view] |= {"split": split[view], "size_hw_px": size_hw, "focal_px": focal_px}
         write_json(folder / "registration.json", report)
         plot_registration(folder / "registration.png", scene, report)
         if lost.exists():
@@ -230,13 +229,13 @@ def plot_registration(path: Path, scene: Scene, report: Mapping[str, Any]) -> No
     for position, (title, x, y) in enumerate((("from above", 0, 1), ("from the side", 0, 2)), start=1):
         axes = figure.add_subplot(1, 2, position)
         axes.scatter(points[:, x], points[:, y], s=1.5, c=colours, linewidths=0)
-        for chosen, colour, label in ((~is_test, "tab:blue", "train"), (is_test, "tab:orange", "test")):
-            if chosen.any():
-                at, ahead = centres[chosen], centres[chosen] + arrow * looks[chosen]
+        for rows, colour, label in ((~is_test, "tab:blue", "train"), (is_test, "tab:orange", "test")):
+            if rows.any():
+                at, ahead = centres[rows], centres[rows] + arrow * looks[rows]
                 lines = [at[:, x], ahead[:, x]], [at[:, y], ahead[:, y]]
                 axes.plot(*lines, color=colour, linewidth=0.8, zorder=2)
-                count = int(chosen.sum())
-                axes.scatter(at[:, x], at[:, y], s=14, color=colour, label=f"{count} {label}", zorder=3)
+                label = f"{rows.sum()} {label}"
+                axes.scatter(at[:, x], at[:, y], s=14, color=colour, label=label, zorder=3)
         axes.set_xlim(low[x] - margin, high[x] + margin)
         axes.set_ylim(low[y] - margin, high[y] + margin)
         axes.set_aspect("equal")

@@ -14,7 +14,7 @@ from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 
 MAX_SIDE_PX = 2**15
 LIMITS = {"size_hw": (1, MAX_SIDE_PX)}
-MOST_PARAMETERS = 16
+MAX_PARAMETERS = 16
 """Number of parameters of COLMAP's largest lens model."""
 
 
@@ -101,7 +101,7 @@ class Cameras:
         if self.photos:
             none = Photo("", (), (0, 0))
             photos = [self.photos.get(name, none) for name in self.names]
-            params = [np.pad(photo.params, (0, MOST_PARAMETERS - len(photo.params))) for photo in photos]
+            params = [np.pad(photo.params, (0, MAX_PARAMETERS - len(photo.params))) for photo in photos]
             lenses = {
                 "photo_model": np.array([photo.model for photo in photos], dtype=np.str_),
                 "photo_params": np.array(params, dtype=np.float64),
@@ -118,11 +118,7 @@ class Cameras:
 
     @staticmethod
     def load(path: Path) -> "Cameras":
-        """Read `cameras.npz`.
-
-        Raises:
-            ArtifactError: the file is missing or damaged, or does not contain valid cameras.
-        """
+        """Read `cameras.npz`; raise ArtifactError if it does not contain valid cameras."""
         arrays = read_npz(path, "names", "cam_from_world", "K", "size_hw")
         numbers = {name: array for name, array in arrays.items() if name != "names"}
         require_types(Cameras, numbers, path, LIMITS)
@@ -138,13 +134,11 @@ class Cameras:
             fault = ""
         if fault:
             raise ArtifactError(f"{path} does not contain valid cameras", expected=fault, fix=remake(path))
-        order = tuple(str(name) for name in names)
+        order = tuple(names.tolist())
         photos = {}
         if "photo_model" in arrays:
-            columns = (arrays[f"photo_{what}"] for what in ("model", "params", "size_hw"))
-            for name, model, params, size_hw in zip(
-                order, *(column.tolist() for column in columns), strict=True
-            ):
+            columns = (arrays[f"photo_{what}"].tolist() for what in ("model", "params", "size_hw"))
+            for name, model, params, size_hw in zip(order, *columns, strict=True):
                 if model:
                     photos[name] = Photo(model, tuple(params), tuple(size_hw))
         return Cameras(order, poses, K, arrays["size_hw"], photos)

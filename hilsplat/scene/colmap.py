@@ -8,22 +8,10 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float64, UInt8
-from PIL import Image
+from PIL import Image  # noqa: F401
 
 # isort: split
 import pycolmap
-
-__all__ = [
-    "Image",
-    "Points",
-    "camera_of",
-    "is_pinhole",
-    "pose_matrix",
-    "pycolmap",
-    "reprojection_errors",
-    "rotation_matrix",
-    "sparse_points",
-]
 
 Points = tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]
 """Positions and colours."""

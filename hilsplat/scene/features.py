@@ -1,7 +1,7 @@
 """Features and verified matches of photographs: upright work images, initial cameras, SIFT, pairs."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -91,16 +91,12 @@ def exif_focal_px(path: Path, size_hw: tuple[int, int]) -> float | None:
 
 
 def prepare_images(
-    sources: Sequence[Path], folder: Path, max_side_px: int, least_share: float = 1.0
+    sources: Sequence[Path], folder: Path, max_side_px: int, min_share: float = 1.0
 ) -> tuple[list[WorkImage], dict[Path, str]]:
     """Write each photograph to `folder` as an upright PNG with a longer side of at most `max_side_px`.
 
-    Returns:
-        the copies, and why the other photographs cannot be used.
-
-    Raises:
-        ImageError: fewer than `least_share` of the files can be used; the message names all others.
-        SceneError: two files would become the same view.
+    Return the copies, and why the other photographs cannot be used; raise ImageError if fewer than
+    `min_share` can be used.
     """
     folder.mkdir(parents=True, exist_ok=True)
     images = []
@@ -116,7 +112,7 @@ def prepare_images(
         size_hw = (pixels.shape[0], pixels.shape[1])
         write_png(folder / view, pixels, WORK_COMPRESSION)
         images.append(WorkImage(view, source, size_hw, exif_focal_px(source, size_hw)))
-    if damaged and len(images) < least_share * len(sources):
+    if damaged and len(images) < min_share * len(sources):
         if len(damaged) == 1:
             raise ImageError(*damaged.values())
         raise ImageError(
@@ -201,30 +197,25 @@ def incremental_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
     return options
 
 
-def verified_matches(database: Path) -> dict[str, dict[str, int]]:
-    """Return the number of verified matches between each pair of views, by view name."""
+def count_matches(database: Path) -> tuple[dict[str, dict[str, int]], dict[str, dict[str, int]]]:
+    """Count the verified matches of each pair of views, and each view's features and matches for the report.
+
+    Two views count as matched if they have at least `MIN_INLIERS` verified matches.
+    """
     with pycolmap.Database.open(database) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
+        features = {name: opened.num_keypoints_for_image(number) for number, name in names.items()}
         pair_ids, inliers = opened.read_two_view_geometry_num_inliers()
     shared: dict[str, dict[str, int]] = {name: {} for name in names.values()}
     for pair_id, count in zip(pair_ids, inliers, strict=True):
         one, other = (names[image_id] for image_id in pycolmap.pair_id_to_image_pair(pair_id))
         shared[one][other] = shared[other][one] = int(count)
-    return shared
-
-
-def count_matches(database: Path, shared: Mapping[str, Mapping[str, int]]) -> dict[str, dict[str, int]]:
-    """Count each view's features and its verified matches, `shared`, for the registration report.
-
-    Two views count as matched if they have at least `MIN_INLIERS` verified matches.
-    """
     counts = {}
-    with pycolmap.Database.open(database) as opened:
-        for image in opened.read_all_images():
-            pairs = [count for count in shared[image.name].values() if count >= MIN_INLIERS]
-            counts[image.name] = {
-                "features": opened.num_keypoints_for_image(image.image_id),
-                "matched_views": len(pairs),
-                "best_pair_matches": max(pairs, default=0),
-            }
-    return counts
+    for name, num_features in features.items():
+        pairs = [count for count in shared[name].values() if count >= MIN_INLIERS]
+        counts[name] = {
+            "features": num_features,
+            "matched_views": len(pairs),
+            "best_pair_matches": max(pairs, default=0),
+        }
+    return shared, counts

@@ -15,6 +15,9 @@ from hilsplat.base.files import IMAGE_SUFFIXES, list_images, regular
 TRAINED = ("output", "outputs", "exports", "language_features")
 """Folders that 3DGS, nerfstudio and LangSplat write beside photographs."""
 
+UNUSED = (*TRAINED, "label", "segmentations", "test_mask")
+"""Folders beside photographs whose images `poses` doesn't read: trained output, and labels of data sets."""
+
 PHOTO_FOLDERS = ("images", "input")
 """Folders of photographs: COLMAP's and nerfstudio's, then that of 3DGS's `convert.py`."""
 
@@ -29,7 +32,6 @@ DATAPARSER = "dataparser_transforms.json"
 
 EXPORTED = ("exports/*/splat.ply", "exports/splat.ply", "splat.ply", "point_cloud.ply")
 """Paths of a PLY exported by nerfstudio or a viewer; a PLY written by 3DGS is preferred."""
-
 
 HEADER_BYTES = 2**14  # number of bytes that are searched for the vertex count
 
@@ -52,8 +54,8 @@ def vertex_count(path: Path) -> int | None:
             header = stream.read(HEADER_BYTES)
     except OSError:
         return None
-    found = re.search(rb"^element vertex ([0-9]+)\s*$", header, re.MULTILINE)
-    return int(found[1]) if found else None
+    match = re.search(rb"^element vertex ([0-9]+)\s*$", header, re.MULTILINE)
+    return int(match[1]) if match else None
 
 
 def trained_gaussians(folder: Path) -> list[Path]:
@@ -66,15 +68,19 @@ def trained_gaussians(folder: Path) -> list[Path]:
     """
     starts = ("output/*/", "output/", "*/", "")
     patterns = [*EXPORTED, *(f"{start}point_cloud/iteration_*/point_cloud.ply" for start in starts)]
-    found = [(place, path) for place, pattern in enumerate(patterns) for path in folder.glob(pattern)]
-    place_of = {path: min(place, len(EXPORTED)) for place, path in found if path.is_file()}
+    pattern_of = {
+        path: min(number, len(EXPORTED))
+        for number, pattern in enumerate(patterns)
+        for path in folder.glob(pattern)
+        if path.is_file()
+    }
 
     def rank(path: Path) -> tuple[int, int, int, str, str]:
-        numbered = re.fullmatch(r"iteration_(\d+)", path.parent.name)
-        steps = int(numbered[1]) if numbered else -1
-        return place_of[path], steps, -(langsplat_level(path) or 0), _written(path), str(path)
+        iteration = re.fullmatch(r"iteration_(\d+)", path.parent.name)
+        steps = int(iteration[1]) if iteration else -1
+        return pattern_of[path], steps, -(langsplat_level(path) or 0), _written(path), str(path)
 
-    return sorted(place_of, key=rank, reverse=True)
+    return sorted(pattern_of, key=rank, reverse=True)
 
 
 def _written(path: Path) -> str:
@@ -100,12 +106,12 @@ def dataparser_of(ply: Path, source: Path) -> Path | None:
     the source folder, and the folder of the latest training run that began before the PLY was written. If no
     run did, the PLY's time is that of a copy, and the latest run is used.
     """
-    places = [ply.parent]
+    candidates = [ply.parent / DATAPARSER]
     if ply.name == "splat.ply":
         runs = sorted(source.glob(f"outputs/*/*/*/{DATAPARSER}"), key=_written)
         earlier = [run for run in runs if _written(run) <= _written(ply)]
-        places += [ply.parent.parent, source, *(run.parent for run in (earlier or runs)[-1:])]
-    return next((place / DATAPARSER for place in places if (place / DATAPARSER).is_file()), None)
+        candidates += [ply.parent.parent / DATAPARSER, source / DATAPARSER, *(earlier or runs)[-1:]]
+    return next((path for path in candidates if path.is_file()), None)
 
 
 def transforms_of(folder: Path, named: Path | None = None) -> Path | None:
@@ -123,10 +129,8 @@ def langsplat_features(folder: Path) -> Path | None:
 def label_files(folder: Path) -> list[Path]:
     """Return the label files of a LERF-OVS scene, from its `label/` folder or the one beside the scene."""
     folder = folder.resolve()
-    for place in (folder / "label", folder.parent / "label" / folder.name):
-        if found := sorted(place.glob("*.json")):
-            return found
-    return []
+    beside = folder.parent / "label" / folder.name
+    return sorted((folder / "label").glob("*.json")) or sorted(beside.glob("*.json"))
 
 
 def photo_folder(folder: Path) -> Path:
@@ -136,36 +140,40 @@ def photo_folder(folder: Path) -> Path:
     phone export's images; else the only folder with images up to two levels below. Of several such folders,
     none is chosen (`folders_with_images` lists them).
     """
-    own = len(list_images(folder))
+    num_images = len(list_images(folder))
     for name in PHOTO_FOLDERS:
         for below in sorted(folder.iterdir()):
-            if below.name.lower() == name and below.is_dir() and len(list_images(below)) > own:
+            if below.name.lower() == name and below.is_dir() and len(list_images(below)) > num_images:
                 return below
-    if own:
+    if num_images:
         return folder
     if export := polycam_folders(folder) or record3d_export(folder):
         return export[0]
-    places = folders_with_images(folder)
-    return next(iter(places)) if len(places) == 1 else folder
+    folders = folders_with_images(folder)
+    return next(iter(folders)) if len(folders) == 1 else folder
+
+
+def images_below(folder: Path) -> list[Path]:
+    """Return the images in a folder and its subfolders, as `visible_files` does."""
+    return [path for path in visible_files(folder) if path.suffix.lower() in IMAGE_SUFFIXES]
 
 
 def folders_with_images(folder: Path) -> dict[Path, int]:
     """Return the number of images of each folder with images, up to two levels below a source."""
-    images = (path for path in visible_files(folder) if path.suffix.lower() in IMAGE_SUFFIXES)
-    counts = Counter(path.parent for path in images)
+    counts = Counter(path.parent for path in images_below(folder))
     return {
-        place: count
-        for place, count in sorted(counts.items())
-        if 1 <= len(parts := place.relative_to(folder).parts) <= 2 and not set(parts) & set(TRAINED)
+        below: count
+        for below, count in sorted(counts.items())
+        if 1 <= len(parts := below.relative_to(folder).parts) <= 2 and not set(parts) & set(TRAINED)
     }
 
 
 def contents(folder: Path) -> str:
     """Return what a folder without usable photographs contains, for messages."""
     kinds = Counter(file.suffix.lower() or "no suffix" for file in folder.iterdir() if file.is_file())
-    found = [f"{count} files ({kind})" for kind, count in sorted(kinds.items())]
-    found += [f"{count} images in {place}/" for place, count in folders_with_images(folder).items()]
-    return ", ".join(found[:8]) or "nothing"
+    items = [f"{count} files ({kind})" for kind, count in sorted(kinds.items())]
+    items += [f"{count} images in {below}/" for below, count in folders_with_images(folder).items()]
+    return ", ".join(items[:8]) or "nothing"
 
 
 def has_known_poses(folder: Path, named: Path | None = None) -> bool:
@@ -208,19 +216,20 @@ def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | No
         return None
     if named is not None:
         return _named_poses(folder, named)
-    found: list[tuple[str, tuple[Path, ...]]] = [("colmap", (place,)) for place in colmap_models(folder)]
-    for name in ("transforms.json", "transforms_train.json"):
-        if (folder / name).is_file():
-            held_out = [folder / f"transforms_{split}.json" for split in ("test", "val")]
-            tests = [path for path in held_out if path.is_file()] if name == "transforms_train.json" else []
-            found.append(("transforms", (folder / name, *tests[:1])))
+    poses: list[tuple[str, tuple[Path, ...]]] = [("colmap", (model,)) for model in colmap_models(folder)]
+    if (folder / "transforms.json").is_file():
+        poses.append(("transforms", (folder / "transforms.json",)))
+    if (folder / "transforms_train.json").is_file():
+        held_out = [folder / f"transforms_{split}.json" for split in ("test", "val")]
+        tests = [path for path in held_out if path.is_file()]
+        poses.append(("transforms", (folder / "transforms_train.json", *tests[:1])))
     if (folder / POSES_BOUNDS).is_file():
-        found.append(("llff", (folder / POSES_BOUNDS,)))
+        poses.append(("llff", (folder / POSES_BOUNDS,)))
     exports = (("polycam", polycam_folders(folder)), ("record3d", record3d_export(folder)))
-    found += [(kind, export) for kind, export in exports if export is not None]
-    if found:
-        (kind, files), *rest = found
-        return KnownPoses(folder, kind, files, tuple(others[-1] for _, others in rest))
+    poses += [(kind, export) for kind, export in exports if export is not None]
+    if poses:
+        (kind, files), *others = poses
+        return KnownPoses(folder, kind, files, tuple(paths[-1] for _, paths in others))
     if (folder / "sparse").is_dir():
         raise SceneError(
             f"{folder / 'sparse'} does not contain a complete COLMAP model",
@@ -236,14 +245,14 @@ def _named_poses(folder: Path, named: Path) -> KnownPoses:
         return KnownPoses(folder, "transforms", (named,))
     if model_files(named):
         return KnownPoses(folder, "colmap", (named,))
-    found = find_known_poses(named) if named.is_dir() else None
-    if found is None or found.kind not in ("colmap", "transforms"):
+    known = find_known_poses(named) if named.is_dir() else None
+    if known is None or known.kind not in ("colmap", "transforms"):
         raise SceneError(
             f"{named} has no poses for {folder}",
             expected="a COLMAP model, a transforms.json, or a folder with either",
             fix="correct the path, or omit it to use the poses beside the images",
         )
-    return replace(found, root=folder)
+    return replace(known, root=folder)
 
 
 def model_files(folder: Path) -> list[Path]:
@@ -257,8 +266,8 @@ def model_files(folder: Path) -> list[Path]:
 
 def colmap_models(folder: Path) -> list[Path]:
     """Return the folders of the COLMAP models in `sparse/`, those with the most images first."""
-    places = [*sorted((folder / "sparse").glob("*/")), folder / "sparse"]
-    return sorted((place for place in places if model_files(place)), key=lambda place: -_num_images(place))
+    folders = [*sorted((folder / "sparse").glob("*/")), folder / "sparse"]
+    return sorted((model for model in folders if model_files(model)), key=lambda model: -_num_images(model))
 
 
 def _num_images(model: Path) -> int:
@@ -292,6 +301,28 @@ def record3d_export(folder: Path) -> tuple[Path, Path] | None:
             if metadata.is_file() and images.is_dir():
                 return images, metadata
     return None
+
+
+def photo_files(folder: Path, named: Path | None = None) -> list[Path]:
+    """Return the files in a source folder that `poses` reads: photographs, and the files of known poses.
+
+    Poses may refer to any image below the folder. Folders that hilsplat wrote and `UNUSED` ones are skipped.
+    """
+    try:
+        known = find_known_poses(folder, named)
+    except SceneError:  # `poses` reports it
+        known = KnownPoses(folder, "", (folder / "sparse",))
+    if known is None:
+        return [path for path in list_images(photo_folder(folder)) if path.is_file()]
+    images = [] if known.kind in ("polycam", "record3d") else images_below(known.root)
+    files = {path for path in images if path.relative_to(known.root).parts[0] not in UNUSED}
+    for path in known.files:
+        files.update(visible_files(path) if path.is_dir() else [path])
+        if known.kind == "transforms":
+            with suppress(SceneError):
+                points = str(read_json_object(path, "").get("ply_file_path", ""))
+                files.add(path.parent / points.replace("\\", "/"))
+    return sorted(path for path in files if path.is_file())
 
 
 def unwrapped(folder: Path) -> Path:

@@ -38,12 +38,10 @@ def placement(camera: Camera, drawn_hw: tuple[int, int], where: str) -> Placemen
     }
     best = min(misfit, key=lambda name: (misfit[name], name == "undistorted"))
     if misfit[best] > max(1.0, SHAPE_TOLERANCE * drawn_hw[0]):
+        sizes = [f"{width} x {height} px ({name})" for name, (height, width) in pictures.items()]
         raise MisalignedArtifactError(
             f"{where} does not match the size of its image",
-            expected=" or ".join(
-                f"{width} x {height} px ({name})" for name, (height, width) in pictures.items()
-            )
-            + ", or a scaled copy",
+            expected=f"{' or '.join(sizes)}, or a scaled copy",
             found=f"{drawn_hw[1]} x {drawn_hw[0]} px (width x height)",
             fix="use what was drawn on this image",
         )
@@ -82,6 +80,6 @@ def _pixels_of_photo(
     xy = lens.img_from_cam(seen @ np.linalg.inv(np.reshape(K, (3, 3))).T)
     xy = np.floor(xy * (np.array(drawn_hw[::-1]) / photo.size_hw[::-1]))
     inside = (xy >= 0).all(axis=1) & (xy < drawn_hw[::-1]).all(axis=1)  # false for NaN
-    found = np.full(len(xy), OUTSIDE, np.int64)
-    found[inside] = (xy[inside] @ [1, drawn_hw[1]]).astype(np.int64)
-    return found.reshape(size_hw)
+    pixels = np.full(len(xy), OUTSIDE, np.int64)
+    pixels[inside] = (xy[inside] @ [1, drawn_hw[1]]).astype(np.int64)
+    return pixels.reshape(size_hw)

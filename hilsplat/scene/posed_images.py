@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,11 +47,7 @@ class PosedImage:
 
 
 def rigid_pose(world_from_cam: Float[np.ndarray, "..."], where: str) -> Float64[np.ndarray, "4 4"]:
-    """Return a 3 x 4 or 4 x 4 camera-to-world matrix as 4 x 4; raise an error if it is not rigid.
-
-    Raises:
-        SceneError: it is not 3 x 4 or 4 x 4, is not finite, scales or mirrors, or does not end in 0 0 0 1.
-    """
+    """Return a 3 x 4 or 4 x 4 camera-to-world matrix as 4 x 4; raise SceneError if it is not rigid."""
     pose = np.eye(4)
     usable = world_from_cam.shape in ((3, 4), (4, 4)) and np.isfinite(world_from_cam).all()
     if usable:
@@ -76,18 +71,10 @@ def write_posed_images(
 ) -> None:
     """Write `images/` and `transforms.json` (OpenGL axes, intrinsics per frame) as a source for `poses`.
 
-    Images are copied byte for byte; distortion is kept, because `poses` undistorts them. Points, if given,
-    must be in the unit of the poses; `points.ply` stores them, and they become the scene's sparse points in
-    the same order. An existing folder is replaced.
+    Names must be unique. Images are copied byte for byte; distortion is kept, because `poses` undistorts
+    them. Points, if given, must be in the unit of the poses; `points.ply` stores them, and they become the
+    scene's sparse points in the same order. An existing folder is replaced.
     """
-    names = [image.name for image in images]
-    twice = sorted(name for name, count in Counter(names).items() if count > 1)
-    if twice or not images:
-        raise SceneError(
-            f"posed images cannot be written to {folder}",
-            expected="at least one image, each with a unique name",
-            found=f"{len(images)} images, duplicate names: {', '.join(twice) or 'none'}",
-        )
     with atomic_folder(folder) as temporary:
         (temporary / "images").mkdir()
         frames = []
@@ -117,7 +104,7 @@ def write_posed_images(
             columns, kinds = [*points.T], [(axis, "<f4") for axis in "xyz"]
             if colours is not None:
                 columns += [*colours.T]
-                kinds += [(name, "u1") for name in ("red", "green", "blue")]
+                kinds += [(channel, "u1") for channel in ("red", "green", "blue")]
             table = np.rec.fromarrays(columns, dtype=kinds)
             PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(temporary / "points.ply")
         write_text(temporary / "transforms.json", json.dumps(content, indent=1) + "\n")

@@ -26,7 +26,6 @@ from hilsplat.scene.features import (
     incremental_options,
     lenses_of,
     prepare_images,
-    verified_matches,
 )
 from hilsplat.scene.importers.importing import import_poses
 from hilsplat.scene.layouts import find_known_poses, photo_folder
@@ -92,9 +91,9 @@ def run_poses(
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)  # by default, COLMAP logs each step
     with stage_log("poses", name) as counts, work_folder(out) as work:
         known = find_known_poses(images, named) if images.is_dir() else None
-        lost, kept = work / LOST_PICTURE, out.with_name(LOST_PICTURE)
-        require_own_picture(kept)
-        delete(kept, LOST_PICTURE)  # from an earlier run
+        lost, picture = work / LOST_PICTURE, out.with_name(LOST_PICTURE)
+        require_own_picture(picture)
+        delete(picture, LOST_PICTURE)  # from an earlier run
         try:
             if known is None:
                 unit = "arbitrary"
@@ -103,8 +102,9 @@ def run_poses(
                 posed = import_poses(known, work, name, settings, seed, threads)
         except RegistrationError as error:
             if lost.exists():
-                shutil.copyfile(lost, kept)
-                error.add_line("picture", f"{kept} shows the unregistered photographs and where they belong")
+                shutil.copyfile(lost, picture)
+                where = "shows the unregistered photographs and where they belong"
+                error.add_line("picture", f"{picture} {where}")
             raise
         report = posed[3]
         for warning in report["warnings"]:
@@ -135,15 +135,16 @@ def _reconstruct(
     camera_model = settings.camera_model
     if camera_model == "auto":
         camera_model = "simple_pinhole" if is_render else "simple_radial"
-    least = settings.min_registered_share
-    work_images, unreadable = prepare_images(sources, work / "images", settings.max_side_px, least)
+    work_images, unreadable = prepare_images(
+        sources, work / "images", settings.max_side_px, settings.min_registered_share
+    )
     database, lenses = work / "features.db", lenses_of(work_images, camera_model, settings.single_camera)
     logger.info("%s: extracting and matching the features of %d images", name, len(work_images))
     matcher = in_own_process(find_matches, database, work / "images", lenses, settings, seed, threads)
-    shared = verified_matches(database)
+    shared, counts = count_matches(database)
     logger.info("%s: %s mapping", name, settings.mapper)
     models = map_views(database, work / "images", work / "models", settings.mapper, seed)
-    report = registration_report(work_images, count_matches(database, shared), models)
+    report = registration_report(work_images, counts, models)
     name_neighbours(shared, report["views"])
     how = f"structure from motion, {settings.mapper} mapper, {matcher} matching, {camera_model}"
     report = {"scene": name, "poses": how, "seed": seed, **report}
@@ -273,26 +274,21 @@ def check_registration(images: Path, name: str, report: Mapping[str, Any], setti
     """Refuse a reconstruction with too few views; otherwise log the unregistered ones."""
     total, registered = report["images"], report["registered"]
     lost = [entry for entry in report["views"].values() if not entry["registered"]]
-    listing = "".join(f"\n            {entry['file']}: {entry['why_not']}" for entry in lost)
-    advice = (
-        "add sharp photographs of textured surfaces between the unregistered ones and the others (neighbours "
-        "less than about 10 degrees apart), or remove the unregistered ones from the folder"
-    )
-    if not report["models"]:
-        raise RegistrationError(
-            f"no camera poses could be found for {name} in {images}",
-            expected=f"a model of at least {MIN_PHOTOS} of the {total} photographs",
-            found=f"none{listing}",
-            fix=advice,
+    if registered < max(1, settings.min_registered_share * total):
+        share, sizes = registered / total, ", ".join(map(str, report["models"])) or "no"
+        reasons = "".join(f"\n            {entry['file']}: {entry['why_not']}" for entry in lost)
+        advice = (
+            "add sharp photographs of textured surfaces between the unregistered ones and the others "
+            "(neighbours less than about 10 degrees apart), or remove the unregistered ones from the folder"
         )
-    if registered < settings.min_registered_share * total:
-        share, sizes = registered / total, ", ".join(map(str, report["models"]))
+        if registered:
+            advice += f"; to continue with {registered} views, set poses.min_registered_share to "
+            advice += f"{np.floor(share * 100) / 100:.2f} or less"
         raise RegistrationError(
-            f"too few photographs of {name} could be registered",
+            f"too few photographs of {name} in {images} could be registered",
             expected=f"at least {settings.min_registered_share:.0%} of {total} (poses.min_registered_share)",
-            found=f"{registered} ({share:.1%}); models of {sizes} views; not registered:{listing}",
-            fix=f"{advice}; to continue with {registered} views, set poses.min_registered_share to "
-            f"{np.floor(share * 100) / 100:.2f} or less",
+            found=f"{registered} ({share:.1%}); models of {sizes} views; not registered:{reasons}",
+            fix=advice,
         )
     for entry in lost:
         logger.warning("%s: %s is not registered: %s", name, entry["file"], entry["why_not"])
@@ -317,17 +313,18 @@ def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> None:
         return
     from matplotlib.figure import Figure
 
-    shown = lost[:MAX_ROWS]
-    figure = Figure(figsize=(12, 1.2 + 2.1 * len(shown)), layout="constrained")
-    rest = f" (the first {MAX_ROWS})" if len(lost) > MAX_ROWS else ""
-    title = f"{len(lost)} of {report['images']} photographs are not registered{rest}"
+    num_rows = min(len(lost), MAX_ROWS)
+    figure = Figure(figsize=(12, 1.2 + 2.1 * num_rows), layout="constrained")
+    limit = f" (the first {MAX_ROWS})" if len(lost) > MAX_ROWS else ""
+    title = f"{len(lost)} of {report['images']} photographs are not registered{limit}"
     figure.suptitle(f"{title}\n{ADVICE}", fontsize=10, parse_math=False)
-    cells = figure.subplots(len(shown), 1 + NEIGHBOURS, squeeze=False)
-    for row, (view, entry) in zip(cells, shown, strict=True):
+    cells = figure.subplots(num_rows, 1 + NEIGHBOURS, squeeze=False)
+    for row, (view, entry) in zip(cells, lost[:MAX_ROWS], strict=True):
         near = entry["belongs_near"]
         titles = [f"{entry['file']}: {entry['why_not'].partition(':')[0]}"]
-        titles += [f"{each['view']}: {each['matches']} shared matches" for each in near]
-        for axes, name, title in zip(row, [view, *(each["view"] for each in near)], titles, strict=False):
+        titles += [f"{neighbour['view']}: {neighbour['matches']} shared matches" for neighbour in near]
+        names = [view, *(neighbour["view"] for neighbour in near)]
+        for axes, name, title in zip(row, names, titles, strict=False):
             axes.imshow(resize_to_fit(read_image(images / name), THUMBNAIL_PX))
             axes.set_title(title, fontsize=7, parse_math=False)
         for axes in row:

@@ -6,7 +6,7 @@ The workflow imports this module at start-up, so it does not import slow modules
 import difflib
 import re
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -165,15 +165,15 @@ def choose_scenes(
         return tuple(in_groups)
     chosen: set[str] = set()
     for name in only:
-        found = [row.name for row in in_groups if name in (row.scene, row.name)]
-        found = found or [row.name for row in rows if name in (row.scene, row.name)]
-        if not found:
+        matches = [row.name for row in in_groups if name in (row.scene, row.name)]
+        matches = matches or [row.name for row in rows if name in (row.scene, row.name)]
+        if not matches:
             raise SceneError(
                 f"setting `only`: no scene is named {name!r}",
                 expected=", ".join(row.name for row in in_groups or rows),
                 fix="correct the name, or add a row to the scene sheet",
             )
-        chosen.update(found)
+        chosen.update(matches)
     return tuple(row for row in rows if row.name in chosen)
 
 
@@ -213,8 +213,8 @@ def _check_header(path: Path, line: int, header: list[str]) -> None:
 def _row(
     path: Path, line: int, cells: dict[str, str], checked_groups: Collection[str] | None, data_root: str
 ) -> SceneRow:
-    def fault(column: str, problem: str, **lines: str) -> SceneError:
-        return SceneError(f"{path}, line {line}, column {column}: {problem}", **lines)
+    def fault(column: str, problem: str, fix: str, **lines: str) -> SceneError:
+        return SceneError(f"{path}, line {line}, column {column}: {problem}", fix=fix, **lines)
 
     def optional(column: str) -> Path | None:
         cell = cells.get(column, "")
@@ -222,77 +222,65 @@ def _row(
 
     for column in ("dataset", "scene", "group"):
         if problem := name_problem(cells[column]):
-            fix = "choose a different name, such as my-desk_2"
-            bad = f"{cells[column]!r} is not a valid name"
-            raise fault(column, bad, expected=NAME_RULE, found=problem, fix=fix)
+            fix, name = "choose a different name, such as my-desk_2", cells[column]
+            raise fault(column, f"{name!r} is not a valid name", fix, expected=NAME_RULE, found=problem)
     if cells["unit"] not in UNITS:
-        expected, fix = f"one of {', '.join(UNITS)}", "correct column unit of that line"
-        raise fault("unit", f"{cells['unit']!r} is unknown", expected=expected, fix=fix)
+        problem, expected = f"{cells['unit']!r} is unknown", f"one of {', '.join(UNITS)}"
+        raise fault("unit", problem, "correct column unit of that line", expected=expected)
     near = difflib.get_close_matches(cells["group"], GROUPS, n=1, cutoff=0.8)
     if near and cells["group"] not in GROUPS:
-        expected, fix = f"did you mean {near[0]!r}?", "correct the group, or choose a more different name"
-        raise fault("group", f"{cells['group']!r} is unknown", expected=expected, fix=fix)
-    source, folder = cells["source"], None
-    is_checked = checked_groups is None or cells["group"] in checked_groups
+        problem, expected = f"{cells['group']!r} is unknown", f"did you mean {near[0]!r}?"
+        raise fault("group", problem, "correct the group, or choose another name", expected=expected)
+    source = cells["source"]
     if not source:
-        raise fault("source", "it is empty", fix="enter world:<kind>:<seed>, or a folder of images")
-    if source.partition(":")[0] in entry_points("hilsplat.generators"):
-        if generated_of(source) is None:
-            raise fault(
-                "source",
-                f"{source!r} does not name a generated scene",
-                expected="<generator>:<kind>:<seed>, as in world:tabletop:201",
-                fix="correct the source",
-            )
-    else:
-        folder = _resolved(path, source, data_root)
-        # The workflow skips and reports scenes missing from a published data set.
-        if folder is not None and is_checked and not source.startswith(DATA_PREFIX):
-            _check_source(f"{path}, line {line}, column source", folder)
-    gaussians, features = optional("gaussians"), optional("features")
-    poses = NO_POSES if cells.get("poses") == str(NO_POSES) else optional("poses")
-    fixed = {column: cells[column] for column in COLUMNS}
-    row = SceneRow(**fixed, folder=folder, gaussians=gaussians, features=features, poses=poses)
-    if not is_checked:
-        return row
-    if gaussians is not None and (problem := _ply_problem(gaussians)):
-        raise fault(
-            "gaussians",
-            f"file {gaussians} {problem}",
-            expected="a 3DGS PLY; relative paths start from the project folder",
-            fix='correct the path, or enter "-" to fit the Gaussians',
-        )
-    if gaussians is None and folder is not None and cells.get("gaussians", "") not in NOTHING:
-        raise fault(
-            "gaussians",
-            f"{cells['gaussians']!r} is relative to data_root, which is not set",
-            fix="set data_root, or enter a path relative to the project folder",
-        )
-    if features is not None and not any(features.glob("*_s.npy")):
-        raise fault(
-            "features",
-            f"folder {features} contains no LangSplat masks",
-            expected="<image>_s.npy and <image>_f.npy for each image",
-            fix='correct the path, or enter "-" to compute the masks',
-        )
-    if poses not in (None, NO_POSES) and not poses.exists():
-        raise fault(
-            "poses",
-            f"{poses} is missing",
-            expected=f"a COLMAP model, a transforms.json, or {NO_POSES}",
-            fix='correct the path, or enter "-" to use the poses in the folder',
-        )
+        raise fault("source", "it is empty", "enter world:<kind>:<seed>, or a folder of images")
+    is_generated = source.partition(":")[0] in entry_points("hilsplat.generators")
+    if is_generated and generated_of(source) is None:
+        expected = "<generator>:<kind>:<seed>, as in world:tabletop:201"
+        problem = f"{source!r} does not name a generated scene"
+        raise fault("source", problem, "correct the source", expected=expected)
+    row = SceneRow(
+        **{column: cells[column] for column in COLUMNS},
+        folder=None if is_generated else _resolved(path, source, data_root),
+        gaussians=optional("gaussians"),
+        features=optional("features"),
+        poses=NO_POSES if cells.get("poses") == str(NO_POSES) else optional("poses"),
+    )
+    if checked_groups is None or row.group in checked_groups:
+        _check_files(row, cells, fault)
     return row
 
 
-def _resolved(sheet: Path, place: str, data_root: str) -> Path | None:
+def _check_files(row: SceneRow, cells: dict[str, str], fault: Callable[..., SceneError]) -> None:
+    # The workflow skips and reports scenes missing from a published data set.
+    if row.folder is not None and not row.source.startswith(DATA_PREFIX):
+        _check_source(row.folder, fault)
+    if row.gaussians is not None and (problem := _ply_problem(row.gaussians)):
+        fix = 'correct the path, or enter "-" to fit the Gaussians'
+        expected = "a 3DGS PLY; relative paths start from the project folder"
+        raise fault("gaussians", f"file {row.gaussians} {problem}", fix, expected=expected)
+    if row.gaussians is None and row.folder is not None and cells.get("gaussians", "") not in NOTHING:
+        problem = f"{cells['gaussians']!r} is relative to data_root, which is not set"
+        fix = "set data_root, or enter a path relative to the project folder"
+        raise fault("gaussians", problem, fix)
+    if row.features is not None and not any(row.features.glob("*_s.npy")):
+        fix = 'correct the path, or enter "-" to compute the masks'
+        expected = "<image>_s.npy and <image>_f.npy for each image"
+        raise fault("features", f"folder {row.features} contains no LangSplat masks", fix, expected=expected)
+    if row.poses not in (None, NO_POSES) and not row.poses.exists():
+        fix = 'correct the path, or enter "-" to use the poses in the folder'
+        expected = f"a COLMAP model, a transforms.json, or {NO_POSES}"
+        raise fault("poses", f"{row.poses} is missing", fix, expected=expected)
+
+
+def _resolved(sheet: Path, cell: str, data_root: str) -> Path | None:
     """Resolve a path against the project root or, for `data:`, the data root (None if that is not set)."""
-    start = project_root(sheet)
-    if place.startswith(DATA_PREFIX):
+    base = project_root(sheet)
+    if cell.startswith(DATA_PREFIX):
         if not data_root:
             return None
-        start = start / Path(data_root).expanduser()
-    return (start / Path(place.removeprefix(DATA_PREFIX)).expanduser()).resolve()
+        base = base / Path(data_root).expanduser()
+    return (base / Path(cell.removeprefix(DATA_PREFIX)).expanduser()).resolve()
 
 
 def _ply_problem(ply: Path) -> str:
@@ -304,18 +292,17 @@ def _ply_problem(ply: Path) -> str:
     return "" if head in (b"ply\n", b"ply\r") else f"is not a PLY: it begins with {head!r}"
 
 
-def _check_source(where: str, folder: Path) -> None:
+def _check_source(folder: Path, fault: Callable[..., SceneError]) -> None:
     if not folder.is_dir():
-        raise SceneError(
-            f"{where}: {folder} {'is not a folder' if folder.exists() else 'is missing'}",
-            expected="a folder of images; relative paths start from the project folder",
-            fix="correct the path, or remove the line",
-        )
+        problem = f"{folder} {'is not a folder' if folder.exists() else 'is missing'}"
+        expected = "a folder of images; relative paths start from the project folder"
+        raise fault("source", problem, "correct the path, or remove the line", expected=expected)
     if not list_images(photo_folder(folder)) and not has_known_poses(folder):
-        raise SceneError(
-            f"{where}: folder {folder} has no images",
+        raise fault(
+            "source",
+            f"folder {folder} has no images",
+            "correct the path, choose one of several folders, or convert the photographs to JPEG or PNG",
             expected=f"files with suffix {', '.join(sorted(IMAGE_SUFFIXES))} in it, in its images/ or input/ "
             "folder, or in a single folder below",
             found=contents(folder),
-            fix="correct the path, choose one of several folders, or convert the photographs to JPEG or PNG",
         )

@@ -17,7 +17,7 @@ def view_name(stem: str) -> str:
     return f"{stem}.png"
 
 
-LONGEST_NAME = 200
+MAX_NAME_BYTES = 200
 """Maximum length of a photograph's file name, bytes; later stages extend it, and file systems allow 255."""
 
 
@@ -90,8 +90,8 @@ def view_names(sources: Sequence[Path]) -> list[str]:
         if "{" in name or "}" in name or not name.isprintable():  # braces are wildcards in Snakemake
             problem = f"the name of photograph {str(source)!r} contains a brace or an unprintable character"
             raise SceneError(problem, fix="rename it")
-        if num_bytes > LONGEST_NAME:
-            limit, problem = f"at most {LONGEST_NAME} bytes", f"the name of photograph {source} is too long"
+        if num_bytes > MAX_NAME_BYTES:
+            limit, problem = f"at most {MAX_NAME_BYTES} bytes", f"the name of photograph {source} is too long"
             raise SceneError(problem, expected=limit, found=num_bytes, fix="rename it")
     same_folder = Counter((source.parent, source.stem) for source in sources)
     prefixes = [[folder.name for folder in source.parents] for source in sources]

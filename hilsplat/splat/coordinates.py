@@ -107,7 +107,6 @@ def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dic
     only record of the coordinates used by our own structure from motion.
     """
     scale, rotation, translation = decompose(scene.scene_from_source)
-    registration = read_json(scene.folder / "registration.json")
     write_json(
         ply.with_suffix(".json"),
         {
@@ -118,7 +117,7 @@ def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dic
             "sh_degree": gaussians.sh_degree,
             "unit": scene.unit,
             "axes": "right-handed; cameras in OpenCV axes (x right, y down, z forward)",
-            "source": registration["poses"],
+            "source": read_json(scene.folder / "registration.json")["poses"],
             "convention": "x_scene = scene_from_source @ [x_source, 1]",
             "scene_from_source": scene.scene_from_source.tolist(),
             "source_from_scene": np.linalg.inv(scene.scene_from_source).tolist(),
@@ -131,11 +130,7 @@ def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dic
 
 
 def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
-    """Return the transform from a PLY's coordinates to its source's, or None if no JSON file contains it.
-
-    Raises:
-        ArtifactError: if the JSON file belongs to a different PLY, or its transform cannot be used.
-    """
+    """Return the transform from a PLY's coordinates to its source's, or None if no JSON file contains it."""
     path = ply.with_suffix(".json")
     if not path.is_file():
         return None
@@ -143,11 +138,11 @@ def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
     if not isinstance(content, dict) or "source_from_scene" not in content:
         return None
     require_as_written(path, sha256_of_file(path))
-    if content.get("ply_sha256") != (found := sha256_of_file(ply)):
+    if content.get("ply_sha256") != (digest := sha256_of_file(ply)):
         raise ArtifactError(
             f"{path} was written for a different {ply.name}",
             expected=f"sha256 {content.get('ply_sha256')}",
-            found=f"sha256 {found}",
+            found=f"sha256 {digest}",
             fix="move it next to the PLY that it was written for, or remove it if the PLY is in the "
             "coordinates of the scene's source",
         )
@@ -160,7 +155,8 @@ def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
 def read_gaussians(ply: Path) -> tuple[Gaussians, list[str]]:
     """Read another program's PLY; return notes on what was changed and left out (`import_ply`)."""
     gaussians, notes, unknown = import_ply(ply, FIX)
-    notes += [f"unknown properties are not used: {', '.join(unknown)}"] if unknown else []
+    if unknown:
+        notes.append(f"unknown properties are not used: {', '.join(unknown)}")
     if len(gaussians) == 0:
         raise ArtifactError(f"{ply} contains no Gaussians", fix=FIX)
     return gaussians, notes
@@ -191,8 +187,7 @@ def import_gaussians(
     elif dataparser is not None:
         transform = transform @ source_from_dataparser(dataparser, transforms)
         moved = f"in nerfstudio's training coordinates, from {dataparser.name}"
-    said = "; ".join([moved, *notes])
-    logger.info("%s: %d Gaussians from %s, %s", scene.name, len(gaussians), ply, said)
+    logger.info("%s: %d Gaussians from %s, %s", scene.name, len(gaussians), ply, "; ".join([moved, *notes]))
     origin = {
         "kind": "imported",
         "file": ply.name,  # its folder is in the provenance record
@@ -205,11 +200,7 @@ def import_gaussians(
 
 
 def write_source_ply(ply: Path, out: Path) -> int:
-    """Write a scene's Gaussians in the coordinates of the scene's source, and return their number.
-
-    Raises:
-        ArtifactError: if `ply` or the JSON file beside it is missing or damaged.
-    """
+    """Write a scene's Gaussians in the coordinates of the scene's source, and return their number."""
     source_from_scene = read_source_from_scene(ply)
     if source_from_scene is None:
         raise ArtifactError(f"{ply.with_suffix('.json')} is missing", fix=run_command(ply))

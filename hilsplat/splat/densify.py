@@ -24,11 +24,11 @@ from hilsplat.splat.gaussians import FIELDS
 from hilsplat.splat.optimise import Adam
 from hilsplat.splat.rasterise.cpu import Gradients, over_ranges
 
-SMALL = 0.01
+MAX_CLONED_SCALE = 0.01
 """Gaussians whose largest axis exceeds this (in units of the extent) are split; others are cloned (3DGS)."""
 SPLIT_FACTOR = 1.6
 """The halves of a split Gaussian get its scales divided by this (3DGS: 0.8 x 2)."""
-HUGE = 0.5
+MAX_SCALE = 0.5
 """Gaussians with a larger axis, in units of the extent, are pruned (3DGS: 0.1, after the first
 opacity reset; larger here, because walls of rooms consist of flat, wide Gaussians)."""
 RESET_OPACITY = 0.01  # 3DGS
@@ -100,7 +100,7 @@ def densify(
     if len(selected) > room:
         selected = np.sort(selected[np.argsort(-mean[selected], kind="stable")[:room]])
     p = adam.parameters
-    large = np.exp(p["log_scales"][selected].max(axis=1, initial=-np.inf)) > SMALL * extent
+    large = np.exp(p["log_scales"][selected].max(axis=1, initial=-np.inf)) > MAX_CLONED_SCALE * extent
     clone, split = selected[~large], selected[large]
     halves = {name: np.repeat(p[name][split], 2, axis=0) for name in FIELDS}
     offsets = generator.normal(size=halves["means"].shape) * np.exp(halves["log_scales"].astype(np.float64))
@@ -116,15 +116,15 @@ def prune(adam: Adam, settings: GaussiansSettings, extent: float) -> None:
     p = adam.parameters
     threshold = np.log(settings.min_opacity / (1 - settings.min_opacity))
     largest = p["log_scales"].max(axis=1, initial=-np.inf)
-    keep = (p["opacity_logits"] > threshold) & (largest < np.log(HUGE * extent))
+    keep = (p["opacity_logits"] > threshold) & (largest < np.log(MAX_SCALE * extent))
     if not keep.all():
         adam.keep(keep)
 
 
 def reset_opacities(adam: Adam) -> None:
     """Cap all opacities at RESET_OPACITY, so that only needed Gaussians become opaque again (3DGS)."""
-    most = np.float32(np.log(RESET_OPACITY / (1 - RESET_OPACITY)))
-    np.minimum(adam.parameters["opacity_logits"], most, out=adam.parameters["opacity_logits"])
+    max_logit = np.float32(np.log(RESET_OPACITY / (1 - RESET_OPACITY)))
+    np.minimum(adam.parameters["opacity_logits"], max_logit, out=adam.parameters["opacity_logits"])
     adam.reset_moments(slice(None), ("opacity_logits",))
 
 

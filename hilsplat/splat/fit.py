@@ -108,24 +108,24 @@ def fit_step(
         behind = state.generator.uniform(size=3).astype(np.float32)
 
     device = choose_device(settings.device)
-    seen = draw(state.adam.as_gaussians(), view.camera, degree, threads=threads, device=device)
-    shown, grad_alpha = seen.image, np.zeros_like(seen.alpha)
+    drawing = draw(state.adam.as_gaussians(), view.camera, degree, threads=threads, device=device)
+    image, grad_alpha = drawing.image, np.zeros_like(drawing.alpha)
     if behind.any():
-        shown = seen.image + (1 - seen.alpha)[..., None] * behind
+        image = drawing.image + (1 - drawing.alpha)[..., None] * behind
     target = to_float(view.image)
-    loss, grad = photometric_loss(shown, target, ssim_weight=settings.ssim_weight, threads=threads)
+    loss, grad = photometric_loss(image, target, ssim_weight=settings.ssim_weight, threads=threads)
     if behind.any():
         grad_alpha = -(grad @ behind)
-    gradients = seen.gradients(grad, grad_alpha)
+    gradients = drawing.gradients(grad, grad_alpha)
     is_frozen = settings.initial == "frozen"
     rate = 0.0 if is_frozen else means_rate(settings, progress)
     if settings.strategy == "mcmc" and not is_frozen:
         add_regularisers(state.adam, gradients, settings, extent)
     elif not is_frozen and state.adam.steps < int(settings.densify_until * settings.iterations):
-        state.gradients.add(gradients.means_px, seen.drawn, view.camera.size_hw)
+        state.gradients.add(gradients.means_px, drawing.drawn, view.camera.size_hw)
     state.adam.step(gradients, settings, extent * rate, threads)
     if state.adam.steps % CURVE_EVERY == 0:
-        error = float(np.square(shown - target).mean(dtype=np.float64))
+        error = float(np.square(image - target).mean(dtype=np.float64))
         state.curve.append([state.adam.steps, loss, -10 * np.log10(max(error, 1e-12)), len(state.adam)])
     if not is_frozen:
         control_density(state.adam, state.gradients, settings, rate, extent, state.generator, threads)
@@ -232,13 +232,13 @@ def write_report(
     flat: list[float] = []
     cells: list[UInt8[np.ndarray, "_ _ 3"]] = []
     for view in views:
-        shown = picture(view.camera)  # scored as a saved 8-bit image
-        drawn, truth = to_float(shown), to_float(view.image)
-        scores[view.camera.name] = {"psnr_db": psnr(drawn, truth), "ssim": ssim(drawn, truth)}
+        rendering = picture(view.camera)  # scored as a saved 8-bit image
+        values, truth = to_float(rendering), to_float(view.image)
+        scores[view.camera.name] = {"psnr_db": psnr(values, truth), "ssim": ssim(values, truth)}
         flat.append(psnr(np.broadcast_to(truth.mean(axis=(0, 1)), truth.shape), truth))
         if len(cells) < 3 * MAX_SHOWN:
-            error = np.abs(view.image.astype(np.int32) - shown) * ERROR_GAIN
-            cells += [view.image, shown, np.minimum(error, 255).astype(np.uint8)]
+            error = np.abs(view.image.astype(np.int32) - rendering) * ERROR_GAIN
+            cells += [view.image, rendering, np.minimum(error, 255).astype(np.uint8)]
     report: dict[str, Any] = {
         "split": split,
         **{name: float(np.mean([score[name] for score in scores.values()])) for name in ("psnr_db", "ssim")},
@@ -306,9 +306,9 @@ def run_gaussians(
     """
     scene = Scene.load(scene_folder)
     with stage_log("gaussians", scene.name) as counts:
+        curve = None
         if existing is not None:
             gaussians, origin = import_gaussians(existing, scene, dataparser, transforms)
-            curve = None
         else:
             # a fit must resume on the same device, because sums differ between CPU and CUDA
             settings = settings.model_copy(update={"device": choose_device(settings.device)})

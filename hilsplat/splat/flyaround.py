@@ -124,8 +124,8 @@ def write_flyaround(
     """
     rendered = in_order(picture, closed_path(cameras, FRAMES), threads)
     film = encoded_film(folder / "flyaround.mp4", rendered, FRAMES_PER_S)
-    shown = [frame for number, frame in enumerate(film) if number % (FRAMES // SHEET_FRAMES) == 0]
-    write_png(folder / "flyaround.png", contact_sheet(shown, columns=4))
+    samples = [frame for number, frame in enumerate(film) if number % (FRAMES // SHEET_FRAMES) == 0]
+    write_png(folder / "flyaround.png", contact_sheet(samples, columns=4))
 
 
 def encoded_film(

@@ -74,8 +74,8 @@ def first_gaussians(
             found=f"{len(xyz)} points, {int((~finite).sum())} not finite",
             fix="specify the points as ply_file_path in transforms.json, or set gaussians.initial to points",
         )
-    known, rgb = xyz[finite], rgb[finite]
-    xyz, rgb = (known[:0], rgb[:0]) if is_random else (known, rgb)
+    sparse, rgb = xyz[finite], rgb[finite]
+    xyz, rgb = (sparse[:0], rgb[:0]) if is_random else (sparse, rgb)
     if len(xyz) > settings.max_gaussians and not is_frozen:
         rows = np.sort(generator.choice(len(xyz), settings.max_gaussians, replace=False))
         xyz, rgb = xyz[rows], rgb[rows]
@@ -83,7 +83,7 @@ def first_gaussians(
         if not is_random:
             logger.warning("%s has only %d sparse points; adding random points", scene.name, len(xyz))
         number = min(RANDOM_POINTS if is_random else ADDED_POINTS, settings.max_gaussians - len(xyz))
-        more = _random_points(cameras, known, number, generator)
+        more = _random_points(cameras, sparse, number, generator)
         xyz, rgb = np.concatenate([xyz, more]), np.concatenate([rgb, np.full((number, 3), 0.5, np.float32)])
     n = len(xyz)
     distances = cKDTree(xyz).query(xyz, k=min(4, n))[0].reshape(n, -1)[:, 1:]
@@ -103,13 +103,13 @@ def first_gaussians(
 
 
 def _random_points(
-    cameras: list[Camera], known: np.ndarray, number: int, generator: np.random.Generator
+    cameras: list[Camera], sparse: np.ndarray, number: int, generator: np.random.Generator
 ) -> np.ndarray:
-    """Sample points in front of random cameras, at depths based on known points or the cameras' extent."""
+    """Sample points in front of random cameras, at depths based on sparse points or the cameras' extent."""
     extent = camera_extent(cameras)
     depths = []
     for camera in cameras:
-        z = known @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
+        z = sparse @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
         depths += z[z > 0].tolist()
     near, far = np.quantile(depths, [0.05, 0.95]) if depths else (0.3 * extent, 2.0 * extent)
     out = np.empty((number, 3))

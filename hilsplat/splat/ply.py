@@ -13,7 +13,7 @@ from hilsplat.scene.importers.ply_file import read_ply
 from hilsplat.splat.gaussians import Gaussians
 
 SATURATED_LOGIT = 16.0  # replaces infinite opacity logits; a float32 sigmoid of 17 is 1
-LARGEST = 1e15  # values and scales above it overflow when squared in float32
+MAX_VALUE = 1e15  # values and scales above it overflow when squared in float32
 MAX_UNUSABLE = 0.5  # share of unusable Gaussians above which a PLY is not imported
 UNUSABLE = "contain a non-finite or huge number, or have no rotation (rot_0..3 are zero)"
 
@@ -72,14 +72,14 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
         PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(temporary)
 
 
-def load_ply(path: Path, fix: str = "") -> Gaussians:
-    """Read a 3DGS PLY of this package; errors suggest `fix` or, if it is empty, a rerun.
+def load_ply(path: Path) -> Gaussians:
+    """Read a 3DGS PLY of this package; errors suggest a rerun.
 
     Raises:
         ArtifactError: as in `import_ply`, and if anything would be changed or left out.
     """
-    fix = fix or remake(Path(path))
-    gaussians, notes, _ = import_ply(Path(path), fix)
+    fix = remake(path)
+    gaussians, notes, _ = import_ply(path, fix)
     if notes:
         raise ArtifactError(f"{path} is not as this package writes it: {'; '.join(notes)}", fix=fix)
     return gaussians
@@ -146,7 +146,7 @@ def _gaussians(values: Float32[np.ndarray, "N P"]) -> Gaussians:
     means, dc, rest, opacity, scales, quats = np.split(values, np.cumsum([3, 3, num_rest, 1, 3]), axis=1)
     rest = rest.reshape(len(values), 3, num_rest // 3).transpose(0, 2, 1)
     sh = np.concatenate([dc[:, None], rest], axis=1)
-    return Gaussians(*(np.ascontiguousarray(each) for each in (means, scales, quats, opacity[:, 0], sh)))
+    return Gaussians(*(np.ascontiguousarray(column) for column in (means, scales, quats, opacity[:, 0], sh)))
 
 
 def _smooth(values: Float32[np.ndarray, "N P"], filter_3d: Float64[np.ndarray, " N"]) -> None:
@@ -160,5 +160,5 @@ def _smooth(values: Float32[np.ndarray, "N P"], filter_3d: Float64[np.ndarray, "
 
 def _unusable(values: Float[np.ndarray, "N P"]) -> Bool[np.ndarray, " N"]:
     """Return which Gaussians have a value or scale that is not finite or too large, or no rotation."""
-    sound = (np.abs(values) < LARGEST).all(axis=1) & (values[:, -7:-4] < np.log(LARGEST)).all(axis=1)
+    sound = (np.abs(values) < MAX_VALUE).all(axis=1) & (values[:, -7:-4] < np.log(MAX_VALUE)).all(axis=1)
     return ~sound | (np.linalg.norm(values[:, -4:].astype(np.float64), axis=1) < 1e-12)

@@ -20,7 +20,7 @@ HEADER = struct.Struct("<IIIBBBB")
 
 STEPS_PER_SPREAD = 8192
 """Minimum number of position steps per median distance of the Gaussians from their centre."""
-LARGEST_STEP = 2**23 - 1
+MAX_STEP = 2**23 - 1
 HARMONIC_STEP = 8
 """Step of harmonics in units of 1/128 (5 bits). The usual 4 bits above degree 1 save 1 byte but lose 2 dB."""
 COLOUR_SCALE = 0.15
@@ -47,7 +47,7 @@ def spz_bytes(gaussians: Gaussians, rows: Int64[np.ndarray, " g"], bits: int) ->
     """
     sh = gaussians.sh[rows]
     steps = np.rint(gaussians.means[rows].astype(np.float64) * FLIPPED * 2**bits)
-    fixed = np.clip(steps, -LARGEST_STEP, LARGEST_STEP).astype("<i4")
+    fixed = np.clip(steps, -MAX_STEP, MAX_STEP).astype("<i4")
     quats = gaussians.quats[rows] / np.linalg.norm(gaussians.quats[rows], axis=1, keepdims=True)
     turned = quats[:, 1:] * FLIPPED * np.where(quats[:, :1] < 0, -1, 1)
     harmonics = np.rint(sh[:, 1:] * HARMONIC_SIGNS[: sh.shape[1] - 1, None] * (128 / HARMONIC_STEP))

@@ -74,7 +74,7 @@ def bent(project, fx, fy, cx, cy):
     def rays(xy):
         wanted = (xy - [cx, cy]) / [fx, fy]
         plain, step = wanted.copy(), 1e-6
-        for _ in range(25):
+        for _ in range(8):
             miss = project(plain) - wanted
             columns = [(project(plain + step * axis) - project(plain)) / step for axis in np.eye(2)]
             jacobian = np.stack(columns, axis=-1)
@@ -109,7 +109,7 @@ def fisheye(fx, fy, cx, cy, k1=0.0, k2=0.0, k3=0.0, k4=0.0):
         length = np.linalg.norm(wanted, axis=1)
         theta = length.copy()
         powers = np.array([1.0, k1, k2, k3, k4])
-        for _ in range(40):
+        for _ in range(12):
             even = theta[:, None] ** (2 * np.arange(5))
             theta = theta - (theta * (even @ powers) - length) / (even @ (powers * (2 * np.arange(5) + 1)))
         across = np.where(length > 1e-12, np.sin(theta) / np.maximum(length, 1e-12), 1.0)
@@ -119,6 +119,7 @@ def fisheye(fx, fy, cx, cy, k1=0.0, k2=0.0, k3=0.0, k4=0.0):
 
 
 def psnr(picture, other):
+    assert np.shape(picture) == np.shape(other)
     error = np.mean((np.asarray(picture, float) - np.asarray(other, float)) ** 2)
     return 99.0 if error == 0 else 10 * np.log10(255**2 / error)
 

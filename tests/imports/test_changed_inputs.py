@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from hilsplat.datasets.sources import photo_files
-from hilsplat.scene.layouts import NO_POSES
+from hilsplat.scene.layouts import NO_POSES, photo_files
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.workflow.scene_data import SceneData
 

@@ -1,12 +1,10 @@
 """COLMAP models as COLMAP and other programs write them."""
 
-import struct
-
 import numpy as np
 import pycolmap
 import pytest
 
-from hilsplat.base.errors import HilsplatError, SceneError
+from hilsplat.base.errors import HilsplatError
 from hilsplat.scene.importers.colmap_model import read_model
 from hilsplat.scene.importers.known_views import read_source
 from hilsplat.scene.layouts import find_known_poses
@@ -63,14 +61,23 @@ FORMS = {
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_text_models_are_read(form, tmp_path, imported):
-    folder = write(tmp_path / "in")
+def test_text_models_are_read(form, tmp_path):
+    folder = write(tmp_path)
     for file, change in FORMS[form]:
         edit(folder, file, change)
-    views, (xyz, rgb), *_ = imported(folder)
-    world.require_right(views, {f"{number:03d}.png": pose for number, pose in enumerate(POSES)}, 45)
+    source = read_source(find_known_poses(folder))
+    assert [view.image.name for view in source.views] == [f"{number:03d}.png" for number in range(6)]
+    for view, pose in zip(source.views, POSES, strict=True):
+        np.testing.assert_allclose(view.cam_from_source, np.linalg.inv(pose), atol=1e-9)
+        assert view.camera.params.tolist() == [80, 78, 47, 37]
+    xyz, rgb = source.points
     np.testing.assert_allclose(xyz, [point[:3] for point in POINTS])
     assert rgb.tolist() == [list(point[3:]) for point in POINTS]
+
+
+def test_pictures_of_a_model_are_right(tmp_path, imported):
+    views, *_ = imported(write(tmp_path / "in"))
+    world.require_right(views, {f"{number:03d}.png": pose for number, pose in enumerate(POSES)}, 45)
 
 
 @pytest.mark.parametrize(
@@ -81,17 +88,15 @@ def test_text_models_are_read(form, tmp_path, imported):
     ],
 )
 @pytest.mark.parametrize("form", ["text", "binary"])
-def test_names_with_spaces_and_signs_are_read(name, form, tmp_path, imported):
-    folder = write(tmp_path / "in", name)
+def test_names_with_spaces_and_signs_are_read(name, form, tmp_path):
+    folder = write(tmp_path, name)
     if form == "binary":  # the text is read by hand here, because pycolmap ends names at spaces
         rewrite_as_binary(folder / "sparse/0", name)
-    views, *_ = imported(folder)
-    assert len(views) == len(POSES)
-    for view in views:
-        number = next(
-            row for row in range(6) if view.view.endswith(f"{name.format(row).rpartition('/')[2][:-4]}.png")
-        )
-        np.testing.assert_allclose(view.cam_from_source, np.linalg.inv(POSES[number]), atol=1e-9)
+    views = {view.image: view for view in read_source(find_known_poses(folder)).views}
+    for number, pose in enumerate(POSES):
+        view = views.pop(folder / "images" / name.format(number))
+        np.testing.assert_allclose(view.cam_from_source, np.linalg.inv(pose), atol=1e-9)
+    assert not views
 
 
 def rewrite_as_binary(folder, name):
@@ -138,11 +143,7 @@ def test_models_with_observations_are_read_as_by_pycolmap(write_model, tmp_path)
 @pytest.mark.parametrize(
     ("file", "change", "message"),
     [
-        (
-            "cameras.txt",
-            lambda text: text.replace(b"80 78", b"80,0 78"),
-            r"cameras\.txt, line 1, cannot be read",
-        ),
+        ("cameras.txt", lambda text: text.replace(b"80 78", b"80,0 78"), r"cameras\.txt, line 1, cannot be"),
         ("cameras.txt", lambda text: text.replace(b" 37", b""), r"cameras\.txt, line 1"),
         ("cameras.txt", lambda text: text.replace(b"PINHOLE", b"PINHOLLE"), r"cameras\.txt, line 1"),
         ("cameras.txt", lambda text: b"\n\n" + text[:9], r"cameras\.txt, line 3"),
@@ -162,8 +163,8 @@ def test_unreadable_lines_are_named(file, change, message, tmp_path, imported):
 
 
 @pytest.mark.parametrize("change", [b"0 0 0 0", b"nan 0 0 1", b"0.5 0.5 0.5 0.9"])
-def test_one_quaternion_that_is_not_a_rotation_leaves_out_its_view(change, tmp_path, imported):
-    folder = write(tmp_path / "in")
+def test_one_quaternion_that_is_not_a_rotation_leaves_out_its_view(change, tmp_path):
+    folder = write(tmp_path)
 
     def changed(text):
         lines = text.split(b"\n")
@@ -172,9 +173,9 @@ def test_one_quaternion_that_is_not_a_rotation_leaves_out_its_view(change, tmp_p
         return b"\n".join(lines)
 
     edit(folder, "images.txt", changed)
-    views, _, _, report = imported(folder)
-    assert [view.view for view in views] == [f"{number:03d}.png" for number in (0, 1, 3, 4, 5)]
-    assert "a quaternion of length 1" in report["views"]["002.png"]["why_not"]
+    source = read_source(find_known_poses(folder))
+    assert [view.name for view in source.views] == [f"{number:03d}.png" for number in (0, 1, 3, 4, 5)]
+    assert "a quaternion of length 1" in source.left_out["002.png"]
 
 
 @pytest.mark.parametrize(
@@ -223,14 +224,6 @@ def test_without_points_they_are_triangulated(tmp_path, imported):
     assert source.points is None
 
 
-def test_points_that_are_not_finite_are_dropped_with_a_note(tmp_path):
-    folder = write(tmp_path)
-    edit(folder, "points3D.txt", lambda text: text.replace(b"2 0.5", b"2 nan").replace(b"4 1.5", b"4 inf"))
-    source = read_source(find_known_poses(folder))
-    assert source.notes == ["2 of 8 points are not finite and are left out"]
-    np.testing.assert_allclose(source.points[0][:, 0], [0, 1, 2, 2.5, 3, 3.5])
-
-
 def test_colours_from_0_to_1_become_bytes(tmp_path):
     folder = write(tmp_path)
     points = [(0, 0, 0, 0.4, 1, 0)]
@@ -239,20 +232,6 @@ def test_colours_from_0_to_1_become_bytes(tmp_path):
 
 
 def test_rigs_whose_cameras_share_file_names_keep_every_view(tmp_path, imported):
-    """COLMAP's rigs: rig1/camera1/0000.png, rig1/camera2/0000.png, rig2/camera1/0000.png, ..."""
-    names = [f"rig{rig}/camera{camera}/0000.png" for rig in (1, 2) for camera in (1, 2, 3)]
-    world.save(tmp_path / "in/images", dict(zip(names, PICTURES, strict=True)), suffix="")
-    images = dict(zip(names, POSES, strict=True))
-    world.write_colmap(tmp_path / "in/sparse/0", LENS, (WIDTH, HEIGHT), images, POINTS)
-    views, *_ = imported(tmp_path / "in")
-    right = {f"{name.replace('/', '_')}": pose for name, pose in images.items()}
-    world.require_right(views, right, 45)
-
-
-@pytest.mark.parametrize("count", [2**40, 2**63, 7])
-def test_wrong_counts_of_binary_models_are_refused(count, tmp_path):
-    folder = write(tmp_path)
-    rewrite_as_binary(folder / "sparse/0", "{:03d}.png")
-    edit(folder, "images.bin", lambda content: struct.pack("<Q", count) + content[8:])
-    with pytest.raises(SceneError, match=r"images\.bin cannot be read"):
-        read_source(find_known_poses(folder))
+    """COLMAP's rigs: rig0/0000.png, rig1/0000.png, ..."""
+    views, *_ = imported(write(tmp_path / "in", "rig{}/0000.png"))
+    world.require_right(views, {f"rig{number}_0000.png": pose for number, pose in enumerate(POSES)}, 45)

@@ -9,7 +9,7 @@ from hilsplat.datasets.labelled import posed_images
 from tests.imports import analytic_world as world
 
 WIDTH, HEIGHT, FOCAL = 144, 112, 120.0
-POSES = {"a": world.cameras()[1]}
+POSES = {"a.png": world.cameras()[1]}
 POINTS = [(0.0, 0.1 * row, 0.0, 200, 100, 50) for row in range(5)]
 
 # Distortion coefficients as small as calibrations of good lenses have them, and as large as action cameras'.
@@ -24,13 +24,9 @@ def lens_of(model, amount):
     """A camera with the first distortion coefficients of a model set; `amount` is 0, 1 or 2."""
     camera = pycolmap.Camera.create_from_model_name(1, model, FOCAL, WIDTH, HEIGHT)
     extra = camera.extra_params_idxs()
-    values = (
-        OTHERS[model][amount]
-        if model in OTHERS
-        else (0.0, SMALL, -LARGE if "DIV" in model else LARGE)[amount]
-    )
+    values = OTHERS.get(model, (0.0, SMALL, -LARGE if "DIV" in model else LARGE))
     params = camera.params.copy()
-    for index, value in zip(extra, np.atleast_1d(values), strict=False):
+    for index, value in zip(extra, np.atleast_1d(values[amount]), strict=False):
         params[index] = value
     camera.params = params
     return camera
@@ -44,15 +40,9 @@ def scene_of(camera, folder):
         return np.column_stack([plain, np.ones(len(plain))])
 
     pictures = {name: world.picture(rays, WIDTH, HEIGHT, pose) for name, pose in POSES.items()}
-    world.save(folder / "images", pictures)
+    world.save(folder / "images", pictures, suffix="")
     lens = f"{camera.model_name} {' '.join(map(repr, camera.params.tolist()))}"
-    world.write_colmap(
-        folder / "sparse/0",
-        lens,
-        (WIDTH, HEIGHT),
-        {f"{name}.png": pose for name, pose in POSES.items()},
-        POINTS,
-    )
+    world.write_colmap(folder / "sparse/0", lens, (WIDTH, HEIGHT), POSES, POINTS)
     return folder
 
 
@@ -62,7 +52,7 @@ def test_pictures_of_every_model_become_pinhole_pictures(model, amount, tmp_path
     camera = lens_of(model, amount)
     views, *_ = imported(scene_of(camera, tmp_path / "in"))
     is_plain = model in ("PINHOLE", "SIMPLE_PINHOLE") or (amount == 0 and model not in {*FISHEYES, "EUCM"})
-    world.require_right(views, {f"{name}.png": pose for name, pose in POSES.items()}, 45 if is_plain else 28)
+    world.require_right(views, POSES, 45 if is_plain else 28)
     assert all((view.photo is None) == is_plain for view in views)
 
 
@@ -80,12 +70,13 @@ def test_labelled_data_sets_refuse_fisheye_lenses_without_coefficients(model, tm
         ("FULL_OPENCV 120 120 72 56 -2 0 0 0 0 0 0 0", "distortion of view a.png cannot be undone"),
         ("SIMPLE_RADIAL nan 72 56 0", "lens of view a.png is not valid"),
         ("PINHOLE 120 0 72 56", "lens of view a.png is not valid"),
+        ("PINHOLE 120 inf 72 56", "lens of view a.png is not valid"),
+        ("PINHOLE 120 120 nan 56", "lens of view a.png is not valid"),
     ],
 )
 def test_lenses_that_cannot_be_undistorted_are_refused(lens, message, tmp_path, imported):
     folder = scene_of(lens_of("PINHOLE", 0), tmp_path / "in")
-    images = {f"{name}.png": pose for name, pose in POSES.items()}
-    world.write_colmap(folder / "sparse/0", lens, (WIDTH, HEIGHT), images, POINTS)
+    world.write_colmap(folder / "sparse/0", lens, (WIDTH, HEIGHT), POSES, POINTS)
     with pytest.raises(HilsplatError, match=message):
         imported(folder)
 
@@ -94,4 +85,4 @@ def test_undistorted_pictures_have_at_most_the_longest_side(tmp_path, imported):
     camera = lens_of("OPENCV_FISHEYE", 0)
     views, *_ = imported(scene_of(camera, tmp_path / "in"), max_side_px=128)
     assert {max(view.camera.width, view.camera.height) for view in views} == {128}
-    world.require_right(views, {f"{name}.png": pose for name, pose in POSES.items()}, 28)
+    world.require_right(views, POSES, 28)

@@ -75,6 +75,7 @@ def test_every_part_is_counted_and_what_is_left_out_is_named(options, tmp_path):
         labels = {"info": {"name": f"{name}.jpg", "width": WIDTH, "height": HEIGHT}, "objects": [{}, {}]}
         (folder / f"label/{name}.json").write_text(json.dumps(labels))
     (folder / "label/000.json").write_text("{")
+    (folder / "output/a/chkpnt30000.pth").touch()
     result = new(folder, tmp_path / "project", *options)
     assert result.exit_code == 0, result.output
     for line in (
@@ -88,54 +89,51 @@ def test_every_part_is_counted_and_what_is_left_out_is_named(options, tmp_path):
         f"features: {folder}/language_features: masks and vectors of 2 of 5 views",
         f"labels: 8 in 4 photographs, used for evaluation: {folder}/label",
         "  not scored, because their views have no pose: 004.json, zzz.json",
+        "skipped, because pickle files can run code: chkpnt30000.pth",
         "5 photographs in",
     ):
         assert line in result.output, result.output
     assert "left out: " in result.output and "000.json is not valid JSON" in result.output
-    assert (tmp_path / "project/config/scenes.tsv").exists() == (not options)
+    sheet = tmp_path / "project/config/scenes.tsv"
+    assert sheet.exists() == (not options)
+    for row in read_sheet(sheet) if not options else []:
+        assert row.gaussians == folder / "output/a/point_cloud/iteration_30000/point_cloud.ply"
+        assert (row.folder, row.features) == (folder, folder / "language_features")
     assert (tmp_path / "project/annotated/photos/desk/001.json").exists() == (not options)
     assert not (tmp_path / "project/annotated/photos/desk/000.json").exists()
 
 
 @pytest.mark.parametrize("kind", ["zip", "r3d"])
 def test_a_dry_run_of_an_archive_leaves_nothing(kind, tmp_path):
-    photographs(tmp_path / "a")
-    with zipfile.ZipFile(tmp_path / f"a.{kind}", "w") as archive:
-        for path in (tmp_path / "a").iterdir():
-            archive.write(path, path.name)
+    archive_with(tmp_path, "{}", kind)
     result = new(tmp_path / f"a.{kind}", tmp_path / "project", "--dry-run")
     assert "6 photographs in" in result.output and "nothing was added" in result.output
     assert not list((tmp_path / "project").rglob("*"))
 
 
 @pytest.mark.parametrize(
-    ("places", "chosen"),
+    "folders",  # the first is meant
     [
-        (["."], "."),
-        (["images"], "images"),
-        (["Images"], "Images"),
-        (["input"], "input"),
-        (["images", "input"], "images"),
-        (["images", "images_2", "images_4"], "images"),
-        (["DCIM/100APPLE"], "DCIM/100APPLE"),
-        (["photos"], "photos"),
-        (["day/morning"], "day/morning"),
-        (["output/renders", "photos"], "photos"),
-        ([".thumbnails", "photos"], "photos"),
+        (".",),
+        ("Images",),
+        ("input",),
+        ("images", "input"),
+        ("images", "images_2", "images_4"),
+        ("DCIM/100APPLE",),
+        ("photos", "output/renders", ".thumbnails"),
     ],
 )
-def test_photographs_are_found_where_people_have_them(places, chosen, tmp_path):
-    for place in places:
-        photographs(tmp_path / place)
-    assert photo_folder(tmp_path) == (tmp_path / chosen)
-    report = add_scene(tmp_path / "p/scenes.tsv", "a", tmp_path)
-    assert report.num_readable == 6 and report.folder == tmp_path / chosen
+def test_photographs_are_found_where_people_have_them(folders, tmp_path):
+    for folder in folders:
+        photographs(tmp_path / folder)
+    assert photo_folder(tmp_path) == tmp_path / folders[0]
 
 
 def test_a_stray_picture_beside_a_folder_of_photographs_is_not_the_set(tmp_path):
     photographs(tmp_path / "images")
     photographs(tmp_path, 1)
-    assert photo_folder(tmp_path) == tmp_path / "images"
+    report = add_scene(tmp_path / "p/scenes.tsv", "a", tmp_path)
+    assert report.num_readable == 6 and report.folder == tmp_path / "images"
 
 
 @pytest.mark.parametrize("places", [["monday", "tuesday"], ["DCIM/100APPLE", "DCIM/101APPLE"]])
@@ -161,44 +159,30 @@ def test_images_of_poses_are_found_in_input(tmp_path):
     assert all(view.image is not None for view in read_source(find_known_poses(tmp_path)).views)
 
 
-@pytest.mark.parametrize("content", [b"", b"no picture", "too large"])
-def test_one_photograph_that_cannot_be_read_is_left_out(content, tmp_path):
+def test_some_photographs_that_cannot_be_read_are_left_out(tmp_path):
     folder = photographs(tmp_path / "a")
-    if content == "too large":
-        Image.new("1", (20_000, 10_000)).save(folder / "bad.png")  # 200 megapixels
-    else:
-        (folder / "bad.png").write_bytes(content)
+    Image.new("1", (20_000, 10_000)).save(folder / "large.png")  # 200 megapixels
+    (folder / "text.png").write_bytes(b"no picture")
     report = str(add_scene(tmp_path / "scenes.tsv", "a", folder))
-    assert "6 photographs in" in report and "1  cannot be read and are left out" in report
-    assert "bad.png: " in report
-    for row in range(4):
+    assert "6 photographs in" in report and "2  cannot be read and are left out" in report
+    assert "large.png: " in report and "text.png: " in report
+    for row in range(3):
         (folder / f"bad{row}.png").write_bytes(b"")
     with pytest.raises(SceneError, match=r"5 of 11 photographs in .* cannot be read"):
         add_scene(tmp_path / "scenes.tsv", "b", folder)
 
 
-def archive_with(folder, name):
-    """An archive whose entries are named as given, which zipfile would change on Linux."""
+def archive_with(folder, name, suffix="zip"):
     photographs(folder / "a")
-    with zipfile.ZipFile(folder / "a.zip", "w") as archive:
+    with zipfile.ZipFile(folder / f"a.{suffix}", "w") as archive:
         for path in (folder / "a").iterdir():
-            entry = zipfile.ZipInfo("x")
-            entry.filename = name.format(path.name)
-            archive.writestr(entry, path.read_bytes())
+            archive.write(path, name.format(path.name))
 
 
-@pytest.mark.parametrize("name", ["photos\\{}", "a\\b\\{}", "{}"])
+@pytest.mark.parametrize("name", ["photos\\{}", "a\\b\\{}"])
 def test_archives_made_on_windows_are_unpacked(name, tmp_path):
     archive_with(tmp_path, name)
     assert add_scene(tmp_path / "p/scenes.tsv", "a", tmp_path / "a.zip").num_readable == 6
-
-
-@pytest.mark.parametrize("name", ["..\\{}", "C:\\a\\{}", "\\\\host\\share\\{}", "a\\..\\..\\{}", "/{}"])
-def test_archives_that_lead_outside_are_refused(name, tmp_path):
-    archive_with(tmp_path, name)
-    with pytest.raises(SceneError, match="outside the folder"):
-        add_scene(tmp_path / "p/scenes.tsv", "a", tmp_path / "a.zip")
-    assert not list((tmp_path / "p").rglob("*.jpg"))
 
 
 def test_other_programs_gaussians_without_poses_are_named_but_not_used(tmp_path):

@@ -1,11 +1,17 @@
 """Phone exports: Polycam and Record3D, to the pixel."""
 
+import functools
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from hilsplat.base.errors import HilsplatError
+from hilsplat.photos.add import add_scene
+from hilsplat.scene.importers import phones
 from hilsplat.scene.importers.known_views import read_source
 from hilsplat.scene.layouts import find_known_poses
 from tests.imports import analytic_world as world
@@ -19,7 +25,7 @@ ARKIT = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 @pytest.fixture(autouse=True)
 def no_points(monkeypatch):
-    """Phone exports have no points; `test_importers.py` triangulates them."""
+    """Phone exports have no points; `test_colmap.py` triangulates them."""
     points = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     monkeypatch.setattr("hilsplat.scene.importers.importing.triangulate", lambda *args: points)
 
@@ -28,15 +34,17 @@ def phone_pose(pose):
     return ARKIT @ pose @ world.OPENGL
 
 
-def pictures(lenses):
-    return {
-        str(row): world.picture(world.pinhole(*lens), WIDTH, HEIGHT, pose)
-        for row, (lens, pose) in enumerate(zip(lenses, POSES, strict=True))
-    }
+@functools.cache
+def picture(row, lens):
+    return world.picture(world.pinhole(*lens), WIDTH, HEIGHT, POSES[row])
 
 
-def record3d(folder, lenses, **more):
-    world.save(folder / "rgb", pictures(lenses), ".png")
+def save_pictures(folder, lenses):
+    world.save(folder, {str(row): picture(row, lens) for row, lens in enumerate(lenses)}, ".png")
+
+
+def record3d(folder, lenses=LENSES, **more):
+    save_pictures(folder / "rgb", lenses)
     rows = []
     for pose in POSES:
         w, *xyz = world.quaternion(phone_pose(pose)[:3, :3])
@@ -50,7 +58,7 @@ def record3d(folder, lenses, **more):
 
 def polycam(folder, border_px=0, **more):
     prefix = "corrected_" if border_px else ""
-    world.save(folder / f"keyframes/{prefix}images", pictures(LENSES), ".png")
+    save_pictures(folder / f"keyframes/{prefix}images", LENSES)
     (folder / f"keyframes/{prefix}cameras").mkdir(parents=True)
     for row, (lens, pose) in enumerate(zip(LENSES, POSES, strict=True)):
         matrix = phone_pose(pose)
@@ -83,17 +91,13 @@ def test_polycam_s_pictures_are_right_with_and_without_their_border(tmp_path, im
     assert view.photo.size_hw == (HEIGHT, WIDTH)  # labels drawn on the picture with its border
 
 
-@pytest.mark.parametrize("missing", [("width",), ("width", "height")])
-def test_polycam_s_size_is_that_of_the_picture_if_it_is_missing(missing, tmp_path, imported):
-    folder = polycam(tmp_path / "in")
-    for path in (folder / "keyframes/cameras").iterdir():
-        content = json.loads(path.read_text())
-        path.write_text(json.dumps({key: value for key, value in content.items() if key not in missing}))
-    views, *_ = imported(folder)
-    world.require_right(views, RIGHT, 45)
+@pytest.mark.parametrize("missing", [{"width": None}, {"width": None, "height": None}])
+def test_polycam_s_size_is_that_of_the_picture_if_it_is_missing(missing, tmp_path):
+    source = read_source(find_known_poses(polycam(tmp_path, **missing)))
+    assert {(view.camera.width, view.camera.height) for view in source.views} == {(WIDTH, HEIGHT)}
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"t_00": 1}', '{"fx": null}'])
+@pytest.mark.parametrize("content", ["{", "[]", '{"t_00": 1}', '{"fx": null}'])
 def test_one_damaged_camera_of_polycam_leaves_out_its_view(content, tmp_path, imported):
     folder = polycam(tmp_path / "in")
     (folder / "keyframes/cameras/2.json").write_text(content)
@@ -110,31 +114,57 @@ def test_one_damaged_camera_of_polycam_leaves_out_its_view(content, tmp_path, im
         (record3d, {"distortion": [0.1, 0]}),
         (record3d, {"poses": [[1, 2, 3]]}),
         (record3d, {"K": [1, 2]}),
+        (record3d, {"K": None}),
         (record3d, {"w": "wide"}),
         (polycam, {"k1": 0.1}),
         (polycam, {"fx": -1}),
     ],
 )
 def test_what_cannot_be_applied_is_refused(write, more, tmp_path, imported):
-    folder = record3d(tmp_path, LENSES, **more) if write is record3d else polycam(tmp_path, **more)
     with pytest.raises(HilsplatError):
-        imported(folder)
+        imported(write(tmp_path, **more))
 
 
-def test_unknown_keys_are_reported(tmp_path):
-    folder = record3d(tmp_path / "r", LENSES, exposure=[1])
-    assert read_source(find_known_poses(folder)).notes == [
-        "keys of metadata.json that are not used: exposure"
-    ]
-    folder = polycam(tmp_path / "p", hdr=True)
-    assert read_source(find_known_poses(folder)).notes == ["keys of cameras that are not used: hdr"]
+@pytest.mark.parametrize(("write", "file"), [(record3d, "metadata.json"), (polycam, "cameras")])
+def test_unknown_keys_are_reported(write, file, tmp_path):
+    source = read_source(find_known_poses(write(tmp_path, hdr=True)))
+    assert source.notes == [f"keys of {file} that are not used: hdr"]
 
 
-def test_a_quaternion_that_is_not_a_rotation_leaves_out_its_view(tmp_path, imported):
-    folder = record3d(tmp_path / "in", LENSES[:1] * 6)
+def test_a_quaternion_that_is_not_a_rotation_leaves_out_its_view(tmp_path):
+    folder = record3d(tmp_path)
     path = folder / "metadata.json"
     content = json.loads(path.read_text())
     content["poses"][1][:4] = [0.5, 0.5, 0.5, 0.9]
     path.write_text(json.dumps(content))
-    views, _, _, report = imported(folder)
-    assert len(views) == 5 and not report["views"]["1.png"]["registered"]
+    source = read_source(find_known_poses(folder))
+    assert len(source.views) == 5 and "pose 1: the pose is not a rotation" in source.left_out["1.png"]
+
+
+def test_corrected_pictures_of_polycam_come_first_and_their_border_scales(tmp_path, imported):
+    polycam(tmp_path / "in")
+    images = polycam(tmp_path / "in", border_px=15) / "keyframes/corrected_images"
+    for path in images.iterdir():
+        Image.open(path).resize((2 * WIDTH, 2 * HEIGHT)).save(path)
+    (view, *_), *_ = imported(tmp_path / "in")
+    fx, fy, cx, cy = LENSES[0]
+    right = [[2 * fx, 0, 2 * cx - 30], [0, 2 * fy, 2 * cy - 30], [0, 0, 1]]
+    np.testing.assert_allclose(view.camera.calibration_matrix(), right)
+    assert (view.camera.width, view.camera.height) == (2 * WIDTH - 60, 2 * HEIGHT - 60)
+
+
+def test_long_recordings_are_thinned_evenly(tmp_path, monkeypatch):
+    monkeypatch.setattr(phones, "MAX_VIEWS", 4)
+    source = read_source(find_known_poses(record3d(tmp_path)))
+    assert [view.name for view in source.views] == ["0.png", "2.png", "3.png", "5.png"]
+
+
+def test_an_r3d_archive_is_unpacked_without_depth_maps(tmp_path):
+    folder = record3d(tmp_path / "in")
+    (folder / "metadata.json").rename(folder / "metadata")
+    (folder / "rgb").rename(folder / "rgbd")
+    (folder / "rgbd/0.depth").touch()
+    Path(shutil.make_archive(tmp_path / "scan", "zip", folder)).rename(tmp_path / "scan.r3d")
+    assert add_scene(tmp_path / "scenes.tsv", "scan", tmp_path / "scan.r3d").num_readable == 6
+    assert find_known_poses(tmp_path / "photos/scan").kind == "record3d"
+    assert not list((tmp_path / "photos/scan").rglob("*.depth"))

@@ -4,32 +4,17 @@ import io
 import struct
 
 import numpy as np
-import pillow_heif
 import pytest
-from PIL import Image, ImageCms
+from PIL import Image
 
 from hilsplat.base.images import read_image, read_mask
 from tests.conftest import PROJECT
 from tests.imports import analytic_world as world
+from tests.unit.base.test_image_formats import red_and_green_swapped
 
 WIDTH, HEIGHT = 96, 72
 POSES = world.cameras(4)
 PICTURES = [world.picture(world.pinhole(80, 80, 48, 36), WIDTH, HEIGHT, pose) for pose in POSES]
-
-
-def swapped_profile():
-    """sRGB's profile with the primaries of red and green exchanged, so that its effect is known exactly."""
-    raw = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
-    tags = {}
-    for row in range(int.from_bytes(raw[128:132], "big")):
-        name, offset, _ = struct.unpack(">4sII", raw[132 + 12 * row : 144 + 12 * row])
-        tags[name] = offset
-    red, green = tags[b"rXYZ"], tags[b"gXYZ"]
-    raw[red : red + 20], raw[green : green + 20] = raw[green : green + 20], raw[red : red + 20]
-    return bytes(raw)
-
-
-SWAPPED = swapped_profile()
 
 
 def exif(orientation):
@@ -46,41 +31,25 @@ def half_transparent(pixels):
     return np.dstack([pixels, np.full(pixels.shape[:2], 128, np.uint8)])
 
 
-FORMS = {  # suffix, the stored picture, how it is saved, and what it must become
-    "plain": (".png", lambda px: Image.fromarray(px), {}, lambda px: px),
-    "profile": (
-        ".png",
-        lambda px: Image.fromarray(px),
-        {"icc_profile": SWAPPED},
-        lambda px: px[..., [1, 0, 2]],
-    ),
-    "16-bit grey": (
-        ".png",
-        lambda px: Image.fromarray(grey16(px)),
-        {},
-        lambda px: np.repeat((grey16(px)[..., None] / 257).round().astype(np.uint8), 3, axis=2),
-    ),
-    "alpha": (".png", lambda px: Image.fromarray(half_transparent(px)), {}, lambda px: px),
-    "profile and alpha": (
-        ".png",
-        lambda px: Image.fromarray(half_transparent(px)),
-        {"icc_profile": SWAPPED},
-        lambda px: px[..., [1, 0, 2]],
-    ),
-    "CMYK": (".tif", lambda px: Image.fromarray(px).convert("CMYK"), {}, lambda px: px),
-    "grey": (
-        ".png",
-        lambda px: Image.fromarray(px[..., 0]),
-        {},
-        lambda px: np.repeat(px[..., :1], 3, axis=2),
-    ),
+def grey(pixels):
+    return np.repeat(pixels[..., None], 3, axis=2)
+
+
+def swapped(pixels):
+    return pixels[..., [1, 0, 2]]
+
+
+FORMS = {  # suffix, what is stored, how it is saved, and what it must become (more: `test_image_formats.py`)
+    "16-bit grey": (".png", grey16, {}, lambda px: grey((grey16(px) / 257).round().astype(np.uint8))),
+    "profile and alpha": (".png", half_transparent, {"icc_profile": red_and_green_swapped()}, swapped),
     "grey with a profile of colours": (
         ".png",
-        lambda px: Image.fromarray(px[..., 0]),
-        {"icc_profile": SWAPPED},
-        lambda px: np.repeat(px[..., :1], 3, axis=2),
+        lambda px: px[..., 0],
+        {"icc_profile": red_and_green_swapped()},
+        lambda px: grey(px[..., 0]),
     ),
-    "lossless WebP": (".webp", lambda px: Image.fromarray(px), {"lossless": True}, lambda px: px),
+    "TIFF": (".tif", lambda px: px, {}, lambda px: px),
+    "lossless WebP": (".webp", lambda px: px, {"lossless": True}, lambda px: px),
 }
 
 
@@ -91,7 +60,7 @@ def test_turned_photographs_with_known_poses_have_the_pixels_of_the_others(form,
     folder = tmp_path / "in/images"
     folder.mkdir(parents=True)
     for number, (pixels, turn) in enumerate(zip(PICTURES, (1, 6, 3, 8), strict=True)):
-        stored(pixels).save(folder / f"{number}{suffix}", exif=exif(turn), **options)
+        Image.fromarray(stored(pixels)).save(folder / f"{number}{suffix}", exif=exif(turn), **options)
     images = {f"{number}{suffix}": pose for number, pose in enumerate(POSES)}
     world.write_colmap(tmp_path / "in/sparse/0", "PINHOLE 80 80 48 36", (WIDTH, HEIGHT), images)
     views, *_ = imported(tmp_path / "in")
@@ -175,13 +144,6 @@ def test_unknown_orientations_do_not_turn(value, tmp_path):
     tags = tiff((0x0112, 8, 1, struct.pack("<hh", value, 0)))
     Image.fromarray(PICTURES[0]).save(tmp_path / "a.png", exif=b"Exif\0\0" + tags)
     np.testing.assert_array_equal(read_image(tmp_path / "a.png"), PICTURES[0])
-
-
-def test_heif_is_upright_by_its_container(tmp_path):
-    pillow_heif.register_heif_opener()
-    Image.fromarray(PICTURES[0]).save(tmp_path / "a.heic", quality=90, exif=exif(6))
-    found = read_image(tmp_path / "a.heic")
-    assert found.shape == (WIDTH, HEIGHT, 3) and world.psnr(found, np.rot90(PICTURES[0], -1)) > 25
 
 
 def test_pictures_are_opened_in_one_place():

@@ -24,54 +24,46 @@ def found(folder):
     return [path.relative_to(folder).as_posix() for path in trained_gaussians(folder)]
 
 
-def iterations(model, *names):
-    return [f"{model}point_cloud/iteration_{name}/point_cloud.ply" for name in names]
+def iteration(model, name):
+    return f"{model}point_cloud/iteration_{name}/point_cloud.ply"
 
 
 @pytest.mark.parametrize("model", ["output/a/", "output/", "a/", ""])
 def test_most_steps_are_first_and_names_without_a_number_last(tmp_path, model):
     names = ("best", "7000", "30000", "30000_old", "30000 (copy)", "", "100000")
-    write(tmp_path, *iterations(model, *names))
+    write(tmp_path, *(iteration(model, name) for name in names))
     order = found(tmp_path)
-    assert order[:3] == iterations(model, "100000", "30000", "7000")
-    assert sorted(order[3:]) == sorted(iterations(model, "best", "30000_old", "30000 (copy)", ""))
+    assert order[:3] == [iteration(model, name) for name in ("100000", "30000", "7000")]
+    assert len(order) == len(names)
 
 
-def test_a_name_without_a_number_is_used_if_it_is_the_only_one(tmp_path):
-    write(tmp_path, "exports/splat/splat.ply", *iterations("output/x/", "best"))
-    assert found(tmp_path) == [*iterations("output/x/", "best"), "exports/splat/splat.ply"]
-
-
-def test_of_equal_steps_the_newest_is_first(tmp_path):
-    for model, day in (("a", 1), ("c", 3), ("b", 2)):
-        write(tmp_path, *iterations(f"output/{model}/", "30000"), at=f"2026-01-0{day}_120000")
-    write(tmp_path, *iterations("output/d/", "7000"), at="2026-01-05_120000")
-    assert found(tmp_path) == [
-        *(iterations(f"output/{m}/", "30000")[0] for m in "cba"),
-        *iterations("output/d/", "7000"),
-    ]
+@pytest.mark.parametrize(
+    "files",  # the first is preferred
+    [
+        [(iteration("output/x/", "best"), "01-01"), ("exports/splat/splat.ply", "01-01")],
+        [
+            (iteration("output/c/", "30000"), "01-03"),
+            (iteration("output/b/", "30000"), "01-02"),
+            (iteration("output/a/", "30000"), "01-01"),
+            (iteration("output/d/", "7000"), "01-05"),
+        ],
+        [("exports/b/splat.ply", "01-09"), ("exports/a/splat.ply", "01-01")],
+        [("exports/a/splat.ply", "01-09"), ("exports/b/splat.ply", "01-01")],
+        # The time in the name precedes that of the copy.
+        [("exports/2026-04-01_120000/splat.ply", "05-01"), ("exports/2026-03-01_120000/splat.ply", "05-02")],
+    ],
+)
+def test_3dgs_is_before_exports_and_of_equals_the_newest_is_first(tmp_path, files):
+    for name, day in files:
+        write(tmp_path, name, at=f"2026-{day}_120000")
+    assert found(tmp_path) == [name for name, _ in files]
 
 
 def test_links_and_folders_of_that_name_are_passed_over(tmp_path):
-    (tmp_path / iterations("output/a/", "9")[0]).mkdir(parents=True)
+    (tmp_path / iteration("output/a/", "9")).mkdir(parents=True)
     (tmp_path / "exports/b").mkdir(parents=True)
     (tmp_path / "exports/b/splat.ply").symlink_to(tmp_path / "gone.ply")
     assert found(tmp_path) == []
-
-
-@pytest.mark.parametrize("latest", ["a", "b", "c"])
-def test_the_latest_export_is_first(tmp_path, latest):
-    for name in "abc":
-        day = 9 if name == latest else 1
-        write(tmp_path, f"exports/{name}/splat.ply", at=f"2026-01-0{day}_120000")
-    assert found(tmp_path)[0] == f"exports/{latest}/splat.ply"
-    assert len(found(tmp_path)) == 3
-
-
-def test_a_timestamp_in_the_name_of_an_export_precedes_that_of_the_copy(tmp_path):
-    write(tmp_path, "exports/2026-03-01_120000/splat.ply", at="2026-05-01_120000")
-    write(tmp_path, "exports/2026-04-01_120000/splat.ply", at="2026-05-01_110000")
-    assert found(tmp_path)[0] == "exports/2026-04-01_120000/splat.ply"
 
 
 def runs(folder, *names):
@@ -116,6 +108,6 @@ def test_a_run_is_named_by_the_folder_around_its_export(tmp_path):
     ):
         write(tmp_path, ply, at="2026-03-01_000000")
         assert run_of(tmp_path, ply) == first
-    write(tmp_path, *iterations("output/a/", "30000"))
-    assert run_of(tmp_path, *iterations("output/a/", "30000")) is None
+    write(tmp_path, iteration("output/a/", "30000"))
+    assert run_of(tmp_path, iteration("output/a/", "30000")) is None
     assert run_of(tmp_path, "exports/gone/splat.ply") == second

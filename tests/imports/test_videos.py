@@ -11,6 +11,7 @@ from PIL import Image
 
 from hilsplat.base.errors import SceneError
 from hilsplat.photos.video import extract_frames
+from tests.imports import analytic_world as world
 
 HEIGHT = 96
 
@@ -56,21 +57,21 @@ def extracted(path, count=2):
     return np.asarray(Image.open(folder / "0001.jpg")), notes
 
 
-def psnr(found, expected):
-    assert found.shape == expected.shape
-    return 10 * np.log10(255**2 / np.square(found.astype(float) - expected).mean())
-
-
 @pytest.mark.parametrize("suffix", ["mp4", "mov", "mkv"])
-@pytest.mark.parametrize(("rotation", "turns"), [(0, 0), (90, 1), (-90, 3), (180, 2)])
 @pytest.mark.parametrize(
-    ("width", "aspect", "shown"),
-    [(144, (4, 3), 192), (144, (16, 15), 154), (128, (3, 4), 96), (128, (1, 1), 128), (64, (2, 1), 128)],
+    ("width", "aspect", "shown", "rotation", "turns"),
+    [
+        (144, (4, 3), 192, 0, 0),
+        (144, (16, 15), 154, 90, 1),
+        (128, (3, 4), 96, -90, 3),
+        (128, (1, 1), 128, 180, 2),
+        (64, (2, 1), 128, 90, 1),
+    ],
 )
 def test_frames_are_stretched_to_square_pixels(tmp_path, suffix, rotation, turns, width, aspect, shown):
     stream = {"size": (HEIGHT, width), "aspect": Fraction(*aspect), "rotation": rotation}
     found, notes = extracted(write(tmp_path / f"a.{suffix}", stream))
-    assert psnr(found, np.rot90(picture((HEIGHT, shown)), turns)) > 38  # lossy: x264, 4:2:0 and JPEG
+    assert world.psnr(found, np.rot90(picture((HEIGHT, shown)), turns)) > 38  # lossy: x264, 4:2:0 and JPEG
     assert notes == [] or "too similar" in notes[0]
 
 
@@ -104,8 +105,8 @@ STREAMS = {
 @pytest.mark.parametrize("case", STREAMS)
 def test_the_best_stream_is_used_and_others_are_reported(tmp_path, case, suffix):
     found, notes = extracted(write(tmp_path / f"a.{suffix}", *STREAMS[case]))
-    assert psnr(found, picture(MAIN["size"], MAIN["turn"])) > 35
-    assert psnr(found, picture(MAIN["size"])) < 20  # the others' picture
+    assert world.psnr(found, picture(MAIN["size"], MAIN["turn"])) > 35
+    assert world.psnr(found, picture(MAIN["size"])) < 20  # the others' picture
     assert f"a.{suffix}: video stream" in notes[0] and "128 x 96 px" in notes[0]
     assert notes[0].endswith(f"of {len(STREAMS[case])}")
 
@@ -114,12 +115,12 @@ def test_equal_streams_are_ranked_by_the_container(tmp_path):
     first, second = ({**MAIN, "turn": turn} for turn in (0.0, 1.5))
     streams = [{**first, "disposition": Disposition(0)}, {**second, "disposition": Disposition.default}]
     found, _ = extracted(write(tmp_path / "a.mkv", *streams))
-    assert psnr(found, picture(MAIN["size"], 1.5)) > 35
+    assert world.psnr(found, picture(MAIN["size"], 1.5)) > 35
 
 
 def test_a_video_of_motion_jpeg_is_read(tmp_path):
     found, notes = extracted(write(tmp_path / "a.avi", {**THUMBNAILS, "options": {"qscale": "1"}}))
-    assert psnr(found, picture(THUMBNAILS["size"])) > 30
+    assert world.psnr(found, picture(THUMBNAILS["size"])) > 30
     assert not any("stream" in note for note in notes)
 
 
@@ -159,7 +160,7 @@ def test_interlaced_video_is_reported(tmp_path):
 def test_pixel_formats_keep_their_colours(tmp_path, codec, form, suffix):
     stream = {"size": (HEIGHT, 128), "codec": codec, "format": form, "options": {}}
     found, _ = extracted(write(tmp_path / f"a.{suffix}", stream))
-    assert psnr(found, picture((HEIGHT, 128))) > 35
+    assert world.psnr(found, picture((HEIGHT, 128))) > 35
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,6 @@ class Lens(NamedTuple):
     params: tuple[float, ...]
 
     def camera(self) -> pycolmap.Camera:
-        """Return pycolmap's camera."""
         return pycolmap.Camera(
             model=self.model, width=self.width, height=self.height, params=list(self.params)
         )
@@ -70,7 +69,6 @@ class ColmapModel:
 def read_model(folder: Path) -> ColmapModel:
     """Read a model; raise SceneError with file and record or line if a file is damaged."""
     cameras, images, *points = model_files(folder)
-    rows: list[tuple[float, ...]] = []
     if cameras.suffix == ".bin":
         lenses, records = _binary(cameras, _binary_lens), _binary(images, _binary_image)
         rows = _binary(points[0], _binary_point) if points else []
@@ -111,16 +109,16 @@ class _Bytes:
 
     def take(self, form: str) -> tuple[Any, ...]:
         """Read numbers laid out as `form`; raise struct.error past the end."""
-        found = struct.unpack_from(f"<{form}", self.data, self.at)
+        numbers = struct.unpack_from(f"<{form}", self.data, self.at)
         self.at += struct.calcsize(f"<{form}")
-        return found
+        return numbers
 
     def name(self) -> str:
         """Read a name that ends with a zero byte."""
         end = self.data.index(b"\0", self.at)
-        found = self.data[self.at : end].decode("utf-8", "surrogateescape")
+        name = self.data[self.at : end].decode("utf-8", "surrogateescape")
         self.at = end + 1
-        return found
+        return name
 
     def skip(self, count: int) -> int:
         """Pass over bytes, and return where they begin; raise struct.error past the end."""
@@ -144,8 +142,8 @@ def _binary(path: Path, record: Callable[[_Bytes], Row]) -> list[Row]:
             except (struct.error, ValueError) as error:
                 reason = "it ends" if isinstance(error, struct.error) else f"{error}"
                 raise ValueError(f"{reason} within record {number + 1} of {count}") from error
-        if rest := len(data.data) - data.at:
-            raise ValueError(f"{rest} bytes follow its {count} records")
+        if num_more := len(data.data) - data.at:
+            raise ValueError(f"{num_more} bytes follow its {count} records")
     return rows
 
 
@@ -199,9 +197,7 @@ def _text_lens(line: str) -> tuple[int, Lens] | None:
     if not line:
         return None
     number, model, width, height, *params = line.split()
-    model_id = (
-        int(pycolmap.CameraModelId.__members__[model]) if model in pycolmap.CameraModelId.__members__ else -1
-    )
+    model_id = int(pycolmap.CameraModelId.__members__.get(model, pycolmap.CameraModelId.INVALID))
     if model_id < 0 or len(params) != PARAMETERS[model_id] or "_" in "".join(params):
         raise ValueError
     return int(number), Lens(model, int(width), int(height), tuple(map(float, params)))

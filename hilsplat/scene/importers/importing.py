@@ -23,7 +23,7 @@ from hilsplat.base.progress import track
 from hilsplat.scene.assemble import Posed, PosedView, photo_of, split_views, undistort
 from hilsplat.scene.colmap import Points, pycolmap, sparse_points
 from hilsplat.scene.features import find_matches, incremental_options
-from hilsplat.scene.importers.known_views import ASPECT_TOLERANCE, KnownView, read_source
+from hilsplat.scene.importers.known_views import ASPECT_TOLERANCE, KnownView, Source, read_source
 from hilsplat.scene.layouts import KnownPoses
 from hilsplat.scene.view_names import view_names
 from hilsplat.settings import PosesSettings
@@ -36,66 +36,42 @@ def import_poses(
 
     Images are matched to poses by name; the report lists poses without an image and images without a pose.
     Pixels are used as stored, because COLMAP ignores the EXIF orientation. The source's axes are kept.
-
-    Raises:
-        SceneError: the model or transforms file cannot be used.
-        RegistrationError: too few of the source's views have an image.
     """
-    source, least = read_source(known), settings.min_registered_share
-    points, left_out = source.points, dict(source.left_out)
-    source.require_most(least, known.files[0])
-    missing = sorted(view.name for view in source.views if view.image is None)
-    total = len(source.views) + len(left_out)
+    source, min_share = read_source(known), settings.min_registered_share
+    source.require_most(min_share, known.files[0])
+    total = len(source.views) + len(source.left_out)
     if total == 0:
         raise SceneError(f"{known.files[0]} of {name} contains no posed views", fix="export it again")
+    missing = sorted(view.name for view in source.views if view.image is None)
+    with_image = [view for view in source.views if view.image is not None]
     files = [view.image for view in source.views if view.image is not None]
-    used = set(files)
-    named = list(
-        zip([view for view in source.views if view.image is not None], view_names(files), strict=True)
-    )
-    views, present = [], []
-    for view, view_name in track(named, "images read"):
+    posed: list[tuple[KnownView, PosedView]] = []
+    for view, view_name in track([*zip(with_image, view_names(files), strict=True)], "images read"):
         try:
-            taken = _with_pixels(view, view_name, work / "images", settings.max_side_px)
-            views.append(undistort(taken, work / "pinhole", settings.max_side_px))
-            present.append(view)
+            distorted = _with_pixels(view, view_name, work / "images", settings.max_side_px)
+            posed.append((view, undistort(distorted, work / "pinhole", settings.max_side_px)))
         except ImageError as error:
-            left_out[view.name] = in_one_line(error)
-    if not views or len(views) < least * total:
+            source.leave_out(view.name, in_one_line(error))
+    if not posed or len(posed) < min_share * total:
         more = [f"and {len(missing) - 20} more"] if len(missing) > 20 else []
-        found = f"{len(views)}; missing: {', '.join([*missing[:20], *more]) or 'none'}"
-        found += "".join(f"\n            left out: {reason}" for reason in [*left_out.values()][:3])
+        found = f"{len(posed)}; missing: {', '.join([*missing[:20], *more]) or 'none'}"
+        found += "".join(f"\n            left out: {reason}" for reason in [*source.left_out.values()][:3])
         raise RegistrationError(
             f"too few posed views of {name} have an image in {known.root}",
-            expected=f"at least {least:.0%} of {total} (poses.min_registered_share)",
+            expected=f"at least {min_share:.0%} of {total} (poses.min_registered_share)",
             found=found,
             fix="put the images where the pose file expects them: in this folder or its images/ folder",
         )
-    origin_of_points = "source"
-    warnings = [*source.notes, *(f"left out: {reason}" for reason in left_out.values())]
+    views = [view for _, view in posed]
+    points = source.points or triangulate(views, work, settings, seed, threads)
+    beside = known.root / "images"
+    images = list_images(beside) if known.kind == "colmap" and beside.is_dir() else []
+    unposed = [path.name for path in images if path not in files]
+    warnings = [*source.notes, *(f"left out: {reason}" for reason in source.left_out.values())]
     if missing:
         warnings.append(f"{len(missing)} of {total} posed views have no image file")
-    if points is None:
-        points = triangulate(views, work, settings, seed, threads)
-        origin_of_points = "triangulated from the known poses"
-    beside = known.root / "images"
-    others = list_images(beside) if known.kind == "colmap" and beside.is_dir() else []
-    unposed = [path for path in others if path not in used]
     if unposed:
         warnings.append(f"{len(unposed)} images have no pose and are skipped")
-    entries: dict[str, Any] = {}
-    for known_view, posed in zip(present, views, strict=True):
-        entries[posed.view] = {"file": Path(known_view.name).name, "registered": True, **known_view.report}
-    for lost, reason in left_out.items():
-        entries[lost] = {"file": lost, "registered": False, "why_not": reason}
-    for gone in missing:
-        entries[gone] = {"file": gone, "registered": False, "why_not": "its image file is missing"}
-    for path in unposed:
-        lacks = {"file": path.name, "registered": False, "why_not": "the source has no pose for it"}
-        entries.setdefault(path.name, lacks)
-    observed = [view.report for view in source.views if view.report.get("observations")]
-    num_observations = sum(entry["observations"] for entry in observed)
-    total_error = sum(entry["observations"] * entry["reprojection_error_px"] for entry in observed)
     origin = ", ".join(
         path.relative_to(known.root).as_posix() if path.is_relative_to(known.root) else path.name
         for path in known.files
@@ -108,20 +84,41 @@ def import_poses(
         "registered": len(views),
         "models": [len(views)],
         "points": len(points[0]),
-        "points_from": origin_of_points,
+        "points_from": "source" if source.points is not None else "triangulated from the known poses",
         "points_per_view": round(len(points[0]) / len(views), 1),
-        "mean_reprojection_error_px": round(total_error / num_observations, 4) if num_observations else None,
+        "mean_reprojection_error_px": _mean_error_px(source),
         "warnings": warnings,
-        "views": entries,
+        "views": _view_entries(posed, source, missing, unposed),
     }
     names = [view.view for view in views]
-    trained = {path.stem for path in (known.root / "images_train").glob("*")}  # of Gaussian Grouping's data
-    held_out = [view.is_test or (bool(trained) and Path(view.name).stem not in trained) for view in present]
+    train = {path.stem for path in (known.root / "images_train").glob("*")}  # of Gaussian Grouping's data
+    held_out = [view.is_test or (bool(train) and Path(view.name).stem not in train) for view, _ in posed]
     if any(held_out):  # the source has its own split
         split = {view: "test" if is_test else "train" for view, is_test in zip(names, held_out, strict=True)}
     else:
         split = split_views(names, settings.test_every)
     return views, points, split, report
+
+
+def _mean_error_px(source: Source) -> float | None:
+    observed = [view.report for view in source.views if view.report.get("observations")]
+    num_observations = sum(entry["observations"] for entry in observed)
+    total = sum(entry["observations"] * entry["reprojection_error_px"] for entry in observed)
+    return round(total / num_observations, 4) if num_observations else None
+
+
+def _view_entries(
+    posed: Sequence[tuple[KnownView, PosedView]], source: Source, missing: list[str], unposed: list[str]
+) -> dict[str, dict[str, Any]]:
+    """Return the report on each view; `missing` views have no image, and `unposed` images no view."""
+    entries: dict[str, dict[str, Any]] = {}
+    for described, view in posed:
+        entries[view.view] = {"file": Path(described.name).name, "registered": True, **described.report}
+    reasons = source.left_out | dict.fromkeys(missing, "its image file is missing")
+    reasons |= {file: "the source has no pose for it" for file in unposed if file not in reasons}
+    for file, reason in reasons.items():
+        entries.setdefault(file, {"file": file, "registered": False, "why_not": reason})
+    return entries
 
 
 def _with_pixels(view: KnownView, view_name: str, folder: Path, max_side_px: int) -> PosedView:

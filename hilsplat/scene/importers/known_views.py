@@ -1,5 +1,6 @@
 """Posed views as other programs describe them: what is read, what is left out, and why."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,7 +9,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from hilsplat.base.artifacts import visible_files
 from hilsplat.base.errors import HilsplatError, SceneError, foreign, in_one_line
 from hilsplat.base.files import IMAGE_SUFFIXES, is_outside, list_images
 from hilsplat.base.images import opened_image
@@ -16,14 +16,14 @@ from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.cameras import MAX_SIDE_PX
 from hilsplat.scene.colmap import Points, pycolmap
 from hilsplat.scene.importers.colmap_model import ModelImage, read_model
-from hilsplat.scene.layouts import KnownPoses
+from hilsplat.scene.layouts import KnownPoses, images_below
 from hilsplat.scene.posed_images import rigid_pose
 from hilsplat.scene.view_names import match_names
 
 ASPECT_TOLERANCE = 0.01
 """Relative tolerance of an image's aspect ratio: a scaled copy is accepted, a different crop is not."""
 
-FARTHEST = 1e9
+MAX_COORDINATE = 1e9
 """Maximum coordinate, in the source's units; beyond it, 32-bit numbers are too coarse."""
 
 
@@ -81,16 +81,16 @@ class Source:
             name += " (again)"
         self.left_out[name] = reason
 
-    def require_most(self, least_share: float, files: object) -> None:
+    def require_most(self, min_share: float, files: object) -> None:
         """Raise SceneError if fewer than this share of the views can be used, with the first reasons."""
         total = len(self.views) + len(self.left_out)
-        if self.left_out and len(self.views) < max(1, least_share * total):
+        if self.left_out and len(self.views) < max(1, min_share * total):
             reasons = list(self.left_out.values())
-            rest = f"\n            and {len(reasons) - 3} more" if len(reasons) > 3 else ""
+            more = f"\n            and {len(reasons) - 3} more" if len(reasons) > 3 else ""
             raise SceneError(
                 f"{len(reasons)} of {total} views of {files} cannot be used",
-                expected=f"at least {least_share:.0%} of the views (poses.min_registered_share)",
-                found="\n            ".join(reasons[:3]) + rest,
+                expected=f"at least {min_share:.0%} of the views (poses.min_registered_share)",
+                found="\n            ".join(reasons[:3]) + more,
                 fix="export the poses again",
             )
 
@@ -111,18 +111,17 @@ class Keys:
 
     def check(self, objects: Iterable[Mapping[str, Any]], file: Path) -> list[str]:
         """Return a note about the keys of a file that are unknown; raise SceneError if one is refused."""
-        unknown: dict[str, None] = {}
+        unknown: set[str] = set()
         for content in objects:
-            for key in content.keys() - self.used - self.harmless:
-                if key in self.refused and np.any(content[key]):
+            for key in content.keys() & self.refused.keys():
+                if np.any(content[key]):
                     raise SceneError(
                         f"{file} describes {self.refused[key]}, which is not supported",
                         found=f"{key}: {str(content[key])[:60]}",
                         fix="export undistorted images of ordinary cameras",
                     )
-                unknown.setdefault(key)
-        names = sorted(key for key in unknown if key not in self.refused)
-        return [f"keys of {file.name} that are not used: {', '.join(names)}"] if names else []
+            unknown |= content.keys() - self.used - self.harmless - self.refused.keys()
+        return [f"keys of {file.name} that are not used: {', '.join(sorted(unknown))}"] if unknown else []
 
 
 def read_source(known: KnownPoses) -> Source:
@@ -150,16 +149,16 @@ def read_source(known: KnownPoses) -> Source:
         raise SceneError(
             f"all {len(poses)} views of {known.files[0]} have the same pose", fix="export it again"
         )
-    images = [view.image for view in source.views if view.image is not None]
-    for view in [view for view in source.views if view.image is not None and images.count(view.image) > 1]:
+    num_views = Counter(view.image for view in source.views)
+    for view in [view for view in source.views if view.image is not None and num_views[view.image] > 1]:
         source.views.remove(view)
         source.leave_out(view.name, f"view {view.name}: other views have the same image {view.image}")
     source.notes += [f"{other} also has poses, which are not used" for other in known.others]
     if source.points is not None:
         xyz, rgb = source.points
         is_finite = np.isfinite(xyz).all(axis=1)
-        if bad := int((~is_finite).sum()):
-            source.notes.append(f"{bad} of {len(xyz)} points are not finite and are left out")
+        if num_lost := int((~is_finite).sum()):
+            source.notes.append(f"{num_lost} of {len(xyz)} points are not finite and are left out")
         # Without points, they are triangulated.
         source.points = (xyz[is_finite], rgb[is_finite]) if is_finite.any() else None
     return source
@@ -180,8 +179,9 @@ def require_valid(view: KnownView) -> None:
     elif not np.isfinite(pose).all() or not are_rotations(pose[:3, :3], RIGID_TOLERANCE):
         fault, found = "rotation", np.array2string(pose[:3, :3], precision=4).replace("\n", "")
         expected = "a matrix that neither scales nor mirrors, or a quaternion of length 1"
-    elif np.abs(pose[:3, 3]).max() > FARTHEST:
-        fault, found, expected = "position", str(pose[:3, 3].tolist()), f"coordinates up to {FARTHEST:g}"
+    elif np.abs(pose[:3, 3]).max() > MAX_COORDINATE:
+        fault, found = "position", str(pose[:3, 3].tolist())
+        expected = f"coordinates up to {MAX_COORDINATE:g}"
     else:
         return
     raise SceneError(f"the camera {fault} of view {view.name} is not valid", expected=expected, found=found)
@@ -202,25 +202,20 @@ def find_images(root: Path, names: Sequence[str]) -> dict[str, Path | None]:
     Raises:
         SceneError: a path leads outside the folder, which has no such image.
     """
-    found: dict[str, Path | None] = {}
+    bases, ends = (root / "images", root), ("", *sorted(IMAGE_SUFFIXES))
+    images: dict[str, Path | None] = {}
     for name in names:
         plain = name.replace("\\", "/")
-        is_inside = not is_outside(name)
-        places = [
-            base / f"{plain}{end}"
-            for base in (root / "images", root)
-            for end in ("", *sorted(IMAGE_SUFFIXES))
-        ]
-        found[name] = next((place for place in places if place.is_file()), None) if is_inside else None
-    if missing := [name for name, image in found.items() if image is None]:
-        images = (path for path in visible_files(root) if path.suffix.lower() in IMAGE_SUFFIXES)
-        below = {path.relative_to(root).as_posix(): path for path in images}
-        matched = match_names(missing, below)
-        found |= {name: below[match] if (match := matched[name]) is not None else None for name in missing}
-    for name in missing:
-        if found[name] is None:
-            require_inside(root, name)
-    return found
+        paths = [] if is_outside(name) else [base / f"{plain}{end}" for base in bases for end in ends]
+        images[name] = next((path for path in paths if path.is_file()), None)
+    if missing := [name for name, image in images.items() if image is None]:
+        below = {path.relative_to(root).as_posix(): path for path in images_below(root)}
+        for name, match in match_names(missing, below).items():
+            if match is None:
+                require_inside(root, name)
+            else:
+                images[name] = below[match]
+    return images
 
 
 def require_inside(root: Path, name: str) -> None:

@@ -94,8 +94,8 @@ def read_record3d(known: KnownPoses) -> Source:
         width, height = int(content["w"]), int(content["h"])
         rows = np.array(content["poses"], dtype=np.float64).reshape(-1, 7)
         lenses = np.tile([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], (len(rows), 1))
-        if (own := content.get("perFrameIntrinsicCoeffs")) is not None:
-            lenses = np.array(own, dtype=np.float64)
+        if (coefficients := content.get("perFrameIntrinsicCoeffs")) is not None:
+            lenses = np.array(coefficients, dtype=np.float64)
             if lenses.shape != (len(rows), 4):
                 raise ValueError(f"perFrameIntrinsicCoeffs has shape {lenses.shape}, but {len(rows)} poses")
     images = {int(path.stem): path for path in list_images(folder) if path.stem.isdigit()}

@@ -26,6 +26,7 @@ from hilsplat.scene.posed_images import OPENGL_TO_OPENCV, rigid_pose
 from hilsplat.scene.view_names import match_names
 
 FOCAL = {axis: (f"fl_{axis}", f"camera_angle_{axis}", f"{axis}_fov") for axis in "xy"}
+FOCAL_KEYS = frozenset((*FOCAL["x"], *FOCAL["y"]))
 """Keys of a focal length: px, field of view in radians, and in degrees."""
 
 FOCAL_TOLERANCE = 0.01
@@ -37,6 +38,9 @@ MODELS = dict.fromkeys(PERSPECTIVES, "OPENCV") | dict.fromkeys(FISHEYES, "OPENCV
 """COLMAP's lens model with the distortion coefficients of a `camera_model`."""
 
 COEFFICIENTS = {"OPENCV": ("k1", "k2", "p1", "p2", "k3"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4")}
+
+COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+"""Names of the columns with a point's colour."""
 
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 
@@ -56,7 +60,7 @@ REFUSED = {
     "k5 k6 p3 p4 s1 s2 s3 s4 b1 b2 distortion_params": "more lens distortion",
 }
 KEYS = Keys(
-    used={*USED.split(), *FOCAL["x"], *FOCAL["y"], *SPLITS},
+    used={*USED.split(), *FOCAL_KEYS, *SPLITS},
     harmless=set(HARMLESS.split()),
     refused={key: meaning for keys, meaning in REFUSED.items() for key in keys.split()},
 )
@@ -80,26 +84,16 @@ def read_transforms(known: KnownPoses) -> Source:
         source.notes += KEYS.check([content, *frames], file)
         names = [str(frame.get("file_path", f"frame {number}")) for number, frame in enumerate(frames)]
         images, held_out = find_images(known.root, names), _held_out(content, names, source.notes)
-        is_test = file.name != known.files[0].name and file.name in (
-            "transforms_test.json",
-            "transforms_val.json",
-        )
+        is_test = file != known.files[0]
         for number, (name, frame) in enumerate(zip(names, frames, strict=True)):
-            own = {axis: any(key in frame for key in FOCAL[axis]) for axis in "xy"}
-            shared = {
-                key: value
-                for key, value in content.items()
-                if not (own["x"] or own["y"]) or key not in (*FOCAL["x"], *FOCAL["y"])
-            }
-            where = f"{file}, frame {number} ({name})"
-            merged = {**shared, **frame}
-            source.add(
-                name, _view, where, merged, name, images[name], is_test or name in held_out, source.notes
-            )
+            replaced = FOCAL_KEYS if FOCAL_KEYS & frame.keys() else frozenset()
+            merged = {key: value for key, value in content.items() if key not in replaced} | frame
+            where, is_held_out = f"{file}, frame {number} ({name})", is_test or name in held_out
+            source.add(name, _view, where, merged, name, images[name], is_held_out, source.notes)
         if source.points is None and content.get("ply_file_path") is not None:
-            place = str(content["ply_file_path"]).replace("\\", "/")
-            require_inside(file.parent, place)
-            source.points = read_ply_points(file.parent / place)
+            ply = str(content["ply_file_path"]).replace("\\", "/")
+            require_inside(file.parent, ply)
+            source.points = read_ply_points(file.parent / ply)
     source.notes = list(dict.fromkeys(source.notes))
     return source
 
@@ -108,14 +102,13 @@ def _held_out(content: Mapping[str, Any], names: list[str], notes: list[str]) ->
     """Return the frames that the file's lists of names keep from training."""
     listed: dict[str, set[str]] = {}
     for key in SPLITS:
-        value = [] if content.get(key) is None else content[key]
-        if not isinstance(value, list):
+        value = content.get(key)
+        if value is not None and not isinstance(value, list):
             notes.append(f"{key} is not a list of names, and is not used")
-            value = []
-        matched = match_names([str(name) for name in value], names)
-        listed[key] = {name for name in matched.values() if name is not None}
-        if lost := sum(name is None for name in matched.values()):
-            notes.append(f"{lost} names in {key} belong to no frame")
+        matches = match_names(map(str, value if isinstance(value, list) else []), names).values()
+        listed[key] = {name for name in matches if name is not None}
+        if num_lost := sum(name is None for name in matches):
+            notes.append(f"{num_lost} names in {key} belong to no frame")
     train, *others = (listed[key] for key in SPLITS)
     return set(names) - train if train else set().union(*others)
 
@@ -135,41 +128,37 @@ def _lens(where: str, frame: Mapping[str, Any], image: Path | None, notes: list[
     """Return the lens of a frame: PINHOLE, or with distortion OPENCV, FULL_OPENCV or OPENCV_FISHEYE."""
     with foreign(where, expected="finite numbers", fix="export it again"):
         stated = str(frame.get("camera_model", "OPENCV")).upper()
-        given = {key: value for key, value in frame.items() if value is not None}
-        if (fisheye := given.get("is_fisheye", False)) not in (True, False):
+        values = {key: value for key, value in frame.items() if value is not None}
+        if (fisheye := values.get("is_fisheye", False)) not in (True, False):
             raise ValueError(f"is_fisheye is {fisheye!r}, not true or false")
-        model = "OPENCV_FISHEYE" if fisheye else MODELS.get(stated)
-        values = {key: float(given.get(key, 0.0)) for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
-        rest = {
-            key: value
-            for key, value in values.items()
-            if value and key not in COEFFICIENTS.get(model or "", ())
-        }
-        if model is None or rest:
+        model = "OPENCV_FISHEYE" if fisheye else MODELS.get(stated, "")
+        bends = {key: float(values.get(key, 0.0)) for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
+        extra = {key: bend for key, bend in bends.items() if bend and key not in COEFFICIENTS.get(model, ())}
+        if not model or extra:
             raise SceneError(
-                f"{where}: lens {stated}{f' with {rest}' if rest else ''} is not supported",
+                f"{where}: lens {stated}{f' with {extra}' if extra else ''} is not supported",
                 expected="; ".join(f"{lens} with {' '.join(keys)}" for lens, keys in COEFFICIENTS.items()),
                 fix="undistort the images first",
             )
-        width, height = given.get("w"), given.get("h")
+        width, height = values.get("w"), values.get("h")
         if width is None or height is None:
             width, height = image_size(image) if image is not None else (2, 2)  # not used without an image
         width, height = int(width), int(height)
         focal = {
             axis: _focal(frame, axis, side, notes)
             for axis, side in (("x", width), ("y", height))
-            if given.keys() & FOCAL[axis]
+            if values.keys() & FOCAL[axis]
         }
         focal_x, focal_y = focal.get("x", focal.get("y")), focal.get("y", focal.get("x"))
         if not focal_x or not focal_y:
             expected = "fl_x (px), camera_angle_x (radians) or x_fov (degrees), or the same for y"
             raise SceneError(f"{where} has no focal length", expected=expected, fix="export it again")
         params = [focal_x, focal_y, float(frame.get("cx", width / 2)), float(frame.get("cy", height / 2))]
-        coefficients = [values[key] for key in COEFFICIENTS[model]]
-        if model == "OPENCV" and values["k3"]:
+        coefficients = [bends[key] for key in COEFFICIENTS[model]]
+        if model == "OPENCV" and bends["k3"]:
             model, coefficients = "FULL_OPENCV", [*coefficients, 0.0, 0.0, 0.0]
         elif model == "OPENCV":
-            model, coefficients = ("OPENCV", coefficients[:4]) if any(coefficients) else ("PINHOLE", [])
+            model, coefficients = (model, coefficients[:4]) if any(coefficients) else ("PINHOLE", [])
         return pycolmap.Camera(model=model, width=width, height=height, params=params + coefficients)
 
 
@@ -189,21 +178,17 @@ def _focal(frame: Mapping[str, Any], axis: str, side_px: int, notes: list[str]) 
 
 
 def read_ply_points(path: Path) -> Points:
-    """Read the points of a PLY file, and their colours: integers, or floats from 0 to 1; grey without any.
-
-    Colours may be named red, green, blue, or r, g, b, or have the prefix diffuse_.
-    """
+    """Read the points of a PLY file, and their colours: integers, or floats from 0 to 1; grey without any."""
     fix = "put the file there, or remove ply_file_path from the transforms file to triangulate points"
     with foreign(f"{path}, with the points,", fix=fix):
         vertex = read_ply(path)["vertex"].data
         xyz = np.stack([vertex[axis] for axis in ("x", "y", "z")], axis=1).astype(np.float64)
-        names = [("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue")]
-        found = next((each for each in names if set(each) <= set(vertex.dtype.names)), None)
-        if found is None:
+        names = next((names for names in COLOURS if set(names) <= set(vertex.dtype.names)), None)
+        if names is None:
             return xyz, np.full(xyz.shape, 128, dtype=np.uint8)
-        rgb = np.stack([vertex[name] for name in found], axis=1)
-        most = float(np.nanmax(rgb)) if rgb.size else 0.0
+        rgb = np.stack([vertex[name] for name in names], axis=1)
+        largest = float(np.nanmax(rgb)) if rgb.size else 0.0
         # Floats are usually in [0, 1]; 16-bit colours of laser scanners may use only 8 bits.
-        limit = 1 if rgb.dtype.kind == "f" and most <= 1 else 255 if most <= 255 else 65535
+        limit = 1 if rgb.dtype.kind == "f" and largest <= 1 else 255 if largest <= 255 else 65535
         rgb = np.nan_to_num(rgb.astype(np.float64) * (255 / limit), nan=128.0)
     return xyz, np.clip(np.rint(rgb), 0, 255).astype(np.uint8)

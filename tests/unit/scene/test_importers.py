@@ -1,22 +1,18 @@
-"""Known poses: COLMAP models, transforms.json and phone exports become the same scene, or are refused."""
+"""Scenes from COLMAP models, and exported scenes that are read back; `tests/imports` has all formats."""
 
 import json
 import shutil
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from hilsplat.base.errors import RegistrationError, SceneError
-from hilsplat.photos.add import add_scene
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.exporting import write_colmap as export_colmap
 from hilsplat.scene.exporting import write_nerfstudio
-from hilsplat.scene.importers import phones
 from hilsplat.scene.importers.colmap_model import read_model
-from hilsplat.scene.importers.known_views import KnownView, read_source, require_valid
 from hilsplat.scene.layouts import NO_POSES, find_known_poses
 from hilsplat.scene.poses import run_poses
 from hilsplat.scene.scene import Scene
@@ -53,9 +49,8 @@ def write_colmap(folder, suffix="bin"):
     (model.write_binary if suffix == "bin" else model.write_text)(folder / "sparse" / "0")
 
 
-@pytest.mark.parametrize("suffix", ["bin", "txt"])
-def test_colmap_model_keeps_intrinsics_and_metric_poses(tmp_path, suffix):
-    write_colmap(tmp_path / "in", suffix)
+def test_colmap_model_keeps_intrinsics_and_metric_poses(tmp_path):
+    write_colmap(tmp_path / "in")
     scene = import_scene(tmp_path / "in", tmp_path / "scene")
     assert scene.cameras.names == ("a.png", "b.png", "c.png")
     np.testing.assert_array_equal(scene.cameras["b.png"].K, [[50, 0, 19], [0, 51, 16], [0, 0, 1]])
@@ -131,58 +126,6 @@ def test_missing_poses_are_refused_and_none_ignores_those_in_the_folder(tmp_path
     assert find_known_poses(tmp_path / "in", NO_POSES) is None
 
 
-def write_transforms(folder, **more):
-    """Three cameras at (0, -3, x) of a z-up world; the first looks along +y."""
-    write_images(folder / "images", ["a.png", "b.png", "c.png"])
-    # OpenGL camera: x right = world x, y up = world z, z back = world -y
-    rotation = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    frames = []
-    for number, name in enumerate("abc"):
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation, [number - 1, -3, 0]
-        frames.append({"file_path": f"./images/{name}", "transform_matrix": pose.tolist()})
-    (folder / "transforms.json").write_text(json.dumps({**more, "frames": frames}))
-
-
-def test_transforms_are_turned_from_opengl_to_opencv_axes(tmp_path):
-    write_transforms(tmp_path / "in", camera_angle_x=2 * np.arctan(0.5))  # focal = 40 / 2 / 0.5 = 40 px
-    scene = import_scene(tmp_path / "in", tmp_path / "scene")
-    camera = scene.cameras["b.png"]
-    np.testing.assert_allclose(camera.K, [[40, 0, 20], [0, 40, 15], [0, 0, 1]])
-    # world +y is ahead (z), world +z is up (-y), world +x is right
-    np.testing.assert_allclose(camera.cam_from_world[:3, :3], [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-12)
-    offset = scene.scene_from_source[:3, 3]
-    np.testing.assert_allclose(camera.centre, offset + np.array([0, -3, 0]), atol=1e-9)
-    report = json.loads((tmp_path / "scene" / "registration.json").read_text())
-    assert report["points"] == len(scene.points_xyz) == 0  # nothing can be triangulated in flat images
-
-
-OUTSIDE = ("../secret", "images/../../secret", "/etc/secret")
-NOT_RIGID = [np.diag([*factors, 1]).tolist() for factors in ((1, 1, -1), (1.01, 1, 1), (np.nan, 1, 1))]
-FRAME = r"frame 1 \(\./images/b\), transform_matrix: the pose is not a rotation"
-
-
-@pytest.mark.parametrize(
-    ("more", "frame", "message"),
-    [
-        ({}, {}, "has no focal length"),
-        ({"fl_x": 40, "camera_model": "FISHEYE624"}, {}, "FISHEYE624 is not supported"),
-        ({"fl_x": 40, "ply_file_path": "gone.ply"}, {}, r"gone\.ply, with the points, cannot be read"),
-        *(({"fl_x": 40}, {"transform_matrix": pose}, FRAME) for pose in NOT_RIGID),
-        *(({"fl_x": 40}, {"file_path": name}, f"a file outside it: {name}") for name in OUTSIDE),
-        *(({"fl_x": 40, "ply_file_path": name}, {}, f"a file outside it: {name}") for name in OUTSIDE),
-    ],
-)
-def test_unusable_transforms_are_refused(tmp_path, more, frame, message):
-    write_transforms(tmp_path / "in", **more)
-    path = tmp_path / "in/transforms.json"
-    content = json.loads(path.read_text())
-    content["frames"][1] |= frame
-    path.write_text(json.dumps(content))
-    with pytest.raises(SceneError, match=message):
-        import_scene(tmp_path / "in", tmp_path / "scene")
-
-
 def test_a_colmap_model_cannot_name_files_outside_its_folder(tmp_path):
     write_colmap(tmp_path / "in", "txt")
     images = tmp_path / "in" / "sparse" / "0" / "images.txt"
@@ -193,89 +136,6 @@ def test_a_colmap_model_cannot_name_files_outside_its_folder(tmp_path):
     assert report["views"]["b.png"]["registered"]
     (tmp_path / "in/images/b.jpg").unlink()
     with pytest.raises(SceneError, match=r"outside it: \.\./\.\./\.\./b\.jpg"):
-        import_scene(tmp_path / "in", tmp_path / "scene")
-
-
-# ---- phone exports: the camera looks along world +z of ARKit, whose y is up ----------------------
-
-LOOKS_ALONG_Z = np.array([[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]])  # columns: right -x, up +y, back -z
-
-
-def write_polycam(folder, corrected=False, size_hw=(90, 120)):
-    prefix = "corrected_" if corrected else ""
-    images, cameras = (folder / "keyframes" / f"{prefix}{what}" for what in ("images", "cameras"))
-    write_images(images, [f"{number}.jpg" for number in range(4)], size_hw)
-    cameras.mkdir(parents=True)
-    for number in range(3):  # the last has no camera
-        matrix = np.column_stack([LOOKS_ALONG_Z, number * np.array([0.1, 0.2, 0.3])])
-        content = {f"t_{row}{column}": matrix[row, column] for row in range(3) for column in range(4)}
-        content |= {"fx": 100.0, "fy": 101.0, "cx": 61.0, "cy": 44.0, "width": 120, "height": 90}
-        (cameras / f"{number}.json").write_text(json.dumps(content))
-
-
-def test_corrected_polycam_images_come_first_and_lose_their_border(tmp_path):
-    write_polycam(tmp_path / "in", corrected=False, size_hw=(30, 40))
-    write_polycam(tmp_path / "in", corrected=True, size_hw=(180, 240))  # twice the camera's size
-    scene = import_scene(tmp_path / "in", tmp_path / "scene")
-    # doubled, less 15 px of the camera, which are 30 of the image, on each side
-    np.testing.assert_allclose(scene.cameras["0.png"].K, [[200, 0, 92], [0, 202, 58], [0, 0, 1]])
-    assert scene.image("0.png").shape == (120, 180, 3)
-
-
-def write_record3d(folder, metadata="metadata.json", images="rgb", count=3):
-    write_images(folder / images, [f"{number}.jpg" for number in range(count)], (90, 120))
-    # half a turn about y: quaternion (0, 1, 0, 0) in the order x, y, z, w
-    poses = [[0, 1, 0, 0, *(number * np.array([0.1, 0.2, 0.3]))] for number in range(count)]
-    intrinsics = [100.0, 0, 0, 0, 101.0, 0, 61.0, 44.0, 1]  # by columns
-    content = {"K": intrinsics, "w": 120, "h": 90, "fps": 60, "poses": poses}
-    (folder / metadata).write_text(json.dumps(content))
-
-
-@pytest.mark.parametrize("write", [write_polycam, write_record3d])
-def test_phone_exports_are_turned_to_z_up(tmp_path, write):
-    """x, y, z of ARKit are y, z, x here: the camera looks along +x, and z is up."""
-    write(tmp_path / "in")
-    cameras = import_scene(tmp_path / "in", tmp_path / "scene").cameras
-    assert cameras.names == ("0.png", "1.png", "2.png")
-    np.testing.assert_allclose(cameras["0.png"].K, [[100, 0, 61], [0, 101, 44], [0, 0, 1]])
-    ahead, down = cameras["1.png"].cam_from_world[[2, 1], :3]
-    np.testing.assert_allclose([ahead, down], [[1, 0, 0], [0, 0, -1]], atol=1e-9)
-    steps = cameras["2.png"].centre - cameras["1.png"].centre
-    np.testing.assert_allclose(steps, [0.3, 0.1, 0.2], atol=1e-6)  # ARKit (0.1, 0.2, 0.3), in metres
-
-
-def test_long_recordings_are_thinned_evenly(tmp_path, monkeypatch):
-    monkeypatch.setattr(phones, "MAX_VIEWS", 4)
-    write_record3d(tmp_path, count=10)
-    source = read_source(find_known_poses(tmp_path))
-    assert [view.name for view in source.views] == ["0.jpg", "3.jpg", "6.jpg", "9.jpg"]
-
-
-def test_an_r3d_archive_is_unpacked_without_depth_maps(tmp_path):
-    write_record3d(tmp_path / "in", "metadata", "rgbd")
-    (tmp_path / "in/rgbd/0.depth").touch()
-    Path(shutil.make_archive(tmp_path / "scan", "zip", tmp_path / "in")).rename(tmp_path / "scan.r3d")
-    assert add_scene(tmp_path / "scenes.tsv", "scan", tmp_path / "scan.r3d").num_readable == 3
-    assert find_known_poses(tmp_path / "photos/scan").kind == "record3d"
-    assert not list((tmp_path / "photos/scan").rglob("*.depth"))
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("{}", "'K' is missing(.|\n)*K \\(9 numbers\\), w, h, and poses"),
-        ("[]", "is not a JSON object"),
-        ("{", "is not valid JSON"),
-        (
-            '{"K": [1,0,0,0,1,0,0,0,1], "w": 1, "h": 1, "poses": [[0,0,0,0,0,0,0]]}',
-            "pose 0: the pose is not a rotation",
-        ),
-    ],
-)
-def test_unusable_phone_exports_are_refused(tmp_path, content, message):
-    write_record3d(tmp_path / "in")
-    (tmp_path / "in/metadata.json").write_text(content)
-    with pytest.raises(SceneError, match=message):
         import_scene(tmp_path / "in", tmp_path / "scene")
 
 
@@ -292,38 +152,3 @@ def test_a_truncated_file_a_larger_count_and_trailing_bytes_are_damage(tmp_path,
         (model / name).write_bytes(content)
         with pytest.raises(SceneError, match=rf"{name} cannot be read: "):
             read_model(model)
-
-
-def changed(*, params=(50, 50, 20, 15), width=40, scale=1.0, position=0.0) -> KnownView:
-    pose = np.diag([scale, scale, scale, 1.0])
-    pose[0, 3] = position
-    camera = pycolmap.Camera(model="PINHOLE", width=width, height=30, params=params)
-    return KnownView("a.png", None, camera, pose)
-
-
-FAULTY_LENSES = [{"params": (focal, 50, 20, 15)} for focal in (-50, 0, np.inf)]
-FAULTY_LENSES += [{"params": (50, 50, np.nan, 15)}, {"width": 0}]
-
-
-@pytest.mark.parametrize(
-    ("changes", "fault"),
-    [
-        *((changes, "lens") for changes in FAULTY_LENSES),
-        *(({"scale": scale}, "rotation") for scale in (0.0, 2.0, np.nan)),
-        ({"position": 1e30}, "position"),
-    ],
-)
-def test_impossible_lenses_and_poses_are_refused(changes, fault):
-    with pytest.raises(SceneError, match=rf"the camera {fault} of view a\.png"):
-        require_valid(changed(**changes))
-
-
-def test_views_that_all_have_one_pose_are_refused(tmp_path):
-    write_transforms(tmp_path, fl_x=40)
-    path = tmp_path / "transforms.json"
-    content = json.loads(path.read_text())
-    for frame in content["frames"]:
-        frame["transform_matrix"] = np.eye(4).tolist()
-    path.write_text(json.dumps(content))
-    with pytest.raises(SceneError, match="same pose"):
-        read_source(find_known_poses(tmp_path))

@@ -158,7 +158,9 @@ def test_too_few_registered_photographs_are_refused_with_all_reasons():
     message = r"at least 70% of 10.*6 \(60\.0%\); models of 6, 4 .*9\.jpg: no features.*0\.60"
     with pytest.raises(RegistrationError, match=f"(?s){message}"):
         check(6, [6, 4])
-    with pytest.raises(RegistrationError, match=r"(?s)no camera poses could be found.*0\.jpg: no features"):
+    with pytest.raises(
+        RegistrationError, match=r"(?s)too few photographs.*models of no views.*0\.jpg: no features"
+    ):
         check(0, [])
 
 

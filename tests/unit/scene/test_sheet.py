@@ -153,20 +153,6 @@ def langsplat_scene(folder: Path) -> Path:
     return folder
 
 
-def test_files_of_3dgs_and_langsplat_are_found_reported_and_recorded(tmp_path):
-    folder = langsplat_scene(tmp_path / "theirs")
-    sheet = write_sheet(tmp_path, WORLD)
-    report = str(add_scene(sheet, "desk", folder))
-    assert "iteration_30000/point_cloud.ply" in report and "language_features" in report
-    assert "skipped, because pickle files can run code: chkpnt30000.pth" in report
-    assert "labels: 0 in 1 photographs" in report
-    assert (tmp_path / "annotated/photos/desk/0.json").is_file()
-    old, new = read_sheet(sheet)
-    assert (old.gaussians, old.features) == (None, None)
-    assert new.features == folder / "language_features"
-    assert new.gaussians == folder / "output/a/point_cloud/iteration_30000/point_cloud.ply"
-
-
 @pytest.mark.parametrize("parent", ["", "output/"])
 @pytest.mark.parametrize(
     ("written", "expected", "shared"),
