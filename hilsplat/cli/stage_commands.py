@@ -483,6 +483,6 @@ def efficiency(
     out: Annotated[Path, typer.Option(help="CSV, with .md beside it")] = Path("results/efficiency.csv"),
 ) -> None:
     """Print the time of each stage, from the benchmark files of a run."""
-    from hilsplat.evaluate.tables.costs import run_efficiency
+    from hilsplat.evaluate.costs import run_efficiency
 
     echo(run_efficiency(results, out))

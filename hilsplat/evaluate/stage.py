@@ -13,6 +13,7 @@ from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.labelled import LabelledScene
 from hilsplat.datasets.points.labelled_points import PointScene
+from hilsplat.evaluate.costs import write_times
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.metrics.instances import InstanceMatches
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
@@ -21,7 +22,6 @@ from hilsplat.evaluate.protocols.points import measure_scene_points
 from hilsplat.evaluate.protocols.view_truth import truths_of
 from hilsplat.evaluate.protocols.views import measure_view, rule_of
 from hilsplat.evaluate.scores import Measured, Score, write_instances, write_scores
-from hilsplat.evaluate.tables.costs import write_times
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.finished import SceneParts

@@ -25,7 +25,7 @@ STAGES: dict[str, str] = {
     "evaluate": "hilsplat.evaluate.stage:run_evaluate",
     "evaluate_files": "hilsplat.evaluate.files_stage:run_evaluate_files",
     "table": "hilsplat.evaluate.tables.build:run_table",
-    "efficiency": "hilsplat.evaluate.tables.costs:run_efficiency",
+    "efficiency": "hilsplat.evaluate.costs:run_efficiency",
     "figures": "hilsplat.evaluate.figures.panel:run_figures",
     "comparison": "hilsplat.evaluate.figures.comparison:run_comparison",
     "sweep": "hilsplat.evaluate.figures.sweep_plot:run_sweep_plot",

@@ -1,13 +1,12 @@
-"""Time and memory of jobs and queries: records beside artifacts, and the cost tables built from them.
+"""Time and memory of jobs and queries, from the records beside artifacts.
 
 Times and memory differ from run to run, so they are not in `scores.csv`, and tables that show them have the
 name suffix `-seconds`. All other files are reproducible byte for byte.
 """
 
 import math
-import statistics
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from hilsplat.base.artifacts import parse_json, sha256_of_file, write_text
@@ -15,26 +14,11 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.base.provenance import read_provenance, require_as_written, require_beginning
 from hilsplat.base.tables import markdown_table, read_csv, write_csv
 from hilsplat.configuration import SECTIONS
-from hilsplat.datasets.sources import LEVELLED
-from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN
-from hilsplat.evaluate.tables.ablation import PAPER_DATA, component_cells
-from hilsplat.evaluate.tables.measured import kind_and_title, row_name, row_place, with_seeds
-from hilsplat.evaluate.tables.rows import Block, Cell, Row, Sources, Table
 
 PREPARATION = ("masks", "coverage_tree", "clip")
 TRAINING = ("contributions", "semantic_tree", "autoencoder", "field")
 TIMES = "times.csv"
 TIME_COLUMNS = ("dataset", "scene", "variant", "method", "seconds")
-
-SECONDS = "-seconds"
-"""Name suffix of tables that are not reproducible byte for byte."""
-
-COST_NOTE = (
-    "Measured rows are means over scenes on this machine. Preparation: masks, coverage trees and CLIP. "
-    "Training: contributions, semantic tree, autoencoder and field. Neither includes the 3D Gaussians. "
-    "Memory is the peak main memory of the training jobs (in the paper, GPU memory). The time of a "
-    "query (one text in one view) covers text encoding, the view's compositing weights, relevancy and mask."
-)
 
 
 @dataclass(frozen=True)
@@ -172,111 +156,3 @@ def read_benchmark(path: Path, results: Path) -> list[Job]:
         numbers = (float(value) if isinstance(value, int | float) else 0.0 for value in sampled)
         jobs.append(Job(path.stem, dataset, scene, variant, elapsed_s, *numbers))
     return jobs
-
-
-def cost_table(sources: Sources, seconds: bool = False) -> Table:
-    """Build the table of training time, memory and seconds per query (paper: computational costs)."""
-    blocks = [sources.reported(PAPER_DATA, "one RTX 3090", families=False)]
-    for data, answers in by_answer(sources).items():
-        scenes = {cost.scene for *_, of_row in answers for cost in of_row}
-        columns = ["Preparation (min)", "Training (min)", "Memory (GB)"]
-        columns += [f"{scene} query (s)" for scene in sorted(scenes)]
-        rows = []
-        for variant, method, of_row in answers:
-            queries = {f"{cost.scene} query (s)": Cell.number(cost.query_s[method]) for cost in of_row}
-            names = {"Method": row_name(variant, method, sources.labels)}
-            rows.append(Row(names, {**time_cells(of_row, method), **queries}))
-        blocks.append(Block(*kind_and_title(data), tuple(rows), tuple(columns)))
-    return finished(sources, "cost", "Computational cost", blocks, seconds)
-
-
-def efficiency_table(sources: Sources, seconds: bool = False) -> Table:
-    """Build the table of quality at three levels beside training time and memory (paper: efficiency)."""
-    columns = ("Preparation (min)", "Training (min)", "Memory (GB)")
-    paper = sources.reported(PAPER_DATA, "one RTX 3090", families=False)
-    blocks = [paper, *quality_blocks(sources, columns)]
-    return finished(sources, "efficiency", "Efficiency", blocks, seconds)
-
-
-def pruning_table(sources: Sources, seconds: bool = False) -> Table:
-    """Build the table of cost and quality with pruned contrastive pairs (paper: sample pruning)."""
-    columns = ("Training (min)", "Memory (GB)", "Query (s)")
-    paper = sources.reported(PAPER_DATA, "sample pruning", families=False)
-    blocks = [paper, *quality_blocks(sources, columns, ("field",))]
-    footnote = (
-        "The paper removes redundant pairs by feature similarity but gives no rule. config/config.yaml "
-        "(variants) sets which pairs our variant removes."
-    )
-    return finished(sources, "pruning", "Cost with pruned pairs", blocks, seconds, (footnote,))
-
-
-def finished(
-    sources: Sources,
-    name: str,
-    title: str,
-    blocks: Sequence[Block],
-    seconds: bool,
-    footnotes: Sequence[str] = (),
-) -> Table:
-    """Return a table with all columns, or only with those that are reproducible."""
-    if seconds:
-        return sources.finished(name + SECONDS, f"{title}, on this machine", blocks, (COST_NOTE, *footnotes))
-    repeated = []
-    for block in blocks:
-        if block.kind != "reported":
-            columns = tuple(column for column in block.columns if column not in block.lower_is_better)
-            block = replace(block, columns=columns)
-        if block.columns:
-            repeated.append(block)
-    elsewhere = f"Table {name}{SECONDS} adds the times and memory measured on this machine."
-    return sources.finished(name, title, repeated, (elsewhere, *footnotes))
-
-
-def quality_blocks(
-    sources: Sources, time_columns: tuple[str, ...], methods: tuple[str, ...] = ("field", "tree")
-) -> list[Block]:
-    """Return mIoU and HC at given levels beside times, for each data set whose queries have levels.
-
-    Labels with levels are a separate data set (Hi-LERF) or belong to the scene's own data set.
-    """
-    quality_columns, blocks = ("Hi-LERF mIoU", "Hi-LERF HC"), []
-    scores = with_seeds(sources.scores)
-    given = scores[(scores["seed"] == "0") & scores["protocol"].str.startswith(LEVEL_GIVEN.full_name)]
-    for data, answers in by_answer(sources).items():
-        rows = []
-        for variant, method, of_row in answers:
-            part = given[
-                given["dataset"].isin([*LEVELLED, data])
-                & given["scene"].isin([cost.scene for cost in of_row])
-                & (given["variant"] == variant)
-                & (given["method"] == method)
-            ]
-            if method not in methods or part.empty:
-                continue
-            quality = component_cells(scores, part)
-            cells = {name: quality[name] for name in quality_columns} | time_cells(of_row, method)
-            rows.append(Row({"Method": row_name(variant, method, sources.labels)}, cells))
-        blocks.append(Block(*kind_and_title(data), tuple(rows), (*quality_columns, *time_columns)))
-    return blocks
-
-
-def time_cells(costs: list[Cost], method: str) -> dict[str, Cell]:
-    """Return the mean times and the maximum memory over scenes, for rows of `method`."""
-    return {
-        "Preparation (min)": Cell.number(statistics.fmean(cost.prepare_s for cost in costs) / 60),
-        "Training (min)": Cell.number(statistics.fmean(cost.train_s for cost in costs) / 60),
-        "Memory (GB)": Cell.number(max(cost.peak_mib for cost in costs) / 1024),
-        "Query (s)": Cell.number(statistics.fmean(cost.query_s[method] for cost in costs)),
-    }
-
-
-def by_answer(sources: Sources) -> dict[str, list[tuple[str, str, list[Cost]]]]:
-    """Map each data set, sorted by name, to (variant, method, costs of the scenes) in row order."""
-    found: dict[tuple[str, str, str], list[Cost]] = {}
-    for cost in sorted(sources.costs, key=lambda cost: cost.scene):
-        for method in cost.query_s:
-            found.setdefault((cost.dataset, cost.variant, method), []).append(cost)
-    rows: dict[str, list[tuple[str, str, list[Cost]]]] = {}
-    for data, variant, method in sorted(found, key=lambda key: row_place(key[1], key[2], sources.labels)):
-        rows.setdefault(data, []).append((variant, method, found[data, variant, method]))
-    return {data: rows[data] for data in sorted(rows)}
