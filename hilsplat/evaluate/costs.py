@@ -55,7 +55,7 @@ def write_times(scores: Path, dataset: str, scene: str, variant: str, seconds: M
 
 def read_costs(scores: Iterable[Path]) -> list[Cost]:
     """Return the costs of the scenes and variants in score files, from the records beside the artifacts."""
-    found = []
+    costs = []
     for path in scores:
         table = Path(path).with_name(TIMES)
         rows = read_csv(table, TIME_COLUMNS, "run the evaluate stage again")
@@ -67,8 +67,8 @@ def read_costs(scores: Iterable[Path]) -> list[Cost]:
         times = _seconds(jobs, PREPARATION), _seconds(jobs, TRAINING)
         peak_mib = max((job.peak_mib for stage in TRAINING if (job := jobs.get(stage))), default=0)
         query_s = {row["method"]: float(row["seconds"]) for row in rows}
-        found.append(Cost(*place, *times, peak_mib or math.nan, query_s))
-    return found
+        costs.append(Cost(*place, *times, peak_mib or math.nan, query_s))
+    return costs
 
 
 def jobs_of(scores: Path) -> dict[str, Job | None]:
@@ -119,7 +119,7 @@ def run_efficiency(results: Path, out: Path) -> str:
     for job in jobs:
         numbers = (f"{job.elapsed_s:.2f}", f"{job.cpu_s:.2f}", f"{job.peak_mib:.0f}")
         rows.append([job.stage, job.dataset, job.scene, job.variant, *numbers])
-    shown = ("stage", "jobs", "mean s", "longest s", "total s", "CPU s", "peak MiB")
+    headings = ("stage", "jobs", "mean s", "longest s", "total s", "CPU s", "peak MiB")
     lines = []
     for name in [*dict.fromkeys(job.stage for job in jobs), "all"]:
         of_row = [job for job in jobs if name in (job.stage, "all")]
@@ -127,7 +127,7 @@ def run_efficiency(results: Path, out: Path) -> str:
         seconds = (sum(times) / len(times), max(times), sum(times), sum(job.cpu_s for job in of_row))
         peak_mib = f"{max(job.peak_mib for job in of_row):.0f}"
         lines.append([name, len(of_row), *(f"{value:.1f}" for value in seconds), peak_mib])
-    text, beside = markdown_table(shown, lines, 1) + "\n", Path(out).with_suffix(".md")
+    text, beside = markdown_table(headings, lines, 1) + "\n", Path(out).with_suffix(".md")
     for path, begin in ((Path(out), ",".join(columns)), (beside, text.partition("\n")[0])):
         require_beginning(path, begin)
     write_csv(Path(out), columns, rows)

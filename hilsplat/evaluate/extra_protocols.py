@@ -11,7 +11,7 @@ from hilsplat.datasets.points.labelled_points import PointScene
 from hilsplat.datasets.registry import dataset_of, open_labels
 from hilsplat.evaluate.protocols.cards import ProtocolCard, card_of
 
-STAND_INS: Mapping[str, tuple[str, ...]] = {
+WORLD_PROTOCOLS: Mapping[str, tuple[str, ...]] = {
     "tabletop": (*dataset_of("3d_ovs").protocols, "lerf-mask/gaussian-grouping"),
     "room": (
         *("scannet/opengaussian-19", "scannet/opengaussian-15", "scannet/opengaussian-10"),
@@ -37,13 +37,13 @@ class ExtraProtocols:
     @staticmethod
     def of_world(kind: str) -> "ExtraProtocols":
         """Return a synthetic scene's protocols, empty for kind ""; raise SceneError for unknown kinds."""
-        if kind and kind not in STAND_INS:
+        if kind and kind not in WORLD_PROTOCOLS:
             raise SceneError(
                 f"unknown kind of synthetic scene: {kind!r}",
-                expected=f"one of {', '.join(STAND_INS)}",
+                expected=f"one of {', '.join(WORLD_PROTOCOLS)}",
                 fix="correct the kind, or omit it",
             )
-        return ExtraProtocols.of(STAND_INS.get(kind, ()), Level.WHOLE)
+        return ExtraProtocols.of(WORLD_PROTOCOLS.get(kind, ()), Level.WHOLE)
 
     @staticmethod
     def of(names: tuple[str, ...], level: Level | None = None) -> "ExtraProtocols":

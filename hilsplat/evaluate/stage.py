@@ -93,31 +93,32 @@ def run_evaluate(
         else:
             answers = LanguageScene.from_parts(parts, settings, threads=threads)
             posed, selections = answers.scene, Selections(answers)
-            for data, known, protocols in scored:
+            for data, annotations, protocols in scored:
                 truths = {}
-                if not isinstance(known, PointScene):
-                    truths = truths_of(known, posed, settings.min_region_px)
+                if not isinstance(annotations, PointScene):
+                    truths = truths_of(annotations, posed, settings.min_region_px)
                     if not truths:
                         logger.warning("no view of %s is annotated: nothing to score", posed.name)
                 counts[f"views of {data}"] = len(truths)
-                kept: dict[str, PackedMasks] = {}
+                masks: dict[str, PackedMasks] = {}
                 for view in track(list(truths), "views scored"):
                     of_view = truths[view]()
-                    kept[view] = PackedMasks(posed.cameras[view].size_hw)
-                    for row in measure_view(selections, of_view, view, kept[view], settings, protocols):
+                    masks[view] = PackedMasks(posed.cameras[view].size_hw)
+                    for row in measure_view(selections, of_view, view, masks[view], settings, protocols):
                         keep(data, view, row)
                     if not seconds and of_view.categories:
                         texts = [query.text for query in of_view.categories[:TIMED_TEXTS]]
                         seconds = time_queries(answers, view, texts, settings)
                     answers.forget(view)  # reusing the freed memory avoids clearing new pages
-                if isinstance(known, Path) and truths and settings.view_consistency:
-                    for view, row in measure_world_consistency(selections, truths, kept, known, settings):
+                if isinstance(annotations, Path) and truths and settings.view_consistency:
+                    given = selections, truths, masks, annotations, settings
+                    for view, row in measure_world_consistency(*given):
                         keep(data, view, row)
-                for each in point_rows(answers, known, protocols, settings, threads):
-                    if isinstance(each, Measured):
-                        keep(data, "", each)
+                for result in point_rows(answers, annotations, protocols, settings, threads):
+                    if isinstance(result, Measured):
+                        keep(data, "", result)
                     else:
-                        matches[data, scene, variant, label, "tree"] = each
+                        matches[data, scene, variant, label, "tree"] = result
         counts["rows"] = len(scores)
         write_times(out, dataset, scene, variant, seconds)
         write_instances(out, matches)

@@ -23,17 +23,11 @@ UNPACK_AGAIN = "unpack or download the file again; this copy is damaged or incom
 
 @dataclass(frozen=True, eq=False)
 class LabelledPoints:
-    """P points with their ground-truth classes, in the frame of the scene's cameras.
+    """P points with their ground-truth classes, in the frame of the scene's cameras."""
 
-    Attributes:
-        xyz: positions, metres.
-        class_id: class number in the data set's files; 0 if undefined.
-        instance_id: instance number from 1, unrelated to numbers in other files; 0 for none.
-    """
-
-    xyz: Float[np.ndarray, "P 3"]
-    class_id: Int32[np.ndarray, " P"]
-    instance_id: Int32[np.ndarray, " P"]
+    xyz: Float[np.ndarray, "P 3"]  # metres
+    class_id: Int32[np.ndarray, " P"]  # number in the data set's files; 0 if undefined
+    instance_id: Int32[np.ndarray, " P"]  # from 1, unrelated to numbers in other files; 0 for none
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -41,18 +35,12 @@ class LabelledPoints:
 
 @dataclass(frozen=True, eq=False)
 class PointScene:
-    """A scene with labelled points.
-
-    Attributes:
-        images: posed images; frames without a pose are omitted.
-        truth: labelled points by labelling, a key of `classes.LABELLINGS`. Only `evaluate` may read them.
-        warnings: one sentence for each item that was skipped or reinterpreted.
-    """
+    """A scene with labelled points."""
 
     name: str
-    images: tuple[PosedImage, ...]
-    truth: Mapping[str, LabelledPoints]
-    warnings: tuple[str, ...] = ()
+    images: tuple[PosedImage, ...]  # frames without a pose are omitted
+    truth: Mapping[str, LabelledPoints]  # by key of `classes.LABELLINGS`; only `evaluate` may read them
+    warnings: tuple[str, ...] = ()  # a sentence for each item that was skipped or reinterpreted
 
     def report(self) -> SceneReport:
         """Report what was read, and warn about what was skipped."""

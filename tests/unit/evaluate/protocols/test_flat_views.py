@@ -193,7 +193,7 @@ def test_wood_wall_alone_is_united_with_wood_table_and_any_grey_is_true(tmp_path
     grey[:20], grey[20:30] = 255, 1
     path = tmp_path / f"{text}.png"
     write_png(path, grey)
-    label = mask_region(path, FOREGROUND, grey.shape, [], least_grey=1)
+    label = mask_region(path, FOREGROUND, grey.shape, [], min_grey=1)
     (query,) = ViewTruth.of_regions([label], grey.shape).categories
     asked = []
 
