@@ -129,7 +129,6 @@ class LabelledScene:
 
     @property
     def num_pairs(self) -> int:
-        """Number of (view, text) pairs."""
         return sum(len({region.text for region in regions}) for regions in self.views.values())
 
     def check_posed(self, names: Collection[str]) -> list[str]:

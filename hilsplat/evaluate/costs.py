@@ -48,7 +48,6 @@ class Cost:
 
 
 def write_times(scores: Path, dataset: str, scene: str, variant: str, seconds: Mapping[str, float]) -> None:
-    """Write `times.csv` beside a score file."""
     rows = [[dataset, scene, variant, method, f"{value:.4f}"] for method, value in sorted(seconds.items())]
     write_csv(Path(scores).with_name(TIMES), TIME_COLUMNS, rows)
 

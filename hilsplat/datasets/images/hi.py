@@ -204,7 +204,6 @@ class Annotated(Dataset):
     """A data set without published scenes: its scenes are those that have been annotated."""
 
     def found(self, root: Path) -> tuple[str, ...]:
-        """Return the scenes that have a label file below the folder."""
         files = root.glob("*/*/*.json")
         return tuple(sorted({f"{path.parent.parent.name}/{path.parent.name}" for path in files}))
 

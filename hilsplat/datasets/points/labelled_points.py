@@ -43,7 +43,6 @@ class PointScene:
     warnings: tuple[str, ...] = ()  # a sentence for each item that was skipped or reinterpreted
 
     def report(self) -> SceneReport:
-        """Report what was read, and warn about what was skipped."""
         facts: dict[str, object] = {"posed images": len(self.images)}
         for labelling, points in self.truth.items():
             facts[f"{labelling} points"] = len(points)
@@ -115,7 +114,6 @@ class PlyMesh:
                 self._content[element]  # raises KeyError if the element is missing
 
     def column(self, element: str, name: str) -> np.ndarray:
-        """Return a property of all vertices or faces, by name."""
         data = self._content[element].data
         if name not in data.dtype.names:
             raise SceneError(
@@ -128,7 +126,6 @@ class PlyMesh:
 
     @cached_property
     def xyz(self) -> Float32[np.ndarray, "P 3"]:
-        """Positions of the vertices."""
         return np.stack([self.column("vertex", axis) for axis in "xyz"], axis=1).astype(np.float32)
 
     @cached_property

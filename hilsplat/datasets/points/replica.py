@@ -164,7 +164,6 @@ def read_semantic_mesh(habitat: Path) -> LabelledPoints:
 
 
 def open_scene(root: Path, scene: str) -> PointScene:
-    """Read the frames and labels of a scene, such as "room_0"."""
     truth = read_semantic_mesh(root / scene / "habitat")
     images, warnings = read_images(root, scene)
     return PointScene(scene, images, {"replica": truth}, warnings)

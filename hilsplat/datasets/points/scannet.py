@@ -193,7 +193,6 @@ def _from_aggregation(
 
 
 def open_scan(root: Path, scan: str) -> PointScene:
-    """Read the frames and labels of a scan."""
     folder = scan_folder(root, scan)
     DATASET.require(root, scan)
     truth, of_labels = read_truth(folder, scan, read_label_table(root / LABEL_TABLE))

@@ -161,7 +161,6 @@ def frame_points(frame: LidarFrame, segment_from_world: Float[np.ndarray, "4 4"]
 
 
 def joined_points(parts: Sequence[LabelledPoints]) -> LabelledPoints:
-    """Concatenate the points of one or more frames or returns."""
     return LabelledPoints(
         np.concatenate([part.xyz for part in parts]),
         np.concatenate([part.class_id for part in parts]),

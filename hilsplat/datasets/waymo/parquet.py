@@ -38,7 +38,6 @@ FRAME, LASER, CAMERA = "key.frame_timestamp_micros", "key.laser_name", "key.came
 
 
 def component_path(split: Path, tag: str, segment: str) -> Path:
-    """Return the path of a component: `<split>/<tag>/<segment>.parquet`."""
     return split / tag / f"{segment}.parquet"
 
 
@@ -142,7 +141,6 @@ def _range_images(
 
 
 def _cameras(split: Path, segment: str) -> dict[int, WaymoCamera]:
-    """Return the car's cameras by their number, which starts at 1."""
     base = "[CameraCalibrationComponent]"
     inner = [f"{base}.intrinsic.{name}" for name in INTRINSIC]
     place, width, height = f"{base}.extrinsic.transform", f"{base}.width", f"{base}.height"

@@ -123,7 +123,6 @@ def frames(path: Path) -> Iterator[tuple[str, Any]]:
 
 @contextmanager
 def _readable(where: str) -> Iterator[None]:
-    """Raise SceneError if the data cannot be decoded."""
     with decoding(where):
         try:
             yield
@@ -174,7 +173,6 @@ def lidar_frames(path: Path) -> Iterator[LidarFrame]:
 
 
 def _named(messages: Iterable[Any], name: int) -> Any:
-    """Return the message from the sensor with the number `name`."""
     for message in messages:
         if message.name == name:
             return message

@@ -51,7 +51,6 @@ def quality_blocks(kind: TableKind, sources: Sources) -> list[Block]:
 
 
 def without_costs(block: Block) -> Block:
-    """Return a measured block with only the columns that are reproducible."""
     return replace(block, columns=tuple(column for column in block.columns if column not in block.costs))
 
 

@@ -94,7 +94,6 @@ def _plain(note: str) -> str:
 
 
 def latex_text(text: str) -> str:
-    """Escape characters that LaTeX would interpret."""
     return text.translate(LATEX_SPECIAL)
 
 

@@ -16,7 +16,6 @@ OVS_SCENES = ("bed", "bench", "room", "sofa", "lawn")
 
 
 def lerf_cells(_: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
-    """Return segmentation and localization per scene, and their means."""
     return scene_cells(part, {"mIoU": "iou", "mBIoU": "boundary_iou", "localization": "localization_box"})
 
 

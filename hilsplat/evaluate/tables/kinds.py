@@ -44,7 +44,6 @@ class TableKind:
     footnotes: tuple[str, ...]
 
     def columns_of(self, scenes: Iterable[str]) -> tuple[str, ...]:
-        """Return the value columns of a block with the given scenes."""
         names = sorted(set(scenes))
         return tuple(
             column.format(scene=scene)

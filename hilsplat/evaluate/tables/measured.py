@@ -214,7 +214,6 @@ def table_value(rows: "pd.DataFrame", metric: str, level: str | None = None) -> 
 
 
 def percent(rows: "pd.DataFrame", metric: str) -> Cell:
-    """Return `table_value` in percent."""
     return Cell.percent(table_value(rows, metric))
 
 

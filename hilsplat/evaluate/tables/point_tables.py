@@ -40,7 +40,6 @@ DRAWS = 1000
 
 
 def replica_cells(_: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
-    """Return mIoU and mAcc per scene, and their means."""
     means = scene_cells(part, {"mIoU": "miou_present", "mAcc": "macc_present"}, "Mean")
     return means | interval_cells(part, "Mean", pooled=False)
 

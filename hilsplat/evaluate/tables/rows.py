@@ -41,7 +41,6 @@ class Cell:
 
     @staticmethod
     def printed(text: str, note: str = "") -> "Cell":
-        """Return a value as printed in the paper."""
         number = re.fullmatch(r"-?\d+(\.\d+)?", text)
         return Cell(text, float(text) if number else None, note)
 
@@ -76,7 +75,6 @@ class Block:
         return tuple(column for column in self.columns if column.endswith(("(min)", "(GB)", "(s)")))
 
     def names(self) -> list[str]:
-        """Return the name columns, in order of appearance."""
         return list(dict.fromkeys(name for row in self.rows for name in row.names))
 
     def filled_columns(self) -> list[str]:
@@ -119,7 +117,6 @@ class Table:
     footnotes: tuple[str, ...]
 
     def numbered_notes(self) -> dict[str, int]:
-        """Return the cell notes, numbered in reading order."""
         cells = (row.cell(column) for block in self.blocks for row in block.rows for column in block.columns)
         notes = dict.fromkeys(cell.note for cell in cells if cell.note)
         return {note: number for number, note in enumerate(notes, start=1)}
