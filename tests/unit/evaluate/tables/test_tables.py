@@ -258,7 +258,7 @@ def test_waymo_pools_the_counts_of_all_scenes(tmp_path):
     row = measured(built(tmp_path, "waymo", [*first, *second])[0])
     # (1 + 8) / (2 + 8) for cars, and 21 absent classes that count 1
     assert cells(row, "mIoU, present classes", "mIoU") == ["90.00", f"{100 * (21 + 0.9) / 22:.2f}"]
-    others = {"pedestrian": 0.0, "bus": 1.0, "truck": 0.0, "cyclist": 1.0}.items()
+    others = {"pedestrian": 0.0, "bus": 1.0, "truck": 0.0, "car": 1.0}.items()
     scores = [
         row for name, value in others for row in class_scores("waymo/segmentation", value, 9, query=name)
     ]
