@@ -11,17 +11,11 @@ from jaxtyping import Int, Int32
 
 @dataclass(frozen=True)
 class ClassSet:
-    """K classes in a fixed order: label k of a prediction is the class in row k - 1; 0 means no class.
+    """K classes in a fixed order: label k of a prediction is the class in row k - 1; 0 means no class."""
 
-    Attributes:
-        name: name of the set, such as `scannet-19`.
-        ids: label of each class in the data set's own files.
-        texts: query of each class.
-    """
-
-    name: str
-    ids: tuple[int, ...]
-    texts: tuple[str, ...]
+    name: str  # such as `scannet-19`
+    ids: tuple[int, ...]  # label of each class in the data set's own files
+    texts: tuple[str, ...]  # query of each class
 
     @staticmethod
     def of(name: str, query_of: Mapping[int, str], ids: Iterable[int] | None = None) -> "ClassSet":
@@ -35,9 +29,9 @@ class ClassSet:
     def labels(self, file_labels: Int[np.ndarray, " P"]) -> Int32[np.ndarray, " P"]:
         """Map the data set's point labels to 1 .. K, or to 0 if their class is not in the set."""
         order = np.argsort(self.ids)
-        known = np.asarray(self.ids)[order]
-        place = np.minimum(np.searchsorted(known, file_labels), len(known) - 1)
-        return np.where(known[place] == file_labels, order[place] + 1, 0).astype(np.int32)
+        ids = np.asarray(self.ids)[order]
+        place = np.minimum(np.searchsorted(ids, file_labels), len(ids) - 1)
+        return np.where(ids[place] == file_labels, order[place] + 1, 0).astype(np.int32)
 
 
 _LISTS = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))

@@ -25,36 +25,22 @@ FORMAT = "hilsplat-hierarchy-1"
 
 @dataclass(frozen=True)
 class AnnotatedNode:
-    """One annotated object, part or subpart of a scene.
+    """One annotated object, part or subpart of a scene."""
 
-    Attributes:
-        id: row in the list of nodes.
-        level: 1 whole, 2 part, 3 subpart.
-        parent: id of the node one level up, -1 for a whole.
-        text: query for the node. The masks of nodes with the same text are merged.
-        synonyms: alternative texts.
-    """
-
-    id: int
-    level: int
-    parent: int
-    text: str
+    id: int  # row in the list of nodes
+    level: int  # 1 whole, 2 part, 3 subpart
+    parent: int  # id of the node one level up, -1 for a whole
+    text: str  # query for the node; the masks of nodes with the same text are merged
     synonyms: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class HierarchyAnnotations:
-    """The annotations of one scene.
+    """The annotations of one scene."""
 
-    Attributes:
-        folder: folder with the label images.
-        nodes: all nodes, by id.
-        views: view name -> ids of the nodes annotated there (those large enough to be scored).
-    """
-
-    folder: Path
-    nodes: tuple[AnnotatedNode, ...]
-    views: Mapping[str, tuple[int, ...]]
+    folder: Path  # contains the label images
+    nodes: tuple[AnnotatedNode, ...]  # by id
+    views: Mapping[str, tuple[int, ...]]  # ids of the annotated nodes that are large enough to be scored
 
     def label_image(self, view: str, level: Level) -> Int32[np.ndarray, "H W"]:
         """Return the node id per pixel, -1 for none."""
@@ -100,7 +86,6 @@ class HierarchyAnnotations:
 
 
 def label_path(folder: Path, view: str, level: Level) -> Path:
-    """Return the path of a view's label image at a level."""
     return folder / "labels" / f"{view}.{level.label}.png"
 
 

@@ -36,24 +36,15 @@ ROUNDING_PX = 1.0
 
 @dataclass(frozen=True, eq=False)
 class LabelledRegion:
-    """A labelled region of one view, and the query text for it.
+    """A labelled region of one view, and the query text for it."""
 
-    Attributes:
-        text: the query, spelt as in the labels.
-        size_hw: size of the label, px.
-        pixels: function that reads the region at the label's size; called whenever the mask is needed.
-        boxes_xyxy: annotated boxes, borders included, px of the label; None if the data set has no boxes.
-        level: level of the region; None if the data set has no levels.
-        path: texts from the whole down to this region; only this region's text if there are no levels.
-        any_grey: like `pixels`, but includes all non-black pixels, as in some protocols; None if identical.
-    """
-
-    text: str
-    size_hw: tuple[int, int]
-    pixels: Callable[[], Bool[np.ndarray, "H W"]]
-    boxes_xyxy: Int[np.ndarray, "B 4"] | None = None
-    level: Level | None = None
-    path: tuple[str, ...] = ()
+    text: str  # the query, spelt as in the labels
+    size_hw: tuple[int, int]  # of the label, px
+    pixels: Callable[[], Bool[np.ndarray, "H W"]]  # reads the region whenever its mask is needed
+    boxes_xyxy: Int[np.ndarray, "B 4"] | None = None  # annotated, borders included, px of the label
+    level: Level | None = None  # None if the data set has no levels
+    path: tuple[str, ...] = ()  # texts from the whole down to this region; its own text without levels
+    # Like `pixels`, but all non-black pixels, as in some protocols; None if identical.
     any_grey: Callable[[], Bool[np.ndarray, "H W"]] | None = None
 
     def mask(
@@ -112,24 +103,16 @@ def extent(mask: Bool[np.ndarray, "H W"]) -> Int[np.ndarray, "B 4"]:
 
 @dataclass(frozen=True, eq=False)
 class LabelledScene:
-    """One scene of an image-labelled data set.
-
-    Attributes:
-        images: all image files of the scene, by view.
-        poses: folder in which `find_known_poses` finds poses; None if the scene has none.
-        views: labelled regions by view, in label order.
-        warnings: one sentence for each item that was reinterpreted or is doubtful.
-        least_posed: minimum share of labelled views with a pose; 1 for published data sets, whose scores are
-            comparable only if every labelled view counts.
-    """
+    """One scene of an image-labelled data set."""
 
     dataset: str
     scene: str
-    images: Mapping[str, Path]
-    poses: Path | None
-    views: Mapping[str, tuple[LabelledRegion, ...]]
-    warnings: tuple[str, ...] = ()
-    least_posed: float = 1.0
+    images: Mapping[str, Path]  # all images of the scene, by view
+    poses: Path | None  # folder in which `find_known_poses` finds poses, if any
+    views: Mapping[str, tuple[LabelledRegion, ...]]  # by view, in label order
+    warnings: tuple[str, ...] = ()  # a sentence for each item that was reinterpreted or is doubtful
+    # Minimum share of labelled views with a pose. Scores of published data sets need all of them.
+    min_posed: float = 1.0
 
     def __post_init__(self) -> None:
         """Add a warning for each text that resembles another one."""
@@ -146,23 +129,22 @@ class LabelledScene:
 
     @property
     def num_pairs(self) -> int:
-        """Number of (view, text) pairs."""
         return sum(len({region.text for region in regions}) for regions in self.views.values())
 
     def check_posed(self, names: Collection[str]) -> list[str]:
         """Return the labelled views that have a pose; log the others.
 
         Raises:
-            SceneError: the share of views that have one is below `least_posed`.
+            SceneError: the share of views that have one is below `min_posed`.
         """
         posed = [view for view in self.views if view in names]
         missing = [view for view in self.views if view not in names]
         lacking = f"labelled views of {self.dataset}/{self.scene} have no pose: {', '.join(missing)}"
-        if len(posed) < self.least_posed * len(self.views):
+        if len(posed) < self.min_posed * len(self.views):
             shown = [*sorted(names)[:5], *(["..."] if len(names) > 5 else [])]
             raise SceneError(
                 lacking,
-                expected=f"a pose for {self.least_posed:.0%} of the {len(self.views)} labelled views",
+                expected=f"a pose for {self.min_posed:.0%} of the {len(self.views)} labelled views",
                 found=f"{len(names)} posed views: {', '.join(shown)}",
                 fix="use the poses included in the data set, or register these images",
             )
@@ -231,29 +213,29 @@ def mask_region(
     image_hw: tuple[int, int],
     warnings: list[str],
     share: float = 0.0,
-    least_grey: int | None = None,
+    min_grey: int | None = None,
 ) -> LabelledRegion:
     """Return the region in a grey mask file, which is named after the query; report resizing in `warnings`.
 
     Args:
         foreground: lowest grey value of the region.
         share: as in `check_label_size`.
-        least_grey: lowest grey value of the region under protocols that use `any_grey`, if different.
+        min_grey: lowest grey value of the region under protocols that use `any_grey`, if different.
     """
     size_hw = image_size_hw(path)
     warnings += check_label_size(f"mask {path}", size_hw, image_hw, share)
-    any_grey = None if least_grey is None else partial(read_mask_file, path, least_grey)
+    any_grey = None if min_grey is None else partial(read_mask_file, path, min_grey)
     pixels = partial(read_mask_file, path, foreground)
     return LabelledRegion(path.stem, size_hw, pixels, path=(path.stem,), any_grey=any_grey)
 
 
-def read_mask_file(path: Path, least: int) -> Bool[np.ndarray, "H W"]:
-    """Return which values in a mask file (`read_mask`) are at least `least`; ImageError if all are 0 or 1."""
+def read_mask_file(path: Path, minimum: int) -> Bool[np.ndarray, "H W"]:
+    """Return which values of a mask file are at least `minimum`; raise ImageError if all are 0 or 1."""
     values = read_mask(path)
-    if values.max() == 1 < least:
+    if values.max() == 1 < minimum:
         expected, fix = "0 and 255", "multiply its values by 255"
         raise ImageError(f"mask {path} has only the values 0 and 1", expected=expected, fix=fix)
-    return values >= least
+    return values >= minimum
 
 
 def check_label_size(

@@ -94,24 +94,24 @@ def run_evaluate_files(
                 min_px = min_region_px or EvaluateSettings().min_region_px
                 views = truths_of(truth, Scene.load(scene), min_px)
         else:
-            dataset, known, extra = ExtraProtocols.open(labels, data_root)
-            for sentence in known.warnings:
+            dataset, labelled, extra = ExtraProtocols.open(labels, data_root)
+            for sentence in labelled.warnings:
                 logger.warning("%s: %s", labels, sentence)
             name = labels.partition("/")[2]
-            if isinstance(known, PointScene):
-                points = known.truth
+            if isinstance(labelled, PointScene):
+                points = labelled.truth
             else:
-                for view, regions in known.views.items():
+                for view, regions in labelled.views.items():
                     if regions:
-                        image_hw = image_size_hw(known.images[view]) if view in known.images else None
+                        image_hw = image_size_hw(labelled.images[view]) if view in labelled.images else None
                         views[view] = partial(ViewTruth.of_regions, regions, regions[0].size_hw, image_hw)
         rows = list(_mask_rows(predictions, views, extra)) if views else []
         matches: dict[tuple[str, ...], InstanceMatches] = {}
-        for each in _point_rows(predictions, points, extra) if points else ():
-            if isinstance(each, Measured):
-                rows.append(("", each))
+        for result in _point_rows(predictions, points, extra) if points else ():
+            if isinstance(result, Measured):
+                rows.append(("", result))
             else:
-                matches[dataset, name, method, "-", METHOD] = each
+                matches[dataset, name, method, "-", METHOD] = result
         scores = [
             Score(dataset=dataset, scene=name, variant=method, masks="-", view=view, **vars(row))
             for view, row in rows
@@ -125,18 +125,18 @@ def _mask_rows(
     predictions: Path, views: Mapping[str, Callable[[], ViewTruth]], extra: ExtraProtocols
 ) -> Iterator[tuple[str, Measured]]:
     """Yield the rows of all views; all files are read first, so that a missing file is reported at once."""
-    found = {view: read_view_masks(predictions, view) for view in views}
+    predicted = {view: read_view_masks(predictions, view) for view in views}
     truths = {view: load() for view, load in views.items()}
-    levels = {level for masks in found.values() for level, _ in masks}
+    levels = {level for masks in predicted.values() for level, _ in masks}
     if not levels:  # every folder is empty: nothing was found in any view
         levels = {query.level.label for truth in truths.values() for query in truth.queries if query.level}
         levels.add("")
     texts: dict[str, set[str]] = {}
-    for each in truths.values():
-        for query in (*each.categories, *each.absent, *each.queries):
+    for truth in truths.values():
+        for query in (*truth.categories, *truth.absent, *truth.queries):
             texts.setdefault(query.level.label if query.level else "", set()).add(query.text)
     for view, truth in truths.items():
-        masks = found[view]
+        masks = predicted[view]
         _check(view, masks, truth, texts)
         flat = _flat_rows(masks, truth, extra) if "" in levels else ()
         levelled = _level_rows(masks, truth) if levels - {""} else ()
@@ -147,12 +147,12 @@ def _check(view: str, masks: Masks, truth: ViewTruth, texts: Mapping[str, set[st
     """Check the sizes and texts of a view's masks; error messages name the view."""
     for (level, text), mask in masks.items():
         where = f"{view}: {level}/{text}" if level else f"{view}: {text}"
-        known = sorted(texts.get(level, ()))
-        if text not in known:
-            near = difflib.get_close_matches(text, known, n=1)
+        of_level = sorted(texts.get(level, ()))
+        if text not in of_level:
+            near = difflib.get_close_matches(text, of_level, n=1)
             raise MisalignedArtifactError(
                 f"{where}: the labels have no text {text!r}" + (f" at level {level}" if level else ""),
-                expected=f"one of {', '.join(known)}",
+                expected=f"one of {', '.join(of_level)}",
                 found=text,
                 fix=f"rename it to {near[0]!r}" if near else "remove it, or correct its name",
             )
@@ -211,8 +211,8 @@ def _level_rows(masks: Masks, truth: ViewTruth) -> Iterator[Measured]:
         yield from _text_rows(cards.LEVEL_GIVEN, query, masks.get((query.level.label, query.text)), [WORDS])
 
     def mask_of(path: tuple[str, ...]) -> Bool[np.ndarray, "H W"]:
-        found = masks.get((Level(len(path)).label, path[-1]))
-        return np.zeros_like(truth.regions[path]) if found is None else truth.own_part(path, found)
+        mask = masks.get((Level(len(path)).label, path[-1]))
+        return np.zeros_like(truth.regions[path]) if mask is None else truth.own_part(path, mask)
 
     yield from consistency_rows(METHOD, protocol, truth, mask_of)
 
@@ -233,15 +233,15 @@ def _point_rows(
         labelling, classes = class_set(card.classes)
         if labelling not in truth:
             continue
-        found = [path for file in _files_of(card) if (path := predictions / file).is_file()]
-        if not found:
+        paths = [path for file in _files_of(card) if (path := predictions / file).is_file()]
+        if not paths:
             logger.info("%s is not scored, because there is no %s", card.name, " or ".join(_files_of(card)))
             continue
         is_scored, points = True, truth[labelling]
         if card is cards.INSTANCES:
-            yield instance_scan(points, classes, *read_point_instances(found[0], len(points)))
+            yield instance_scan(points, classes, *read_point_instances(paths[0], len(points)))
         else:
-            predicted = classes.labels(read_point_classes(found[0], len(points)))
+            predicted = classes.labels(read_point_classes(paths[0], len(points)))
             labels = classes.labels(points.class_id)
             yield from measure_points(card, METHOD, labels, predicted, classes, "files")
     if not is_scored:
@@ -265,25 +265,25 @@ def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.nd
         ImageError: a PNG is damaged.
     """
     stem = Path(view).stem
-    place, packed = folder / stem, folder / f"{stem}.npz"
-    if packed.is_file() and place.is_dir():
+    images, packed = folder / stem, folder / f"{stem}.npz"
+    if packed.is_file() and images.is_dir():
         raise ArtifactError(
             f"view {stem} has two sets of predictions",
-            expected=f"{packed.name} or {place.name}/",
+            expected=f"{packed.name} or {images.name}/",
             found="both",
             fix="remove one of them",
         )
     if packed.is_file():
         arrays = read_npz(packed, max_gib=2.0)  # 500 masks of 4 megapixels
         return {_key(name): _as_mask(array, f"{packed}: {name}") for name, array in arrays.items()}
-    if not place.is_dir():
+    if not images.is_dir():
         raise ArtifactError(
             f"view {stem} has no predictions",
-            expected=f"{place}/<text>.png, or {packed.name}",
+            expected=f"{images}/<text>.png, or {packed.name}",
             fix="write them, or create an empty folder if nothing was found",
         )
-    files = sorted(place.rglob("*.png"))
-    names = {path: _key(path.relative_to(place).with_suffix("").as_posix()) for path in files}
+    files = sorted(images.rglob("*.png"))
+    names = {path: _key(path.relative_to(images).with_suffix("").as_posix()) for path in files}
     return {name: _as_mask(read_mask(path), str(path)) for path, name in names.items()}
 
 

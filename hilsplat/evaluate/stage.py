@@ -14,6 +14,7 @@ from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.generators import Truth
 from hilsplat.datasets.labelled import LabelledScene
 from hilsplat.datasets.points.labelled_points import PointScene
+from hilsplat.evaluate.costs import write_times
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.metrics.instances import InstanceMatches
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
@@ -22,7 +23,6 @@ from hilsplat.evaluate.protocols.points import measure_scene_points
 from hilsplat.evaluate.protocols.view_truth import truths_of
 from hilsplat.evaluate.protocols.views import measure_view, rule_of
 from hilsplat.evaluate.scores import Measured, Score, write_instances, write_scores
-from hilsplat.evaluate.tables.costs import write_times
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.finished import SceneParts
@@ -92,33 +92,33 @@ def run_evaluate(
         else:
             answers = LanguageScene.from_parts(parts, settings, threads=threads)
             posed, selections = answers.scene, Selections(answers)
-            for data, known, protocols in scored:
+            for data, annotations, protocols in scored:
                 truths = {}
-                if not isinstance(known, PointScene):
-                    labels_of = known if isinstance(known, LabelledScene) else known.folder
-                    truths = truths_of(labels_of, posed, settings.min_region_px)
+                if not isinstance(annotations, PointScene):
+                    regions = annotations if isinstance(annotations, LabelledScene) else annotations.folder
+                    truths = truths_of(regions, posed, settings.min_region_px)
                     if not truths:
                         logger.warning("no view of %s is annotated: nothing to score", posed.name)
                 counts[f"views of {data}"] = len(truths)
-                kept: dict[str, PackedMasks] = {}
+                masks: dict[str, PackedMasks] = {}
                 for view in track(list(truths), "views scored"):
                     of_view = truths[view]()
-                    kept[view] = PackedMasks(posed.cameras[view].size_hw)
-                    for row in measure_view(selections, of_view, view, kept[view], settings, protocols):
+                    masks[view] = PackedMasks(posed.cameras[view].size_hw)
+                    for row in measure_view(selections, of_view, view, masks[view], settings, protocols):
                         keep(data, view, row)
                     if not seconds and of_view.categories:
                         texts = [query.text for query in of_view.categories[:TIMED_TEXTS]]
                         seconds = time_queries(answers, view, texts, settings)
                     answers.views.cache.forget(view)  # reusing the freed memory avoids clearing new pages
                 is_checked = bool(truths) and settings.view_consistency
-                if is_checked and not isinstance(known, LabelledScene | PointScene):
-                    for view, row in known.consistency(selections, truths, kept, settings):
+                if is_checked and not isinstance(annotations, LabelledScene | PointScene):
+                    for view, row in annotations.consistency(selections, truths, masks, settings):
                         keep(data, view, row)
-                for each in point_rows(answers, known, protocols, settings, threads):
-                    if isinstance(each, Measured):
-                        keep(data, "", each)
+                for result in point_rows(answers, annotations, protocols, settings, threads):
+                    if isinstance(result, Measured):
+                        keep(data, "", result)
                     else:
-                        matches[data, scene, variant, label, "tree"] = each
+                        matches[data, scene, variant, label, "tree"] = result
         counts["rows"] = len(scores)
         write_times(out, dataset, scene, variant, seconds)
         write_instances(out, matches)

@@ -29,10 +29,10 @@ IMAGES_OF = {"hi_lerf": "lerf_ovs", "hi_3dovs": "3d_ovs"}
 PROPOSED = "proposed"
 """Value of `origin` for objects proposed by a program, which are ignored until the user accepts them."""
 
-LEAST_POSED = 0.5
+MIN_POSED = 0.5
 """Minimum share of annotated photographs with a pose; below it, they probably show another scene."""
 
-OUTSIDE_SHARE = 0.01
+MAX_OUTSIDE = 0.01
 """Share of a child's area that may be outside its parent, to allow for rasterised borders."""
 
 
@@ -69,7 +69,7 @@ def open_annotated(root: Path, scene: str) -> LabelledScene:
         warnings += labels.warnings
         has_levels = any("level" in thing.keys for thing in labels.objects)
         views[view] = regions_of(labels, warnings) if has_levels else merged_regions(labels)
-    return LabelledScene("annotated", scene, {}, None, views, tuple(warnings), LEAST_POSED)
+    return LabelledScene("annotated", scene, {}, None, views, tuple(warnings), MIN_POSED)
 
 
 def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, ...]:
@@ -158,7 +158,7 @@ def parents_of(
 def _nesting_violations(
     labels: IsatFile, objects: Mapping[int, IsatObject], parents: Mapping[int, int | None]
 ) -> list[str]:
-    """Return a sentence for every child with more than `OUTSIDE_SHARE` of its area outside its parent."""
+    """Return a sentence for every child with more than `MAX_OUTSIDE` of its area outside its parent."""
     masks = {number: fill_polygons(thing.polygons, labels.size_hw) for number, thing in objects.items()}
     sentences = []
     for number, parent in parents.items():
@@ -166,7 +166,7 @@ def _nesting_violations(
             continue
         area_px = np.count_nonzero(masks[number])
         outside = np.count_nonzero(masks[number] & ~masks[parent])
-        if outside > OUTSIDE_SHARE * area_px:
+        if outside > MAX_OUTSIDE * area_px:
             sentences.append(
                 f"{labels.path.name}, id {number} ({objects[number].category}): {outside / area_px:.1%} of "
                 f"its area is outside its parent {parent} ({objects[parent].category})"
@@ -205,7 +205,6 @@ class Annotated(Dataset):
     """A data set without published scenes: its scenes are those that have been annotated."""
 
     def found(self, root: Path) -> tuple[str, ...]:
-        """Return the scenes that have a label file below the folder."""
         files = root.glob("*/*/*.json")
         return tuple(sorted({f"{path.parent.parent.name}/{path.parent.name}" for path in files}))
 

@@ -21,7 +21,7 @@ from hilsplat.scene.layouts import read_json_object
 
 Polygon = Float[np.ndarray, "_ 2"] | Int[np.ndarray, "_ 2"] | Sequence[tuple[int, int]]
 
-LARGEST_SIDE_PX = 20_000
+MAX_SIDE_PX = 20_000
 """Limit on the image size stated in a label file; drawing regions at a wrong size could exhaust memory."""
 
 SLACK_PX = 1.0
@@ -64,19 +64,12 @@ def trace_polygons(mask: Bool[np.ndarray, "H W"]) -> list[Int[np.ndarray, "_ 2"]
 
 @dataclass(frozen=True, eq=False)
 class IsatObject:
-    """One annotated object.
+    """One annotated object."""
 
-    Attributes:
-        category: the text, verbatim.
-        polygons: vertices, px; the region is the union of the filled polygons.
-        box_xyxy: whole pixels inside the annotated box, borders included.
-        keys: all keys of the object in the file.
-    """
-
-    category: str
-    polygons: tuple[Float[np.ndarray, "_ 2"], ...]
-    box_xyxy: Int64[np.ndarray, " 4"]
-    keys: Mapping[str, Any]
+    category: str  # the text, verbatim
+    polygons: tuple[Float[np.ndarray, "_ 2"], ...]  # vertices, px; the region is their filled union
+    box_xyxy: Int64[np.ndarray, " 4"]  # whole pixels inside the annotated box, borders included
+    keys: Mapping[str, Any]  # all keys of the object in the file
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,10 +116,10 @@ def stated_size(where: str, content: Any) -> tuple[int, int]:
     sides: list[Any] = [
         content.get(key) if isinstance(content, dict) else None for key in ("height", "width")
     ]
-    if not all(type(side) is int and 0 < side <= LARGEST_SIDE_PX for side in sides):
+    if not all(type(side) is int and 0 < side <= MAX_SIDE_PX for side in sides):
         raise SceneError(
             f"{where} does not state a valid image size",
-            expected=f"height and width in pixels, at most {LARGEST_SIDE_PX}",
+            expected=f"height and width in pixels, at most {MAX_SIDE_PX}",
             found=f"height {sides[0]!r}, width {sides[1]!r}",
             fix="export the labels again",
         )

@@ -90,7 +90,7 @@ def _regions(
     if extra:
         warnings.append(f"{place.name}: masks of unknown classes are ignored: {', '.join(extra)}")
     return tuple(
-        mask_region(files[prompt], FOREGROUND, image_hw, warnings, SHAPE_TOLERANCE, least_grey=1)
+        mask_region(files[prompt], FOREGROUND, image_hw, warnings, SHAPE_TOLERANCE, min_grey=1)
         for prompt in prompts
     )
 

@@ -3,7 +3,8 @@
 Each reader raises SceneError if its file is missing or damaged.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,24 +16,18 @@ from plyfile import PlyData, PlyParseError
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.dataset import SceneReport, listing
 from hilsplat.scene import layouts
-from hilsplat.scene.posed_images import PosedImage
+from hilsplat.scene.posed_images import PosedImage, rigid_pose
 
 UNPACK_AGAIN = "unpack or download the file again; this copy is damaged or incomplete"
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledPoints:
-    """P points with their ground-truth classes, in the frame of the scene's cameras.
+    """P points with their ground-truth classes, in the frame of the scene's cameras."""
 
-    Attributes:
-        xyz: positions, metres.
-        class_id: class number in the data set's files; 0 if undefined.
-        instance_id: instance number from 1, unrelated to numbers in other files; 0 for none.
-    """
-
-    xyz: Float[np.ndarray, "P 3"]
-    class_id: Int32[np.ndarray, " P"]
-    instance_id: Int32[np.ndarray, " P"]
+    xyz: Float[np.ndarray, "P 3"]  # metres
+    class_id: Int32[np.ndarray, " P"]  # number in the data set's files; 0 if undefined
+    instance_id: Int32[np.ndarray, " P"]  # from 1, unrelated to numbers in other files; 0 for none
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -40,21 +35,14 @@ class LabelledPoints:
 
 @dataclass(frozen=True, eq=False)
 class PointScene:
-    """A scene with labelled points.
-
-    Attributes:
-        images: posed images; frames without a pose are omitted.
-        truth: labelled points by labelling, a key of `classes.LABELLINGS`. Only `evaluate` may read them.
-        warnings: one sentence for each item that was skipped or reinterpreted.
-    """
+    """A scene with labelled points."""
 
     name: str
-    images: tuple[PosedImage, ...]
-    truth: Mapping[str, LabelledPoints]
-    warnings: tuple[str, ...] = ()
+    images: tuple[PosedImage, ...]  # frames without a pose are omitted
+    truth: Mapping[str, LabelledPoints]  # by key of `classes.LABELLINGS`; only `evaluate` may read them
+    warnings: tuple[str, ...] = ()  # a sentence for each item that was skipped or reinterpreted
 
     def report(self) -> SceneReport:
-        """Report what was read, and warn about what was skipped."""
         facts: dict[str, object] = {"posed images": len(self.images)}
         for labelling, points in self.truth.items():
             facts[f"{labelling} points"] = len(points)
@@ -62,6 +50,16 @@ class PointScene:
             facts[f"{labelling} classes"] = len(np.unique(points.class_id[points.class_id > 0]))
             facts[f"{labelling} instances"] = len(np.unique(points.instance_id[points.instance_id > 0]))
         return SceneReport(facts, self.warnings)
+
+
+@contextmanager
+def decoding(where: object, expected: str | None = None, fix: str = UNPACK_AGAIN) -> Iterator[None]:
+    """Raise SceneError with the reason if the block cannot decode the data described by `where`."""
+    try:
+        yield
+    except (ValueError, KeyError, IndexError, TypeError, OSError, PlyParseError) as error:
+        reason = repr(error) if isinstance(error, KeyError) else error
+        raise SceneError(f"{where} cannot be read: {reason}", expected=expected, fix=fix) from error
 
 
 def require_file(path: Path, fix: str = UNPACK_AGAIN) -> Path:
@@ -86,14 +84,23 @@ def read_json_object(path: Path, keys: tuple[str, ...]) -> dict:
 
 def read_matrices(path: Path, columns: int) -> Float64[np.ndarray, "M 4 4"]:
     """Read a text file: lines of 16 numbers, or one matrix as 4 lines of 4 (inf and nan are allowed)."""
-    try:
-        rows = np.loadtxt(require_file(path), comments=None, encoding="utf-8", ndmin=2)
+    expected = f"{columns} numbers per line" + (", 4 lines" if columns == 4 else "")
+    with decoding(require_file(path), expected):
+        rows = np.loadtxt(path, comments=None, encoding="utf-8", ndmin=2)
         if rows.shape[1] != columns or (columns == 4 and len(rows) != 4):
             raise ValueError(f"{rows.shape[0]} lines of {rows.shape[1]} numbers")
-    except ValueError as error:
-        expected = f"{columns} numbers per line" + (", 4 lines" if columns == 4 else "")
-        raise SceneError(f"{path} cannot be read: {error}", expected=expected, fix=UNPACK_AGAIN) from error
     return rows.reshape(-1, 4, 4)
+
+
+def posed_frame(
+    path: Path,
+    world_from_cam: Float64[np.ndarray, "4 4"],
+    where: str,
+    K: Float[np.ndarray, "3 3"],
+    size_hw: tuple[int, int],
+) -> PosedImage:
+    """Return an image of a sequence with its pose, which is described by `where` in messages."""
+    return PosedImage(path.name, path, np.linalg.inv(rigid_pose(world_from_cam, where)), K, size_hw)
 
 
 class PlyMesh:
@@ -101,20 +108,12 @@ class PlyMesh:
 
     def __init__(self, path: Path, corners: int, fix: str = UNPACK_AGAIN) -> None:
         self.path, self.fix = require_file(path, fix), fix
-        try:
+        with decoding(path, f"a PLY mesh with {corners} corners per face", fix):
             self._content = PlyData.read(path, known_list_len={"face": {"vertex_indices": corners}})
             for element in ("vertex", "face"):
                 self._content[element]  # raises KeyError if the element is missing
-        except (PlyParseError, KeyError, ValueError, OSError) as error:
-            raise SceneError(
-                f"{path} cannot be read: {error}",
-                expected=f"a PLY mesh with {corners} corners per face",
-                found=f"a file of {path.stat().st_size} bytes",
-                fix=fix,
-            ) from error
 
     def column(self, element: str, name: str) -> np.ndarray:
-        """Return a property of all vertices or faces, by name."""
         data = self._content[element].data
         if name not in data.dtype.names:
             raise SceneError(
@@ -127,7 +126,6 @@ class PlyMesh:
 
     @cached_property
     def xyz(self) -> Float32[np.ndarray, "P 3"]:
-        """Positions of the vertices."""
         return np.stack([self.column("vertex", axis) for axis in "xyz"], axis=1).astype(np.float32)
 
     @cached_property
@@ -136,10 +134,5 @@ class PlyMesh:
         faces = self.column("face", "vertex_indices").astype(np.int32)
         count = len(self._content["vertex"].data)
         if faces.size and (faces.min() < 0 or faces.max() >= count):
-            raise SceneError(
-                f"{self.path}: a face has an invalid vertex index",
-                expected=f"0 to {count - 1}",
-                found=f"{faces.min()} to {faces.max()}",
-                fix=self.fix,
-            )
+            raise SceneError(f"{self.path}: a face has an invalid vertex index", fix=self.fix)
         return faces

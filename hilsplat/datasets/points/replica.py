@@ -27,10 +27,12 @@ from hilsplat.datasets.points.labelled_points import (
     LabelledPoints,
     PlyMesh,
     PointScene,
+    decoding,
+    posed_frame,
     read_json_object,
     read_matrices,
 )
-from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage, rigid_pose
+from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage
 
 LAYOUTS = (("traj.txt", "results", "frame"), ("traj_w_c.txt", "rgb", "rgb_"))
 """Pose file, image folder and image name prefix, for NICE-SLAM, then for Semantic-NeRF and vMAP."""
@@ -61,15 +63,9 @@ def find_sequence(root: Path, scene: str) -> tuple[Path, tuple[str, str, str]]:
 def read_lens(path: Path) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
     """Return K and the image size from `cam_params.json`, which is beside a NICE-SLAM sequence."""
     camera = read_json_object(path, ("camera",))["camera"]
-    try:
+    with decoding(path, "numbers w, h, fx, fy, cx, cy under the key camera"):
         fx, fy, cx, cy = (float(camera[key]) for key in ("fx", "fy", "cx", "cy"))
         size_hw = int(camera["h"]), int(camera["w"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise SceneError(
-            f"{path} cannot be read: {error!r}",
-            expected="numbers w, h, fx, fy, cx, cy under the key camera",
-            fix=UNPACK_AGAIN,
-        ) from error
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]) + HALF_PIXEL, size_hw
 
 
@@ -102,12 +98,12 @@ def read_images(root: Path, scene: str) -> tuple[tuple[PosedImage, ...], tuple[s
     else:  # the renderings' stated centre, 599.5 of 1200 px, is relative to the first pixel's centre
         size_hw = height, width = image_size_hw(frames[0][1])
         K = np.array([[width / 2, 0.0, width / 2], [0.0, width / 2, height / 2], [0.0, 0.0, 1.0]])
-    images = []
-    for number, image in frames:
-        pose = np.linalg.inv(rigid_pose(poses[number], f"{path}, line {number + 1}"))
-        images.append(PosedImage(image.name, image, pose, K, size_hw))
+    images = tuple(
+        posed_frame(image, poses[number], f"{path}, line {number + 1}", K, size_hw)
+        for number, image in frames
+    )
     more = len(poses) - len(frames)
-    return tuple(images), (f"{more} poses have no image and are skipped",) if more else ()
+    return images, (f"{more} poses have no image and are skipped",) if more else ()
 
 
 def class_of_objects(path: Path) -> Int32[np.ndarray, " O"]:
@@ -116,15 +112,9 @@ def class_of_objects(path: Path) -> Int32[np.ndarray, " O"]:
     Names and ids must be those of the release.
     """
     content = read_json_object(path, ("classes", "id_to_label"))
-    try:
+    with decoding(path, "id_to_label: a list of class ids; classes: objects with id and name"):
         classes = np.asarray(content["id_to_label"], dtype=np.int32).reshape(-1)
         names = {int(entry["id"]): str(entry["name"]) for entry in content["classes"]}
-    except (TypeError, ValueError, KeyError) as error:
-        raise SceneError(
-            f"{path} cannot be read: {error!r}",
-            expected="id_to_label: a list of class ids; classes: objects with id and name",
-            fix=UNPACK_AGAIN,
-        ) from error
     other = [f"{number} {name}" for number, name in names.items() if REPLICA_NAMES.get(number) != name]
     strange = sorted(set(classes[classes > 0].tolist()) - set(REPLICA_NAMES))
     if other or strange:
@@ -174,7 +164,6 @@ def read_semantic_mesh(habitat: Path) -> LabelledPoints:
 
 
 def open_scene(root: Path, scene: str) -> PointScene:
-    """Read the frames and labels of a scene, such as "room_0"."""
     truth = read_semantic_mesh(root / scene / "habitat")
     images, warnings = read_images(root, scene)
     return PointScene(scene, images, {"replica": truth}, warnings)

@@ -20,15 +20,16 @@ from hilsplat.datasets.classes import SCANNET200
 from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.labelled import image_size_hw
 from hilsplat.datasets.points.labelled_points import (
-    UNPACK_AGAIN,
     LabelledPoints,
     PlyMesh,
     PointScene,
+    decoding,
+    posed_frame,
     read_json_object,
     read_matrices,
     require_file,
 )
-from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage, rigid_pose
+from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage
 
 LABEL_TABLE = "scannetv2-labels.combined.tsv"
 SAME_PLACE_M = 1e-4
@@ -55,7 +56,7 @@ def scan_folder(root: Path, scan: str) -> Path:
 def read_label_table(path: Path) -> dict[str, int]:
     """Map each raw category to its id in the label table, or to 0 if it is not one of the 200 classes."""
     require_file(path, f"download {LABEL_TABLE} from ScanNet's release to the data set's folder")
-    found = {}
+    labels = {}
     with path.open(encoding="utf-8", newline="") as stream:
         rows = csv.DictReader(stream, delimiter="\t")
         needed = {"id", "raw_category"}
@@ -67,12 +68,10 @@ def read_label_table(path: Path) -> dict[str, int]:
                 fix="download the table again, from the latest release",
             )
         for row in rows:
-            try:
+            with decoding(f"{path}, line {rows.line_num}"):
                 label = int(row["id"] or 0)
-            except ValueError as error:
-                raise SceneError(f"{path}, line {rows.line_num}: {error}", fix=UNPACK_AGAIN) from error
-            found[row["raw_category"]] = label if label in SCANNET200.ids else 0
-    return found
+            labels[row["raw_category"]] = label if label in SCANNET200.ids else 0
+    return labels
 
 
 def read_images(folder: Path, scan: str) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
@@ -85,7 +84,7 @@ def read_images(folder: Path, scan: str) -> tuple[tuple[PosedImage, ...], tuple[
     """
     frames = sorted((_frame_number(path), path) for path in list_images(folder / "color"))
     K = read_matrices(folder / "intrinsic" / "intrinsic_color.txt", 4)[0, :3, :3] + HALF_PIXEL
-    lost, without, images = [], [], []
+    lost, unposed, images = [], [], []
     described = folder / f"{scan}.txt"
     info = dict(re.findall("(.*) = (.*)", described.read_text("utf-8"))) if described.is_file() else {}
     if "colorHeight" in info and "colorWidth" in info:
@@ -95,26 +94,25 @@ def read_images(folder: Path, scan: str) -> tuple[tuple[PosedImage, ...], tuple[
     for number, path in frames:
         pose = folder / "pose" / f"{number}.txt"
         if not pose.is_file():
-            without.append(number)
+            unposed.append(number)
             continue
         world_from_cam = read_matrices(pose, 4)[0]
         if not np.isfinite(world_from_cam).all():
             lost.append(number)
             continue
-        cam_from_world = np.linalg.inv(rigid_pose(world_from_cam, str(pose)))
-        images.append(PosedImage(path.name, path, cam_from_world, K, size_hw))
+        images.append(posed_frame(path, world_from_cam, str(pose), K, size_hw))
     if not images:
         raise SceneError(
             f"{scan} has no usable frames",
             expected="images in color/, each with a finite matrix in pose/",
-            found=f"{len(frames)} images; {len(without)} without a pose, {len(lost)} with failed tracking",
+            found=f"{len(frames)} images; {len(unposed)} without a pose, {len(lost)} with failed tracking",
             fix="export poses and images again",
         )
     warnings = []
     if lost:
         warnings.append(f"{len(lost)} frames are skipped because tracking failed (infinite poses)")
-    if without:
-        warnings.append(f"{len(without)} images (first: {without[0]}) have no file in pose/ and are skipped")
+    if unposed:
+        warnings.append(f"{len(unposed)} images (first: {unposed[0]}) have no file in pose/ and are skipped")
     return tuple(images), tuple(warnings)
 
 
@@ -179,15 +177,9 @@ def _from_aggregation(
     fine, instance = np.zeros((2, num_points), dtype=np.int32)
     unknown: Counter = Counter()
     for row, group in enumerate(read_json_object(path, ("segGroups",))["segGroups"]):
-        try:
+        with decoding(f"{path}, group {row}", "objectId, label and a list of segments"):
             category, number = str(group["label"]), int(group["objectId"]) + 1
             members = np.asarray(group["segments"], dtype=np.int64)
-        except (KeyError, TypeError, ValueError) as error:
-            raise SceneError(
-                f"{path}, group {row} cannot be read: {error!r}",
-                expected="objectId, label and a list of segments",
-                fix=UNPACK_AGAIN,
-            ) from error
         rows = np.isin(segments, members)
         if not rows.any():
             raise SceneError(
@@ -201,7 +193,6 @@ def _from_aggregation(
 
 
 def open_scan(root: Path, scan: str) -> PointScene:
-    """Read the frames and labels of a scan."""
     folder = scan_folder(root, scan)
     DATASET.require(root, scan)
     truth, of_labels = read_truth(folder, scan, read_label_table(root / LABEL_TABLE))

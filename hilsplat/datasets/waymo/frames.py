@@ -28,48 +28,34 @@ CV_FROM_WAYMO = np.array(
 
 @dataclass(frozen=True, eq=False)
 class LidarReturn:
-    """One labelled return of the top lidar.
+    """One labelled return of the top lidar."""
 
-    Attributes:
-        image: range (metres; zero or negative if there is no return), intensity, elongation, no-label zone.
-        labels: instance and class.
-    """
-
+    # Range (metres; zero or negative if there is no return), intensity, elongation, no-label zone.
     image: Float32[np.ndarray, "H W 4"]
-    labels: Int32[np.ndarray, "h w 2"]  # h = H and w = W, checked by `frame_points`
+    labels: Int32[np.ndarray, "h w 2"]  # instance, class; h = H and w = W, checked by `frame_points`
 
 
 @dataclass(frozen=True, eq=False)
 class LidarFrame:
-    """One revolution of the top lidar.
-
-    Attributes:
-        inclinations: inclinations of the rows, radians, highest first.
-        pixel_pose: vehicle pose in the world at each pixel: roll, pitch, yaw (radians), x, y, z (metres).
-        returns: one or two returns.
-    """
+    """One revolution of the top lidar."""
 
     timestamp_micros: int
     world_from_vehicle: Float[np.ndarray, "4 4"]
     vehicle_from_lidar: Float[np.ndarray, "4 4"]
-    inclinations: Float[np.ndarray, " h"]  # h = H, checked by `frame_points`
+    inclinations: Float[np.ndarray, " h"]  # radians, highest first; h = H, checked by `frame_points`
+    # Vehicle pose in the world at each pixel: roll, pitch, yaw (radians), x, y, z (metres).
     pixel_pose: Float32[np.ndarray, "H W 6"]
-    returns: tuple[LidarReturn, ...]
+    returns: tuple[LidarReturn, ...]  # one or two
 
 
 @dataclass(frozen=True, eq=False)
 class WaymoCamera:
-    """One camera of the car.
-
-    Attributes:
-        intrinsic: f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3; px with the first pixel's left edge at 0, and
-            distortion in OpenCV's definition, as in this project.
-        vehicle_from_cam: pose on the vehicle, in Waymo's camera axes.
-    """
+    """One camera of the car."""
 
     name: str
+    # f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3: px with the first pixel's left edge at 0, OpenCV's distortion
     intrinsic: Float[np.ndarray, " 9"]
-    vehicle_from_cam: Float[np.ndarray, "4 4"]
+    vehicle_from_cam: Float[np.ndarray, "4 4"]  # in Waymo's camera axes
     size_hw: tuple[int, int]
 
 
@@ -175,7 +161,6 @@ def frame_points(frame: LidarFrame, segment_from_world: Float[np.ndarray, "4 4"]
 
 
 def joined_points(parts: Sequence[LabelledPoints]) -> LabelledPoints:
-    """Concatenate the points of one or more frames or returns."""
     return LabelledPoints(
         np.concatenate([part.xyz for part in parts]),
         np.concatenate([part.class_id for part in parts]),

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.dataset import listing
-from hilsplat.datasets.points.labelled_points import UNPACK_AGAIN
+from hilsplat.datasets.points.labelled_points import UNPACK_AGAIN, decoding
 from hilsplat.datasets.waymo.frames import (
     CAMERAS,
     TOP,
@@ -38,7 +38,6 @@ FRAME, LASER, CAMERA = "key.frame_timestamp_micros", "key.laser_name", "key.came
 
 
 def component_path(split: Path, tag: str, segment: str) -> Path:
-    """Return the path of a component: `<split>/<tag>/<segment>.parquet`."""
     return split / tag / f"{segment}.parquet"
 
 
@@ -49,7 +48,6 @@ def read_component(
 
     `only` maps columns to required values; rows with other values are not decoded.
     """
-    import pyarrow as pa
     import pyarrow.parquet as parquet
 
     path = component_path(split, tag, segment)
@@ -60,24 +58,18 @@ def read_component(
             found=listing(path.parent),
             fix=f"download {tag}/{segment}.parquet from the same release",
         )
-    try:
-        known = parquet.read_schema(path).names
-        lacking = [name for name in (*columns, *(only or {})) if name not in known]
+    with decoding(path):
+        names = parquet.read_schema(path).names
+        lacking = [name for name in (*columns, *(only or {})) if name not in names]
         if lacking:
             raise SceneError(
                 f"{path} is not component {tag} of release 2",
                 expected=f"columns {', '.join(lacking)}",
-                found=", ".join(known[:12]),
+                found=", ".join(names[:12]),
                 fix="download the component again",
             )
         keep = [(name, "==", value) for name, value in (only or {}).items()]
         table = parquet.read_table(path, columns=columns, filters=keep or None, partitioning=None)
-    except (pa.ArrowInvalid, OSError) as error:
-        raise SceneError(
-            f"{path} cannot be read: {error}",
-            found=f"a file of {path.stat().st_size} bytes",
-            fix=UNPACK_AGAIN,
-        ) from error
     return table.to_pandas(ignore_metadata=True, integer_object_nulls=True).to_dict("records")
 
 
@@ -142,19 +134,13 @@ def _range_images(
             images.append(None)
             continue
         shape = tuple(int(size) for size in sizes)
-        if len(shape) != 3 or shape[2] != depth or np.prod(shape) != len(values):
-            raise SceneError(
-                f"segment {segment}, frame {time}: {name} has the wrong shape",
-                expected=f"height x width x {depth}",
-                found=f"{len(values)} values for {' x '.join(map(str, shape))}",
-                fix=UNPACK_AGAIN,
-            )
-        images.append(values.reshape(shape))
+        with decoding(f"segment {segment}, frame {time}: {name}", f"height x width x {depth}"):
+            height, width, _ = shape
+            images.append(values.reshape(height, width, depth))
     return images
 
 
 def _cameras(split: Path, segment: str) -> dict[int, WaymoCamera]:
-    """Return the car's cameras by their number, which starts at 1."""
     base = "[CameraCalibrationComponent]"
     inner = [f"{base}.intrinsic.{name}" for name in INTRINSIC]
     place, width, height = f"{base}.extrinsic.transform", f"{base}.width", f"{base}.height"
@@ -172,14 +158,14 @@ def _cameras(split: Path, segment: str) -> dict[int, WaymoCamera]:
 
 def camera_shots(split: Path, segment: str, every: int = 1) -> Iterator[CameraShot]:
     """Yield the images of every n-th frame, sorted by time and camera."""
-    known = _cameras(split, segment)
+    cameras = _cameras(split, segment)
     pose = "[CameraImageComponent].pose.transform"
     rows = read_component(split, "camera_image", segment, [FRAME, CAMERA])
-    strange = sorted({row[CAMERA] for row in rows} - set(known))
+    strange = sorted({row[CAMERA] for row in rows} - set(cameras))
     if strange:
         raise SceneError(
             f"segment {segment} has images from uncalibrated cameras",
-            expected=", ".join(map(str, sorted(known))),
+            expected=", ".join(map(str, sorted(cameras))),
             found=", ".join(map(str, strange)),
             fix="download camera_image and camera_calibration from the same release",
         )
@@ -188,4 +174,4 @@ def camera_shots(split: Path, segment: str, every: int = 1) -> Iterator[CameraSh
         of_frame = read_component(split, "camera_image", segment, columns, {FRAME: time})
         for row in sorted(of_frame, key=lambda row: row[CAMERA]):
             encoded = row["[CameraImageComponent].image"]
-            yield CameraShot(time, known[row[CAMERA]], encoded, row[pose].reshape(4, 4))
+            yield CameraShot(time, cameras[row[CAMERA]], encoded, row[pose].reshape(4, 4))

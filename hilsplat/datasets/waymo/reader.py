@@ -84,7 +84,6 @@ class Segments(Dataset):
         return open_segment(root, scene, every=10).report()
 
     def found(self, root: Path) -> tuple[str, ...]:
-        """Return the labelled segments below the folder."""
         files = [path for split in SPLITS for path in (root / split).glob(f"{LABELS}/*.parquet")]
         return tuple(sorted({*(path.stem for path in files), *record_files(root)}))
 

@@ -18,7 +18,7 @@ from google.protobuf.message import DecodeError
 from jaxtyping import Float
 
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.points.labelled_points import UNPACK_AGAIN, require_file
+from hilsplat.datasets.points.labelled_points import UNPACK_AGAIN, decoding, require_file
 from hilsplat.datasets.waymo.frames import (
     CAMERAS,
     TOP,
@@ -86,8 +86,8 @@ def matrix(compressed: bytes, dtype: type) -> np.ndarray:
     content = unpacker.decompress(compressed, 2**26)  # 16 times the largest matrix of Waymo
     if not unpacker.eof:
         raise ValueError("its data is truncated, or unpacks to more than 64 MiB")
-    found = kind.FromString(content)
-    return np.array(found.data, dtype=dtype).reshape(tuple(found.shape.dims))
+    message = kind.FromString(content)
+    return np.array(message.data, dtype=dtype).reshape(tuple(message.shape.dims))
 
 
 def records(path: Path) -> Iterator[bytes]:
@@ -123,11 +123,11 @@ def frames(path: Path) -> Iterator[tuple[str, Any]]:
 
 @contextmanager
 def _readable(where: str) -> Iterator[None]:
-    """Raise SceneError if the data cannot be decoded."""
-    try:
-        yield
-    except (ValueError, IndexError, DecodeError, zlib.error) as error:
-        raise SceneError(f"{where} cannot be read: {error}", fix=UNPACK_AGAIN) from error
+    with decoding(where):
+        try:
+            yield
+        except (DecodeError, zlib.error) as error:
+            raise ValueError(error) from error
 
 
 def first_pose(path: Path) -> Float[np.ndarray, "4 4"]:
@@ -173,7 +173,6 @@ def lidar_frames(path: Path) -> Iterator[LidarFrame]:
 
 
 def _named(messages: Iterable[Any], name: int) -> Any:
-    """Return the message from the sensor with the number `name`."""
     for message in messages:
         if message.name == name:
             return message

@@ -60,7 +60,6 @@ class Shown:
 
     @property
     def title(self) -> str:
-        """Title of the photograph."""
         return self.view if self.truth is None else f"truth, {self.view}"
 
     def score(self, mask: Bool[np.ndarray, "H W"]) -> str:
@@ -68,7 +67,6 @@ class Shown:
         return "" if self.truth is None else f"IoU {iou(mask, self.truth):.2f}"
 
     def tree_mask(self, answers: LanguageScene, *, by_path: bool = False) -> Bool[np.ndarray, "H W"]:
-        """Return the mask of the tree's answer in the view."""
         return answers.views.node_masks(self.view, self.hits(answers, by_path=by_path).ids)
 
 

@@ -132,7 +132,6 @@ class SmoothedRelevancy:
 
     @staticmethod
     def of(relevancy: Float[np.ndarray, "3 H W"], rule: RelevancyRule) -> "SmoothedRelevancy":
-        """Filter all three levels."""
         side_px = filter_side_px(rule.filter_px, relevancy.shape[1])
         raw = np.asarray(relevancy, np.float32)
         filtered = np.stack([mean_filter(of_level, side_px, rule.border) for of_level in raw])

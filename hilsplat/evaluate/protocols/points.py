@@ -154,7 +154,6 @@ def instance_scan(
 
 
 def class_set(name: str) -> tuple[str, ClassSet]:
-    """Return the labelling and the class set with the given name."""
     sets = {classes.name: (labelling, classes) for labelling, sets in LABELLINGS.items() for classes in sets}
     return sets[name]
 

@@ -37,7 +37,6 @@ class Query:
     any_grey: Bool[np.ndarray, "H W"]  # region for protocols with the ground truth `any grey`
 
     def region(self, truth: str) -> Bool[np.ndarray, "H W"]:
-        """Return the ground-truth region for protocols with the given `truth`: `labels` or `any grey`."""
         return self.any_grey if truth == "any grey" else self.truth
 
 
@@ -145,7 +144,6 @@ class ViewTruth:
 
 
 def _merged(queries: Iterable[Query], by_level: bool) -> tuple[Query, ...]:
-    """Return one query per text, or per text and level."""
     groups: dict[tuple[str, Level | None], list[Query]] = {}
     for query in queries:
         groups.setdefault((query.text, query.level if by_level else None), []).append(query)

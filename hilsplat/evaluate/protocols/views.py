@@ -34,7 +34,6 @@ RELEVANCY_CHUNK_MIB = 512
 
 
 def rule_of(settings: EvaluateSettings) -> RelevancyRule:
-    """Return the map rule that the settings describe."""
     return RelevancyRule(
         settings.filter_px,
         settings.mix,
@@ -63,7 +62,6 @@ def label_of(card: cards.ProtocolCard, method: str, settings: EvaluateSettings) 
 
 
 def given_key(method: str, query: Query, settings: EvaluateSettings) -> tuple:
-    """Return the key under which the answer at the query's level is stored."""
     return (method, label_of(cards.LEVEL_GIVEN, method, settings), query.text, query.level)
 
 

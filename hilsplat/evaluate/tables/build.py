@@ -1,8 +1,7 @@
 """Build any table by name, in about a second: imports neither torch nor other slow packages."""
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -10,57 +9,33 @@ from hilsplat.base.artifacts import write_text
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.files import project_path
 from hilsplat.base.tables import write_csv
+from hilsplat.evaluate.costs import read_costs
 from hilsplat.evaluate.scores import read_instances, read_scores
-from hilsplat.evaluate.tables.ablation import ablation_table
-from hilsplat.evaluate.tables.costs import SECONDS, cost_table, efficiency_table, pruning_table, read_costs
+from hilsplat.evaluate.tables.ablation import ablation_blocks
+from hilsplat.evaluate.tables.cost_tables import cost_blocks, quality_blocks, without_costs
 from hilsplat.evaluate.tables.formats import as_html, as_latex, as_markdown, csv_rows
-from hilsplat.evaluate.tables.image_tables import frames_table, hierarchy_table, lerf_table, ovs_table
-from hilsplat.evaluate.tables.point_tables import replica_table, scannet_table, waymo_table
-from hilsplat.evaluate.tables.rows import Sources, Table, read_published
+from hilsplat.evaluate.tables.image_tables import frames_blocks, hierarchy_cells, lerf_cells, ovs_cells
+from hilsplat.evaluate.tables.kinds import NOTES, SECONDS, TABLES, TableKind
+from hilsplat.evaluate.tables.measured import measured_blocks
+from hilsplat.evaluate.tables.point_tables import replica_cells, scannet_blocks, waymo_cells
+from hilsplat.evaluate.tables.rows import Block, Sources, Table, read_published, reported_block
+from hilsplat.segment.origin import made_from_truth
 
 logger = logging.getLogger(__name__)
 
-LEVELLED = ("tabletop", "lerf_ovs", "3d_ovs")
-"""Data used for the ablations: the synthetic stand-in, and images with labels at levels."""
-
-
-@dataclass(frozen=True)
-class TableKind:
-    """One table: its builder, the kinds of scenes and data sets that it covers, and its variants.
-
-    `variants` is the configuration key that lists the variants. Tables of other variants than `main_variants`
-    are measured only on the scenes in `sweep_scenes`. `shows_costs` adds job and query times.
-    """
-
-    build: Callable[[Sources], Table]
-    data: tuple[str, ...]
-    variants: str = "main_variants"
-    shows_costs: bool = False
-
-
-TABLES: dict[str, TableKind] = {
-    "lerf": TableKind(lerf_table, ("tabletop", "lerf_ovs", "lerf_mask")),
-    "3dovs": TableKind(ovs_table, ("tabletop", "3d_ovs")),
-    "replica": TableKind(replica_table, ("room", "replica")),
-    "scannet": TableKind(scannet_table, ("room", "scannet")),
-    "waymo": TableKind(waymo_table, ("street", "waymo")),
-    "hierarchy": TableKind(hierarchy_table, ("tabletop", "room", "street", "lerf_ovs", "3d_ovs")),
-    "ablation": TableKind(partial(ablation_table, name="ablation"), LEVELLED, "ablation_variants"),
-    "components": TableKind(partial(ablation_table, name="components"), LEVELLED, "component_variants"),
-    "cost": TableKind(cost_table, LEVELLED, shows_costs=True),
-    "cost-seconds": TableKind(partial(cost_table, seconds=True), LEVELLED, shows_costs=True),
-    "pruning": TableKind(pruning_table, LEVELLED, "pruning_variants", shows_costs=True),
-    "pruning-seconds": TableKind(
-        partial(pruning_table, seconds=True), LEVELLED, "pruning_variants", shows_costs=True
-    ),
-    "efficiency": TableKind(efficiency_table, LEVELLED, shows_costs=True),
-    "efficiency-seconds": TableKind(partial(efficiency_table, seconds=True), LEVELLED, shows_costs=True),
-    "theta": TableKind(partial(ablation_table, name="theta"), LEVELLED, "theta_variants"),
-    "omega": TableKind(partial(ablation_table, name="omega"), LEVELLED, "omega_variants"),
-    "frames-hi-lerf": TableKind(partial(frames_table, data="Hi-LERF"), ("tabletop", "lerf_ovs")),
-    "frames-hi-3dovs": TableKind(partial(frames_table, data="Hi-3DOVS"), ("tabletop", "3d_ovs")),
+BLOCKS: dict[str, Callable[[TableKind, Sources], list[Block]]] = {
+    "lerf": partial(measured_blocks, cells_of=lerf_cells),
+    "3dovs": partial(measured_blocks, cells_of=ovs_cells),
+    "replica": partial(measured_blocks, cells_of=replica_cells),
+    "scannet": scannet_blocks,
+    "waymo": partial(measured_blocks, cells_of=waymo_cells),
+    "hierarchy": partial(measured_blocks, cells_of=hierarchy_cells),
+    **dict.fromkeys(("ablation", "components", "theta", "omega"), ablation_blocks),
+    "cost": cost_blocks,
+    **dict.fromkeys(("pruning", "efficiency"), quality_blocks),
+    **dict.fromkeys(("frames-hi-lerf", "frames-hi-3dovs"), frames_blocks),
 }
-"""Every table by name, in report order; a new table needs a function and an entry here."""
+"""Table (without `-seconds`) -> function that returns its measured rows."""
 
 
 def published_values(table: str) -> Path:
@@ -88,19 +63,34 @@ def run_table(
     """
     if name not in TABLES:
         raise ArtifactError(f"there is no table {name!r}", expected=f"one of {', '.join(TABLES)}")
-    kind = TABLES[name]
-    sources = Sources(
-        read_published(published),
-        read_scores(scores),
-        labels,
-        read_costs(scores) if kind.shows_costs else (),
-        read_instances(scores),
-        absent,
-    )
-    table, out = kind.build(sources), Path(out)
+    costs = read_costs(scores) if TABLES[name].shows_costs else ()
+    sources = Sources(read_published(published), read_scores(scores), labels, costs, read_instances(scores))
+    table, out = table_of(name, sources, absent), Path(out)
     write_text(out.with_suffix(".md"), as_markdown(table))
     write_text(out.with_suffix(".tex"), as_latex(table))
     write_text(out.with_suffix(".html"), as_html(table))
     write_csv(out, *csv_rows(table))
     rows = sum(len(block.rows) for block in table.blocks)
     logger.info("table %s: %d blocks, %d rows", name, len(table.blocks), rows)
+
+
+def table_of(name: str, sources: Sources, absent: Sequence[str]) -> Table:
+    """Return a table with the paper's blocks, measured blocks, and its footnotes."""
+    kind = TABLES[name]
+    reported = [reported_block(sources.published, **description) for description in kind.reported]
+    measured = BLOCKS[name.removesuffix(SECONDS)](kind, sources)
+    if kind.shows_costs and not name.endswith(SECONDS):
+        measured = [block for block in map(without_costs, measured) if block.columns]
+    blocks = tuple(block for block in (*reported, *measured) if block.rows)
+    not_measured = [f"Not measured: {sentence}" for sentence in absent]
+    return Table(name, kind.title, blocks, (*_warnings(blocks), *kind.footnotes, *not_measured))
+
+
+def _warnings(blocks: Sequence[Block]) -> Iterator[str]:
+    rows = [row for block in blocks for row in block.rows]
+    if any(block.kind == "synthetic stand-in" for block in blocks):
+        yield NOTES["stand-in"]
+    if any(made_from_truth(row.names.get("Masks", "")) for row in rows):
+        yield NOTES["true masks"]
+    if any("Seeds" in row.names for row in rows):
+        yield NOTES["seeds"]

@@ -10,21 +10,15 @@ from collections.abc import Iterator
 from hilsplat.base.tables import plain_markdown
 from hilsplat.evaluate.tables.rows import Block, Cell, Table
 
-LATEX_SPECIAL = {
+LATEX_NAMES = {
     "\\": r"\textbackslash{}",
-    "&": r"\&",
-    "%": r"\%",
-    "$": r"\$",
-    "#": r"\#",
-    "_": r"\_",
-    "{": r"\{",
-    "}": r"\}",
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
     ">": r"\textgreater{}",
     "<": r"\textless{}",
     "±": r"$\pm$",
 }
+LATEX_SPECIAL = str.maketrans({letter: "\\" + letter for letter in "&%$#_{}"} | LATEX_NAMES)
 
 HTML_STYLE = """<style>
 .hilsplat-table { font: 14px/1.4 system-ui, sans-serif; color: #1b1b1b; background: #fff; padding: 1em; }
@@ -51,8 +45,8 @@ def csv_rows(table: Table) -> tuple[list[str], list[list[str]]]:
         for row in block.rows:
             cells = [row.cell(column) if column in block.columns else Cell() for column in values]
             notes = " ".join(dict.fromkeys(cell.note for cell in cells if cell.note))
-            shown = [_csv_value(cell, block.kind) for cell in cells]
-            rows.append([block.kind, block.data, *(row.names.get(n, "") for n in names), *shown, notes])
+            texts = [_csv_value(cell, block.kind) for cell in cells]
+            rows.append([block.kind, block.data, *(row.names.get(n, "") for n in names), *texts, notes])
     return ["kind", "data", *(name.lower() for name in names), *values, "notes"], rows
 
 
@@ -100,8 +94,7 @@ def _plain(note: str) -> str:
 
 
 def latex_text(text: str) -> str:
-    """Escape characters that LaTeX would interpret."""
-    return "".join(LATEX_SPECIAL.get(letter, letter) for letter in text)
+    return text.translate(LATEX_SPECIAL)
 
 
 def as_latex(table: Table) -> str:

@@ -10,11 +10,14 @@ from typing import TYPE_CHECKING
 
 from hilsplat.base.levels import LEVELS
 from hilsplat.evaluate.protocols import cards
+from hilsplat.evaluate.tables.kinds import TableKind
 from hilsplat.evaluate.tables.rows import Block, Cell, Row, Sources
 from hilsplat.segment.origin import made_from_truth
 
 if TYPE_CHECKING:
     import pandas as pd
+
+CellsOf = Callable[["pd.DataFrame", "pd.DataFrame"], dict[str, Cell]]
 
 SEED = re.compile(r"(?P<variant>.+)\.seed(?P<seed>[0-9]+)")
 """Variant name with a seed; all seeds of a variant share a row."""
@@ -31,7 +34,7 @@ PROTOCOLS = {
 }
 """Protocol -> its name in tables; other protocols keep their own."""
 
-STAND_INS = {
+SYNTHETIC_DATA = {
     "synthetic": "generated tabletops",
     "synthetic-rooms": "generated rooms",
     "synthetic-streets": "generated streets",
@@ -40,52 +43,58 @@ STAND_INS = {
 
 
 def measured_blocks(
+    kind: TableKind,
     sources: Sources,
-    protocols: tuple[str, ...],
-    cells_of: Callable[["pd.DataFrame"], dict[str, Cell]],
-    columns_of: Callable[["pd.DataFrame"], Sequence[str]],
-    unranked: frozenset[str] = frozenset(),
-    ranked_by_protocol: bool = True,
-    over_seeds: Callable[["pd.DataFrame"], dict[str, Cell]] = lambda part: {},
+    cells_of: CellsOf,
+    over_seeds: CellsOf = lambda scores, part: {},
     label_of: Callable[[str], str] = lambda protocol: protocol,
 ) -> list[Block]:
     """Return one block per data set, with one row per variant, method, masks and protocol.
 
     Args:
-        protocols: prefixes of the protocols that have rows.
-        cells_of: computes a row's values from one seed's scores; `over_seeds` uses all seeds at once.
-        columns_of: returns the value columns, from the scores of a data set.
+        cells_of: computes a row's values from all scores and the row's scores of one seed.
+        over_seeds: computes values from all seeds of the row.
         label_of: maps protocols to labels; those with the same label share a row.
     """
+    scores = with_seeds(sources.scores)
+    of_methods = scores[scores["method"].isin(kind.methods)] if kind.methods else scores
     blocks = []
-    for data, of_data in with_seeds(sources.scores).groupby("dataset", sort=True):
-        placed: list[tuple[tuple, Row]] = []
-        selected = of_data[of_data["protocol"].str.startswith(protocols)]
-        selected = selected.assign(label=selected["protocol"].map(label_of))
-        groups = selected.groupby(["variant", "masks", "method", "label"], sort=True)
-        for (variant, masks, method, label), part in groups:
-            is_truth, from_truth = method == "truth", made_from_truth(masks)
-            is_diagnostic = from_truth and not is_truth
-            warning = "diagnostic, true masks: " if is_diagnostic else ""
-            names = {
-                "Method": warning + row_name(variant, method, sources.labels),
-                "Masks": "-" if is_truth else masks,
-                "Protocol": PROTOCOLS.get(label, label),
-            }
-            seeds = [cells_of(of_seed) for _, of_seed in part.groupby("seed", sort=True)]
-            seeds = seeds[:1] if is_truth else seeds  # annotations are the same under every seed
-            if len(seeds) > 1:
-                names["Seeds"] = str(len(seeds))
-            protocol = list(PROTOCOLS).index(label) if label in PROTOCOLS else -1
-            place = from_truth, protocol, *row_place(variant, method, sources.labels), masks, label
-            group = label if ranked_by_protocol else ""
-            cells = {**mean_over_seeds(seeds), **over_seeds(part)}
-            placed.append((place, Row(names, cells, None if is_truth or is_diagnostic else group)))
-        rows = without_repeats([row for _, row in sorted(placed, key=lambda each: each[0])])
-        if rows:
-            columns = tuple(columns_of(selected))
-            blocks.append(Block(*kind_and_title(str(data)), rows, columns, unranked=unranked))
+    for protocols in kind.protocols:
+        for data, of_data in of_methods.groupby("dataset", sort=True):
+            selected = of_data[of_data["protocol"].str.startswith(protocols)]
+            selected = selected.assign(label=selected["protocol"].map(label_of))
+            rows: list[tuple[tuple, Row]] = []
+            groups = selected.groupby(["variant", "masks", "method", "label"], sort=True)
+            for (variant, masks, method, label), part in groups:
+                seeds = [cells_of(scores, of_seed) for _, of_seed in part.groupby("seed", sort=True)]
+                seeds = seeds[:1] if method == "truth" else seeds  # annotations are the same under every seed
+                names = _row_names(variant, masks, method, label, sources.labels)
+                if len(seeds) > 1:
+                    names["Seeds"] = str(len(seeds))
+                cells = mean_over_seeds(seeds) | over_seeds(scores, part)
+                is_ranked = method != "truth" and not made_from_truth(masks)
+                group = label if kind.ranked_by_protocol else ""
+                protocol = list(PROTOCOLS).index(label) if label in PROTOCOLS else -1
+                order = row_place(variant, method, sources.labels)
+                place = made_from_truth(masks), protocol, *order, masks, label
+                rows.append((place, Row(names, cells, group if is_ranked else None)))
+            if rows:
+                distinct = without_repeats([row for _, row in sorted(rows, key=lambda pair: pair[0])])
+                columns = kind.columns_of(selected["scene"])
+                blocks.append(Block(*kind_and_title(str(data)), distinct, columns, kind.unranked))
     return blocks
+
+
+def _row_names(
+    variant: str, masks: str, method: str, label: str, labels: Mapping[str, str]
+) -> dict[str, str]:
+    is_truth = method == "truth"
+    warning = "diagnostic, true masks: " if made_from_truth(masks) and not is_truth else ""
+    return {
+        "Method": warning + row_name(variant, method, labels),
+        "Masks": "-" if is_truth else masks,
+        "Protocol": PROTOCOLS.get(label, label),
+    }
 
 
 def with_seeds(scores: "pd.DataFrame") -> "pd.DataFrame":
@@ -121,8 +130,8 @@ def without_repeats(rows: Sequence[Row]) -> tuple[Row, ...]:
 def row_place(variant: str, method: str, labels: Mapping[str, str]) -> tuple[int, str, int]:
     """Return the sort key of a row: the default variant, then variants in label order, then others."""
     order, methods = ["default", *labels], list(ANSWERS)
-    known = order.index(variant) if variant in order else len(order)
-    return known, variant, methods.index(method) if method in methods else len(methods)
+    place = order.index(variant) if variant in order else len(order)
+    return place, variant, methods.index(method) if method in methods else len(methods)
 
 
 def row_name(variant: str, method: str, labels: Mapping[str, str]) -> str:
@@ -141,7 +150,7 @@ def row_name(variant: str, method: str, labels: Mapping[str, str]) -> str:
 def kind_and_title(dataset: str) -> tuple[str, str, str]:
     """Return kind, data set and heading of measured rows."""
     if dataset.startswith("synthetic"):
-        what = STAND_INS.get(dataset, dataset)
+        what = SYNTHETIC_DATA.get(dataset, dataset)
         return "synthetic stand-in", dataset, f"Measured on a synthetic stand-in ({what}); not comparable"
     return "measured", dataset, f"Measured on {dataset}"
 
@@ -155,7 +164,7 @@ def scene_cells(
         values = scene_values(part, metric)
         for scene in sorted(set(part["scene"])):
             cells[f"{scene} {name}"] = Cell.percent(values.get(scene, float("nan")))
-        cells[f"{average} {name}"] = Cell.percent(table_value(part, metric))
+        cells[f"{average} {name}"] = percent(part, metric)
     return cells
 
 
@@ -187,16 +196,16 @@ def scene_values(rows: "pd.DataFrame", metric: str, level: str | None = None) ->
     The number is the mean over the scene's rows (at `level`, if given). Under a protocol with averaging
     `classes`, it is the mean over the views of each query, then over queries.
     """
-    kept = rows[rows["metric"] == metric]
+    values = rows[rows["metric"] == metric]
     if level is not None:
-        kept = kept[kept["level"] == level]
-    orders = {cards.card_of(label).averaging for label in kept["protocol"].unique()}
+        values = values[values["level"] == level]
+    orders = {cards.card_of(label).averaging for label in values["protocol"].unique()}
     assert len(orders) <= 1, f"rows of several averaging orders: {sorted(orders)}"
     assert "pooled" not in orders, "pooled protocols have no number per scene"
     if "classes" in orders:
-        of_query = kept.groupby(["scene", "query"], sort=True)["value"].mean()
+        of_query = values.groupby(["scene", "query"], sort=True)["value"].mean()
         return of_query.groupby(level="scene", sort=True).mean()
-    return kept.groupby("scene", sort=True)["value"].mean()
+    return values.groupby("scene", sort=True)["value"].mean()
 
 
 def table_value(rows: "pd.DataFrame", metric: str, level: str | None = None) -> float:
@@ -204,9 +213,13 @@ def table_value(rows: "pd.DataFrame", metric: str, level: str | None = None) -> 
     return float(scene_values(rows, metric, level).mean())
 
 
+def percent(rows: "pd.DataFrame", metric: str) -> Cell:
+    return Cell.percent(table_value(rows, metric))
+
+
 def level_averages_of_scenes(rows: "pd.DataFrame", metric: str) -> "pd.Series":
     """Return one number per scene, for paired comparisons: mean over a level's rows, levels, then seeds."""
-    kept = rows[rows["metric"] == metric]
-    of_level = kept.groupby(["scene", "seed", "level"], sort=True)["value"].mean()
+    values = rows[rows["metric"] == metric]
+    of_level = values.groupby(["scene", "seed", "level"], sort=True)["value"].mean()
     of_seed = of_level.groupby(level=["scene", "seed"], sort=True).mean()
     return of_seed.groupby(level="scene", sort=True).mean()

@@ -1,34 +1,19 @@
 """Parts of a table (cells, rows, blocks of one kind, footnotes) and the input from which tables are built."""
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hilsplat.base.tables import read_csv
-from hilsplat.segment.origin import made_from_truth
+from hilsplat.evaluate.costs import Cost
+from hilsplat.evaluate.metrics.instances import InstanceMatches
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # takes a quarter of a second, and workflow start-up doesn't need it
     import pandas as pd
 
-    from hilsplat.evaluate.metrics.instances import InstanceMatches
-    from hilsplat.evaluate.tables.costs import Cost
-
 PUBLISHED_COLUMNS = ("method", "family", "column", "value", "note")
-
-STAND_IN_NOTE = (
-    "Rows of a synthetic stand-in are measured on generated scenes with the models named under Masks. "
-    "They compare components of the method with each other and are not comparable with reported rows."
-)
-
-TRUE_MASKS_NOTE = (
-    "Rows that begin with 'diagnostic, true masks' use masks made from the true labels, with the "
-    "faults named under Masks. They are not results and are not ranked; they separate errors of the "
-    "method from errors of the segmenter."
-)
-
-SEEDS_NOTE = "Values with ± are mean and standard deviation over seeds; rows without ± are deterministic."
 
 
 @dataclass(frozen=True)
@@ -51,8 +36,11 @@ class Cell:
         return Cell() if value != value else Cell(f"{value:.2f}", value)
 
     @staticmethod
+    def count(value: int) -> "Cell":
+        return Cell(str(value), float(value))
+
+    @staticmethod
     def printed(text: str, note: str = "") -> "Cell":
-        """Return a value as printed in the paper."""
         number = re.fullmatch(r"-?\d+(\.\d+)?", text)
         return Cell(text, float(text) if number else None, note)
 
@@ -79,15 +67,14 @@ class Block:
     title: str
     rows: tuple[Row, ...]
     columns: tuple[str, ...]  # value columns in display order
-    unranked: frozenset[str] = frozenset()
+    unranked: tuple[str, ...] = ()
 
     @property
-    def lower_is_better(self) -> frozenset[str]:
+    def costs(self) -> tuple[str, ...]:
         """Columns of times and memory, in which the smallest value is best."""
-        return frozenset(column for column in self.columns if column.endswith(("(min)", "(GB)", "(s)")))
+        return tuple(column for column in self.columns if column.endswith(("(min)", "(GB)", "(s)")))
 
     def names(self) -> list[str]:
-        """Return the name columns, in order of appearance."""
         return list(dict.fromkeys(name for row in self.rows for name in row.names))
 
     def filled_columns(self) -> list[str]:
@@ -108,12 +95,12 @@ class Block:
                 cell = row.cell(column)
                 if row.ranked_with is not None and cell.value is not None:
                     # Displayed values are compared, so that equal texts get the same rank.
-                    shown = float(cell.text.partition(" ")[0])
-                    groups.setdefault(row.ranked_with, {})[number] = shown
+                    value = float(cell.text.partition(" ")[0])
+                    groups.setdefault(row.ranked_with, {})[number] = value
             for values in groups.values():
                 if len(values) < 2:
                     continue
-                best = sorted(set(values.values()), reverse=column not in self.lower_is_better)[:3]
+                best = sorted(set(values.values()), reverse=column not in self.costs)[:3]
                 for number, value in values.items():
                     if value in best:
                         ranks[number, column] = best.index(value) + 1
@@ -130,15 +117,9 @@ class Table:
     footnotes: tuple[str, ...]
 
     def numbered_notes(self) -> dict[str, int]:
-        """Return the cell notes, numbered in reading order."""
         cells = (row.cell(column) for block in self.blocks for row in block.rows for column in block.columns)
         notes = dict.fromkeys(cell.note for cell in cells if cell.note)
         return {note: number for number, note in enumerate(notes, start=1)}
-
-
-def read_published(path: Path) -> list[dict[str, str]]:
-    """Read the rows of one of the paper's tables, as transcribed in `config/published/`."""
-    return read_csv(path, PUBLISHED_COLUMNS, "restore it from the repository")
 
 
 @dataclass(frozen=True)
@@ -148,51 +129,45 @@ class Sources:
     published: Sequence[Mapping[str, str]]  # the paper's values (`read_published`)
     scores: "pd.DataFrame"
     labels: Mapping[str, str]  # variant -> its name in tables
-    costs: Sequence["Cost"] = ()  # by scene and variant, if the table contains costs
+    costs: Sequence[Cost] = ()  # by scene and variant, if the table contains costs
     # by (data set, scene, variant, masks, method), if scans have instances
-    instances: Mapping[tuple[str, ...], "InstanceMatches"] = field(default_factory=dict)
-    absent: Sequence[str] = ()  # a sentence with the reason for each data set that was not measured
+    instances: Mapping[tuple[str, ...], InstanceMatches] = field(default_factory=dict)
 
-    def reported(
-        self,
-        data: str,
-        title: str = "",
-        rename: Callable[[str], str | None] = lambda column: column,
-        families: bool = True,
-    ) -> Block:
-        """Return a block with the paper's rows.
 
-        Args:
-            title: name used in the heading; by default the data set.
-            rename: maps the paper's columns to ours, or to None to omit them.
-            families: whether to include the family of each method.
-        """
-        rows: dict[tuple[str, str], dict[str, Cell]] = {}
-        columns: dict[str, None] = {}
-        for entry in self.published:
-            column = rename(entry["column"])
-            if column is None:
-                continue
-            columns[column] = None
-            cells = rows.setdefault((entry["family"], entry["method"]), {})
-            cells[column] = Cell.printed(entry["value"], entry["note"])
-        shown = tuple(
-            Row({"Family": family, "Method": method} if families else {"Method": method}, cells)
-            for (family, method), cells in rows.items()
-            if any(cell.text != "-" for cell in cells.values())
-        )
-        return Block("reported", data, f"Reported in the paper: {title or data}", shown, tuple(columns))
+def read_published(path: Path) -> list[dict[str, str]]:
+    """Read the rows of one of the paper's tables, as transcribed in `config/published/`."""
+    return read_csv(path, PUBLISHED_COLUMNS, "restore it from the repository")
 
-    def finished(self, name: str, title: str, blocks: Iterable[Block], footnotes: Sequence[str]) -> Table:
-        """Return a table with its footnotes and the warnings that its rows require."""
-        blocks = tuple(block for block in blocks if block.rows)
-        warnings = []
-        rows = [row for block in blocks for row in block.rows]
-        if any(block.kind == "synthetic stand-in" for block in blocks):
-            warnings.append(STAND_IN_NOTE)
-        if any(made_from_truth(row.names.get("Masks", "")) for row in rows):
-            warnings.append(TRUE_MASKS_NOTE)
-        if any("Seeds" in row.names for row in rows):
-            warnings.append(SEEDS_NOTE)
-        absent = [f"Not measured: {sentence}" for sentence in self.absent]
-        return Table(name, title, blocks, (*warnings, *footnotes, *absent))
+
+def reported_block(
+    published: Sequence[Mapping[str, str]],
+    data: str,
+    heading: str = "",
+    prefix: str = "",
+    renamed: Mapping[str, str] | None = None,
+    families: bool = True,
+) -> Block:
+    """Return a block with the paper's rows.
+
+    Args:
+        heading: name used in the heading; by default the data set.
+        prefix: only columns that begin with it are shown, without it.
+        renamed: the paper's columns (without prefix) -> ours, if different.
+        families: whether to include the family of each method.
+    """
+    rows: dict[tuple[str, str], dict[str, Cell]] = {}
+    columns: dict[str, None] = {}
+    for entry in published:
+        if not entry["column"].startswith(prefix):
+            continue
+        column = entry["column"].removeprefix(prefix)
+        column = (renamed or {}).get(column, column)
+        columns[column] = None
+        cells = rows.setdefault((entry["family"], entry["method"]), {})
+        cells[column] = Cell.printed(entry["value"], entry["note"])
+    filled = tuple(
+        Row({"Family": family, "Method": method} if families else {"Method": method}, cells)
+        for (family, method), cells in rows.items()
+        if any(cell.text != "-" for cell in cells.values())
+    )
+    return Block("reported", data, f"Reported in the paper: {heading or data}", filled, tuple(columns))

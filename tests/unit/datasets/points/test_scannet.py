@@ -142,7 +142,7 @@ NUMBERLESS = '{"segGroups": [{"label": "wall", "segments": [7]}]}'
     [
         (mesh_of(np.tile(XYZ, (2, 1))), "does not match.*the same 10 vertices.*found     5 vertices"),
         (mesh_of(XYZ + np.float32([0.5, 0, 0])), "does not match.*found     vertices at other positions"),
-        (truncate_labels, r"labels\.ply cannot be read.*found     a file of \d+ bytes.*fix "),
+        (truncate_labels, r"labels\.ply cannot be read.*expected  a PLY mesh.*fix "),
         (moved(LABELS, "labels.ply"), r"scene0000_00 of ScanNet v2 is incomplete.*labels\.ply.*unpack"),
         (moved("color/0.jpg", "color/first.jpg"), r"first\.jpg is not named like a frame\n.*<number>\.jpg"),
         (moved("", f"../../{SCAN}"), "wrong place.*fix       move .*scannet/scene0000_00 to .*scans"),

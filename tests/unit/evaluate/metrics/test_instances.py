@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hilsplat.base.errors import MisalignedArtifactError
@@ -157,19 +157,3 @@ def test_area_equals_the_plain_sum_and_is_bounded(entries, misses):
     area = curve_area(confidence, np.array([hit for _, hit in entries], dtype=bool), misses)
     assert area == pytest.approx(plain_curve(entries, misses))
     assert 0 <= area <= 1 + 1e-12  # rounding of a sum of a dozen shares
-
-
-runs = st.lists(st.tuples(st.integers(0, 19), st.integers(1, 20)), max_size=5)
-
-
-@settings(max_examples=20, deadline=None)
-@given(runs, st.randoms(use_true_random=False))
-def test_order_of_predictions_does_not_matter_while_they_match_different_instances(cuts, random):
-    predictions = [
-        (first, min(first + length, 20), 0.1 + 0.1 * row) for row, (first, length) in enumerate(cuts)
-    ]
-    truth = [(A, 8), (B, 7), (VOID, 5)]
-    shuffled = random.sample(predictions, len(predictions))
-    one, other = precisions(scan_of(truth, predictions)), precisions(scan_of(truth, shuffled))
-    # Above one half a prediction can match one instance only.
-    np.testing.assert_allclose(one[:, :-1], other[:, :-1])

@@ -11,7 +11,7 @@ from hilsplat.base.levels import Level
 from hilsplat.datasets.images.ovs3d import FOREGROUND
 from hilsplat.datasets.labelled import mask_region
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
-from hilsplat.evaluate.protocols.cards import LERF_MASK, OVS_ARGMAX, OVS_LANGSPLAT_V2, OVS_NODES, card_of
+from hilsplat.evaluate.protocols.cards import LERF_MASK, OVS_ARGMAX, OVS_NODES, card_of
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.query.relevancy import relevancy_of_margins
@@ -129,7 +129,8 @@ def test_a_tree_answers_with_its_own_nodes_and_a_field_with_its_mask_or_not_at_a
     assert {row.protocol for row in tree + field} == {f"{card.full_name} (wholes)"}
 
 
-RULE = OVS_LANGSPLAT_V2.rule
+LANGSPLAT_V2 = card_of("3d-ovs/langsplat-v2")
+RULE = LANGSPLAT_V2.rule
 
 
 def window_means(values, reach):
@@ -193,7 +194,7 @@ def test_wood_wall_alone_is_united_with_wood_table_and_any_grey_is_true(tmp_path
     grey[:20], grey[20:30] = 255, 1
     path = tmp_path / f"{text}.png"
     write_png(path, grey)
-    label = mask_region(path, FOREGROUND, grey.shape, [], least_grey=1)
+    label = mask_region(path, FOREGROUND, grey.shape, [], min_grey=1)
     (query,) = ViewTruth.of_regions([label], grey.shape).categories
     asked = []
 
@@ -205,7 +206,7 @@ def test_wood_wall_alone_is_united_with_wood_table_and_any_grey_is_true(tmp_path
         return high_in((20, 30))[None]
 
     scene = SimpleNamespace(field=SimpleNamespace(relevancy=relevancy))
-    flat = FlatProtocols(scene, "v.png", [OVS_LANGSPLAT_V2, card_of("3d-ovs/langsplat")], None)
+    flat = FlatProtocols(scene, "v.png", [LANGSPLAT_V2, card_of("3d-ovs/langsplat")], None)
     rows = added(flat, high_in((0, 20)), query)
     found = {row.protocol.partition("@")[0]: row.value for row in rows if row.metric == "iou"}
     assert asked == others

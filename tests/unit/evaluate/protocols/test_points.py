@@ -15,7 +15,7 @@ from hilsplat.datasets.classes import (
 )
 from hilsplat.datasets.points.labelled_points import LabelledPoints
 from hilsplat.datasets.registry import DATASETS
-from hilsplat.evaluate.extra_protocols import STAND_INS, ExtraProtocols
+from hilsplat.evaluate.extra_protocols import WORLD_PROTOCOLS, ExtraProtocols
 from hilsplat.evaluate.metrics.instances import average_precision, match_instances
 from hilsplat.evaluate.protocols.cards import card_of
 from hilsplat.evaluate.protocols.carry import gaussians_of_points
@@ -184,9 +184,9 @@ def test_cameras_on_a_line_still_fix_the_similarity(moved, error):
 
 
 def test_stand_ins_and_data_sets_name_protocols_that_exist():
-    for kind in STAND_INS:
+    for kind in WORLD_PROTOCOLS:
         asked = ExtraProtocols.of_world(kind)
-        assert len(asked.flat) + len(asked.points) == len(STAND_INS[kind])
+        assert len(asked.flat) + len(asked.points) == len(WORLD_PROTOCOLS[kind])
     assert not ExtraProtocols.of_world("").flat and not ExtraProtocols.of_world("").points
     for dataset in DATASETS.values():
         asked = ExtraProtocols.of(dataset.protocols)

@@ -8,9 +8,9 @@ import pytest
 
 from hilsplat.base.artifacts import provenance_path, read_json
 from hilsplat.base.errors import ArtifactError
+from hilsplat.evaluate.costs import read_costs, run_efficiency, write_times
 from hilsplat.evaluate.scores import write_scores
 from hilsplat.evaluate.tables.build import published_values, run_table
-from hilsplat.evaluate.tables.costs import read_costs, run_efficiency, write_times
 from tests.conftest import PROJECT
 from tests.unit.artifact_changes import write_record
 from tests.unit.evaluate.builders import score

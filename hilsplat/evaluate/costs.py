@@ -1,0 +1,157 @@
+"""Time and memory of jobs and queries, from the records beside artifacts.
+
+Times and memory differ from run to run, so they are not in `scores.csv`, and tables that show them have the
+name suffix `-seconds`. All other files are reproducible byte for byte.
+"""
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from hilsplat.base.artifacts import parse_json, sha256_of_file, write_text
+from hilsplat.base.errors import ArtifactError
+from hilsplat.base.provenance import read_provenance, require_as_written, require_beginning
+from hilsplat.base.tables import markdown_table, read_csv, write_csv
+from hilsplat.configuration import SECTIONS
+
+PREPARATION = ("masks", "coverage_tree", "clip")
+TRAINING = ("contributions", "semantic_tree", "autoencoder", "field")
+TIMES = "times.csv"
+TIME_COLUMNS = ("dataset", "scene", "variant", "method", "seconds")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One finished job. Data set, scene and variant are empty if they don't apply."""
+
+    stage: str
+    dataset: str
+    scene: str
+    variant: str
+    elapsed_s: float  # wall-clock time
+    cpu_s: float  # of the job and its child processes; 0 if the job was too short to be sampled
+    peak_mib: float  # peak resident memory; 0 if the job was too short to be sampled
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Cost of one scene under one variant; shared stages are counted in full. Unrecorded values are nan."""
+
+    dataset: str
+    scene: str
+    variant: str
+    prepare_s: float  # wall-clock time of masks, coverage trees and CLIP
+    train_s: float  # wall-clock time of contributions, semantic tree, autoencoder and field
+    peak_mib: float  # peak resident memory of the training jobs
+    query_s: Mapping[str, float]  # per method, seconds from a text to a mask in a view
+
+
+def write_times(scores: Path, dataset: str, scene: str, variant: str, seconds: Mapping[str, float]) -> None:
+    rows = [[dataset, scene, variant, method, f"{value:.4f}"] for method, value in sorted(seconds.items())]
+    write_csv(Path(scores).with_name(TIMES), TIME_COLUMNS, rows)
+
+
+def read_costs(scores: Iterable[Path]) -> list[Cost]:
+    """Return the costs of the scenes and variants in score files, from the records beside the artifacts."""
+    costs = []
+    for path in scores:
+        table = Path(path).with_name(TIMES)
+        rows = read_csv(table, TIME_COLUMNS, "run the evaluate stage again")
+        require_as_written(table, sha256_of_file(table))
+        if not rows:  # a scene without labels
+            continue
+        jobs = jobs_of(Path(path))
+        place = rows[0]["dataset"], rows[0]["scene"], rows[0]["variant"]
+        times = _seconds(jobs, PREPARATION), _seconds(jobs, TRAINING)
+        peak_mib = max((job.peak_mib for stage in TRAINING if (job := jobs.get(stage))), default=0)
+        query_s = {row["method"]: float(row["seconds"]) for row in rows}
+        costs.append(Cost(*place, *times, peak_mib or math.nan, query_s))
+    return costs
+
+
+def jobs_of(scores: Path) -> dict[str, Job | None]:
+    """Map each stage behind a score file to its job, run by any variant, or to None if it has no record.
+
+    The score file's provenance lists the artifacts that `evaluate` read; the field's provenance lists the
+    rest. Stages whose output was not read are absent, such as trees for a baseline.
+    """
+    places = _inputs(scores)
+    if "field" in places:
+        places = {**_inputs(places["field"]), **places}
+    jobs: dict[str, Job | None] = {}
+    for stage in (*PREPARATION, *TRAINING):
+        if stage in places:
+            record = places[stage].parent / "benchmarks" / f"{stage}.jsonl"
+            jobs[stage] = read_benchmark(record, record.parents[2])[-1] if record.is_file() else None
+    return jobs
+
+
+def _inputs(artifact: Path) -> dict[str, Path]:
+    record = read_provenance(artifact)
+    return {name: Path(entry.path) for name, entry in record.inputs.items()} if record else {}
+
+
+def _seconds(jobs: Mapping[str, Job | None], stages: tuple[str, ...]) -> float:
+    """Return the wall-clock time of `stages`, s; nan if a job has no record or `jobs` has none of them."""
+    needed = [jobs[stage] for stage in stages if stage in jobs]
+    if not needed:
+        return math.nan
+    return sum(job.elapsed_s if job is not None else math.nan for job in needed)
+
+
+def run_efficiency(results: Path, out: Path) -> str:
+    """Write a CSV of all jobs below `results` and, beside it, a Markdown table of stages; return the table.
+
+    Raises:
+        ArtifactError: there is no benchmark file, one is unreadable, or an output path has an unrelated file.
+    """
+    files = sorted(Path(results).glob("**/benchmarks/*.jsonl"))
+    if not files:
+        raise ArtifactError(f"{results} contains no benchmark files", fix="run the workflow first")
+    jobs = [job for path in files for job in read_benchmark(path, Path(results))]
+    stages = list(SECTIONS)  # in the order of the data flow; other stages come after them, by name
+    places = {job.stage: stages.index(job.stage) if job.stage in stages else len(stages) for job in jobs}
+    jobs.sort(key=lambda job: (places[job.stage], job.stage, job.dataset, job.scene, job.variant))
+    columns = ("stage", "dataset", "scene", "variant", "seconds", "cpu_seconds", "peak_mib")
+    rows = []
+    for job in jobs:
+        numbers = (f"{job.elapsed_s:.2f}", f"{job.cpu_s:.2f}", f"{job.peak_mib:.0f}")
+        rows.append([job.stage, job.dataset, job.scene, job.variant, *numbers])
+    headings = ("stage", "jobs", "mean s", "longest s", "total s", "CPU s", "peak MiB")
+    lines = []
+    for name in [*dict.fromkeys(job.stage for job in jobs), "all"]:
+        of_row = [job for job in jobs if name in (job.stage, "all")]
+        times = [job.elapsed_s for job in of_row]
+        seconds = (sum(times) / len(times), max(times), sum(times), sum(job.cpu_s for job in of_row))
+        peak_mib = f"{max(job.peak_mib for job in of_row):.0f}"
+        lines.append([name, len(of_row), *(f"{value:.1f}" for value in seconds), peak_mib])
+    text, beside = markdown_table(headings, lines, 1) + "\n", Path(out).with_suffix(".md")
+    for path, begin in ((Path(out), ",".join(columns)), (beside, text.partition("\n")[0])):
+        require_beginning(path, begin)
+    write_csv(Path(out), columns, rows)
+    write_text(beside, text)
+    return text
+
+
+def read_benchmark(path: Path, results: Path) -> list[Job]:
+    """Read the jobs of `<dataset>/<scene>[/<variant>]/benchmarks/<stage>.jsonl`, one per line.
+
+    Raises:
+        ArtifactError: a line is not a JSON object with a time.
+    """
+    place = path.relative_to(results).parts[:-2]
+    dataset, scene, variant = (*place, "", "", "")[:3]
+    jobs = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            record = parse_json(line)
+            elapsed_s = float(record["s"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise ArtifactError(
+                f"{path} is not a valid benchmark file: {error}", fix="run its stage again"
+            ) from error
+        sampled = (record.get("cpu_time"), record.get("max_rss"))  # "-" or null if Snakemake could not sample
+        numbers = (float(value) if isinstance(value, int | float) else 0.0 for value in sampled)
+        jobs.append(Job(path.stem, dataset, scene, variant, elapsed_s, *numbers))
+    return jobs

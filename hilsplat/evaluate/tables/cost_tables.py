@@ -1,0 +1,76 @@
+"""Measured rows of the tables of time, memory and quality."""
+
+import statistics
+from dataclasses import replace
+
+from hilsplat.datasets.sources import LEVELLED
+from hilsplat.evaluate.costs import Cost
+from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN
+from hilsplat.evaluate.tables.ablation import component_cells
+from hilsplat.evaluate.tables.kinds import TableKind
+from hilsplat.evaluate.tables.measured import kind_and_title, row_name, row_place, with_seeds
+from hilsplat.evaluate.tables.rows import Block, Cell, Row, Sources
+
+
+def cost_blocks(kind: TableKind, sources: Sources) -> list[Block]:
+    """Return times, memory and seconds per query in each scene."""
+    blocks = []
+    for data, answers in by_answer(sources).items():
+        rows = []
+        for variant, method, costs in answers:
+            queries = {f"{cost.scene} query (s)": Cell.number(cost.query_s[method]) for cost in costs}
+            names = {"Method": row_name(variant, method, sources.labels)}
+            rows.append(Row(names, time_cells(costs, method) | queries))
+        scenes = {cost.scene for *_, costs in answers for cost in costs}
+        blocks.append(Block(*kind_and_title(data), tuple(rows), kind.columns_of(scenes)))
+    return blocks
+
+
+def quality_blocks(kind: TableKind, sources: Sources) -> list[Block]:
+    """Return mIoU and HC at given levels beside times, for each data set whose queries have levels.
+
+    Labels with levels are a separate data set (Hi-LERF) or belong to the scene's own data set.
+    """
+    blocks = []
+    scores = with_seeds(sources.scores)
+    given = scores[(scores["seed"] == "0") & scores["protocol"].str.startswith(LEVEL_GIVEN.full_name)]
+    for data, answers in by_answer(sources).items():
+        rows = []
+        for variant, method, costs in answers:
+            part = given[
+                given["dataset"].isin([*LEVELLED, data])
+                & given["scene"].isin([cost.scene for cost in costs])
+                & (given["variant"] == variant)
+                & (given["method"] == method)
+            ]
+            if method in kind.methods and not part.empty:
+                cells = component_cells(scores, part) | time_cells(costs, method)
+                rows.append(Row({"Method": row_name(variant, method, sources.labels)}, cells))
+        blocks.append(Block(*kind_and_title(data), tuple(rows), kind.columns_of(())))
+    return blocks
+
+
+def without_costs(block: Block) -> Block:
+    return replace(block, columns=tuple(column for column in block.columns if column not in block.costs))
+
+
+def time_cells(costs: list[Cost], method: str) -> dict[str, Cell]:
+    """Return the mean times and the maximum memory over scenes, for rows of `method`."""
+    return {
+        "Preparation (min)": Cell.number(statistics.fmean(cost.prepare_s for cost in costs) / 60),
+        "Training (min)": Cell.number(statistics.fmean(cost.train_s for cost in costs) / 60),
+        "Memory (GB)": Cell.number(max(cost.peak_mib for cost in costs) / 1024),
+        "Query (s)": Cell.number(statistics.fmean(cost.query_s[method] for cost in costs)),
+    }
+
+
+def by_answer(sources: Sources) -> dict[str, list[tuple[str, str, list[Cost]]]]:
+    """Map each data set, sorted by name, to (variant, method, costs of the scenes) in row order."""
+    groups: dict[tuple[str, str, str], list[Cost]] = {}
+    for cost in sorted(sources.costs, key=lambda cost: cost.scene):
+        for method in cost.query_s:
+            groups.setdefault((cost.dataset, cost.variant, method), []).append(cost)
+    rows: dict[str, list[tuple[str, str, list[Cost]]]] = {}
+    for data, variant, method in sorted(groups, key=lambda key: row_place(key[1], key[2], sources.labels)):
+        rows.setdefault(data, []).append((variant, method, groups[data, variant, method]))
+    return {data: rows[data] for data in sorted(rows)}

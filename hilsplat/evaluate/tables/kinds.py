@@ -1,0 +1,72 @@
+"""The tables, described in `kinds.json`: titles, columns, protocols, the paper's rows and footnotes."""
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+_DESCRIPTIONS = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))
+
+SECONDS = "-seconds"
+"""Name suffix of tables that show times and memory, so they are not reproducible byte for byte."""
+
+NOTES: dict[str, str] = _DESCRIPTIONS["notes"]
+"""Footnotes of several tables, by the name under which `kinds.json` lists them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableKind:
+    """One table; `like` in `kinds.json` names a table from which omitted values are taken.
+
+    Attributes:
+        data: kinds of synthetic scenes and data sets that it covers.
+        variants: key of the configuration that lists the variants. Tables of other variants than
+            `main_variants` are measured only on the scenes in `sweep_scenes`.
+        shows_costs: whether it needs the times of jobs and queries.
+        reported: arguments of `rows.reported_block` for each block with the paper's values.
+        protocols: prefixes of the protocols that have rows, for each set of measured blocks.
+        methods: methods that have rows; empty for all.
+        columns: value columns. A group whose columns name `{scene}` is repeated for each scene.
+        ranked_by_protocol: whether only rows of the same protocol are ranked together.
+    """
+
+    title: str
+    data: tuple[str, ...]
+    variants: str = "main_variants"
+    shows_costs: bool = False
+    reported: tuple[dict[str, Any], ...]
+    protocols: tuple[tuple[str, ...], ...] = ()
+    methods: tuple[str, ...] = ()
+    columns: tuple[tuple[str, ...], ...] = ()
+    unranked: tuple[str, ...] = ()
+    ranked_by_protocol: bool = True
+    footnotes: tuple[str, ...]
+
+    def columns_of(self, scenes: Iterable[str]) -> tuple[str, ...]:
+        names = sorted(set(scenes))
+        return tuple(
+            column.format(scene=scene)
+            for group in self.columns
+            for scene in (names if "{scene}" in group[0] else ("",))
+            for column in group
+        )
+
+
+def _described(name: str) -> dict[str, Any]:
+    fields = dict(_DESCRIPTIONS["tables"][name])
+    base = fields.pop("like", None)
+    return {**_described(base), **fields} if base else fields
+
+
+def _kind(name: str) -> TableKind:
+    fields = {key: _frozen(value) for key, value in _described(name).items()}
+    return TableKind(**{**fields, "footnotes": tuple(NOTES.get(note, note) for note in fields["footnotes"])})
+
+
+def _frozen(value: Any) -> Any:
+    return tuple(map(_frozen, value)) if isinstance(value, list) else value
+
+
+TABLES: dict[str, TableKind] = {name: _kind(name) for name in _DESCRIPTIONS["tables"]}
+"""Every table by name, in report order."""
