@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hilsplat.datasets.dataset import ABLATIONS
 from hilsplat.datasets.generators import Generator, Kind
 from hilsplat.datasets.points.labelled_points import LabelledPoints
 from hilsplat.scene.cameras import Cameras
@@ -45,10 +46,15 @@ ROOM = (
     *("scannet200/opengaussian", "scannet200/benchmark", "scannet200/instances", "replica/per-scene"),
 )
 STREET = ("waymo/segmentation",)
+FRAMES = ("frames-hi-lerf", "frames-hi-3dovs")
 
 GENERATOR = Generator(
     name="world",
-    kinds={"tabletop": Kind(TABLETOP), "room": Kind(ROOM), "street": Kind(STREET)},
+    kinds={
+        "tabletop": Kind(TABLETOP, ("lerf", "3dovs", "hierarchy", *FRAMES, *ABLATIONS)),
+        "room": Kind(ROOM, ("replica", "scannet", "hierarchy")),
+        "street": Kind(STREET, ("waymo", "hierarchy")),
+    },
     size=size_of,
     open=WorldTruth,
     pictures=("masks",),

@@ -9,6 +9,13 @@ from typing import Any, Literal
 from hilsplat.base.errors import SceneError
 
 
+ABLATIONS = (
+    *("ablation", "components", "cost", "cost-seconds", "pruning", "pruning-seconds"),
+    *("efficiency", "efficiency-seconds", "theta", "omega"),
+)
+"""Tables of scenes whose labels have levels, besides those of benchmarks."""
+
+
 @dataclass(frozen=True)
 class SceneReport:
     """Counts of what was read in a scene, and a sentence for each item that was reinterpreted or not used."""

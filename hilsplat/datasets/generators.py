@@ -36,9 +36,10 @@ class Truth(Protocol):
 
 @dataclass(frozen=True)
 class Kind:
-    """One kind of generated scene: the protocols that score it (`evaluate.protocols.cards`)."""
+    """One kind of generated scene: the protocols that score it, and the tables that show it (`evaluate`)."""
 
     protocols: tuple[str, ...]
+    tables: tuple[str, ...]
 
 
 @dataclass(frozen=True)

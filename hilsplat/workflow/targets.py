@@ -46,7 +46,7 @@ def absent_of(plan: Plan) -> Callable[..., list[str]]:
 def scores(plan: Plan, table: str, name: str = "scores.csv") -> list[str]:
     """Return a table's score files, or the files `name` beside them; sweeps use `sweep_scenes`, if set."""
     kind = TABLES[table]
-    rows = [row for row in labelled(plan) if data_of(row) in kind.data]
+    rows = [row for row in labelled(plan) if table in tables_of(row)]
     if kind.variants != "main_variants" and plan.run.sweep_scenes:
         rows = [row for row in rows if row.scene in plan.run.sweep_scenes]
     return [
@@ -60,15 +60,16 @@ def scores(plan: Plan, table: str, name: str = "scores.csv") -> list[str]:
 def absent(plan: Plan, table: str) -> list[str]:
     """Return a sentence about each of a table's data sets that has unmeasured scenes."""
     by_dataset: dict[str, list[tuple[str, str]]] = {}
+    sources = {data_of(row) for row in plan.rows}
     for row in plan.rows:
         reason = plan.data.absence(row)
         place = published(row.source)
-        if place and place[0] in TABLES[table].data and reason is not None:
+        if place and table in DATASETS[place[0]].tables and reason is not None:
             by_dataset.setdefault(row.dataset, []).append((row.scene, reason))
     sentences = [
         f"{name}: no labelled segment was found in {plan.run.data_root or 'data_root, which is not set'}."
-        for name in TABLES[table].data
-        if name in plan.run.groups and name in DATASETS and not any(data_of(row) == name for row in plan.rows)
+        for name in DATASETS
+        if name in plan.run.groups and table in DATASETS[name].tables and name not in sources
     ]
     for dataset, scenes in by_dataset.items():
         reasons = {reason for _, reason in scenes}
@@ -94,6 +95,14 @@ def data_of(row: SceneRow) -> str:
         return row.generated.kind
     place = published(row.source)
     return place[0] if place else ""
+
+
+def tables_of(row: SceneRow) -> tuple[str, ...]:
+    """Return the names of the tables that show a scene with published or generated labels."""
+    if row.generated:
+        return GENERATORS[row.generated.generator].kinds[row.generated.kind].tables
+    place = published(row.source)
+    return DATASETS[place[0]].tables if place else ()
 
 
 def tables(plan: Plan) -> list[str]:

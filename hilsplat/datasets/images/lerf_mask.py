@@ -82,6 +82,7 @@ DATASET = Dataset(
     name="lerf_mask",
     title="LERF-Mask",
     labels="images",
+    tables=("lerf",),
     scenes=("figurines", "ramen", "teatime"),
     licence="none stated for images and masks (the authors' code: Apache-2.0)",
     terms="For research use only; do not redistribute.",

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.dataset import Dataset
+from hilsplat.datasets.dataset import ABLATIONS, Dataset
 from hilsplat.datasets.images.isat import IsatFile, IsatObject, fill_polygons, read_isat
 from hilsplat.datasets.labelled import LabelledRegion, LabelledScene, images_by_view, require_images
 from hilsplat.datasets.published import FRAMES, PAIRS, differences
@@ -74,6 +74,7 @@ DATASET = Dataset(
     name="lerf_ovs",
     title="LERF-OVS",
     labels="images",
+    tables=("lerf", "hierarchy", "frames-hi-lerf", *ABLATIONS),
     scenes=("figurines", "ramen", "teatime", "waldo_kitchen"),
     licence="none stated for images and labels",
     terms="For research use only; do not redistribute.",

@@ -8,7 +8,7 @@ with ground truth `any grey`. A missing file or folder, or an unusable classes.t
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.dataset import Dataset
+from hilsplat.datasets.dataset import ABLATIONS, Dataset
 from hilsplat.datasets.labelled import (
     LabelledRegion,
     LabelledScene,
@@ -99,6 +99,7 @@ DATASET = Dataset(
     name="3d_ovs",
     title="3D-OVS",
     labels="images",
+    tables=("3dovs", "hierarchy", "frames-hi-3dovs", *ABLATIONS),
     scenes=tuple(FRAMES["3d_ovs"]),
     licence="none stated for images and masks (the authors' code: MIT)",
     terms="For research use only; do not redistribute.",

@@ -173,6 +173,7 @@ DATASET = Dataset(
     name="replica",
     title="Replica",
     labels="points",
+    tables=("replica",),
     scenes=(*(f"office_{number}" for number in range(5)), *(f"room_{number}" for number in range(3))),
     licence="Replica Research Terms",
     terms="Non-commercial research and education only; do not redistribute the data.",

@@ -209,6 +209,7 @@ DATASET = Dataset(
     name="scannet",
     title="ScanNet v2",
     labels="points",
+    tables=("scannet",),
     # The ten scans of OpenGaussian's table. All but the last are in the training split.
     scenes=tuple(f"scene{number:04d}_00" for number in (0, 62, 70, 97, 140, 200, 347, 400, 590, 645)),
     licence="code MIT; data under the ScanNet Terms of Use",

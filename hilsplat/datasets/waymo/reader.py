@@ -100,6 +100,7 @@ DATASET = Segments(
     name="waymo",
     title="Waymo Open Dataset, 3D semantic segmentation",
     labels="points",
+    tables=("waymo",),
     scenes=(),
     licence="code Apache-2.0; data under the Waymo Dataset License Agreement for Non-Commercial Use",
     terms="Non-commercial use after registration; do not redistribute the data.",

@@ -17,10 +17,9 @@ NOTES: dict[str, str] = _DESCRIPTIONS["notes"]
 
 @dataclass(frozen=True, kw_only=True)
 class TableKind:
-    """One table; `like` in `kinds.json` names a table from which omitted values are taken.
+    """One table; data sets and kinds of generated scenes name the tables that show them. `like` in `kinds.json` names a table from which omitted values are taken.
 
     Attributes:
-        data: kinds of synthetic scenes and data sets that it covers.
         variants: key of the configuration that lists the variants. Tables of other variants than
             `main_variants` are measured only on the scenes in `sweep_scenes`.
         shows_costs: whether it needs the times of jobs and queries.
@@ -32,7 +31,6 @@ class TableKind:
     """
 
     title: str
-    data: tuple[str, ...]
     variants: str = "main_variants"
     shows_costs: bool = False
     reported: tuple[dict[str, Any], ...]
