@@ -15,7 +15,8 @@ import safetensors.numpy
 from jaxtyping import AbstractArray, jaxtyped
 from safetensors import SafetensorError, safe_open
 
-from hilsplat.base.artifacts import atomic_path, parse_json, remake
+from hilsplat.base.artifacts import parse_json, rebuild_command
+from hilsplat.base.atomic import atomic_path
 from hilsplat.base.errors import ArtifactError
 
 Made = TypeVar("Made")
@@ -42,7 +43,7 @@ def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Li
                     f"{path}: array {name} has the wrong type or shape",
                     expected=described(declared),
                     found=f"{array.dtype} of shape {array.shape}",
-                    fix=remake(path),
+                    fix=rebuild_command(path),
                 )
             low, high = limits.get(name, (-np.inf, np.inf))
             if array.dtype.kind not in "biuf" or not array.size:
@@ -53,7 +54,7 @@ def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Li
                     f"{path}: array {name} contains an impossible value",
                     expected="finite numbers" if np.isinf(low) and np.isinf(high) else f"{low:g} to {high:g}",
                     found=f"{least} to {most}",
-                    fix=remake(path),
+                    fix=rebuild_command(path),
                 )
 
 
@@ -76,7 +77,7 @@ def made(
             f"{path} was written by a different version of hilsplat",
             expected=", ".join(sorted(expected - set(more))),
             found=", ".join(sorted(arrays)) or "no arrays",
-            fix=remake(path),
+            fix=rebuild_command(path),
         )
     require_types(maker, arrays, path, limits or {})
     return maker(**arrays, **more)
@@ -103,7 +104,7 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         if about.pop("crc32") != _checksum(arrays, about):
             raise ValueError("its content was changed after it was written")
     except (OSError, SafetensorError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ArtifactError(f"{path} cannot be read: {error}", fix=remake(path)) from error
+        raise ArtifactError(f"{path} cannot be read: {error}", fix=rebuild_command(path)) from error
     return arrays, about
 
 

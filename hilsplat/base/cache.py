@@ -1,4 +1,4 @@
-"""Cache sizes, pruning of finished views and checkpoints, and remembered examinations of this machine."""
+"""Caches: finished views and checkpoints, their sizes and pruning, and examinations of this machine."""
 
 import logging
 import os
@@ -9,12 +9,15 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import platformdirs
 
-from hilsplat.base.artifacts import existing_folder, sha256_of_json, visible_files, write_text
-from hilsplat.base.errors import HilsplatError
+from hilsplat.base.artifacts import read_npz, write_arrays, write_text
+from hilsplat.base.atomic import existing_folder
+from hilsplat.base.errors import ArtifactError, HilsplatError
+from hilsplat.base.lineage import sha256_of_json, visible_files
 from hilsplat.base.processes import remove_leftovers
-from hilsplat.base.removal import DIGEST, ENTRY, delete, is_tagged
+from hilsplat.base.removal import DIGEST, ENTRY, delete, is_tagged, tag
 
 logger = logging.getLogger(__name__)
 
@@ -80,6 +83,51 @@ def prune_cache(
             freed += used[path].st_size
             deleted += 1
     return deleted, freed / 2**20
+
+
+class ViewCache:
+    """Cache of a stage's finished views as .npz files, which a rerun uses if the stage was killed.
+
+    Keys must cover all inputs of the result: the settings, and the digests of the image, model and code.
+    Entries are not `compressed` if they are floating-point numbers, which shrink too little to benefit.
+    """
+
+    def __init__(self, folder: Path, *, compressed: bool = True) -> None:
+        self.folder = Path(folder)
+        self.compressed = compressed
+        self.hits = 0
+
+    def path(self, key: str) -> Path:
+        """Return the path of a key's file, which may not exist."""
+        return self.folder / key[:2] / f"{key}.npz"
+
+    def get(self, key: str, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+        """Return the entry, computing and storing it if it is missing or damaged."""
+        arrays = self.find(key)
+        if arrays is not None:
+            self.hits += 1
+            return arrays
+        arrays = compute()
+        self.put(key, arrays)
+        return arrays
+
+    def find(self, key: str) -> dict[str, np.ndarray] | None:
+        """Return the entry, or None if it is missing or damaged."""
+        path = self.path(key)
+        if path.is_file():
+            with suppress(ArtifactError):
+                if arrays := read_npz(path):  # a file that ends in zeros may look like an empty archive
+                    with suppress(OSError):  # another process may have pruned it
+                        os.utime(path)  # last use, for pruning
+                    return arrays
+        return None
+
+    def put(self, key: str, arrays: dict[str, np.ndarray]) -> None:
+        """Store an entry, replacing any existing one."""
+        # A power failure may truncate entries or fill them with zeros. Checksums reveal this on reading, and
+        # the entry is recomputed. A flush to disk, which takes milliseconds, is therefore unnecessary.
+        tag(self.folder)
+        write_arrays(self.path(key), arrays, compressed=self.compressed, durable=False)
 
 
 def remembered(kind: str, key: object, examine: Callable[[], str]) -> str:

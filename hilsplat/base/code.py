@@ -16,8 +16,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from hilsplat.base.artifacts import atomic_path, read_memo, sha256_of_bytes, sha256_of_json
+from hilsplat.base.artifacts import read_memo
+from hilsplat.base.atomic import atomic_path
 from hilsplat.base.errors import HilsplatError
+from hilsplat.base.lineage import sha256_of_bytes, sha256_of_json
 
 PACKAGES = ("hilsplat", "cpusplat")
 """Packages whose modules count, as do those of the packages of the roots, such as a plugin's."""

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import ExifTags, Image, ImageCms, PngImagePlugin
 
-from hilsplat.base.artifacts import atomic_path
+from hilsplat.base.atomic import atomic_path
 from hilsplat.base.errors import ImageError
 
 logger = logging.getLogger(__name__)

@@ -35,8 +35,7 @@ def world_make(
 ) -> None:
     """Make a synthetic scene: images, and ground truth for evaluation only."""
     section = section_of("world", settings)
-    beside = (out / "images", out / "truth")
-    with stage("world", out, settings=section, beside=beside) as run:
+    with stage("world", out / "images", settings=section, beside=(out / "truth",)) as run:
         run(source, section, out, threads)
 
 

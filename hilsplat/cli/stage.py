@@ -10,13 +10,8 @@ from typing import Annotated, Any
 
 import typer
 
-from hilsplat.base.artifacts import (
-    output_lock,
-    parse_json,
-    provenance_path,
-    require_free_space,
-    was_interrupted,
-)
+from hilsplat.base.artifacts import parse_json, provenance_path
+from hilsplat.base.atomic import output_lock, require_free_space, was_interrupted
 from hilsplat.base.cache import writable
 from hilsplat.base.errors import HilsplatError, SettingsError, visible
 from hilsplat.base.plugins import load
@@ -107,7 +102,8 @@ def stage(
         ArtifactError: an output would replace something other than an earlier output of the stage.
         HilsplatError: an input is missing, or changed while the stage ran.
     """
-    from hilsplat.base.provenance import Inputs, require_replaceable, write_provenance
+    from hilsplat.base.lineage import Inputs, write_provenance
+    from hilsplat.base.ownership import require_replaceable
     from hilsplat.splat.rasterise.device import choose_device
 
     start_logging(timestamps=True)

@@ -53,7 +53,7 @@ def find_poses(
     from hilsplat.datasets.sources import photo_files
 
     section = section_of("poses", settings)
-    is_own = any(provenance_path(place).is_file() for place in (images, images.parent))
+    is_own = provenance_path(images).is_file()
     read = photo_files(images, poses) if images.is_dir() and not is_own else images
     with stage("poses", out, settings=section, seed=seed, inputs={"images": read}) as run:
         run(images, out, name, unit, render, section, seed, threads, poses)

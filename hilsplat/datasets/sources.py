@@ -8,10 +8,9 @@ from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
 
-from hilsplat.base.artifacts import visible_files
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES, list_images
-from hilsplat.base.provenance import files_of
+from hilsplat.base.lineage import files_of, visible_files
 from hilsplat.datasets.registry import DATASETS, dataset_of, open_labels
 from hilsplat.scene.layouts import TRAINED, KnownPoses, find_known_poses, photo_folder, read_json_object
 from hilsplat.scene.sheet import DATA_PREFIX

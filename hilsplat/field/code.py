@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from hilsplat.base.arrays import made, read_tensors, require_types, write_tensors
-from hilsplat.base.artifacts import read_npz, remake, sealed
+from hilsplat.base.artifacts import read_npz, rebuild_command, sealed
 from hilsplat.base.errors import ArtifactError
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.decoder import PackedLayers
@@ -177,7 +177,9 @@ def load_code(folder: Path) -> Code:
             model.arrays[name] = state[name]
         return model
     except (KeyError, ValueError) as error:
-        raise ArtifactError(f"{path} is from a different version: {error}", fix=remake(path)) from error
+        raise ArtifactError(
+            f"{path} is from a different version: {error}", fix=rebuild_command(path)
+        ) from error
 
 
 def autoencoder_file(folder: Path) -> Path:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from hilsplat.base.artifacts import read_index, run_command, sha256_of_file
-from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
-from hilsplat.base.provenance import read_provenance
+from hilsplat.base.artifacts import read_index, run_command
+from hilsplat.base.errors import ArtifactError
+from hilsplat.base.lineage import read_provenance
 from hilsplat.settings import EvaluateSettings
 
 KEY_VIEWS = "key-views"
@@ -166,20 +166,3 @@ def _recorded_input(artifact: Path, name: str, folder: Path) -> Path | None:
     path = Path(record.inputs[name].path)
     recorded = folder / path.parent.name / path.name
     return recorded if path.name and recorded.exists() else None
-
-
-def require_same(what: str, scene: str, path: Path, expected_sha256: str) -> None:
-    """Raise MisalignedArtifactError if the artifact `what` was made for a different file."""
-    require_made_for(path, sha256_of_file(path), scene, {what: expected_sha256})
-
-
-def require_made_for(path: Path, found_sha256: str, scene: str, made_for: dict[str, str]) -> None:
-    """Raise MisalignedArtifactError if a digest in `made_for` (by artifact) differs from the file's."""
-    for what, expected in made_for.items():
-        if found_sha256 != expected:
-            raise MisalignedArtifactError(
-                f"the {what} of {scene} was made for a different {Path(path).name}",
-                expected=f"sha256 {expected[:12]}",
-                found=f"sha256 {found_sha256[:12]} in {path}",
-                fix=f"rerun the stage that writes the {what}",
-            )

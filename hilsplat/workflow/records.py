@@ -10,10 +10,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hilsplat.base.artifacts import provenance_path, run_command, sha256_of_path, was_interrupted
+from hilsplat.base.artifacts import provenance_path, run_command
+from hilsplat.base.atomic import was_interrupted
 from hilsplat.base.errors import ArtifactError, HilsplatError
+from hilsplat.base.lineage import Provenance, files_of, read_provenance, sha256_of_path, sizes_of
 from hilsplat.base.progress import track
-from hilsplat.base.provenance import Provenance, files_of, read_provenance, sizes_of
 from hilsplat.datasets.sources import is_exported
 from hilsplat.methods.registry import OURS
 from hilsplat.models.store import model_digest
@@ -36,7 +37,6 @@ class Expected:
     """How a plan makes an artifact.
 
     Attributes:
-        output: an output declared by the rule, if the rule does not declare the artifact itself.
         seed: seed expected in the provenance; None if the artifact is deterministic.
         plugins: readers or baselines that are part of the code digest.
     """
@@ -45,7 +45,6 @@ class Expected:
     settings: Mapping[str, Any] = field(default_factory=dict)
     seed: int | None = None
     plugins: tuple[str, ...] = ()
-    output: str = ""
 
 
 def expected_artifacts(plan: Plan) -> dict[str, Expected]:
@@ -60,7 +59,7 @@ def expected_artifacts(plan: Plan) -> dict[str, Expected]:
             found.setdefault(plan.path(job, *variant, name), Expected(stage, **how))
 
         if row.world:
-            add("world", "world", row, output=plan.path(row, "world/images"))
+            add("world/images", "world", row)
         if is_exported(row.source):
             add("source", "source", row, plugins=plan.data.source_reader(row))
         add("scene", "poses", row, seed=plan.run.seed)
@@ -105,10 +104,10 @@ def outdated(plan: Plan, *, every_byte: bool = False) -> dict[str, str]:
     records = Records(plan.results, every_byte=every_byte)
     found = {}
     for path, how in expected.items():
-        if provenance_path(Path(path)).is_file() or Path(how.output or path).exists():
+        if provenance_path(Path(path)).is_file() or Path(path).exists():
             state, reason = records.state(Path(path), how)
             if state != WHOLE:
-                found[how.output or path] = reason
+                found[path] = reason
     return found
 
 

@@ -18,7 +18,8 @@ import yaml
 from PIL import Image
 
 from hilsplat.base.arrays import read_tensors, write_tensors
-from hilsplat.base.artifacts import provenance_path, sha256_of_file
+from hilsplat.base.artifacts import provenance_path
+from hilsplat.base.lineage import sha256_of_file
 from hilsplat.configuration import read_config
 from hilsplat.query.answer import answer, file_name
 from hilsplat.query.names import tree_digest

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from hilsplat.base.artifacts import visible_files
 from hilsplat.base.errors import HilsplatError, SceneError, foreign, in_one_line
 from hilsplat.base.files import IMAGE_SUFFIXES, is_outside, list_images
 from hilsplat.base.images import opened_image
+from hilsplat.base.lineage import visible_files
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.cameras import MAX_SIDE_PX
 from hilsplat.scene.colmap import Points, pycolmap

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from hilsplat.base.artifacts import read_index, read_json, read_npy, sha256_of_path, write_index, write_npy
+from hilsplat.base.artifacts import read_index, read_json, read_npy, write_index, write_npy
 from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.lineage import sha256_of_path
 from hilsplat.semantic_tree import nodes
 from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.semantic_tree.nodes import (

@@ -5,9 +5,9 @@ import pytest
 import scipy.sparse as sp
 from plyfile import PlyData
 
-from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import Level
+from hilsplat.base.lineage import sha256_of_file
 from hilsplat.segment.sam import point_grid
 from hilsplat.semantic_tree.build import RANKED, crop_ranks
 from hilsplat.semantic_tree.export import write_selection_ply, write_tree_ply

@@ -1,11 +1,14 @@
-"""Provenance records beside artifacts, and checks that a command replaces only its own earlier outputs."""
+"""What an artifact was made from, and whether that is still true: digests, provenance records, belonging."""
 
 import functools
+import hashlib
+import json
 import os
 import platform
 import subprocess
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -13,18 +16,20 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from hilsplat.base.artifacts import (
+    RECORD,
+    RUN,
     provenance_path,
     read_json,
     read_memo,
-    remake,
+    rebuild_command,
     seal_of,
-    sha256_of_path,
-    visible_files,
-    was_interrupted,
     write_json,
 )
-from hilsplat.base.errors import ArtifactError, HilsplatError, ImageError
-from hilsplat.base.images import opened_image
+from hilsplat.base.errors import ArtifactError, HilsplatError, MisalignedArtifactError
+from hilsplat.base.files import regular
+
+CONVERTED = ".made_from.json"
+"""Hidden file in a folder of extracted frames or unpacked photographs that records their source."""
 
 LIBRARIES = (
     *("hilsplat", "numpy", "scipy", "torch", "numba", "pycolmap", "onnxruntime"),
@@ -32,8 +37,91 @@ LIBRARIES = (
 )
 """Libraries that affect results."""
 
-SOFTWARE = {"Software": "hilsplat"}
-"""Metadata of the PNGs that commands draw for users; these files have no provenance record."""
+
+def sha256_of_bytes(*parts: bytes) -> str:
+    """Return the SHA-256 of the parts, each preceded by its length so that boundaries matter."""
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(len(part).to_bytes(8, "little"))
+        digest.update(part)
+    return digest.hexdigest()
+
+
+def sha256_of_json(value: Any) -> str:
+    """Return the SHA-256 of a JSON value; the order of keys does not matter."""
+    return sha256_of_bytes(json.dumps(value, sort_keys=True).encode())
+
+
+def sha256_of_file(path: Path) -> str:
+    with regular(Path(path)).open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def sha256_of_path(path: Path) -> str:
+    """Return the SHA-256 of a file, or of the names and bytes of a folder's non-hidden files."""
+    path = Path(path)
+    if path.is_file():
+        return sha256_of_file(path)
+    files = visible_files(path)
+    if not files:
+        raise ArtifactError(f"{path} is missing or empty", fix=rebuild_command(path))
+    return sha256_of_json([(file.relative_to(path).as_posix(), sha256_of_file(file)) for file in files])
+
+
+def digests_of(paths: Collection[str], memo: Path) -> dict[str, str]:
+    """Map each path to its file's SHA-256, or "unreadable"; only files that changed since `memo` are read.
+
+    Programs cannot set the status change time, so it reveals a replacement of the same size and time.
+    """
+    old = read_memo(memo, dict[str, str])
+
+    def entry(path: str) -> str:
+        with suppress(OSError, HilsplatError):  # the stage reports them
+            stat = Path(path).stat()
+            stamp = f"{stat.st_size} {stat.st_mtime_ns} {stat.st_ctime_ns} "
+            is_unchanged = old.get(path, "").startswith(stamp)
+            return old[path] if is_unchanged else stamp + sha256_of_file(Path(path))
+        return "unreadable"
+
+    with ThreadPoolExecutor() as threads:
+        entries = dict(zip(paths, threads.map(entry, paths), strict=True))
+    if not entries.items() <= old.items():
+        with suppress(OSError):  # a read-only folder of results
+            write_json(memo, old | entries)
+    return {path: entry.split()[-1] for path, entry in entries.items()}
+
+
+def visible_files(folder: Path) -> list[Path]:
+    """Return the files in a folder and its subfolders, sorted; follow links, and skip what is hidden.
+
+    Subfolders that hilsplat wrote are skipped too, because a project may be in a folder of photographs.
+    """
+    files = []
+    for parent, folders, names in os.walk(folder, followlinks=True):
+        folders[:] = [name for name in folders if name[0] != "." and not _is_apart(Path(parent, name))]
+        files += [path for name in names if name[0] != "." and (path := Path(parent, name)).is_file()]
+    return sorted(files)
+
+
+def _is_apart(folder: Path) -> bool:
+    """Return whether a folder is results, an artifact, a converted source, or a link to a parent folder."""
+    marks = (folder / RUN, folder / CONVERTED, provenance_path(folder))
+    return any(map(Path.is_file, marks)) or folder.parent.resolve().is_relative_to(folder.resolve())
+
+
+def files_of(path: Path | Sequence[Path]) -> list[Path]:
+    """Return the non-hidden files in a folder, or the given file or files that exist."""
+    if not isinstance(path, Path):
+        return [file for part in path for file in files_of(part)]
+    if not path.is_dir():
+        return [path] if path.exists() else []
+    return visible_files(path)
+
+
+def sizes_of(path: Path) -> dict[str, int]:
+    """Map the relative path of each file of an artifact ("." for a single file) to its size in bytes."""
+    path = Path(path)
+    return {file.relative_to(path).as_posix(): file.stat().st_size for file in files_of(path)}
 
 
 class Inputs:
@@ -49,11 +137,11 @@ class Inputs:
                 )
         self._files = self._signatures()
         self.records = {name: self._record(path) for name, path in paths.items()}
+        has_records = functools.cache(_has_records)  # a folder may contain thousands of photographs
         for record in self.records.values():
             files = record.get("files", {record["path"]: record.get("sha256")})
-            has_record = functools.cache(_has_record)  # a folder may contain thousands of photographs
             for path, digest in files.items():
-                if has_record(Path(path).parent):
+                if has_records(Path(path).parent):
                     require_as_written(Path(path), digest)
 
     def require_unchanged(self) -> None:
@@ -79,15 +167,6 @@ class Inputs:
             return {"path": str(path), "sha256": sha256_of_path(path) if files_of(path) else None}
         digests = {str(file): sha256_of_path(file) if file.exists() else None for file in path}
         return {"path": os.path.commonpath(digests) if digests else "", "files": digests}
-
-
-def files_of(path: Path | Sequence[Path]) -> list[Path]:
-    """Return the non-hidden files in a folder, or the given file or files that exist."""
-    if not isinstance(path, Path):
-        return [file for each in path for file in files_of(each)]
-    if not path.is_dir():
-        return [path] if path.exists() else []
-    return visible_files(path)
 
 
 def write_provenance(
@@ -171,24 +250,25 @@ def read_provenance(artifact: Path) -> Provenance | None:
         values = read_json(path)
         record = Provenance.model_validate(values)
         if record.seal is not None and values.pop("seal") != seal_of(values):
-            raise ArtifactError(f"{path} was changed after it was written", fix=remake(artifact))
+            raise ArtifactError(f"{path} was changed after it was written", fix=rebuild_command(artifact))
         return record
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         raise ArtifactError(
-            f"{path} is damaged: {'.'.join(map(str, first['loc']))}: {first['msg']}", fix=remake(artifact)
+            f"{path} is damaged: {'.'.join(map(str, first['loc']))}: {first['msg']}",
+            fix=rebuild_command(artifact),
         ) from error
 
 
-def _has_record(folder: Path) -> bool:
-    return provenance_path(folder).is_file() or any(folder.glob(f"*{provenance_path(Path()).name}"))
+def _has_records(folder: Path) -> bool:
+    return any(folder.glob(f"*{RECORD}"))
 
 
 def require_as_written(path: Path, sha256: str | None) -> None:
     """Raise ArtifactError if an artifact's digest differs from its provenance; other files are ignored."""
-    ending = provenance_path(Path()).name
-    beside = [path.parent / file.name.removesuffix(ending) for file in path.parent.glob(f"*{ending}")]
-    for artifact in [path] if path in beside else [path.parent, *beside]:  # `world` records `world/images`
+    records = path.parent.glob(f"*{RECORD}")
+    beside = [record.with_name(record.name.removesuffix(RECORD)) for record in records]
+    for artifact in [path] if path in beside else beside:
         record = read_provenance(artifact)
         written = record.outputs.get(os.path.relpath(path, artifact.parent)) if record else None
         if written is not None and written.sha256 != sha256:
@@ -196,14 +276,26 @@ def require_as_written(path: Path, sha256: str | None) -> None:
                 f"{path} was changed after it was written",
                 expected=f"sha256 {written.sha256[:12]}, as in {provenance_path(artifact).name}",
                 found=f"sha256 {(sha256 or 'of nothing')[:12]}",
-                fix=remake(artifact),
+                fix=rebuild_command(artifact),
             )
 
 
-def sizes_of(path: Path) -> dict[str, int]:
-    """Map the relative path of each file of an artifact ("." for a single file) to its size in bytes."""
-    path = Path(path)
-    return {file.relative_to(path).as_posix(): file.stat().st_size for file in files_of(path)}
+def require_made_from(
+    artifact: object, source: object, recorded: str | None, digest: str | None, fix: str | None = None
+) -> None:
+    """Raise MisalignedArtifactError unless an artifact was made from a source.
+
+    Args:
+        recorded: digest of the source when the artifact was made; None if it was made without it.
+        digest: digest of the source now; None if there is no such source.
+    """
+    if recorded != digest:
+        raise MisalignedArtifactError(
+            f"{artifact} was not made from {source}",
+            expected=f"digest {recorded[:12]}" if recorded else "nothing",
+            found=f"digest {digest[:12]}" if digest else "nothing",
+            fix=fix or f"rerun the stage that writes {artifact}",
+        )
 
 
 @functools.cache
@@ -230,121 +322,3 @@ def git_commit() -> str:
         return commit + ("+edits" if git("status", "--porcelain", "--untracked-files=no") else "")
     except (OSError, subprocess.SubprocessError):
         return "unknown"
-
-
-def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Path]) -> None:
-    """Check that a stage can write its outputs without overwriting unrelated data.
-
-    An existing file or folder may be replaced if it is empty, if the same stage wrote it according to the
-    provenance of the first output, or if a process was killed while writing it.
-
-    Raises:
-        ArtifactError: an output is or contains an input or the working, home or root folder, or exists and is
-            not an earlier output of the stage.
-    """
-    own = _recorded_outputs(outputs[0], stage)
-    read = [Path(each).resolve() for each in inputs]
-    for out in outputs:
-        place = out.resolve()
-        for each in read:
-            if place == each or place in each.parents:
-                what = "is an input" if place == each else f"contains the input {each}"
-                raise ArtifactError(f"output {out} {what} of {stage}", fix="choose another output")
-        for name, folder in (("working", Path.cwd()), ("home", Path.home())):
-            if place == folder.resolve() or place in folder.resolve().parents:
-                raise ArtifactError(
-                    f"output {out} is or contains the {name} folder", fix="choose a new file or folder"
-                )
-        if not _is_something(out) or place in own or was_interrupted(out):
-            continue
-        raise _foreign(out, stage, f"a new path, or an earlier output of {stage} with its provenance")
-
-
-def require_own_picture(path: Path, beside: Path | None = None) -> None:
-    """Raise ArtifactError if a path is not a .png, or if it or `beside` is a file of other programs."""
-    if path.suffix.lower() != ".png":
-        raise ArtifactError(f"output {path} is not a PNG file", expected="a name that ends in .png")
-    if _is_something(path) and not _is_own_picture(path):
-        raise _foreign(path)
-    if beside is not None and _is_something(beside) and not _is_something(path):
-        raise _foreign(beside)
-
-
-def _is_own_picture(path: Path) -> bool:
-    try:
-        with opened_image(path) as image:
-            return bool(image.info.get("Software") == SOFTWARE["Software"])
-    except ImageError:
-        return False
-
-
-@contextmanager
-def replaced_folder(folder: Path) -> Iterator[None]:
-    """Replace a folder in the block; raise ArtifactError if a file in it is not from the last such block."""
-    record = folder.with_name(f".{folder.name}.written.json")  # size and time of each file
-    known = read_memo(record, dict[str, list[int]])
-    if others := sorted(name for name, stat in _stats(folder).items() if known.get(name) != stat):
-        raise ArtifactError(
-            f"{folder} contains files that hilsplat did not write, or that were changed later",
-            found=", ".join(others[:3]),
-            fix="move them elsewhere, or choose another folder (--out)",
-        )
-    yield
-    write_json(record, _stats(folder))
-
-
-def _stats(folder: Path) -> dict[str, list[int]]:
-    stats = {file.relative_to(folder).as_posix(): file.stat() for file in files_of(folder)}
-    return {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
-
-
-def require_beginning(path: Path, line: str) -> None:
-    """Raise ArtifactError if a table would replace a file whose first line is not `line`."""
-    if not _is_something(path):
-        return
-    try:
-        with path.open(encoding="utf-8") as stream:
-            is_own = stream.readline().strip() == line.strip()
-    except (OSError, ValueError):
-        is_own = False
-    if not is_own:
-        raise _foreign(path)
-
-
-def _foreign(path: Path, writer: str = "hilsplat", expected: str | None = None) -> ArtifactError:
-    return ArtifactError(
-        f"output {path} exists, but {writer} did not write it",
-        expected=expected,
-        found=_described(path),
-        fix="choose another output, or remove this one first",
-    )
-
-
-def _recorded_outputs(artifact: Path, stage: str) -> set[Path]:
-    try:
-        record = read_provenance(artifact)
-    except ArtifactError:
-        return set()
-    if record is None or record.stage != stage:
-        return set()
-    return {(artifact.parent / name).resolve() for name in record.outputs}
-
-
-def _is_something(path: Path) -> bool:
-    """Return whether a path exists and is not empty, ignoring hidden files such as Snakemake's markers."""
-    if not os.path.lexists(path):
-        return False
-    if path.is_dir():
-        return bool(_visible(path))
-    return not path.is_file() or path.stat().st_size > 0
-
-
-def _visible(folder: Path) -> list[str]:
-    return [path.name for path in folder.iterdir() if not path.name.startswith(".")]
-
-
-def _described(path: Path) -> str:
-    if path.is_dir():
-        names = sorted(_visible(path))
-        return f"a folder of {len(names)} entries: {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
-    return f"a file of {path.stat().st_size} bytes" if path.is_file() else "neither a file nor a folder"
