@@ -210,7 +210,7 @@ ROWS = {
     "Gaussians of another scene beside a tree": row(
         lambda: GAUSSIANS.write_bytes(GAUSSIANS.read_bytes()[:-4] + b"\0\0\x80?"),
         ASK,
-        "the semantic tree of photos/desk was made for a different gaussians.ply",
+        "default/semantic_tree was not made from results/photos/desk/gaussians.ply",
     ),
     "Gaussians without a rotation": row(
         without_rotation, ("export", "photos/desk", "--as", "ply"), "gaussians.ply", "1 of", "no rotation"

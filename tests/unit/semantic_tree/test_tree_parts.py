@@ -93,7 +93,7 @@ def test_an_exported_tree_or_selection_is_a_valid_3dgs_ply(tmp_path):
     write_selection_ply(ply, np.array([1, 3]), tmp_path / "selection.ply")
     assert load_ply(tmp_path / "selection.ply").means[:, 0].tolist() == [3, 9]
     save_ply(ply, round_gaussians(means + 1))  # as many Gaussians
-    with pytest.raises(MisalignedArtifactError, match=r"made for a different .*\.ply"):
+    with pytest.raises(MisalignedArtifactError, match=r"semantic tree was not made from .*\.ply"):
         write_tree_ply(ply, tree, out)
 
 

@@ -163,7 +163,7 @@ def test_a_plan_expects_what_its_rules_write(tmp_path, monkeypatch):
     plan = plan_of(tmp_path, BENCHMARK[:1], variants=variants)
     found = expected_artifacts(plan)
     folder = "results/synthetic/one"
-    assert found[f"{folder}/world"].output == f"{folder}/world/images"
+    assert found[f"{folder}/world/images"].stage == "world"
     assert found[f"{folder}/lifted/field.safetensors"].stage == "method"
     assert found[f"{folder}/lifted/field.safetensors"].plugins == ("hilsplat.methods.lifted:fit",)
     assert set(found[f"{folder}/truth/masks"].settings) == {"masks", "perturb"}
