@@ -137,11 +137,12 @@ class Inputs:
                 )
         self._files = self._signatures()
         self.records = {name: self._record(path) for name, path in paths.items()}
-        has_records = functools.cache(_has_records)  # a folder may contain thousands of photographs
         for record in self.records.values():
             files = record.get("files", {record["path"]: record.get("sha256")})
+            folders = {Path(path).parent for path in files}  # of thousands of photographs
+            has_records = {folder: any(folder.glob(f"*{RECORD}")) for folder in folders}
             for path, digest in files.items():
-                if has_records(Path(path).parent):
+                if has_records[Path(path).parent]:
                     require_as_written(Path(path), digest)
 
     def require_unchanged(self) -> None:
@@ -258,10 +259,6 @@ def read_provenance(artifact: Path) -> Provenance | None:
             f"{path} is damaged: {'.'.join(map(str, first['loc']))}: {first['msg']}",
             fix=rebuild_command(artifact),
         ) from error
-
-
-def _has_records(folder: Path) -> bool:
-    return any(folder.glob(f"*{RECORD}"))
 
 
 def require_as_written(path: Path, sha256: str | None) -> None:

@@ -17,7 +17,7 @@ def load(place: str) -> Any:
 class Plugins(Mapping[str, Part], Generic[Part]):
     """Components by name, imported on first access.
 
-    The code identity (`base.identity`) does not follow the entries. A stage that uses one component depends
+    Code digests (`base.code`) do not follow the entries. A stage that uses one component depends
     only on that one, and adds the component's import path in `places` to the roots of its digest.
     """
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float32
 
-from hilsplat.base.arrays import made, read_tensors, require_types, write_tensors
+from hilsplat.base.arrays import build_checked, read_tensors, require_types, write_tensors
 from hilsplat.base.artifacts import read_npz, rebuild_command, sealed
 from hilsplat.base.errors import ArtifactError
 from hilsplat.contributions.rows import Contributions
@@ -215,4 +215,4 @@ class LanguageField:
     @staticmethod
     def load(path: Path) -> "LanguageField":
         """Read `field.safetensors`; raise ArtifactError if it is missing, damaged or not a language field."""
-        return made(LanguageField, *read_tensors(path), path)
+        return build_checked(LanguageField, *read_tensors(path), path)

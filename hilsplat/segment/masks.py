@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32, Int64, UInt8, UInt32
 
-from hilsplat.base.arrays import made, require_types
+from hilsplat.base.arrays import build_checked, require_types
 from hilsplat.base.artifacts import read_npz, rebuild_command, write_npz
 from hilsplat.base.errors import ArtifactError, EmptyMaskError
 from hilsplat.base.levels import NONE, Level
@@ -214,7 +214,7 @@ class HierarchicalMasks:
         is_size = size.shape == (2,) and size.dtype.kind in "iu"
         if not is_size or size.min() < 1 or size.max() > MAX_SIDE_PX:
             raise _damaged(path, "size_hw", f"two sides from 1 to {MAX_SIDE_PX} px", str(size.tolist()))
-        masks = made(HierarchicalMasks, arrays, {"size_hw": tuple(size.tolist())}, path, LIMITS)
+        masks = build_checked(HierarchicalMasks, arrays, {"size_hw": tuple(size.tolist())}, path, LIMITS)
         masks._require_whole(path)
         return masks
 

@@ -8,7 +8,7 @@ import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float32, Int32, Int64, UInt8
 
 from cpusplat.compiled import compiled
-from hilsplat.base.arrays import made
+from hilsplat.base.arrays import build_checked
 from hilsplat.base.artifacts import read_index, read_npz, rebuild_command, sealed
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, NONE, Level
@@ -159,7 +159,7 @@ class SemanticTree:
         index = read_index(folder, *names)
         known = {"view_names": tuple(index["views"]), **{name: index[name] for name in names}}
         path = sealed(folder, "tree.npz")
-        tree = made(SemanticTree, read_npz(path), known, path, LIMITS)
+        tree = build_checked(SemanticTree, read_npz(path), known, path, LIMITS)
         tree._require_whole(path)
         if clip_folder is None:
             return tree

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hilsplat.base import artifacts
-from hilsplat.base.arrays import made
+from hilsplat.base.arrays import build_checked
 from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.errors import ArtifactError
 
@@ -61,5 +61,5 @@ def test_arrays_of_another_version_are_recognised():
 
     left, right = np.zeros(2), np.ones(1)
     with pytest.raises(ArtifactError, match=r"a different version(.|\n)*left, right(.|\n)*left, middle"):
-        made(Pair, {"left": left, "middle": right}, {"name": "a"}, Path("old.npz"))
-    assert made(Pair, {"left": left, "right": right}, {"name": "a"}, Path("new.npz")).name == "a"
+        build_checked(Pair, {"left": left, "middle": right}, {"name": "a"}, Path("old.npz"))
+    assert build_checked(Pair, {"left": left, "right": right}, {"name": "a"}, Path("new.npz")).name == "a"

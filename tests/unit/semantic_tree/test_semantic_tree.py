@@ -155,7 +155,9 @@ def test_masks_in_another_order_are_refused(tree_of_boxes):
     index = read_index(world.clip)
     index["views"]["002.png"]["masks_sha256"] = "0" * 64
     write_index(world.clip, index.pop("views"), **index)
-    with pytest.raises(MisalignedArtifactError, match=rf"{world.clip} was not made from the masks of view 002\.png"):
+    with pytest.raises(
+        MisalignedArtifactError, match=rf"{world.clip} was not made from the masks of view 002\.png"
+    ):
         SemanticTree.load(out, world.clip)
     reverse_masks(world, "002.png")
     message = rf"{contributions} was not made from the masks of view 002\.png"
