@@ -103,7 +103,7 @@ def test_an_old_version_is_never_partly_restored(tmp_path):
 WRITER = """
 import os, sys, time
 os.getpid = lambda: int(sys.argv[2])  # the number in another process namespace
-from hilsplat.base.artifacts import atomic_folder, atomic_path
+from hilsplat.base.atomic import atomic_folder, atomic_path
 with {writer}(sys.argv[1]) as temporary:
     print(flush=True)
     time.sleep(60)

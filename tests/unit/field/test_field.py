@@ -314,7 +314,7 @@ def test_a_field_resumes_from_another_one(flat_boxes):
     assert begun.pop("ridge") == 0  # which pulls towards the start
     assert begun == pytest.approx({name: trained[name] for name in begun}, rel=1e-4)
     LanguageField(LanguageField.load(first).features, "other", "code").save(first)
-    with pytest.raises(MisalignedArtifactError, match="not made from the Gaussians of .*contributions"):
+    with pytest.raises(MisalignedArtifactError, match=r"not made from the Gaussians of .*contributions"):
         solved_field(flat_boxes, "second", onward, start=first)
 
 
