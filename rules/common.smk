@@ -10,7 +10,7 @@ from pathlib import Path
 from snakemake.exceptions import WorkflowError
 from snakemake.logging import logger
 
-from hilsplat.base.artifacts import sha256_of_bytes
+from hilsplat.base.lineage import sha256_of_bytes
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.files import INSTALLED
 from hilsplat.configuration import merged_config

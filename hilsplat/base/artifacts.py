@@ -62,10 +62,14 @@ def run_command(path: Path, *options: str) -> str:
 
 
 def rebuild_command(path: Path) -> str:
-    """Return the command that rebuilds an artifact, given the artifact or a file in it."""
-    for artifact in (Path(path), *Path(path).parents):
-        if provenance_path(artifact).is_file():
-            return run_command(artifact, "--verify")
+    """Return the command that rebuilds an artifact, given one of its outputs or a file in one."""
+    for output in (Path(path), *Path(path).parents):
+        if provenance_path(output).is_file():
+            return run_command(output, "--verify")
+        for record in output.parent.glob(f"*{RECORD}"):  # of another output of the same stage
+            outputs = read_memo(record, dict[str, Any]).get("outputs")
+            if isinstance(outputs, dict) and output.name in outputs:
+                return run_command(record.with_name(record.name.removesuffix(RECORD)), "--verify")
     return "rerun the stage that writes it"
 
 
