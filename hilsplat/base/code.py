@@ -63,9 +63,11 @@ def modules_of(*roots: Code) -> list[str]:
 
 def _digests(roots: tuple[Code, ...]) -> dict[str, str]:
     with PARSING:
-        return _closure(
-            tuple(root.partition(":")[0] if isinstance(root, str) else root.__module__ for root in roots)
-        )
+        return _closure(tuple(_module(root) for root in roots))
+
+
+def _module(code: Code) -> str:
+    return code.partition(":")[0] if isinstance(code, str) else code.__module__
 
 
 @functools.cache
@@ -83,15 +85,13 @@ def _closure(roots: tuple[str, ...]) -> dict[str, str]:
             continue
         facts[module] = _facts(module, path, memo.get(module))
         names = (name for name in facts[module].imports if name.partition(".")[0] in packages)
-        waiting += [name if _file(name) else name.rpartition(".")[0] for name in names]
+        waiting += [name if _file(name) else name.rpartition(".")[0] or name for name in names]
     if not facts.items() <= memo.items():
         memo.update(facts)
-        with (
-            suppress(OSError, HilsplatError),
-            atomic_path(MEMO, durable=False) as temporary,
-        ):  # read-only package
+        # The package may be read-only.
+        with suppress(OSError, HilsplatError), atomic_path(MEMO, durable=False) as temporary:
             temporary.write_text(json.dumps(memo), encoding="utf-8")
-    return {module: found.digest for module, found in facts.items()}
+    return {module: of_module.digest for module, of_module in facts.items()}
 
 
 @functools.cache
@@ -110,7 +110,7 @@ def _file(module: str) -> Path | None:
     bases = [Path(folder, *parts) for folder in spec.submodule_search_locations or ()]
     files = [file for base in bases for file in (base / "__init__.py", base.with_suffix(".py"))]
     if not bases and not parts:
-        files = [Path(spec.origin or "").with_suffix(".py")]
+        files = [Path(spec.origin or module).with_suffix(".py")]
     return next(filter(Path.is_file, files), None)
 
 

@@ -98,18 +98,18 @@ class FinishedScene:
 
         A scene without labels has no scores, but its panel was drawn with the same settings.
         """
-        scores, place = self.folder / self.variant / "scores.csv", self.folder.resolve()
-        panel = place.parent.parent / "figures" / place.parent.name / place.name / "panel.png"
+        scores, scene = self.folder / self.variant / "scores.csv", self.folder.resolve()
+        panel = scene.parent.parent / "figures" / scene.parent.name / scene.name / "panel.png"
         if (record := read_provenance(scores)) is not None:
-            found = record.settings
+            settings = record.settings
         elif (record := read_provenance(panel)) is not None:
-            found = record.settings.get("evaluate", {})
+            settings = record.settings.get("evaluate", {})
         else:
-            found = {}
+            settings = {}
             logger.warning("%s: no scores or panel record the settings; using the defaults", self.folder)
-        known = {name: value for name, value in found.items() if name in EvaluateSettings.model_fields}
+        values = {name: settings[name] for name in EvaluateSettings.model_fields if name in settings}
         try:
-            return EvaluateSettings(**known)
+            return EvaluateSettings(**values)
         except ValidationError as error:
             raise ArtifactError(
                 f"the recorded query settings are not valid: {error.errors(include_url=False)[0]['msg']}",
@@ -145,8 +145,8 @@ def is_drawn(scene: Path) -> bool:
 
 def finished_variants(folder: Path) -> list[str]:
     """Return the variants of a scene that accept queries: those with their own field or CLIP vectors."""
-    made = [path for name in ("field.safetensors", "clip") for path in folder.glob(f"*/{name}")]
-    return sorted({path.parent.name for path in made})
+    outputs = [path for name in ("field.safetensors", "clip") for path in folder.glob(f"*/{name}")]
+    return sorted({path.parent.name for path in outputs})
 
 
 def _unfinished(folder: Path, missing: Path) -> ArtifactError:
