@@ -9,11 +9,10 @@ import subprocess
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
 from typing import Any
-
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from hilsplat.base.artifacts import (
     RECORD,
@@ -206,14 +205,16 @@ def write_provenance(
     write_json(provenance_path(artifact), {**record, "seal": seal_of(record)})
 
 
-class Written(BaseModel):
+@dataclass(frozen=True)
+class Written:
     """An output as it was written: its digest from `sha256_of_path`, and sizes from `sizes_of`."""
 
     sha256: str
     bytes: dict[str, int]
 
 
-class Read(BaseModel):
+@dataclass(frozen=True)
+class Read:
     """An input as a stage read it: its digest, or one digest per listed file; None if empty or missing."""
 
     path: str
@@ -221,35 +222,45 @@ class Read(BaseModel):
     files: dict[str, str | None] | None = None
 
 
-class Provenance(BaseModel):
+@dataclass(frozen=True)
+class Provenance:
     """A record, as `write_provenance` documents it; `seal` is its checksum, which old records lack."""
 
-    model_config = ConfigDict(extra="forbid")
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012
 
     stage: str
-    artifact: str = ""
-    command: tuple[str, ...] = ()
     code: str
     plugins: tuple[str, ...]
     settings: dict[str, Any]
     seed: int | None
-    device: str | None = None
     inputs: dict[str, Read]
     outputs: dict[str, Written]
+    artifact: str = ""
+    command: tuple[str, ...] = ()
+    device: str | None = None
     python: str = ""
-    libraries: dict[str, str] = Field(default_factory=dict)
+    libraries: dict[str, str] = field(default_factory=dict)
     git: str = ""
     seal: int | None = None
 
 
+@functools.cache
+def _checker() -> Any:
+    from pydantic import TypeAdapter  # commands start a tenth faster without it
+
+    return TypeAdapter(Provenance)
+
+
 def read_provenance(artifact: Path) -> Provenance | None:
     """Return the provenance of an artifact, or None; raise ArtifactError if the record is damaged."""
+    from pydantic import ValidationError
+
     path = provenance_path(artifact)
     if not path.is_file():
         return None
     try:
         values = read_json(path)
-        record = Provenance.model_validate(values)
+        record: Provenance = _checker().validate_python(values)
         if record.seal is not None and values.pop("seal") != seal_of(values):
             raise ArtifactError(f"{path} was changed after it was written", fix=rebuild_command(artifact))
         return record
