@@ -22,7 +22,8 @@ from typing import Literal
 import numpy as np
 
 from benchmarks.memory import status_mib
-from hilsplat.base.artifacts import atomic_folder, write_index, write_npy
+from hilsplat.base.artifacts import write_index, write_npy
+from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.processes import keep_freed_memory
 from hilsplat.base.progress import track

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 import psutil
 
-from hilsplat.base.artifacts import read_index, sha256_of_file, write_index
+from hilsplat.base.artifacts import read_index, write_index
+from hilsplat.base.lineage import sha256_of_file
 from hilsplat.base.tables import markdown_table
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply, save_ply

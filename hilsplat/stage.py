@@ -19,11 +19,13 @@ from typing import Annotated, Any, Generic, Literal, NamedTuple, ParamSpec, Type
 
 import typer
 
-from hilsplat.base.artifacts import output_lock, provenance_path, require_free_space, was_interrupted
+from hilsplat.base.artifacts import provenance_path
+from hilsplat.base.atomic import output_lock, require_free_space, was_interrupted
 from hilsplat.base.cache import writable
 from hilsplat.base.code import code_digest, modules_of
 from hilsplat.base.errors import HilsplatError
-from hilsplat.base.provenance import Inputs, require_replaceable, write_provenance
+from hilsplat.base.lineage import Inputs, write_provenance
+from hilsplat.base.ownership import require_replaceable
 from hilsplat.base.removal import delete
 from hilsplat.configuration import SECTIONS, StageSettings
 from hilsplat.models.store import model_path

@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Int32, UInt8
 
-from hilsplat.base.artifacts import atomic_path, read_index, read_json
+from hilsplat.base.artifacts import read_index, read_json
+from hilsplat.base.atomic import atomic_path
 from hilsplat.base.files import list_images
 from hilsplat.base.images import read_image
 from hilsplat.base.levels import LEVELS, NONE, Level
-from hilsplat.base.provenance import SOFTWARE, require_own_picture
+from hilsplat.base.ownership import SOFTWARE, require_own_picture
 from hilsplat.datasets.hierarchy import AnnotatedNode, HierarchyAnnotations
 from hilsplat.segment.pictures import row_colours
 

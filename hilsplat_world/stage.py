@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hilsplat.base.artifacts import atomic_folder, require_free_space, write_index, write_json, write_npz
+from hilsplat.base.artifacts import write_index, write_json, write_npz
+from hilsplat.base.atomic import atomic_folder, require_free_space
 from hilsplat.base.errors import SceneError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, Level

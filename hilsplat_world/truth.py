@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
-from hilsplat.base.artifacts import atomic_path
+from hilsplat.base.atomic import atomic_path
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.hierarchy import AnnotatedNode
 from hilsplat.datasets.points.labelled_points import PlyMesh

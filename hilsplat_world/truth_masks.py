@@ -23,9 +23,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int32
 from scipy.sparse.csgraph import connected_components
 
-from hilsplat.base.artifacts import atomic_folder, read_index, read_json, sha256_of_json, write_index
+from hilsplat.base.artifacts import read_index, read_json, write_index
+from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, NONE, Level
+from hilsplat.base.lineage import sha256_of_json
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.hierarchy import AnnotatedNode, HierarchyAnnotations

@@ -21,7 +21,8 @@ from PIL import Image, ImageDraw
 from pycocotools import mask as coco_masks
 
 from hilsplat.annotate.labels import Label, as_file, known_labels, placed_rings, traced
-from hilsplat.base.artifacts import atomic_folder, parse_json, write_text
+from hilsplat.base.artifacts import parse_json, write_text
+from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.errors import HilsplatError, SceneError, first_line, foreign
 from hilsplat.base.images import open_image
 from hilsplat.datasets.hierarchy import HierarchyAnnotations

@@ -15,14 +15,15 @@ import safetensors.numpy
 from jaxtyping import AbstractArray, jaxtyped
 from safetensors import SafetensorError, safe_open
 
-from hilsplat.base.artifacts import atomic_path, parse_json, remake
+from hilsplat.base.artifacts import parse_json, rebuild_command
+from hilsplat.base.atomic import atomic_path
 from hilsplat.base.errors import ArtifactError
 
-Made = TypeVar("Made")
+Built = TypeVar("Built")
 Limits = Mapping[str, tuple[int | float, int | float]]  # array name -> minimum and maximum
 
 
-def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Limits) -> None:
+def require_types(cls: type, arrays: Mapping[str, Any], path: Path, limits: Limits) -> None:
     """Check arrays, by field name, against the jaxtyping annotations of a dataclass.
 
     Dimensions with the same name must have the same size.
@@ -30,7 +31,7 @@ def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Li
     Raises:
         ArtifactError: an array has the wrong type or shape, or contains a non-finite or out-of-range value.
     """
-    hints = get_type_hints(maker)
+    hints = get_type_hints(cls)
     with jaxtyped("context"):
         for name, array in arrays.items():
             declared: Any = hints.get(name)
@@ -42,18 +43,18 @@ def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Li
                     f"{path}: array {name} has the wrong type or shape",
                     expected=described(declared),
                     found=f"{array.dtype} of shape {array.shape}",
-                    fix=remake(path),
+                    fix=rebuild_command(path),
                 )
             low, high = limits.get(name, (-np.inf, np.inf))
             if array.dtype.kind not in "biuf" or not array.size:
                 continue
-            least, most = array.min(), array.max()  # NaN if any value is NaN
-            if not (low <= least and most <= high and np.isfinite(least) and np.isfinite(most)):
+            lowest, highest = array.min(), array.max()  # NaN if any value is NaN
+            if not (low <= lowest and highest <= high and np.isfinite([lowest, highest]).all()):
                 raise ArtifactError(
                     f"{path}: array {name} contains an impossible value",
-                    expected="finite numbers" if np.isinf(low) and np.isinf(high) else f"{low:g} to {high:g}",
-                    found=f"{least} to {most}",
-                    fix=remake(path),
+                    expected=f"{low:g} to {high:g}" if name in limits else "finite numbers",
+                    found=f"{lowest} to {highest}",
+                    fix=rebuild_command(path),
                 )
 
 
@@ -62,24 +63,24 @@ def described(declared: type[AbstractArray]) -> str:
     return f"{declared.__name__.partition('[')[0]}[{declared.dim_str.strip()}]"
 
 
-def made(
-    maker: type[Made],
+def build_checked(
+    cls: type[Built],
     arrays: Mapping[str, np.ndarray],
-    more: Mapping[str, Any],
+    others: Mapping[str, Any],
     path: Path,
     limits: Limits | None = None,
-) -> Made:
+) -> Built:
     """Create a dataclass instance from a file's arrays and other fields; raise ArtifactError on mismatch."""
-    expected = {field.name for field in fields(maker) if field.init}  # type: ignore[arg-type]
-    if {*arrays, *more} != expected:
+    names = {field.name for field in fields(cls) if field.init}  # type: ignore[arg-type]
+    if {*arrays, *others} != names:
         raise ArtifactError(
             f"{path} was written by a different version of hilsplat",
-            expected=", ".join(sorted(expected - set(more))),
+            expected=", ".join(sorted(names - set(others))),
             found=", ".join(sorted(arrays)) or "no arrays",
-            fix=remake(path),
+            fix=rebuild_command(path),
         )
-    require_types(maker, arrays, path, limits or {})
-    return maker(**arrays, **more)
+    require_types(cls, arrays, path, limits or {})
+    return cls(**arrays, **others)
 
 
 TENSORS_KEY = "hilsplat"
@@ -89,9 +90,9 @@ TENSORS_KEY = "hilsplat"
 def write_tensors(path: Path, arrays: Mapping[str, np.ndarray], **about: Any) -> None:
     """Write a .safetensors file atomically; identical arrays produce identical bytes."""
     arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    known = json.dumps({**about, "crc32": _checksum(arrays, about)}, sort_keys=True)
+    metadata = json.dumps({**about, "crc32": _checksum(arrays, about)}, sort_keys=True)
     with atomic_path(path) as temporary:
-        safetensors.numpy.save_file(arrays, temporary, metadata={TENSORS_KEY: known})
+        safetensors.numpy.save_file(arrays, temporary, metadata={TENSORS_KEY: metadata})
 
 
 def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -103,7 +104,7 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         if about.pop("crc32") != _checksum(arrays, about):
             raise ValueError("its content was changed after it was written")
     except (OSError, SafetensorError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ArtifactError(f"{path} cannot be read: {error}", fix=remake(path)) from error
+        raise ArtifactError(f"{path} cannot be read: {error}", fix=rebuild_command(path)) from error
     return arrays, about
 
 

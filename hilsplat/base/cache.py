@@ -1,4 +1,4 @@
-"""Cache sizes, pruning of finished views and checkpoints, and remembered examinations of this machine."""
+"""Caches: finished views and checkpoints, their sizes and pruning, and examinations of this machine."""
 
 import logging
 import os
@@ -9,12 +9,15 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import platformdirs
 
-from hilsplat.base.artifacts import existing_folder, sha256_of_json, visible_files, write_text
-from hilsplat.base.errors import HilsplatError
+from hilsplat.base.artifacts import read_npz, write_arrays, write_text
+from hilsplat.base.atomic import existing_folder
+from hilsplat.base.errors import ArtifactError, HilsplatError
+from hilsplat.base.lineage import sha256_of_json, visible_files
 from hilsplat.base.processes import remove_leftovers
-from hilsplat.base.removal import DIGEST, ENTRY, delete, is_tagged
+from hilsplat.base.removal import DIGEST, ENTRY, delete, is_tagged, tag
 
 logger = logging.getLogger(__name__)
 
@@ -29,8 +32,8 @@ FIT_DAYS = 1.0
 
 def caches(folder: Path) -> dict[str, list[Path]]:
     """Map the name of each cache, a subfolder or file of `folder`, to the cache's complete entries."""
-    places = sorted(Path(folder).glob("[!.]*"))
-    return {place.name: visible_files(place) if place.is_dir() else [place] for place in places}
+    paths = sorted(Path(folder).glob("[!.]*"))
+    return {path.name: visible_files(path) if path.is_dir() else [path] for path in paths}
 
 
 def size_table(folder: Path) -> str:
@@ -55,12 +58,12 @@ def prune_cache(
         days: delete entries not used for this many days.
         max_mib: then delete the least recently used until the rest is at most this size.
     """
-    known = (*VIEW_CACHES, CHECKPOINTS)
-    if unknown := sorted(set(stages) - set(known)):
-        raise HilsplatError(f"unknown cache: {', '.join(unknown)}", expected=f"one of {', '.join(known)}")
+    prunable = (*VIEW_CACHES, CHECKPOINTS)
+    if unknown := sorted(set(stages) - set(prunable)):
+        raise HilsplatError(f"unknown cache: {', '.join(unknown)}", expected=f"one of {', '.join(prunable)}")
     # The cache is in the results folder, where killed jobs leave unfinished files beside their outputs.
     remove_leftovers(folder.parent if Path(folder).name == ".cache" else folder)
-    chosen = set(stages or (VIEW_CACHES if days is None else known))
+    chosen = set(stages or (VIEW_CACHES if days is None else prunable))
     now, freed, deleted = time.time(), 0, 0
     used = {
         path: path.stat()
@@ -73,17 +76,62 @@ def prune_cache(
     total = sum(stat.st_size for stat in used.values())
     for path in oldest_first:
         idle_days = (now - used[path].st_mtime) / 86400
-        old = days is not None and idle_days >= days
-        much = max_mib is not None and total - freed > max_mib * 2**20
-        if (old or much) and not (path.parent.name == CHECKPOINTS and idle_days < FIT_DAYS):
+        is_old = days is not None and idle_days >= days
+        is_excess = max_mib is not None and total - freed > max_mib * 2**20
+        is_in_use = path.parent.name == CHECKPOINTS and idle_days < FIT_DAYS
+        if (is_old or is_excess) and not is_in_use:
             delete(path, re.escape(path.name))
             freed += used[path].st_size
             deleted += 1
     return deleted, freed / 2**20
 
 
+class ViewCache:
+    """Cache of a stage's finished views as .npz files, which a rerun uses if the stage was killed.
+
+    Keys must cover all inputs of the result: the settings, and the digests of the image, model and code.
+    Entries are not `compressed` if they are floating-point numbers, which shrink too little to benefit.
+    """
+
+    def __init__(self, folder: Path, *, compressed: bool = True) -> None:
+        self.folder = Path(folder)
+        self.compressed = compressed
+        self.hits = 0
+
+    def path(self, key: str) -> Path:
+        return self.folder / key[:2] / f"{key}.npz"
+
+    def get(self, key: str, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+        """Return the entry, computing and storing it if it is missing or damaged."""
+        arrays = self.find(key)
+        if arrays is not None:
+            self.hits += 1
+            return arrays
+        arrays = compute()
+        self.put(key, arrays)
+        return arrays
+
+    def find(self, key: str) -> dict[str, np.ndarray] | None:
+        """Return the entry, or None if it is missing or damaged."""
+        path = self.path(key)
+        if path.is_file():
+            with suppress(ArtifactError):
+                if arrays := read_npz(path):  # a file that ends in zeros may look like an empty archive
+                    with suppress(OSError):  # another process may have pruned it
+                        os.utime(path)  # last use, for pruning
+                    return arrays
+        return None
+
+    def put(self, key: str, arrays: dict[str, np.ndarray]) -> None:
+        """Store an entry, replacing any existing one."""
+        # A power failure may truncate entries or fill them with zeros. Checksums reveal this on reading, and
+        # the entry is recomputed. A flush to disk, which takes milliseconds, is therefore unnecessary.
+        tag(self.folder)
+        write_arrays(self.path(key), arrays, compressed=self.compressed, durable=False)
+
+
 def remembered(kind: str, key: object, examine: Callable[[], str]) -> str:
-    """Return the text that an examination found, which is done once for each key.
+    """Return the result of an examination, which is done once for each key.
 
     If the user's cache folder cannot be written, each process examines again.
 
@@ -91,17 +139,16 @@ def remembered(kind: str, key: object, examine: Callable[[], str]) -> str:
         kind: name of a folder of results, which `forget` clears.
         key: JSON value that changes if the result may change, such as versions of libraries.
     """
-    place = _folder(kind) / sha256_of_json(key)
+    path = _folder(kind) / sha256_of_json(key)
     with suppress(OSError, ValueError):
-        return place.read_text(encoding="utf-8")
-    found = examine()
+        return path.read_text(encoding="utf-8")
+    result = examine()
     with suppress(OSError, HilsplatError):
-        write_text(place, found)
-    return found
+        write_text(path, result)
+    return result
 
 
 def forget(kind: str) -> None:
-    """Delete the results of one kind."""
     with suppress(OSError):
         for path in _folder(kind).iterdir():
             if re.fullmatch(DIGEST, path.name):
@@ -122,8 +169,8 @@ def use_writable_cache() -> None:
     folder = Path(tempfile.gettempdir()) / f"hilsplat-{os.getuid()}"
     with suppress(FileExistsError):
         folder.mkdir(mode=0o700)
-    found = folder.lstat()
-    if found.st_uid != os.getuid() or found.st_mode & 0o022:  # not ours
+    stat = folder.lstat()
+    if stat.st_uid != os.getuid() or stat.st_mode & 0o022:  # not ours
         folder = Path(tempfile.mkdtemp(prefix="hilsplat-"))
     os.environ["XDG_CACHE_HOME"] = os.environ["MPLCONFIGDIR"] = str(folder)
     os.environ.setdefault("HOME", str(folder))

@@ -1,22 +1,25 @@
 """The code digest of a stage: of all modules that it imports, without comments and docstrings.
 
 It decides which rules rerun and which cache entries are valid (docs/workflow.md). A module counts as a whole,
-with the JSON file of the same name beside it. Imports inside functions count, those for type checking do not.
+with its data: JSON and TSV files of the same name beside it. Imports inside functions count, imports for type
+checking do not, and neither do the packages that contain an imported module.
 """
 
 import ast
 import functools
-import hashlib
 import importlib.util
 import json
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from hilsplat.base.artifacts import atomic_path, read_memo
+from hilsplat.base.artifacts import read_memo
+from hilsplat.base.atomic import atomic_path
 from hilsplat.base.errors import HilsplatError
+from hilsplat.base.lineage import sha256_of_bytes, sha256_of_json
 
 PACKAGES = ("hilsplat", "cpusplat")
 """Packages whose modules count, as do those of the packages of the roots, such as a plugin's."""
@@ -24,12 +27,19 @@ PACKAGES = ("hilsplat", "cpusplat")
 NEUTRAL = ("hilsplat.settings", __name__)
 """Modules that don't count: settings, whose values are parameters of the rules, and this one."""
 
+MEMO = Path(__file__).parent / "__pycache__" / f"code.{sys.implementation.cache_tag}.json"
+"""Facts of each module; parsing all modules takes seconds."""
+
+PARSING = threading.Lock()
+"""Before Python 3.11.8, the parser fails if two threads parse at once (python/cpython#106905)."""
+
 Code = str | Callable[..., Any]
 
 
 class Facts(NamedTuple):
-    """Digest of a module, and dotted names that it imports, each of a module or of something in one."""
+    """State of a module's files, digest of their content, and dotted names of modules or objects imported."""
 
+    state: str
     digest: str
     imports: list[str]
 
@@ -41,107 +51,97 @@ def code_digest(*roots: Code) -> str:
         roots: functions or classes, as objects or as "hilsplat.field.field:run_field", or names of modules.
 
     Raises:
-        HilsplatError: a module, or one that it imports, does not exist.
+        HilsplatError: the module of a root does not exist.
     """
-    text = json.dumps([(module, _facts(module).digest) for module in modules_of(*roots)])
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    return sha256_of_json(_digests(roots))[:16]
 
 
 def modules_of(*roots: Code) -> list[str]:
     """Return the names of the modules that `code_digest` covers, sorted."""
-    names = tuple(root.partition(":")[0] if isinstance(root, str) else root.__module__ for root in roots)
-    return _closure(names)
+    return sorted(_digests(roots))
+
+
+def _digests(roots: tuple[Code, ...]) -> dict[str, str]:
+    with PARSING:
+        return _closure(tuple(_module(root) for root in roots))
+
+
+def _module(code: Code) -> str:
+    return code.partition(":")[0] if isinstance(code, str) else code.__module__
 
 
 @functools.cache
-def _closure(roots: tuple[str, ...]) -> list[str]:
+def _closure(roots: tuple[str, ...]) -> dict[str, str]:
+    """Map each module that the root modules import, and these, to its digest."""
+    if missing := [name for name in roots if _file(name) is None]:
+        raise HilsplatError(f"there is no module {missing[0]}")
     packages = {*PACKAGES, *(name.partition(".")[0] for name in roots)}
-    found, waiting = set[str](), list(roots)
+    memo = _memo()
+    facts, waiting = dict[str, Facts](), list(roots)
     while waiting:
-        name = waiting.pop()
-        if name in found:
+        module = waiting.pop()
+        path = _file(module)
+        if path is None or module in facts or module in NEUTRAL:
             continue
-        if _file(name) is None:
-            raise HilsplatError(f"there is no module {name}")
-        found.add(name)
-        for target in _facts(name).imports:
-            if target.partition(".")[0] in packages:
-                module = target if _file(target) else target.rpartition(".")[0]
-                if module not in NEUTRAL:
-                    waiting.append(module)
-    return sorted(found)
+        facts[module] = _facts(module, path, memo.get(module))
+        names = (name for name in facts[module].imports if name.partition(".")[0] in packages)
+        waiting += [name if _file(name) else name.rpartition(".")[0] or name for name in names]
+    if not facts.items() <= memo.items():
+        memo.update(facts)
+        # The package may be read-only.
+        with suppress(OSError, HilsplatError), atomic_path(MEMO, durable=False) as temporary:
+            temporary.write_text(json.dumps(memo), encoding="utf-8")
+    return {module: of_module.digest for module, of_module in facts.items()}
+
+
+@functools.cache
+def _memo() -> dict[str, Facts]:
+    memo: dict[str, Facts] = read_memo(MEMO, dict[str, Facts])
+    return memo
 
 
 @functools.cache
 def _file(module: str) -> Path | None:
-    """Return the file of a module without importing it; None if there is no such module."""
+    """Return the source file of a module, or None, without importing its package."""
     package, *parts = module.split(".")
-    root = _root(package)
-    if root is None:
-        return None
-    base = root.joinpath(*parts)
-    return next((p for p in (base.with_suffix(".py"), base / "__init__.py") if p.is_file()), None)
-
-
-@functools.cache
-def _root(package: str) -> Path | None:
     spec = importlib.util.find_spec(package)
-    folders = spec.submodule_search_locations if spec else None
-    return Path(folders[0]) if folders else None
+    if spec is None:
+        return None
+    bases = [Path(folder, *parts) for folder in spec.submodule_search_locations or ()]
+    files = [file for base in bases for file in (base / "__init__.py", base.with_suffix(".py"))]
+    if not bases and not parts:
+        files = [Path(spec.origin or module).with_suffix(".py")]
+    return next(filter(Path.is_file, files), None)
 
 
-@functools.cache
-def _facts(module: str) -> Facts:
-    """Return the facts of a module, from a memo in its package if the file is unchanged (parsing is slow)."""
-    path, root = _file(module), _root(module.partition(".")[0])
-    assert path is not None and root is not None, module
-    data = path.with_suffix(".json")
-    stats = [file.stat() for file in (path, data) if file.is_file()]
-    key = repr([(stat.st_mtime_ns, stat.st_size, stat.st_ino) for stat in stats])
-    memo = root / "__pycache__" / f"code.{sys.implementation.cache_tag}.json"
-    known = _memo(memo).get(module, {})
-    if known.get("key") == key:
-        return Facts(known["digest"], known["imports"])
-    facts = _parsed(path.read_bytes(), data.read_bytes() if data.is_file() else b"", module, path)
-    _memo(memo)[module] = {"key": key, **facts._asdict()}
-    with suppress(OSError, HilsplatError), atomic_path(memo, durable=False) as temporary:  # may be read-only
-        temporary.write_text(json.dumps(_memo(memo)))
-    return facts
-
-
-@functools.cache
-def _memo(path: Path) -> dict[str, dict[str, Any]]:
-    return read_memo(path, dict[str, dict[str, Any]])
-
-
-def _parsed(text: bytes, data: bytes, module: str, path: Path) -> Facts:
-    tree = ast.parse(text)
+def _facts(module: str, path: Path, known: Facts | None) -> Facts:
+    files = [path, *filter(Path.is_file, (path.with_suffix(".json"), path.with_suffix(".tsv")))]
+    stats = [file.stat() for file in files]  # before the files are read: they may change after it
+    state = repr([(stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino) for stat in stats])
+    if known is not None and known.state == state:
+        return known
+    text, *data = (file.read_bytes() for file in files)
+    tree = _Bare().visit(ast.parse(text, str(path)))
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-    imports = sorted({name for statement in _statements(tree) for name in _imported(statement, package)})
+    return Facts(state, sha256_of_bytes(ast.dump(tree).encode(), *data), sorted({*_imported(tree, package)}))
+
+
+def _imported(tree: ast.AST, package: str) -> Iterator[str]:
     for node in ast.walk(tree):
-        for body in (getattr(node, "body", None), getattr(node, "orelse", None)):
-            if isinstance(body, list):  # docstrings are statements, as are strings after an attribute
-                body[:] = [statement for statement in body if not _is_string(statement)]
-    return Facts(hashlib.sha256(ast.dump(tree).encode() + data).hexdigest(), imports)
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            module = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
+            yield from (f"{module}.{alias.name}" for alias in node.names)
 
 
-def _statements(tree: ast.AST) -> Iterator[ast.AST]:
-    """Yield all nodes outside of `if TYPE_CHECKING:`."""
-    for node in ast.iter_child_nodes(tree):
-        if not (isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")):
-            yield node
-            yield from _statements(node)
+class _Bare(ast.NodeTransformer):
+    """Removal of docstrings and other bare strings, and of what only type checkers read."""
 
+    def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
+        is_text = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        return None if is_text else node
 
-def _imported(node: ast.AST, package: str) -> Iterator[str]:
-    if isinstance(node, ast.Import):
-        yield from (alias.name for alias in node.names)
-    elif isinstance(node, ast.ImportFrom):
-        parents = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
-        base = ".".join([*parents, *([node.module] if node.module else [])])
-        yield from (f"{base}.{alias.name}" for alias in node.names)
-
-
-def _is_string(node: ast.AST) -> bool:
-    value = getattr(node, "value", None) if isinstance(node, ast.Expr) else None
-    return isinstance(value, ast.Constant) and isinstance(value.value, str)
+    def visit_If(self, node: ast.If) -> ast.AST | list[ast.stmt]:
+        self.generic_visit(node)
+        return node.orelse if ast.unparse(node.test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING") else node

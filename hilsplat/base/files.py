@@ -51,7 +51,6 @@ def regular(path: Path) -> Path:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Return the image files in a folder, sorted; skip hidden files."""
     return list_files(folder, IMAGE_SUFFIXES)
 
 

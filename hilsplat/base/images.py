@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import ExifTags, Image, ImageCms, PngImagePlugin
 
-from hilsplat.base.artifacts import atomic_path
+from hilsplat.base.atomic import atomic_path
 from hilsplat.base.errors import ImageError
 
 logger = logging.getLogger(__name__)
@@ -76,14 +76,14 @@ def opened_image(path: Path, what: str = "image") -> Iterator[Image.Image]:
 
 def exif_tags(image: Image.Image, ifd: ExifTags.IFD | None = None) -> Mapping[int, Any]:
     """Return an image's EXIF tags, those of its main directory or of `ifd`; skip damaged ones."""
-    found = {}
+    values = {}
     with warnings.catch_warnings(action="ignore"), suppress(Exception):  # Pillow raises anything
         exif = image.getexif()
         tags: Mapping[int, Any] = exif if ifd is None else exif.get_ifd(ifd)
         for tag in tags:
             with suppress(Exception):
-                found[tag] = tags[tag]
-    return found
+                values[tag] = tags[tag]
+    return values
 
 
 def orientation(image: Image.Image) -> int:

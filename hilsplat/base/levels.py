@@ -18,7 +18,7 @@ class Level(IntEnum):
 
     @property
     def label(self) -> str:
-        """Lower-case name used in files and tables."""
+        """Name in files and tables."""
         return self.name.lower()
 
     @property

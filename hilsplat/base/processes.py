@@ -137,12 +137,12 @@ def remove_leftovers(folder: Path) -> list[Path]:
     ours, unless it is empty.
     """
     removed = []
-    for place, folders, _ in os.walk(folder):
+    for parent, folders, _ in os.walk(folder):
         for name in folders:
-            found = UNFINISHED.fullmatch(name)
-            if found is None or found["host"] != host_token():
+            match = UNFINISHED.fullmatch(name)
+            if match is None or match["host"] != host_token():
                 continue
-            path = Path(place) / name
+            path = Path(parent) / name
             with suppress(BlockingIOError, FileNotFoundError, PermissionError):
                 is_new = not any(path.iterdir())  # its writer may be about to create the lock
                 with (path / LOCK).open("ab" if is_new else "rb+") as stream:
@@ -187,15 +187,15 @@ def in_processes(
         raise HilsplatError(f"a process of {work} was killed, {KILLED}", fix=KILLED_FIX) from error
 
 
-def _pool(workers: int, initializer: Callable[..., None], *given: Any) -> Any:
+def _pool(workers: int, initializer: Callable[..., None], *arguments: Any) -> Any:
     from concurrent.futures import ProcessPoolExecutor  # imported late: most commands need no pool
     from multiprocessing import get_context
 
-    return ProcessPoolExecutor(workers, get_context("spawn"), initializer, given)
+    return ProcessPoolExecutor(workers, get_context("spawn"), initializer, arguments)
 
 
-def in_own_process(work: Callable[..., Result], *given: Any) -> Result:
-    """Return `work(*given)`, computed in a separate process that a library may terminate.
+def in_own_process(work: Callable[..., Result], *arguments: Any) -> Result:
+    """Return `work(*arguments)`, computed in a separate process that a library may terminate.
 
     Raises:
         ChildProcessError: the process ended without a result; the message contains the last 2000 characters
@@ -208,7 +208,7 @@ def in_own_process(work: Callable[..., Result], *given: Any) -> Result:
         stderr = Path(folder) / "stderr"
         try:
             with _pool(1, _begin_alone, os.getpid(), stderr) as pool:
-                return pool.submit(work, *given).result()
+                return pool.submit(work, *arguments).result()
         except BrokenProcessPool:
             last = stderr.read_text(errors="replace")[-2000:] if stderr.exists() else ""
             raise ChildProcessError(

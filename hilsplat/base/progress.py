@@ -37,13 +37,13 @@ WARNING = re.compile(r"^\d{4}-\S+ \S+ WARNING \S+ (?P<text>.+?)(?=\n\d{4}-|\Z)",
 
 def last_progress(log: Path) -> tuple[str, int, int] | None:
     """Return the last progress reported in a stage's log (loop, items done, total items), or None."""
-    found = list(PROGRESS.finditer(_tail(log)))
-    return (found[-1]["what"], int(found[-1]["done"]), int(found[-1]["total"])) if found else None
+    *_, last = [None, *PROGRESS.finditer(_tail(log))]
+    return (last["what"], int(last["done"]), int(last["total"])) if last else None
 
 
 def warnings_in(log: Path) -> list[str]:
     """Return the warnings in a stage's log."""
-    return [found["text"].rstrip() for found in WARNING.finditer(_tail(log, sys.maxsize))]
+    return [match["text"].rstrip() for match in WARNING.finditer(_tail(log, sys.maxsize))]
 
 
 def _tail(log: Path, num_bytes: int = LOG_TAIL_BYTES) -> str:

@@ -32,7 +32,7 @@ def read_csv(path: Path, columns: Sequence[str] | None, fix: str) -> list[dict[s
         with regular(Path(path)).open(encoding="utf-8", newline="") as stream:
             lines = [line for line in csv.reader(stream) if line]
         header, *rows = ([re.sub(f"^'{FORMULA}", "", cell) for cell in line] for line in lines)
-        found = [dict(zip(header, row, strict=True)) for row in rows]
+        table = [dict(zip(header, row, strict=True)) for row in rows]
     except FileNotFoundError as error:
         raise ArtifactError(f"{path} is missing", fix=fix) from error
     except (ValueError, OSError, csv.Error) as error:
@@ -41,7 +41,7 @@ def read_csv(path: Path, columns: Sequence[str] | None, fix: str) -> list[dict[s
         raise ArtifactError(
             f"{path} has unexpected columns", expected=", ".join(columns), found=", ".join(header), fix=fix
         )
-    return found
+    return table
 
 
 def plain_markdown(text: str) -> str:

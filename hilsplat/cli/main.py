@@ -83,7 +83,7 @@ def options(
             os.dup2(file, stream.fileno())  # also redirects libraries that print to the file descriptor
     start_logging()
     if version:
-        from hilsplat.base.provenance import version_of
+        from hilsplat.base.lineage import version_of
 
         echo(f"hilsplat {version_of('hilsplat') or 'not installed'}")
         raise typer.Exit

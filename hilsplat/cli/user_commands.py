@@ -158,7 +158,7 @@ def export(
 
     Poses and Gaussians are in the coordinates of the scene's source.
     """
-    from hilsplat.base.provenance import replaced_folder
+    from hilsplat.base.ownership import replaced_folder
 
     folder = scene_folder(scene, results)
     if out is not None:

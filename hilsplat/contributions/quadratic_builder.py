@@ -10,17 +10,11 @@ from queue import SimpleQueue
 import numpy as np
 import scipy.sparse as sp
 
-from hilsplat.base.artifacts import (
-    INDEX,
-    atomic_folder,
-    read_index,
-    read_npy,
-    sealed,
-    sha256_of_json,
-    write_index,
-)
+from hilsplat.base.artifacts import INDEX, read_index, read_npy, sealed, write_index
+from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS
+from hilsplat.base.lineage import sha256_of_json
 from hilsplat.base.removal import DIGEST, delete
 from hilsplat.contributions.kernels import SUMS, add_to_block, enlarged, merge_rows, transpose
 from hilsplat.contributions.quadratic import Gram, Quadratic, StackedWeights

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 
-from hilsplat.base.arrays import made
+from hilsplat.base.arrays import build_checked
 from hilsplat.base.artifacts import read_index, read_npy, read_npz, sealed
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import Level
@@ -100,4 +100,4 @@ class Contributions:
         known = {name: index[name] for name in names}
         views = tuple(index["views"])
         path = sealed(folder, "rows.npz")
-        return made(Contributions, read_npz(path), {"folder": folder, "views": views, **known}, path)
+        return build_checked(Contributions, read_npz(path), {"folder": folder, "views": views, **known}, path)

@@ -21,18 +21,12 @@ import numpy as np
 import scipy.sparse as sp
 
 from hilsplat.base.arrays import require_types
-from hilsplat.base.artifacts import (
-    ViewCache,
-    atomic_folder,
-    read_index,
-    sha256_of_bytes,
-    sha256_of_file,
-    sha256_of_json,
-    write_index,
-    write_npz,
-)
+from hilsplat.base.artifacts import read_index, write_index, write_npz
+from hilsplat.base.atomic import atomic_folder
+from hilsplat.base.cache import ViewCache
 from hilsplat.base.code import code_digest
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
+from hilsplat.base.lineage import sha256_of_bytes, sha256_of_file, sha256_of_json
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.contributions.compositing import normalised_weights

@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 from hilsplat.base.errors import SceneError
 
-
 ABLATIONS = (
     *("ablation", "components", "cost", "cost-seconds", "pruning", "pruning-seconds"),
     *("efficiency", "efficiency-seconds", "theta", "omega"),

@@ -8,7 +8,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
-from hilsplat.base.provenance import files_of
+from hilsplat.base.lineage import files_of
 from hilsplat.datasets.registry import DATASETS, dataset_of, open_labels
 from hilsplat.scene.sheet import DATA_PREFIX
 

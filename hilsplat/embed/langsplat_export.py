@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from hilsplat.base.artifacts import atomic_folder, read_npy, write_npy
+from hilsplat.base.artifacts import read_npy, write_npy
+from hilsplat.base.atomic import atomic_folder
 from hilsplat.embed.langsplat_files import MAPS, stems_of
 from hilsplat.embed.vectors import require_every_vector
 from hilsplat.scene.exporting import add_colmap

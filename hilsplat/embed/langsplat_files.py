@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float16
 
-from hilsplat.base.artifacts import atomic_folder, read_npy, write_index, write_npy
+from hilsplat.base.artifacts import read_npy, write_index, write_npy
+from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.base.progress import stage_log, track

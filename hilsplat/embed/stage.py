@@ -7,20 +7,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int64
 
-from hilsplat.base.artifacts import (
-    ViewCache,
-    atomic_folder,
-    read_index,
-    read_npz,
-    sealed,
-    sha256_of_bytes,
-    sha256_of_file,
-    sha256_of_json,
-    write_index,
-    write_npy,
-)
+from hilsplat.base.artifacts import read_index, read_npz, sealed, write_index, write_npy
+from hilsplat.base.atomic import atomic_folder
+from hilsplat.base.cache import ViewCache
 from hilsplat.base.code import code_digest
 from hilsplat.base.errors import MisalignedArtifactError, ModelError
+from hilsplat.base.lineage import sha256_of_bytes, sha256_of_file, sha256_of_json
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel, unit

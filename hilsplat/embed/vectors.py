@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Shaped
 
-from hilsplat.base.artifacts import read_npy, remake, sealed
+from hilsplat.base.artifacts import read_npy, rebuild_command, sealed
 from hilsplat.base.errors import ArtifactError
 from hilsplat.segment.digests import require_same_masks
 
@@ -27,7 +27,7 @@ def mask_embeddings(clip_folder: Path, folder: Path) -> Float32[np.ndarray, "M C
         raise ArtifactError(
             f"the CLIP vectors in {clip_folder} differ in width",
             found=", ".join(f"{view}: {part.shape}" for view, part in parts.items())[:300],
-            fix=remake(clip_folder),
+            fix=rebuild_command(clip_folder),
         )
     for view, part in parts.items():
         lengths = np.linalg.norm(part.astype(np.float32), axis=1)
@@ -37,7 +37,7 @@ def mask_embeddings(clip_folder: Path, folder: Path) -> Float32[np.ndarray, "M C
                 f"{np.count_nonzero(wrong)} CLIP vectors of {view} in {clip_folder} are invalid",
                 expected="vectors of length 1, or 0 for crops that were not embedded",
                 found=f"length {lengths[wrong][0]}",
-                fix=remake(clip_folder),
+                fix=rebuild_command(clip_folder),
             )
     return np.concatenate(list(parts.values()), dtype=np.float32)
 

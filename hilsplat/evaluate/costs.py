@@ -9,9 +9,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from hilsplat.base.artifacts import parse_json, sha256_of_file, write_text
+from hilsplat.base.artifacts import parse_json, write_text
 from hilsplat.base.errors import ArtifactError
-from hilsplat.base.provenance import read_provenance, require_as_written, require_beginning
+from hilsplat.base.lineage import read_provenance, require_as_written, sha256_of_file
+from hilsplat.base.ownership import require_beginning
 from hilsplat.base.tables import markdown_table, read_csv, write_csv
 from hilsplat.configuration import SECTIONS
 

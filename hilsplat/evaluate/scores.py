@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hilsplat.base.artifacts import read_npz, remake, write_npz
+from hilsplat.base.artifacts import read_npz, rebuild_command, write_npz
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.tables import read_csv, write_csv
 from hilsplat.evaluate.metrics.instances import InstanceMatches
@@ -66,11 +66,11 @@ def read_scores(paths: Iterable[Path]) -> "pd.DataFrame":
 
     rows: list[dict[str, object]] = []
     for path in paths:
-        found = read_csv(path, COLUMNS, remake(path))
+        found = read_csv(path, COLUMNS, rebuild_command(path))
         try:
             rows += [{**row, "value": float(row["value"]), "n": int(row["n"])} for row in found]
         except ValueError as error:
-            raise ArtifactError(f"{path} cannot be read: {error}", fix=remake(path)) from error
+            raise ArtifactError(f"{path} cannot be read: {error}", fix=rebuild_command(path)) from error
     return pd.DataFrame(rows, columns=list(COLUMNS)).astype({"value": float, "n": int})
 
 

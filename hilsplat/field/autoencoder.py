@@ -12,7 +12,9 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from cpusplat.compiled import compiled
-from hilsplat.base.artifacts import atomic_folder, read_index, sha256_of_file, write_index, write_npz
+from hilsplat.base.artifacts import read_index, write_index, write_npz
+from hilsplat.base.atomic import atomic_folder
+from hilsplat.base.lineage import sha256_of_file
 from hilsplat.base.progress import stage_log
 from hilsplat.embed.vectors import mask_embeddings, require_every_vector
 from hilsplat.field.adam import Adam

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float32
 
-from hilsplat.base.arrays import made, read_tensors, require_types, write_tensors
-from hilsplat.base.artifacts import read_npz, remake, sealed
+from hilsplat.base.arrays import build_checked, read_tensors, require_types, write_tensors
+from hilsplat.base.artifacts import read_npz, rebuild_command, sealed
 from hilsplat.base.errors import ArtifactError
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.decoder import PackedLayers
@@ -177,7 +177,9 @@ def load_code(folder: Path) -> Code:
             model.arrays[name] = state[name]
         return model
     except (KeyError, ValueError) as error:
-        raise ArtifactError(f"{path} is from a different version: {error}", fix=remake(path)) from error
+        raise ArtifactError(
+            f"{path} is from a different version: {error}", fix=rebuild_command(path)
+        ) from error
 
 
 def autoencoder_file(folder: Path) -> Path:
@@ -213,4 +215,4 @@ class LanguageField:
     @staticmethod
     def load(path: Path) -> "LanguageField":
         """Read `field.safetensors`; raise ArtifactError if it is missing, damaged or not a language field."""
-        return made(LanguageField, *read_tensors(path), path)
+        return build_checked(LanguageField, *read_tensors(path), path)

@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from hilsplat.base.artifacts import read_index, read_npz, sealed, sha256_of_file, write_json
-from hilsplat.base.errors import MisalignedArtifactError, SettingsError
+from hilsplat.base.artifacts import read_index, read_npz, sealed, write_json
+from hilsplat.base.errors import SettingsError
+from hilsplat.base.lineage import require_made_from, sha256_of_file
 from hilsplat.base.progress import stage_log
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.rows import Contributions
@@ -55,14 +56,11 @@ def run_field(
     with stage_log("field", scene) as counts:
         first: str | np.ndarray = settings.start
         if start is not None:
-            begun = LanguageField.load(start)
-            made_from = contributions.gaussians_sha256, code_sha256
-            if (begun.gaussians_sha256, begun.autoencoder_sha256) != made_from:
-                raise MisalignedArtifactError(
-                    f"{start} was computed from different Gaussians or a different code",
-                    fix="compute both fields from the same Gaussians and autoencoder",
-                )
-            first = begun.features
+            initial = LanguageField.load(start)
+            gaussians = f"the Gaussians of {contributions_folder}"
+            require_made_from(start, gaussians, initial.gaussians_sha256, contributions.gaussians_sha256)
+            require_made_from(start, autoencoder_folder, initial.autoencoder_sha256, code_sha256)
+            first = initial.features
         problem, contrast = field_losses(contributions, parents, latents, settings, first, seed, threads)
         if rendered is None:
             features, report = solve_field(problem, contrast)

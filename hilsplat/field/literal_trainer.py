@@ -19,13 +19,13 @@ import scipy.sparse as sp
 from jaxtyping import Bool, Float32, Float64, Int64
 
 from hilsplat.base.levels import LEVELS
+from hilsplat.base.lineage import require_made_from, sha256_of_file
 from hilsplat.contributions.compositing import MIN_ALPHA
 from hilsplat.contributions.rows import Contributions
 from hilsplat.contributions.view_matrices import label_maps, painted_indicator, random_half
 from hilsplat.field.adam import Adam, in_random_order
 from hilsplat.field.contrast import Contrast, ViewRelations, compared, instance_term, part_term
 from hilsplat.field.problem import QuadraticProblem
-from hilsplat.scene.finished import require_same
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import digests_in, load_masks
 from hilsplat.settings import FieldSettings
@@ -131,7 +131,8 @@ def train_literally(
     """
     settings, (scene_folder, gaussians_ply, masks_folder) = contrast.settings, rendered
     scene = Scene.load(scene_folder)
-    require_same("contributions", scene.name, gaussians_ply, contributions.gaussians_sha256)
+    recorded, digest = contributions.gaussians_sha256, sha256_of_file(gaussians_ply)
+    require_made_from(contributions.folder, gaussians_ply, recorded, digest)
     gaussians, device = load_ply(gaussians_ply), choose_device("auto")
     features = problem.lifted.reshape(len(gaussians), -1).astype(np.float32)
     channels = features.shape[1] // len(LEVELS)

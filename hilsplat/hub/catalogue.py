@@ -12,8 +12,9 @@ from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError, O
 from huggingface_hub.utils import validate_repo_id
 from huggingface_hub.utils.sha import git_hash
 
-from hilsplat.base.artifacts import parse_json, sha256_of_file
+from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import DownloadError, first_line
+from hilsplat.base.lineage import sha256_of_file
 from hilsplat.hub.pins import pins
 from hilsplat.hub.retries import repeated
 from hilsplat.models.layouts import LAYOUTS, SUPPORTED, layout_of

@@ -22,16 +22,8 @@ from huggingface_hub import constants
 from huggingface_hub.errors import GatedRepoError, RepositoryNotFoundError
 from huggingface_hub.utils import disable_progress_bars
 
-from hilsplat.base.artifacts import (
-    FULL_DISK,
-    atomic_folder,
-    explain_full_disk,
-    output_lock,
-    read_json,
-    read_memo,
-    require_free_space,
-    write_json,
-)
+from hilsplat.base.artifacts import read_json, read_memo, write_json
+from hilsplat.base.atomic import FULL_DISK, atomic_folder, explain_full_disk, output_lock, require_free_space
 from hilsplat.base.errors import DownloadError, ModelError, first_line
 from hilsplat.base.progress import track
 from hilsplat.base.removal import delete, is_tagged, tag

@@ -13,9 +13,9 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float32, Int32, Int64
 
-from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.lineage import require_made_from, sha256_of_file
 from hilsplat.base.progress import stage_log, track
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.contributions.mask_operator import MaskOperator
@@ -24,7 +24,6 @@ from hilsplat.contributions.view_matrices import label_maps
 from hilsplat.field.code import LanguageField, LinearCode, autoencoder_file, load_code, load_latents
 from hilsplat.methods.registry import method_of
 from hilsplat.scene.cameras import Camera
-from hilsplat.scene.finished import require_same
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import digests_in, load_masks
 from hilsplat.segment.masks import HierarchicalMasks
@@ -101,7 +100,8 @@ class MethodInputs:
     @cached_property
     def _loaded(self) -> tuple:
         scene = Scene.load(self.scene_folder)
-        require_same("contributions", scene.name, self.gaussians_ply, self.contributions.gaussians_sha256)
+        recorded, digest = self.contributions.gaussians_sha256, sha256_of_file(self.gaussians_ply)
+        require_made_from(self.contributions.folder, self.gaussians_ply, recorded, digest)
         return load_ply(self.gaussians_ply), scene
 
 

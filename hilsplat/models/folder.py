@@ -12,8 +12,9 @@ from typing import Annotated, Any
 
 from pydantic import AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from hilsplat.base.artifacts import read_json, sha256_of_file, sha256_of_json
+from hilsplat.base.artifacts import read_json
 from hilsplat.base.errors import ArtifactError, ModelError
+from hilsplat.base.lineage import sha256_of_file, sha256_of_json
 from hilsplat.models.layouts import LAYOUTS, OTHER_TYPES, SECTIONS, SUPPORTED, TORCH_SUFFIXES, layout_of
 from hilsplat.models.network import Network
 from hilsplat.models.onnx_graph import Graph, external_files, whole_clip

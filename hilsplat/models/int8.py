@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from hilsplat.base.artifacts import ViewCache, atomic_path, sha256_of_json
+from hilsplat.base.atomic import atomic_path
+from hilsplat.base.cache import ViewCache
+from hilsplat.base.lineage import sha256_of_json
 from hilsplat.base.removal import is_unfinished
 from hilsplat.models.fast_paths import or_as_exported
 from hilsplat.models.folder import ModelFolder, external_weights, input_side_px

@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from hilsplat.base.artifacts import atomic_path, sha256_of_bytes, sha256_of_json
+from hilsplat.base.atomic import atomic_path
 from hilsplat.base.errors import ModelError, first_line
 from hilsplat.base.files import regular
+from hilsplat.base.lineage import sha256_of_bytes, sha256_of_json
 
 WHOLE = "model.onnx"
 """Network with both halves, in the model folder itself or in its subfolder `onnx/`."""

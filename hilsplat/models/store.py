@@ -12,8 +12,9 @@ from typing import Any
 
 import platformdirs
 
-from hilsplat.base.artifacts import digests_of, parse_json, sha256_of_json, visible_files
+from hilsplat.base.artifacts import parse_json
 from hilsplat.base.files import project_path
+from hilsplat.base.lineage import digests_of, sha256_of_json, visible_files
 from hilsplat.models.layouts import LAYOUTS, layout_of
 
 MODELS = Path("models")

@@ -6,7 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from hilsplat.base.artifacts import atomic_folder, changing, write_text
+from hilsplat.base.artifacts import write_text
+from hilsplat.base.atomic import atomic_folder, changing
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import NAME_RULE, name_problem
 from hilsplat.base.removal import undone_on_error

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import cv2
 
-from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import ImageError, first_line
 from hilsplat.base.files import list_images
 from hilsplat.base.images import opened_image, orientation, read_image, require_usable_size, resize_to_fit
+from hilsplat.base.lineage import sha256_of_file
 from hilsplat.base.progress import track
 from hilsplat.photos.check import CHECK_SIDE_PX, CheckedPhoto, photo_doubts
 from hilsplat.scene.features import exif_focal_px

@@ -8,9 +8,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path, PurePosixPath
 
-from hilsplat.base.artifacts import CONVERTED, atomic_folder, read_memo, require_free_space, write_json
+from hilsplat.base.artifacts import read_memo, write_json
+from hilsplat.base.atomic import atomic_folder, require_free_space
 from hilsplat.base.errors import HilsplatError, SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_outside, list_files, list_images
+from hilsplat.base.lineage import CONVERTED
 from hilsplat.base.removal import undone_on_error
 from hilsplat.scene.layouts import has_known_poses, photo_folder, unwrapped
 

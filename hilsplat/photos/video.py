@@ -16,8 +16,9 @@ from av.video.stream import VideoStream
 from jaxtyping import Int64, UInt8
 from PIL import Image
 
-from hilsplat.base.artifacts import sha256_of_file, write_json
+from hilsplat.base.artifacts import write_json
 from hilsplat.base.errors import SceneError, foreign
+from hilsplat.base.lineage import sha256_of_file
 from hilsplat.base.progress import track
 from hilsplat.photos.video_colours import rgb_pixels
 

@@ -4,9 +4,9 @@ import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from hilsplat.base.artifacts import sha256_of_bytes
 from hilsplat.base.levels import LEVELS, PATH_SEPARATOR, path_of
-from hilsplat.base.provenance import require_own_picture
+from hilsplat.base.lineage import sha256_of_bytes
+from hilsplat.base.ownership import require_own_picture
 from hilsplat.query.hits import Hit, counted, doubts_of
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.node_search import NodeHits

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, Int64, UInt8
 
-from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import LEVELS, NONE, Level, path_of
+from hilsplat.base.lineage import require_made_from, sha256_of_file
 from hilsplat.embed.clip import ClipModel, open_clip_of
 from hilsplat.field.code import LanguageField, autoencoder_file, load_code
 from hilsplat.models.store import is_embedded, meaningless
@@ -27,7 +27,7 @@ from hilsplat.query.node_names import NodeNaming
 from hilsplat.query.node_search import NodeHits, TextAnswer, search
 from hilsplat.query.relevancy import margin_of_relevancy, margins, relevancy_of_margins
 from hilsplat.query.scene_views import Opened, SceneViews, ViewStore
-from hilsplat.scene.finished import FinishedScene, SceneParts, is_drawn, require_made_for
+from hilsplat.scene.finished import FinishedScene, SceneParts, is_drawn
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import OrientedBox, SemanticTree
 from hilsplat.settings import EvaluateSettings
@@ -100,20 +100,19 @@ class LanguageScene:
         clip = files.get(open_clip_of, parts.clip, settings.template)
         views = SceneViews(scene, gaussians, tree, threads, ViewStore(files.max_mib))
 
-        def require(path: Path, made_for: dict[str, str]) -> None:
-            require_made_for(path, files.get(sha256_of_file, path), scene.name, made_for)
+        def require(artifact: Path, source: Path, recorded: str) -> None:
+            require_made_from(artifact, source, recorded, files.get(sha256_of_file, source))
 
-        for_gaussians = {"semantic tree": tree.gaussians_sha256}
+        require(parts.semantic_tree, parts.scene / "cameras.npz", tree.cameras_sha256)
+        require(parts.semantic_tree, parts.gaussians, tree.gaussians_sha256)
         decoded_field = None
         if parts.field is not None and parts.autoencoder is not None:
             language = files.get(LanguageField.load, parts.field)
-            for_gaussians["language field"] = language.gaussians_sha256
-            require(autoencoder_file(parts.autoencoder), {"language field": language.autoencoder_sha256})
+            require(parts.field, parts.gaussians, language.gaussians_sha256)
+            require(parts.field, autoencoder_file(parts.autoencoder), language.autoencoder_sha256)
             code = files.get(load_code, parts.autoencoder)
             clip.require_width(code.channels, f"autoencoder {parts.autoencoder}")
             decoded_field = FieldAnswers(views, language, code, clip, settings)
-        require(parts.scene / "cameras.npz", {"semantic tree": tree.cameras_sha256})
-        require(parts.gaussians, for_gaussians)
         return LanguageScene(views, clip, settings, decoded_field)
 
     @property

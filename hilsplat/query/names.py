@@ -12,9 +12,10 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, NonNegativeInt, ValidationError
 
-from hilsplat.base.artifacts import read_json, read_npz, sha256_of_file, write_json
+from hilsplat.base.artifacts import read_json, read_npz, write_json
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import PATH_SEPARATOR, plain_text
+from hilsplat.base.lineage import sha256_of_file
 from hilsplat.web.file_changes import NO_FILE, replacing, version_of
 
 FILE = "names.json"

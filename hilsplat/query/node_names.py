@@ -10,23 +10,22 @@ from jaxtyping import Float32
 
 from hilsplat.base.artifacts import (
     INDEX,
-    ViewCache,
-    atomic_folder,
     read_index,
     read_json,
     read_npy,
-    remake,
+    rebuild_command,
     sealed,
-    sha256_of_file,
-    sha256_of_json,
     write_index,
     write_json,
     write_npy,
 )
+from hilsplat.base.atomic import atomic_folder
+from hilsplat.base.cache import ViewCache
 from hilsplat.base.code import code_digest
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.files import regular
 from hilsplat.base.levels import LEVELS, NONE, Level
+from hilsplat.base.lineage import sha256_of_file, sha256_of_json
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel, open_clip_of
 from hilsplat.models.store import AUTO
@@ -136,7 +135,7 @@ class NodeNaming:
             raise ArtifactError(
                 f"{folder / 'names.json'} or rivals.npy is damaged: {error!r}",
                 expected=f"{index['nodes']} names, and vectors (W, C)",
-                fix=remake(folder),
+                fix=rebuild_command(folder),
             ) from error
         return NodeNaming(names, surfaces, rivals)
 

@@ -9,9 +9,9 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hilsplat.base.artifacts import atomic_path
+from hilsplat.base.atomic import atomic_path
 from hilsplat.base.levels import Level
-from hilsplat.base.provenance import SOFTWARE
+from hilsplat.base.ownership import SOFTWARE
 from hilsplat.query.scene_views import upright
 from hilsplat.scene.cameras import Cameras
 from hilsplat.splat.gaussians import Gaussians

@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from hilsplat.base.artifacts import atomic_folder, write_json
+from hilsplat.base.artifacts import write_json
+from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.query.language_scene import LanguageScene

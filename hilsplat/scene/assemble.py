@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from hilsplat.base.artifacts import atomic_folder, write_json
+from hilsplat.base.artifacts import write_json
+from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.errors import ImageError
 from hilsplat.base.images import read_image, require_usable_size, write_png
 from hilsplat.scene.cameras import Cameras, Photo

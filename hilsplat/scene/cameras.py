@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int32
 
 from hilsplat.base.arrays import require_types
-from hilsplat.base.artifacts import read_npz, remake, write_npz
+from hilsplat.base.artifacts import read_npz, rebuild_command, write_npz
 from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 
@@ -133,7 +133,9 @@ class Cameras:
         else:
             fault = ""
         if fault:
-            raise ArtifactError(f"{path} does not contain valid cameras", expected=fault, fix=remake(path))
+            raise ArtifactError(
+                f"{path} does not contain valid cameras", expected=fault, fix=rebuild_command(path)
+            )
         order = tuple(names.tolist())
         photos = {}
         if "photo_model" in arrays:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from hilsplat.base.artifacts import atomic_folder
+from hilsplat.base.atomic import atomic_folder
 from hilsplat.scene.assemble import move_cameras
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.posed_images import PosedImage, write_posed_images

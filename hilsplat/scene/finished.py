@@ -6,9 +6,9 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from hilsplat.base.artifacts import read_index, run_command, sha256_of_file
-from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
-from hilsplat.base.provenance import read_provenance
+from hilsplat.base.artifacts import read_index, run_command
+from hilsplat.base.errors import ArtifactError
+from hilsplat.base.lineage import read_provenance
 from hilsplat.settings import EvaluateSettings
 
 KEY_VIEWS = "key-views"
@@ -98,18 +98,18 @@ class FinishedScene:
 
         A scene without labels has no scores, but its panel was drawn with the same settings.
         """
-        scores, place = self.folder / self.variant / "scores.csv", self.folder.resolve()
-        panel = place.parent.parent / "figures" / place.parent.name / place.name / "panel.png"
+        scores, scene = self.folder / self.variant / "scores.csv", self.folder.resolve()
+        panel = scene.parent.parent / "figures" / scene.parent.name / scene.name / "panel.png"
         if (record := read_provenance(scores)) is not None:
-            found = record.settings
+            settings = record.settings
         elif (record := read_provenance(panel)) is not None:
-            found = record.settings.get("evaluate", {})
+            settings = record.settings.get("evaluate", {})
         else:
-            found = {}
+            settings = {}
             logger.warning("%s: no scores or panel record the settings; using the defaults", self.folder)
-        known = {name: value for name, value in found.items() if name in EvaluateSettings.model_fields}
+        values = {name: settings[name] for name in EvaluateSettings.model_fields if name in settings}
         try:
-            return EvaluateSettings(**known)
+            return EvaluateSettings(**values)
         except ValidationError as error:
             raise ArtifactError(
                 f"the recorded query settings are not valid: {error.errors(include_url=False)[0]['msg']}",
@@ -145,8 +145,8 @@ def is_drawn(scene: Path) -> bool:
 
 def finished_variants(folder: Path) -> list[str]:
     """Return the variants of a scene that accept queries: those with their own field or CLIP vectors."""
-    made = [path for name in ("field.safetensors", "clip") for path in folder.glob(f"*/{name}")]
-    return sorted({path.parent.name for path in made})
+    outputs = [path for name in ("field.safetensors", "clip") for path in folder.glob(f"*/{name}")]
+    return sorted({path.parent.name for path in outputs})
 
 
 def _unfinished(folder: Path, missing: Path) -> ArtifactError:
@@ -166,20 +166,3 @@ def _recorded_input(artifact: Path, name: str, folder: Path) -> Path | None:
     path = Path(record.inputs[name].path)
     recorded = folder / path.parent.name / path.name
     return recorded if path.name and recorded.exists() else None
-
-
-def require_same(what: str, scene: str, path: Path, expected_sha256: str) -> None:
-    """Raise MisalignedArtifactError if the artifact `what` was made for a different file."""
-    require_made_for(path, sha256_of_file(path), scene, {what: expected_sha256})
-
-
-def require_made_for(path: Path, found_sha256: str, scene: str, made_for: dict[str, str]) -> None:
-    """Raise MisalignedArtifactError if a digest in `made_for` (by artifact) differs from the file's."""
-    for what, expected in made_for.items():
-        if found_sha256 != expected:
-            raise MisalignedArtifactError(
-                f"the {what} of {scene} was made for a different {Path(path).name}",
-                expected=f"sha256 {expected[:12]}",
-                found=f"sha256 {found_sha256[:12]} in {path}",
-                fix=f"rerun the stage that writes the {what}",
-            )

@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from hilsplat.base.artifacts import parse_json, visible_files
+from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import HilsplatError, SceneError, first_line
 from hilsplat.base.files import IMAGE_SUFFIXES, list_images, regular
+from hilsplat.base.lineage import visible_files
 
 TRAINED = ("output", "outputs", "exports", "language_features")
 """Folders that 3DGS, nerfstudio and LangSplat write beside photographs."""

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt8
 from plyfile import PlyData, PlyElement
 
-from hilsplat.base.artifacts import atomic_folder, write_text
+from hilsplat.base.artifacts import write_text
+from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.errors import SceneError
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 

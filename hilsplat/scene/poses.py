@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from hilsplat.base.artifacts import work_folder
+from hilsplat.base.atomic import work_folder
 from hilsplat.base.errors import RegistrationError, SceneError
 from hilsplat.base.files import list_images
 from hilsplat.base.images import read_image, resize_to_fit
+from hilsplat.base.ownership import SOFTWARE, require_own_picture
 from hilsplat.base.processes import in_own_process
 from hilsplat.base.progress import stage_log
-from hilsplat.base.provenance import SOFTWARE, require_own_picture
 from hilsplat.base.removal import delete
 from hilsplat.scene.assemble import Posed, PosedView, split_views, write_scene
 from hilsplat.scene.colmap import camera_of, pose_matrix, pycolmap, reprojection_errors, sparse_points

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int32, Int64, UInt8
 
-from hilsplat.base.artifacts import atomic_folder, read_index, write_index, write_npz
+from hilsplat.base.artifacts import read_index, write_index, write_npz
+from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.progress import stage_log, track
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks

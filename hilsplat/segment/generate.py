@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int8, Int32, Int64, Real, UInt8
 
-from hilsplat.base.artifacts import sha256_of_bytes, sha256_of_json
 from hilsplat.base.code import code_digest
 from hilsplat.base.levels import Level
+from hilsplat.base.lineage import sha256_of_bytes, sha256_of_json
 from hilsplat.segment.kernels import cleaned_runs, upscaled_runs
 from hilsplat.segment.masks import HierarchicalMasks, join_rows, take_runs
 from hilsplat.segment.sam import (

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32, Int64, UInt8, UInt32
 
-from hilsplat.base.arrays import made, require_types
-from hilsplat.base.artifacts import read_npz, remake, write_npz
+from hilsplat.base.arrays import build_checked, require_types
+from hilsplat.base.artifacts import read_npz, rebuild_command, write_npz
 from hilsplat.base.errors import ArtifactError, EmptyMaskError
 from hilsplat.base.levels import NONE, Level
 from hilsplat.segment.kernels import areas_and_boxes, paint_runs, shared_pixels
@@ -214,7 +214,7 @@ class HierarchicalMasks:
         is_size = size.shape == (2,) and size.dtype.kind in "iu"
         if not is_size or size.min() < 1 or size.max() > MAX_SIDE_PX:
             raise _damaged(path, "size_hw", f"two sides from 1 to {MAX_SIDE_PX} px", str(size.tolist()))
-        masks = made(HierarchicalMasks, arrays, {"size_hw": tuple(size.tolist())}, path, LIMITS)
+        masks = build_checked(HierarchicalMasks, arrays, {"size_hw": tuple(size.tolist())}, path, LIMITS)
         masks._require_whole(path)
         return masks
 
@@ -239,7 +239,7 @@ class HierarchicalMasks:
 
 def _damaged(path: Path, name: str, expected: str, found: str | None = None) -> ArtifactError:
     problem = f"{path}: array {name} contains an impossible value"
-    return ArtifactError(problem, expected=expected, found=found, fix=remake(path))
+    return ArtifactError(problem, expected=expected, found=found, fix=rebuild_command(path))
 
 
 def region_ious(

@@ -12,7 +12,7 @@ from hilsplat.base.artifacts import read_index, read_npz, sealed
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, NONE, Level
-from hilsplat.base.provenance import SOFTWARE, require_own_picture
+from hilsplat.base.ownership import SOFTWARE, require_own_picture
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.crops import square_crop
 from hilsplat.segment.digests import require_same_masks

@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int8, Int32, Int64, Real, UInt8
 from PIL import Image
 
-from hilsplat.base.artifacts import sha256_of_bytes
 from hilsplat.base.errors import ModelError
 from hilsplat.base.levels import Level
+from hilsplat.base.lineage import sha256_of_bytes
 from hilsplat.base.processes import in_order
 from hilsplat.models.fast_paths import or_as_exported
 from hilsplat.models.folder import SAM_SIDE_PX, ModelFolder, input_side_px, open_model_folder

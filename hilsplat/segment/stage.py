@@ -8,10 +8,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from hilsplat.base.artifacts import ViewCache, atomic_folder, sha256_of_file, sha256_of_json, write_index
+from hilsplat.base.artifacts import write_index
+from hilsplat.base.atomic import atomic_folder
+from hilsplat.base.cache import ViewCache
 from hilsplat.base.code import code_digest
 from hilsplat.base.errors import SceneError
 from hilsplat.base.levels import LEVELS
+from hilsplat.base.lineage import sha256_of_file, sha256_of_json
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.models.int8 import CHECKED_VIEWS

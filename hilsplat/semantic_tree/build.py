@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32
 
 from hilsplat.base.arrays import require_types
-from hilsplat.base.artifacts import atomic_folder, read_index, write_index, write_json, write_npz
+from hilsplat.base.artifacts import read_index, write_index, write_json, write_npz
+from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.progress import stage_log
 from hilsplat.contributions.rows import Contributions

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int32, Int64
 
-from hilsplat.base.artifacts import atomic_path
+from hilsplat.base.atomic import atomic_path
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.scene.finished import require_same
+from hilsplat.base.lineage import require_made_from, sha256_of_file
 from hilsplat.semantic_tree.tree import SemanticTree
 
 
@@ -41,7 +41,8 @@ def write_tree_ply(gaussians_ply: Path, tree: SemanticTree, out: Path) -> None:
     Raises:
         MisalignedArtifactError: the tree was computed from a different PLY.
     """
-    require_same("semantic tree", str(gaussians_ply.parent), gaussians_ply, tree.gaussians_sha256)
+    digest = sha256_of_file(gaussians_ply)
+    require_made_from("the semantic tree", gaussians_ply, tree.gaussians_sha256, digest)
     nodes = {f"node_{level.label}": tree.node_of_gaussian[:, level.index] for level in LEVELS}
     _write(gaussians_ply, slice(None), nodes, out)
 

@@ -8,8 +8,8 @@ from jaxtyping import Float, Int32
 from scipy.ndimage import find_objects
 
 from hilsplat.base.levels import LEVELS, NONE, Level
+from hilsplat.base.lineage import require_made_from, sha256_of_file
 from hilsplat.contributions.compositing import normalised_weights
-from hilsplat.scene.finished import require_same
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.sam import point_grid
 from hilsplat.segment.stage import run_masks
@@ -41,7 +41,8 @@ def run_guided_masks(
     """
     scene, gaussians = Scene.load(scene_folder), load_ply(gaussians_ply)
     tree = SemanticTree.load(semantic_tree_folder)
-    require_same("semantic tree", scene.name, gaussians_ply, tree.gaussians_sha256)
+    digest = sha256_of_file(gaussians_ply)
+    require_made_from(semantic_tree_folder, gaussians_ply, tree.gaussians_sha256, digest)
     grid = point_grid(settings.points_per_side)
 
     def points(view: str) -> np.ndarray:

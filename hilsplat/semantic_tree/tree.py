@@ -8,8 +8,8 @@ import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float32, Int32, Int64, UInt8
 
 from cpusplat.compiled import compiled
-from hilsplat.base.arrays import made
-from hilsplat.base.artifacts import read_index, read_npz, remake, sealed
+from hilsplat.base.arrays import build_checked
+from hilsplat.base.artifacts import read_index, read_npz, rebuild_command, sealed
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.embed.vectors import mask_embeddings
@@ -110,11 +110,13 @@ class SemanticTree:
                     f"{path}: array {name} refers to nodes that do not exist",
                     expected=f"-1 to {most}",
                     found=f"{values.min()} to {values.max()}",
-                    fix=remake(path),
+                    fix=rebuild_command(path),
                 )
         child = self.parent != NONE
         if (self.level[self.parent[child]] >= self.level[child]).any():
-            raise ArtifactError(f"{path}: a node's parent is not at a coarser level", fix=remake(path))
+            raise ArtifactError(
+                f"{path}: a node's parent is not at a coarser level", fix=rebuild_command(path)
+            )
 
     def nodes_of(self, level: Level) -> Int64[np.ndarray, " t"]:
         """Return the nodes of a level, in order."""
@@ -157,7 +159,7 @@ class SemanticTree:
         index = read_index(folder, *names)
         known = {"view_names": tuple(index["views"]), **{name: index[name] for name in names}}
         path = sealed(folder, "tree.npz")
-        tree = made(SemanticTree, read_npz(path), known, path, LIMITS)
+        tree = build_checked(SemanticTree, read_npz(path), known, path, LIMITS)
         tree._require_whole(path)
         if clip_folder is None:
             return tree
@@ -167,7 +169,7 @@ class SemanticTree:
                 f"{clip_folder} has no vector for some nodes of {folder}",
                 expected="vectors of the masks that show each node",
                 found=f"none for {int((~tree.clip.any(axis=1)).sum())} of {len(tree)} nodes",
-                fix=remake(Path(clip_folder)),
+                fix=rebuild_command(Path(clip_folder)),
             )
         return tree
 

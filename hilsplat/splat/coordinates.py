@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float, Float64
 from scipy.special import sph_harm_y
 
-from hilsplat.base.artifacts import read_json, run_command, sha256_of_file, write_json
+from hilsplat.base.artifacts import read_json, run_command, write_json
 from hilsplat.base.errors import ArtifactError, HilsplatError
-from hilsplat.base.provenance import require_as_written
+from hilsplat.base.lineage import require_as_written, require_made_from, sha256_of_file
 from hilsplat.base.rotations import are_rotations, multiply, quaternion_of
 from hilsplat.scene.importers.nerfstudio import source_from_dataparser
 from hilsplat.scene.scene import Scene
@@ -138,14 +138,8 @@ def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
     if not isinstance(content, dict) or "source_from_scene" not in content:
         return None
     require_as_written(path, sha256_of_file(path))
-    if content.get("ply_sha256") != (digest := sha256_of_file(ply)):
-        raise ArtifactError(
-            f"{path} was written for a different {ply.name}",
-            expected=f"sha256 {content.get('ply_sha256')}",
-            found=f"sha256 {digest}",
-            fix="move it next to the PLY that it was written for, or remove it if the PLY is in the "
-            "coordinates of the scene's source",
-        )
+    fix = "move it next to its PLY, or remove it if this PLY is in the coordinates of the scene's source"
+    require_made_from(path, ply, str(content.get("ply_sha256")), sha256_of_file(ply), fix)
     matrix = np.array(content["source_from_scene"], dtype=np.float64)
     if matrix.shape != (4, 4):
         raise ArtifactError(f"{path}: source_from_scene is not a 4 x 4 matrix", found=f"shape {matrix.shape}")

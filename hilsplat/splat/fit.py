@@ -9,18 +9,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from hilsplat.base.artifacts import (
-    atomic_folder,
-    read_npz,
-    sha256_of_json,
-    sha256_of_path,
-    write_index,
-    write_json,
-    write_stored_npz,
-)
+from hilsplat.base.artifacts import read_npz, write_arrays, write_index, write_json
+from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.code import code_digest
 from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.base.images import to_float, write_png
+from hilsplat.base.lineage import sha256_of_json, sha256_of_path
 from hilsplat.base.progress import stage_log, track
 from hilsplat.base.removal import delete, tag
 from hilsplat.scene.cameras import Camera
@@ -59,17 +53,17 @@ class FitState:
     def save(self, path: Path) -> None:
         """Write a checkpoint."""
         tag(path.parent)
-        arrays = {f"{table}_{name}": getattr(self.adam, table)[name] for table in TABLES for name in FIELDS}
-        write_stored_npz(  # compression would take longer than a hundred steps
-            path,
-            steps=np.array(self.adam.steps),
-            order=np.array(self.order, dtype=np.int64),
-            generator=np.array(json.dumps(self.generator.bit_generator.state)),
-            gradient_total=self.gradients.total,
-            gradient_seen=self.gradients.seen,
-            curve=np.array(self.curve).reshape(-1, 4),
-            **arrays,
-        )
+        arrays = {
+            "steps": np.array(self.adam.steps),
+            "order": np.array(self.order, dtype=np.int64),
+            "generator": np.array(json.dumps(self.generator.bit_generator.state)),
+            "gradient_total": self.gradients.total,
+            "gradient_seen": self.gradients.seen,
+            "curve": np.array(self.curve).reshape(-1, 4),
+        }
+        for table in TABLES:
+            arrays |= {f"{table}_{name}": getattr(self.adam, table)[name] for name in FIELDS}
+        write_arrays(path, arrays, compressed=False)  # compression would take longer than a hundred steps
 
     @staticmethod
     def load(path: Path) -> "FitState | None":

@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 from plyfile import PlyData, PlyElement
 
-from hilsplat.base.artifacts import atomic_path, remake
+from hilsplat.base.artifacts import rebuild_command
+from hilsplat.base.atomic import atomic_path
 from hilsplat.base.errors import ArtifactError, foreign
 from hilsplat.scene.importers.ply_file import read_ply
 from hilsplat.splat.gaussians import Gaussians
@@ -78,7 +79,7 @@ def load_ply(path: Path) -> Gaussians:
     Raises:
         ArtifactError: as in `import_ply`, and if anything would be changed or left out.
     """
-    fix = remake(path)
+    fix = rebuild_command(path)
     gaussians, notes, _ = import_ply(path, fix)
     if notes:
         raise ArtifactError(f"{path} is not as this package writes it: {'; '.join(notes)}", fix=fix)

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from hilsplat.base.artifacts import read_index, run_command, sha256_of_file
+from hilsplat.base.artifacts import read_index, run_command
 from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError
+from hilsplat.base.lineage import sha256_of_file
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.names import NodeNames, tree_digest

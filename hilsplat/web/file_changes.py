@@ -4,8 +4,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from hilsplat.base.artifacts import changing, sha256_of_bytes
+from hilsplat.base.atomic import changing
 from hilsplat.base.errors import ArtifactError
+from hilsplat.base.lineage import sha256_of_bytes
 
 
 class StaleSceneError(ArtifactError):

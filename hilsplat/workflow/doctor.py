@@ -13,9 +13,9 @@ from typing import Literal
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
-from hilsplat.base.artifacts import existing_folder
+from hilsplat.base.atomic import existing_folder
 from hilsplat.base.errors import HilsplatError
-from hilsplat.base.provenance import version_of
+from hilsplat.base.lineage import version_of
 from hilsplat.configuration import merged_config
 from hilsplat.models.memory import machine_mib
 from hilsplat.models.store import RECOMMENDED, broken_models, present_models, user_models

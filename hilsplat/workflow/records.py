@@ -9,10 +9,11 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
-from hilsplat.base.artifacts import provenance_path, run_command, sha256_of_path, was_interrupted
+from hilsplat.base.artifacts import provenance_path, run_command
+from hilsplat.base.atomic import was_interrupted
 from hilsplat.base.errors import ArtifactError, HilsplatError
+from hilsplat.base.lineage import Provenance, files_of, read_provenance, sha256_of_path, sizes_of
 from hilsplat.base.progress import track
-from hilsplat.base.provenance import Provenance, files_of, read_provenance, sizes_of
 from hilsplat.models.store import model_digest
 from hilsplat.stages import all_stages
 from hilsplat.workflow.plan import Plan

@@ -21,7 +21,7 @@ import numpy as np
 from hilsplat.base.errors import ImageError, ModelError
 from hilsplat.base.images import opened_image
 from hilsplat.base.levels import LEVELS
-from hilsplat.base.provenance import version_of
+from hilsplat.base.lineage import version_of
 from hilsplat.datasets.generators import GENERATORS
 from hilsplat.models.store import model_path, read_model
 from hilsplat.scene.layouts import vertex_count

@@ -11,8 +11,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Protocol, runtime_checkable
 
-from hilsplat.base.artifacts import digests_of, sha256_of_json
 from hilsplat.base.errors import SettingsError
+from hilsplat.base.lineage import digests_of, sha256_of_json
 from hilsplat.datasets.registry import readers_of
 from hilsplat.datasets.sources import absence, image_files, is_exported, label_files, label_sets
 from hilsplat.scene.layouts import dataparser_of, photo_files, transforms_of

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from hilsplat.base.artifacts import sha256_of_file, write_json, write_text
+from hilsplat.base.artifacts import write_json, write_text
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS
+from hilsplat.base.lineage import sha256_of_file
 from hilsplat.base.tables import markdown_table
 from models.training.clip import CROP_PX, DIMENSIONS
 from models.training.data import LabelledViews, nested_targets

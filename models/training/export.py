@@ -11,7 +11,8 @@ from onnx import numpy_helper
 from tokenizers import Tokenizer
 from torch import Tensor, nn
 
-from hilsplat.base.artifacts import atomic_path, write_json
+from hilsplat.base.artifacts import write_json
+from hilsplat.base.atomic import atomic_path
 from hilsplat.models.layouts import DECODER, PREVIEW
 from hilsplat.segment.sam import OWN, Thresholds
 from models.training.clip import CROP_PX, DIMENSIONS, ClipText, ClipVision

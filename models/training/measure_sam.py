@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Shaped, UInt8
 from torch.nn import functional
 
-from hilsplat.base.artifacts import sha256_of_bytes
 from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.lineage import sha256_of_bytes
 from hilsplat.base.processes import in_processes
 from hilsplat.base.progress import track
 from hilsplat.segment.generate import decode_candidates, masks_from_candidates

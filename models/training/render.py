@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hilsplat.base.artifacts import read_npz, sha256_of_bytes, sha256_of_json, write_npz
+from hilsplat.base.artifacts import read_npz, write_npz
 from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.lineage import sha256_of_bytes, sha256_of_json
 from hilsplat.base.processes import in_processes
 from hilsplat.base.progress import track
 from hilsplat.datasets.hierarchy import AnnotatedNode

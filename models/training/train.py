@@ -7,8 +7,10 @@ from typing import Any
 
 import torch
 
-from hilsplat.base.artifacts import atomic_folder, sha256_of_json, write_text
+from hilsplat.base.artifacts import write_text
+from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.errors import ModelError, SettingsError
+from hilsplat.base.lineage import sha256_of_json
 from hilsplat.base.progress import stage_log
 from hilsplat.segment.sam import SamModel
 from models.training.card import RECORD, write_clip_card, write_sam_card

@@ -1,6 +1,6 @@
 from pathlib import Path
 
-from hilsplat.base.artifacts import sha256_of_bytes
+from hilsplat.base.lineage import sha256_of_bytes
 
 
 # The small models of the synthetic world. A default run does not train them, because the repository contains them.

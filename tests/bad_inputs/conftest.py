@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from hilsplat.base.artifacts import visible_files
 from hilsplat.base.errors import HilsplatError
+from hilsplat.base.lineage import visible_files
 from hilsplat.cli.main import main
 from tests.conftest import PROJECT
 

@@ -18,7 +18,8 @@ import yaml
 from PIL import Image
 
 from hilsplat.base.arrays import read_tensors, write_tensors
-from hilsplat.base.artifacts import provenance_path, sha256_of_file
+from hilsplat.base.artifacts import provenance_path
+from hilsplat.base.lineage import sha256_of_file
 from hilsplat.configuration import read_config
 from hilsplat.query.answer import answer, file_name
 from hilsplat.query.names import tree_digest
@@ -209,7 +210,7 @@ ROWS = {
     "Gaussians of another scene beside a tree": row(
         lambda: GAUSSIANS.write_bytes(GAUSSIANS.read_bytes()[:-4] + b"\0\0\x80?"),
         ASK,
-        "the semantic tree of photos/desk was made for a different gaussians.ply",
+        "default/semantic_tree was not made from results/photos/desk/gaussians.ply",
     ),
     "Gaussians without a rotation": row(
         without_rotation, ("export", "photos/desk", "--as", "ply"), "gaussians.ply", "1 of", "no rotation"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilsplat.base.artifacts import atomic_folder
+from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.images import write_png
 from tests.browser.conftest import (
     HEIGHT,

@@ -4,7 +4,8 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from hilsplat.base.artifacts import atomic_folder, provenance_path, read_index, write_index, write_json
+from hilsplat.base.artifacts import provenance_path, read_index, write_index, write_json
+from hilsplat.base.atomic import atomic_folder
 
 
 def write_record(artifact: Path, **parts: Any) -> None:

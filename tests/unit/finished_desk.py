@@ -17,7 +17,7 @@ from tokenizers import Tokenizer, models, pre_tokenizers
 
 from hilsplat.base.artifacts import write_index, write_json
 from hilsplat.base.images import write_png
-from hilsplat.base.provenance import Inputs, write_provenance
+from hilsplat.base.lineage import Inputs, write_provenance
 from hilsplat.cli.main import app
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import index_entry

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from hilsplat.base.artifacts import provenance_path, visible_files
-from hilsplat.base.provenance import files_of, read_provenance
+from hilsplat.base.artifacts import provenance_path
+from hilsplat.base.lineage import files_of, read_provenance, visible_files
 from hilsplat.cli.main import main
 from hilsplat.workflow.records import WHOLE, Records
 from tests.workflow.conftest import SCENE, Project

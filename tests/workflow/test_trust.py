@@ -29,7 +29,7 @@ def damage_file(project: Project) -> None:
 
 
 def damage_provenance(project: Project) -> None:
-    (project.root / f"{SCENE}/world.provenance.json").write_text("{")
+    (project.root / f"{SCENE}/world/images.provenance.json").write_text("{")
 
 
 def change_file(project: Project) -> None:

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Bool
 from matplotlib.figure import Figure, FigureBase
 
-from hilsplat.base.artifacts import atomic_path, read_index
+from hilsplat.base.artifacts import read_index
+from hilsplat.base.atomic import atomic_path
 from hilsplat.base.levels import LEVELS, Level, path_of
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.registry import open_labelled

@@ -17,7 +17,9 @@ NOTES: dict[str, str] = _DESCRIPTIONS["notes"]
 
 @dataclass(frozen=True, kw_only=True)
 class TableKind:
-    """One table; data sets and kinds of generated scenes name the tables that show them. `like` in `kinds.json` names a table from which omitted values are taken.
+    """One table; `like` in `kinds.json` names a table from which omitted values are taken.
+
+    Data sets and kinds of generated scenes name the tables that show them.
 
     Attributes:
         variants: key of the configuration that lists the variants. Tables of other variants than

@@ -1,14 +1,19 @@
-"""The caches: their size, the entries that are deleted, and the files of users that are not."""
+"""The caches: finished views, their size, the entries that are deleted, and files of users, which are not."""
 
 import os
 import shutil
 import time
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
-from hilsplat.base.cache import prune_cache, size_table
+from hilsplat.base.artifacts import read_npz, write_arrays
+from hilsplat.base.atomic import atomic_path
+from hilsplat.base.cache import ViewCache, prune_cache, size_table
 from hilsplat.base.errors import HilsplatError
+from hilsplat.base.lineage import sha256_of_json
 from hilsplat.base.processes import host_token
 from hilsplat.base.removal import tag
 
@@ -121,3 +126,69 @@ def test_a_link_in_a_cache_is_deleted_without_its_target(cache, tmp_path_factory
     (cache / f"masks/00/{5:064}.npz").symlink_to(drawing)
     prune_cache(cache, ["masks"], days=0.0, max_mib=0.0)
     assert drawing.exists()
+
+
+def test_cache_computes_once_and_recovers_from_a_damaged_entry(tmp_path: Path) -> None:
+    cache = ViewCache(tmp_path)
+    for hits in (0, 1):
+        assert cache.get("key", lambda: {"x": np.array([1, 2])})["x"].tolist() == [1, 2]
+        assert cache.hits == hits
+    cache.path("key").write_bytes(b"broken")
+    assert cache.get("key", lambda: {"x": np.array([3])})["x"].tolist() == [3]
+    assert cache.hits == 1
+
+
+@pytest.mark.parametrize("compressed", [True, False])
+def test_entries_that_a_power_failure_cut_or_filled_with_zeros_are_computed_again(
+    tmp_path: Path, flushed: list[str], compressed: bool
+) -> None:
+    cache = ViewCache(tmp_path, compressed=compressed)
+    arrays = {"x": np.arange(60.0), "none": np.zeros((0, 3)), "is": np.arange(100) % 3 == 0}
+    cache.get("key", lambda: arrays)
+    assert flushed == []
+    path = cache.path("key")
+    whole = path.read_bytes()
+    size = len(whole)
+    zeros = [(start, start + 16) for start in range(0, size, 5)]
+    zeros += [(end, size) for end in range(size - 40, size)]
+    cut = [whole[:end] for end in range(0, size, 9)]
+    for damaged in [whole[:start] + bytes(end - start) + whole[end:] for start, end in zeros] + cut:
+        path.write_bytes(damaged)
+        found = cache.get("key", lambda: arrays)
+        assert found.keys() == arrays.keys()
+        assert all(np.array_equal(found[name], arrays[name]) for name in arrays)
+
+
+def test_two_nodes_that_compute_one_view_leave_one_whole_entry(tmp_path: Path, monkeypatch) -> None:
+    """The other node writes and ends while this one writes."""
+    cache, other = ViewCache(tmp_path), ViewCache(tmp_path)
+    key = sha256_of_json({"image": "abc"})
+    write = write_arrays
+
+    def write_beside_the_other(path: Path, *arguments: Any, **options: bool) -> None:
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(b"half an ent")
+            with monkeypatch.context() as node:
+                node.setattr("hilsplat.base.cache.write_arrays", write)
+                node.setattr("hilsplat.base.processes.host_token", lambda: "0" * 8)
+                other.get(key, lambda: {"x": np.arange(3)})
+            write(temporary, *arguments, **options)
+
+    monkeypatch.setattr("hilsplat.base.cache.write_arrays", write_beside_the_other)
+    mine = cache.get(key, lambda: {"x": np.arange(3)})
+    np.testing.assert_array_equal(mine["x"], read_npz(cache.path(key))["x"])
+    assert [path for path in tmp_path.rglob("*.npz") if path.is_file()] == [cache.path(key)]
+
+
+def test_an_entry_that_another_node_prunes_is_still_read(tmp_path: Path, monkeypatch) -> None:
+    cache, key = ViewCache(tmp_path), "abc"
+    cache.get(key, lambda: {"x": np.arange(3)})
+    read = read_npz
+
+    def read_and_prune(path: Path) -> dict[str, np.ndarray]:
+        arrays = read(path)
+        path.unlink()
+        return arrays
+
+    monkeypatch.setattr("hilsplat.base.cache.read_npz", read_and_prune)
+    assert cache.get(key, dict)["x"].tolist() == [0, 1, 2]

@@ -10,17 +10,18 @@ from pathlib import Path
 import pytest
 
 from hilsplat.base import processes, removal
-from hilsplat.base.artifacts import atomic_folder, write_text
+from hilsplat.base.artifacts import write_text
+from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.processes import host_token, remove_leftovers
 
 KILL = """
 import ctypes, errno, os, shutil, signal, sys
 from pathlib import Path
-from hilsplat.base import artifacts, processes, removal
+from hilsplat.base import artifacts, atomic, processes, removal
 
 kind, folder = sys.argv[1], Path(sys.argv[2])
 path = folder / "artifact"
-TRACED = {artifacts.__file__, processes.__file__, removal.__file__, shutil.__file__}
+TRACED = {artifacts.__file__, atomic.__file__, processes.__file__, removal.__file__, shutil.__file__}
 
 def no_exchange(*arguments):
     ctypes.set_errno(errno.EINVAL)
@@ -33,7 +34,7 @@ def write(text):
     if kind == "file":
         artifacts.write_text(path, text)
     else:
-        with artifacts.atomic_folder(path) as new:
+        with atomic.atomic_folder(path) as new:
             for name in "ab":
                 artifacts.write_text(new / name, text)
 
@@ -102,7 +103,7 @@ def test_an_old_version_is_never_partly_restored(tmp_path):
 WRITER = """
 import os, sys, time
 os.getpid = lambda: int(sys.argv[2])  # the number in another process namespace
-from hilsplat.base.artifacts import atomic_folder, atomic_path
+from hilsplat.base.atomic import atomic_folder, atomic_path
 with {writer}(sys.argv[1]) as temporary:
     print(flush=True)
     time.sleep(60)

@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilsplat.base.artifacts import lock_path, provenance_path
+from hilsplat.base.artifacts import provenance_path
+from hilsplat.base.atomic import lock_path
 from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.base.images import write_png
-from hilsplat.base.provenance import SOFTWARE, require_beginning, require_own_picture, require_replaceable
+from hilsplat.base.ownership import SOFTWARE, require_beginning, require_own_picture, require_replaceable
 from hilsplat.cli.main import app
 from hilsplat.stage import PathIn, PathOut, Registry
 from tests.unit.artifact_changes import write_record

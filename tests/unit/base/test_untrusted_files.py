@@ -15,7 +15,7 @@ from hilsplat.base.artifacts import read_npy, read_npz
 from hilsplat.base.errors import ArtifactError, HilsplatError, ImageError, SceneError
 from hilsplat.base.images import FORMATS, open_image, read_image, require_usable_size
 from hilsplat.base.levels import Level
-from hilsplat.base.provenance import require_own_picture
+from hilsplat.base.ownership import require_own_picture
 from hilsplat.datasets.hierarchy import HierarchyAnnotations, label_path
 from hilsplat.datasets.labelled import image_size_hw
 from hilsplat.embed.langsplat_files import read_view

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from hilsplat.base.artifacts import read_index, sha256_of_path, write_index
+from hilsplat.base.artifacts import read_index, write_index
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import Level
+from hilsplat.base.lineage import sha256_of_path
 from hilsplat.contributions import quadratic_builder, stage
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.contributions.quadratic import Gram, StackedWeights, level_mass

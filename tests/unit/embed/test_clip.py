@@ -7,8 +7,9 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from hilsplat.base.artifacts import read_index, read_npy, sha256_of_path, write_index, write_npz
+from hilsplat.base.artifacts import read_index, read_npy, write_index, write_npz
 from hilsplat.base.errors import MisalignedArtifactError, ModelError, SettingsError
+from hilsplat.base.lineage import sha256_of_path
 from hilsplat.configuration import parse_section
 from hilsplat.embed.clip import ClipModel, open_clip_of, unit
 from hilsplat.embed.stage import chosen_masks, run_clip

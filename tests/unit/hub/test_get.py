@@ -16,8 +16,8 @@ import pytest
 import requests
 from huggingface_hub.utils import reset_sessions
 
-from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import DiskSpaceError, DownloadError, ModelError
+from hilsplat.base.lineage import sha256_of_file
 from hilsplat.embed.clip import ClipModel
 from hilsplat.embed.model_check import check_models
 from hilsplat.hub import catalogue, get

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import onnx
 
-from hilsplat.base.artifacts import sha256_of_file
+from hilsplat.base.lineage import sha256_of_file
 from tests.conftest import PROJECT
 from tests.unit.hub.conftest import SAM
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from hilsplat.base.artifacts import sha256_of_path
+from hilsplat.base.lineage import sha256_of_path
 from hilsplat.configuration import with_models
 from hilsplat.models.store import model_digest, model_path, present_models, read_model, real_model
 from hilsplat.settings import ClipSettings, FieldSettings, MasksSettings

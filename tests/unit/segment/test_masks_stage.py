@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilsplat.base.artifacts import read_index, read_npz, sha256_of_path
+from hilsplat.base.artifacts import read_index, read_npz
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.images import read_image
+from hilsplat.base.lineage import sha256_of_path
 from hilsplat.models import repeatable
 from hilsplat.models.folder import open_model_folder
 from hilsplat.models.layouts import DECODER, PREVIEW

@@ -5,9 +5,9 @@ import pytest
 import scipy.sparse as sp
 from plyfile import PlyData
 
-from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import Level
+from hilsplat.base.lineage import sha256_of_file
 from hilsplat.segment.sam import point_grid
 from hilsplat.semantic_tree.build import RANKED, crop_ranks
 from hilsplat.semantic_tree.export import write_selection_ply, write_tree_ply
@@ -93,7 +93,7 @@ def test_an_exported_tree_or_selection_is_a_valid_3dgs_ply(tmp_path):
     write_selection_ply(ply, np.array([1, 3]), tmp_path / "selection.ply")
     assert load_ply(tmp_path / "selection.ply").means[:, 0].tolist() == [3, 9]
     save_ply(ply, round_gaussians(means + 1))  # as many Gaussians
-    with pytest.raises(MisalignedArtifactError, match=r"made for a different .*\.ply"):
+    with pytest.raises(MisalignedArtifactError, match=r"semantic tree was not made from .*\.ply"):
         write_tree_ply(ply, tree, out)
 
 

@@ -111,7 +111,7 @@ def test_a_ply_of_this_package_is_moved_by_the_json_beside_it(turned_scene, sour
     np.testing.assert_allclose(again.means, three_gaussians().means, atol=1e-5)
     assert "JSON" in origin["taken_as"]
     shutil.copyfile(source_ply, out / "g.ply")
-    with pytest.raises(ArtifactError, match="was written for a different"):
+    with pytest.raises(ArtifactError, match="was not made from"):
         import_gaussians(out / "g.ply", turned_scene)
     write_json(out / "g.json", {"something": "else"})
     again, origin = import_gaussians(out / "g.ply", turned_scene)

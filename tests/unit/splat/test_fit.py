@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit
 
-from hilsplat.base.artifacts import read_index, read_json, read_npz, write_stored_npz
+from hilsplat.base.artifacts import read_index, read_json, read_npz, write_arrays
 from hilsplat.base.errors import SceneError
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
@@ -123,7 +123,7 @@ def test_a_checkpoint_with_other_content_is_ignored(scene, tmp_path, change):
     assert fit.FitState.load(path) is not None
     arrays = read_npz(path)
     change(arrays)
-    write_stored_npz(path, **arrays)
+    write_arrays(path, arrays, compressed=False)
     assert fit.FitState.load(path) is None
 
 

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from hilsplat.base.errors import ModelError
-from hilsplat.base.provenance import version_of
+from hilsplat.base.lineage import version_of
 from hilsplat.cli.main import app
 from hilsplat.models.folder import ModelFolder
 from hilsplat.splat.rasterise import parity

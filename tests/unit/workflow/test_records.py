@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from hilsplat.base.artifacts import lock_path, output_lock, provenance_path, write_json
+from hilsplat.base.artifacts import provenance_path, write_json
+from hilsplat.base.atomic import lock_path, output_lock
 from hilsplat.base.errors import ArtifactError
-from hilsplat.base.provenance import Inputs, write_provenance
+from hilsplat.base.lineage import Inputs, write_provenance
 from hilsplat.models.store import model_digest
 from hilsplat.stages import stage_of
 from hilsplat.workflow.records import outdated, verify

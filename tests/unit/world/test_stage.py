@@ -5,11 +5,12 @@ from runpy import run_path
 import numpy as np
 import pytest
 
-from hilsplat.base.artifacts import read_index, read_json, sha256_of_path
+from hilsplat.base.artifacts import read_index, read_json
 from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.base.files import list_images
 from hilsplat.base.images import read_image
 from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.lineage import sha256_of_path
 from hilsplat.datasets.hierarchy import AnnotatedNode, HierarchyAnnotations
 from hilsplat.scene.cameras import Cameras
 from hilsplat.settings import WorldSettings

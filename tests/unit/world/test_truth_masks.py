@@ -5,17 +5,11 @@ import itertools
 import numpy as np
 import pytest
 
-from hilsplat.base.artifacts import (
-    provenance_path,
-    read_index,
-    read_json,
-    sha256_of_path,
-    write_index,
-    write_json,
-)
+from hilsplat.base.artifacts import provenance_path, read_index, read_json, write_index, write_json
 from hilsplat.base.errors import HilsplatError, MisalignedArtifactError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.lineage import sha256_of_path
 from hilsplat.cli import stage_commands
 from hilsplat.datasets.hierarchy import AnnotatedNode, write_hierarchy
 from hilsplat.segment.masks import HierarchicalMasks

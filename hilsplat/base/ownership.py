@@ -1,0 +1,132 @@
+"""Checks that a command replaces only its own earlier outputs."""
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from hilsplat.base.artifacts import read_memo, write_json
+from hilsplat.base.atomic import was_interrupted
+from hilsplat.base.errors import ArtifactError, ImageError
+from hilsplat.base.images import opened_image
+from hilsplat.base.lineage import files_of, read_provenance
+
+SOFTWARE = {"Software": "hilsplat"}
+"""Metadata of the PNGs that commands draw for users; these files have no provenance record."""
+
+
+def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Path]) -> None:
+    """Check that a stage can write its outputs without overwriting unrelated data.
+
+    An existing file or folder may be replaced if it is empty, if the same stage wrote it according to the
+    provenance of the first output, or if a process was killed while writing it.
+
+    Raises:
+        ArtifactError: an output is or contains an input or the working, home or root folder, or exists and is
+            not an earlier output of the stage.
+    """
+    recorded = _recorded_outputs(outputs[0], stage)
+    sources = [Path(path).resolve() for path in inputs]
+    for out in outputs:
+        path = out.resolve()
+        for source in sources:
+            if source.is_relative_to(path):
+                what = "is an input" if path == source else f"contains the input {source}"
+                raise ArtifactError(f"output {out} {what} of {stage}", fix="choose another output")
+        for name, folder in (("working", Path.cwd()), ("home", Path.home())):
+            if folder.resolve().is_relative_to(path):
+                raise ArtifactError(
+                    f"output {out} is or contains the {name} folder", fix="choose a new file or folder"
+                )
+        if _is_something(out) and path not in recorded and not was_interrupted(out):
+            raise _foreign(out, stage, f"a new path, or an earlier output of {stage} with its provenance")
+
+
+def require_own_picture(path: Path, beside: Path | None = None) -> None:
+    """Raise ArtifactError if a path is not a .png, or if it or `beside` is a file of other programs."""
+    if path.suffix.lower() != ".png":
+        raise ArtifactError(f"output {path} is not a PNG file", expected="a name that ends in .png")
+    if _is_something(path) and not _is_own_picture(path):
+        raise _foreign(path)
+    if beside is not None and _is_something(beside) and not _is_something(path):
+        raise _foreign(beside)
+
+
+def _is_own_picture(path: Path) -> bool:
+    try:
+        with opened_image(path) as image:
+            return bool(image.info.get("Software") == SOFTWARE["Software"])
+    except ImageError:
+        return False
+
+
+@contextmanager
+def replaced_folder(folder: Path) -> Iterator[None]:
+    """Replace a folder in the block; raise ArtifactError if a file in it is not from the last such block."""
+    record = folder.with_name(f".{folder.name}.written.json")  # size and time of each file
+    written = read_memo(record, dict[str, list[int]])
+    if others := sorted(name for name, stat in _stats(folder).items() if written.get(name) != stat):
+        raise ArtifactError(
+            f"{folder} contains files that hilsplat did not write, or that were changed later",
+            found=", ".join(others[:3]),
+            fix="move them elsewhere, or choose another folder (--out)",
+        )
+    yield
+    write_json(record, _stats(folder))
+
+
+def _stats(folder: Path) -> dict[str, list[int]]:
+    stats = {file.relative_to(folder).as_posix(): file.stat() for file in files_of(folder)}
+    return {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
+
+
+def require_beginning(path: Path, line: str) -> None:
+    """Raise ArtifactError if a table would replace a file whose first line is not `line`."""
+    if not _is_something(path):
+        return
+    try:
+        with path.open(encoding="utf-8") as stream:
+            is_own = stream.readline().strip() == line.strip()
+    except (OSError, ValueError):
+        is_own = False
+    if not is_own:
+        raise _foreign(path)
+
+
+def _foreign(path: Path, writer: str = "hilsplat", expected: str | None = None) -> ArtifactError:
+    return ArtifactError(
+        f"output {path} exists, but {writer} did not write it",
+        expected=expected,
+        found=_described(path),
+        fix="choose another output, or remove this one first",
+    )
+
+
+def _recorded_outputs(artifact: Path, stage: str) -> set[Path]:
+    try:
+        record = read_provenance(artifact)
+    except ArtifactError:
+        return set()
+    if record is None or record.stage != stage:
+        return set()
+    return {(artifact.parent / name).resolve() for name in record.outputs}
+
+
+def _is_something(path: Path) -> bool:
+    """Return whether a path exists and is not empty, ignoring hidden files such as Snakemake's markers."""
+    if not os.path.lexists(path):
+        return False
+    if path.is_dir():
+        return bool(_visible(path))
+    return not path.is_file() or path.stat().st_size > 0
+
+
+def _visible(folder: Path) -> list[str]:
+    return [path.name for path in folder.iterdir() if not path.name.startswith(".")]
+
+
+def _described(path: Path) -> str:
+    if path.is_dir():
+        names = sorted(_visible(path))
+        return f"a folder of {len(names)} entries: {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
+    return f"a file of {path.stat().st_size} bytes" if path.is_file() else "neither a file nor a folder"

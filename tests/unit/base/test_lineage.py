@@ -1,0 +1,55 @@
+"""Digests follow content; artifacts of different sources are refused."""
+
+from pathlib import Path
+
+import pytest
+
+from hilsplat.base.artifacts import RUN, rebuild_command, write_json
+from hilsplat.base.atomic import work_folder
+from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.lineage import require_made_from, sha256_of_bytes, sha256_of_json, sha256_of_path
+from tests.unit.artifact_changes import write_record
+
+
+def test_digest_of_parts_depends_on_their_boundaries() -> None:
+    assert sha256_of_bytes(b"ab", b"c") != sha256_of_bytes(b"a", b"bc")
+    assert sha256_of_json({"a": 1, "b": 2}) == sha256_of_json({"b": 2, "a": 1})
+
+
+def test_folder_digest_follows_names_and_bytes(tmp_path: Path) -> None:
+    folder = tmp_path / "f"
+    folder.mkdir()
+    (folder / "a").write_bytes(b"1")
+    first = sha256_of_path(folder)
+    with work_folder(folder / "hidden") as unfinished:
+        (unfinished / "c").write_bytes(b"2")
+        assert sha256_of_path(folder) == first
+    (folder / "a").rename(folder / "b")
+    assert sha256_of_path(folder) != first
+
+
+@pytest.mark.parametrize(
+    ("recorded", "digest", "expected", "found"),
+    [("a" * 64, "b" * 64, "digest aaaaaaaaaaaa", "digest bbbbbbbbbbbb"), (None, "b", "nothing", "digest b")],
+)
+def test_an_artifact_of_another_source_is_refused(recorded, digest, expected, found):
+    require_made_from("clip", "masks", digest, digest)
+    with pytest.raises(MisalignedArtifactError) as raised:
+        require_made_from("clip", "masks", recorded, digest)
+    assert str(raised.value).splitlines() == [
+        "clip was not made from masks",
+        f"  expected  {expected}",
+        f"  found     {found}",
+        "  fix       rerun the stage that writes clip",
+    ]
+
+
+def test_the_command_that_rebuilds_a_file_names_the_artifact_that_records_it(tmp_path: Path) -> None:
+    images = tmp_path / "here/set/scene/world/images"
+    images.mkdir(parents=True)
+    write_json(tmp_path / "here" / RUN, {"results": ["out"], "config": ["a.yaml"], "overrides": ["x=1"]})
+    write_record(images, outputs=dict.fromkeys(("images", "truth")))
+    command = "hilsplat run --config a.yaml --verify out/set/scene/world/images -- --config x=1"
+    for path in (images, images / "000.png", images.parent / "truth/labels/000.png"):
+        assert rebuild_command(path) == command
+    assert rebuild_command(images.parent) == "rerun the stage that writes it"
