@@ -615,7 +615,7 @@ def efficiency(
     ),
 ) -> str:
     """Print the time of each stage, from the benchmark files of a run."""
-    from hilsplat.evaluate.tables.costs import run_efficiency
+    from hilsplat.evaluate.costs import run_efficiency
 
     return run_efficiency(results, out)
 

@@ -7,13 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from hilsplat.workflow.stages import STAGES
 
 from hilsplat.base import code
 from hilsplat.base.code import code_digest, modules_of
 from hilsplat.base.errors import HilsplatError
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.methods.registry import METHODS
+from hilsplat.stages import all_stages, stage_of
 
 
 @pytest.fixture
@@ -138,10 +138,11 @@ def test_unchanged_modules_are_parsed_once_whatever_is_in_the_memo(tmp_path, for
 
 
 def test_every_stage_and_plugin_has_its_code_and_nothing_else_is_imported_by_string(project):
-    for place in (*STAGES.values(), *DATASETS.places.values(), *METHODS.places.values()):
+    for place in (*DATASETS.places.values(), *METHODS.places.values()):
         assert place.partition(":")[0] in modules_of(place)
-    assert "hilsplat.semantic_tree.linkage" in modules_of(STAGES["semantic_tree"])
-    assert "hilsplat.semantic_tree.linkage" not in modules_of(STAGES["masks"])
+    assert all(stage.modules() and stage.code_digest() for stage in all_stages().values())
+    assert "hilsplat.semantic_tree.linkage" in stage_of("semantic_tree").modules()
+    assert "hilsplat.semantic_tree.linkage" not in stage_of("masks").modules()
     texts = {path: path.read_text() for path in (project / "hilsplat").rglob("*.py")}
     by_string = [path for path, text in texts.items() if "import_module" in text or "__import__(" in text]
     assert by_string == [project / "hilsplat/base/plugins.py"]
