@@ -120,7 +120,7 @@ def masks(
         return
     if features is not None:
         with stage("langsplat", out, inputs={"scene": scene, "features": features}) as files:
-            files.read_masks(scene, features, out)
+            files.run_imported_masks(scene, features, out)
         return
     inputs = {"scene": scene, **(model_input(section) if section.segmenter == "sam" else {})}
     if section.key_views < 1:
@@ -202,7 +202,7 @@ def clip(
     inputs = {"scene": scene, "masks": masks, **model_input(section), "semantic_tree": semantic_tree}
     if features is not None:
         with stage("langsplat", out, settings=section, inputs={**inputs, "features": features}) as files:
-            files.read_clip(scene, features, out, section)
+            files.run_imported_clip(scene, features, out, section)
         return
     with stage("clip", out, settings=section, inputs=inputs) as run:
         run(scene, masks, semantic_tree, out, cache, section, threads, memory)

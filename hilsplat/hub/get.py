@@ -49,10 +49,10 @@ from hilsplat.hub.catalogue import (
 )
 from hilsplat.hub.pins import pins
 from hilsplat.hub.retries import WRONG_LENGTH, reason_of, repeated
-from hilsplat.models.folder import ModelFolder, input_side_px, preprocessing_of
+from hilsplat.models.folder import ModelFolder, preprocessing_of
 from hilsplat.models.int8 import LARGE_BYTES
 from hilsplat.models.layouts import LAYOUTS, layout_of
-from hilsplat.models.memory import needs
+from hilsplat.models.memory import needs_of
 from hilsplat.models.onnx_graph import external_files, split_clip, whole_clip
 from hilsplat.models.store import RECOMMENDED, real_model, user_models
 
@@ -227,22 +227,20 @@ def _prepare(requested: ModelRequest, listing: Listing, target: Path, variant: s
     return found
 
 
-def _needs(found: Prepared) -> str:
+def _needs(prepared: Prepared) -> str:
     """Describe the disk space and memory that a model needs."""
-    config = read_json(found.staging / "config.json")
+    config = read_json(prepared.staging / "config.json")
     layout = layout_of(config)
     assert layout is not None  # `choose_files` refuses other models
-    (file,) = found.listing.require(LAYOUTS[layout].preprocessing)
-    preprocessing = preprocessing_of(_fetch(found.listing, file, found.staging))
-    model = ModelFolder(found.staging, layout, config, preprocessing, {}, ())
-    num_bytes, is_reduced = found.num_bytes(), bool(found.variant)
-    memory = needs(
-        layout, config, input_side_px(model), num_bytes, BATCHES[model.kind], as_exported=is_reduced
-    )
+    (file,) = prepared.listing.require(LAYOUTS[layout].preprocessing)
+    preprocessing = preprocessing_of(_fetch(prepared.listing, file, prepared.staging))
+    model = ModelFolder(prepared.staging, layout, config, preprocessing, {}, ())
+    num_bytes, is_reduced = prepared.num_bytes(), bool(prepared.variant)
+    memory = needs_of(model, BATCHES[model.kind], as_exported=is_reduced, num_bytes=num_bytes)
     memory_mib, has_int8 = memory.total_mib(1), not is_reduced and num_bytes <= LARGE_BYTES
     disk = f"needs {num_bytes * (1 + INT8_SHARE * has_int8) / 1e6:.0f} MB of disk space"
     disk += " with its int8 networks" * has_int8
-    export = f"; its export needs about {3 * num_bytes / 1e9:.1f} GB" if found.choice.exported else ""
+    export = f"; its export needs about {3 * num_bytes / 1e9:.1f} GB" if prepared.choice.exported else ""
     return f"{disk}, and about {memory_mib * 2**20 / 1e9:.1f} GB of memory on a CPU{export}"
 
 

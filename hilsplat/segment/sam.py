@@ -21,11 +21,10 @@ from hilsplat.base.artifacts import sha256_of_bytes
 from hilsplat.base.errors import ModelError
 from hilsplat.base.levels import Level
 from hilsplat.base.processes import in_order
-from hilsplat.models.fast_paths import or_as_exported
 from hilsplat.models.folder import SAM_SIDE_PX, ModelFolder, input_side_px, open_model_folder
 from hilsplat.models.int8 import CHECKED_GRID, agreement_of_masks, considers_int8, int8_network, use_int8
 from hilsplat.models.layouts import DECODER, PREVIEW
-from hilsplat.models.network import CPU, Network, execution_providers
+from hilsplat.models.network import CPU, Network, execution_providers, or_as_exported
 from hilsplat.models.onnx_graph import Graph, with_rowwise_attention
 from hilsplat.models.repeatable import random_pixels, require_repeatable_once
 from hilsplat.segment.decoder_network import DecoderNetwork

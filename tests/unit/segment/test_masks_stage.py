@@ -93,7 +93,7 @@ def test_prompts_that_repeat_others_in_the_preview_are_skipped(scene, tmp_path, 
 @pytest.mark.parametrize("change", [{"box_nms_iou": 0.95}, {"generator": "official"}])
 def test_all_prompts_are_decoded_where_repeated_masks_could_stay(scene, tmp_path, celled, calls, change):
     chosen = celled.model_copy(update=change)
-    run_masks(scene, tmp_path / "masks", tmp_path / "cache", chosen, threads=1, key_views=["000.png"])
+    run_masks(scene, tmp_path / "masks", tmp_path / "cache", chosen, threads=1, views=["000.png"])
     assert (calls.count(PREVIEW), calls.count(DECODER)) == (0, 16)
 
 
