@@ -55,8 +55,9 @@ def read_view(folder: Path, camera: Camera) -> tuple[HierarchicalMasks, Float16[
     """Read the masks and vectors of one view, with rows in `content_order`.
 
     The mixed-level map is ignored. Where masks of one level overlap, the files contain only the mask
-    painted last. The files contain no scores, so predicted IoU and stability are set to 1. Maps of the view's
-    photograph or of a scaled copy, such as LangSplat's 1080 rows, are transferred to the view (nearest pixel).
+    painted last. The files contain no scores, so predicted IoU and stability are set to 1. Maps of the
+    photograph or of a scaled copy, such as LangSplat's 1080 rows, are transferred to the view (nearest
+    pixel).
 
     Raises:
         ArtifactError: a file is missing, damaged, pickled, or in a different format.

@@ -168,7 +168,8 @@ def models_table() -> str:
         [
             *lines,
             "",
-            "Install: hilsplat models get NAME (or owner/name on the hub); without a name, the recommended pair",
+            "Install: hilsplat models get NAME (or owner/name on the hub); "
+            "without a name, the recommended pair",
             f"Models are stored in {user_models()}; those in a project's models/ take precedence.",
         ]
     )

@@ -114,8 +114,18 @@ def run_graph_masks(
     with stage_log("masks", scene.name) as counts:
         logger.info("masks %s: graph segmenter (no model); the levels are three scales", scene.name)
 
+        arguments = settings.graph_scales, settings.min_area_px
+
         def segment(view: str) -> HierarchicalMasks:
-            return _with_levels(graph_masks(scene, view, view_cache, settings), settings)
+            key = sha256_of_json(
+                {
+                    "image": sha256_of_file(scene.image_path(view)),
+                    "settings": arguments,
+                    "code": code_digest(segment_graph, HierarchicalMasks),
+                }
+            )
+            arrays = view_cache.get(key, lambda: segment_graph(scene.image(view), *arguments).arrays())
+            return _with_levels(HierarchicalMasks.from_arrays(arrays), settings)
 
         chosen = train_views(scene) if views is None else views
         masks = zip(chosen, in_order(segment, chosen, threads), strict=True)
@@ -185,19 +195,3 @@ def sam_masks(
         }
     )
     return HierarchicalMasks.from_arrays(cache.get(masks_key, from_candidates))
-
-
-def graph_masks(scene: Scene, view: str, cache: ViewCache, settings: MasksSettings) -> HierarchicalMasks:
-    """Segment one view with the graph segmenter."""
-    key = sha256_of_json(
-        {
-            "image": sha256_of_file(scene.image_path(view)),
-            "settings": [settings.graph_scales, settings.min_area_px],
-            "code": code_digest(segment_graph, HierarchicalMasks),
-        }
-    )
-
-    def segment() -> dict[str, np.ndarray]:
-        return segment_graph(scene.image(view), settings.graph_scales, settings.min_area_px).arrays()
-
-    return HierarchicalMasks.from_arrays(cache.get(key, segment))
