@@ -18,10 +18,8 @@ The two attentions of a layer, its layer norm and the next attention process one
 for several prompts (`decoder_kernels`). Operations on tokens alone use plain numpy in this module.
 """
 
-from collections import namedtuple
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import onnxruntime
@@ -32,6 +30,15 @@ from hilsplat.base.errors import ModelError
 from hilsplat.models.network import one_thread_session
 from hilsplat.models.onnx_graph import Graph
 from hilsplat.segment import decoder_kernels as kernels
+from hilsplat.segment.decoder_kernels import (
+    FirstLayer,
+    FirstPrompts,
+    MaskImage,
+    MaskPrompts,
+    SecondLayer,
+    SecondPrompts,
+    Upscaling,
+)
 from hilsplat.segment.decoder_network import DecoderNetwork
 from hilsplat.segment.decoder_weights import DecoderGraph, Linear
 
@@ -41,62 +48,6 @@ BLOCK = 64
 PROMPTS = 16
 """Prompts per call, applied to each block one after the other while the block is in the cache."""
 HEADS_PER_ATTENTION = 8  # if the model's configuration doesn't specify them
-
-
-class FirstLayer(NamedTuple):
-    """Image arrays that the kernels read at the first layer, block by block."""
-
-    queries: np.ndarray  # queries of the pixel-to-token attention
-    before: np.ndarray  # products of the pixels' features with the output projection of the values
-    square: np.ndarray  # squared length of each pixel's features
-    cross: np.ndarray  # products of the pixels' features with the bias that is added to them
-    scaled_keys: np.ndarray  # keys of the token-to-pixel attention: the part scaled by the layer norm
-    fixed_keys: np.ndarray
-    values: np.ndarray  # values of the token-to-pixel attention, before the layer norm's scale
-
-
-class FirstPrompts(NamedTuple):
-    """Prompt arrays that the kernels read at the first layer."""
-
-    update_keys: np.ndarray  # keys of the pixel-to-token attention
-    twice_changes: np.ndarray  # twice the difference between each token's values and the last token's
-    gram: np.ndarray  # products of these differences after the output projection (`doubled_below`)
-    last: np.ndarray  # values of the last token
-    square: np.ndarray  # squared length of the constant that the last token and the bias add to every pixel
-    linear: np.ndarray  # twice the products of that constant with the differences
-    queries: np.ndarray  # queries of the token-to-pixel attention
-    low: np.ndarray  # products of `queries` with the keys of the factors
-    offset: np.ndarray  # products of `queries` with the keys of that constant
-
-
-SecondLayer = namedtuple(
-    "SecondLayer",
-    "scaled_queries fixed_queries before_first before_second square cross_first cross_second "
-    "scaled_keys fixed_keys values",
-)
-"""Image arrays that the kernels read at the second layer; names as in `FirstLayer`. Queries and products have
-two parts, for the values of the first and of the second layer."""
-SecondPrompts = namedtuple(
-    "SecondPrompts",
-    "update_keys update_low update_offset twice_changes linear gram last square queries low offset",
-)
-"""Prompt arrays that the kernels read at the second layer; names as in `FirstPrompts`."""
-
-
-Upscaling = namedtuple("Upscaling", "norm_scale norm_shift fixed second bias")
-"""Weights of the two upscalings and of the layer norm between them."""
-MaskImage = namedtuple("MaskImage", "scaled detail finest")
-"""Image arrays for mask logits: the upscaled image embedding, and the finer features of SAM 2."""
-
-
-class MaskPrompts(NamedTuple):
-    """Prompt arrays for mask logits."""
-
-    masks: int  # per prompt
-    factors: np.ndarray  # after the first upscaling
-    both_scales: np.ndarray  # constants of the first layer after the first upscaling
-    second_scale: np.ndarray  # constants of the second layer after the first upscaling
-    combine: np.ndarray  # channel weights of each mask
 
 
 @dataclass(frozen=True)

@@ -112,9 +112,8 @@ def run_graph_masks(
     """Segment training views with the graph segmenter; arguments as in `run_sam_masks`."""
     scene, view_cache = Scene.load(scene_folder), ViewCache(cache / "masks")
     with stage_log("masks", scene.name) as counts:
-        logger.info("masks %s: graph segmenter (no model); the levels are three scales", scene.name)
-
         arguments = settings.graph_scales, settings.min_area_px
+        logger.info("masks %s: graph segmenter (no model); the levels are three scales", scene.name)
 
         def segment(view: str) -> HierarchicalMasks:
             key = sha256_of_json(
