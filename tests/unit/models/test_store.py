@@ -92,6 +92,7 @@ def test_models_of_the_user_are_found_from_any_folder_after_those_of_the_project
 @pytest.mark.parametrize("memo", ["[]", "{", '{"a": 1}', '{"a": "b", "a": "c"}', "[" * 100_000, None])
 def test_a_damaged_cache_of_digests_is_replaced(models, memo):
     cache = Path("cache/digests.json")
+    model_digest.cache_clear()
     expected = model_digest(models / "sam-tiny", cache.parent)
     assert expected == sha256_of_path(models / "sam-tiny")
     paths = json.loads(cache.read_text()).keys()
