@@ -132,11 +132,11 @@ def _measure(model: SamModel | ClipModel, precision: str) -> Seconds:
     encoded, image_s = _second_call(lambda: model.encode(np.zeros((side, side, 3), np.uint8), encoder))
     points = np.full((model.prompts_per_call(1, 1), 2), side / 2)
     _, masks_s = _second_call(lambda: model.decode(encoded, points))
-    seconds = {"image": image_s, "masks": masks_s / len(points)}
+    times = {"image": image_s, "masks": masks_s / len(points)}
     if model.previews:
         _, preview_s = _second_call(lambda: model.preview(encoded, points))
-        seconds["preview"] = preview_s / len(points)
-    return seconds
+        times["preview"] = preview_s / len(points)
+    return times
 
 
 def _second_call(call: Callable[[], Result]) -> tuple[Result, float]:

@@ -154,8 +154,8 @@ def decode_candidates(
     parts = []
     for crop, (left, top, right, bottom) in enumerate(boxes):
         encoded = model.encode(np.ascontiguousarray(image[top:bottom, left:right]))
-        on_grid = points is None or crop > 0
-        prompts: Prompts = {"points": grid * (right - left, bottom - top) if on_grid else points}
+        on_grid = grid * (right - left, bottom - top)
+        prompts: Prompts = {"points": on_grid if points is None or crop else points}
         if uses_preview(model, settings):
             prompts = distinct_prompts(encoded, prompts, model, settings, batch)
         for called, number in calls(prompts, batch):
