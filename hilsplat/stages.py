@@ -133,9 +133,9 @@ def gaussians(
 @stage(artifact="masks", when=lambda scene: scene.is_imported)
 def imported_masks(scene: PathIn, features: PathIn, out: PathOut) -> None:
     """Import LangSplat's masks, a folder of _s.npy and _f.npy files."""
-    from hilsplat.embed.langsplat_files import read_masks
+    from hilsplat.embed.langsplat_files import run_imported_masks
 
-    read_masks(scene, features, out)
+    run_imported_masks(scene, features, out)
 
 
 @stage(artifact="masks", loop="masks of views", when=lambda scene: scene.settings.masks.key_views < 1)
@@ -254,9 +254,9 @@ def imported_clip(
     scene: PathIn, masks: PathIn, features: PathIn, out: PathOut, settings: of.ClipSettings
 ) -> None:
     """Import LangSplat's CLIP vectors, a folder of _s.npy and _f.npy files."""
-    from hilsplat.embed.langsplat_files import read_clip
+    from hilsplat.embed.langsplat_files import run_imported_clip
 
-    read_clip(scene, features, out, settings)
+    run_imported_clip(scene, features, out, settings)
 
 
 @stage(loop="CLIP of views")

@@ -8,7 +8,6 @@ import hashlib
 import json
 import re
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -49,7 +48,6 @@ class LoopbackHub:
     reached: threading.Event = field(default_factory=threading.Event)  # set while an answer waits
     released: threading.Event = field(default_factory=threading.Event)  # lets a waiting answer go on
     is_lenient: bool = False  # answers every revision with the current commit
-    drip_s: float = 0.0  # pause after each 64 KiB of a large file
     ranged: bool = True  # False: ignore Range headers and send whole files, as some mirrors do
     asked: list[tuple[str, str, str]] = field(default_factory=list)  # method, path and Range header
 
@@ -152,7 +150,6 @@ def handler_of(hub: LoopbackHub) -> type[BaseHTTPRequestHandler]:
                 self.close_connection = True
 
         def send(self, body: bytes) -> None:
-            step = 2**16 if hub.drip_s else len(body)
             for part in [each for each in hub.held if each in self.path]:
                 first = hub.held.pop(part)
                 self.wfile.write(body[:first])
@@ -161,9 +158,7 @@ def handler_of(hub: LoopbackHub) -> type[BaseHTTPRequestHandler]:
                 hub.reached.set()
                 hub.released.wait(60)
             with suppress(ConnectionError):  # the client was killed
-                for start in range(0, len(body), step or 1):
-                    self.wfile.write(body[start : start + step])
-                    time.sleep(hub.drip_s)
+                self.wfile.write(body)
 
         def log_message(self, format: str, *args: object) -> None:
             pass

@@ -35,7 +35,7 @@ class ClipModel:
     def __init__(self, model: ModelFolder, template: str = "{}") -> None:
         self.model = model
         self.template = template
-        self._known_texts: dict[str, np.ndarray] = {}
+        self._text_vectors: dict[str, np.ndarray] = {}
         self.digest = model.digest
         self.text = model.network("text_model")
         self.ids, (self.words,) = next(iter(self.text.spec.inputs)), self.text.spec.outputs
@@ -69,12 +69,12 @@ class ClipModel:
     @cached_property
     def vision(self) -> Network:
         """Vision network, opened on first use because it is large and not needed for texts."""
-        opened = self.model.network("vision_model")
-        (vector,) = opened.spec.outputs
-        widths = opened.fixed_axis(vector, 1), self.text.fixed_axis(self.words, 1)
+        network = self.model.network("vision_model")
+        (vector,) = network.spec.outputs
+        widths = network.fixed_axis(vector, 1), self.text.fixed_axis(self.words, 1)
         require_one_space(self.model.folder, *widths)
-        require_repeatable_once(self.model, opened, "as exported", random_pixels(opened, self.side_px))
-        return opened
+        require_repeatable_once(self.model, network, "as exported", random_pixels(network, self.side_px))
+        return network
 
     @property
     def pixels(self) -> str:
@@ -88,15 +88,15 @@ class ClipModel:
 
     def _pad_id(self, text_config: dict[str, Any]) -> int:
         """Return the padding token's id from the tokenizer, else its configuration, else the model's."""
-        named = (self.tokenizer.padding or {}).get("pad_id")
-        beside = self.model.tokenizer.with_name("tokenizer_config.json")
-        if named is None and beside.is_file():
-            token = read_json(beside).get("pad_token")
+        pad_id = (self.tokenizer.padding or {}).get("pad_id")
+        config = self.model.tokenizer.with_name("tokenizer_config.json")
+        if pad_id is None and config.is_file():
+            token = read_json(config).get("pad_token")
             token = token.get("content") if isinstance(token, dict) else token
-            named = self.tokenizer.token_to_id(token) if token else None
-        if named is None:
-            named = text_config.get("pad_token_id", 1 if self.siglip else 0)
-        return int(named or 0)
+            pad_id = self.tokenizer.token_to_id(token) if token else None
+        if pad_id is None:
+            pad_id = text_config.get("pad_token_id", 1 if self.siglip else 0)
+        return int(pad_id or 0)
 
     @staticmethod
     def load(folder: Path, variant: str = "") -> "ClipModel":
@@ -112,8 +112,12 @@ class ClipModel:
 
     def about(self, settings: ClipSettings) -> dict[str, Any]:
         """Return the entries that identify the model in an artifact's index."""
-        named = {"model": settings.model, "model_variant": settings.variant}
-        return {"dim": self.width, **named, "model_sha256": self.digest}
+        return {
+            "dim": self.width,
+            "model": settings.model,
+            "model_variant": settings.variant,
+            "model_sha256": self.digest,
+        }
 
     def require_width(self, numbers: int, what: str) -> None:
         """Raise a MisalignedArtifactError unless an artifact's vectors have this model's width."""
@@ -175,16 +179,16 @@ class ClipModel:
         raises a ModelError.
         """
         for text in texts:
-            if text not in self._known_texts:
-                self._known_texts[text] = self._embed_text(text)
-        return np.stack([self._known_texts[text] for text in texts])
+            if text not in self._text_vectors:
+                self._text_vectors[text] = self._embed_text(text)
+        return np.stack([self._text_vectors[text] for text in texts])
 
     def unknown_words(self, text: str) -> list[str]:
         """Return the words of a text that are not in the vocabulary; empty for word-piece tokenizers."""
         unknown = self.tokenizer.token_to_id(getattr(self.tokenizer.model, "unk_token", None) or "")
         encoding = self.tokenizer.encode(text)
-        places = zip(encoding.ids, encoding.offsets, strict=True)
-        words = [text[start:end] for number, (start, end) in places if number == unknown]
+        tokens = zip(encoding.ids, encoding.offsets, strict=True)
+        words = [text[start:end] for token, (start, end) in tokens if token == unknown]
         return [word for word in words if any(letter.isalnum() for letter in word)]
 
     def _embed_text(self, text: str) -> Float32[np.ndarray, " C"]:
@@ -212,8 +216,8 @@ class ClipModel:
     def _tokens(self, sentence: str) -> dict[str, np.ndarray]:
         """Return the text network's inputs for one sentence."""
         encoding = self.tokenizer.encode(sentence)
-        mask, ids = (np.array([each], dtype=np.int64) for each in (encoding.attention_mask, encoding.ids))
-        return {self.ids: ids, "attention_mask": mask}
+        mask = np.array([encoding.attention_mask], dtype=np.int64)
+        return {self.ids: np.array([encoding.ids], dtype=np.int64), "attention_mask": mask}
 
 
 def unit(vectors: Float32[np.ndarray, "N C"]) -> Float32[np.ndarray, "N C"]:
@@ -236,12 +240,11 @@ def open_clip_of(clip_folder: Path, template: str = "{}") -> ClipModel:
     recorded, expected = Path(index["model"]), index["model_sha256"]
     variant = index.get("model_variant", "")
     roots = list(dict.fromkeys([Path.cwd(), *clip_folder.resolve().parents, INSTALLED]))
-    stores = [place for place in (*(root / MODELS for root in roots), user_models()) if place.is_dir()]
+    stores = list(filter(Path.is_dir, [*(root / MODELS for root in roots), user_models()]))
     configs = [config for store in stores for pattern in MODEL_PATTERNS for config in store.glob(pattern)]
-    seen: dict[Path, str] = {}
+    digests: dict[Path, str] = {}
     for folder in [*(root / recorded for root in roots), *sorted(config.parent for config in configs)]:
-        place = folder.resolve()
-        if place in seen or not place.is_dir():
+        if folder.resolve() in digests or not folder.is_dir():
             continue
         try:
             model = open_model_folder(folder, "clip", variant=variant)
@@ -249,11 +252,11 @@ def open_clip_of(clip_folder: Path, template: str = "{}") -> ClipModel:
             continue  # a SAM model, or an incomplete copy
         if model.digest == expected:
             return ClipModel(model, template)
-        seen[place] = model.digest
+        digests[folder.resolve()] = model.digest
     raise ModelError(
         f"the CLIP model that embedded the masks in {clip_folder} was not found",
         expected=f"a model folder with digest {expected[:12]}, originally {recorded}",
-        found=", ".join(f"{folder} with digest {digest[:12]}" for folder, digest in seen.items())
+        found=", ".join(f"{folder} with digest {digest[:12]}" for folder, digest in digests.items())
         or f"no CLIP model at {recorded} or in {', '.join(map(str, stores)) or 'any models/ folder'}",
         fix=f"fetch it (hilsplat models get), copy its folder into {user_models()}, or rerun the clip stage "
         "with a CLIP model that you have",

@@ -24,11 +24,11 @@ def maps_of(masks: HierarchicalMasks) -> tuple[Float32[np.ndarray, "4 H W"], Int
     maps, rows = [], []
     count = 0
     for level in MAPS:
-        mine = np.arange(len(masks)) if level is None else masks.rows_of(level)
+        of_level = np.arange(len(masks)) if level is None else masks.rows_of(level)
         labels = masks.label_map(level)
-        maps.append(np.where(labels >= 0, count + np.searchsorted(mine, labels), -1))
-        rows.append(mine)
-        count += len(mine)
+        maps.append(np.where(labels >= 0, count + np.searchsorted(of_level, labels), -1))
+        rows.append(of_level)
+        count += len(of_level)
     return np.stack(maps).astype(np.float32), np.concatenate(rows)
 
 

@@ -22,16 +22,16 @@ from hilsplat.embed.clip import ClipModel, unit
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.placement import placed
 from hilsplat.scene.scene import Scene
-from hilsplat.segment.digests import MASKS_SHA256, digest_of, index_entry
+from hilsplat.segment.digests import MASKS_SHA256, digest_of
 from hilsplat.segment.masks import HierarchicalMasks, runs_of_labels
-from hilsplat.segment.stage import train_views
+from hilsplat.segment.stage import train_views, write_masks
 from hilsplat.settings import ClipSettings
 
 logger = logging.getLogger(__name__)
 
-LEAST_SHARE = 0.5
+MIN_SHARE = 0.5
 """Minimum share of training views with files; if fewer, the files probably belong to a different scene."""
-CHECKED_MASKS, LEAST_COSINE = 32, 0.8
+CHECKED_MASKS, MIN_COSINE = 32, 0.8
 """Number of masks embedded again as a check, and the minimum median cosine with the vectors in the files.
 The same CLIP model reaches 0.99; a different model of the same width, about 0."""
 MAPS: tuple[Level | None, ...] = (None, Level.SUBPART, Level.PART, Level.WHOLE)
@@ -52,21 +52,19 @@ def stems_of(views: list[str]) -> dict[str, str]:
     return stems
 
 
-def read_view(
-    folder: Path, view: str, size_hw: tuple[int, int], camera: Camera | None = None
-) -> tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]:
+def read_view(folder: Path, camera: Camera) -> tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]:
     """Read the masks and vectors of one view, with rows in `content_order`.
 
     The mixed-level map is ignored. Where masks of one level overlap, the files contain only the mask
-    painted last. The files contain no scores, so predicted IoU and stability are set to 1. With the view's
-    camera, maps of its photograph or of a scaled copy, such as LangSplat's 1080 rows, are transferred to the
-    view (nearest pixel).
+    painted last. The files contain no scores, so predicted IoU and stability are set to 1. Maps of the
+    photograph or of a scaled copy, such as LangSplat's 1080 rows, are transferred to the view (nearest
+    pixel).
 
     Raises:
         ArtifactError: a file is missing, damaged, pickled, or in a different format.
-        MisalignedArtifactError: the maps have a different size, and fit neither camera nor photograph.
+        MisalignedArtifactError: the maps fit neither view nor photograph.
     """
-    maps_path, vectors_path = (folder / f"{stem_of(view)}_{kind}.npy" for kind in "sf")
+    maps_path, vectors_path = (folder / f"{stem_of(camera.name)}_{kind}.npy" for kind in "sf")
     maps, vectors = read_npy(maps_path), read_npy(vectors_path)
     if maps.ndim != 3 or len(maps) != len(MAPS) or not maps.size:
         shape = "an array of shape (4, height, width): default, s, m, l"
@@ -85,26 +83,20 @@ def read_view(
             found=f"row numbers from {maps.min():g} to {maps.max():g}",
             fix="use two files from the same preprocessing run",
         )
-    height, width = labels.shape[1:]
-    if (height, width) != size_hw and camera is None:
-        wrong = f"{maps_path} does not match the size of view {view}"
-        raise MisalignedArtifactError(wrong, expected=size_hw, found=(height, width))
-    if camera is not None:  # 0 is outside the photograph
-        labels = np.stack([placed(each + 1, camera, str(maps_path)) for each in labels]) - 1
     parts, vector_rows = [], []
-    for place, level in enumerate(MAPS):
+    for level, drawn in zip(MAPS, labels, strict=True):
         if level is None:
             continue
-        chosen = np.unique(labels[place])
-        chosen = chosen[chosen >= 0]
-        ones = np.ones(len(chosen), np.float32)
-        runs = runs_of_labels(labels[place], chosen)
-        parts.append(HierarchicalMasks.from_runs(*runs, level, ones, ones, size_hw))
-        vector_rows.append(chosen)
+        label_map = placed(drawn + 1, camera, str(maps_path)) - 1  # 0 is outside the photograph
+        rows = np.unique(label_map[label_map >= 0])
+        ones = np.ones(len(rows), np.float32)
+        runs = runs_of_labels(label_map, rows)
+        parts.append(HierarchicalMasks.from_runs(*runs, level, ones, ones, camera.size_hw))
+        vector_rows.append(rows)
     masks = HierarchicalMasks.concatenate(parts)
     order = masks.content_order()
-    found = vectors[np.concatenate(vector_rows)[order]].astype(np.float32)
-    return masks.take(order), unit(found).astype(np.float16)
+    vectors = vectors[np.concatenate(vector_rows)[order]].astype(np.float32)
+    return masks.take(order), unit(vectors).astype(np.float16)
 
 
 def _read_all(scene: Scene, folder: Path) -> dict[str, tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]]:
@@ -112,37 +104,29 @@ def _read_all(scene: Scene, folder: Path) -> dict[str, tuple[HierarchicalMasks, 
     maps = {view: f"{stem}_s.npy" for view, stem in stems_of(train_views(scene)).items()}
     views = [view for view, name in maps.items() if (folder / name).is_file()]
     missing = [name for view, name in maps.items() if view not in views]
-    lacking = f"{folder} lacks the maps of {len(missing)} of {len(maps)} training views of {scene.name}"
-    if len(views) < LEAST_SHARE * len(maps):
+    problem = f"{folder} lacks the maps of {len(missing)} of {len(maps)} training views of {scene.name}"
+    if len(views) < MIN_SHARE * len(maps):
         raise ArtifactError(
-            lacking,
+            problem,
             expected=", ".join(missing[:5]),
             found=", ".join(sorted(path.name for path in folder.glob("*_s.npy"))[:5]) or "none",
             fix="pass the language_features folder that LangSplat wrote for the same images",
         )
     if missing:
-        logger.warning("%s: %s", lacking, ", ".join(missing[:5]))
-    cameras = {view: scene.cameras[view] for view in views}
-    posed = track(list(cameras.items()), "LangSplat's files")
-    return {view: read_view(folder, view, camera.size_hw, camera) for view, camera in posed}
+        logger.warning("%s: %s", problem, ", ".join(missing[:5]))
+    return {view: read_view(folder, scene.cameras[view]) for view in track(views, "LangSplat's files")}
 
 
-def read_masks(scene_folder: Path, files: Path, out: Path) -> None:
-    """Write LangSplat's masks in the format of the masks stage: `<view>.npz` and `index.json`."""
+def run_imported_masks(scene_folder: Path, files: Path, out: Path) -> None:
+    """Write LangSplat's masks in the format of `segment.stage.write_masks`."""
     scene = Scene.load(scene_folder)
-    with stage_log("langsplat masks", scene.name) as counts, atomic_folder(out) as folder:
-        index = {}
-        for view, (masks, _) in _read_all(scene, files).items():
-            masks.save(folder / f"{view}.npz")
-            index[view] = index_entry(masks)
-        origin = {"segmenter": "langsplat", "model": None, "model_sha256": None}
-        partial = len(index) < len(train_views(scene))
-        write_index(folder, index, scene=scene.name, partial=partial, **origin)
-        counts.update(views=len(index))
+    with stage_log("langsplat masks", scene.name) as counts:
+        masks = {view: masks for view, (masks, _) in _read_all(scene, files).items()}
+        counts.update(write_masks(out, scene, masks.items(), len(masks), "langsplat"))
 
 
-def read_clip(scene_folder: Path, files: Path, out: Path, settings: ClipSettings) -> None:
-    """Write LangSplat's vectors in the format of the clip stage: `<view>.npy`, with rows as in `read_masks`.
+def run_imported_clip(scene_folder: Path, files: Path, out: Path, settings: ClipSettings) -> None:
+    """Write LangSplat's vectors in the format of the clip stage, with rows as in `run_imported_masks`.
 
     A MisalignedArtifactError is raised unless the vectors are those of `settings.model`, which embeds texts.
     """
@@ -150,9 +134,9 @@ def read_clip(scene_folder: Path, files: Path, out: Path, settings: ClipSettings
     model = ClipModel.load(Path(settings.model), variant=settings.variant)
     with stage_log("langsplat clip", scene.name) as counts, atomic_folder(out) as folder:
         index = {}
-        found = _read_all(scene, files)
-        _require_model(model, scene, files, found)
-        for view, (masks, vectors) in found.items():
+        views = _read_all(scene, files)
+        _require_model(model, scene, files, views)
+        for view, (masks, vectors) in views.items():
             write_npy(folder / f"{view}.npy", vectors)
             index[view] = {MASKS_SHA256: digest_of(masks), "masks": len(vectors)}
         write_index(folder, index, scene=scene.name, **model.about(settings), background="langsplat")
@@ -160,23 +144,24 @@ def read_clip(scene_folder: Path, files: Path, out: Path, settings: ClipSettings
 
 
 def _require_model(
-    model: ClipModel, scene: Scene, files: Path, found: dict[str, tuple[HierarchicalMasks, np.ndarray]]
+    model: ClipModel, scene: Scene, files: Path, views: dict[str, tuple[HierarchicalMasks, np.ndarray]]
 ) -> None:
     """Embed some masks of a view again, as LangSplat does, and compare the vectors.
 
     Comparing only widths would not distinguish all CLIP models.
     """
-    view = max(found, key=lambda view: len(found[view][0]))
-    masks, vectors = found[view]
+    view = max(views, key=lambda view: len(views[view][0]))
+    masks, vectors = views[view]
     model.require_width(vectors.shape[1], f"{files / stem_of(view)}_f.npy")
     rows = np.arange(len(masks))[:: max(1, len(masks) // CHECKED_MASKS)]
-    own = model.embed_masks(scene.image(view), masks, ClipSettings(crop="langsplat"), rows).astype(np.float32)
-    cosine = float(np.median((own * vectors[rows].astype(np.float32)).sum(axis=1))) if len(rows) else 1.0
+    again = model.embed_masks(scene.image(view), masks, ClipSettings(crop="langsplat"), rows)
+    cosines = (again.astype(np.float32) * vectors[rows].astype(np.float32)).sum(axis=1)
+    cosine = float(np.median(cosines)) if len(rows) else 1.0
     logger.info("the CLIP model in %s agrees with %s: median cosine %.3f", model.model.folder, files, cosine)
-    if cosine < LEAST_COSINE:
+    if cosine < MIN_COSINE:
         raise MisalignedArtifactError(
             f"the vectors in {files} were not computed by the CLIP model in {model.model.folder}",
-            expected=f"a median cosine of at least {LEAST_COSINE} with the model's vectors of the same masks",
+            expected=f"a median cosine of at least {MIN_COSINE} with the model's vectors of the same masks",
             found=f"{cosine:.3f} for {len(rows)} masks of {view}",
             fix="set clip.model to the model that computed them; LangSplat uses clip-vit-b-16-laion2b "
             "(hilsplat models get clip-vit-b-16-laion2b)",

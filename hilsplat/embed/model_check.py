@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -21,9 +21,10 @@ from hilsplat.segment.sam import SamModel
 CACHE = Path("results/.cache")
 """Folder for measured timings, and for int8 networks if the models folder is read-only."""
 IMAGE_NETWORKS = {"sam": "vision_encoder", "clip": "vision_model"}
-LARGEST_PROVIDER_DIFFERENCE = 0.02
+MAX_PROVIDER_DIFFERENCE = 0.02
 """Maximum relative difference attributed to rounding, such as that of TF32 products on CUDA."""
 Measured = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Result = TypeVar("Result")
 Seconds = dict[str, float]
 """Timings (s). SAM: "image" per image; "masks" and optional "preview" per prompt. CLIP: "crop" per crop."""
 
@@ -38,11 +39,10 @@ def check_model(folder: Path, variant: str = "") -> str:
     lines = [f"folder     {model.folder}", f"kind       {model.layout}", f"image      {side} x {side} px"]
     opened = SamModel(model) if model.kind == "sam" else ClipModel(model)
     precisions = ["fp32", "int8"] if considers_int8("auto", model, IMAGE_NETWORKS[model.kind]) else ["fp32"]
-    measured = {precision: _measure(opened, precision) for precision in precisions}
-    seconds = {precision: each for precision, each in measured.items() if each}
-    times = "; ".join(
-        f"{precision}: " + ", ".join(f"{value:.4f} s per {what}" for what, value in each.items())
-        for precision, each in seconds.items()
+    seconds = {name: times for name in precisions if (times := _measure(opened, name))}
+    listed = "; ".join(
+        f"{precision}: " + ", ".join(f"{value:.4f} s per {what}" for what, value in times.items())
+        for precision, times in seconds.items()
     )
     if isinstance(opened, SamModel):
         encoded = opened.encode(np.zeros((side, side, 3), np.uint8))
@@ -62,7 +62,7 @@ def check_model(folder: Path, variant: str = "") -> str:
         lines += [f"vectors    {vectors.shape[1]} dimensions"]
         providers = opened.vision.providers
     _remember(folder, variant, seconds, writable(CACHE))
-    lines += [f"time       {times}", f"runs on    {', '.join(providers)}", f"digest     {model.digest}"]
+    lines += [f"time       {listed}", f"runs on    {', '.join(providers)}", f"digest     {model.digest}"]
     return "\n".join(lines)
 
 
@@ -91,11 +91,13 @@ def provider_disagreement(folder: Path) -> str | None:
         provider: model.network(name, provider=provider)(pixel_values=pixels) for provider in providers
     }
     reference = outputs.pop("CPUExecutionProvider")
-    for provider, found in outputs.items():
-        pairs = zip(reference, found, strict=True)
-        apart = max(float(np.linalg.norm(a - b)) / max(float(np.linalg.norm(a)), 1e-12) for a, b in pairs)
-        if not apart <= LARGEST_PROVIDER_DIFFERENCE:
-            return f"{provider} differs from the CPU by {apart:.2g} times the output's norm"
+    for provider, values in outputs.items():
+        pairs = zip(reference, values, strict=True)
+        difference = max(
+            float(np.linalg.norm(a - b)) / max(float(np.linalg.norm(a)), 1e-12) for a, b in pairs
+        )
+        if not difference <= MAX_PROVIDER_DIFFERENCE:
+            return f"{provider} differs from the CPU by {difference:.2g} times the output's norm"
     return None
 
 
@@ -106,12 +108,12 @@ def seconds_of(folder: Path, variant: str, precision: str, cache: Path) -> Secon
     """
     model = open_model_folder(folder, variant=variant)
     requested = "int8" if considers_int8(precision, model, IMAGE_NETWORKS[model.kind]) else "fp32"
-    found = _known(cache).get(_key(folder, variant, requested), {})
-    if not found.keys() >= ({"crop"} if model.kind == "clip" else {"image", "masks"}):
+    seconds = _known(cache).get(_key(folder, variant, requested), {})
+    if not seconds.keys() >= ({"crop"} if model.kind == "clip" else {"image", "masks"}):
         opened = SamModel(model) if model.kind == "sam" else ClipModel(model)
-        found = _measure(opened, requested) or _measure(opened, "fp32")
-        _remember(folder, variant, {requested: found}, writable(cache))
-    return found
+        seconds = _measure(opened, requested) or _measure(opened, "fp32")
+        _remember(folder, variant, {requested: seconds}, writable(cache))
+    return seconds
 
 
 def _measure(model: SamModel | ClipModel, precision: str) -> Seconds:
@@ -127,21 +129,21 @@ def _measure(model: SamModel | ClipModel, precision: str) -> Seconds:
     encoder = model.int8_encoder(writable(CACHE)) if is_int8 else model.encoder
     if encoder is None:
         return {}
-    encoded, seconds = _second_call(lambda: model.encode(np.zeros((side, side, 3), np.uint8), encoder))
-    found = {"image": seconds}
-    prompts = model.prompts_per_call(1, 1)
-    for name, decode in (("masks", model.decode), ("preview", model.preview)):
-        if name == "masks" or model.previews:
-            _, seconds = _second_call(decode, encoded, np.full((prompts, 2), side / 2))
-            found[name] = seconds / prompts
-    return found
+    encoded, image_s = _second_call(lambda: model.encode(np.zeros((side, side, 3), np.uint8), encoder))
+    points = np.full((model.prompts_per_call(1, 1), 2), side / 2)
+    _, masks_s = _second_call(lambda: model.decode(encoded, points))
+    times = {"image": image_s, "masks": masks_s / len(points)}
+    if model.previews:
+        _, preview_s = _second_call(lambda: model.preview(encoded, points))
+        times["preview"] = preview_s / len(points)
+    return times
 
 
-def _second_call(call: Callable[..., Any], *given: object) -> tuple[Any, float]:
+def _second_call(call: Callable[[], Result]) -> tuple[Result, float]:
     """Return the result and duration (s) of a second call; the first call compiles and fills caches."""
-    call(*given)
+    call()
     start = time.perf_counter()
-    return call(*given), time.perf_counter() - start
+    return call(), time.perf_counter() - start
 
 
 def _key(folder: Path, variant: str, precision: str) -> str:
@@ -152,6 +154,6 @@ def _known(cache: Path) -> dict[str, Seconds]:
     return read_memo(cache / "model_seconds.json", dict[str, dict[str, Measured]])
 
 
-def _remember(folder: Path, variant: str, found: dict[str, Seconds], cache: Path) -> None:
-    measured = {_key(folder, variant, precision): seconds for precision, seconds in found.items()}
+def _remember(folder: Path, variant: str, by_precision: dict[str, Seconds], cache: Path) -> None:
+    measured = {_key(folder, variant, precision): seconds for precision, seconds in by_precision.items()}
     write_json(cache / "model_seconds.json", _known(cache) | measured)

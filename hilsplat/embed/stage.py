@@ -30,7 +30,6 @@ from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks, pixel
 from hilsplat.settings import ClipSettings
 
 FEW_CROPS = 10  # number of crops from which equal vectors show a broken model
-
 RERUN_MASKS = "rerun the masks stage for this scene"
 
 
@@ -102,29 +101,29 @@ def run_clip(
                 fix=RERUN_MASKS,
             )
         rows = np.arange(len(masks)) if chosen is None else chosen[view]
-        found = view_cache.find(key)
-        known = np.zeros((len(masks), model.width), np.float16)
-        if found is not None:
-            known[order] = found["clip"]
-        missing = rows[~known[rows].any(axis=1)]
+        entry = view_cache.find(key)
+        cached = np.zeros((len(masks), model.width), np.float16)
+        if entry is not None:
+            cached[order] = entry["clip"]
+        missing = rows[~cached[rows].any(axis=1)]
         if len(missing):
-            known[missing] = model.embed_masks(scene.image(view), masks, settings, missing)
-            view_cache.put(key, {"clip": known[order]})
+            cached[missing] = model.embed_masks(scene.image(view), masks, settings, missing)
+            view_cache.put(key, {"clip": cached[order]})
         else:
             view_cache.hits += 1
-        vectors = np.zeros_like(known)
-        vectors[rows] = known[rows]
+        vectors = np.zeros_like(cached)
+        vectors[rows] = cached[rows]
         return vectors
 
     with stage_log("clip", scene.name) as counts, atomic_folder(out) as folder:
         index: dict[str, dict[str, Any]] = {}
         distinct = set[bytes]()
-        made = in_order(embed, views, threads)
-        for view, vectors in zip(views, track(made, "CLIP of views", len(views)), strict=True):
+        embedded = track(in_order(embed, views, threads), "CLIP of views", len(views))
+        for view, vectors in zip(views, embedded, strict=True):
             write_npy(folder / f"{view}.npy", vectors)
-            crops = int(vectors.any(axis=1).sum())
-            distinct.update(vector.tobytes() for vector in vectors[vectors.any(axis=1)][:FEW_CROPS])
-            index[view] = {MASKS_SHA256: digests[view], "masks": len(vectors), "crops": crops}
+            crops = vectors[vectors.any(axis=1)]
+            distinct.update(vector.tobytes() for vector in crops[:FEW_CROPS])
+            index[view] = {MASKS_SHA256: digests[view], "masks": len(vectors), "crops": len(crops)}
         more = {"precision": model.precision, "background": settings.background}
         if len(distinct) == 1 and sum(entry["crops"] for entry in index.values()) >= FEW_CROPS:
             raise ModelError(
@@ -151,28 +150,25 @@ def _choose_precision(
         return
     entries = read_index(masks_folder)["views"]
     rows = chosen or {view: np.arange(entries[view]["whole"]) for view in digests}
-    places = [(view, row) for view in digests for row in rows[view].tolist()]
-    places = places[:: max(1, len(places) // CHECKED_CROPS)][:CHECKED_CROPS]
-    if not places:
-        return
-    crops = np.stack(
-        [
-            model.crop(scene.image(view), load_masks(masks_folder, view, digests), row, settings)
-            for view, row in places
-        ]
-    )
-    quantised = int8_network(model.model, "vision_model", cache)
+    pairs = [(view, row) for view in digests for row in rows[view].tolist()]
+    pairs = pairs[:: max(1, len(pairs) // CHECKED_CROPS)][:CHECKED_CROPS]
+    quantised = int8_network(model.model, "vision_model", cache) if pairs else None
     if quantised is None:
         return
 
-    def both(one: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        (found,) = quantised(**{model.pixels: model.prepare(one[None])})
-        return model.embed_crops(one[None]), unit(found)
+    def crop(pair: tuple[str, int]) -> np.ndarray:
+        view, row = pair
+        return model.crop(scene.image(view), load_masks(masks_folder, view, digests), row, settings)
+
+    def embed_twice(crop: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        (vectors,) = quantised(**{model.pixels: model.prepare(crop[None])})
+        return model.embed_crops(crop[None]), unit(vectors)
 
     def measure() -> dict[str, float]:
-        pairs = zip(*in_order(both, list(crops), threads), strict=True)
-        full, found = (np.concatenate(each) for each in pairs)
-        return agreement_of_vectors(full, found, model.embed_texts(list(WORDS)))
+        full, int8 = map(np.concatenate, zip(*in_order(embed_twice, list(crops), threads), strict=True))
+        return agreement_of_vectors(full, int8, model.embed_texts(list(WORDS)))
+
+    crops = np.stack(list(map(crop, pairs)))
 
     inputs = {"model": model.digest, "crops": sha256_of_bytes(crops.tobytes()), "words": WORDS}
     if use_int8(settings.precision, "CLIP", cache, inputs, measure):

@@ -21,25 +21,25 @@ def mask_embeddings(clip_folder: Path, folder: Path) -> Float32[np.ndarray, "M C
         MisalignedArtifactError: the vectors were computed from other masks.
     """
     views = require_same_masks(clip_folder, folder)
-    parts = {view: read_npy(sealed(clip_folder, f"{view}.npy")) for view in views}
-    widths = {part.shape[1] if part.ndim == 2 else -1 for part in parts.values()}
+    vectors = {view: read_npy(sealed(clip_folder, f"{view}.npy")) for view in views}
+    widths = {part.shape[1] if part.ndim == 2 else -1 for part in vectors.values()}
     if len(widths) > 1 or -1 in widths:
         raise ArtifactError(
             f"the CLIP vectors in {clip_folder} differ in width",
-            found=", ".join(f"{view}: {part.shape}" for view, part in parts.items())[:300],
+            found=", ".join(f"{view}: {part.shape}" for view, part in vectors.items())[:300],
             fix=rebuild_command(clip_folder),
         )
-    for view, part in parts.items():
+    for view, part in vectors.items():
         lengths = np.linalg.norm(part.astype(np.float32), axis=1)
-        wrong = ~((lengths == 0) | (np.abs(lengths - 1) < UNIT_TOLERANCE))  # also NaN
-        if wrong.any():
+        invalid = ~((lengths == 0) | (np.abs(lengths - 1) < UNIT_TOLERANCE))  # also NaN
+        if invalid.any():
             raise ArtifactError(
-                f"{np.count_nonzero(wrong)} CLIP vectors of {view} in {clip_folder} are invalid",
+                f"{np.count_nonzero(invalid)} CLIP vectors of {view} in {clip_folder} are invalid",
                 expected="vectors of length 1, or 0 for crops that were not embedded",
-                found=f"length {lengths[wrong][0]}",
+                found=f"length {lengths[invalid][0]}",
                 fix=rebuild_command(clip_folder),
             )
-    return np.concatenate(list(parts.values()), dtype=np.float32)
+    return np.concatenate(list(vectors.values()), dtype=np.float32)
 
 
 def require_every_vector(vectors: Shaped[np.ndarray, "M C"], clip_folder: Path, purpose: str) -> None:

@@ -57,10 +57,10 @@ class ModelRequest:
             problem = f"{name!r} is not a repository name: {error}"
             raise DownloadError(problem, fix="write owner/name") from error
         if name.count("/") != 1:
-            known = ", ".join(release.name for release in RELEASES)
+            names = ", ".join(release.name for release in RELEASES)
             raise DownloadError(
                 f"unknown model {name!r}",
-                expected=f"{known}, or owner/name on the hub",
+                expected=f"{names}, or owner/name on the hub",
                 fix="choose one from `hilsplat models list`, or write owner/name",
             )
         return ModelRequest(f"{name.split('/')[1]}{ending}", name, None)
@@ -142,15 +142,16 @@ def read_listing(repository: str, revision: str | None) -> Listing:
             found=f"{type(error).__name__}: {first_line(error)}",
             fix="unset HF_ENDPOINT, or set it to a complete mirror; a proxy may also have answered",
         ) from error
-    known, files = _pinned_digests(repository, str(info.sha)), {}
-    for each in info.siblings or ():
-        if not _is_inside(each.rfilename):
+    pinned, files = _pinned_digests(repository, str(info.sha)), {}
+    for file in info.siblings or ():
+        path = file.rfilename
+        if not _is_inside(path):
             continue  # valid repositories have no such path; the file would be written outside the folder
-        digest = known.get(each.rfilename) or (each.lfs.sha256 if each.lfs else each.blob_id)
-        if digest is None or each.size is None:
-            problem = f"{constants.ENDPOINT} reports no size or digest for {each.rfilename} (?blobs=true)"
+        digest = pinned.get(path) or (file.lfs.sha256 if file.lfs else file.blob_id)
+        if digest is None or file.size is None:
+            problem = f"{constants.ENDPOINT} reports no size or digest for {path} (?blobs=true)"
             raise DownloadError(problem, fix="unset HF_ENDPOINT, or set it to a complete mirror")
-        files[each.rfilename] = HubFile(each.rfilename, each.size, digest)
+        files[path] = HubFile(path, file.size, digest)
     licence = getattr(info.card_data, "license", None)
     return Listing(repository, str(info.sha), first_line(licence) if licence else "", files)
 
@@ -162,10 +163,10 @@ def read_cached_listing(repository: str, revision: str | None) -> Listing | None
     except LocalEntryNotFoundError:
         return None
     snapshot = Path(folder)
-    known, files = _pinned_digests(repository, snapshot.name), {}
-    for file in [path for path in snapshot.rglob("*") if path.is_file()]:
+    pinned, files = _pinned_digests(repository, snapshot.name), {}
+    for file in filter(Path.is_file, snapshot.rglob("*")):
         path = file.relative_to(snapshot).as_posix()
-        files[path] = HubFile(path, file.stat().st_size, known.get(path) or file.resolve().name, file)
+        files[path] = HubFile(path, file.stat().st_size, pinned.get(path) or file.resolve().name, file)
     return Listing(repository, snapshot.name, "", files)
 
 
@@ -207,12 +208,14 @@ def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
         )
     layout, ending = LAYOUTS[kind], f"_{variant}" if variant else ""
     for networks in (networks_of(kind), [WHOLES if kind in ("clip", "siglip") else ()]):
-        present = [[place for place in each if f"{place}{ending}.onnx" in listing.files] for each in networks]
+        present = [
+            [place for place in places if f"{place}{ending}.onnx" in listing.files] for places in networks
+        ]
         if all(present):
-            places = [each[0] for each in present]
+            chosen = [places[0] for places in present]
             listing.require(*layout.described)
             plain = [*layout.described, *(path for path in layout.beside if path in listing.files)]
-            files = {f"{place}{ending}.onnx": f"{place}.onnx" for place in places}
+            files = {f"{place}{ending}.onnx": f"{place}.onnx" for place in chosen}
             # external weights keep their names, because the networks refer to them by name
             prefixes = tuple(f"{network}{mark}data" for network in files for mark in "_.")
             weights = [path for path in listing.files if path.startswith(prefixes)]

@@ -11,7 +11,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -41,10 +41,10 @@ from hilsplat.hub.catalogue import (
 )
 from hilsplat.hub.pins import pins
 from hilsplat.hub.retries import WRONG_LENGTH, reason_of, repeated
-from hilsplat.models.folder import ModelFolder, input_side_px, preprocessing_of
+from hilsplat.models.folder import ModelFolder, preprocessing_of
 from hilsplat.models.int8 import LARGE_BYTES
 from hilsplat.models.layouts import LAYOUTS, layout_of
-from hilsplat.models.memory import needs
+from hilsplat.models.memory import needs_of
 from hilsplat.models.onnx_graph import external_files, split_clip, whole_clip
 from hilsplat.models.store import RECOMMENDED, real_model, user_models
 
@@ -67,8 +67,6 @@ NEEDED = ("optimum-onnx", "transformers", "torch")
 """Packages that an export requires."""
 INSTALL = "pip install --constraint constraints.txt --editable '.[export]'"
 LAST_LINES = 15  # number of lines of the exporter's output shown in an error
-
-
 BETWEEN = (
     (
         requests.exceptions.SSLError,
@@ -85,8 +83,8 @@ BETWEEN = (
 
 
 @dataclass(frozen=True)
-class Prepared:
-    """A model whose required files are known."""
+class Download:
+    """A model to download, with the required files."""
 
     requested: ModelRequest
     listing: Listing
@@ -123,27 +121,27 @@ def get_models(
         logger.info("downloading the recommended pair: %s", " and ".join(RECOMMENDED))
     if revision is not None and len(names) != 1:
         raise DownloadError(f"--revision requires one model, found {len(names)} names", fix="pass one model")
-    prepared, texts = [], []
+    downloads, reports = [], []
     for name in names or RECOMMENDED:
         requested = ModelRequest.named(name, variant)
         target = models / requested.name
         with explain_refusals(requested, models):
             listing = _listing(requested, revision)
             if _is_present(requested, target, listing):
-                texts.append(f"{target} already exists, from {listing.repository} at {listing.revision}")
+                reports.append(f"{target} already exists, from {listing.repository} at {listing.revision}")
             else:
-                prepared.append(_prepare(requested, listing, target, variant))
-    if prepared:
-        fetched = sum(each.num_bytes(missing=True) for each in prepared)
-        made = sum(each.num_bytes() * (EXPORT_FACTOR - 1) for each in prepared if each.choice.exported)
+                downloads.append(_prepare(requested, listing, target, variant))
+    if downloads:
+        missing = sum(download.num_bytes(missing=True) for download in downloads)
+        exports = sum(download.num_bytes() for download in downloads if download.choice.exported)
         free = shutil.disk_usage(models).free
-        logger.info("%.1f MB to download; %.1f GB free on the disk of %s", fetched / 1e6, free / 1e9, models)
-        require_free_space(models, (fetched + made + SPARE_BYTES) / 2**20)
-    for found in prepared:
-        with explain_refusals(found.requested, models), output_lock(found.target):
-            texts.append(_install(found))
+        logger.info("%.1f MB to download; %.1f GB free on the disk of %s", missing / 1e6, free / 1e9, models)
+        require_free_space(models, (missing + exports * (EXPORT_FACTOR - 1) + SPARE_BYTES) / 2**20)
+    for download in downloads:
+        with explain_refusals(download.requested, models), output_lock(download.target):
+            reports.append(_install(download))
     used = [model.name for family in ("sam", "clip") if (model := real_model(family)) is not None]
-    return "\n\n".join([*texts, f"photographs use {' and '.join(used)}"])
+    return "\n\n".join([*reports, f"photographs use {' and '.join(used)}"])
 
 
 def _is_present(requested: ModelRequest, target: Path, listing: Listing) -> bool:
@@ -199,7 +197,7 @@ def _listing(requested: ModelRequest, revision: str | None) -> Listing:
         return cached
 
 
-def _prepare(requested: ModelRequest, listing: Listing, target: Path, variant: str) -> Prepared:
+def _prepare(requested: ModelRequest, listing: Listing, target: Path, variant: str) -> Download:
     """Choose the files to download according to the repository's config.json."""
     staging = target.with_name(STAGING.format(name=target.name))
     if staging.exists() and not is_tagged(staging):
@@ -207,89 +205,77 @@ def _prepare(requested: ModelRequest, listing: Listing, target: Path, variant: s
     tag(staging)
     (config,) = listing.require("config.json")
     choice = choose_files(listing, _fetch(listing, config, staging).read_bytes(), variant)
-    found = Prepared(requested, listing, choice, staging, target, variant)
+    download = Download(requested, listing, choice, staging, target, variant)
     licence = requested.release.licence if requested.release else "not stated by the hub"
     source = f"{requested.name}: {requested.repository} at {listing.revision[:12]}"
-    size = f"{found.num_bytes() / 1e6:.1f} MB in {len(choice.files)} files"
-    left = f"{found.num_bytes(missing=True) / 1e6:.1f} MB still to download"
+    size = f"{download.num_bytes() / 1e6:.1f} MB in {len(choice.files)} files"
+    left = f"{download.num_bytes(missing=True) / 1e6:.1f} MB still to download"
     logger.info("%s, %s, %s; licence: %s", source, size, left, listing.licence or licence)
-    logger.info("%s: %s", requested.name, _needs(found))
+    logger.info("%s: %s", requested.name, _needs(download))
     if choice.exported:
         require_exporter(requested.repository)
-    return found
+    return download
 
 
-def _needs(found: Prepared) -> str:
+def _needs(download: Download) -> str:
     """Describe the disk space and memory that a model needs."""
-    config = read_json(found.staging / "config.json")
+    config = read_json(download.staging / "config.json")
     layout = layout_of(config)
     assert layout is not None  # `choose_files` refuses other models
-    (file,) = found.listing.require(LAYOUTS[layout].preprocessing)
-    preprocessing = preprocessing_of(_fetch(found.listing, file, found.staging))
-    model = ModelFolder(found.staging, layout, config, preprocessing, {}, ())
-    num_bytes, is_reduced = found.num_bytes(), bool(found.variant)
-    memory = needs(
-        layout, config, input_side_px(model), num_bytes, BATCHES[model.kind], as_exported=is_reduced
-    )
+    (file,) = download.listing.require(LAYOUTS[layout].preprocessing)
+    preprocessing = preprocessing_of(_fetch(download.listing, file, download.staging))
+    model = ModelFolder(download.staging, layout, config, preprocessing, {}, ())
+    num_bytes, is_reduced = download.num_bytes(), bool(download.variant)
+    memory = needs_of(model, BATCHES[model.kind], as_exported=is_reduced, num_bytes=num_bytes)
     memory_mib, has_int8 = memory.total_mib(1), not is_reduced and num_bytes <= LARGE_BYTES
     disk = f"needs {num_bytes * (1 + INT8_SHARE * has_int8) / 1e6:.0f} MB of disk space"
     disk += " with its int8 networks" * has_int8
-    export = f"; its export needs about {3 * num_bytes / 1e9:.1f} GB" if found.choice.exported else ""
+    export = f"; its export needs about {3 * num_bytes / 1e9:.1f} GB" if download.choice.exported else ""
     return f"{disk}, and about {memory_mib * 2**20 / 1e9:.1f} GB of memory on a CPU{export}"
 
 
-def _install(found: Prepared) -> str:
+def _install(download: Download) -> str:
     """Download all files, complete and check the model in a new folder, and replace the target by it."""
-    listing, choice = found.listing, found.choice
-    for path in track(list(choice.files), f"files of {found.requested.name}"):
-        _fetch(listing, listing.files[path], found.staging)
-    if more := _further_weights(found):
-        for path in more:
-            _fetch(listing, listing.files[path], found.staging)
-        choice = replace(choice, files={**choice.files, **more})
-        found = replace(found, choice=choice)
-    with atomic_folder(found.target) as made:
+    listing, staging, files = download.listing, download.staging, dict(download.choice.files)
+    for path in track(list(files), f"files of {download.requested.name}"):
+        _fetch(listing, listing.files[path], staging)
+    for network in [path for path in files if path.endswith(".onnx")]:
+        for name in external_files(staging / network):  # weights in files of any name
+            path = (Path(network).parent / name).as_posix()
+            if path in listing.files and path not in files:
+                _fetch(listing, listing.files[path], staging)
+                files[path] = path
+    with atomic_folder(download.target) as folder:
         versions = {}
-        if choice.exported:
-            versions = {"exported": export_networks(found.staging, made)}
+        if download.choice.exported:
+            versions = {"exported": export_networks(staging, folder)}
         else:
-            for path, place in choice.files.items():
-                (made / place).parent.mkdir(parents=True, exist_ok=True)
+            for path, place in files.items():
+                (folder / place).parent.mkdir(parents=True, exist_ok=True)
                 try:
-                    (made / place).hardlink_to(found.staging / path)
+                    (folder / place).hardlink_to(staging / path)
                 except OSError:  # the file system has no hard links
-                    shutil.copyfile(found.staging / path, made / place)
-        text = _complete(found, made, **versions)
-        _keep_others(found.target, made)
-    delete(found.staging, STAGING.format(name=re.escape(found.target.name)))
-    return text
+                    shutil.copyfile(staging / path, folder / place)
+        report = _complete(folder, download.target, listing.require(*sorted(files)), listing, **versions)
+        _keep_others(download.target, folder)
+    delete(staging, STAGING.format(name=re.escape(download.target.name)))
+    return report
 
 
-def _keep_others(former: Path, made: Path) -> None:
+def _keep_others(former: Path, folder: Path) -> None:
     """Copy the files that a former version did not download, such as a vocabulary, into the new version."""
-    held = {ORIGIN, *(read_json(former / ORIGIN)["holds"] if former.exists() else ())}
+    downloaded = {ORIGIN, *(read_json(former / ORIGIN)["holds"] if former.exists() else ())}
     for path in former.rglob("*"):
-        place = made / path.relative_to(former)
-        if path.is_dir() or path.relative_to(former).as_posix() in held:
+        name = path.relative_to(former)
+        if path.is_dir() or name.as_posix() in downloaded:
             continue
-        if place.exists():
+        if (folder / name).exists():
             raise DownloadError(
                 f"{path} was not downloaded, and the new version has a file of this name",
                 fix="rename or move it, then run the command again",
             )
-        place.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy2(path, place, follow_symlinks=False)
-
-
-def _further_weights(found: Prepared) -> dict[str, str]:
-    """Return further files of the repository to which the downloaded networks refer, in any name."""
-    listed = [
-        (Path(path).parent / name).as_posix()
-        for path in found.choice.files
-        if path.endswith(".onnx")
-        for name in external_files(found.staging / path)
-    ]
-    return {path: path for path in listed if path in found.listing.files and path not in found.choice.files}
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(path, folder / name, follow_symlinks=False)
 
 
 def _fetch(listing: Listing, file: HubFile, staging: Path) -> Path:
@@ -300,13 +286,13 @@ def _fetch(listing: Listing, file: HubFile, staging: Path) -> Path:
     else:
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(file.cached, target)
-    found, size = file.digest_of(target), target.stat().st_size
-    if found != file.digest:
+    digest, size = file.digest_of(target), target.stat().st_size
+    if digest != file.digest:
         delete(target, re.escape(target.name))
         raise DownloadError(
             f"{file.path} of {listing.repository} does not have the expected digest",
             expected=f"digest {file.digest}, {file.size} bytes",
-            found=f"digest {found}, {size} bytes; the file was deleted",
+            found=f"digest {digest}, {size} bytes; the file was deleted",
             fix="run the command again; if the error persists, a proxy or mirror probably modifies the file",
         )
     return target
@@ -337,27 +323,29 @@ def _download(listing: Listing, file: HubFile, staging: Path) -> None:
         ) from error
 
 
-def _complete(found: Prepared, made: Path, **more: Any) -> str:
+def _complete(folder: Path, target: Path, files: list[HubFile], listing: Listing, **more: Any) -> str:
     """Check a model folder, write `origin.json` into it, and return the report."""
-    if whole := whole_clip(made):
-        split_clip(made)
+    if whole := whole_clip(folder):
+        split_clip(folder)
         delete(whole)
-    text = check_model(made).replace(str(made), str(found.target))
-    files = [path for path in sorted(made.rglob("*")) if path.is_file() and path.name != ORIGIN]
-    fetched = []
-    for path in sorted(found.choice.files):
-        file = found.listing.files[path]
-        kind = "sha256" if len(file.digest) == 64 else "git_sha1"
-        fetched.append({"path": path, "bytes": file.size, kind: file.digest})
+    report = check_model(folder).replace(str(folder), str(target))
+    contents = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != ORIGIN]
     origin = {
-        "repository": found.listing.repository,
-        "revision": found.listing.revision,
-        "files": fetched,
+        "repository": listing.repository,
+        "revision": listing.revision,
+        "files": [
+            {
+                "path": file.path,
+                "bytes": file.size,
+                "sha256" if len(file.digest) == 64 else "git_sha1": file.digest,
+            }
+            for file in files
+        ],
         **more,
-        "holds": {path.relative_to(made).as_posix(): path.stat().st_size for path in files},
+        "holds": {path.relative_to(folder).as_posix(): path.stat().st_size for path in contents},
     }
-    write_json(made / ORIGIN, origin)
-    return text
+    write_json(folder / ORIGIN, origin)
+    return report
 
 
 @contextmanager

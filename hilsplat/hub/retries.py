@@ -16,7 +16,7 @@ logger = logging.getLogger(__name__)
 
 WAITS_S = (1.0, 2.0, 4.0, 8.0)
 """Waiting times between attempts."""
-LONGEST_S = 120.0
+MAX_WAIT_S = 120.0
 """Longest waiting time accepted from a `Retry-After` header."""
 BROKEN = (requests.ConnectionError, requests.Timeout, requests.exceptions.ChunkedEncodingError)
 """Errors raised by a broken connection."""
@@ -58,7 +58,7 @@ def _pause_s(error: Exception, wait_s: float) -> float | None:
         if status != 429 and status < 500:
             return None
         asked_s = retry_after_s(reason.response)
-        return None if asked_s > LONGEST_S else max(wait_s, asked_s)
+        return None if asked_s > MAX_WAIT_S else max(wait_s, asked_s)
     if isinstance(reason, BROKEN) or str(reason).startswith(WRONG_LENGTH):
         return wait_s
     return None

@@ -15,7 +15,15 @@ from pydantic import AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field
 from hilsplat.base.artifacts import read_json
 from hilsplat.base.errors import ArtifactError, ModelError
 from hilsplat.base.lineage import sha256_of_file, sha256_of_json
-from hilsplat.models.layouts import LAYOUTS, OTHER_TYPES, SECTIONS, SUPPORTED, TORCH_SUFFIXES, layout_of
+from hilsplat.models.layouts import (
+    LAYOUTS,
+    OTHER_TYPES,
+    SECTIONS,
+    SUPPORTED,
+    TORCH_SUFFIXES,
+    Layout,
+    layout_of,
+)
 from hilsplat.models.network import Network
 from hilsplat.models.onnx_graph import Graph, external_files, whole_clip
 from hilsplat.models.store import model_path
@@ -112,30 +120,30 @@ def open_model_folder(
     alternative = f", or {fix}" if fix else ""
     if not folder.is_dir():
         raise ModelError(f"model folder {folder} is missing", fix=OTHER_FOLDER + alternative)
-    name, config = _layout_of(folder, kind, OTHER_FOLDER + alternative)
+    name, config = _read_config(folder, kind, OTHER_FOLDER + alternative)
     layout = LAYOUTS[name]
     ending = f"_{variant}.onnx" if variant else ".onnx"
     networks, missing = {}, []
     for network, spec in layout.usable.items():
-        places = [folder / f"{place}{ending}" for place in spec.places]
-        found = next((place for place in places if place.is_file()), None)
-        if found is not None:
-            networks[network] = found
+        paths = [folder / f"{place}{ending}" for place in spec.places]
+        existing = next(filter(Path.is_file, paths), None)
+        if existing is not None:
+            networks[network] = existing
         elif network in layout.networks:
             missing.append(f"{spec.places[-1]}{ending}")
     missing += [file for file in layout.described if not (folder / file).is_file()]
     if missing:
-        raise _incomplete(folder, name, missing, variant, alternative)
+        raise _incomplete(folder, name, missing, alternative)
     preprocessing = preprocessing_of(folder / layout.preprocessing)
     weights = [path for network in networks.values() for path in external_weights(network)]
-    described = [folder / file for file in (*layout.described, *layout.beside) if (folder / file).is_file()]
-    files = tuple(sorted({*described, *networks.values(), *weights}))
+    texts = filter(Path.is_file, (folder / file for file in (*layout.described, *layout.beside)))
+    files = tuple(sorted({*texts, *networks.values(), *weights}))
     return ModelFolder(folder, name, config, preprocessing, networks, files)
 
 
-def _layout_of(folder: Path, kind: str | None, fix: str) -> tuple[str, dict[str, Any]]:
+def _read_config(folder: Path, kind: str | None, fix: str) -> tuple[str, dict[str, Any]]:
     """Return a folder's layout and configuration; raise a ModelError for a different kind of model."""
-    supported = "; ".join(SUPPORTED[each] for each in ([kind] if kind else SUPPORTED))
+    supported = SUPPORTED[kind] if kind else "; ".join(SUPPORTED.values())
     try:
         config = read_json(folder / "config.json")
     except ArtifactError as error:
@@ -157,42 +165,41 @@ def _layout_of(folder: Path, kind: str | None, fix: str) -> tuple[str, dict[str,
     return name, config
 
 
-def _incomplete(folder: Path, name: str, missing: list[str], variant: str, alternative: str) -> ModelError:
-    """Return the error for a folder that lacks files: what was found instead, and how to fix it."""
+def _incomplete(folder: Path, name: str, missing: list[str], alternative: str) -> ModelError:
     layout = LAYOUTS[name]
-    found = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
-    expected = [*layout.described, *(f"{spec.places[-1]}.onnx" for spec in layout.networks.values())]
-    variants = variants_of(folder, name)
+    files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    variants = _variants(folder, layout)
     if any(file.endswith(".onnx") for file in missing) and variants:
-        listed = ", ".join(repr(each) for each in variants)
-        remedy = f"its networks have suffixes: set {SECTIONS[layout.kind]}.variant to one of {listed}"
+        listed = ", ".join(map(repr, variants))
+        fix = f"its networks have suffixes: set {SECTIONS[layout.kind]}.variant to one of {listed}"
     elif layout.kind == "clip" and whole_clip(folder):
-        remedy = f"split its single network into the required two: hilsplat models split {folder}"
-    elif any(file.endswith(TORCH_SUFFIXES) for file in found) and not any(folder.rglob("*.onnx")):
-        remedy = (
+        fix = f"split its single network into the required two: hilsplat models split {folder}"
+    elif any(file.endswith(TORCH_SUFFIXES) for file in files) and not any(folder.rglob("*.onnx")):
+        fix = (
             "these are PyTorch weights, but hilsplat reads ONNX networks: fetch an ONNX export of the model "
             "(hilsplat models get), or export it (docs/models.md)"
         )
     else:
-        remedy = "fetch or export the complete model again"
+        fix = "fetch or export the complete model again"
     return ModelError(
         f"model folder {folder} lacks {', '.join(missing)}",
-        expected=", ".join(expected),
-        found=", ".join(found[:20]),
-        fix=remedy + alternative,
+        expected=", ".join(
+            [*layout.described, *(f"{spec.places[-1]}.onnx" for spec in layout.networks.values())]
+        ),
+        found=", ".join(files[:20]),
+        fix=fix + alternative,
     )
 
 
-def variants_of(folder: Path, layout: str) -> list[str]:
+def _variants(folder: Path, layout: Layout) -> list[str]:
     """Return the suffixes, such as `fp16`, for which a folder has all networks; "" for the plain names."""
-    found = []
-    for spec in LAYOUTS[layout].networks.values():
-        rests = set[str]()
+    suffixes = []
+    for spec in layout.networks.values():
+        endings = set[str]()
         for place in spec.places:
-            plain = Path(place).name
-            rests |= {path.stem.removeprefix(plain) for path in folder.glob(f"{place}*.onnx")}
-        found.append({rest[1:] for rest in rests if rest[:1] in ("", "_")})
-    return sorted(set.intersection(*found))
+            endings |= {path.stem.removeprefix(Path(place).name) for path in folder.glob(f"{place}*.onnx")}
+        suffixes.append({ending[1:] for ending in endings if ending[:1] in ("", "_")})
+    return sorted(set.intersection(*suffixes))
 
 
 def preprocessing_of(path: Path) -> dict[str, Any]:
@@ -201,7 +208,7 @@ def preprocessing_of(path: Path) -> dict[str, Any]:
     A ModelError is raised if the file is unreadable, disables a step, or contains an invalid value.
     """
     try:
-        found = Preprocessing.model_validate(read_json(path)).model_dump(exclude_none=True)
+        values = Preprocessing.model_validate(read_json(path)).model_dump(exclude_none=True)
     except ArtifactError as error:
         raise ModelError(f"{path} cannot be read: {error}", fix=WHOLE_COPY) from error
     except ValidationError as error:
@@ -209,16 +216,16 @@ def preprocessing_of(path: Path) -> dict[str, Any]:
         problem = f"{path}: {fault['loc'][0] if fault['loc'] else 'its content'} is invalid"
         value = str(fault["input"])[:80]
         raise ModelError(problem, expected=fault["msg"], found=value, fix=WHOLE_COPY) from error
-    switches = SWITCHES if "pad_size" not in found else (*SWITCHES, "do_pad")
-    if switched_off := [key for key in switches if found.get(key) is False]:
+    switches = SWITCHES if "pad_size" not in values else (*SWITCHES, "do_pad")
+    if switched_off := [key for key in switches if values.get(key) is False]:
         raise ModelError(
             f"{path} disables {', '.join(switched_off)}",
             expected="images resized, divided by 255 and normalised, as in the released models",
             fix="export the model again with its own preprocessor",
         )
-    if found.get("pad_size", MAX_SIDE_PX) < found.get("size", SAM_SIDE_PX):
+    if values.get("pad_size", MAX_SIDE_PX) < values.get("size", SAM_SIDE_PX):
         raise ModelError(f"{path}: pad_size is smaller than size", fix=WHOLE_COPY)
-    return found
+    return values
 
 
 def external_weights(network: Path) -> list[Path]:
@@ -226,7 +233,7 @@ def external_weights(network: Path) -> list[Path]:
 
     A ModelError is raised if such a file is missing, or named by a path that leads out of the folder.
     """
-    found = []
+    paths = []
     for name in external_files(network):
         path = network.parent / name
         if Path(name).is_absolute() or ".." in Path(name).parts or not path.is_file():
@@ -236,8 +243,8 @@ def external_weights(network: Path) -> list[Path]:
                 found=", ".join(sorted(other.name for other in network.parent.iterdir())),
                 fix=WHOLE_COPY,
             )
-        found.append(path)
-    return found
+        paths.append(path)
+    return paths
 
 
 def input_side_px(model: ModelFolder) -> int:

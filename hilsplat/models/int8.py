@@ -13,9 +13,8 @@ from hilsplat.base.atomic import atomic_path
 from hilsplat.base.cache import ViewCache
 from hilsplat.base.lineage import sha256_of_json
 from hilsplat.base.removal import is_unfinished
-from hilsplat.models.fast_paths import or_as_exported
 from hilsplat.models.folder import ModelFolder, external_weights, input_side_px
-from hilsplat.models.network import CPU, Network, execution_providers
+from hilsplat.models.network import CPU, Network, execution_providers, or_as_exported
 from hilsplat.models.onnx_graph import Graph, needed_names
 from hilsplat.models.repeatable import random_pixels, require_repeatable_once
 
@@ -31,7 +30,7 @@ WORDS = (
 )
 """Texts ranked for each crop: the canonical phrases of LERF and everyday words."""
 
-LEAST = {"mask IoU": 0.98, "cosine": 0.99, "rank correlation": 0.95}
+MIN_AGREEMENT = {"mask IoU": 0.98, "cosine": 0.99, "rank correlation": 0.95}
 """Minimum agreement of int8 with float32: mean IoU of masks from the same prompts, mean cosine of vectors,
 and rank correlation of `WORDS` by cosine with a crop. Two crops of one object from neighbouring views agree
 less."""
@@ -102,16 +101,15 @@ def _quantise(source: Graph, out: Path, exact: Sequence[str]) -> None:
                 per_channel=True,
                 weight_type=QuantType.QInt8,
                 op_types_to_quantize=["MatMul", "Gemm"],
-                nodes_to_exclude=_leading_only_to(graph.graph, exact),
+                nodes_to_exclude=_nodes_only_for(graph.graph, exact),
             )
     finally:
         logging.disable(logging.NOTSET)
 
 
-def _leading_only_to(graph: Any, outputs: Sequence[str]) -> list[str]:
-    """Return the names of nodes that only the given outputs need."""
+def _nodes_only_for(graph: Any, outputs: Sequence[str]) -> list[str]:
     needed = needed_names(graph, outputs)
-    others = needed_names(graph, [each.name for each in graph.output if each.name not in outputs])
+    others = needed_names(graph, [value.name for value in graph.output if value.name not in outputs])
     return sorted(
         node.name
         for node in graph.node
@@ -127,17 +125,17 @@ def use_int8(
     Args:
         what: name of the network in the log.
         inputs: digests of the model and of the data that `measure` reads; they are the cache key.
-        measure: function that returns the agreement of int8 with float32, by keys of `LEAST`.
+        measure: function that returns the agreement of int8 with float32, by keys of `MIN_AGREEMENT`.
     """
-    kept = ViewCache(cache / "int8").get(
+    agreement = ViewCache(cache / "int8").get(
         sha256_of_json([RECIPE, inputs]),
         lambda: {name: np.array([value]) for name, value in measure().items()},
     )
-    found = {name: float(value[0]) for name, value in kept.items()}
-    use = precision == "int8" or all(value >= LEAST[name] for name, value in found.items())
-    measured = ", ".join(f"{name} {value:.4f} (minimum: {LEAST[name]})" for name, value in found.items())
-    logger.info("%s runs in %s. int8 vs. float32: %s", what, "int8" if use else "float32", measured)
-    return use
+    minima = [(name, float(value[0]), MIN_AGREEMENT[name]) for name, value in agreement.items()]
+    is_used = precision == "int8" or all(value >= minimum for _, value, minimum in minima)
+    measured = ", ".join(f"{name} {value:.4f} (minimum: {minimum})" for name, value, minimum in minima)
+    logger.info("%s runs in %s. int8 vs. float32: %s", what, "int8" if is_used else "float32", measured)
+    return is_used
 
 
 def agreement_of_vectors(

@@ -2,7 +2,6 @@
 
 import math
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,45 +53,37 @@ class Needs:
         return max(1, min(threads, fitting))
 
 
-def needs_of(model: ModelFolder, batch: int, *, as_exported: bool = False) -> Needs:
+def needs_of(
+    model: ModelFolder, batch: int, *, as_exported: bool = False, num_bytes: int | None = None
+) -> Needs:
     """Estimate the memory of a model from its configuration and file sizes.
 
-    `batch` is the number of prompts (SAM) or crops (CLIP) per call; see `SamModel` for `as_exported`.
+    Args:
+        batch: prompts (SAM) or crops (CLIP) per call.
+        as_exported: as in `SamModel`.
+        num_bytes: size of the networks; None for the size of the folder's files.
     """
-    described = {*(model.folder / name for name in LAYOUTS[model.layout].described)}
-    weights = sum(path.stat().st_size for path in model.files if path not in described)
-    side = input_side_px(model)
-    return needs(model.layout, model.config, side, weights, batch, as_exported=as_exported)
-
-
-def needs(
-    layout: str,
-    config: Mapping[str, Any],
-    side: int,
-    num_bytes: int,
-    batch: int,
-    *,
-    as_exported: bool = False,
-) -> Needs:
-    """Estimate the memory of a model from its configuration, input side (px) and networks' size."""
-    kind, weights = LAYOUTS[layout].kind, 1.2 * num_bytes / MIB
-    vision = config.get("vision_config", config.get("vision_cfg"))
+    if num_bytes is None:
+        described = {model.folder / name for name in LAYOUTS[model.layout].described}
+        num_bytes = sum(path.stat().st_size for path in model.files if path not in described)
+    side, weights = input_side_px(model), 1.2 * num_bytes / MIB
+    vision = model.config.get("vision_config", model.config.get("vision_cfg"))
     if not isinstance(vision, dict):
-        picture, as_exported = side * side * UNKNOWN_BYTES_PER_PX / MIB, True
-    elif kind == "clip":
+        image, as_exported = side * side * UNKNOWN_BYTES_PER_PX / MIB, True
+    elif model.kind == "clip":
         tokens = (side / _patch_px(vision)) ** 2
-        picture = 2 * _attention_mib(vision, side) + CLIP_TOKEN_MIB * tokens
-    elif layout == "sam" and not as_exported:
+        image = 2 * _attention_mib(vision, side) + CLIP_TOKEN_MIB * tokens
+    elif model.layout == "sam" and not as_exported:
         patches = side / _patch_px(vision)
         features = patches**2 * vision.get("hidden_size", 768) * 4 / MIB
-        picture = ACTIVATIONS * features + ATTENTION_COPIES * _attention_mib(vision, side) / patches
+        image = ACTIVATIONS * features + ATTENTION_COPIES * _attention_mib(vision, side) / patches
     else:
-        heads = SAM2_HEADS if layout == "sam2" else SAM_HEADS
-        picture = ATTENTION_COPIES * _attention_mib(vision, side, heads)
-    if kind == "clip":
-        return Needs(weights, batch * picture)
+        heads = SAM2_HEADS if model.layout == "sam2" else SAM_HEADS
+        image = ATTENTION_COPIES * _attention_mib(vision, side, heads)
+    if model.kind == "clip":
+        return Needs(weights, batch * image)
     decoder = batch * PROMPT_MIB if as_exported else FACTORED_MIB
-    return Needs(weights, picture + decoder * (side / 1024) ** 2)
+    return Needs(weights, image + decoder * (side / 1024) ** 2)
 
 
 def _attention_mib(vision: dict[str, Any], side_px: int, default_heads: int = SAM_HEADS) -> float:
@@ -120,7 +111,7 @@ CGROUP_FILES = {
 
 
 def machine_mib() -> float:
-    """Return the memory in MiB available to this process: that of its machine, container or cluster job."""
+    """Return the memory in MiB available to this process, on its machine, in its container or cluster job."""
     physical = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / MIB
     return min([physical, *(limit for limit, _ in _cgroups())])
 
@@ -131,8 +122,8 @@ def available_mib() -> float:
         lines = (SYSTEM / "proc/meminfo").read_text(encoding="ascii").splitlines()
     except OSError:  # not Linux
         return machine_mib()
-    (found,) = [line.split()[1] for line in lines if line.startswith("MemAvailable:")]
-    return min([int(found) / 1024, *(limit - used for limit, used in _cgroups())])
+    (free_kib,) = [line.split()[1] for line in lines if line.startswith("MemAvailable:")]
+    return min([int(free_kib) / 1024, *(limit - used for limit, used in _cgroups())])
 
 
 def _cgroups() -> list[tuple[float, float]]:
@@ -145,23 +136,23 @@ def _cgroups() -> list[tuple[float, float]]:
         lines = (SYSTEM / "proc/self/cgroup").read_text(encoding="utf-8").splitlines()
     except OSError:  # not Linux
         return []
-    found = []
+    groups = []
     for _, controllers, path in (line.split(":", 2) for line in lines):
         if controllers and "memory" not in controllers.split(","):
             continue
         mount = SYSTEM / "sys/fs/cgroup" / ("memory" if controllers else "")
         limit_file, use_file, reclaimable = CGROUP_FILES[1 if controllers else 2]
-        own = mount / path.lstrip("/")
-        if ".." in own.parts or not own.is_dir():  # inside a container, the mount is the container's group
-            own = mount
-        for group in (own, *own.parents):
+        innermost = mount / path.lstrip("/")
+        if ".." in innermost.parts or not innermost.is_dir():  # the mount is the container's own group
+            innermost = mount
+        for group in (innermost, *innermost.parents):
             if not group.is_relative_to(mount):
                 break
             limit, used, stat = (_text(group / name) for name in (limit_file, use_file, "memory.stat"))
             if limit.isdigit():
                 pages = dict(line.split() for line in stat.splitlines())
-                found.append((int(limit) / MIB, (int(used) - int(pages[reclaimable])) / MIB))
-    return found
+                groups.append((int(limit) / MIB, (int(used) - int(pages[reclaimable])) / MIB))
+    return groups
 
 
 def _text(path: Path) -> str:

@@ -4,12 +4,12 @@ import contextlib
 import ctypes
 import io
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import onnxruntime
@@ -20,6 +20,8 @@ from hilsplat.models.onnx_graph import Graph, has_external_weights, refuse_point
 
 logger = logging.getLogger(__name__)
 
+Fast = TypeVar("Fast")
+
 EXPORT_AGAIN = "export the model in the layout of the Hugging Face ONNX exports"
 DTYPES = {
     "tensor(float)": np.float32,
@@ -28,8 +30,6 @@ DTYPES = {
     "tensor(int64)": np.int64,
     "tensor(int32)": np.int32,
 }
-
-
 CPU, CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
 SILENT, WARNINGS = 4, 2  # severities of onnxruntime's log
 OVERWRITTEN = (
@@ -61,11 +61,16 @@ def cuda_provider_problem() -> str | None:
             logger.warning("onnxruntime runs on the CPU: %s", OVERWRITTEN)
             return OVERWRITTEN
         return "onnxruntime is built without CUDA"
+    text = (
+        """<ir_version: 8, opset_import: ["" : 17]> same (float[1] x) => (float[1] y) { y = Identity (x) }"""
+    )
     try:
+        from onnx.parser import parse_model
+
         onnxruntime.set_default_logger_severity(SILENT)  # the problem is reported below
         with contextlib.redirect_stdout(io.StringIO()):
             onnxruntime.preload_dlls()  # CUDA and cuDNN as installed with torch
-        session = one_thread_session(_identity(), (CUDA, CPU))
+        session = one_thread_session(Graph(parse_model(text), {}), (CUDA, CPU))
         session.run(None, {"x": np.zeros(1, np.float32)})
         problem = None if session.get_providers()[0] == CUDA else _missing_library()
     except Exception as error:  # onnxruntime's errors share no public base class
@@ -75,15 +80,6 @@ def cuda_provider_problem() -> str | None:
     if problem:
         logger.warning("onnxruntime runs on the CPU, because CUDA cannot be used: %s", problem)
     return problem
-
-
-def _identity() -> Graph:
-    from onnx.parser import parse_model
-
-    text = (
-        """<ir_version: 8, opset_import: ["" : 17]> same (float[1] x) => (float[1] y) { y = Identity (x) }"""
-    )
-    return Graph(parse_model(text), {})
 
 
 def _missing_library() -> str:
@@ -109,6 +105,20 @@ def one_thread_session(network: Graph | Path, providers: Sequence[str]) -> onnxr
     values = [onnxruntime.OrtValue.ortvalue_from_numpy(value) for value in network.weights.values()]
     options.add_external_initializers(list(network.weights), values)
     return onnxruntime.InferenceSession(network.serialized(), options, providers=list(providers))
+
+
+def or_as_exported(network: Path, cost: str, prepare: Callable[[], Fast]) -> Fast | None:
+    """Return a faster form of a network, or log a warning and return None if `prepare` raises any exception.
+
+    Args:
+        network: file of the network.
+        cost: what running the network as exported costs, such as "each image takes twice as long".
+    """
+    try:
+        return prepare()
+    except Exception as error:  # exporters write many forms of graphs, and each of them can run as exported
+        logger.warning("%s runs as exported, and %s: %s", network, cost, first_line(error))
+        return None
 
 
 class Network:
@@ -149,10 +159,10 @@ class Network:
             ) from error
         self.inputs = {item.name: item for item in self.session.get_inputs()}
         self.outputs = {item.name: item for item in self.session.get_outputs()}
-        outputs = {}
-        for name, axes in spec.outputs.items():
-            other = spec.synonyms.get(name, name)
-            outputs[other if name not in self.outputs and other in self.outputs else name] = axes
+        renamed = {
+            old: new for old, new in spec.synonyms.items() if {old, new} & self.outputs.keys() == {new}
+        }
+        outputs = {renamed.get(name, name): axes for name, axes in spec.outputs.items()}
         self.spec = spec = replace(spec, outputs=outputs)
         self._check("inputs", spec.inputs, self.inputs, spec.optional)
         self._check("outputs", spec.outputs, self.outputs, tuple(self.outputs))
@@ -162,15 +172,15 @@ class Network:
     def _check(
         self, what: str, expected: Mapping[str, Axes], found: dict[str, Any], optional: tuple[str, ...]
     ) -> None:
-        wrong = [name for name in expected if name not in found]
-        wrong += [name for name in found if name not in expected and name not in optional]
-        for name in [name for name in expected if name in found]:
-            item = found[name]
-            if item.type not in DTYPES or (item.shape and not _fits(item.shape, expected[name])):
-                wrong.append(name)
-        if wrong:
+        refused = [name for name in expected if name not in found]
+        refused += [name for name in found if name not in expected and name not in optional]
+        for name, item in found.items():
+            is_typed = item.type in DTYPES
+            if name in expected and not (is_typed and (not item.shape or _fits(item.shape, expected[name]))):
+                refused.append(name)
+        if refused:
             raise ModelError(
-                f"network {self.path} has unexpected or missing {what}: {', '.join(wrong)}",
+                f"network {self.path} has unexpected or missing {what}: {', '.join(refused)}",
                 expected=", ".join(_described(name, axes) for name, axes in expected.items()),
                 found=", ".join(f"{name} {list(item.shape)} {item.type}" for name, item in found.items()),
                 fix=EXPORT_AGAIN,
@@ -186,8 +196,11 @@ class Network:
 
         A ModelError is raised if the network rejects the inputs, or an output has an unexpected shape.
         """
-        known = {name: value for name, value in feeds.items() if name in self.inputs}
-        cast = {name: np.asarray(value, DTYPES[self.inputs[name].type]) for name, value in known.items()}
+        cast = {
+            name: np.asarray(value, DTYPES[self.inputs[name].type])
+            for name, value in feeds.items()
+            if name in self.inputs
+        }
         try:
             outputs = self.session.run(list(self.spec.outputs), cast)
         except Exception as error:  # onnxruntime's errors share no public base class

@@ -55,7 +55,7 @@ class Graph:
         refuse_pointer(path)
         try:
             model = onnx.load(str(path), load_external_data=False)
-            initializers = {each.name for each in model.graph.initializer}
+            initializers = {tensor.name for tensor in model.graph.initializer}
             weights = {}
             for tensor in tensors_of(model.graph):
                 if (place := location_of(tensor)) is None:
@@ -73,7 +73,6 @@ class Graph:
         return Graph(model, weights)
 
     def serialized(self) -> bytes:
-        """Return the network without its external weights, as bytes."""
         return bytes(self.model.SerializeToString())
 
     @property
@@ -93,8 +92,8 @@ class Graph:
     def reduced(self, outputs: Sequence[str]) -> "Graph":
         """Return the nodes that compute the given values, which become the outputs."""
         model = reduced(copy.deepcopy(self.model), outputs)
-        kept = {each.name for each in model.graph.initializer}
-        return Graph(model, {name: value for name, value in self.weights.items() if name in kept})
+        names = {tensor.name for tensor in model.graph.initializer}
+        return Graph(model, {name: value for name, value in self.weights.items() if name in names})
 
 
 def location_of(tensor: Any) -> str | None:
@@ -147,7 +146,6 @@ def refuse_pointer(path: Path) -> None:
 
 
 def _external_bytes(network: Path, tensor: Any, location: str) -> np.ndarray:
-    """Map the bytes of an external tensor into memory."""
     from onnx.external_data_helper import ExternalDataInfo
 
     info, path = ExternalDataInfo(tensor), network.parent / location
@@ -172,7 +170,6 @@ def _native_dtype(tensor: Any) -> np.dtype | None:
 
 
 def _inline(tensor: Any, content: np.ndarray) -> None:
-    """Store the values of an external tensor in the network."""
     import onnx
 
     tensor.raw_data = content.tobytes()
@@ -186,17 +183,17 @@ def reduced(model: Any, outputs: Sequence[str]) -> Any:
 
     graph = model.graph
     needed = needed_names(graph, outputs)
-    kept = {
+    declared = {value.name: value for value in graph.output}
+    untyped = onnx.TensorProto.FLOAT, None
+    fields = {
         "node": [node for node in graph.node if needed & set(node.output)],
-        "initializer": [each for each in graph.initializer if each.name in needed],
-        "input": [each for each in graph.input if each.name in needed],
+        "initializer": [tensor for tensor in graph.initializer if tensor.name in needed],
+        "input": [value for value in graph.input if value.name in needed],
+        "output": [
+            declared.get(name) or onnx.helper.make_tensor_value_info(name, *untyped) for name in outputs
+        ],
     }
-    known = {each.name: each for each in graph.output}
-    unknown = onnx.TensorProto.FLOAT, None
-    kept["output"] = [
-        known.get(name) or onnx.helper.make_tensor_value_info(name, *unknown) for name in outputs
-    ]
-    for field, values in kept.items():
+    for field, values in fields.items():
         target = getattr(graph, field)
         del target[:]
         target.extend(values)
@@ -217,8 +214,8 @@ def needed_names(graph: Any, outputs: Sequence[str]) -> set[str]:
 
 def _inputs(node: Any) -> list[str]:
     """Return the names that a node and its subgraphs read."""
-    inner = [each for attribute in node.attribute for each in (attribute.g, *attribute.graphs)]
-    return [*node.input, *(name for graph in inner for part in graph.node for name in _inputs(part))]
+    subgraphs = [graph for attribute in node.attribute for graph in (attribute.g, *attribute.graphs)]
+    return [*node.input, *(name for graph in subgraphs for inner in graph.node for name in _inputs(inner))]
 
 
 def without_joined(graph: Graph, name: str, other: str) -> Graph | None:
@@ -230,26 +227,27 @@ def without_joined(graph: Graph, name: str, other: str) -> Graph | None:
     joins tokens that were never computed, so results change from call to call.
     """
     model = copy.deepcopy(graph.model)
-    by_name, by_other = (computed_from(graph, each) for each in (name, other))
-    found = False
+    from_name, from_other = computed_from(graph, name), computed_from(graph, other)
+    is_changed = False
     for node in model.graph.node:
-        rest = [each for each in node.input if each not in by_name]
-        if node.op_type == "Concat" and 0 < len(rest) < len(node.input) and by_other.intersection(rest):
-            del node.input[:]
-            node.input.extend(rest)
-            found = True
-    return Graph(model, graph.weights).reduced([each.name for each in model.graph.output]) if found else None
+        others = [value for value in node.input if value not in from_name]
+        if node.op_type == "Concat" and 0 < len(others) < len(node.input) and from_other.intersection(others):
+            node.input[:] = others
+            is_changed = True
+    if not is_changed:
+        return None
+    return Graph(model, graph.weights).reduced([output.name for output in model.graph.output])
 
 
 def computed_from(graph: Graph, name: str) -> set[str]:
     """Return a value's name and those of all values computed from its numbers, not only from its shape."""
-    found, before = {name}, 0
-    while len(found) > before:  # converters to float16 append nodes in any order
-        before = len(found)
+    names, before = {name}, 0
+    while len(names) > before:  # converters to float16 append nodes in any order
+        before = len(names)
         for node in graph.model.graph.node:
-            if node.op_type != "Shape" and found.intersection(_inputs(node)):
-                found.update(node.output)
-    return found
+            if node.op_type != "Shape" and names.intersection(_inputs(node)):
+                names.update(node.output)
+    return names
 
 
 def reads_through(graph: Graph, name: str, operators: Iterable[str]) -> bool:
@@ -283,36 +281,36 @@ def with_rowwise_attention(path: Path, layers: Iterable[int], heads: int, side: 
     """
     import onnx
 
-    read = Graph.read(path)
-    graph = read.model.graph
-    if any(each.data_type == onnx.TensorProto.FLOAT16 for each in graph.initializer):
+    network = Graph.read(path)
+    graph = network.model.graph
+    if any(tensor.data_type == onnx.TensorProto.FLOAT16 for tensor in graph.initializer):
         raise ModelError("its weights are float16")
     makers = {name: node for node in graph.node for name in node.output}
     for layer in layers:
         ending = f"/layers.{layer}/attn/Softmax"
-        found = [node for node in graph.node if node.name.endswith(ending)]
-        sums = _scores(found[0], makers) if len(found) == 1 else None
-        readers = _readers(graph, found[0].output[0]) if found else []
-        if sums is None or len(readers) != 1 or readers[0].op_type != "MatMul":
+        softmaxes = [node for node in graph.node if node.name.endswith(ending)]
+        scores = _scores(softmaxes[0], makers) if len(softmaxes) == 1 else None
+        readers = _readers(graph, softmaxes[0].output[0]) if softmaxes else []
+        if scores is None or len(readers) != 1 or readers[0].op_type != "MatMul":
             raise ModelError(f"layer {layer} has no global attention in the form of transformers")
-        (queries, keys), positions = sums
+        (queries, keys), positions = scores
         values, output = readers[0].input[1], readers[0].output[0]
         nodes = _row_loop(f"rowwise_{layer}_", queries, keys, values, positions, output, heads, side)
-        place = list(graph.node).index(readers[0])
+        number = list(graph.node).index(readers[0])
         graph.node.remove(readers[0])
         for offset, node in enumerate(nodes):
-            graph.node.insert(place + offset, node)
-    reduced(read.model, [each.name for each in graph.output])
-    return read
+            graph.node.insert(number + offset, node)
+    reduced(network.model, [output.name for output in graph.output])
+    return network
 
 
 def _readers(graph: Any, value: str) -> list[Any]:
     """Return the nodes that read a value, directly or after casts."""
-    found = []
+    nodes = []
     for node in graph.node:
         if value in node.input:
-            found += _readers(graph, node.output[0]) if node.op_type == "Cast" else [node]
-    return found
+            nodes += _readers(graph, node.output[0]) if node.op_type == "Cast" else [node]
+    return nodes
 
 
 def _scores(softmax: Any, makers: dict[str, Any]) -> tuple[list[str], list[str]] | None:
@@ -369,7 +367,7 @@ def _row_loop(
 
 def whole_clip(folder: Path) -> Path | None:
     """Return the path of a folder's network with both halves, or None."""
-    return next((place for place in (folder / WHOLE, folder / "onnx" / WHOLE) if place.is_file()), None)
+    return next(filter(Path.is_file, (folder / WHOLE, folder / "onnx" / WHOLE)), None)
 
 
 def split_clip(folder: Path) -> list[Path]:

@@ -46,9 +46,9 @@ def require_repeatable_once(
 ) -> None:
     """Apply `require_repeatable` to a form of a slow network, once for each version of onnxruntime."""
 
-    def examine() -> str:
+    def check() -> str:
         require_repeatable(network, feeds, {name: np.flip(value, axis=-1) for name, value in feeds.items()})
         return "repeatable"
 
     key = [model.digest, network.path.name, form, onnxruntime.__version__, network.providers]
-    remembered("networks", key, examine)
+    remembered("networks", key, check)

@@ -3,6 +3,7 @@
 This module opens no networks, so that importing it to plan a run is fast.
 """
 
+import csv
 import functools
 import os
 from collections.abc import Mapping
@@ -32,33 +33,28 @@ class Release:
     name: str  # name of the model folder
     repository: str
     megabytes: int  # approximate size of the download; the exact size is reported before a transfer
+    family: str  # "sam" or "clip"
+    licence: str  # licence of the weights
     use: str
-    family: str = "sam"  # "sam" or "clip"
-    licence: str = "Apache-2.0"  # licence of the weights
 
 
-RELEASES = (
-    Release("sam-vit-huge", "Xenova/sam-vit-huge", 2570, "masks as in the paper; needs a GPU"),
-    Release("sam-vit-large", "Xenova/sam-vit-large", 1250, "between huge and base; needs a GPU"),
-    Release("sam-vit-base", "Xenova/sam-vit-base", 376, "the smallest original SAM"),
-    Release(
-        "sam2.1-hiera-small", "onnx-community/sam2.1-hiera-small-ONNX", 184, "masks of photographs, on a CPU"
-    ),
-    Release(
-        "sam2.1-hiera-base-plus", "onnx-community/sam2.1-hiera-base-plus-ONNX", 328, "between small and ViT-B"
-    ),
-    Release("edgetam", "onnx-community/EdgeTAM-ONNX", 37, "the fastest encoder"),
-    Release("slimsam-77", "Xenova/slimsam-77-uniform", 40, "low memory and time"),
-    Release(
-        "clip-vit-b-16-laion2b",
-        "laion/CLIP-ViT-B-16-laion2B-s34B-b88K",
-        600,
-        "queries as in LangSplat and the paper; exported on this machine by the extra `export`",
-        "clip",
-        "MIT",
-    ),
-    Release("clip-vit-base-patch16", "Xenova/clip-vit-base-patch16", 601, "queries", "clip", "MIT"),
-)
+def _releases() -> tuple[Release, ...]:
+    with Path(__file__).with_name("releases.tsv").open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream, delimiter="\t"))
+    return tuple(
+        Release(
+            name=row["name"],
+            repository=row["repository"],
+            megabytes=int(row["megabytes"]),
+            family=row["family"],
+            licence=row["licence"],
+            use=row["use"],
+        )
+        for row in rows
+    )
+
+
+RELEASES = _releases()
 """Released models, in the order of preference of `auto` within each family."""
 
 RECOMMENDED = ("sam2.1-hiera-small", "clip-vit-base-patch16")
@@ -81,13 +77,13 @@ def is_embedded(config: Mapping[str, Any]) -> bool:
 
 def read_model(folder: Path) -> PresentModel | None:
     """Return the model in a folder, or None if it has no network or its config.json is not supported."""
-    place = model_path(folder)
+    path = model_path(folder)
     try:
-        config = parse_json((place / "config.json").read_text(encoding="utf-8"))
+        config = parse_json((path / "config.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
     layout = layout_of(config)
-    if layout is None or not any(place.rglob("*.onnx")):
+    if layout is None or not any(path.rglob("*.onnx")):
         return None
     return PresentModel(folder, LAYOUTS[layout].kind, is_embedded(config))
 
@@ -103,9 +99,11 @@ def model_path(path: str | Path) -> Path:
 
     Any other path is returned unchanged, so that messages show what the user wrote.
     """
-    place = project_path(path)
-    of_user = user_models() / place.name
-    return of_user if not place.exists() and place.parent == MODELS and of_user.exists() else place
+    in_project = project_path(path)
+    of_user = user_models() / in_project.name
+    if in_project.parent == MODELS and not in_project.exists() and of_user.exists():
+        return of_user
+    return in_project
 
 
 def present_models() -> list[PresentModel]:
@@ -144,8 +142,8 @@ def model_digest(folder: Path, cache: Path) -> str:
     """
     if not folder.is_dir():
         return f"{folder} is missing"
-    found = digests_of([str(path) for path in visible_files(folder)], cache / "digests.json")
-    return sha256_of_json([(Path(path).relative_to(folder).as_posix(), found[path]) for path in found])
+    digests = digests_of([str(path) for path in visible_files(folder)], cache / "digests.json")
+    return sha256_of_json([(Path(path).relative_to(folder).as_posix(), digests[path]) for path in digests])
 
 
 def real_model(family: str) -> Path | None:
@@ -156,13 +154,13 @@ def real_model(family: str) -> Path | None:
 
 def models_table() -> str:
     """Return a table of released and installed models that marks those used for photographs."""
-    here = {model.folder.name: model for model in present_models()}
+    present = {model.folder.name: model for model in present_models()}
     chosen = (real_model("sam"), real_model("clip"))
 
     def state(name: str) -> str:
-        if name not in here:
-            return "incomplete" if (user_models() / f".{name}.part").is_dir() else ""
-        return "in use" if here[name].folder in chosen else "installed"
+        if name in present:
+            return "in use" if present[name].folder in chosen else "installed"
+        return "incomplete" if (user_models() / f".{name}.part").is_dir() else ""
 
     rows: list[tuple[object, ...]] = [("name", "kind", "MB", "licence", "", "use")]
     for release in RELEASES:
@@ -170,19 +168,22 @@ def models_table() -> str:
         kind, licence = release.family.upper(), release.licence
         rows.append((release.name, kind, release.megabytes, licence, state(release.name), use))
     released = [release.name for release in RELEASES]
-    for name, model in here.items():
-        if name not in released:
-            files = [path for path in model.folder.rglob("*") if path.is_file()]
-            megabytes = f"{sum(path.stat().st_size for path in files) / 1e6:.0f}"
-            use = "the synthetic world only" if model.embedded else ""
-            rows.append((name, model.family.upper(), megabytes, "", state(name), use))
+    for name, model in present.items():
+        if name in released:
+            continue
+        num_bytes = sum(path.stat().st_size for path in model.folder.rglob("*") if path.is_file())
+        use = "the synthetic world only" if model.embedded else ""
+        rows.append((name, model.family.upper(), f"{num_bytes / 1e6:.0f}", "", state(name), use))
     lines = ["{:<24} {:<5} {:>8}  {:<11} {:<11} {}".format(*row).rstrip() for row in rows]
-    lines += [
-        "",
-        "Install: hilsplat models get NAME (or owner/name on the hub); without a name, the recommended pair",
-        f"Models are stored in {user_models()}; those in a project's models/ take precedence.",
-    ]
-    return "\n".join(lines)
+    return "\n".join(
+        [
+            *lines,
+            "",
+            "Install: hilsplat models get NAME (or owner/name on the hub); "
+            "without a name, the recommended pair",
+            f"Models are stored in {user_models()}; those in a project's models/ take precedence.",
+        ]
+    )
 
 
 def meaningless(name: str) -> str:

@@ -80,8 +80,8 @@ def with_tree_levels(masks: HierarchicalMasks, theta: float) -> HierarchicalMask
     that predicted them. This rule is from a comment in the source of the paper (Sec. III-B).
     """
     depth = depths(coverage_parents(masks.overlaps_px(), None, theta))
-    found = replace(masks, level=np.minimum(depth, len(LEVELS)).astype(np.uint8))
-    return found.take(found.content_order())
+    levelled = replace(masks, level=np.minimum(depth, len(LEVELS)).astype(np.uint8))
+    return levelled.take(levelled.content_order())
 
 
 def run_coverage_tree(masks_folder: Path, out: Path, settings: CoverageTreeSettings) -> None:

@@ -18,7 +18,7 @@ def square_crop(
     `context` is the margin on each side as a share of the box's longer side, clipped at the image's border.
     """
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    (y0, y1), (x0, x1) = ((int(found[0]), int(found[-1]) + 1) for found in (rows, columns))
+    (y0, y1), (x0, x1) = ((int(inside[0]), int(inside[-1]) + 1) for inside in (rows, columns))
     margin = round(context * max(y1 - y0, x1 - x0))
     window = np.s_[max(0, y0 - margin) : y1 + margin, max(0, x0 - margin) : x1 + margin]
     return crop_to_square(image[window], mask[window], background, size)

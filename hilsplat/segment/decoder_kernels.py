@@ -5,7 +5,8 @@ last, or with pixels first where a sum runs over pixels. H: heads; T: tokens; D:
 of a block. A prompt has H (T - 1) factors per layer: each head's softmax weights of all tokens but the last.
 """
 
-from typing import no_type_check
+from collections import namedtuple
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 
@@ -31,6 +32,62 @@ LEAST = np.float32(-126)
 one_row, three_rows, four_rows, six_rows, seven_rows, eight_rows = map(rows_of_products, (1, 3, 4, 6, 7, 8))
 
 ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
+
+
+class FirstLayer(NamedTuple):
+    """Image arrays of the first layer, block by block."""
+
+    queries: np.ndarray  # queries of the pixel-to-token attention
+    before: np.ndarray  # products of the pixels' features with the output projection of the values
+    square: np.ndarray  # squared length of each pixel's features
+    cross: np.ndarray  # products of the pixels' features with the bias that is added to them
+    scaled_keys: np.ndarray  # keys of the token-to-pixel attention: the part scaled by the layer norm
+    fixed_keys: np.ndarray
+    values: np.ndarray  # values of the token-to-pixel attention, before the layer norm's scale
+
+
+class FirstPrompts(NamedTuple):
+    """Prompt arrays of the first layer."""
+
+    update_keys: np.ndarray  # keys of the pixel-to-token attention
+    twice_changes: np.ndarray  # twice the difference between each token's values and the last token's
+    gram: np.ndarray  # products of these differences after the output projection (`doubled_below`)
+    last: np.ndarray  # values of the last token
+    square: np.ndarray  # squared length of the constant that the last token and the bias add to every pixel
+    linear: np.ndarray  # twice the products of that constant with the differences
+    queries: np.ndarray  # queries of the token-to-pixel attention
+    low: np.ndarray  # products of `queries` with the keys of the factors
+    offset: np.ndarray  # products of `queries` with the keys of that constant
+
+
+SecondLayer = namedtuple(
+    "SecondLayer",
+    "scaled_queries fixed_queries before_first before_second square cross_first cross_second "
+    "scaled_keys fixed_keys values",
+)
+"""Image arrays of the second layer; names as in `FirstLayer`. Queries and products have
+two parts, for the values of the first and of the second layer."""
+SecondPrompts = namedtuple(
+    "SecondPrompts",
+    "update_keys update_low update_offset twice_changes linear gram last square queries low offset",
+)
+"""Prompt arrays of the second layer; names as in `FirstPrompts`."""
+
+
+Upscaling = namedtuple("Upscaling", "norm_scale norm_shift fixed second bias")
+"""Weights of the two upscalings and of the layer norm between them."""
+MaskImage = namedtuple("MaskImage", "scaled detail finest")
+"""Image arrays for mask logits: the upscaled image embedding, and the finer features of SAM 2."""
+
+
+class MaskPrompts(NamedTuple):
+    """Prompt arrays for mask logits."""
+
+    masks: int  # per prompt
+    factors: np.ndarray  # after the first upscaling
+    both_scales: np.ndarray  # constants of the first layer after the first upscaling
+    second_scale: np.ndarray  # constants of the second layer after the first upscaling
+    combine: np.ndarray  # channel weights of each mask
 
 
 @compiled

@@ -28,10 +28,10 @@ class DecoderNetwork:
 
     def __init__(self, model: ModelFolder, name: str) -> None:
         self.graph = Graph.read(model.networks[name])
-        alone = without_joined(self.graph, BOXES, POINTS)
-        self.graph = alone or self.graph
-        self.network = model.network(name, alone)
-        self.pads = alone is not None and not reads_through(self.graph, LABELS, ("Concat", "Pad"))
+        without_boxes = without_joined(self.graph, BOXES, POINTS)
+        self.graph = without_boxes or self.graph
+        self.network = model.network(name, without_boxes)
+        self.pads = without_boxes is not None and not reads_through(self.graph, LABELS, ("Concat", "Pad"))
         problem = "requires a box with each prompt" if self._needs_boxes() else ""
         if self.pads and LABELS not in self.network.inputs:
             problem = f"accepts boxes, but no {LABELS}"
@@ -50,7 +50,7 @@ class DecoderNetwork:
 
     def _needs_boxes(self) -> bool:
         """Return whether the network accepts only a fixed number of boxes, and its results depend on them."""
-        outputs = {each.name for each in self.graph.model.graph.output}
+        outputs = {value.name for value in self.graph.model.graph.output}
         if BOXES not in self.network.inputs or not self.network.fixed_axis(BOXES, 1):
             return False
         return bool(outputs & computed_from(self.graph, BOXES))
@@ -68,18 +68,15 @@ class DecoderNetwork:
             labels = np.pad(labels, ((0, 0), (0, 1)), constant_values=PADDING)
         images = len(points_xy) if self.axis == 0 else 1
         boxes = self.network.fixed_axis(BOXES, 1) if BOXES in self.network.inputs else None
-        repeated = {
-            name: value
-            if len(value) == images or self.network.fixed_axis(name, 0) == 1
-            else np.repeat(value, images, axis=0)
-            for name, value in features.items()
-        }
-        return {
+        feeds: dict[str, np.ndarray] = {
             POINTS: np.expand_dims(points_xy, 1 - self.axis).astype(np.float32),
             LABELS: np.expand_dims(labels, 1 - self.axis).astype(np.int64),
             BOXES: np.zeros((images, boxes or 0, 4), np.float32),
-            **repeated,
         }
+        for name, value in features.items():
+            is_single = len(value) == images or self.network.fixed_axis(name, 0) == 1
+            feeds[name] = value if is_single else np.repeat(value, images, axis=0)
+        return feeds
 
     def __call__(
         self,
@@ -94,8 +91,8 @@ class DecoderNetwork:
                 expected=f"an input {LABELS}",
                 fix="use only points inside the object, or another model",
             )
-        found = self.network(**self.feeds(features, points_xy, inside))
-        scores, logits = (each.swapaxes(0, 1 - self.axis)[0] for each in found)
+        outputs = self.network(**self.feeds(features, points_xy, inside))
+        scores, logits = (output.swapaxes(0, 1 - self.axis)[0] for output in outputs)
         return scores, logits
 
     def require_repeatable(self, features: Mapping[str, np.ndarray], side_px: int) -> None:

@@ -33,9 +33,9 @@ class Linear:
     def __call__(self, x: Float32[np.ndarray, "*n i"]) -> Float32[np.ndarray, "*n o"]:
         panels, bias = self._packed
         rows = np.ascontiguousarray(x, np.float32).reshape(-1, x.shape[-1])
-        found = np.empty((len(rows), len(bias)), np.float32)
-        kernels.linear(rows.reshape(-1), panels, bias, *rows.shape, found.reshape(-1))
-        return found[:, : len(self.bias)].reshape(*x.shape[:-1], -1)
+        products = np.empty((len(rows), len(bias)), np.float32)
+        kernels.linear(rows.reshape(-1), panels, bias, *rows.shape, products.reshape(-1))
+        return products[:, : len(self.bias)].reshape(*x.shape[:-1], -1)
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Norm:
 
 @dataclass(frozen=True)
 class Attention:
-    """The four projections of an attention block."""
+    """Projections of an attention block."""
 
     q: Linear
     k: Linear
@@ -74,7 +74,7 @@ class DecoderGraph:
     def __init__(self, graph: Graph) -> None:
         self._graph = graph
         model = graph.model.graph
-        self._initializers = {each.name: each for each in model.initializer}
+        self._initializers = {tensor.name: tensor for tensor in model.initializer}
         self._nodes = {node.name: node for node in model.node}
         self._makers = {name: node for node in model.node for name in node.output}
         self._readers = {name: node for node in model.node for name in node.input}
@@ -96,20 +96,20 @@ class DecoderGraph:
     def perceptron(self, module: str) -> list[Linear]:
         """Return the linear layers of a perceptron, in order."""
         names = ["proj_in", *(f"layers.{number}" for number in range(8)), "proj_out", "lin1", "lin2"]
-        found = [name for name in names if self._find(f"{module}/{name}/MatMul") is not None]
-        if not found:
+        layers = [f"{module}/{name}" for name in names if self._find(f"{module}/{name}/MatMul") is not None]
+        if not layers:
             raise _unusual(f"it has no layers in {module}")
-        return [self.linear(f"{module}/{name}") for name in found]
+        return [self.linear(layer) for layer in layers]
 
     def norm(self, module: str) -> Norm:
         """Return a layer norm, which is one node since opset 17, or several nodes."""
         node = self._find(f"{module}/LayerNormalization")
         if node is not None:
-            eps = [each.f for each in node.attribute if each.name == "epsilon"] or [DEFAULT_EPS]
+            eps = [entry.f for entry in node.attribute if entry.name == "epsilon"] or [DEFAULT_EPS]
             values = [*self._constants(node), np.array(eps[0])]
         else:
-            nodes = [self._node(f"{module}/{name}") for name in ("Mul", "Add_1", "Add")]
-            values = [value for each in nodes for value in self._constants(each)]
+            names = [f"{module}/{name}" for name in ("Mul", "Add_1", "Add")]
+            values = [value for name in names for value in self._constants(self._node(name))]
         if len(values) != 3 or np.size(values[2]) != 1:
             raise _unusual(f"{module} has no constant weights")
         return Norm(values[0].reshape(-1), values[1].reshape(-1), values[2].item())
@@ -122,7 +122,6 @@ class DecoderGraph:
         return values[0], values[1]
 
     def has(self, module: str, operator: str) -> bool:
-        """Return whether a module has a node of the given operator type."""
         return any(f"{module}/" in name and node.op_type == operator for name, node in self._nodes.items())
 
     def until(self, *modules: str) -> Graph:

@@ -18,10 +18,8 @@ The two attentions of a layer, its layer norm and the next attention process one
 for several prompts (`decoder_kernels`). Operations on tokens alone use plain numpy in this module.
 """
 
-from collections import namedtuple
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import onnxruntime
@@ -32,6 +30,15 @@ from hilsplat.base.errors import ModelError
 from hilsplat.models.network import one_thread_session
 from hilsplat.models.onnx_graph import Graph
 from hilsplat.segment import decoder_kernels as kernels
+from hilsplat.segment.decoder_kernels import (
+    FirstLayer,
+    FirstPrompts,
+    MaskImage,
+    MaskPrompts,
+    SecondLayer,
+    SecondPrompts,
+    Upscaling,
+)
 from hilsplat.segment.decoder_network import DecoderNetwork
 from hilsplat.segment.decoder_weights import DecoderGraph, Linear
 
@@ -41,62 +48,6 @@ BLOCK = 64
 PROMPTS = 16
 """Prompts per call, applied to each block one after the other while the block is in the cache."""
 HEADS_PER_ATTENTION = 8  # if the model's configuration doesn't specify them
-
-
-class FirstLayer(NamedTuple):
-    """Image arrays that the kernels read at the first layer, block by block."""
-
-    queries: np.ndarray  # queries of the pixel-to-token attention
-    before: np.ndarray  # products of the pixels' features with the output projection of the values
-    square: np.ndarray  # squared length of each pixel's features
-    cross: np.ndarray  # products of the pixels' features with the bias that is added to them
-    scaled_keys: np.ndarray  # keys of the token-to-pixel attention: the part scaled by the layer norm
-    fixed_keys: np.ndarray
-    values: np.ndarray  # values of the token-to-pixel attention, before the layer norm's scale
-
-
-class FirstPrompts(NamedTuple):
-    """Prompt arrays that the kernels read at the first layer."""
-
-    update_keys: np.ndarray  # keys of the pixel-to-token attention
-    twice_changes: np.ndarray  # twice the difference between each token's values and the last token's
-    gram: np.ndarray  # products of these differences after the output projection (`doubled_below`)
-    last: np.ndarray  # values of the last token
-    square: np.ndarray  # squared length of the constant that the last token and the bias add to every pixel
-    linear: np.ndarray  # twice the products of that constant with the differences
-    queries: np.ndarray  # queries of the token-to-pixel attention
-    low: np.ndarray  # products of `queries` with the keys of the factors
-    offset: np.ndarray  # products of `queries` with the keys of that constant
-
-
-SecondLayer = namedtuple(
-    "SecondLayer",
-    "scaled_queries fixed_queries before_first before_second square cross_first cross_second "
-    "scaled_keys fixed_keys values",
-)
-"""Image arrays that the kernels read at the second layer; names as in `FirstLayer`. Queries and products have
-two parts, for the values of the first and of the second layer."""
-SecondPrompts = namedtuple(
-    "SecondPrompts",
-    "update_keys update_low update_offset twice_changes linear gram last square queries low offset",
-)
-"""Prompt arrays that the kernels read at the second layer; names as in `FirstPrompts`."""
-
-
-Upscaling = namedtuple("Upscaling", "norm_scale norm_shift fixed second bias")
-"""Weights of the two upscalings and of the layer norm between them."""
-MaskImage = namedtuple("MaskImage", "scaled detail finest")
-"""Image arrays for mask logits: the upscaled image embedding, and the finer features of SAM 2."""
-
-
-class MaskPrompts(NamedTuple):
-    """Prompt arrays for mask logits."""
-
-    masks: int  # per prompt
-    factors: np.ndarray  # after the first upscaling
-    both_scales: np.ndarray  # constants of the first layer after the first upscaling
-    second_scale: np.ndarray  # constants of the second layer after the first upscaling
-    combine: np.ndarray  # channel weights of each mask
 
 
 @dataclass(frozen=True)
@@ -139,16 +90,16 @@ class FactoredDecoder:
         # inputs of these modules: the prompt tokens; the image features without and with positions
         tokens, image_side = ["self_attn/q_proj"], [f"cross_attn_token_to_image/{part}_proj" for part in "vk"]
         self._graphs = [
-            graph.until(*(f"{layers[0]}/{each}" for each in ends)) for ends in (tokens, image_side)
+            graph.until(*(f"{layers[0]}/{module}" for module in modules)) for modules in (tokens, image_side)
         ]
         _relax_shapes(self._graphs[0])
         self._tokens, self._image_side = (
-            one_thread_session(each, ["CPUExecutionProvider"]) for each in self._graphs
+            one_thread_session(subgraph, ["CPUExecutionProvider"]) for subgraph in self._graphs
         )
         self.inner = len(self._reads[0].q.bias)
-        one, other = (self._token_rows(np.full((1, 2), place)) for place in (0.0, 9.0))
-        same = (one == other).all(axis=-1).reshape(-1)
-        self._iou_token = int(np.argmin(same)) - 5  # SAM 2 has a token for the object score before it
+        tokens0, tokens9 = (self._token_rows(np.full((1, 2), place)) for place in (0.0, 9.0))
+        is_constant = (tokens0 == tokens9).all(axis=-1).reshape(-1)
+        self._iou_token = int(np.argmin(is_constant)) - 5  # SAM 2 has a token for the object score before it
         self.dim = self.inner // heads
         self._fold(graph, layers)
 
@@ -158,11 +109,11 @@ class FactoredDecoder:
         self._eps = norms[0].eps
         (g1, b1), (g2, b2) = ((wide(norm.scale), wide(norm.shift)) for norm in norms)
         # output projections of values (inner, channels): before and after the next layer norm
-        out0, out1 = (centred(wide(each.out.weight).T, 1) for each in self._updates)
+        out0, out1 = (centred(wide(update.out.weight).T, 1) for update in self._updates)
         scaled = out0 * g1
         both = np.concatenate([centred(scaled, 1), out1])
         finer = both * g2
-        self._g1, self._b1, self._g2, self._b2 = (single(each) for each in (g1, b1, g2, b2))
+        self._g1, self._b1, self._g2, self._b2 = map(single, (g1, b1, g2, b2))
         self._out0, self._out1, self._both = single(out0), single(out1), single(both)
         self._bias0 = single(centred(wide(self._updates[0].out.bias)))
         self._bias1 = single(centred(b1 + wide(self._updates[1].out.bias)))
@@ -215,8 +166,8 @@ class FactoredDecoder:
             return np.ascontiguousarray(single(rows).reshape(shape).transpose(1, 0, 2)).reshape(-1)
 
         def by_pixel(rows: np.ndarray) -> np.ndarray:
-            found = single(rows).reshape(self.heads, self.dim, -1, pixels).transpose(2, 0, 3, 1)
-            return np.pad(found, [(0, 0)] * 3 + [(0, up(self.dim) - self.dim)]).reshape(-1)
+            values = single(rows).reshape(self.heads, self.dim, -1, pixels).transpose(2, 0, 3, 1)
+            return np.pad(values, [(0, 0)] * 3 + [(0, up(self.dim) - self.dim)]).reshape(-1)
 
         def projected(layer: Linear, rows: np.ndarray) -> np.ndarray:
             return wide(layer.weight) @ rows
@@ -281,7 +232,7 @@ class FactoredDecoder:
         rows = self._scores(read0.q(q + pe))
         sums = PixelSums(sizes, 0)
         kernels.read_image(sizes, flat(rows), image.keys, image.values, sums.top, sums.sums)
-        q = self._think(0, q + read0.out(joined(sums.values())))
+        q = self._perceptron(0, q + read0.out(joined(sums.values())))
 
         keys0, (change0, last0) = self._scores(update0.k(q + pe)), self._token_values(update0.v(q))
         c0 = self._bias0 + last0 @ self._out0
@@ -305,8 +256,8 @@ class FactoredDecoder:
         kernels.update_and_read_first(
             sizes, channels, self._eps, image.first, first, sums.top, sums.sums, s1, e
         )
-        found = sums.values(_through(change0, self._values1, self.heads), self._split(d0 @ read1.v.weight.T))
-        q = self._think(1, q + read1.out(joined(found + self._split(read1.v(self._b1)))))
+        values = sums.values(_through(change0, self._values1, self.heads), self._split(d0 @ read1.v.weight.T))
+        q = self._perceptron(1, q + read1.out(joined(values + self._split(read1.v(self._b1)))))
 
         keys1, (change1, last1) = self._scores(update1.k(q + pe)), self._token_values(update1.v(q))
         kc = self._bias1 + last1 @ self._out1
@@ -319,7 +270,7 @@ class FactoredDecoder:
             update_low=flat(_low(keys1, self._low_update1, change0)),
             update_offset=flat(_offsets(keys1, update1.q, [d0])),
             twice_changes=flat(2 * changes),
-            linear=flat(2 * np.stack([_along(changes, each @ self._both.T) for each in (d0c, kc)], axis=-1)),
+            linear=flat(2 * np.stack([_along(changes, x @ self._both.T) for x in (d0c, kc)], axis=-1)),
             gram=flat(doubled_below(_between(changes, self._gram1))),
             last=flat(np.stack([last0, last1], axis=1)),
             square=flat(np.stack(squares, axis=1)),
@@ -332,17 +283,17 @@ class FactoredDecoder:
         kernels.update_and_read_second(
             sizes, channels, self._eps, image.second, second, s1, e, sums.top, sums.sums, s2, e2
         )
-        found = sums.values(
+        values = sums.values(
             _through(changes, self._values2, self.heads),
-            *(self._split(each @ read2.v.weight.T) for each in (d0g, kg)),
+            *(self._split(x @ read2.v.weight.T) for x in (d0g, kg)),
         )
-        q = self._last_norm(q + read2.out(joined(found + self._split(read2.v(self._b2)))))
+        q = self._last_norm(q + read2.out(joined(values + self._split(read2.v(self._b2)))))
 
-        iou = _layers(self._iou_head, q[:, self._iou_token])[:, 1:]
+        iou = _perceptron(self._iou_head, q[:, self._iou_token])[:, 1:]
         if self._iou_sigmoid:
             iou = 1 / (1 + np.exp(-iou))
         first_mask = self._iou_token + 2  # the first of four masks is for unambiguous prompts
-        combine = [_layers(head, q[:, first_mask + k]) for k, head in enumerate(self._mask_heads)]
+        combine = [_perceptron(head, q[:, first_mask + k]) for k, head in enumerate(self._mask_heads)]
         kept = {
             "keys0": keys0,
             "keys1": keys1,
@@ -376,7 +327,7 @@ class FactoredDecoder:
         factors = flat(through.reshape(number, 2 * self.heads * others, -1).swapaxes(1, 2))
         height, width = (side * (4 if fine else 1) for side in image.grid_hw)
         out = np.empty((number, kept["combine"].shape[1], height, width), np.float32)
-        prompts = MaskPrompts(out.shape[1], factors, *(flat(kept[each]) for each in MaskPrompts._fields[2:]))
+        prompts = MaskPrompts(out.shape[1], factors, *(flat(kept[name]) for name in MaskPrompts._fields[2:]))
         kernels.mask_logits(
             self._sizes(image, number, others + 1), fine, self._upscale_eps, self._upscaling, image.masks,
             prompts, flat(kept["s1"]), flat(kept["s2"]), e, up(2 * self.heads * others), image.grid_hw[1],
@@ -386,13 +337,10 @@ class FactoredDecoder:
 
     def _token_rows(self, points_xy: Float[np.ndarray, "P 2"]) -> Float32[np.ndarray, "P T C"]:
         """Return the tokens of each prompt before the first layer."""
-        blank = {
-            each.name: np.zeros((1, 1, 1, 1), np.float32)
-            for each in self._tokens.get_inputs()
-            if each.name.startswith("image_")
-        }
-        (found,) = self._run(self._tokens, blank, points_xy)
-        return found.reshape(len(points_xy), *found.shape[-2:])
+        names = [node.name for node in self._tokens.get_inputs() if node.name.startswith("image_")]
+        blank = dict.fromkeys(names, np.zeros((1, 1, 1, 1), np.float32))
+        (tokens,) = self._run(self._tokens, blank, points_xy)
+        return tokens.reshape(len(points_xy), *tokens.shape[-2:])
 
     def _run(
         self,
@@ -402,7 +350,7 @@ class FactoredDecoder:
     ) -> list[np.ndarray]:
         """Run a subgraph of the decoder for prompts of one point."""
         feeds = self._network.feeds(features, points_xy[:, None])
-        return session.run(None, {each.name: feeds[each.name] for each in session.get_inputs()})
+        return session.run(None, {node.name: feeds[node.name] for node in session.get_inputs()})
 
     def _sizes(self, image: ImageTerms, number: int, tokens: int) -> tuple[int, ...]:
         """Return the sizes that `decoder_kernels.read_image` documents."""
@@ -414,19 +362,17 @@ class FactoredDecoder:
         """Apply a layer's self-attention; the first layer uses neither positions nor a residual."""
         attention, norm = self._self[layer], self._norms[layer][0]
         x = q + pe if layer else q
-        queries, keys, values = (
-            self._split(each) for each in (attention.q(x), attention.k(x), attention.v(q))
-        )
+        queries, keys, values = map(self._split, (attention.q(x), attention.k(x), attention.v(q)))
         scores = queries @ keys.swapaxes(2, 3) / np.float32(queries.shape[3] ** 0.5)
         weights = np.exp(scores - scores.max(axis=3, keepdims=True))
-        found = attention.out(joined(weights / weights.sum(axis=3, keepdims=True) @ values))
-        return norm(q + found if layer else found)
+        update = attention.out(joined(weights / weights.sum(axis=3, keepdims=True) @ values))
+        return norm(q + update if layer else update)
 
-    def _think(self, layer: int, q: np.ndarray) -> np.ndarray:
+    def _perceptron(self, layer: int, q: np.ndarray) -> np.ndarray:
         """Apply the two norms after a layer's attention to the image, and the perceptron between them."""
         _, norm, last_norm = self._norms[layer]
         q = norm(q)
-        return last_norm(q + _layers(self._mlps[layer], q))
+        return last_norm(q + _perceptron(self._mlps[layer], q))
 
     def _split(self, x: Float32[np.ndarray, "*n i"]) -> Float32[np.ndarray, "n H T D"]:
         """Split heads: (n, T, H D) -> (n, H, T, D); one vector per prompt (n, H D) counts as one token."""
@@ -462,24 +408,24 @@ class PixelSums:
         """
         number, _, heads, tokens, dim, _, depth = self.sizes
         sums = self.sums.reshape(number, heads, tokens, -1)
-        found = sums[..., :dim]
+        values = sums[..., :dim]
         if factor_values is not None:
-            found = found + sums[..., depth : depth + self.factors] @ factor_values
+            values = values + sums[..., depth : depth + self.factors] @ factor_values
         total, *scales = (sums[..., k, None] for k in range(-WIDTH, -WIDTH + 3))
         for scale, value in zip(scales, scale_values, strict=False):
-            found = found + scale * value
-        return found / total
+            values = values + scale * value
+        return values / total
 
 
 def _relax_shapes(graph: Graph) -> None:
     """Remove the declared shapes of the image features; the tokens depend only on the number of images."""
-    for each in graph.model.graph.input:
-        if each.name.startswith("image_"):
-            for side in each.type.tensor_type.shape.dim:
+    for value in graph.model.graph.input:
+        if value.name.startswith("image_"):
+            for side in value.type.tensor_type.shape.dim:
                 side.Clear()
 
 
-def _layers(layers: list[Linear], x: np.ndarray) -> np.ndarray:
+def _perceptron(layers: list[Linear], x: np.ndarray) -> np.ndarray:
     """Apply linear layers with ReLUs between them."""
     for layer in layers[:-1]:
         x = np.maximum(layer(x), 0)
@@ -510,15 +456,15 @@ def _between(changes: Float32[np.ndarray, "n K J D"], base: Float32[np.ndarray, 
 def _through(changes: np.ndarray, base: Float32[np.ndarray, "KD HD"], heads: int) -> np.ndarray:
     """Multiply changes by a matrix and split heads: (n, K, J, D) -> (n, H, K J, D)."""
     number, kinds, others, dim = changes.shape
-    found = changes @ base.reshape(kinds, dim, -1)
-    return found.reshape(number, kinds * others, heads, -1).swapaxes(1, 2)
+    products = changes @ base.reshape(kinds, dim, -1)
+    return products.reshape(number, kinds * others, heads, -1).swapaxes(1, 2)
 
 
 def _offsets(rows: np.ndarray, layer: Linear, vectors: list[np.ndarray]) -> np.ndarray:
     """Return products of rows with projected vectors (n, C): (n, H, T, D) -> (n, H, T, vectors)."""
     number, heads, _, dim = rows.shape
-    projected = [(each @ layer.weight.T).reshape(number, heads, dim, 1) for each in vectors]
-    return np.concatenate([rows @ each for each in projected], axis=-1)
+    projected = [(vector @ layer.weight.T).reshape(number, heads, dim, 1) for vector in vectors]
+    return np.concatenate([rows @ vector for vector in projected], axis=-1)
 
 
 def doubled_below(gram: Float32[np.ndarray, "n F F"]) -> Float32[np.ndarray, "n F F"]:
@@ -527,22 +473,18 @@ def doubled_below(gram: Float32[np.ndarray, "n F F"]) -> Float32[np.ndarray, "n 
 
 
 def joined(x: Float32[np.ndarray, "n H T D"]) -> Float32[np.ndarray, "n T HD"]:
-    """Concatenate the heads."""
     return x.swapaxes(1, 2).reshape(x.shape[0], x.shape[2], -1)
 
 
 def wide(x: np.ndarray) -> Float64[np.ndarray, "..."]:
-    """Convert to float64."""
     return x.astype(np.float64)
 
 
 def single(x: np.ndarray) -> Float32[np.ndarray, "..."]:
-    """Convert to float32."""
     return x.astype(np.float32)
 
 
 def centred(x: np.ndarray, axis: int = -1) -> np.ndarray:
-    """Subtract the mean along an axis."""
     return x - x.mean(axis=axis, keepdims=True)
 
 
@@ -552,5 +494,4 @@ def flat(x: np.ndarray) -> Float32[np.ndarray, " n"]:
 
 
 def up(number: int) -> int:
-    """Round up to a multiple of the SIMD width."""
-    return -(-number // WIDTH) * WIDTH
+    return -(-number // WIDTH) * WIDTH  # the next multiple of the SIMD width

@@ -154,12 +154,12 @@ def decode_candidates(
     parts = []
     for crop, (left, top, right, bottom) in enumerate(boxes):
         encoded = model.encode(np.ascontiguousarray(image[top:bottom, left:right]))
-        own = grid * (right - left, bottom - top) if points is None or crop else points
-        prompts: Prompts = {"points": own}
+        on_grid = grid * (right - left, bottom - top)
+        prompts: Prompts = {"points": on_grid if points is None or crop else points}
         if uses_preview(model, settings):
             prompts = distinct_prompts(encoded, prompts, model, settings, batch)
         for called, number in calls(prompts, batch):
-            scores, logits = (found[:number] for found in model.finish(encoded, called))
+            scores, logits = (values[:number] for values in model.finish(encoded, called))
             parts.append(keep_candidates(scores, logits, encoded.frame, crop, settings, thresholds))
     return Candidates.concatenate(parts)
 
@@ -192,14 +192,14 @@ def distinct_prompts(
     prompts, 200 to 300 remain; at least one is kept.
     """
     iou_floor, stability_floor = floors(model.thresholds(settings))
-    found, kept = [], []
+    measured, previewed = [], []
     for called, number in calls(prompts, batch):
-        scores, logits, rest = model.preview(encoded, called["points"])
+        scores, logits, arrays = model.preview(encoded, called["points"])
         flat = logits[:number].reshape(-1, *logits.shape[2:])
         _, stability, boxes = read_logits(flat, settings.stability_offset, encoded.frame)
-        found.append((scores[:number], stability.reshape(number, -1), boxes.reshape(number, -1, 4)))
-        kept.append({name: rows[:number] for name, rows in rest.items()})
-    predicted_iou, stability, boxes = (np.concatenate(each) for each in zip(*found, strict=True))
+        measured.append((scores[:number], stability.reshape(number, -1), boxes.reshape(number, -1, 4)))
+        previewed.append({name: rows[:number] for name, rows in arrays.items()})
+    predicted_iou, stability, boxes = map(np.concatenate, zip(*measured, strict=True))
     likely = (predicted_iou >= iou_floor) & (stability >= stability_floor) & boxes.any(axis=2)
     chosen = np.zeros(len(likely), bool)
     for head in range(len(HEADS)):
@@ -208,7 +208,8 @@ def distinct_prompts(
         distinct = distinct_boxes(boxes[at], predicted_iou[at], REPEAT_IOU, stability[at], REPEAT_SLACK)
         chosen[rows[distinct]] = True
     chosen[0] |= not chosen.any()
-    return {name: np.concatenate([each.pop(name) for each in kept])[chosen] for name in list(kept[0])}
+    names = list(previewed[0])
+    return {name: np.concatenate([arrays.pop(name) for arrays in previewed])[chosen] for name in names}
 
 
 def keep_candidates(

@@ -222,14 +222,14 @@ class HierarchicalMasks:
         """Check that offsets, runs, areas and boxes are consistent."""
         lengths, ends = np.diff(self.offsets), self.offsets[[0, -1]].tolist() if len(self.offsets) else []
         if len(self.offsets) != len(self) + 1 or ends != [0, len(self.runs)] or (lengths <= 0).any():
-            found = f"{len(self.offsets)} from {ends}, smallest step {lengths.min(initial=0)}"
-            raise _damaged(path, "offsets", f"{len(self) + 1} ascending from 0 to {len(self.runs)}", found)
+            offsets = f"{len(self.offsets)} from {ends}, smallest step {lengths.min(initial=0)}"
+            raise _damaged(path, "offsets", f"{len(self) + 1} ascending from 0 to {len(self.runs)}", offsets)
         height, width = self.size_hw
         if len(self):
             pixels = np.add.reduceat(self.runs.astype(np.int64), self.offsets[:-1])
             if (pixels != height * width).any():
-                found = f"{pixels[pixels != height * width][0]} in one mask"
-                raise _damaged(path, "runs", f"{height * width} pixels per mask", found)
+                wrong = f"{pixels[pixels != height * width][0]} in one mask"
+                raise _damaged(path, "runs", f"{height * width} pixels per mask", wrong)
         area_px, boxes = areas_and_boxes(self.runs, self.offsets, width)
         if not (area_px > 0).all() or not np.array_equal(area_px, self.area_px):
             raise _damaged(path, "area_px", "the areas of the masks")
@@ -253,10 +253,10 @@ def region_ious(
     ids, index = np.unique(flat, return_inverse=True)
     first = int(np.searchsorted(ids, 0))
     areas = np.bincount(index, minlength=len(ids))
-    guesses = masks.reshape(len(masks), flat.size)
+    flat_masks = masks.reshape(len(masks), flat.size)
     shared = np.zeros((len(ids), len(masks)))
-    for row, guess in enumerate(guesses):
-        shared[:, row] = np.bincount(index[guess], minlength=len(ids))
-    union = areas[:, None] + guesses.sum(axis=1)[None] - shared
-    found = (shared / np.maximum(union, 1)).astype(np.float32)
-    return ids[first:].astype(np.int64), areas[first:].astype(np.int64), found[first:]
+    for row, mask in enumerate(flat_masks):
+        shared[:, row] = np.bincount(index[mask], minlength=len(ids))
+    union = areas[:, None] + flat_masks.sum(axis=1)[None] - shared
+    ious = (shared / np.maximum(union, 1)).astype(np.float32)
+    return ids[first:].astype(np.int64), areas[first:].astype(np.int64), ious[first:]

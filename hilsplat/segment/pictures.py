@@ -85,13 +85,13 @@ def tree_picture(
     def height(row: int) -> int:
         return 1 + max(map(height, children.get(row, [])), default=0)
 
-    shown, left = [], MAX_LEAVES
+    roots, left = [], MAX_LEAVES
     for root in sorted(children.get(NONE, []), key=lambda row: (-nodes(row), row)):
         if leaves(root) <= left:
-            shown.append(root)
+            roots.append(root)
             left -= leaves(root)
     step_x, step_y = 2 * THUMB_PX, THUMB_PX + 6
-    columns = max(map(height, shown), default=1)
+    columns = max(map(height, roots), default=1)
     canvas = np.full((max(1, MAX_LEAVES - left) * step_y + 6, columns * step_x, 3), 255, np.uint8)
     palette, tops = row_colours(len(masks)), itertools.count(6, step_y)
 
@@ -109,7 +109,7 @@ def tree_picture(
         cv2.rectangle(canvas, (x, y), (x + THUMB_PX, y + THUMB_PX), colour, 2)
         return y
 
-    for root in shown:
+    for root in roots:
         draw(root, 0)
     return canvas
 

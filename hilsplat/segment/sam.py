@@ -21,11 +21,10 @@ from hilsplat.base.errors import ModelError
 from hilsplat.base.levels import Level
 from hilsplat.base.lineage import sha256_of_bytes
 from hilsplat.base.processes import in_order
-from hilsplat.models.fast_paths import or_as_exported
 from hilsplat.models.folder import SAM_SIDE_PX, ModelFolder, input_side_px, open_model_folder
 from hilsplat.models.int8 import CHECKED_GRID, agreement_of_masks, considers_int8, int8_network, use_int8
 from hilsplat.models.layouts import DECODER, PREVIEW
-from hilsplat.models.network import CPU, Network, execution_providers
+from hilsplat.models.network import CPU, Network, execution_providers, or_as_exported
 from hilsplat.models.onnx_graph import Graph, with_rowwise_attention
 from hilsplat.models.repeatable import random_pixels, require_repeatable_once
 from hilsplat.segment.decoder_network import DecoderNetwork
@@ -103,10 +102,9 @@ class SamModel:
     as_exported: bool = True  # the encoder or decoder runs as exported, which takes more memory
 
     def __init__(self, model: ModelFolder) -> None:
-        self.model = model
+        self.model, self.digest = model, model.digest
         self.own = own_thresholds(model)
         self.stretches = model.layout == "sam2"
-        self.digest = model.digest
         self.decoder = DecoderNetwork(model, DECODER)
         if PREVIEW in model.networks:
             self.previewer = DecoderNetwork(model, PREVIEW)
@@ -148,9 +146,8 @@ class SamModel:
 
         def measure() -> dict[str, float]:
             work = [(image, encoder) for encoder in (self.encoder, quantised) for image in images]
-            found = list(in_order(masks, work, threads))
-            halves = found[: len(images)], found[len(images) :]
-            return agreement_of_masks(*(np.concatenate(half) for half in halves))
+            full, int8 = np.split(np.stack(list(in_order(masks, work, threads))), 2)
+            return agreement_of_masks(np.concatenate(full), np.concatenate(int8))
 
         digests = [sha256_of_bytes(image.tobytes()) for image in images]
         inputs = {"model": self.digest, "images": digests, "grid": CHECKED_GRID}
@@ -166,20 +163,22 @@ class SamModel:
         """Return the encoder, and its graph if a ViT's global attention is computed row by row on a CPU."""
         vision, path = self.model.config.get("vision_config"), self.model.networks["vision_encoder"]
 
-        def opened(graph: Graph | None) -> tuple[Graph | None, Network]:
+        def open_as(graph: Graph | None) -> tuple[Graph | None, Network]:
             network = self.model.network("vision_encoder", graph)
             form = "as exported" if graph is None else "row-wise"
             require_repeatable_once(self.model, network, form, random_pixels(network, self.padded_hw[0]))
             return graph, network
 
         if self.stretches or not isinstance(vision, dict) or execution_providers()[0] != CPU:
-            return opened(None)
+            return open_as(None)
         layers = vision.get("global_attn_indexes", (2, 5, 8, 11))
         heads = vision.get("num_attention_heads", 12)
         side = vision.get("image_size", 1024) // vision.get("patch_size", 16)
         cost = "each image takes about 5 times as much memory"
-        found = or_as_exported(path, cost, lambda: opened(with_rowwise_attention(path, layers, heads, side)))
-        return found or opened(None)
+        rowwise = or_as_exported(
+            path, cost, lambda: open_as(with_rowwise_attention(path, layers, heads, side))
+        )
+        return rowwise or open_as(None)
 
     def _random_features(self) -> dict[str, np.ndarray]:
         """Return random image features; the encoder runs only if no network declares their shapes."""
@@ -191,13 +190,13 @@ class SamModel:
         }
         if all(map(all, shapes.values())):
             return {name: rng.standard_normal((1, *shape), np.float32) for name, shape in shapes.items()}
-        found = self.encoder(**random_pixels(self.encoder, self.padded_hw[0]))
-        return dict(zip(self.encoder.spec.outputs, found, strict=True))
+        features = self.encoder(**random_pixels(self.encoder, self.padded_hw[0]))
+        return dict(zip(self.encoder.spec.outputs, features, strict=True))
 
     def _factor(self, features: Mapping[str, np.ndarray]) -> FactoredDecoder:
         """Return the factored decoder; raise an exception if factoring or the comparison fails."""
-        described = self.model.config.get("mask_decoder_config", {})
-        factored = FactoredDecoder(self.decoder, described.get("num_attention_heads", HEADS_PER_ATTENTION))
+        config = self.model.config.get("mask_decoder_config", {})
+        factored = FactoredDecoder(self.decoder, config.get("num_attention_heads", HEADS_PER_ATTENTION))
         difference = largest_difference(factored, self.decoder, features, self.padded_hw[0])
         if not difference <= AGREEMENT:
             raise ModelError(f"the factored decoder differs by {difference:.2g}")
@@ -206,8 +205,8 @@ class SamModel:
     @staticmethod
     def load(folder: Path, variant: str = "") -> "SamModel":
         """Open a model folder; errors as in `open_model_folder`."""
-        other = "set masks.segmenter: graph, which needs no model"
-        return SamModel(open_model_folder(folder, "sam", variant=variant, fix=other))
+        fix = "set masks.segmenter: graph, which needs no model"
+        return SamModel(open_model_folder(folder, "sam", variant=variant, fix=fix))
 
     def thresholds(self, settings: MasksSettings) -> Thresholds:
         """Return the settings' thresholds, with the model's own in place of `auto`."""
@@ -289,8 +288,8 @@ class SamModel:
         """Decode prompts at a lower resolution (requires `previews`); pass the third result to `finish`."""
         points = in_input(points_xy, encoded.frame)
         if self.factored and encoded.terms:
-            iou, logits, kept = self.factored.decode(encoded.terms, points, fine=False)
-            return self._finite(iou), logits, {"iou": iou, **kept}
+            iou, logits, prompts = self.factored.decode(encoded.terms, points, fine=False)
+            return self._finite(iou), logits, {"iou": iou, **prompts}
         assert self.previewer is not None
         iou, logits = self.previewer(encoded.features, points[:, None])
         return self._finite(iou), logits, {"points": points_xy}
@@ -313,13 +312,13 @@ def in_input(points_xy: Float[np.ndarray, "P 2"], frame: Frame) -> Float[np.ndar
 
 def enlarged(logits: Float32[np.ndarray, "K h w"], frame: Frame) -> Bool[np.ndarray, "K H W"]:
     """Upscale low-resolution logits as SamProcessor does, and return the masks at the image's size."""
-    found = []
-    for each in logits:
+    masks = []
+    for values in logits:
         if not frame.stretched:
-            each = cv2.resize(each, frame.padded_hw[::-1], interpolation=cv2.INTER_LINEAR)
-            each = each[: frame.resized_hw[0], : frame.resized_hw[1]]
-        found.append(cv2.resize(each, frame.original_hw[::-1], interpolation=cv2.INTER_LINEAR) > 0)
-    return np.stack(found)
+            values = cv2.resize(values, frame.padded_hw[::-1], interpolation=cv2.INTER_LINEAR)
+            values = values[: frame.resized_hw[0], : frame.resized_hw[1]]
+        masks.append(cv2.resize(values, frame.original_hw[::-1], interpolation=cv2.INTER_LINEAR) > 0)
+    return np.stack(masks)
 
 
 def largest_difference(
@@ -332,10 +331,10 @@ def largest_difference(
     points = np.random.default_rng(0).uniform(0, side_px, (CHECKED_PROMPTS, 1, 2))
     step = decoder.prompts_per_call or CHECKED_PROMPTS
     calls = [decoder(features, points[start : start + step]) for start in range(0, CHECKED_PROMPTS, step)]
-    iou, logits = (np.concatenate(each) for each in zip(*calls, strict=True))
-    own_iou, own_logits, _ = factored.decode(factored.image(features), points[:, 0], fine=True)
-    off = np.abs(own_logits - logits).max() / max(1, np.abs(logits).max())
-    return float(max(off, np.abs(own_iou - iou).max()))
+    iou, logits = map(np.concatenate, zip(*calls, strict=True))
+    fast_iou, fast_logits, _ = factored.decode(factored.image(features), points[:, 0], fine=True)
+    difference = np.abs(fast_logits - logits).max() / max(1, np.abs(logits).max())
+    return float(max(difference, np.abs(fast_iou - iou).max()))
 
 
 def own_thresholds(model: ModelFolder) -> Thresholds:
@@ -344,12 +343,12 @@ def own_thresholds(model: ModelFolder) -> Thresholds:
     A ModelError is raised for an unknown key or a value out of range.
     """
     own: Any = model.config.get(OWN, {})
-    known = vars(REAL_SAM)
+    names = vars(REAL_SAM)
     try:
-        if not isinstance(own, dict) or not own.keys() <= known.keys():
-            raise ValueError(f"known keys are {', '.join(known)}")
-        read = MasksSettings(**own)
-        return replace(REAL_SAM, **{name: getattr(read, name) for name in own})
+        if not isinstance(own, dict) or not own.keys() <= names.keys():
+            raise ValueError(f"known keys are {', '.join(names)}")
+        settings = MasksSettings(**own)
+        return replace(REAL_SAM, **{name: getattr(settings, name) for name in own})
     except ValueError as error:  # includes pydantic's ValidationError
         raise ModelError(
             f"{model.folder / 'config.json'}: {OWN} is invalid: {error}", fix="correct or remove it"
@@ -376,18 +375,18 @@ def read_logits(
     # an integer exceeds x if and only if it exceeds floor(x)
     upper, lower = math.floor(offset / LOGIT_STEP), math.floor(-offset / LOGIT_STEP)
     steps, stability = np.empty(logits.shape, np.int8), np.empty(len(logits), np.float32)
-    for row, each in enumerate(logits):  # one by one, in the processor's cache
-        steps[row] = np.rint(each / np.float32(LOGIT_STEP)).clip(-127, 127)
-        seen = steps[row, :height, :width]
-        stability[row] = np.count_nonzero(seen > upper) / max(1, int(np.count_nonzero(seen > lower)))
+    for row, values in enumerate(logits):  # one by one, in the processor's cache
+        steps[row] = np.rint(values / np.float32(LOGIT_STEP)).clip(-127, 127)
+        visible = steps[row, :height, :width]
+        stability[row] = np.count_nonzero(visible > upper) / max(1, int(np.count_nonzero(visible > lower)))
     return steps, stability, positive_boxes(steps)
 
 
 def positive_boxes(logits: Real[np.ndarray, "K h w"]) -> Int32[np.ndarray, "K 4"]:
     """Return the box (xyxy, end exclusive) of the positive logits of each mask, all 0 if there are none."""
     boxes = np.empty((len(logits), 4), np.int32)
-    for row, each in enumerate(logits):
-        x, y, width, height = cv2.boundingRect((each > 0).view(np.uint8))
+    for row, values in enumerate(logits):
+        x, y, width, height = cv2.boundingRect((values > 0).view(np.uint8))
         boxes[row] = x, y, x + width, y + height
     return boxes
 

@@ -1,7 +1,7 @@
-"""Stage `masks`: masks at three levels for every training view."""
+"""Stages that segment training views at three levels, with SAM or with the graph segmenter."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from hilsplat.base.artifacts import write_index
 from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.cache import ViewCache
 from hilsplat.base.code import code_digest
-from hilsplat.base.errors import SceneError
+from hilsplat.base.errors import SceneError, SettingsError
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.lineage import sha256_of_file, sha256_of_json
 from hilsplat.base.processes import in_order
@@ -46,66 +46,135 @@ def run_masks(
     settings: MasksSettings,
     threads: int,
     memory_mib: float | None = None,
-    key_views: Sequence[str] | None = None,
-    prompts: Callable[[str], np.ndarray | None] = lambda view: None,
+    views: Sequence[str] | None = None,
+) -> None:
+    """Segment training views with the segmenter in the settings; arguments as in `run_sam_masks`."""
+    if settings.segmenter == "sam":
+        run_sam_masks(scene_folder, out, cache, settings, threads, memory_mib, views)
+    elif settings.segmenter == "graph":
+        run_graph_masks(scene_folder, out, cache, settings, threads, views)
+    else:
+        raise SettingsError(
+            f"masks.segmenter {settings.segmenter} needs a generated scene's ground truth",
+            fix="set masks.segmenter to sam or graph; the workflow runs `hilsplat world perturb`",
+        )
+
+
+def run_sam_masks(
+    scene_folder: Path,
+    out: Path,
+    cache: Path,
+    settings: MasksSettings,
+    threads: int,
+    memory_mib: float | None = None,
+    views: Sequence[str] | None = None,
+    prompts: Callable[[str], np.ndarray] | None = None,
     finished: Path | None = None,
 ) -> None:
-    """Segment training views at three levels.
+    """Segment training views with SAM.
 
     Args:
-        out: folder to write: `<view>.npz` (`HierarchicalMasks`) and `index.json` (`digests.index_entry`).
-        cache: folder of the view cache. For SAM it contains the decoder's candidates and the masks, so
-            changing thresholds doesn't rerun the networks, and changing levels needs no computation.
+        out: folder to write (`write_masks`).
+        cache: folder of the view cache. It contains the decoder's candidates and the masks, so changing
+            thresholds doesn't rerun the networks, and changing levels needs no computation.
         threads: views processed in parallel if they fit into memory; the result does not depend on it.
         memory_mib: memory that the stage may use; None for all free memory.
-        key_views: views to segment; None for every training view.
-        prompts: function that returns a view's prompt points for SAM (x, y, px), or None to use the grid.
+        views: views to segment; None for every training view.
+        prompts: function that returns a view's prompt points (x, y, px); None for the grid.
         finished: earlier output of this stage whose views are reused unchanged.
     """
-    scene = Scene.load(scene_folder)
-    views = train_views(scene) if key_views is None else list(key_views)
-    view_cache = ViewCache(cache / "masks")
-    taken = digests_in(finished) if finished else {}
-    model: SamModel | None = None
-    identity: dict[str, str | None] = {"segmenter": settings.segmenter, "model": None, "model_sha256": None}
-
-    def segment(view: str) -> HierarchicalMasks:
-        if finished and view in taken:
-            return load_masks(finished, view, taken)
-        if model is None:
-            masks = graph_masks(scene, view, view_cache, settings)
-        else:
-            masks = sam_masks(scene, view, model, view_cache, settings, prompts(view))
-        if settings.levels == "head":
-            return masks
-        return with_tree_levels(masks, settings.theta or CoverageTreeSettings().theta)
-
+    scene, view_cache = Scene.load(scene_folder), ViewCache(cache / "masks")
+    finished_digests = digests_in(finished) if finished else {}
     with stage_log("masks", scene.name) as counts:
-        if settings.segmenter == "sam":
-            model = SamModel.load(Path(settings.model), settings.variant)
-            every = train_views(scene)  # independent of `key_views`
-            checked = [scene.image(view) for view in every[:: max(1, len(every) // CHECKED_VIEWS)]]
-            model.choose_precision(settings.precision, checked[:CHECKED_VIEWS], cache, threads)
-            identity.update(model=settings.model, model_sha256=model.digest, precision=model.precision)
-            limit = model.thresholds(settings).points_per_batch
-            batch = model.prompts_per_call(limit, settings.points_per_side**2)
-            needs = needs_of(model.model, batch, as_exported=model.as_exported)
-            threads = needs.views_at_once(threads, memory_mib)
-            logger.info("masks %s: %d views at once, %.0f MiB each", scene.name, threads, needs.view_mib)
-        else:
-            logger.info("masks %s: graph segmenter (no model); the levels are three scales", scene.name)
-        index: dict[str, Any] = {}
-        with atomic_folder(out) as folder:
-            found = in_order(segment, views, threads)
-            for view, masks in zip(views, track(found, "masks of views", len(views)), strict=True):
-                masks.save(folder / f"{view}.npz")
-                index[view] = index_entry(masks)
-            write_index(folder, index, scene=scene.name, partial=key_views is not None, **identity)
-        total = {level.label: sum(entry[level.label] for entry in index.values()) for level in LEVELS}
-        for level, number in total.items():
-            if not number:
-                logger.warning("masks %s: no view has a mask at level %s", scene.name, level)
-        counts.update(views=len(views), **total, from_cache=view_cache.hits)
+        model = SamModel.load(Path(settings.model), settings.variant)
+        training = train_views(scene)
+        checked = training[:: max(1, len(training) // CHECKED_VIEWS)][:CHECKED_VIEWS]
+        model.choose_precision(settings.precision, [scene.image(view) for view in checked], cache, threads)
+        limit = model.thresholds(settings).points_per_batch
+        batch = model.prompts_per_call(limit, settings.points_per_side**2)
+        needs = needs_of(model.model, batch, as_exported=model.as_exported)
+        threads = needs.views_at_once(threads, memory_mib)
+        logger.info("masks %s: %d views at once, %.0f MiB each", scene.name, threads, needs.view_mib)
+
+        def segment(view: str) -> HierarchicalMasks:
+            if finished and view in finished_digests:
+                return load_masks(finished, view, finished_digests)
+            points = prompts(view) if prompts else None
+            return _with_levels(sam_masks(scene, view, model, view_cache, settings, points), settings)
+
+        chosen = training if views is None else views
+        masks = zip(chosen, in_order(segment, chosen, threads), strict=True)
+        origin = {"model": settings.model, "model_sha256": model.digest, "precision": model.precision}
+        counts.update(write_masks(out, scene, masks, len(chosen), "sam", **origin))
+        counts.update(from_cache=view_cache.hits)
+
+
+def run_graph_masks(
+    scene_folder: Path,
+    out: Path,
+    cache: Path,
+    settings: MasksSettings,
+    threads: int,
+    views: Sequence[str] | None = None,
+) -> None:
+    """Segment training views with the graph segmenter; arguments as in `run_sam_masks`."""
+    scene, view_cache = Scene.load(scene_folder), ViewCache(cache / "masks")
+    with stage_log("masks", scene.name) as counts:
+        arguments = settings.graph_scales, settings.min_area_px
+        logger.info("masks %s: graph segmenter (no model); the levels are three scales", scene.name)
+
+        def segment(view: str) -> HierarchicalMasks:
+            key = sha256_of_json(
+                {
+                    "image": sha256_of_file(scene.image_path(view)),
+                    "settings": arguments,
+                    "code": code_digest(segment_graph, HierarchicalMasks),
+                }
+            )
+            arrays = view_cache.get(key, lambda: segment_graph(scene.image(view), *arguments).arrays())
+            return _with_levels(HierarchicalMasks.from_arrays(arrays), settings)
+
+        chosen = train_views(scene) if views is None else views
+        masks = zip(chosen, in_order(segment, chosen, threads), strict=True)
+        counts.update(write_masks(out, scene, masks, len(chosen), "graph"))
+        counts.update(from_cache=view_cache.hits)
+
+
+def write_masks(
+    out: Path,
+    scene: Scene,
+    masks: Iterable[tuple[str, HierarchicalMasks]],
+    number: int,
+    segmenter: str,
+    *,
+    model: str | None = None,
+    model_sha256: str | None = None,
+    **more: str,
+) -> dict[str, int]:
+    """Write `<view>.npz` of each view and `index.json` (`digests.index_entry`); return the totals to log.
+
+    Args:
+        masks: view and masks, for `number` training views.
+        segmenter, model, model_sha256, more: origin of the masks, recorded in the index.
+    """
+    index: dict[str, Any] = {}
+    with atomic_folder(out) as folder:
+        for view, masks_of_view in track(masks, "masks of views", number):
+            masks_of_view.save(folder / f"{view}.npz")
+            index[view] = index_entry(masks_of_view)
+        origin = {"segmenter": segmenter, "model": model, "model_sha256": model_sha256, **more}
+        write_index(folder, index, scene=scene.name, partial=number < len(train_views(scene)), **origin)
+    totals = {level.label: sum(entry[level.label] for entry in index.values()) for level in LEVELS}
+    for level, total in totals.items():
+        if not total:
+            logger.warning("masks %s: no view has a mask at level %s", scene.name, level)
+    return {"views": number, **totals}
+
+
+def _with_levels(masks: HierarchicalMasks, settings: MasksSettings) -> HierarchicalMasks:
+    if settings.levels == "head":
+        return masks
+    return with_tree_levels(masks, settings.theta or CoverageTreeSettings().theta)
 
 
 def sam_masks(
@@ -133,19 +202,3 @@ def sam_masks(
         }
     )
     return HierarchicalMasks.from_arrays(cache.get(masks_key, from_candidates))
-
-
-def graph_masks(scene: Scene, view: str, cache: ViewCache, settings: MasksSettings) -> HierarchicalMasks:
-    """Segment one view with the graph segmenter."""
-    key = sha256_of_json(
-        {
-            "image": sha256_of_file(scene.image_path(view)),
-            "settings": [settings.graph_scales, settings.min_area_px],
-            "code": code_digest(segment_graph, HierarchicalMasks),
-        }
-    )
-
-    def segment() -> dict[str, np.ndarray]:
-        return segment_graph(scene.image(view), settings.graph_scales, settings.min_area_px).arrays()
-
-    return HierarchicalMasks.from_arrays(cache.get(key, segment))

@@ -85,9 +85,9 @@ def _greedy(
         allowed = box_iou(boxes[block], boxes[start:]) <= iou_max
         if stability is not None:
             allowed |= stability[start:] > stability[block, None] + slack
-        for place, row in zip(block, allowed, strict=True):
-            if alive[place]:
-                alive[place + 1 :] &= row[place + 1 - start :]
+        for row, is_allowed in zip(block, allowed, strict=True):
+            if alive[row]:
+                alive[row + 1 :] &= is_allowed[row + 1 - start :]
     return alive
 
 
@@ -131,13 +131,13 @@ def suppress_masks(
     The result is in `content_order`, so shuffled input gives the same result. A level may become empty.
     """
     masks = masks.take(masks.content_order())
-    kept = []
+    best = []
     for level in LEVELS:
         rows = masks.rows_of(level)
         of_level = masks.take(rows)
         score = of_level.predicted_iou.astype(np.float64) * of_level.stability
-        keep = keep_best_masks(
-            of_level.overlaps_px(), score, iou_max=iou_max, score_min=score_min, inner=inner
+        overlap_px = of_level.overlaps_px()
+        best.append(
+            rows[keep_best_masks(overlap_px, score, iou_max=iou_max, score_min=score_min, inner=inner)]
         )
-        kept.append(rows[keep])
-    return masks.take(np.concatenate(kept))
+    return masks.take(np.concatenate(best))

@@ -7,7 +7,7 @@ import typer
 from pydantic import ValidationError
 
 from hilsplat.base.errors import HilsplatError
-from hilsplat.cli.stage import start_logging
+from hilsplat.cli.common import start_logging
 from hilsplat.configuration import settings_error
 from models.training.settings import TrainingSettings
 from models.training.train import require_own_models, train_models

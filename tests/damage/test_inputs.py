@@ -27,7 +27,7 @@ from hilsplat.base.images import read_image, read_mask
 from hilsplat.configuration import read_config
 from hilsplat.embed.langsplat_files import read_view
 from hilsplat.photos.intake import unpack_photographs
-from hilsplat.scene.cameras import Cameras
+from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.scene.importers.known_views import KnownView, Source, read_source
 from hilsplat.scene.importers.nerfstudio import source_from_dataparser
 from hilsplat.scene.layouts import find_known_poses
@@ -439,7 +439,7 @@ def langsplat(folder: Path) -> Case:
                 for known_level, mask, vector in expected
             ), f"level {level}: {direction}"
 
-    return Case(paths, lambda: read_view(folder, "000.png", SIZE_HW), check)
+    return Case(paths, lambda: read_view(folder, Camera("000.png", np.eye(4), np.eye(3), SIZE_HW)), check)
 
 
 def pictures(

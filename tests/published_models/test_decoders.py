@@ -51,12 +51,6 @@ def test_the_published_sam_2_decoder_is_factored(sam2, photograph, caplog):
     assert_answers(model, photograph, answer, EXACT)
 
 
-def test_a_folder_of_links_is_factored(sam2, photograph, tmp_path):
-    model = SamModel.load(exports.link(sam2[0], tmp_path))
-    assert model.factored is not None
-    assert_answers(model, photograph, sam2[1], EXACT)
-
-
 @pytest.mark.parametrize("fixed_points", [True, False])
 def test_plain_torchscript_and_free_prompts_are_factored(changed, sam2_model, photograph, fixed_points):
     folder, answer = changed(

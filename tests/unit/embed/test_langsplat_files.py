@@ -1,6 +1,5 @@
 """LangSplat's files: exported files are read back, and files of other programs are checked."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.images import read_image
 from hilsplat.embed.clip import ClipModel
 from hilsplat.embed.langsplat_export import maps_of, write_langsplat
-from hilsplat.embed.langsplat_files import read_clip, read_masks, read_view
+from hilsplat.embed.langsplat_files import read_view, run_imported_clip, run_imported_masks
 from hilsplat.scene.cameras import Camera
 from hilsplat.segment.digests import digest_of, index_entry
 from hilsplat.segment.masks import HierarchicalMasks
@@ -19,6 +18,10 @@ from hilsplat.settings import ClipSettings
 from tests.unit.segment.handmade import assert_equal_masks, pack, save_scene
 
 SIZE = (6, 8)
+
+
+def camera(size_hw: tuple[int, int], name: str = "a.png") -> Camera:
+    return Camera(name, np.eye(4), np.eye(3), size_hw)
 
 
 def nested() -> HierarchicalMasks:
@@ -80,12 +83,12 @@ def test_exported_files_are_read_back(ours, files, scene, model, tmp_path):
     assert (maps.shape, maps.dtype) == ((4, *SIZE), np.float32)
     assert (vectors.shape, vectors.dtype) == ((8, model.width), np.float32)
     np.save(files / "a_f.npy", 3 * vectors)  # lengths are normalised
-    read_masks(scene, files, tmp_path / "masks again")
+    run_imported_masks(scene, files, tmp_path / "masks again")
     found = HierarchicalMasks.load(tmp_path / "masks again" / "a.png.npz")
     assert_equal_masks(found, nested())  # masks of a level do not overlap, so nothing was painted over
     assert read_index(tmp_path / "masks again")["views"]["a.png"] == index_entry(found)
     settings = ClipSettings(model=str(model.model.folder))
-    read_clip(scene, files, tmp_path / "clip again", settings)
+    run_imported_clip(scene, files, tmp_path / "clip again", settings)
     index = read_index(tmp_path / "clip again")
     assert (index["dim"], index["model"]) == (model.width, settings.model)
     assert index["views"]["a.png"] == {"masks_sha256": digest_of(found), "masks": 4}
@@ -96,17 +99,14 @@ def test_exported_files_are_read_back(ours, files, scene, model, tmp_path):
 def test_a_view_may_have_no_masks(tmp_path):
     np.save(tmp_path / "x_s.npy", np.full((4, 2, 4), -1, np.float32))
     np.save(tmp_path / "x_f.npy", np.zeros((0, 5), np.float32))
-    masks, vectors = read_view(tmp_path, "x.y.jpg", (2, 4))
+    masks, vectors = read_view(tmp_path, camera((2, 4), "x.y.jpg"))
     assert (len(masks), vectors.shape) == (0, (0, 5))
 
 
 def test_maps_of_another_size_are_resized_and_of_another_shape_refused(files):
-    camera = Camera("a.png", np.eye(4), np.eye(3), (12, 16))
-    with pytest.raises(MisalignedArtifactError, match=r"the size of view a.png\n.*\(12, 16\)\n.*\(6, 8\)"):
-        read_view(files, "a.png", (12, 16))  # without a camera, it is unknown what the maps were drawn on
     with pytest.raises(MisalignedArtifactError, match=r"12 x 12 px(.|\n)*8 x 6 px"):
-        read_view(files, "a.png", (12, 12), replace(camera, size_hw=(12, 12)))
-    masks, _ = read_view(files, "a.png", (12, 16), camera)
+        read_view(files, camera((12, 12)))
+    masks, _ = read_view(files, camera((12, 16)))
     np.testing.assert_array_equal(masks.area_px, 4 * nested().area_px)
 
 
@@ -126,17 +126,17 @@ def test_invalid_files_are_refused_and_nothing_is_unpickled(tmp_path, maps, vect
     np.save(tmp_path / "a_s.npy", maps, allow_pickle=True)
     np.save(tmp_path / "a_f.npy", vectors)
     with pytest.raises(ArtifactError, match=words):
-        read_view(tmp_path, "a.png", SIZE)
+        read_view(tmp_path, camera(SIZE))
 
 
 def test_missing_files_are_reported_and_half_of_the_views_need_them(files, scene, tmp_path, caplog):
     (files / "b_s.npy").unlink()
-    read_masks(scene, files, tmp_path / "out")
+    run_imported_masks(scene, files, tmp_path / "out")
     assert "lacks the maps of 1 of 2 training views of set/scene: b_s.npy" in caplog.text
     assert list(read_index(tmp_path / "out")["views"]) == ["a.png"]
     (files / "a_s.npy").unlink()
     with pytest.raises(ArtifactError, match=r"lacks the maps of 2 of 2 training views(.|\n)*b_s.npy"):
-        read_masks(scene, files, tmp_path / "other")
+        run_imported_masks(scene, files, tmp_path / "other")
     assert not (tmp_path / "other").exists()
 
 
@@ -165,5 +165,5 @@ def test_vectors_of_another_clip_are_refused(files, scene, model, tmp_path, widt
     for path in files.glob("*_f.npy"):
         np.save(path, (np.load(path) @ turn).astype(np.float32)[:, :width])
     with pytest.raises(MisalignedArtifactError, match=words):
-        read_clip(scene, files, tmp_path / "out", ClipSettings(model=str(model.model.folder)))
+        run_imported_clip(scene, files, tmp_path / "out", ClipSettings(model=str(model.model.folder)))
     assert not (tmp_path / "out").exists()

@@ -19,44 +19,27 @@ LARGEST = r"less than or equal to 4096"
 INTEGER, NUMBER = "a valid integer", "a valid number"
 
 BAD = [
-    *(
-        (key, value, words)
-        for key in ("size", "crop_size", "pad_size")
-        for value, words in (
-            (100_000, LARGEST),
-            ({"height": 100_000, "width": 100_000}, LARGEST),
-            (-1, "greater than or equal to 1"),
-            (0, "greater than or equal to 1"),
-            (True, INTEGER),
-            ("224", INTEGER),
-            (224.5, INTEGER),
-            ([], INTEGER),
-            ({}, INTEGER),
-            ({"height": 224, "width": 336}, INTEGER),
-            ({"shortest_edge": 224, "longest_edge": 448}, INTEGER),
-            ({"height": [1] * 10**5}, INTEGER),
-        )
-    ),
+    ("size", 100_000, LARGEST),
+    ("crop_size", {"height": 100_000, "width": 100_000}, LARGEST),
+    ("pad_size", 0, "greater than or equal to 1"),
+    ("size", True, INTEGER),
+    ("crop_size", "224", INTEGER),
+    ("pad_size", [], INTEGER),
+    ("size", {"height": 224, "width": 336}, INTEGER),
+    ("crop_size", {"shortest_edge": 224, "longest_edge": 448}, INTEGER),
+    ("pad_size", {"height": [1] * 10**5}, INTEGER),
     ("image_mean", 0.5, "a valid list"),
     ("image_mean", [0.5], "at least 3 items"),
-    ("image_mean", [0.5] * 4, "at most 3 items"),
     ("image_mean", [0.5, 0.5, True], NUMBER),
     ("image_mean", [0.5, 0.5, float("nan")], "finite"),
     ("image_mean", [0.5, 0.5, 1e300], "less than or equal to 255"),
-    ("image_std", [1, 1, -1], "greater than or equal to 0.001"),
     ("image_std", [1, 1, 1e-300], "greater than or equal to 0.001"),
     ("image_std", [1, 1, float("inf")], "finite"),
     ("rescale_factor", 0, "greater than 0"),
-    ("rescale_factor", -1, "greater than 0"),
     ("rescale_factor", 255, "less than or equal to 1"),
     ("rescale_factor", "1/255", NUMBER),
-    ("rescale_factor", float("nan"), "finite"),
     ("resample", 99, "less than or equal to 5"),
-    ("resample", -1, "greater than or equal to 0"),
-    ("resample", "bicubic", INTEGER),
     ("do_resize", "false", "a valid boolean"),
-    ("do_normalize", 0, "a valid boolean"),
-    ("do_center_crop", 1, "a valid boolean"),
 ]
 
 

@@ -89,20 +89,14 @@ def test_models_of_the_user_are_found_from_any_folder_after_those_of_the_project
     assert model_path("models/none") == Path("models/none")
 
 
-@pytest.mark.parametrize("memo", ["[]", '"x"', "{", '{"a": 1}', '{"a": "b", "a": "c"}', "[" * 100_000])
+@pytest.mark.parametrize("memo", ["[]", "{", '{"a": 1}', '{"a": "b", "a": "c"}', "[" * 100_000, None])
 def test_a_damaged_cache_of_digests_is_replaced(models, memo):
-    cache = Path("cache")
-    expected = sha256_of_path(models / "sam-tiny")
-    cache.mkdir()
-    (cache / "digests.json").write_text(memo)
+    cache = Path("cache/digests.json")
     model_digest.cache_clear()
-    assert model_digest(models / "sam-tiny", cache) == expected
-    assert len(json.loads((cache / "digests.json").read_text())) > 1, "one entry for each file"
-
-
-def test_a_cached_digest_of_the_wrong_type_is_computed_again(models):
-    expected = model_digest(models / "clip-tiny", Path("cache"))
-    memo = Path("cache/digests.json")
-    memo.write_text(json.dumps(dict.fromkeys(json.loads(memo.read_text()), 7)))
+    expected = model_digest(models / "sam-tiny", cache.parent)
+    assert expected == sha256_of_path(models / "sam-tiny")
+    paths = json.loads(cache.read_text()).keys()
+    cache.write_text(memo or json.dumps(dict.fromkeys(paths, 7)))
     model_digest.cache_clear()
-    assert model_digest(models / "clip-tiny", Path("cache")) == expected
+    assert model_digest(models / "sam-tiny", cache.parent) == expected
+    assert json.loads(cache.read_text()).keys() >= paths

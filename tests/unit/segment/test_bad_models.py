@@ -40,11 +40,9 @@ def as_torch(folder: Path) -> None:
         (written(ENCODER, b""), r"cannot be opened(.|\n)*a file of 0 bytes"),
         (written(ENCODER, b"half"), r"encoder.onnx cannot be opened(.|\n)*fetch a complete copy"),
         (written(ENCODER, LFS_POINTER), r"Git LFS pointer(.|\n)*git lfs pull"),
-        (written(DECODER, LFS_POINTER), r"Git LFS pointer(.|\n)*git lfs pull"),
         (written(DECODER, b"half"), r"decoder.onnx cannot be opened(.|\n)*fetch a complete copy"),
         (written(CONFIG, b"{"), r"no readable config.json(.|\n)*model_type"),
         (written(CONFIG, []), r"a different kind of model(.|\n)*model_type"),
-        (written(CONFIG, {"model_type": 3}), r"a different kind of model(.|\n)*model_type"),
         (written(CONFIG, {"model_type": "sam3"}), r"SAM 2 or 2.1 \(sam2\)(.|\n)*sam3(.|\n)*use SAM 2.1"),
         (written(CONFIG, {"model_type": "blip"}), r"SAM 2 or 2.1 \(sam2\)(.|\n)*blip(.|\n)*docs/models.md"),
         (written(CONFIG, SAM | {"mask_generation": {"stability_min": 3}}), "mask_generation is invalid"),
@@ -52,8 +50,6 @@ def as_torch(folder: Path) -> None:
         (written(CONFIG, SAM | {"mask_generation": [1]}), "mask_generation is invalid"),
         (written(PREPROCESSOR, {"do_normalize": False}), "disables do_normalize"),
         (written(PREPROCESSOR, {"image_std": [0, 1, 1]}), "image_std is invalid"),
-        (written(PREPROCESSOR, {"image_std": "x"}), "image_std is invalid"),
-        (written(PREPROCESSOR, {"image_mean": [1e999, 0, 0]}), "image_mean is invalid"),
     ],
 )
 def test_incomplete_damaged_and_unsupported_folders_are_refused(own_sam, change, words):

@@ -1,15 +1,11 @@
 """Automatic mask generation, with a network that returns discs around the prompts."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from benchmarks.canned_sam import CannedSam, NetworkClock
-from benchmarks.memory import status_mib
 from hilsplat.base.levels import Level
 from hilsplat.segment.coverage import coverage_tree
 from hilsplat.segment.generate import (
@@ -28,7 +24,6 @@ from tests.unit.segment.handmade import assert_equal_masks, generate, pack, quan
 
 SETTINGS = MasksSettings(points_per_side=2, points_per_batch=3, stability_min=0.0, min_area_px=1)
 IMAGE = np.zeros((32, 32, 3), dtype=np.uint8)
-CLEAR = Path("/proc/self/clear_refs")
 EVERYTHING = MasksSettings(
     predicted_iou_min=0, stability_min=0, nms_score=0, min_area_px=1, box_nms_iou=1, nms_iou=1, nms_inner=0
 )
@@ -182,21 +177,3 @@ def test_prompts_with_a_mask_that_repeats_no_better_one_are_kept():
 
 def test_one_prompt_is_kept_if_the_preview_is_empty():
     assert prompts_of(Previewed([[0.05] * 3] * 3, [[(8, 3)] * 3] * 3)) == [0]
-
-
-@pytest.mark.skipif(not CLEAR.exists(), reason="only Linux can reset the peak of memory (/proc)")
-def test_three_thousand_candidates_stay_below_the_bound():
-    model = CannedSam(NetworkClock())
-    settings = MasksSettings(
-        points_per_batch=64, predicted_iou_min=0.7, stability_min=0.5, nms_score=0, min_area_px=100
-    )
-    image = np.random.default_rng(0).integers(0, 255, (728, 986, 3), dtype=np.uint8)
-    CLEAR.write_text("5")
-    before = status_mib("VmRSS")
-    candidates = decode_candidates(image, model, settings)
-    masks = masks_from_candidates(candidates, (728, 986), model, settings)
-    coverage_tree(masks, theta=0.9)
-    assert len(candidates.head) >= 3000
-    assert len(masks) > 100
-    # the bound is 1.5 GiB; one call of 64 prompts alone holds 50 MiB of logits, here twice
-    assert status_mib("VmHWM") - before < 400

@@ -36,23 +36,24 @@ def test_the_masks_are_those_of_the_published_generator(crop_layers, points_per_
         np.testing.assert_array_equal(masks.predicted_iou[rows], scores[nearest].astype(np.float32))
 
 
-def test_end_exclusive_boxes_have_a_different_iou_than_official_ones():
-    # 4 and 3 columns: IoU 3 / 4; ending at the last one inside, 2 / 3
-    boxes = np.array([[0, 0, 4, 9], [0, 0, 3, 9]])
-    score = np.array([0.9, 0.8])
-    assert suppress_boxes(boxes, score, 0.7).tolist() == [0]
-    assert distinct_boxes(last_inside(boxes), score, 0.7).tolist() == [0, 1]
+@pytest.mark.parametrize(
+    ("boxes", "score", "iou_max", "officially", "ours"),
+    [
+        # 4 and 3 columns: IoU 3 / 4; ending at the last one inside, 2 / 3
+        ([[0, 0, 4, 9], [0, 0, 3, 9]], [0.9, 0.8], 0.7, [0, 1], [0]),
+        # equal scores: the earlier box officially, the larger one here
+        ([[0, 0, 10, 9], [0, 0, 10, 10]], [1.0, 1.0], 0.5, [0], [1]),
+    ],
+)
+def test_ends_of_boxes_and_ties_differ_from_official_ones(boxes, score, iou_max, officially, ours):
+    boxes, score = np.array(boxes), np.array(score)
+    assert distinct_boxes(last_inside(boxes), score, iou_max).tolist() == officially
+    assert suppress_boxes(boxes, score, iou_max).tolist() == ours
 
 
 def test_scores_above_one_do_not_outweigh_the_first_rank():
     boxes = np.array([[0, 0, 10, 10], [0, 0, 10, 9]])
     assert suppress_boxes(boxes, np.array([2.5, 0.1]), 0.5, np.array([0.0, 1.0])).tolist() == [1]
-
-
-def test_ties_are_broken_by_row_officially_and_by_area_here():
-    boxes, score = np.array([[0, 0, 10, 9], [0, 0, 10, 10]]), np.ones(2)
-    assert distinct_boxes(last_inside(boxes), score, 0.5).tolist() == [0]
-    assert suppress_boxes(boxes, score, 0.5).tolist() == [1]
 
 
 def test_a_small_mask_can_be_kept_and_counts_as_changed():

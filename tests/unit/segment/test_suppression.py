@@ -67,14 +67,6 @@ def test_distinct_boxes_lead_to_the_same_suppression_at_any_threshold(seed, scor
     assert best(np.sort(distinct_boxes(boxes, score, 0.9, stability))) == best(np.arange(40))
 
 
-def test_a_contained_mask_is_dropped_even_with_the_better_score():
-    masks = np.array([[[1, 1, 1, 1, 1]], [[1, 1, 0, 0, 0]]], dtype=bool)
-    score = np.array([0.2, 0.9])
-    for inner, expected in ((0.5, [True, False]), (0.0, [True, True])):  # 0 keeps nesting inside a level
-        keep = keep_best_masks(pack(masks).overlaps_px(), score, iou_max=0.8, score_min=0.0, inner=inner)
-        assert keep.tolist() == expected
-
-
 @given(
     nonempty_masks,
     st.data(),
