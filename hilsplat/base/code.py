@@ -21,7 +21,7 @@ from hilsplat.base.errors import HilsplatError
 PACKAGES = ("hilsplat", "cpusplat")
 """Packages whose modules count, as do those of the packages of the roots, such as a plugin's."""
 
-NEUTRAL = ("hilsplat.settings", __name__)
+NEUTRAL = ("hilsplat.settings", "hilsplat.baselines", __name__)
 """Modules that don't count: settings, whose values are parameters of the rules, and this one."""
 
 Code = str | Callable[..., Any]

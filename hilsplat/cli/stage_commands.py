@@ -307,13 +307,13 @@ def method(
     threads: Threads = 1,
 ) -> None:
     """Compute the language field with the baseline selected in the settings."""
+    from hilsplat.baselines import method_of
     from hilsplat.methods.method import MethodInputs
-    from hilsplat.methods.registry import METHODS
 
     section = section_of("method", settings)
     inputs = {"scene": scene, "gaussians": gaussians, "masks": masks}
     inputs |= {"contributions": contributions, "autoencoder": autoencoder}
-    plugins = (METHODS.places[section.name],) if section.name in METHODS else ()
+    plugins = (method_of(section.name).fit,)
     parts = MethodInputs(scene, gaussians, masks, contributions, autoencoder, threads)
     with stage("method", out, settings=section, seed=seed, inputs=inputs, plugins=plugins) as run:
         run(parts, out, section, seed)

@@ -20,10 +20,10 @@ from scipy.cluster.vq import vq
 
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import track
+from hilsplat.baselines import MethodSettings
 from hilsplat.contributions.view_matrices import painted_indicator
 from hilsplat.methods.common.groups import kmeans
 from hilsplat.methods.method import MethodInputs
-from hilsplat.settings import MethodSettings
 
 TOP_GAUSSIANS = 45  # number of Gaussians, by weight, that get a pixel's vector, as published
 PART = 4  # elements of a CLIP vector that share a byte

@@ -27,12 +27,12 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from hilsplat.base.levels import LEVELS, NONE
+from hilsplat.baselines import TrainedSettings
 from hilsplat.field.code import LinearCode, unit_rows
 from hilsplat.methods.common.groups import density_clusters, features_of_groups, group_means, kmeans
 from hilsplat.methods.common.training import alike, of_seen, product, train, unit
 from hilsplat.methods.langsplat_v2 import as_vectors
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
-from hilsplat.settings import MethodSettings
 
 SLICES = (16, 8, 8)
 PREFIX = (16, 24, 32)
@@ -163,7 +163,7 @@ def object_latents(
     return found
 
 
-def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
+def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train features, find objects at each level, and assign each object the code of its descriptors."""
     contributions, code = inputs.contributions, inputs.linear_code("laga")
     views, found = labelled_views(inputs, settings.pixel_step), inputs.no_features()

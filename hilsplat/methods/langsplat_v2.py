@@ -6,7 +6,7 @@ maps them to CLIP vectors without an autoencoder. The loss is 1 - cosine; Adam s
 (ZhaoYujie2002/LangSplatV2 `train.py`, `scene/gaussian_model.py`, `utils/vq_utils.py`).
 
 Departs from the published code:
-    - fewer and larger steps, and a pixel grid instead of all pixels (`MethodSettings`);
+    - fewer and larger steps, and a pixel grid instead of all pixels (`TrainedSettings`);
     - codebook entries, and therefore their mixtures, are vectors m + U z of the scene's linear code; d = 64
       reproduces the masks' vectors with a mean cosine of 0.9998 on the development scenes;
     - the loss is averaged over the labelled pixels of the grid, rendered mixtures are divided by alpha,
@@ -21,11 +21,11 @@ from jaxtyping import Float32, Int64
 from cpusplat.compiled import compiled
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
+from hilsplat.baselines import TrainedSettings
 from hilsplat.field.adam import Adam, in_random_order
 from hilsplat.field.code import LinearCode, unit_rows
 from hilsplat.methods.common.groups import kmeans
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
-from hilsplat.settings import MethodSettings
 
 ENTRIES = 64  # codebook entries per level (LangSplatV2)
 KEPT = 4  # non-zero coefficients per Gaussian and level (LangSplatV2)
@@ -88,7 +88,7 @@ def train_level(
     num_gaussians: int,
     codebook: Float32[np.ndarray, "E D"],  # initial entries, at least `KEPT`
     code: LinearCode,
-    settings: MethodSettings,
+    settings: TrainedSettings,
     seed: int,
 ) -> Float32[np.ndarray, "N D"]:
     """Train the logits (from zero) and the codebook; return the mixture of every Gaussian."""
@@ -104,7 +104,7 @@ def train_level(
     return np.einsum("nk,nkd->nd", shares, entries[chosen])
 
 
-def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
+def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train the three levels one after the other; Gaussians in no mask of a level get zeros."""
     latents, code = inputs.latents, inputs.linear_code("langsplat_v2")
     views, features = labelled_views(inputs, settings.pixel_step), inputs.no_features()

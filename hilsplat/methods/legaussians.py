@@ -31,10 +31,10 @@ from torch import Tensor, nn
 from torch.nn.functional import cross_entropy
 
 from hilsplat.base.levels import LEVELS
+from hilsplat.baselines import TrainedSettings
 from hilsplat.methods.common.groups import kmeans, standardised
 from hilsplat.methods.common.training import alike, of_seen, one_torch_thread, product, train, unit
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
-from hilsplat.settings import MethodSettings
 
 ENTRIES = 128
 CHANNELS = 8
@@ -74,7 +74,7 @@ def smoothing_loss(
     return follow + ((predicted.detach() - codes).square().mean(1) * weight).mean()
 
 
-def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
+def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Quantise the codes, train, and look up the entries; Gaussians in no mask of a level get zeros."""
     contributions, latents = inputs.contributions, inputs.latents
     codebooks, entry = [], np.zeros(len(latents), np.int64)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -16,19 +17,19 @@ from jaxtyping import Bool, Float32, Int32, Int64
 from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.plugins import load
 from hilsplat.base.progress import stage_log, track
+from hilsplat.baselines import MethodSettings, method_of
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.rows import Contributions
 from hilsplat.contributions.view_matrices import label_maps
 from hilsplat.field.code import LanguageField, LinearCode, autoencoder_file, load_code, load_latents
-from hilsplat.methods.registry import method_of
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.finished import require_same
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import digests_in, load_masks
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.settings import MethodSettings
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 
@@ -105,7 +106,7 @@ class MethodInputs:
         return load_ply(self.gaussians_ply), scene
 
 
-Fit = Callable[[MethodInputs, MethodSettings, int], np.ndarray]
+Fit = Callable[[MethodInputs, Any, int], np.ndarray]
 """A baseline: maps inputs, settings and a seed to the features of every Gaussian and level, (N, 3, D)."""
 
 
@@ -116,7 +117,8 @@ def run_method(inputs: MethodInputs, out: Path, settings: MethodSettings, seed: 
         SettingsError: there is no such method.
         ArtifactError: the method returned features of the wrong shape or non-finite values.
     """
-    fit, contributions = method_of(settings.name), inputs.contributions
+    method, contributions = method_of(settings.name), inputs.contributions
+    fit: Fit = load(method.fit)
     with stage_log(f"method {settings.name}", Path(inputs.scene_folder).parent.name) as counts:
         features = np.asarray(fit(inputs, settings, seed), dtype=np.float32)
         expected = (contributions.num_gaussians, len(LEVELS), inputs.latents.shape[1])
@@ -125,7 +127,7 @@ def run_method(inputs: MethodInputs, out: Path, settings: MethodSettings, seed: 
                 f"method {settings.name} did not return a language field",
                 expected=f"finite features of shape {expected}",
                 found=f"shape {features.shape}, {np.count_nonzero(~np.isfinite(features))} non-finite",
-                fix=f"correct hilsplat/methods/{settings.name}.py",
+                fix=f"correct {method.fit}",
             )
         digest = sha256_of_file(autoencoder_file(inputs.autoencoder_folder))
         LanguageField(features, contributions.gaussians_sha256, digest).save(out)

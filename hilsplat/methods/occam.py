@@ -15,9 +15,9 @@ from jaxtyping import Float, Float32, Int64
 
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import track
+from hilsplat.baselines import MethodSettings
 from hilsplat.methods.method import MethodInputs
 from hilsplat.scene.cameras import Camera
-from hilsplat.settings import MethodSettings
 
 
 def centre_pixels(means: Float[np.ndarray, "N 3"], camera: Camera) -> Int64[np.ndarray, " N"]:

@@ -26,16 +26,15 @@ from torch import Tensor
 from torch.nn.functional import log_softmax
 
 from hilsplat.base.levels import LEVELS
-from hilsplat.methods.common.groups import cluster_field, clusters, thresholds_of
+from hilsplat.baselines import OmniSeg3DSettings
+from hilsplat.methods.common.groups import cluster_field, clusters
 from hilsplat.methods.common.training import alike, product, segment_means, train, unit
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
-from hilsplat.settings import MethodSettings
 
 CHANNELS = 16
 MIN_PATCH_PX = 3
 LEVEL_WEIGHT = 0.2  # factor on a patch's weight for each mask fewer that it shares
 SPREAD, MIN_TEMPERATURE, MAX_TEMPERATURE = 10.0, 0.5, 1.0
-THRESHOLDS = (0.5, 0.8, 0.95)
 
 
 def patches(labels: Int32[np.ndarray, "p 3"]) -> tuple[Int64[np.ndarray, " p"], Int64[np.ndarray, "k k"]]:
@@ -89,9 +88,8 @@ def hierarchical_loss(
     return total
 
 
-def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
+def fit(inputs: MethodInputs, settings: OmniSeg3DSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train features, cluster them at three increasing cosines, and assign clusters the codes of masks."""
-    thresholds = thresholds_of(settings, THRESHOLDS)
     views = labelled_views(inputs, settings.pixel_step)
     features = alike(inputs.contributions.num_gaussians, CHANNELS, seed)
 
@@ -104,5 +102,5 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
         return hierarchical_loss(rendered, torch.from_numpy(patch[inside]), torch.from_numpy(shared))
 
     train(views, [features], loss, settings, seed)
-    distances = tuple(1 - least for least in thresholds)
+    distances = tuple(1 - least for least in settings.thresholds)
     return cluster_field(inputs, clusters(unit(features.detach()).numpy(), distances, seed, "cosine"))

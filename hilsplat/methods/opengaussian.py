@@ -26,10 +26,10 @@ from jaxtyping import Float, Float32, Int64
 from torch import Tensor
 
 from hilsplat.base.levels import LEVELS, NONE
+from hilsplat.baselines import OpenGaussianSettings
 from hilsplat.methods.common.groups import associated_codes, kmeans, standardised
 from hilsplat.methods.common.training import product, segment_means, train, unit
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
-from hilsplat.settings import MethodSettings
 
 CHANNELS = 6
 SMOOTHING = 0.1
@@ -67,7 +67,7 @@ def contrast_loss(means: Float[Tensor, "m D"], done: float) -> Float[Tensor, ""]
 
 
 def instance_features(
-    inputs: MethodInputs, settings: MethodSettings, seed: int
+    inputs: MethodInputs, settings: OpenGaussianSettings, seed: int
 ) -> Float32[np.ndarray, "N 3 D"]:
     """Return trained instance features of all levels: unit vectors mapped to [0, 1]."""
     views, contributions = labelled_views(inputs, settings.pixel_step), inputs.contributions
@@ -118,7 +118,7 @@ def instances(
     return leaf
 
 
-def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
+def fit(inputs: MethodInputs, settings: OpenGaussianSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train instance features, and assign each level's instances the codes of the masks that fit them.
 
     Gaussians get 0 if no mask fits their instance.

@@ -26,11 +26,11 @@ from jaxtyping import Bool, Float, Float32, Float64, Int32
 from torch import Tensor
 
 from hilsplat.base.levels import LEVELS, NONE
+from hilsplat.baselines import TrainedSettings
 from hilsplat.contributions.rows import Contributions
 from hilsplat.methods.common.groups import cluster_field, clusters, nearest
 from hilsplat.methods.common.training import alike, of_seen, product, train, unit
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
-from hilsplat.settings import MethodSettings
 
 CHANNELS = 32
 NEIGHBOURS = 16
@@ -118,7 +118,7 @@ def neighbour_mean(means: Float32[np.ndarray, "N 3"]) -> sp.csr_matrix:
     return sp.csr_matrix((data, (np.repeat(np.arange(num), count), near.ravel())), shape=(num, num))
 
 
-def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
+def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train features, cluster them at each level's median scale, and assign clusters the codes of masks."""
     contributions = inputs.contributions
     scales = mask_scales(contributions)

@@ -29,11 +29,12 @@ from torch.nn.functional import softplus
 
 from cpusplat.compiled import compiled
 from hilsplat.base.levels import NONE
-from hilsplat.methods.common.groups import cluster_field, nearest, thresholds_of
+from hilsplat.baselines import VchSettings
+from hilsplat.methods.common.groups import cluster_field, nearest
 from hilsplat.methods.common.training import alike, product, train, unit
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 from hilsplat.segment.coverage import coverage_tree
-from hilsplat.settings import CoverageTreeSettings, MethodSettings
+from hilsplat.settings import CoverageTreeSettings
 
 CHANNELS = 16
 TEMPERATURE = 0.1
@@ -42,7 +43,6 @@ PIXEL_NEIGHBOURS = 10
 BORDER = 10.0  # added to edges across mask borders, per level, when the spanning tree is chosen
 NEIGHBOURS = 16
 LARGEST = 200
-THRESHOLDS = (0.6, 0.5, 0.45)
 
 
 @compiled
@@ -162,15 +162,15 @@ def components(
     return np.stack(found, axis=1)
 
 
-def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
+def fit(inputs: MethodInputs, settings: VchSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train vectors, connect Gaussians at decreasing distances, and assign components the codes of masks."""
-    thresholds = thresholds_of(settings, THRESHOLDS)
+    theta = settings.theta or CoverageTreeSettings().theta
     contributions = inputs.contributions
     views = labelled_views(inputs, settings.pixel_step)
     trees = {}  # level and parent of the masks, by view number
     for view in views:
         masks = inputs.view_masks(contributions.views[view.number])
-        trees[view.number] = (masks.level, coverage_tree(masks, CoverageTreeSettings().theta)[0])
+        trees[view.number] = (masks.level, coverage_tree(masks, theta)[0])
     features = alike(contributions.num_gaussians, CHANNELS, seed)
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
@@ -188,4 +188,4 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
 
     train(views, [features], loss, settings, seed)
     trained = unit(features.detach()).numpy()
-    return cluster_field(inputs, components(trained, contributions.means(), thresholds))
+    return cluster_field(inputs, components(trained, contributions.means(), settings.thresholds))

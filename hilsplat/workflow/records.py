@@ -14,8 +14,8 @@ from hilsplat.base.artifacts import provenance_path, run_command, sha256_of_path
 from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.base.progress import track
 from hilsplat.base.provenance import Provenance, files_of, read_provenance, sizes_of
+from hilsplat.baselines import OURS
 from hilsplat.datasets.sources import is_exported
-from hilsplat.methods.registry import OURS
 from hilsplat.models.store import model_digest
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.scene_data import of_variant

@@ -11,12 +11,10 @@ from scipy.cluster.vq import kmeans2, vq
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.field.code import unit_rows
 from hilsplat.methods.method import MethodInputs
 from hilsplat.semantic_tree.nodes import level_ious
-from hilsplat.settings import MethodSettings
 
 ROUNDS = 20  # Lloyd iterations; more would reduce the error by less than 1 %
 CENTRES = 256  # k-means centres that `clusters` merges
@@ -173,18 +171,3 @@ def density_clusters(
     graph = sp.csr_matrix((np.ones(len(pairs), bool), pairs.T), shape=(len(where), len(where)))
     found[where] = connected_components(graph, directed=False)[1]
     return found
-
-
-def thresholds_of(settings: MethodSettings, own: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return the configured thresholds or the method's; raise `SettingsError` if their order is wrong."""
-    if settings.thresholds == "auto":
-        return own
-    grow = own[0] < own[-1]
-    if list(settings.thresholds) != sorted(set(settings.thresholds), reverse=not grow):
-        raise SettingsError(
-            f"method.thresholds: {settings.name} cannot nest levels with these thresholds",
-            expected=f"numbers that {'rise' if grow else 'fall'} from whole to subpart, such as {list(own)}",
-            found=str(list(settings.thresholds)),
-            fix="reorder the numbers",
-        )
-    return settings.thresholds

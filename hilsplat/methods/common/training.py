@@ -15,9 +15,9 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from hilsplat.base.progress import track
+from hilsplat.baselines import TrainedSettings
 from hilsplat.field.adam import in_random_order
 from hilsplat.methods.method import LabelledView
-from hilsplat.settings import MethodSettings
 
 PIXELS = 4096  # maximum per step; published codes use 4096 (VCH), 32,768 (OmniSeg3D) or whole views
 START_NOISE = 0.1  # standard deviation of initial features about their common value
@@ -87,7 +87,7 @@ def train(
     views: list[LabelledView],
     parameters: list[Any],  # tensors, or parameter groups of `torch.optim.Adam` with their own rates
     loss: Loss,
-    settings: MethodSettings,
+    settings: TrainedSettings,
     seed: int,  # for the order of views and the pixels
     pixels: int = PIXELS,  # maximum per step
 ) -> None:

@@ -1,6 +1,7 @@
 """Methods that group Gaussians: losses worked by hand or by plain loops, groups known by construction."""
 
 import inspect
+import json
 import types
 
 import numpy as np
@@ -10,30 +11,29 @@ import torch
 from torch.nn.functional import cross_entropy
 
 from hilsplat.base.errors import ArtifactError, SettingsError
+from hilsplat.baselines import TrainedSettings
+from hilsplat.configuration import parse_section
 from hilsplat.field.code import LinearCode
-from hilsplat.methods import laga, legaussians, omniseg3d, saga, vch
+from hilsplat.methods import laga, legaussians, saga, vch
 from hilsplat.methods.common import groups
-from hilsplat.methods.common.groups import associated_codes, clusters, density_clusters, kmeans, thresholds_of
+from hilsplat.methods.common.groups import associated_codes, clusters, density_clusters, kmeans
 from hilsplat.methods.common.training import product, train, unit
 from hilsplat.methods.gaussian_grouping import neighbour_loss
 from hilsplat.methods.method import LabelledView, labelled_views
 from hilsplat.methods.omniseg3d import hierarchical_loss, patches
 from hilsplat.methods.opengaussian import contrast_loss, instances, smoothing_loss
 from hilsplat.methods.vch import components, triplets, ultrametric
-from hilsplat.settings import MethodSettings
 
 RNG = np.random.default_rng(0)
 
 
 @pytest.mark.parametrize(
-    ("method", "wrong", "direction"), [(omniseg3d, (0.9, 0.7, 0.5), "rise"), (vch, (0.1, 0.2, 0.2), "fall")]
+    ("name", "thresholds", "direction"),
+    [("omniseg3d", [0.9, 0.7, 0.5], "increase"), ("vch", [0.1, 0.2, 0.2], "decrease")],
 )
-def test_thresholds_out_of_order_are_refused(method, wrong, direction):
-    settings = MethodSettings(name=method.__name__.rpartition(".")[2], thresholds=wrong)
-    with pytest.raises(
-        SettingsError, match=rf"method.thresholds: {settings.name} .*\n.*numbers that {direction}"
-    ):
-        thresholds_of(settings, method.THRESHOLDS)
+def test_thresholds_out_of_order_are_refused(name, thresholds, direction):
+    with pytest.raises(SettingsError, match=f"method: .*thresholds must {direction} from whole to subpart"):
+        parse_section("method", json.dumps({"name": name, "thresholds": thresholds}))
 
 
 def test_labelled_pixels_are_covered_and_have_their_coordinates():
@@ -74,7 +74,7 @@ def test_a_step_uses_distinct_pixels_of_a_view(most, expected):
         shares.append(done)
         return product(view.weights, feature).sum()
 
-    train([view], [feature], loss, MethodSettings(name="saga", steps=20), 0, most)
+    train([view], [feature], loss, TrainedSettings(name="saga", steps=20), 0, most)
     assert shares == [step / 20 for step in range(20)]
     assert {len(set(pixels)) for pixels in seen} == {len(pixels) for pixels in seen} == {expected}
     assert set().union(*seen) == set(range(5))
