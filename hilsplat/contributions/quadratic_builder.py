@@ -64,19 +64,19 @@ class _Rows:
 
     def replace(self, indptr: np.ndarray, indices: np.ndarray, values: np.ndarray) -> None:
         """Copy other rows over these; columns and values may have more entries than `indptr` uses."""
-        kept = int(indptr[-1])
-        self._make_room(kept, 0)
+        size = int(indptr[-1])
+        self._make_room(size, 0)
         self.indptr = indptr
-        self._indices[:kept], self._values[:kept] = indices[:kept], values[:kept]
+        self._indices[:size], self._values[:size] = indices[:size], values[:size]
 
     def merge(self, late: "_Rows") -> None:
         """Add pairs that these rows don't contain."""
         self._make_room(self.nonzeros + late.nonzeros, self.nonzeros)
         merge_rows(self.indptr, self._indices, self._values, *late.arrays())
 
-    def _make_room(self, needed: int, kept: int) -> None:
+    def _make_room(self, needed: int, size: int) -> None:
         if needed > len(self._indices):
-            self._indices, self._values = enlarged(self._indices, self._values, kept, 2 * needed)
+            self._indices, self._values = enlarged(self._indices, self._values, size, 2 * needed)
 
 
 class GramBuilder:
@@ -118,8 +118,8 @@ class GramBuilder:
                 return
             rows, late, indptr = self._rows[block], self._late[block], np.zeros(end - begin + 1, np.int64)
             number, sums, fresh, *buffers = self._idle.get()
-            known = rows.arrays(), late.arrays(), number
-            buffers = add_to_block(begin, end, arrays, columns, *known, sums, fresh, indptr, *buffers)
+            pairs = rows.arrays(), late.arrays(), number
+            buffers = add_to_block(begin, end, arrays, columns, *pairs, sums, fresh, indptr, *buffers)
             late.replace(indptr, *buffers)
             self._idle.put((number, sums, fresh, *buffers))
             if MERGE_AT * late.nonzeros > rows.nonzeros:
@@ -199,11 +199,11 @@ class QuadraticBuilder:
         if self._keeps_weights:
             # copied, because a part shares the memory of all weights of its view, which may be much larger
             self._parts.append(StackedWeights(part.weights.copy(), part.valid))
-        most = MAX_WEIGHTS
+        limit = MAX_WEIGHTS
         if self._gram is not None:
             self._gram.add(part)
-            most = min(most, CLEARLY_MORE * self._gram.nonzeros)
-        if self._may_drop and self.weights_nonzeros > most:
+            limit = min(limit, CLEARLY_MORE * self._gram.nonzeros)
+        if self._may_drop and self.weights_nonzeros > limit:
             self._parts, self._keeps_weights = [], False
 
     def state(self) -> dict[str, np.ndarray]:
@@ -212,9 +212,9 @@ class QuadraticBuilder:
         if self._gram is not None:
             out |= self._gram.state()
         if self._parts:
-            held = stack_weights(self._parts)
-            out |= {"valid": held.valid, "data": held.weights.data}
-            out |= {"columns": held.weights.indices, "starts": held.weights.indptr}
+            stacked = stack_weights(self._parts)
+            out |= {"valid": stacked.valid, "data": stacked.weights.data}
+            out |= {"columns": stacked.weights.indices, "starts": stacked.weights.indptr}
         return out
 
     def restore(self, state: dict[str, np.ndarray]) -> None:

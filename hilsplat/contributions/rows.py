@@ -97,7 +97,7 @@ class Contributions:
         """
         folder, names = Path(folder), ("num_gaussians", "gaussians_sha256", "cameras_sha256", "min_weight")
         index = read_index(folder, *names)
-        known = {name: index[name] for name in names}
+        values = {name: index[name] for name in names}
         views = tuple(index["views"])
         path = sealed(folder, "rows.npz")
-        return made(Contributions, read_npz(path), {"folder": folder, "views": views, **known}, path)
+        return made(Contributions, read_npz(path), {"folder": folder, "views": views, **values}, path)

@@ -62,7 +62,7 @@ def view_relations(
                 rows=rows[every],
                 depth=depth[np.ix_(every, every)],
                 level=contributions.level[rows[every]].astype(np.int64),
-                parts=tuple((rows[own], visible_parent[own]) for own in chosen[1:]),
+                parts=tuple((rows[masks], visible_parent[masks]) for masks in chosen[1:]),
             )
         )
     return relations
@@ -170,10 +170,10 @@ class Contrast:
             total += settings.weight_instance * loss
             by_means += settings.weight_instance * gradient
         if settings.weight_part:
-            loss, (own, by_half, by_other) = part_term(means, halves, others, self.relations, settings)
+            loss, (by_mean, by_half, by_other) = part_term(means, halves, others, self.relations, settings)
             total += settings.weight_part * loss
             n, half, rest = self._counts()
-            by_means += settings.weight_part * (own + n / rest * by_other)
+            by_means += settings.weight_part * (by_mean + n / rest * by_other)
             by_halves = settings.weight_part * (by_half - half / rest * by_other)
         gradient = self.masks.spread(by_means.astype(np.float32))
         if by_halves is not None:

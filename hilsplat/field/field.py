@@ -38,11 +38,11 @@ def run_field(
         MisalignedArtifactError: an input belongs to different masks, Gaussians or codes.
         SettingsError: an input that the settings require is missing, or one that they do not use is given.
     """
-    for name, value, given, options in (
+    for name, value, option, options in (
         ("trainer", "literal", rendered, "--scene, --gaussians and --masks"),
         ("start", "langsplat", start, "--start <field.safetensors>"),
     ):
-        if (getattr(settings, name) == value) != (given is not None):
+        if (getattr(settings, name) == value) != (option is not None):
             raise SettingsError(
                 f"field.{name} and the options do not match",
                 expected=f"{options} if and only if {name}: {value}",
@@ -55,14 +55,14 @@ def run_field(
     with stage_log("field", scene) as counts:
         first: str | np.ndarray = settings.start
         if start is not None:
-            begun = LanguageField.load(start)
+            initial = LanguageField.load(start)
             made_from = contributions.gaussians_sha256, code_sha256
-            if (begun.gaussians_sha256, begun.autoencoder_sha256) != made_from:
+            if (initial.gaussians_sha256, initial.autoencoder_sha256) != made_from:
                 raise MisalignedArtifactError(
                     f"{start} was computed from different Gaussians or a different code",
                     fix="compute both fields from the same Gaussians and autoencoder",
                 )
-            first = begun.features
+            first = initial.features
         problem, contrast = field_losses(contributions, parents, latents, settings, first, seed, threads)
         if rendered is None:
             features, report = solve_field(problem, contrast)

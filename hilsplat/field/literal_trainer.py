@@ -70,15 +70,15 @@ def view_losses(
     sums, half_sums = (
         (matrix @ flat).reshape(-1, levels, channels)[of_level] for matrix in (view.painted, view.half)
     )
-    own = sums / np.maximum(count, 1)
+    averages = sums / np.maximum(count, 1)
     mask_of = np.full((pixels, levels), -1)
     of_entry = np.repeat(of_level[0], np.diff(view.painted.indptr))
     mask_of[view.painted.indices, view.level[of_entry]] = of_entry
     inside = mask_of >= 0
-    at, here = mask_of[inside], shown[inside]
+    at, painted = mask_of[inside], shown[inside]
     gradient = np.zeros_like(shown)
     scale = num_views / num_pixels
-    to_latent, to_mean = here - latents[view.rows[at]], here - own[at]
+    to_latent, to_mean = painted - latents[view.rows[at]], painted - averages[at]
     losses = {"clustering": scale * float(np.square(to_mean).sum())}
     by_pixel = 2 * scale * settings.weight_clustering * to_mean
     if settings.language == "l1":
@@ -90,7 +90,7 @@ def view_losses(
         by_pixel += 2 * scale * settings.weight_language * to_latent
     means, halves, others = (np.zeros((len(latents), channels)) for _ in range(3))
     rest = np.maximum(count - half_count, 1)
-    means[view.rows] = own
+    means[view.rows] = averages
     halves[view.rows] = half_sums / np.maximum(half_count, 1)
     others[view.rows] = (sums - half_sums) / rest
     in_instance, in_part = compared([view.relations])
@@ -157,16 +157,16 @@ def train_literally(
     order = in_random_order(views, np.random.default_rng(seed), settings.iterations)
     for step, number in enumerate(order, start=1):
         camera = scene.cameras[contributions.views[number]]
-        seen = draw(gaussians, camera, 0, features=features, threads=threads, device=device)
+        render = draw(gaussians, camera, 0, features=features, threads=threads, device=device)
         if number not in targets:
-            targets[number] = targets_of(number, seen.alpha.reshape(-1) >= MIN_ALPHA)
-        alpha = np.maximum(seen.alpha.reshape(-1, 1), 1e-6)
-        shown = (seen.image[..., 3:].reshape(len(alpha), -1) / alpha).astype(np.float64)
-        maps = shown.reshape(len(alpha), len(LEVELS), channels)
+            targets[number] = targets_of(number, render.alpha.reshape(-1) >= MIN_ALPHA)
+        alpha = np.maximum(render.alpha.reshape(-1, 1), 1e-6)
+        blended = (render.image[..., 3:].reshape(len(alpha), -1) / alpha).astype(np.float64)
+        maps = blended.reshape(len(alpha), len(LEVELS), channels)
         losses, by_maps = view_losses(maps, targets[number], problem.latents, settings, shares)
-        by_image = np.zeros((*seen.alpha.shape, 3 + features.shape[1]), np.float32)
-        by_image[..., 3:] = (by_maps.reshape(shown.shape) / alpha).reshape(*seen.alpha.shape, -1)
-        gradient = seen.gradients(by_image, np.zeros_like(seen.alpha)).features
+        by_image = np.zeros((*render.alpha.shape, 3 + features.shape[1]), np.float32)
+        by_image[..., 3:] = (by_maps.reshape(blended.shape) / alpha).reshape(*render.alpha.shape, -1)
+        gradient = render.gradients(by_image, np.zeros_like(render.alpha)).features
         if settings.ridge:
             pull = ridge * (features.reshape(problem.lifted.shape) - problem.lifted)
             gradient = gradient + pull.reshape(features.shape)
@@ -177,6 +177,6 @@ def train_literally(
             curve.append({"step": step, "loss": float(np.mean(recent)), "seconds": seconds})
             logger.info("literal trainer: step %d, loss %.5f", step, curve[-1]["loss"])
             recent = []
-    found = features.reshape(problem.lifted.shape)
-    report["trained"] = problem.terms(found) | contrast.values(found)
-    return found, {**report, "curve": curve}
+    trained = features.reshape(problem.lifted.shape)
+    report["trained"] = problem.terms(trained) | contrast.values(trained)
+    return trained, {**report, "curve": curve}

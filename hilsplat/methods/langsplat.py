@@ -81,9 +81,9 @@ def train_level(
     adam = Adam(features, settings.rate)
     codes = [np.pad(latents[view.rows], ((0, 0), (0, wide - channels))).reshape(-1) for view in views]
     pairs, random = list(zip(views, codes, strict=True)), np.random.default_rng(seed)
-    for view, own in in_random_order(pairs, random, settings.steps):
+    for view, painted in in_random_order(pairs, random, settings.steps):
         rows = view.weights.indptr, view.weights.indices, view.weights.data
-        l1_gradient(*rows, view.labels[:, level.index], own, channels, wide, features, gradient)
+        l1_gradient(*rows, view.labels[:, level.index], painted, channels, wide, features, gradient)
         adam.step(gradient)
     return features.reshape(num_gaussians, wide)[:, :channels].copy()
 

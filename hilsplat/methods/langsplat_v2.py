@@ -44,8 +44,8 @@ def largest_shares(
 def as_vectors(latents: Float32[np.ndarray, "B D"], code: LinearCode) -> Float32[np.ndarray, "B D+1"]:
     """Return m + U z in D + 1 coordinates that preserve lengths and angles: D along U, one for the rest."""
     along = code.basis @ code.mean
-    rest = np.linalg.norm(code.mean - along @ code.basis)
-    return np.column_stack([latents + along, np.full(len(latents), rest)]).astype(np.float32)
+    across = np.linalg.norm(code.mean - along @ code.basis)
+    return np.column_stack([latents + along, np.full(len(latents), across)]).astype(np.float32)
 
 
 def cosine_loss(
@@ -67,8 +67,8 @@ def step(
 ) -> tuple[float, Float32[np.ndarray, "N E"], Float32[np.ndarray, "E D"]]:
     """Return the loss over a view's labelled pixels and its gradients with respect to logits and codebook."""
     chosen, shares = largest_shares(logits)
-    kept = np.arange(0, chosen.size + 1, chosen.shape[1])
-    mixture = sp.csr_matrix((shares.ravel(), chosen.ravel(), kept), shape=logits.shape)
+    starts = np.arange(0, chosen.size + 1, chosen.shape[1])
+    mixture = sp.csr_matrix((shares.ravel(), chosen.ravel(), starts), shape=logits.shape)
     mixed = (weights @ mixture).toarray()
     vectors = unit_rows(as_vectors(targets, code))
     entries = as_vectors(codebook, code)

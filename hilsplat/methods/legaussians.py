@@ -93,9 +93,9 @@ def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[n
     places = torch.from_numpy(standardised(contributions.means()))
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
-        weights, seen = of_seen(view.weights)
-        rendered = product(weights, codes[seen]).reshape(-1, levels, CHANNELS)
-        uncertainty = product(weights, doubt[seen].sigmoid())
+        weights, gaussians = of_seen(view.weights)
+        rendered = product(weights, codes[gaussians]).reshape(-1, levels, CHANNELS)
+        uncertainty = product(weights, doubt[gaussians].sigmoid())
         chosen = torch.from_numpy(random.integers(num, size=min(SAMPLES, num)))
         total = SMOOTHING * smoothing_loss(
             codes[chosen].reshape(-1, CHANNELS),
@@ -110,7 +110,7 @@ def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[n
                 total = total + index_loss(logits, target, uncertainty[inside, level.index])
         return total
 
-    networks = [weight for each in (*decoders, position) for weight in each.parameters()]
+    networks = [weight for part in (*decoders, position) for weight in part.parameters()]
     groups = [
         {"params": [codes]},
         {"params": networks, "lr": NETWORK_RATE * settings.rate},
@@ -118,6 +118,6 @@ def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[n
     ]
     train(views, groups, loss, settings, seed, PIXELS)
     with one_torch_thread(), torch.no_grad():
-        own = unit(codes.reshape(num, levels, CHANNELS))
-        features = [book[decoders[k](own[:, k]).argmax(1).numpy()] for k, book in enumerate(codebooks)]
+        unit_codes = unit(codes.reshape(num, levels, CHANNELS))
+        features = [book[decoders[k](unit_codes[:, k]).argmax(1).numpy()] for k, book in enumerate(codebooks)]
     return np.where(inputs.seen()[..., None], np.stack(features, axis=1), np.float32(0))

@@ -58,8 +58,8 @@ class MethodInputs:
     def view_weights(self, view: str) -> sp.csr_matrix:
         """Return a view's compositing weights (pixels x Gaussians); rows sum to 1, or 0 if uncovered."""
         gaussians, scene = self._loaded
-        least = self.contributions.min_weight
-        weights = pixel_weights(gaussians, scene.cameras[view], min_weight=least, threads=self.threads)
+        min_weight = self.contributions.min_weight
+        weights = pixel_weights(gaussians, scene.cameras[view], min_weight=min_weight, threads=self.threads)
         return normalised_weights(weights)
 
     def view_masks(self, view: str) -> HierarchicalMasks:
@@ -160,7 +160,7 @@ def labelled_views(inputs: MethodInputs, pixel_step: int) -> list[LabelledView]:
     Raises:
         ArtifactError: no view has a labelled pixel.
     """
-    found = []
+    views = []
     rows = inputs.contributions.rows_of_views()
     for number, name in enumerate(track(list(inputs.contributions.views), "weights of views")):
         weights, labels = inputs.view_weights(name), inputs.view_labels(name)
@@ -170,10 +170,10 @@ def labelled_views(inputs: MethodInputs, pixel_step: int) -> list[LabelledView]:
         pixels = grid[covered & (labels[grid] >= 0).any(axis=1)]
         if len(pixels):
             xy = np.stack([pixels % width, pixels // width], axis=1)
-            found.append(LabelledView(number, rows[number], weights[pixels], labels[pixels], xy))
-    if not found:
+            views.append(LabelledView(number, rows[number], weights[pixels], labels[pixels], xy))
+    if not views:
         raise ArtifactError(
             f"no training view has a labelled pixel on a {pixel_step} px grid",
             fix="reduce method.pixel_step, or loosen masks.predicted_iou_min and rerun the masks stage",
         )
-    return found
+    return views

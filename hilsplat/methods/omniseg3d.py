@@ -70,12 +70,12 @@ def hierarchical_loss(
     spread, _ = segment_means(apart, patch, num)
     temperature = (SPREAD * spread[:, 0]).clamp(MIN_TEMPERATURE, MAX_TEMPERATURE)
     surprise = -log_softmax(rendered @ unit(prototypes).T / temperature, dim=1)
-    own = surprise.gather(1, patch[:, None])
-    total = own.mean()
+    own_patch = surprise.gather(1, patch[:, None])
+    total = own_patch.mean()
     missing = shared.diagonal()[:, None] - shared
     distance = missing.clamp(min=1).masked_fill(shared == 0, 0)
     distance.fill_diagonal_(0)
-    floor = own
+    floor = own_patch
     for step in range(1, len(LEVELS)):
         near = (distance == step)[patch]
         has = near.any(dim=1)
@@ -102,5 +102,5 @@ def fit(inputs: MethodInputs, settings: OmniSeg3DSettings, seed: int) -> Float32
         return hierarchical_loss(rendered, torch.from_numpy(patch[inside]), torch.from_numpy(shared))
 
     train(views, [features], loss, settings, seed)
-    distances = tuple(1 - least for least in settings.thresholds)
+    distances = tuple(1 - cosine for cosine in settings.thresholds)
     return cluster_field(inputs, clusters(unit(features.detach()).numpy(), distances, seed, "cosine"))

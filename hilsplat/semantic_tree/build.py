@@ -68,15 +68,15 @@ def crop_ranks(
     order = np.argsort(node, kind="stable")
     starts = np.flatnonzero(np.diff(node[order], prepend=NONE))
     for rows in np.split(order, starts)[1:]:
-        left = score[rows].astype(np.float64)
+        remaining = score[rows].astype(np.float64)
         new = np.ones(len(rows))
-        for place in range(min(RANKED, len(rows))):
-            best = int((left * new).argmax())
-            rank[rows[best]] = place
+        for number in range(min(RANKED, len(rows))):
+            best = int((remaining * new).argmax())
+            rank[rows[best]] = number
             cosine = np.clip(directions[rows] @ directions[rows[best]], -1, 1)
             apart = np.rad2deg(np.arccos(cosine)) / APART_DEG
             new = np.minimum(new, np.clip(apart, MIN_NEW, 1))
-            left[best] = -1
+            remaining[best] = -1
     return rank
 
 

@@ -57,8 +57,8 @@ def product(matrix: sp.csr_matrix, features: Float[Tensor, "N D"]) -> Float[Tens
 
 def of_seen(matrix: sp.csr_matrix) -> tuple[sp.csr_matrix, Int64[Tensor, " s"]]:
     """Return the matrix without empty columns, and the indices of the others; a step shows few Gaussians."""
-    columns, place = np.unique(matrix.indices, return_inverse=True)
-    parts = matrix.data, place.reshape(-1), matrix.indptr
+    columns, column_of_entry = np.unique(matrix.indices, return_inverse=True)
+    parts = matrix.data, column_of_entry.reshape(-1), matrix.indptr
     small = sp.csr_matrix(parts, shape=(matrix.shape[0], len(columns)))
     return small, torch.from_numpy(columns.astype(np.int64))
 
