@@ -34,7 +34,6 @@ class Gram:
 
     @property
     def nonzeros(self) -> int:
-        """Number of stored pairs of Gaussians."""
         return len(self.indices)
 
     @property
@@ -78,7 +77,6 @@ class StackedWeights:
 
     @property
     def nonzeros(self) -> int:
-        """Number of stored weights."""
         return self.weights.nnz
 
     @property

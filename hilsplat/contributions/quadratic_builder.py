@@ -55,11 +55,9 @@ class _Rows:
 
     @property
     def nonzeros(self) -> int:
-        """Number of pairs of Gaussians."""
         return int(self.indptr[-1])
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return row starts, columns and values."""
         return self.indptr, self._indices[: self.nonzeros], self._values[: self.nonzeros]
 
     def replace(self, indptr: np.ndarray, indices: np.ndarray, values: np.ndarray) -> None:
@@ -103,7 +101,6 @@ class GramBuilder:
 
     @property
     def nonzeros(self) -> int:
-        """Number of pairs of Gaussians so far."""
         return sum(rows.nonzeros for rows in (*self._rows, *self._late))
 
     def add(self, part: StackedWeights) -> None:
@@ -149,7 +146,6 @@ class GramBuilder:
         return begins, self._cells
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return all sums so far as arrays."""
         return {
             f"{name}_{number}": array
             for number in range(BLOCKS)
@@ -157,7 +153,6 @@ class GramBuilder:
         }
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Continue from `state`."""
         for number, rows in enumerate(self._rows):
             rows.replace(*(state[f"{name}_{number}"] for name in ROWS))
 
@@ -194,7 +189,6 @@ class QuadraticBuilder:
         self.weights_nonzeros = 0
 
     def add(self, part: StackedWeights) -> None:
-        """Add the labelled pixels of a view."""
         self.weights_nonzeros += part.nonzeros
         if self._keeps_weights:
             # copied, because a part shares the memory of all weights of its view, which may be much larger
@@ -207,7 +201,6 @@ class QuadraticBuilder:
             self._parts, self._keeps_weights = [], False
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return all parts added so far as arrays."""
         out = {"nonzeros": np.array([self.weights_nonzeros, self._keeps_weights], np.int64)}
         if self._gram is not None:
             out |= self._gram.state()
@@ -228,7 +221,6 @@ class QuadraticBuilder:
             self._parts = [StackedWeights(matrix, state["valid"])]
 
     def finish(self) -> Quadratic:
-        """Return G or W of all added parts."""
         if self._gram is None or (self._keeps_weights and self.weights_nonzeros < self._gram.nonzeros):
             return stack_weights(self._parts)
         return self._gram.finish()
@@ -272,12 +264,10 @@ class QuadraticCheckpoint:
         self._last = time.monotonic()
 
     def forget(self) -> None:
-        """Delete the checkpoint of a finished pass."""
         delete(self._folder, DIGEST)
 
 
 def stack_weights(parts: list[StackedWeights]) -> StackedWeights:
-    """Concatenate the rows of all parts."""
     if len(parts) == 1:
         return parts[0]
     matrix = sp.vstack([part.weights for part in parts], format="csr")

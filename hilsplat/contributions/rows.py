@@ -42,7 +42,6 @@ class Contributions:
         return len(self.view)
 
     def rows_of(self, level: Level) -> Int64[np.ndarray, " m"]:
-        """Return the rows of a level, in order."""
         return np.flatnonzero(self.level == int(level))
 
     def rows_of_views(self) -> list[Int64[np.ndarray, " m"]]:

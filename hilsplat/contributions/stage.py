@@ -80,13 +80,11 @@ class ArrayStream:
         return self._rows
 
     def append(self, values: np.ndarray) -> None:
-        """Add rows."""
         values = np.ascontiguousarray(values, self._dtype)
         self._rows += len(values)
         self._stream.write(values.data)
 
     def close(self) -> None:
-        """Complete the header."""
         self._stream.seek(0)
         self._write_header()
         self._stream.close()

@@ -181,7 +181,6 @@ def load_code(folder: Path) -> Code:
 
 
 def autoencoder_file(folder: Path) -> Path:
-    """Return the path of the weights in a finished folder."""
     return Path(folder) / "autoencoder.safetensors"
 
 

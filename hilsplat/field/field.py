@@ -67,9 +67,9 @@ def run_field(
         if rendered is None:
             features, report = solve_field(problem, contrast)
         else:
-            from hilsplat.field.literal_trainer import train_literally
+            from hilsplat.field.literal_trainer import train_by_rendering
 
-            features, report = train_literally(problem, contrast, contributions, rendered, seed, threads)
+            features, report = train_by_rendering(problem, contrast, contributions, rendered, seed, threads)
         total_mass = contributions.mass().sum(axis=0, dtype=np.float64)
         features = keep_labelled(features, problem.mass, total_mass, settings.min_labelled_share)
         LanguageField(features, contributions.gaussians_sha256, code_sha256).save(out)

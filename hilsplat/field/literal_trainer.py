@@ -113,7 +113,7 @@ def view_losses(
     return losses, gradient
 
 
-def train_literally(
+def train_by_rendering(
     problem: QuadraticProblem,
     contrast: Contrast,
     contributions: Contributions,

@@ -46,7 +46,6 @@ PIXELS = 2048
 
 
 def unit_slices(features: Float[Tensor, "n 32"]) -> Float[Tensor, "n 32"]:
-    """Scale each of the three slices to length 1."""
     return torch.cat([unit(part) for part in features.split(SLICES, 1)], 1)
 
 

@@ -50,7 +50,6 @@ PIXELS = 1024
 
 
 def network(sizes: tuple[int, ...]) -> nn.Sequential:
-    """Return linear layers with ReLUs between them."""
     layers: list[nn.Module] = []
     for inward, outward in itertools.pairwise(sizes):
         layers += [nn.Linear(inward, outward), nn.ReLU()]

@@ -71,11 +71,9 @@ class MethodInputs:
         return label_maps(self.view_masks(view))
 
     def view_camera(self, view: str) -> Camera:
-        """Return a view's camera."""
         return self._loaded[1].cameras[view]
 
     def no_features(self) -> Float32[np.ndarray, "N 3 D"]:
-        """Return a field of zeros."""
         return np.zeros((self.contributions.num_gaussians, len(LEVELS), self.latents.shape[1]), np.float32)
 
     def seen(self) -> Bool[np.ndarray, "N 3"]:
@@ -146,11 +144,9 @@ class LabelledView:
     xy: Int64[np.ndarray, "p 2"]  # column and row of each pixel, px
 
     def chosen(self, pixels: Int64[np.ndarray, " q"]) -> "LabelledView":
-        """Return the given pixels, in that order."""
         return replace(self, weights=self.weights[pixels], labels=self.labels[pixels], xy=self.xy[pixels])
 
     def at(self, level: Level) -> Int64[np.ndarray, " q"]:
-        """Return the pixels labelled at a level, in order."""
         return np.flatnonzero(self.labels[:, level.index] >= 0)
 
 

@@ -44,7 +44,6 @@ class OrientedBox:
         return OrientedBox(centre, (first, second, third), size)
 
     def corners(self) -> Float[np.ndarray, "8 3"]:
-        """Return the eight corners."""
         signs = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3, indexing="ij"), axis=-1).reshape(8, 3)
         return np.asarray(self.centre) + (signs * np.asarray(self.size)) @ np.asarray(self.axes)
 
@@ -117,11 +116,9 @@ class SemanticTree:
             raise ArtifactError(f"{path}: a node's parent is not at a coarser level", fix=remake(path))
 
     def nodes_of(self, level: Level) -> Int64[np.ndarray, " t"]:
-        """Return the nodes of a level, in order."""
         return np.flatnonzero(self.level == int(level))
 
     def children_of(self, nodes: Int64[np.ndarray, " t"]) -> Int64[np.ndarray, " c"]:
-        """Return the direct children of the nodes."""
         return np.flatnonzero(np.isin(self.parent, nodes))
 
     def ancestors(self) -> Int32[np.ndarray, "T 3"]:

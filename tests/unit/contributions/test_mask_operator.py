@@ -21,8 +21,8 @@ def test_products_have_the_bytes_of_plain_loops_on_any_number_of_threads(channel
     values = rng.normal(size=(14, channels)).astype(np.float32)
     means, spread = np.zeros_like(values), np.zeros_like(features)
     for mask, level in enumerate(operator.level_index):
-        for k in range(operator.indptr[mask], operator.indptr[mask + 1]):
-            gaussian, weight = operator.indices[k], operator.data[k]
+        for k in range(A.indptr[mask], A.indptr[mask + 1]):
+            gaussian, weight = A.indices[k], A.data[k]
             means[mask] += weight * features[gaussian, level]
             spread[gaussian, level] += weight * values[mask]
     assert operator.means(features).tobytes() == means.tobytes()
