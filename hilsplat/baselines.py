@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Annotated, Any
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.settings import Section, Size, knob
@@ -22,6 +22,18 @@ GROUP = "hilsplat.methods"
 
 Granularity = Annotated[float, Field(gt=0, lt=2)]
 Granularities = tuple[Granularity, Granularity, Granularity]
+
+
+def _rising(thresholds: Granularities) -> Granularities:
+    if not thresholds[0] < thresholds[1] < thresholds[2]:
+        raise ValueError("levels are nested only if the numbers rise from whole to subpart")
+    return thresholds
+
+
+def _falling(thresholds: Granularities) -> Granularities:
+    if not thresholds[0] > thresholds[1] > thresholds[2]:
+        raise ValueError("levels are nested only if the numbers fall from whole to subpart")
+    return thresholds
 
 
 class MethodSettings(Section):
@@ -58,20 +70,14 @@ class OpenGaussianSettings(TrainedSettings):
 
 
 class OmniSeg3DSettings(TrainedSettings):
-    thresholds: Granularities = knob(
-        (0.5, 0.8, 0.95), "minimum average cosine of a cluster: whole, part, subpart; increasing"
+    thresholds: Annotated[Granularities, AfterValidator(_rising)] = knob(
+        (0.5, 0.8, 0.95), "minimum average cosine of a cluster: whole, part, subpart; rising"
     )
-
-    @model_validator(mode="after")
-    def _nested(self) -> "OmniSeg3DSettings":
-        if list(self.thresholds) != sorted(set(self.thresholds)):
-            raise ValueError("thresholds must increase from whole to subpart, so that levels are nested")
-        return self
 
 
 class VchSettings(TrainedSettings):
-    thresholds: Granularities = knob(
-        (0.6, 0.5, 0.45), "maximum edge of a component: whole, part, subpart; decreasing"
+    thresholds: Annotated[Granularities, AfterValidator(_falling)] = knob(
+        (0.6, 0.5, 0.45), "maximum edge of a component: whole, part, subpart; falling"
     )
     theta: float | None = knob(
         None,
@@ -80,12 +86,6 @@ class VchSettings(TrainedSettings):
         lt=1,
         origin="VCH: 0.95",
     )
-
-    @model_validator(mode="after")
-    def _nested(self) -> "VchSettings":
-        if list(self.thresholds) != sorted(set(self.thresholds), reverse=True):
-            raise ValueError("thresholds must decrease from whole to subpart, so that levels are nested")
-        return self
 
 
 @dataclass(frozen=True)

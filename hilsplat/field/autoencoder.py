@@ -110,7 +110,7 @@ def train_autoencoder(
     batch = min(settings.batch, len(data))
     per_epoch = len(data) // batch
     steps = max(settings.epochs * per_epoch, settings.min_steps)
-    arrays = Autoencoder.drawn(channels, latent, twister).arrays
+    arrays = Autoencoder.initial(channels, latent, twister).arrays
     drawn = {name: values for name, values in arrays.items() if "running" not in name}
     flat = np.concatenate([values.reshape(-1) for values in drawn.values()])
     slope = np.empty_like(flat)

@@ -86,7 +86,7 @@ def distinct(
     return np.flatnonzero(kept)
 
 
-def compared(relations: list[ViewRelations]) -> tuple[int, int]:
+def num_compared(relations: list[ViewRelations]) -> tuple[int, int]:
     """Return the number of views averaged in L_ins, and of (view, level) pairs averaged in L_part."""
     return sum(len(view.rows) > 1 for view in relations), sum(len(view.parts) for view in relations)
 

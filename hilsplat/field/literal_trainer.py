@@ -23,7 +23,7 @@ from hilsplat.contributions.compositing import MIN_ALPHA
 from hilsplat.contributions.rows import Contributions
 from hilsplat.contributions.view_matrices import label_maps, painted_indicator, random_half
 from hilsplat.field.adam import Adam, in_random_order
-from hilsplat.field.contrast import Contrast, ViewRelations, compared, instance_term, part_term
+from hilsplat.field.contrast import Contrast, ViewRelations, instance_term, num_compared, part_term
 from hilsplat.field.problem import QuadraticProblem
 from hilsplat.scene.finished import require_same
 from hilsplat.scene.scene import Scene
@@ -54,7 +54,7 @@ def view_losses(
     view: ViewTargets,
     latents: Float32[np.ndarray, "M D"],  # latent of every mask of the scene
     settings: FieldSettings,
-    shares: tuple[int, float, int, int],  # totals of the scene: views, labelled pixels, `compared`
+    shares: tuple[int, float, int, int],  # totals of the scene: views, labelled pixels, `num_compared`
 ) -> tuple[dict[str, float], Float64[np.ndarray, "P 3 D"]]:
     """Compute all losses on the rendered maps of one view, and the gradient of their weighted sum.
 
@@ -93,7 +93,7 @@ def view_losses(
     means[view.rows] = averages
     halves[view.rows] = half_sums / np.maximum(half_count, 1)
     others[view.rows] = (sums - half_sums) / rest
-    in_instance, in_part = compared([view.relations])
+    in_instance, in_part = num_compared([view.relations])
     losses["instance"], by_means = instance_term(means, [view.relations], settings)
     losses["part"], (own_part, by_half, by_other) = part_term(
         means, halves, others, [view.relations], settings
@@ -135,7 +135,7 @@ def train_by_rendering(
     gaussians, device = load_ply(gaussians_ply), choose_device("auto")
     features = problem.lifted.reshape(len(gaussians), -1).astype(np.float32)
     channels = features.shape[1] // len(LEVELS)
-    shares = len(contributions.views), problem.total_pixels, *compared(contrast.relations)
+    shares = len(contributions.views), problem.total_pixels, *num_compared(contrast.relations)
     report: dict[str, object] = {"start": problem.terms(problem.lifted) | contrast.values(problem.lifted)}
     targets: dict[int, ViewTargets] = {}
     adam, curve, recent = Adam(features, settings.rate), list[dict[str, float]](), list[float]()

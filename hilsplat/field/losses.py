@@ -14,7 +14,7 @@ from hilsplat.base.levels import NONE
 
 SOFTENING = 1e-3  # added in quadrature to every distance, so that its logarithm has a finite slope at zero
 
-SHORTEST = 1e-6  # added in quadrature to lengths in denominators, so that the cosine of a zero vector is 0
+MIN_LENGTH = 1e-6  # added in quadrature to lengths in denominators, so that the cosine of a zero vector is 0
 
 
 def log_distance_loss(
@@ -103,11 +103,11 @@ def similarity_without_parent(
     gets no gradient: parts move relative to their whole, not the whole relative to its parts.
     """
     centred = anchors - parent
-    square = np.square(centred).sum(axis=1, keepdims=True) + SHORTEST**2
+    square = np.square(centred).sum(axis=1, keepdims=True) + MIN_LENGTH**2
     along = centred @ others.T - (centred * parent).sum(axis=1, keepdims=True)
     # |other - parent|^2 from dot products, which needs A x B numbers instead of A x B x D
     far = np.square(others).sum(axis=1) - 2 * parent @ others.T + np.square(parent).sum(axis=1, keepdims=True)
-    softened = np.maximum(far, 0) + SHORTEST**2
+    softened = np.maximum(far, 0) + MIN_LENGTH**2
     scale = 1 / np.sqrt(square * softened)
     similarity = along * scale
 

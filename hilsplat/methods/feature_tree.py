@@ -31,7 +31,7 @@ STEPS = 60  # number of L-BFGS steps
 RIDGE = 1e-3  # weight of the pull towards the random start; prevents drift in unobserved directions
 
 
-def farthest_alike(
+def merge_distances(
     means: Float32[np.ndarray, "M D"], contributions: Contributions, parents: dict[str, np.ndarray]
 ) -> tuple[float, ...]:
     """Return, per level, half the median distance between masks that share a view and a parent."""
@@ -93,7 +93,7 @@ def run_feature_tree(
     no_latents = np.zeros((len(contributions), settings.feature_size), np.float32)
     problem, contrast = field_losses(contributions, parents, no_latents, losses, "random", seed, threads)
     features, _ = solve_field(problem, contrast)
-    farthest = farthest_alike(problem.masks.means(features), contributions, parents)
+    farthest = merge_distances(problem.masks.means(features), contributions, parents)
     features = np.where((problem.mass > 0)[:, :, None], features, np.float32(np.nan))
     clusters = nested_clusters(features, farthest, seed)
     S, mass = contributions.matrix("S"), contributions.mass()

@@ -30,7 +30,7 @@ from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.baselines import TrainedSettings
 from hilsplat.field.code import LinearCode, unit_rows
 from hilsplat.methods.common.groups import density_clusters, features_of_groups, group_means, kmeans
-from hilsplat.methods.common.training import alike, of_seen, product, train, unit
+from hilsplat.methods.common.training import initial_features, nonempty_columns, product, train, unit
 from hilsplat.methods.langsplat_v2 import as_vectors
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 
@@ -169,10 +169,10 @@ def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[n
     """Train features, find objects at each level, and assign each object the code of its descriptors."""
     contributions, code = inputs.contributions, inputs.linear_code("laga")
     views, field = labelled_views(inputs, settings.pixel_step), inputs.no_features()
-    trained = alike(contributions.num_gaussians, sum(SLICES), seed)
+    trained = initial_features(contributions.num_gaussians, sum(SLICES), seed)
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
-        weights, gaussians = of_seen(view.weights)
+        weights, gaussians = nonempty_columns(view.weights)
         rendered = product(weights, unit_slices(trained[gaussians]))
         return nested_loss(rendered, masks_of_pixels(view.labels), random)
 

@@ -28,11 +28,11 @@ from hilsplat.methods.common.groups import kmeans
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 
 ENTRIES = 64  # codebook entries per level (LangSplatV2)
-KEPT = 4  # non-zero coefficients per Gaussian and level (LangSplatV2)
+SHARES = 4  # non-zero coefficients per Gaussian and level (LangSplatV2)
 
 
 def largest_shares(
-    logits: Float32[np.ndarray, "N E"], kept: int = KEPT
+    logits: Float32[np.ndarray, "N E"], kept: int = SHARES
 ) -> tuple[Int64[np.ndarray, "N K"], Float32[np.ndarray, "N K"]]:
     """Return each softmax's largest entries and their shares, which sum to 1; lower entries win ties."""
     chosen = np.zeros((len(logits), kept), np.int64)
@@ -86,7 +86,7 @@ def train_level(
     latents: Float32[np.ndarray, "M D"],
     level: Level,
     num_gaussians: int,
-    codebook: Float32[np.ndarray, "E D"],  # initial entries, at least `KEPT`
+    codebook: Float32[np.ndarray, "E D"],  # initial entries, at least `SHARES`
     code: LinearCode,
     settings: TrainedSettings,
     seed: int,

@@ -33,7 +33,14 @@ from torch.nn.functional import cross_entropy
 from hilsplat.base.levels import LEVELS
 from hilsplat.baselines import TrainedSettings
 from hilsplat.methods.common.groups import kmeans, standardised
-from hilsplat.methods.common.training import alike, of_seen, one_torch_thread, product, train, unit
+from hilsplat.methods.common.training import (
+    initial_features,
+    nonempty_columns,
+    one_torch_thread,
+    product,
+    train,
+    unit,
+)
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 
 ENTRIES = 128
@@ -82,7 +89,7 @@ def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[n
         codebook, entry[rows] = kmeans(latents[rows], ENTRIES, seed + level.index)
         codebooks.append(codebook)
     views, num, levels = labelled_views(inputs, settings.pixel_step), contributions.num_gaussians, len(LEVELS)
-    codes = alike(num, levels * CHANNELS, seed)
+    codes = initial_features(num, levels * CHANNELS, seed)
     doubt = torch.full((num, levels), float(np.log(FIRST_UNCERTAINTY / (1 - FIRST_UNCERTAINTY))))
     doubt.requires_grad_()
     with torch.random.fork_rng(devices=()):
@@ -92,7 +99,7 @@ def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[n
     places = torch.from_numpy(standardised(contributions.means()))
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
-        weights, gaussians = of_seen(view.weights)
+        weights, gaussians = nonempty_columns(view.weights)
         rendered = product(weights, codes[gaussians]).reshape(-1, levels, CHANNELS)
         uncertainty = product(weights, doubt[gaussians].sigmoid())
         chosen = torch.from_numpy(random.integers(num, size=min(SAMPLES, num)))

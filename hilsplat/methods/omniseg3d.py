@@ -13,7 +13,7 @@ authors' unless stated otherwise; they use `steps` 10,000 and `rate` 0.01.
 Departs:
     - larger masks do not first absorb smaller ones; patches come from our painted masks;
     - fewer steps, each on 4096 (not 32,768) pixels of a view; prototypes of at least 3 (not 20) pixels;
-    - initial vectors are almost identical instead of independent (see `training.alike`);
+    - initial vectors are almost identical instead of independent (see `training.initial_features`);
     - pixel vectors are divided by their length instead of constrained by a penalty of weight 100;
     - the authors threshold the cosine with a clicked pixel and don't support text: here 256 k-means centres
       are merged by average cosine down to the threshold.
@@ -28,7 +28,7 @@ from torch.nn.functional import log_softmax
 from hilsplat.base.levels import LEVELS
 from hilsplat.baselines import OmniSeg3DSettings
 from hilsplat.methods.common.groups import cluster_field, clusters
-from hilsplat.methods.common.training import alike, product, segment_means, train, unit
+from hilsplat.methods.common.training import initial_features, product, segment_means, train, unit
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 
 CHANNELS = 16
@@ -91,7 +91,7 @@ def hierarchical_loss(
 def fit(inputs: MethodInputs, settings: OmniSeg3DSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train features, cluster them at three increasing cosines, and assign clusters the codes of masks."""
     views = labelled_views(inputs, settings.pixel_step)
-    features = alike(inputs.contributions.num_gaussians, CHANNELS, seed)
+    features = initial_features(inputs.contributions.num_gaussians, CHANNELS, seed)
 
     def loss(view: LabelledView, _: np.random.Generator, __: float) -> Tensor:
         patch, shared = patches(view.labels)

@@ -29,7 +29,7 @@ from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.baselines import TrainedSettings
 from hilsplat.contributions.rows import Contributions
 from hilsplat.methods.common.groups import cluster_field, clusters, nearest
-from hilsplat.methods.common.training import alike, of_seen, product, train, unit
+from hilsplat.methods.common.training import initial_features, nonempty_columns, product, train, unit
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 
 CHANNELS = 32
@@ -58,7 +58,7 @@ def drawn_scales(scales: Float64[np.ndarray, " m"], random: np.random.Generator)
     return ends[chosen] + (ends[chosen + 1] - ends[chosen]) * random.random(len(chosen))
 
 
-def together(
+def grouped_at(
     labels: Int32[np.ndarray, "p 3"], scales: Float64[np.ndarray, "p 3"], scale: float
 ) -> Bool[np.ndarray, "p p"]:
     """Return whether two pixels share a mask at or below the scale, or the smallest mask above the scale.
@@ -123,7 +123,7 @@ def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[n
     contributions = inputs.contributions
     scales = mask_scales(contributions)
     views = labelled_views(inputs, settings.pixel_step)
-    features = alike(contributions.num_gaussians, CHANNELS, seed)
+    features = initial_features(contributions.num_gaussians, CHANNELS, seed)
     draw = torch.Generator().manual_seed(seed)
     gate = (2 * torch.rand(2, CHANNELS, generator=draw) - 1).requires_grad_()  # slope and offset
     smooth = neighbour_mean(contributions.means())
@@ -138,8 +138,8 @@ def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[n
         scale = np.where(has, scales[rows][view.labels], 0)
         area = np.where(has, contributions.area_px[rows][view.labels], 0).sum(axis=1) / has.sum(axis=1)
         at = drawn_scales(scales[rows], random)
-        same = np.stack([together(view.labels, scale, scale_limit) for scale_limit in at])
-        weights, gaussians = of_seen(view.weights @ smooth)
+        same = np.stack([grouped_at(view.labels, scale, scale_limit) for scale_limit in at])
+        weights, gaussians = nonempty_columns(view.weights @ smooth)
         rendered = product(weights, unit(features[gaussians]))
         return affinity_loss(rendered, gates(at), same, pair_weights(area), random)
 

@@ -31,7 +31,7 @@ from cpusplat.compiled import compiled
 from hilsplat.base.levels import NONE
 from hilsplat.baselines import VchSettings
 from hilsplat.methods.common.groups import cluster_field, nearest
-from hilsplat.methods.common.training import alike, product, train, unit
+from hilsplat.methods.common.training import initial_features, product, train, unit
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 from hilsplat.segment.coverage import coverage_tree
 from hilsplat.settings import CoverageTreeSettings
@@ -42,7 +42,7 @@ PAIRS = 64  # triplets per mask and step
 PIXEL_NEIGHBOURS = 10
 BORDER = 10.0  # added to edges across mask borders, per level, when the spanning tree is chosen
 NEIGHBOURS = 16
-LARGEST = 200
+MAX_COMPONENTS = 200
 
 
 @compiled
@@ -156,7 +156,7 @@ def components(
         number, part = connected_components(graph, directed=False)
         order = np.argsort(-np.bincount(part, minlength=number), kind="stable")
         rank = np.argsort(order)[part]
-        large, small = np.flatnonzero(rank < LARGEST), np.flatnonzero(rank >= LARGEST)
+        large, small = np.flatnonzero(rank < MAX_COMPONENTS), np.flatnonzero(rank >= MAX_COMPONENTS)
         rank[small] = rank[large[cKDTree(means[large]).query(means[small])[1]]]
         ranks.append(rank)
     return np.stack(ranks, axis=1)
@@ -171,7 +171,7 @@ def fit(inputs: MethodInputs, settings: VchSettings, seed: int) -> Float32[np.nd
     for view in views:
         masks = inputs.view_masks(contributions.views[view.number])
         trees[view.number] = (masks.level, coverage_tree(masks, theta)[0])
-    features = alike(contributions.num_gaussians, CHANNELS, seed)
+    features = initial_features(contributions.num_gaussians, CHANNELS, seed)
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
         a, b, c = chosen = triplets(view.labels, *trees[view.number], random)

@@ -40,7 +40,7 @@ APART_DEG = 30.0
 MIN_NEW = 0.1
 """Share of a crop's score that remains if a higher-ranked crop has the same direction."""
 
-RANKED = 32
+MAX_RANKED = 32
 """Number of crops ranked per node."""
 
 MIN_IOU = 1e-3
@@ -62,7 +62,7 @@ def crop_ranks(
         directions: unit vectors from nodes to cameras.
 
     Returns:
-        rank of each mask within its node, 0 for the best; -1 for masks without a node or beyond `RANKED`.
+        rank of each mask within its node, 0 for the best; -1 for masks without a node or beyond `MAX_RANKED`.
     """
     rank = np.full(len(node), NONE, np.int32)
     order = np.argsort(node, kind="stable")
@@ -70,7 +70,7 @@ def crop_ranks(
     for rows in np.split(order, starts)[1:]:
         remaining = score[rows].astype(np.float64)
         new = np.ones(len(rows))
-        for number in range(min(RANKED, len(rows))):
+        for number in range(min(MAX_RANKED, len(rows))):
             best = int((remaining * new).argmax())
             rank[rows[best]] = number
             cosine = np.clip(directions[rows] @ directions[rows[best]], -1, 1)

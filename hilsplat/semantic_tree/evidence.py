@@ -70,7 +70,7 @@ def mask_evidence(
     full = everywhere[np.arange(num), view]
     seen = np.where(everywhere < min_covisible * full[:, None], 0.0, everywhere)
     pairs = (*rows, weighted, *by_column, view, seen, everywhere)
-    parts = [list(lists) for lists in zip(*over_edges(_shared_pairs, edges, threads, *pairs), strict=True)]
+    parts = [list(arrays) for arrays in zip(*over_edges(_shared_pairs, edges, threads, *pairs), strict=True)]
     # Each list is freed once it is concatenated, because two copies of all pairs would need much memory.
     counts, indices, inter, union = (np.concatenate(parts.pop(0)) for _ in range(4))
     indptr = np.concatenate(([0], np.cumsum(counts)))

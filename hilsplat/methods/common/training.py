@@ -55,7 +55,7 @@ def product(matrix: sp.csr_matrix, features: Float[Tensor, "N D"]) -> Float[Tens
     return _Product.apply(features, matrix)
 
 
-def of_seen(matrix: sp.csr_matrix) -> tuple[sp.csr_matrix, Int64[Tensor, " s"]]:
+def nonempty_columns(matrix: sp.csr_matrix) -> tuple[sp.csr_matrix, Int64[Tensor, " s"]]:
     """Return the matrix without empty columns, and the indices of the others; a step shows few Gaussians."""
     columns, column_of_entry = np.unique(matrix.indices, return_inverse=True)
     parts = matrix.data, column_of_entry.reshape(-1), matrix.indptr
@@ -68,7 +68,7 @@ def unit(rows: Float[Tensor, "*n D"]) -> Float[Tensor, "*n D"]:
     return rows / rows.norm(dim=-1, keepdim=True).clamp(min=1e-9)
 
 
-def alike(num_gaussians: int, channels: int, seed: int) -> Float[Tensor, "N D"]:
+def initial_features(num_gaussians: int, channels: int, seed: int) -> Float[Tensor, "N D"]:
     """Return trainable initial features that are almost the same for all Gaussians.
 
     Gaussians with equal features stay together unless a mask separates them; with independent starts, each

@@ -29,10 +29,10 @@ RNG = np.random.default_rng(0)
 
 @pytest.mark.parametrize(
     ("name", "thresholds", "direction"),
-    [("omniseg3d", [0.9, 0.7, 0.5], "increase"), ("vch", [0.1, 0.2, 0.2], "decrease")],
+    [("omniseg3d", [0.9, 0.7, 0.5], "rise"), ("vch", [0.1, 0.2, 0.2], "fall")],
 )
 def test_thresholds_out_of_order_are_refused(name, thresholds, direction):
-    with pytest.raises(SettingsError, match=f"method: .*thresholds must {direction} from whole to subpart"):
+    with pytest.raises(SettingsError, match=rf"method\.thresholds: .*{direction} from whole to subpart"):
         parse_section("method", json.dumps({"name": name, "thresholds": thresholds}))
 
 
@@ -232,7 +232,7 @@ def test_components_split_where_features_jump_and_small_ones_join_the_nearest_la
     found = components(features, means, (1.5, 0.95, 0.1))
     assert [len(np.unique(level)) for level in found.T] == [1, 2, 3]
     assert found[0, 2] == 0 and found[30, 2] == 1 and found[50, 2] == 2  # largest first
-    monkeypatch.setattr(vch, "LARGEST", 2)
+    monkeypatch.setattr(vch, "MAX_COMPONENTS", 2)
     assert (components(features, means, (1.5, 0.95, 0.1))[50:, 2] == 1).all()
 
 
@@ -350,11 +350,11 @@ def test_pixels_share_masks_up_to_a_scale_and_the_smallest_one_above_it():
     # whole 0 (scale 4) holds parts 1 and 2 (scale 2); pixel 3 is in the whole alone, pixel 4 in another
     labels = np.int32([[0, 1, -1], [0, 1, -1], [0, 2, -1], [0, -1, -1], [5, -1, -1]])
     scales = np.where(labels >= 0, np.where(labels % 5 == 0, 4.0, 2.0), 0)
-    large = saga.together(labels, scales, 5.0)
+    large = saga.grouped_at(labels, scales, 5.0)
     assert large[:4, :4].all() and not large[4, :4].any()
-    between = saga.together(labels, scales, 3.0)
+    between = saga.grouped_at(labels, scales, 3.0)
     assert (between == large).all()  # parts stay masks of their own, and the whole is the smallest above
-    small = saga.together(labels, scales, 1.0)
+    small = saga.grouped_at(labels, scales, 1.0)
     assert small[0].tolist() == [True, True, False, False, False]
     assert small[3].tolist() == [False, False, False, True, False]
 
