@@ -13,7 +13,7 @@ hardyho/ultrametric_feature_fields. The constants below are the authors'; they u
 Departs:
     - vectors of 16 numbers on frozen Gaussians, not an instant-NGP field of 128 with its own density;
     - unit length by division, without a penalty on the norm; depth is not smoothed;
-    - a parent contains 0.9 of a mask, as in our coverage tree, not 0.95 with an IoU below 0.9;
+    - a parent contains `theta` (0.9) of a mask, as in our coverage tree, not 0.95 with an IoU below 0.9;
     - components consist of Gaussians, not of 0.002 voxels; all but the 200 largest join the nearest of these;
     - the authors don't support text.
 """
