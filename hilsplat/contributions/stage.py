@@ -210,8 +210,10 @@ def run_contributions(
 
         @cache_calls
         def weights() -> sp.csr_matrix:
-            options = {"min_weight": settings.min_weight, "threads": threads_each, "device": device}
-            return normalised_weights(pixel_weights(gaussians, camera, **options))
+            least = settings.min_weight
+            return normalised_weights(
+                pixel_weights(gaussians, camera, min_weight=least, threads=threads_each, device=device)
+            )
 
         matrices = store.get(
             keys[number], lambda: view_contributions(camera.name, weights(), masks, threads_each)
