@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union, get_a
 
 import yaml
 from pydantic import BaseModel, ValidationError, create_model, field_validator
+from pydantic.fields import FieldInfo
 
 from hilsplat import settings
 from hilsplat.base.artifacts import parse_json
@@ -17,6 +18,7 @@ from hilsplat.base.errors import SettingsError
 from hilsplat.base.files import NAME_RULE, name_problem, project_path, regular
 from hilsplat.base.levels import path_of
 from hilsplat.base.plugins import entry_points
+from hilsplat.baselines import MethodSettings, VchSettings, own_settings, settings_class
 from hilsplat.models.store import AUTO, EMBEDDED, read_model, real_model
 from hilsplat.settings import LARGEST, Section, knob
 
@@ -38,20 +40,28 @@ class CoreSettings(Section):
     semantic_tree: settings.SemanticTreeSettings = settings.SemanticTreeSettings()
     autoencoder: settings.AutoencoderSettings = settings.AutoencoderSettings()
     field: settings.FieldSettings = settings.FieldSettings()
-    method: settings.MethodSettings = settings.MethodSettings()
+    method: MethodSettings = MethodSettings()
     evaluate: settings.EvaluateSettings = settings.EvaluateSettings()
     query: settings.QuerySettings = settings.QuerySettings()
     figures: settings.FiguresSettings = settings.FiguresSettings()
 
+    @field_validator("method", mode="before")
+    @classmethod
+    def _of_named_method(cls, value: Any) -> Any:
+        return value if isinstance(value, MethodSettings) else validated("method", value, "method")
+
     def with_models(self) -> "CoreSettings":
         """Return all sections after resolving values that depend on others: models, crops, theta."""
-        clip, masks = with_models(self.clip), with_models(self.masks)
+        clip, masks, method = with_models(self.clip), with_models(self.masks), self.method
+        theta = {"theta": self.coverage_tree.theta}
         if masks.levels == "tree" and masks.theta is None:
-            masks = masks.model_copy(update={"theta": self.coverage_tree.theta})
+            masks = masks.model_copy(update=theta)
+        if isinstance(method, VchSettings) and method.theta is None:
+            method = method.model_copy(update=theta)
         if clip.crops == AUTO:
             crops = "masks" if self.autoencoder.targets == "mask" else "nodes"
             clip = clip.model_copy(update={"crops": crops})
-        return self.model_copy(update={"masks": masks, "clip": clip})
+        return self.model_copy(update={"masks": masks, "clip": clip, "method": method})
 
 
 _PLUGIN_SECTIONS: dict[str, type[Section]] = dict(entry_points("hilsplat.settings"))
@@ -70,11 +80,19 @@ SECTIONS: dict[str, type[Section]] = _PLUGIN_SECTIONS | {name: type(part) for na
 def parse_section(name: str, text: str) -> Any:
     """Parse a section from JSON; raise SettingsError if a key is unknown or a value is invalid."""
     try:
-        return SECTIONS[name].model_validate(parse_json(text or "{}"))
-    except ValidationError as error:
-        raise settings_error(error, name, SECTIONS[name]) from error
+        values = parse_json(text or "{}")
     except ValueError as error:
         raise SettingsError(f"{name}: the settings are not valid JSON: {error}", found=text[:80]) from error
+    return validated(name, values, name)
+
+
+def validated(name: str, values: Any, where: str) -> Section:
+    """Validate a section, that of the named method for `method`; `where` is its place in messages."""
+    section = settings_class(values) if name == "method" else SECTIONS[name]
+    try:
+        return section.model_validate(values)
+    except ValidationError as error:
+        raise settings_error(error, where, section) from error
 
 
 Settings = TypeVar("Settings", bound=Section)
@@ -210,11 +228,10 @@ class RunSettings(StageSettings):
         for where, layer in layers:
             require_known(where, layer, SECTIONS)
             for section, values in layer.items():
-                changed = sections[section].model_dump() | values
-                try:
-                    sections[section] = SECTIONS[section].model_validate(changed)
-                except ValidationError as error:
-                    raise settings_error(error, f"{where}.{section}", SECTIONS[section]) from error
+                below = sections[section].model_dump()
+                if section == "method" and values.get("name", below["name"]) != below["name"]:
+                    below = {}  # settings of a different method
+                sections[section] = validated(section, below | values, f"{where}.{section}")
         return StageSettings.model_validate(sections)
 
 
@@ -345,36 +362,53 @@ def _merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]
 
 
 def config_schema() -> dict[str, Any]:
-    """Return the configuration's JSON schema, for editors that check YAML (`hilsplat settings --schema`)."""
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **RunSettings.model_json_schema()}
+    """Return the configuration's JSON schema, for editors that check YAML (`hilsplat settings --schema`).
+
+    Section `method` may contain the settings of any method.
+    """
+    schema = RunSettings.model_json_schema()
+    properties = schema["$defs"]["MethodSettings"]["properties"]
+    for name in own_settings():
+        properties |= settings_class({"name": name}).model_json_schema()["properties"]
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
 def knob_table() -> str:
     """Format all settings as text: name, default, choices or range, unit, origin, meaning."""
-    lines = []
+    entries: dict[tuple[str, str], list[str]] = {}  # entry -> methods, if it is a setting of some methods
     models: dict[str, type[BaseModel]] = {"": RunSettings, **SECTIONS}
     for section, model in models.items():
         for name, field in model.model_fields.items():
-            if not section and name in SECTIONS:
-                continue
-            extra = field.json_schema_extra
-            assert isinstance(extra, dict), name  # every field is defined with `knob`
-            choices: list[str] = []
-            limits = [*field.metadata]
-            is_union = get_origin(field.annotation) in (Union, UnionType)
-            for part in get_args(field.annotation) if is_union else [field.annotation]:
-                if get_origin(part) is Literal:
-                    choices += get_args(part)
-                elif get_origin(part) is Annotated:
-                    limits += get_args(part)[1].metadata
-            bounds = ", ".join(
-                f"{symbol} {getattr(limit, attribute)}"
-                for limit in limits
-                for attribute, symbol in (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"))
-                if hasattr(limit, attribute) and getattr(limit, attribute) != LARGEST
-            )
-            facts = ["|".join(choices), bounds, extra["unit"], f"origin: {extra['origin']}"]
-            place = f"{section}.{name}" if section else name
-            lines.append(f"{place} = {field.default!r}  ({'; '.join(str(fact) for fact in facts if fact)})")
-            lines.append(f"    {field.description}")
+            if section or name not in SECTIONS:
+                entries[_entry(f"{section}.{name}" if section else name, field)] = []
+        if section == "method":
+            for method, fields in own_settings().items():
+                for name, field in fields.items():
+                    entries.setdefault(_entry(f"method.{name}", field), []).append(method)
+    lines = []
+    for (facts, description), methods in entries.items():
+        lines += [facts, f"    {', '.join(methods)}: {description}" if methods else f"    {description}"]
     return "\n".join(lines)
+
+
+def _entry(place: str, field: FieldInfo) -> tuple[str, str]:
+    """Return the line with a setting's facts, and its description."""
+    extra = field.json_schema_extra
+    assert isinstance(extra, dict), place  # every field is defined with `knob`
+    choices: list[str] = []
+    limits = [*field.metadata]
+    is_union = get_origin(field.annotation) in (Union, UnionType)
+    for part in get_args(field.annotation) if is_union else [field.annotation]:
+        if get_origin(part) is Literal:
+            choices += get_args(part)
+        elif get_origin(part) is Annotated:
+            limits += get_args(part)[1].metadata
+    bounds = ", ".join(
+        f"{symbol} {getattr(limit, attribute)}"
+        for limit in limits
+        for attribute, symbol in (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"))
+        if hasattr(limit, attribute) and getattr(limit, attribute) != LARGEST
+    )
+    facts = ["|".join(choices), bounds, extra["unit"], f"origin: {extra['origin']}"]
+    shown = "; ".join(str(fact) for fact in facts if fact)
+    return f"{place} = {field.default!r}  ({shown})", str(field.description)

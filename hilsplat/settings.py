@@ -52,7 +52,6 @@ def _takes(annotation: Any, kind: type) -> bool:
 
 
 Share = Annotated[float, Field(ge=0, le=1)]
-Granularity = Annotated[float, Field(gt=0, lt=2)]
 Size = Annotated[int, Field(ge=1, le=1000)]
 Suffix = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]*$")]
 Auto = Literal["auto"]
@@ -395,40 +394,6 @@ class FieldSettings(Section):
         if self.language == "l1" and self.trainer != "literal":
             raise ValueError("language: l1 needs trainer: literal; the fast trainer needs a squared loss")
         return self
-
-
-class MethodSettings(Section):
-    """The method that computes the field: ours or a baseline (hilsplat/methods)."""
-
-    name: str = knob(
-        "hilsplat",
-        "hilsplat, or a baseline in hilsplat/methods/registry.py; all but hilsplat, lifted, occam and "
-        "dr_splat are trained",
-    )
-    steps: int = knob(
-        1800,
-        "trained methods: steps, each on one view; per level for langsplat, langsplat_v2 and "
-        "gaussian_grouping, otherwise for all levels together",
-        ge=1,
-        origin="LangSplat, LangSplatV2: 30000",
-    )
-    rate: float = knob(0.0025, "trained methods: Adam step size", gt=0, origin="LangSplat")
-    pixel_step: int = knob(2, "trained methods: pixel stride in x and y", ge=1, origin="LangSplat: 1")
-    codebook: tuple[Size, Size] = knob(
-        (64, 10),
-        "opengaussian: number of groups by feature and position, and of groups by feature within each",
-        origin="OpenGaussian: (64, 10) on LERF, (64, 5) on ScanNet",
-    )
-    thresholds: tuple[Granularity, Granularity, Granularity] | Auto = knob(
-        "auto",
-        "granularity of whole, part, subpart; omniseg3d: minimum average cosine of a cluster, increasing; "
-        "vch: maximum edge of a component, decreasing; auto: the method's own",
-    )
-
-    @property
-    def is_random(self) -> bool:
-        """Whether the method depends on the seed: our solver and plain averaging do not; others may."""
-        return self.name not in ("hilsplat", "lifted", "occam")
 
 
 class EvaluateSettings(Section):

@@ -20,6 +20,7 @@ from hilsplat import settings as of
 from hilsplat.base.artifacts import provenance_path
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.plugins import entry_points
+from hilsplat.baselines import OURS, MethodSettings, method_of
 from hilsplat.models.store import AUTO
 from hilsplat.stage import (
     DEFAULT_CACHE,
@@ -319,16 +320,13 @@ def autoencoder(
 
 
 def _baseline(arguments: Mapping[str, Any]) -> Reads:
-    from hilsplat.methods.registry import METHODS
-
-    name = arguments["settings"].name
-    return Reads(plugins=(METHODS.places[name],) if name in METHODS else ())
+    return Reads(plugins=(method_of(arguments["settings"].name).fit,))
 
 
 @stage(
     artifact="field",
     file="field.safetensors",
-    when=lambda scene: scene.settings.method.name != of.MethodSettings().name,
+    when=lambda scene: scene.settings.method.name != OURS,
     reads=_baseline,
 )
 def method(
@@ -338,7 +336,7 @@ def method(
     contributions: PathIn,
     autoencoder: PathIn,
     out: PathOut,
-    settings: of.MethodSettings,
+    settings: MethodSettings,
     seed: Seed = 0,
     threads: Threads = 1,
 ) -> None:

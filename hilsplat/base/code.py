@@ -24,7 +24,7 @@ from hilsplat.base.lineage import sha256_of_bytes, sha256_of_json
 PACKAGES = ("hilsplat", "cpusplat")
 """Packages whose modules count, as do those of the packages of the roots, such as a plugin's."""
 
-NEUTRAL = ("hilsplat.settings", __name__)
+NEUTRAL = ("hilsplat.settings", "hilsplat.baselines", __name__)
 """Modules that don't count: settings, whose values are parameters of the rules, and this one."""
 
 MEMO = Path(__file__).parent / "__pycache__" / f"code.{sys.implementation.cache_tag}.json"

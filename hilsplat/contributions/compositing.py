@@ -67,15 +67,15 @@ def rendered_latents(
     """
     rows = weights.indptr, weights.indices, weights.data
     shares = weights @ (features != 0).any(axis=2).astype(np.float32)
-    shown = []
+    levels = []
     for level in range(features.shape[1]):
         pixels = np.flatnonzero(shares[:, level] > MIN_LATENT_SHARE)
         wide = padded(features[:, level])
-        found = np.empty((len(pixels), wide.shape[1]), np.float32)
+        latents = np.empty((len(pixels), wide.shape[1]), np.float32)
         share = shares[pixels, level]
-        _render(*rows, pixels, share, wide.reshape(-1), wide.shape[1], found.reshape(-1))
-        shown.append((pixels, found[:, : features.shape[2]]))
-    return shown
+        _render(*rows, pixels, share, wide.reshape(-1), wide.shape[1], latents.reshape(-1))
+        levels.append((pixels, latents[:, : features.shape[2]]))
+    return levels
 
 
 @compiled

@@ -53,13 +53,13 @@ def key_views(scene: Scene, gaussians_ply: Path, share: float, threads: int = 1)
         return visible_mass(pixel_weights(gaussians, camera.scaled((height, width)), min_weight=MIN_WEIGHT))
 
     masses = np.stack(list(in_order(mass, names, threads)))
-    seen = masses > MIN_VISIBLE_PX
-    importance = np.where(seen, masses, 0).sum(axis=0, dtype=np.float64) / np.maximum(seen.sum(axis=0), 1)
+    shows = masses > MIN_VISIBLE_PX
+    importance = np.where(shows, masses, 0).sum(axis=0, dtype=np.float64) / np.maximum(shows.sum(axis=0), 1)
     chosen: list[int] = []
     for _ in range(math.ceil(share * len(names))):
-        gains = seen @ importance
+        gains = shows @ importance
         gains[chosen] = -1
         best = int(gains.argmax())
         chosen.append(best)
-        importance[seen[best]] /= 2
+        importance[shows[best]] /= 2
     return [names[number] for number in sorted(chosen)]

@@ -32,23 +32,20 @@ class MaskOperator:
     of sums does not depend on the number of threads. `level_index` is each mask's level, from 0.
     """
 
-    indptr: np.ndarray
-    indices: np.ndarray
-    data: Float32[np.ndarray, " E"]
+    A: sp.csr_matrix
     level_index: Int64[np.ndarray, " M"]
-    num_gaussians: int
     threads: int = 1
 
     @staticmethod
     def of(A: sp.csr_matrix, level: UInt8[np.ndarray, " M"], threads: int = 1) -> "MaskOperator":
         """Build the operator from A (M x N) and the level of each row."""
-        return MaskOperator(A.indptr, A.indices, A.data, level.astype(np.int64) - 1, A.shape[1], threads)
+        return MaskOperator(A, level.astype(np.int64) - 1, threads)
 
     def means(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "M D"]:
         """Return A F: the mean rendered feature of each mask at its level."""
         out = np.zeros((len(self.level_index), features.shape[2]), features.dtype)
         features, A = np.ascontiguousarray(features), self._arrays()
-        shares = np.searchsorted(self.indptr, np.linspace(0, self.indptr[-1], self.threads + 1)[1:-1])
+        shares = np.searchsorted(A[0], np.linspace(0, A[0][-1], self.threads + 1)[1:-1])
         edges = [0, *shares.tolist(), len(out)]
         if out.dtype == np.float32 and out.shape[1] % WIDTH == 0:
             flat = features.reshape(-1), out.shape[1], out.reshape(-1)
@@ -61,15 +58,16 @@ class MaskOperator:
         """Return A' x at each level: the adjoint of `means`."""
         wide = padded(values)
         width = wide.shape[1]
-        out = np.zeros((self.num_gaussians, 3, width), np.float32)
+        num_gaussians = self.A.shape[1]
+        out = np.zeros((num_gaussians, 3, width), np.float32)
         parts = 1 if self.threads == 1 else SPREAD_PARTS * self.threads
-        edges = np.linspace(0, self.num_gaussians, parts + 1).astype(np.int64).tolist()
+        edges = np.linspace(0, num_gaussians, parts + 1).astype(np.int64).tolist()
         flat = wide.reshape(-1), width, out.reshape(-1)
         over_edges(_spread, edges, self.threads, *self._arrays(), *flat)
         return np.ascontiguousarray(out[:, :, : values.shape[1]])
 
     def _arrays(self) -> tuple[np.ndarray, ...]:
-        return self.indptr, self.indices, self.data, self.level_index
+        return self.A.indptr, self.A.indices, self.A.data, self.level_index
 
 
 def lifted_average(

@@ -34,7 +34,6 @@ class Gram:
 
     @property
     def nonzeros(self) -> int:
-        """Number of stored pairs of Gaussians."""
         return len(self.indices)
 
     @property
@@ -56,8 +55,8 @@ class Gram:
 
         parts = over_edges(part, edges, self.threads)
         total = parts[0]
-        for begin, rest in zip(edges[1:-1], parts[1:], strict=True):
-            total[begin:] += rest
+        for begin, sums in zip(edges[1:-1], parts[1:], strict=True):
+            total[begin:] += sums
         return np.ascontiguousarray(total[:, :, : features.shape[2]])
 
     def form(self, features: Float32[np.ndarray, "N 3 D"]) -> float:
@@ -78,7 +77,6 @@ class StackedWeights:
 
     @property
     def nonzeros(self) -> int:
-        """Number of stored weights."""
         return self.weights.nnz
 
     @property
@@ -88,7 +86,7 @@ class StackedWeights:
     def product(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "N 3 D"]:
         """Return W' diag(valid_l) W F_l for every level, in the precision of F, on one thread."""
         W, levels = self.weights, zip(self.valid.T, features.swapaxes(0, 1), strict=True)
-        return np.stack([W.T @ (valid[:, None] * (W @ own)) for valid, own in levels], axis=1)
+        return np.stack([W.T @ (valid[:, None] * (W @ of_level)) for valid, of_level in levels], axis=1)
 
     def form(self, features: Float32[np.ndarray, "N 3 D"]) -> float:
         """Return the sum over levels of tr F'GF, summed in float64."""

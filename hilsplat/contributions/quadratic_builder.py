@@ -49,28 +49,26 @@ class _Rows:
 
     @property
     def nonzeros(self) -> int:
-        """Number of pairs of Gaussians."""
         return int(self.indptr[-1])
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return row starts, columns and values."""
         return self.indptr, self._indices[: self.nonzeros], self._values[: self.nonzeros]
 
     def replace(self, indptr: np.ndarray, indices: np.ndarray, values: np.ndarray) -> None:
         """Copy other rows over these; columns and values may have more entries than `indptr` uses."""
-        kept = int(indptr[-1])
-        self._make_room(kept, 0)
+        size = int(indptr[-1])
+        self._make_room(size, 0)
         self.indptr = indptr
-        self._indices[:kept], self._values[:kept] = indices[:kept], values[:kept]
+        self._indices[:size], self._values[:size] = indices[:size], values[:size]
 
     def merge(self, late: "_Rows") -> None:
         """Add pairs that these rows don't contain."""
         self._make_room(self.nonzeros + late.nonzeros, self.nonzeros)
         merge_rows(self.indptr, self._indices, self._values, *late.arrays())
 
-    def _make_room(self, needed: int, kept: int) -> None:
+    def _make_room(self, needed: int, size: int) -> None:
         if needed > len(self._indices):
-            self._indices, self._values = enlarged(self._indices, self._values, kept, 2 * needed)
+            self._indices, self._values = enlarged(self._indices, self._values, size, 2 * needed)
 
 
 class GramBuilder:
@@ -97,7 +95,6 @@ class GramBuilder:
 
     @property
     def nonzeros(self) -> int:
-        """Number of pairs of Gaussians so far."""
         return sum(rows.nonzeros for rows in (*self._rows, *self._late))
 
     def add(self, part: StackedWeights) -> None:
@@ -112,8 +109,8 @@ class GramBuilder:
                 return
             rows, late, indptr = self._rows[block], self._late[block], np.zeros(end - begin + 1, np.int64)
             number, sums, fresh, *buffers = self._idle.get()
-            known = rows.arrays(), late.arrays(), number
-            buffers = add_to_block(begin, end, arrays, columns, *known, sums, fresh, indptr, *buffers)
+            pairs = rows.arrays(), late.arrays(), number
+            buffers = add_to_block(begin, end, arrays, columns, *pairs, sums, fresh, indptr, *buffers)
             late.replace(indptr, *buffers)
             self._idle.put((number, sums, fresh, *buffers))
             if MERGE_AT * late.nonzeros > rows.nonzeros:
@@ -143,7 +140,6 @@ class GramBuilder:
         return begins, self._cells
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return all sums so far as arrays."""
         return {
             f"{name}_{number}": array
             for number in range(BLOCKS)
@@ -151,7 +147,6 @@ class GramBuilder:
         }
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Continue from `state`."""
         for number, rows in enumerate(self._rows):
             rows.replace(*(state[f"{name}_{number}"] for name in ROWS))
 
@@ -188,27 +183,25 @@ class QuadraticBuilder:
         self.weights_nonzeros = 0
 
     def add(self, part: StackedWeights) -> None:
-        """Add the labelled pixels of a view."""
         self.weights_nonzeros += part.nonzeros
         if self._keeps_weights:
             # copied, because a part shares the memory of all weights of its view, which may be much larger
             self._parts.append(StackedWeights(part.weights.copy(), part.valid))
-        most = MAX_WEIGHTS
+        limit = MAX_WEIGHTS
         if self._gram is not None:
             self._gram.add(part)
-            most = min(most, CLEARLY_MORE * self._gram.nonzeros)
-        if self._may_drop and self.weights_nonzeros > most:
+            limit = min(limit, CLEARLY_MORE * self._gram.nonzeros)
+        if self._may_drop and self.weights_nonzeros > limit:
             self._parts, self._keeps_weights = [], False
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return all parts added so far as arrays."""
         out = {"nonzeros": np.array([self.weights_nonzeros, self._keeps_weights], np.int64)}
         if self._gram is not None:
             out |= self._gram.state()
         if self._parts:
-            held = stack_weights(self._parts)
-            out |= {"valid": held.valid, "data": held.weights.data}
-            out |= {"columns": held.weights.indices, "starts": held.weights.indptr}
+            stacked = stack_weights(self._parts)
+            out |= {"valid": stacked.valid, "data": stacked.weights.data}
+            out |= {"columns": stacked.weights.indices, "starts": stacked.weights.indptr}
         return out
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
@@ -222,7 +215,6 @@ class QuadraticBuilder:
             self._parts = [StackedWeights(matrix, state["valid"])]
 
     def finish(self) -> Quadratic:
-        """Return G or W of all added parts."""
         if self._gram is None or (self._keeps_weights and self.weights_nonzeros < self._gram.nonzeros):
             return stack_weights(self._parts)
         return self._gram.finish()
@@ -266,12 +258,10 @@ class QuadraticCheckpoint:
         self._last = time.monotonic()
 
     def forget(self) -> None:
-        """Delete the checkpoint of a finished pass."""
         delete(self._folder, DIGEST)
 
 
 def stack_weights(parts: list[StackedWeights]) -> StackedWeights:
-    """Concatenate the rows of all parts."""
     if len(parts) == 1:
         return parts[0]
     matrix = sp.vstack([part.weights for part in parts], format="csr")

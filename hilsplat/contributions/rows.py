@@ -42,7 +42,6 @@ class Contributions:
         return len(self.view)
 
     def rows_of(self, level: Level) -> Int64[np.ndarray, " m"]:
-        """Return the rows of a level, in order."""
         return np.flatnonzero(self.level == int(level))
 
     def rows_of_views(self) -> list[Int64[np.ndarray, " m"]]:
@@ -97,7 +96,8 @@ class Contributions:
         """
         folder, names = Path(folder), ("num_gaussians", "gaussians_sha256", "cameras_sha256", "min_weight")
         index = read_index(folder, *names)
-        known = {name: index[name] for name in names}
+        values = {name: index[name] for name in names}
         views = tuple(index["views"])
         path = sealed(folder, "rows.npz")
-        return build_checked(Contributions, read_npz(path), {"folder": folder, "views": views, **known}, path)
+        fields = {"folder": folder, "views": views, **values}
+        return build_checked(Contributions, read_npz(path), fields, path)

@@ -12,10 +12,10 @@ into one label map per level, with indicator B and areas n, the stage computes
 The language field's losses and the semantic tree need no other data from the images.
 """
 
-import logging
 import math
 from functools import cache as cache_calls
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -34,6 +34,7 @@ from hilsplat.contributions.quadratic import Gram, StackedWeights
 from hilsplat.contributions.quadratic_builder import QuadraticBuilder, QuadraticCheckpoint
 from hilsplat.contributions.rows import Contributions
 from hilsplat.contributions.view_matrices import label_maps, labelled_rows, view_contributions
+from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks
 from hilsplat.segment.masks import HierarchicalMasks
@@ -41,8 +42,6 @@ from hilsplat.settings import ContributionsSettings
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 from hilsplat.splat.rasterise.device import choose_device
-
-logger = logging.getLogger(__name__)
 
 MATRICES = ("A", "A_half", "S")
 PARTS = {"data": np.float32, "indices": np.int32, "indptr": np.int64}
@@ -75,16 +74,89 @@ class ArrayStream:
         return self._rows
 
     def append(self, values: np.ndarray) -> None:
-        """Add rows."""
         values = np.ascontiguousarray(values, self._dtype)
         self._rows += len(values)
         self._stream.write(values.data)
 
     def close(self) -> None:
-        """Complete the header."""
         self._stream.seek(0)
         self._write_header()
         self._stream.close()
+
+
+class Output:
+    """The stage's files: matrices are written view by view, and one row per mask at the end."""
+
+    def __init__(self, folder: Path, num_gaussians: int) -> None:
+        self._folder = folder
+        self._rows: dict[str, list[np.ndarray]] = {}
+        self._streams = {
+            f"{name}_{part}": ArrayStream(folder / name / f"{part}.npy", dtype)
+            for name in MATRICES
+            for part, dtype in PARTS.items()
+        }
+        self._streams["mass"] = ArrayStream(folder / "mass.npy", np.float32, (num_gaussians,))
+        for name in MATRICES:
+            self._streams[f"{name}_indptr"].append(np.zeros(1))
+
+    def append(self, number: int, masks: HierarchicalMasks, matrices: dict[str, np.ndarray]) -> None:
+        """Add the matrices of view `number` (see `view_contributions`)."""
+        values = matrices | {"mass": matrices["mass"][None]}
+        for name in MATRICES:
+            values[f"{name}_indptr"] = matrices[f"{name}_indptr"][1:] + len(self._streams[f"{name}_data"])
+        for name, stream in self._streams.items():
+            stream.append(values[name])
+        rows = {
+            "view": np.full(len(masks), number, np.int32),
+            "mask": np.arange(len(masks), dtype=np.int32),
+            "level": masks.level,
+            "area_px": masks.area_px,
+            "pixels": matrices["pixels"],
+            "half_pixels": matrices["half_pixels"],
+        }
+        for name, column in rows.items():
+            self._rows.setdefault(name, []).append(column)
+
+    @property
+    def masks_per_view(self) -> list[int]:
+        return [len(column) for column in self._rows.get("view", [])]
+
+    @property
+    def nonzeros(self) -> dict[str, int]:
+        return {name: len(self._streams[f"{name}_data"]) for name in MATRICES}
+
+    def finish(self, out: Path) -> None:
+        """Complete the matrices and write the rows; `out` names them in errors."""
+        for stream in self._streams.values():
+            stream.close()
+        arrays = {name: np.concatenate(columns) for name, columns in self._rows.items()}
+        require_types(Contributions, arrays, out / "rows.npz", {})
+        write_npz(self._folder / "rows.npz", **arrays)
+
+
+def view_key(camera: Camera, masks_sha256: str | None, inputs: dict[str, Any]) -> str:
+    """Return the cache key of a view's matrices; `inputs` are the same for all views."""
+    pose = sha256_of_bytes(camera.cam_from_world.tobytes(), camera.K.tobytes())
+    return sha256_of_json({**inputs, "masks": masks_sha256, "camera": pose, "view": camera.name})
+
+
+def view_masks(masks_folder: Path, camera: Camera, digests: dict[str, str]) -> HierarchicalMasks:
+    """Read the masks of a view; raise MisalignedArtifactError if their size or digest differs."""
+    masks = load_masks(masks_folder, camera.name, digests)
+    if masks.size_hw != camera.size_hw:
+        raise MisalignedArtifactError(
+            f"the masks of view {camera.name} do not match the size of its camera",
+            expected=f"{camera.size_hw[0]} x {camera.size_hw[1]} (height x width)",
+            found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
+            fix="rerun the masks stage",
+        )
+    return masks
+
+
+def views_at_once(cameras: list[Camera], threads: int) -> int:
+    """Return 2 if W of two views fits in memory, because half the work on a view uses one thread, else 1."""
+    most_px = max((math.prod(camera.size_hw) for camera in cameras), default=0)
+    return min(2, max(1, threads)) if most_px * WEIGHTS_PER_PIXEL <= MAX_WEIGHTS_TOGETHER else 1
 
 
 def run_contributions(
@@ -108,109 +180,64 @@ def run_contributions(
             recorded in their index.
         ArtifactError: no training view has masks.
     """
-    scene = Scene.load(scene_folder)
-    gaussians = load_ply(gaussians_ply)
-    gaussians_sha256 = sha256_of_file(gaussians_ply)
-    device = choose_device(settings.device)
-    digests = digests_in(masks_folder)
-    about = {
-        "code": code_digest(run_contributions),
+    scene, gaussians = Scene.load(scene_folder), load_ply(gaussians_ply)
+    gaussians_sha256, digests = sha256_of_file(gaussians_ply), digests_in(masks_folder)
+    names = digests if read_index(masks_folder).get("partial") else scene.views("train")
+    cameras = [scene.cameras[name] for name in names]
+    device, code = choose_device(settings.device), code_digest(run_contributions)
+    inputs = {
+        "code": code,
         "device": device,
         "gaussians": gaussians_sha256,
         "min_weight": settings.min_weight,
     }
-    names = digests if read_index(masks_folder).get("partial") else scene.views("train")
-    cameras = [scene.cameras[name] for name in names]
-    keys = [
-        sha256_of_json(
-            {
-                **about,
-                "masks": digests.get(camera.name),
-                "camera": sha256_of_bytes(camera.cam_from_world.tobytes(), camera.K.tobytes()),
-                "view": camera.name,
-            }
-        )
-        for camera in cameras
-    ]
-    # two views are prepared at once if W fits, because half the work uses one thread
-    most_px = max((math.prod(camera.size_hw) for camera in cameras), default=0)
-    together = min(2, max(1, threads)) if most_px * WEIGHTS_PER_PIXEL <= MAX_WEIGHTS_TOGETHER else 1
+    keys = [view_key(camera, digests.get(camera.name), inputs) for camera in cameras]
+    together = views_at_once(cameras, threads)
     threads_each = max(1, threads // together)
     store = ViewCache(Path(cache) / "contributions", compressed=False)
     checkpoint = QuadraticCheckpoint(store.folder / "partial", keys, settings.keep)
-    rows: dict[str, list[np.ndarray]] = {
-        name: [] for name in ("view", "mask", "level", "area_px", "pixels", "half_pixels")
-    }
+
+    def prepare(number: int) -> tuple[HierarchicalMasks, dict[str, np.ndarray], StackedWeights | None]:
+        """Return the masks and matrices of a view, and its rows of W if they are not yet in G."""
+        camera = cameras[number]
+        masks = view_masks(masks_folder, camera, digests)
+
+        @cache_calls
+        def weights() -> sp.csr_matrix:
+            least = settings.min_weight
+            return normalised_weights(
+                pixel_weights(gaussians, camera, min_weight=least, threads=threads_each, device=device)
+            )
+
+        matrices = store.get(
+            keys[number], lambda: view_contributions(camera.name, weights(), masks, threads_each)
+        )
+        if settings.keep == "none" or number < summed:
+            return masks, matrices, None
+        return masks, matrices, labelled_rows(weights(), label_maps(masks))
+
     with stage_log("contributions", scene.name) as counts, atomic_folder(out) as folder:
         builder = QuadraticBuilder(len(gaussians), settings.keep, threads)
         summed = checkpoint.resume(builder)
-        streams = {
-            f"{name}_{what}": ArrayStream(folder / name / f"{what}.npy", dtype)
-            for name in MATRICES
-            for what, dtype in PARTS.items()
-        }
-        streams["mass"] = ArrayStream(folder / "mass.npy", np.float32, (len(gaussians),))
-        for name in MATRICES:
-            streams[f"{name}_indptr"].append(np.zeros(1))
-
-        def prepare(number: int) -> tuple[HierarchicalMasks, dict[str, np.ndarray], StackedWeights | None]:
-            """Return the masks and matrices of a view, and its rows of W if they are not yet in G."""
-            camera = cameras[number]
-            masks = load_masks(masks_folder, camera.name, digests)
-            if masks.size_hw != camera.size_hw:
-                raise MisalignedArtifactError(
-                    f"the masks of view {camera.name} do not match the size of its camera",
-                    expected=f"{camera.size_hw[0]} x {camera.size_hw[1]} (height x width)",
-                    found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
-                    fix="rerun the masks stage",
-                )
-
-            @cache_calls
-            def weights() -> sp.csr_matrix:
-                least = settings.min_weight
-                return normalised_weights(
-                    pixel_weights(gaussians, camera, min_weight=least, threads=threads_each, device=device)
-                )
-
-            part = store.get(
-                keys[number], lambda: view_contributions(camera.name, weights(), masks, threads_each)
-            )
-            if settings.keep == "none" or number < summed:
-                return masks, part, None
-            return masks, part, labelled_rows(weights(), label_maps(masks))
-
+        output = Output(folder, len(gaussians))
         prepared = in_order(prepare, range(len(cameras)), together)
         prepared = track(prepared, "contributions of views", len(cameras))
-        for number, (masks, part, labelled) in enumerate(prepared):
-            part["mass"] = part["mass"][None]
-            for name in MATRICES:
-                part[f"{name}_indptr"] = part[f"{name}_indptr"][1:] + len(streams[f"{name}_data"])
-            for name, stream in streams.items():
-                stream.append(part[name])
-            rows["view"].append(np.full(len(masks), number, np.int32))
-            rows["mask"].append(np.arange(len(masks), dtype=np.int32))
-            rows["level"].append(masks.level)
-            rows["area_px"].append(masks.area_px)
-            rows["pixels"].append(part["pixels"])
-            rows["half_pixels"].append(part["half_pixels"])
+        for number, (masks, matrices, labelled) in enumerate(prepared):
+            output.append(number, masks, matrices)
             if labelled is not None:
                 builder.add(labelled)
                 checkpoint.offer(builder, number + 1)
-        for stream in streams.values():
-            stream.close()
-        num_masks = sum(len(part) for part in rows["view"])
+        num_masks = sum(output.masks_per_view)
         if not num_masks:
             raise ArtifactError(
                 f"no training view of {scene.name} has masks",
                 fix="loosen masks.predicted_iou_min or masks.stability_min, then rerun the masks stage",
             )
+        output.finish(out)
         np.save(folder / "means.npy", gaussians.means)
         np.save(folder / "centres.npy", np.stack([camera.centre for camera in cameras]))
-        arrays = {name: np.concatenate(values) for name, values in rows.items()}
-        require_types(Contributions, arrays, out / "rows.npz", {})
-        write_npz(folder / "rows.npz", **arrays)
         counts |= {"views": len(cameras), "masks": num_masks}
-        nonzeros = {name: len(streams[f"{name}_data"]) for name in MATRICES}
+        nonzeros = output.nonzeros
         if settings.keep != "none":
             quadratic = builder.finish()
             quadratic.save(folder)
@@ -221,8 +248,8 @@ def run_contributions(
         write_index(
             folder,
             {
-                camera.name: {MASKS_SHA256: digests[camera.name], "masks": len(part)}
-                for camera, part in zip(cameras, rows["view"], strict=True)
+                camera.name: {MASKS_SHA256: digests[camera.name], "masks": count}
+                for camera, count in zip(cameras, output.masks_per_view, strict=True)
             },
             scene=scene.name,
             num_gaussians=len(gaussians),

@@ -46,11 +46,11 @@ def view_contributions(
     runs = masks.runs, masks.offsets, masks.level.astype(np.int64) - 1
     W = weights.indptr, weights.indices, weights.data, weights.shape[1]
     parts = over_edges(summed_masks, edges, threads, *runs, *pixels, *W)
-    counts, sizes, columns, sums = (np.concatenate(each) for each in zip(*parts, strict=True))
+    counts, sizes, columns, sums = (np.concatenate(part) for part in zip(*parts, strict=True))
     starts = np.concatenate([[0], np.cumsum(sizes)])
-    shown, in_half = counts.T
-    arrays = {"pixels": shown.copy(), "half_pixels": in_half.copy(), "mass": visible_mass(weights)}
-    areas = {"S": np.ones(len(masks)), "A": np.maximum(shown, 1), "A_half": np.maximum(in_half, 1)}
+    painted, in_half = counts.T
+    arrays = {"pixels": painted.copy(), "half_pixels": in_half.copy(), "mass": visible_mass(weights)}
+    areas = {"S": np.ones(len(masks)), "A": np.maximum(painted, 1), "A_half": np.maximum(in_half, 1)}
     for index, (name, area) in enumerate(areas.items()):
         present = sums[:, index] > 0
         scaled = np.repeat(1.0 / area, sizes) * sums[:, index]

@@ -77,7 +77,7 @@ def run_autoencoder(
         decoded = model.decode_array(model.encode_array(train))
         cosine = float((decoded * train).sum(axis=1).mean())
         embedded = np.flatnonzero(clip.any(axis=1))
-        own = float((model.decode_array(latents[embedded]) * clip[embedded]).sum(axis=1).mean())
+        own_cosine = float((model.decode_array(latents[embedded]) * clip[embedded]).sum(axis=1).mean())
         counts |= {"vectors": len(train), "mean decoder cosine": round(cosine, 4)}
         with atomic_folder(out) as folder:
             model.save(autoencoder_file(folder))
@@ -91,7 +91,7 @@ def run_autoencoder(
                 vectors=len(train),
                 masks=len(clip),
                 decoder_cosine=round(cosine, 6),
-                decoder_cosine_own=round(own, 6),
+                decoder_cosine_own=round(own_cosine, 6),
                 autoencoder_sha256=sha256_of_file(autoencoder_file(folder)),
             )
 
@@ -112,17 +112,17 @@ def train_autoencoder(
     batch = min(settings.batch, len(data))
     per_epoch = len(data) // batch
     steps = max(settings.epochs * per_epoch, settings.min_steps)
-    arrays = Autoencoder.drawn(channels, latent, twister).arrays
+    arrays = Autoencoder.initial(channels, latent, twister).arrays
     drawn = {name: values for name, values in arrays.items() if "running" not in name}
     flat = np.concatenate([values.reshape(-1) for values in drawn.values()])
     slope = np.empty_like(flat)
     parameters, gradients = _as_arrays(flat, drawn), _as_arrays(slope, drawn)
     adam = Adam(flat, settings.learning_rate, eps=1e-8)
     for step in range(steps):
-        place = step % per_epoch
-        if place == 0:
+        number = step % per_epoch
+        if number == 0:
             order = torch_order(len(data), twister)
-        chosen = data[order[place * batch : (place + 1) * batch]]
+        chosen = data[order[number * batch : (number + 1) * batch]]
         loss_gradients(parameters, chosen, latent, settings.cosine_weight, gradients)
         adam.rate = settings.learning_rate * (1 + math.cos(math.pi * step / steps)) / 2
         adam.step(slope)
@@ -175,14 +175,14 @@ def loss_gradients(
 
 def statistics(parameters: Arrays, data: Float32[np.ndarray, "B C"], latent: int) -> Arrays:
     """Compute the mean and unbiased variance of all vectors at each BatchNorm, for use after training."""
-    found: Arrays = {}
+    running: Arrays = {}
     encoder, _ = layers_of(data.shape[1], latent)
     values = data
     for layer, after in pairwise(encoder):
         values = _forward(parameters, [layer], values)[0]
-        found[f"{after.norm}.running_mean"] = values.mean(axis=0)
-        found[f"{after.norm}.running_var"] = values.var(axis=0, ddof=1)
-    return found
+        running[f"{after.norm}.running_mean"] = values.mean(axis=0)
+        running[f"{after.norm}.running_var"] = values.var(axis=0, ddof=1)
+    return running
 
 
 def _forward(parameters: Arrays, layers: list[Layer], values: np.ndarray) -> tuple[np.ndarray, list[Passed]]:

@@ -141,7 +141,7 @@ class Autoencoder:
         return PackedLayers.of([self._affine(layer.name) for layer in self._decoder])
 
     @staticmethod
-    def drawn(channels: int, latent: int, twister: np.random.RandomState) -> "Autoencoder":
+    def initial(channels: int, latent: int, twister: np.random.RandomState) -> "Autoencoder":
         """Draw the weights that torch draws from this generator state; BatchNorm starts as the identity."""
         arrays: dict[str, np.ndarray] = {}
         for layer in (layer for side in layers_of(channels, latent) for layer in side):
@@ -170,7 +170,7 @@ def load_code(folder: Path) -> Code:
     try:
         if about.get("code") == "pca":
             return LinearCode(state["mean"], state["basis"])
-        model = Autoencoder.drawn(about["channels"], about["latent"], np.random.RandomState(0))
+        model = Autoencoder.initial(about["channels"], about["latent"], np.random.RandomState(0))
         for name, values in model.arrays.items():
             if name not in state or state[name].shape != values.shape:
                 raise ValueError(f"array {name} of shape {values.shape} is missing")
@@ -183,7 +183,6 @@ def load_code(folder: Path) -> Code:
 
 
 def autoencoder_file(folder: Path) -> Path:
-    """Return the path of the weights in a finished folder."""
     return Path(folder) / "autoencoder.safetensors"
 
 

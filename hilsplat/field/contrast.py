@@ -31,7 +31,7 @@ class ViewRelations:
     rows: Int64[np.ndarray, " m"]  # selected masks of all levels
     depth: Int64[np.ndarray, "m m"]  # depth of the deepest common ancestor of each pair of masks
     level: Int64[np.ndarray, " m"]  # level of each selected mask
-    # for PART and SUBPART: the selected masks and the rows of their parents, -1 for none
+    # of each level with masks to compare: the selected masks and the rows of their parents, -1 for none
     parts: tuple[tuple[Int64[np.ndarray, " _"], Int64[np.ndarray, " _"]], ...]
 
 
@@ -57,12 +57,13 @@ def view_relations(
             chosen.append(np.sort(order))
         every = np.sort(np.concatenate(chosen))
         visible_parent = np.where((parent != NONE) & (pixels[parent] > 0), rows[parent], NONE)
+        parts = ((rows[masks], visible_parent[masks]) for masks in chosen[1:])
         relations.append(
             ViewRelations(
                 rows=rows[every],
                 depth=depth[np.ix_(every, every)],
                 level=contributions.level[rows[every]].astype(np.int64),
-                parts=tuple((rows[own], visible_parent[own]) for own in chosen[1:]),
+                parts=tuple(part for part in parts if len(part[0]) > 1 and (part[1] != NONE).any()),
             )
         )
     return relations
@@ -85,13 +86,9 @@ def distinct(
     return np.flatnonzero(kept)
 
 
-def compared(relations: list[ViewRelations]) -> tuple[int, int]:
+def num_compared(relations: list[ViewRelations]) -> tuple[int, int]:
     """Return the number of views averaged in L_ins, and of (view, level) pairs averaged in L_part."""
-    instance = sum(len(view.rows) > 1 for view in relations)
-    part = sum(
-        len(rows) > 1 and bool((parent != NONE).any()) for view in relations for rows, parent in view.parts
-    )
-    return instance, part
+    return sum(len(view.rows) > 1 for view in relations), sum(len(view.parts) for view in relations)
 
 
 def instance_term(
@@ -125,16 +122,13 @@ def part_term(
     by_means, by_halves, by_others = (np.zeros(means.shape) for _ in range(3))
     for view in relations:
         for rows, parent in view.parts:
-            has_parent = parent != NONE
-            if len(rows) < 2 or not has_parent.any():
-                continue
             parent_means = means[np.maximum(parent, 0)]
             if settings.part_mode == "literal":
                 loss, by_rows = part_loss_literal(means[rows], parent, parent_means, settings.tau)
                 by_means[rows] += by_rows
             else:
                 loss, by_half, by_other = part_loss_disentangle(
-                    halves[rows], other_halves[rows], has_parent, parent_means, settings.tau
+                    halves[rows], other_halves[rows], parent != NONE, parent_means, settings.tau
                 )
                 by_halves[rows] += by_half
                 by_others[rows] += by_other
@@ -170,10 +164,10 @@ class Contrast:
             total += settings.weight_instance * loss
             by_means += settings.weight_instance * gradient
         if settings.weight_part:
-            loss, (own, by_half, by_other) = part_term(means, halves, others, self.relations, settings)
+            loss, (by_mean, by_half, by_other) = part_term(means, halves, others, self.relations, settings)
             total += settings.weight_part * loss
             n, half, rest = self._counts()
-            by_means += settings.weight_part * (own + n / rest * by_other)
+            by_means += settings.weight_part * (by_mean + n / rest * by_other)
             by_halves = settings.weight_part * (by_half - half / rest * by_other)
         gradient = self.masks.spread(by_means.astype(np.float32))
         if by_halves is not None:

@@ -57,7 +57,7 @@ class PackedLayers(NamedTuple):
             missing = -len(bias) % UNITS
             weights.append(np.pad(weight, ((0, missing), (0, 0))).reshape(-1))
             biases.append(np.pad(bias, (0, missing)))
-        flat_weights, flat_biases = (np.concatenate(each).astype(np.float32) for each in (weights, biases))
+        flat_weights, flat_biases = (np.concatenate(parts).astype(np.float32) for parts in (weights, biases))
         return PackedLayers(np.array(widths), flat_weights, flat_biases)
 
     def through(self, rows: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B C"]:

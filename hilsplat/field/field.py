@@ -39,11 +39,11 @@ def run_field(
         MisalignedArtifactError: an input belongs to different masks, Gaussians or codes.
         SettingsError: an input that the settings require is missing, or one that they do not use is given.
     """
-    for name, value, given, options in (
+    for name, value, option, options in (
         ("trainer", "literal", rendered, "--scene, --gaussians and --masks"),
         ("start", "langsplat", start, "--start <field.safetensors>"),
     ):
-        if (getattr(settings, name) == value) != (given is not None):
+        if (getattr(settings, name) == value) != (option is not None):
             raise SettingsError(
                 f"field.{name} and the options do not match",
                 expected=f"{options} if and only if {name}: {value}",
@@ -65,9 +65,9 @@ def run_field(
         if rendered is None:
             features, report = solve_field(problem, contrast)
         else:
-            from hilsplat.field.literal_trainer import train_literally
+            from hilsplat.field.literal_trainer import train_by_rendering
 
-            features, report = train_literally(problem, contrast, contributions, rendered, seed, threads)
+            features, report = train_by_rendering(problem, contrast, contributions, rendered, seed, threads)
         total_mass = contributions.mass().sum(axis=0, dtype=np.float64)
         features = keep_labelled(features, problem.mass, total_mass, settings.min_labelled_share)
         LanguageField(features, contributions.gaussians_sha256, code_sha256).save(out)

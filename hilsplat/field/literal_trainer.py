@@ -24,7 +24,7 @@ from hilsplat.contributions.compositing import MIN_ALPHA
 from hilsplat.contributions.rows import Contributions
 from hilsplat.contributions.view_matrices import label_maps, painted_indicator, random_half
 from hilsplat.field.adam import Adam, in_random_order
-from hilsplat.field.contrast import Contrast, ViewRelations, compared, instance_term, part_term
+from hilsplat.field.contrast import Contrast, ViewRelations, instance_term, num_compared, part_term
 from hilsplat.field.problem import QuadraticProblem
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import digests_in, load_masks
@@ -54,7 +54,7 @@ def view_losses(
     view: ViewTargets,
     latents: Float32[np.ndarray, "M D"],  # latent of every mask of the scene
     settings: FieldSettings,
-    shares: tuple[int, float, int, int],  # totals of the scene: views, labelled pixels, `compared`
+    shares: tuple[int, float, int, int],  # totals of the scene: views, labelled pixels, `num_compared`
 ) -> tuple[dict[str, float], Float64[np.ndarray, "P 3 D"]]:
     """Compute all losses on the rendered maps of one view, and the gradient of their weighted sum.
 
@@ -70,15 +70,15 @@ def view_losses(
     sums, half_sums = (
         (matrix @ flat).reshape(-1, levels, channels)[of_level] for matrix in (view.painted, view.half)
     )
-    own = sums / np.maximum(count, 1)
+    averages = sums / np.maximum(count, 1)
     mask_of = np.full((pixels, levels), -1)
     of_entry = np.repeat(of_level[0], np.diff(view.painted.indptr))
     mask_of[view.painted.indices, view.level[of_entry]] = of_entry
     inside = mask_of >= 0
-    at, here = mask_of[inside], shown[inside]
+    at, painted = mask_of[inside], shown[inside]
     gradient = np.zeros_like(shown)
     scale = num_views / num_pixels
-    to_latent, to_mean = here - latents[view.rows[at]], here - own[at]
+    to_latent, to_mean = painted - latents[view.rows[at]], painted - averages[at]
     losses = {"clustering": scale * float(np.square(to_mean).sum())}
     by_pixel = 2 * scale * settings.weight_clustering * to_mean
     if settings.language == "l1":
@@ -90,10 +90,10 @@ def view_losses(
         by_pixel += 2 * scale * settings.weight_language * to_latent
     means, halves, others = (np.zeros((len(latents), channels)) for _ in range(3))
     rest = np.maximum(count - half_count, 1)
-    means[view.rows] = own
+    means[view.rows] = averages
     halves[view.rows] = half_sums / np.maximum(half_count, 1)
     others[view.rows] = (sums - half_sums) / rest
-    in_instance, in_part = compared([view.relations])
+    in_instance, in_part = num_compared([view.relations])
     losses["instance"], by_means = instance_term(means, [view.relations], settings)
     losses["part"], (own_part, by_half, by_other) = part_term(
         means, halves, others, [view.relations], settings
@@ -113,7 +113,7 @@ def view_losses(
     return losses, gradient
 
 
-def train_literally(
+def train_by_rendering(
     problem: QuadraticProblem,
     contrast: Contrast,
     contributions: Contributions,
@@ -136,7 +136,7 @@ def train_literally(
     gaussians, device = load_ply(gaussians_ply), choose_device("auto")
     features = problem.lifted.reshape(len(gaussians), -1).astype(np.float32)
     channels = features.shape[1] // len(LEVELS)
-    shares = len(contributions.views), problem.total_pixels, *compared(contrast.relations)
+    shares = len(contributions.views), problem.total_pixels, *num_compared(contrast.relations)
     report: dict[str, object] = {"start": problem.terms(problem.lifted) | contrast.values(problem.lifted)}
     targets: dict[int, ViewTargets] = {}
     adam, curve, recent = Adam(features, settings.rate), list[dict[str, float]](), list[float]()
@@ -158,16 +158,16 @@ def train_literally(
     order = in_random_order(views, np.random.default_rng(seed), settings.iterations)
     for step, number in enumerate(order, start=1):
         camera = scene.cameras[contributions.views[number]]
-        seen = draw(gaussians, camera, 0, features=features, threads=threads, device=device)
+        render = draw(gaussians, camera, 0, features=features, threads=threads, device=device)
         if number not in targets:
-            targets[number] = targets_of(number, seen.alpha.reshape(-1) >= MIN_ALPHA)
-        alpha = np.maximum(seen.alpha.reshape(-1, 1), 1e-6)
-        shown = (seen.image[..., 3:].reshape(len(alpha), -1) / alpha).astype(np.float64)
-        maps = shown.reshape(len(alpha), len(LEVELS), channels)
+            targets[number] = targets_of(number, render.alpha.reshape(-1) >= MIN_ALPHA)
+        alpha = np.maximum(render.alpha.reshape(-1, 1), 1e-6)
+        blended = (render.image[..., 3:].reshape(len(alpha), -1) / alpha).astype(np.float64)
+        maps = blended.reshape(len(alpha), len(LEVELS), channels)
         losses, by_maps = view_losses(maps, targets[number], problem.latents, settings, shares)
-        by_image = np.zeros((*seen.alpha.shape, 3 + features.shape[1]), np.float32)
-        by_image[..., 3:] = (by_maps.reshape(shown.shape) / alpha).reshape(*seen.alpha.shape, -1)
-        gradient = seen.gradients(by_image, np.zeros_like(seen.alpha)).features
+        by_image = np.zeros((*render.alpha.shape, 3 + features.shape[1]), np.float32)
+        by_image[..., 3:] = (by_maps.reshape(blended.shape) / alpha).reshape(*render.alpha.shape, -1)
+        gradient = render.gradients(by_image, np.zeros_like(render.alpha)).features
         if settings.ridge:
             pull = ridge * (features.reshape(problem.lifted.shape) - problem.lifted)
             gradient = gradient + pull.reshape(features.shape)
@@ -178,6 +178,6 @@ def train_literally(
             curve.append({"step": step, "loss": float(np.mean(recent)), "seconds": seconds})
             logger.info("literal trainer: step %d, loss %.5f", step, curve[-1]["loss"])
             recent = []
-    found = features.reshape(problem.lifted.shape)
-    report["trained"] = problem.terms(found) | contrast.values(found)
-    return found, {**report, "curve": curve}
+    trained = features.reshape(problem.lifted.shape)
+    report["trained"] = problem.terms(trained) | contrast.values(trained)
+    return trained, {**report, "curve": curve}

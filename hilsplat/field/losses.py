@@ -14,7 +14,7 @@ from hilsplat.base.levels import NONE
 
 SOFTENING = 1e-3  # added in quadrature to every distance, so that its logarithm has a finite slope at zero
 
-SHORTEST = 1e-6  # added in quadrature to lengths in denominators, so that the cosine of a zero vector is 0
+MIN_LENGTH = 1e-6  # added in quadrature to lengths in denominators, so that the cosine of a zero vector is 0
 
 
 def log_distance_loss(
@@ -102,12 +102,12 @@ def similarity_without_parent(
     parent mean in Eq. 4 has no index; we use the anchor's parent for both positives and negatives. The parent
     gets no gradient: parts move relative to their whole, not the whole relative to its parts.
     """
-    own = anchors - parent
-    square = np.square(own).sum(axis=1, keepdims=True) + SHORTEST**2
-    along = own @ others.T - (own * parent).sum(axis=1, keepdims=True)
+    centred = anchors - parent
+    square = np.square(centred).sum(axis=1, keepdims=True) + MIN_LENGTH**2
+    along = centred @ others.T - (centred * parent).sum(axis=1, keepdims=True)
     # |other - parent|^2 from dot products, which needs A x B numbers instead of A x B x D
     far = np.square(others).sum(axis=1) - 2 * parent @ others.T + np.square(parent).sum(axis=1, keepdims=True)
-    softened = np.maximum(far, 0) + SHORTEST**2
+    softened = np.maximum(far, 0) + MIN_LENGTH**2
     scale = 1 / np.sqrt(square * softened)
     similarity = along * scale
 
@@ -115,8 +115,8 @@ def similarity_without_parent(
         by_along, shrinking = by * scale, by * similarity
         by_far = np.where(far >= 0, -0.5 * shrinking / softened, 0)
         by_own = by_along @ others - by_along.sum(axis=1, keepdims=True) * parent
-        by_own -= shrinking.sum(axis=1, keepdims=True) / square * own
-        by_others = by_along.T @ own + 2 * (by_far.sum(axis=0)[:, None] * others - by_far.T @ parent)
+        by_own -= shrinking.sum(axis=1, keepdims=True) / square * centred
+        by_others = by_along.T @ centred + 2 * (by_far.sum(axis=0)[:, None] * others - by_far.T @ parent)
         return by_own, by_others
 
     return similarity, pull_back
@@ -139,9 +139,9 @@ def part_loss_literal(
     """
     similarity, pull_back = similarity_without_parent(means, means, parent_means)
     has_parent = parent != NONE
-    both = has_parent[:, None] & has_parent[None]
+    comparable = has_parent[:, None] & has_parent[None]
     same = parent[:, None] == parent[None]
-    positive, negative = both & same & ~np.eye(len(means), dtype=bool), both & ~same
+    positive, negative = comparable & same & ~np.eye(len(means), dtype=bool), comparable & ~same
     anchors = np.flatnonzero(positive.any(axis=1) & negative.any(axis=1))
     if not len(anchors):
         return 0.0, np.zeros(means.shape)
@@ -172,9 +172,9 @@ def part_loss_disentangle(
     similarity, pull_back = similarity_without_parent(half[anchors], other_half, parent_means[anchors])
     scaled = similarity / tau
     total, shares = log_sum_exp(scaled)
-    own = np.arange(len(anchors)), anchors
-    loss = float((total - scaled[own]).mean())
-    shares[own] -= 1
+    positives = np.arange(len(anchors)), anchors
+    loss = float((total - scaled[positives]).mean())
+    shares[positives] -= 1
     by_half[anchors], by_other = pull_back(shares / (len(anchors) * tau))
     return loss, by_half, by_other
 
@@ -183,7 +183,7 @@ def log_sum_exp(
     values: Float64[np.ndarray, "A B"],
 ) -> tuple[Float64[np.ndarray, " A"], Float64[np.ndarray, "A B"]]:
     """Return the log-sum-exp of each row, and the gradient, which is the softmax."""
-    most = values.max(axis=1, keepdims=True)
-    powers = np.exp(values - most)
+    largest = values.max(axis=1, keepdims=True)
+    powers = np.exp(values - largest)
     total = powers.sum(axis=1, keepdims=True)
-    return (np.log(total) + most)[:, 0], powers / total
+    return (np.log(total) + largest)[:, 0], powers / total

@@ -20,10 +20,10 @@ from scipy.cluster.vq import vq
 
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import track
+from hilsplat.baselines import MethodSettings
 from hilsplat.contributions.view_matrices import painted_indicator
 from hilsplat.methods.common.groups import kmeans
 from hilsplat.methods.method import MethodInputs
-from hilsplat.settings import MethodSettings
 
 TOP_GAUSSIANS = 45  # number of Gaussians, by weight, that get a pixel's vector, as published
 PART = 4  # elements of a CLIP vector that share a byte
@@ -32,12 +32,12 @@ UNSEEN = 1e-9  # averages shorter than this have no direction
 
 def heaviest(weights: sp.csr_matrix, count: int) -> sp.csr_matrix:
     """Return the `count` largest weights of each row; lower columns win ties."""
-    kept = weights.copy()
-    for row in np.flatnonzero(np.diff(kept.indptr) > count):
-        own = kept.data[kept.indptr[row] : kept.indptr[row + 1]]
-        own[np.argsort(-own, kind="stable")[count:]] = 0
-    kept.eliminate_zeros()
-    return kept
+    result = weights.copy()
+    for row in np.flatnonzero(np.diff(result.indptr) > count):
+        row_weights = result.data[result.indptr[row] : result.indptr[row + 1]]
+        row_weights[np.argsort(-row_weights, kind="stable")[count:]] = 0
+    result.eliminate_zeros()
+    return result
 
 
 def register(
@@ -53,10 +53,11 @@ def register(
     for view, rows in zip(track(list(contributions.views), "views"), rows_of_views, strict=True):
         weights = heaviest(inputs.view_weights(view), count)
         covered = np.diff(weights.indptr) > 0
-        shown = painted_indicator(inputs.view_labels(view), len(rows), covered) @ weights  # masks x Gaussians
+        painted = painted_indicator(inputs.view_labels(view), len(rows), covered)
+        in_masks = painted @ weights  # masks x Gaussians
         for level in LEVELS:
-            own = np.flatnonzero(contributions.level[rows] == int(level))
-            sums[:, level.index] += (shown[own].T @ vectors[rows[own]]).astype(np.float32)
+            of_level = np.flatnonzero(contributions.level[rows] == int(level))
+            sums[:, level.index] += (in_masks[of_level].T @ vectors[rows[of_level]]).astype(np.float32)
     length = np.linalg.norm(sums, axis=2, keepdims=True)
     return np.where(length > UNSEEN, sums / np.maximum(length, UNSEEN), np.float32(0))
 

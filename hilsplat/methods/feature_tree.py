@@ -31,18 +31,18 @@ STEPS = 60  # number of L-BFGS steps
 RIDGE = 1e-3  # weight of the pull towards the random start; prevents drift in unobserved directions
 
 
-def farthest_alike(
+def merge_distances(
     means: Float32[np.ndarray, "M D"], contributions: Contributions, parents: dict[str, np.ndarray]
 ) -> tuple[float, ...]:
     """Return, per level, half the median distance between masks that share a view and a parent."""
-    found: list[list[float]] = [[] for _ in LEVELS]
+    distances: list[list[float]] = [[] for _ in LEVELS]
     for view, rows in zip(contributions.views, contributions.rows_of_views(), strict=True):
         level, parent = contributions.level[rows], parents[view]
         usable = contributions.pixels[rows] > 0
         alike = (level[:, None] == level) & (parent[:, None] == parent) & usable[:, None] & usable
         for a, b in np.argwhere(np.triu(alike, 1)):
-            found[level[a] - 1].append(float(np.linalg.norm(means[rows[a]] - means[rows[b]])))
-    return tuple(0.5 * float(np.median(values)) if values else np.inf for values in found)
+            distances[level[a] - 1].append(float(np.linalg.norm(means[rows[a]] - means[rows[b]])))
+    return tuple(0.5 * float(np.median(values)) if values else np.inf for values in distances)
 
 
 def nested_clusters(
@@ -52,21 +52,21 @@ def nested_clusters(
 
     Clusters are divided by k-means; centres with an average distance of at most `farthest` are merged.
     """
-    found = np.full(features.shape[:2], NONE, np.int64)
+    nested = np.full(features.shape[:2], NONE, np.int64)
     around = np.zeros(len(features), np.int64)
     for level in LEVELS:
         has = ~np.isnan(features[:, level.index, 0])
         number = 0
         for cluster in np.unique(around[has]):
             inside = np.flatnonzero(has & (around == cluster))
-            rows, most = features[inside, level.index], farthest[level.index]
+            rows, distance = features[inside, level.index], farthest[level.index]
             count = int(np.clip(len(rows) // CENTRE_OF, 1, CENTRES))
-            own = clusters(rows, (most,), seed, "euclidean", count)[:, 0]
-            found[inside, level.index] = number + own
-            number += int(own.max()) + 1
+            cluster_of_row = clusters(rows, (distance,), seed, "euclidean", count)[:, 0]
+            nested[inside, level.index] = number + cluster_of_row
+            number += int(cluster_of_row.max()) + 1
         # Gaussians without a cluster remain grouped by their whole.
-        around = np.where(has, found[:, level.index], -2 - around)
-    return found
+        around = np.where(has, nested[:, level.index], -2 - around)
+    return nested
 
 
 def run_feature_tree(
@@ -93,25 +93,25 @@ def run_feature_tree(
     no_latents = np.zeros((len(contributions), settings.feature_size), np.float32)
     problem, contrast = field_losses(contributions, parents, no_latents, losses, "random", seed, threads)
     features, _ = solve_field(problem, contrast)
-    farthest = farthest_alike(problem.masks.means(features), contributions, parents)
+    farthest = merge_distances(problem.masks.means(features), contributions, parents)
     features = np.where((problem.mass > 0)[:, :, None], features, np.float32(np.nan))
     clusters = nested_clusters(features, farthest, seed)
     S, mass = contributions.matrix("S"), contributions.mass()
 
     def nodes(level: Level) -> LevelNodes:
         rows = contributions.rows_of(level)
-        own, view = clusters[:, level.index], contributions.view[rows]
-        fits, iou = best_fits(level_ious(own.astype(np.int32), S[rows], mass, view))
+        cluster, view = clusters[:, level.index], contributions.view[rows]
+        fits, iou = best_fits(level_ious(cluster.astype(np.int32), S[rows], mass, view))
         of_mask = np.where(iou > MIN_FIT, fits, NONE).astype(np.int64)
-        number = int(own.max(initial=NONE)) + 1
+        number = int(cluster.max(initial=NONE)) + 1
         pairs = np.unique(np.stack([of_mask, view], axis=1)[of_mask != NONE], axis=0)
-        kept = np.flatnonzero(np.bincount(pairs[:, 0], minlength=number) >= settings.min_views)
+        with_views = np.flatnonzero(np.bincount(pairs[:, 0], minlength=number) >= settings.min_views)
         renumber = np.full(number + 1, NONE, np.int64)
-        renumber[kept] = np.arange(len(kept))
+        renumber[with_views] = np.arange(len(with_views))
         quality, _ = group_means(iou[of_mask != NONE, None], of_mask[of_mask != NONE], number)
-        of_gaussian = renumber[own].astype(np.int32)
+        of_gaussian = renumber[cluster].astype(np.int32)
         return LevelNodes(
-            renumber[of_mask], of_gaussian, (of_gaussian != NONE).astype(np.float32), quality[kept, 0]
+            renumber[of_mask], of_gaussian, (of_gaussian != NONE).astype(np.float32), quality[with_views, 0]
         )
 
     run_semantic_tree(contributions_folder, masks_folder, out, settings, threads, map(nodes, LEVELS))

@@ -26,12 +26,13 @@ from torch import Tensor
 from torch.nn.functional import cross_entropy, log_softmax
 
 from hilsplat.base.levels import LEVELS, NONE, Level
+from hilsplat.baselines import TrainedSettings
 from hilsplat.contributions.rows import Contributions
 from hilsplat.methods.common.groups import features_of_groups, group_means, nearest
 from hilsplat.methods.common.training import one_torch_thread, product, train
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 from hilsplat.semantic_tree.nodes import linked_nodes
-from hilsplat.settings import MethodSettings, SemanticTreeSettings
+from hilsplat.settings import SemanticTreeSettings
 
 CHANNELS = 16
 SMOOTHING = 2.0
@@ -65,7 +66,7 @@ def identity_of_gaussians(
     contributions: Contributions,
     identity: Int64[np.ndarray, " M"],  # of every mask of the scene, -1 for none or at other levels
     level: Level,
-    settings: MethodSettings,
+    settings: TrainedSettings,
     seed: int,
 ) -> Int64[np.ndarray, " N"]:
     """Train the codes and the classifier of a level, and classify the Gaussians."""
@@ -96,7 +97,7 @@ def identity_of_gaussians(
         return (codes.detach() @ classifier.detach()).argmax(1).numpy()
 
 
-def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
+def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Classify the Gaussians at each level, and assign each identity the mean code of its masks.
 
     A level without identities gets zeros.

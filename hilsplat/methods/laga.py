@@ -27,12 +27,12 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from hilsplat.base.levels import LEVELS, NONE
+from hilsplat.baselines import TrainedSettings
 from hilsplat.field.code import LinearCode, unit_rows
 from hilsplat.methods.common.groups import density_clusters, features_of_groups, group_means, kmeans
-from hilsplat.methods.common.training import alike, of_seen, product, train, unit
+from hilsplat.methods.common.training import initial_features, nonempty_columns, product, train, unit
 from hilsplat.methods.langsplat_v2 import as_vectors
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
-from hilsplat.settings import MethodSettings
 
 SLICES = (16, 8, 8)
 PREFIX = (16, 24, 32)
@@ -46,22 +46,21 @@ PIXELS = 2048
 
 
 def unit_slices(features: Float[Tensor, "n 32"]) -> Float[Tensor, "n 32"]:
-    """Scale each of the three slices to length 1."""
     return torch.cat([unit(part) for part in features.split(SLICES, 1)], 1)
 
 
 def masks_of_pixels(labels: Int32[np.ndarray, "p 3"]) -> list[Bool[np.ndarray, "p _"]]:
     """Return the pixels of each level's usable masks: large enough, and not a duplicate of a finer mask."""
-    least = max(MIN_SHARE * len(labels), 1)
-    every, found = [label[:, None] == np.unique(label[label >= 0]) for label in labels.T], []
+    min_pixels = max(MIN_SHARE * len(labels), 1)
+    every, usable = [label[:, None] == np.unique(label[label >= 0]) for label in labels.T], []
     for index, inside in enumerate(every):
-        keep = large = inside.sum(axis=0) > least
+        keep = large = inside.sum(axis=0) > min_pixels
         for finer in every[index + 1 :]:
             shared = inside.T.astype(np.float32) @ finer.astype(np.float32)
             union = inside.sum(axis=0)[:, None] + finer.sum(axis=0)[None] - shared
             keep = keep & (np.max(shared / union, axis=1, initial=0) < SAME_IOU)
-        found.append(inside[:, keep if keep.any() else large])
-    return found
+        usable.append(inside[:, keep if keep.any() else large])
+    return usable
 
 
 def nested_loss(
@@ -72,40 +71,43 @@ def nested_loss(
     `masks` contains the pixels of each mask, level by level. Outside a mask, all hard pixels are
     used, plus as many random pixels as there are pixels inside.
     """
-    inside = [torch.from_numpy(each) for each in masks]
+    inside = [torch.from_numpy(pixels) for pixels in masks]
     last = len(LEVELS) - 1
 
     def cosine(level: int, prefix: int) -> Tensor:
-        own = rendered[:, : PREFIX[prefix]]
-        return unit(own) @ unit(inside[level].T.to(own.dtype) @ own).T
+        features = rendered[:, : PREFIX[prefix]]
+        return unit(features) @ unit(inside[level].T.to(features.dtype) @ features).T
 
     lengths = torch.stack([part.norm(dim=1).mean() for part in rendered.split(SLICES, 1)])
     total = (1 - lengths.mean()).square()
-    for level, shown in enumerate(inside):
-        if not shown.shape[1]:
+    for level, pixels_inside in enumerate(inside):
+        if not pixels_inside.shape[1]:
             continue
-        own = near = far = cosine(level, level)
+        similarity = near = far = cosine(level, level)
         if level > 0:
             near = torch.minimum(near, cosine(level, level - 1))
         if level < last:
             far = torch.maximum(far, cosine(level, level + 1))
-        outside = ~shown
-        share = shown.sum(0) / outside.sum(0).clamp(min=1)
-        drawn = torch.from_numpy(random.random(shown.shape, dtype=np.float32)) < share
-        negative = outside & (drawn | (own.detach() > HARD_COSINE))
-        total = total - (near * shown).sum() / shown.sum()
+        outside = ~pixels_inside
+        share = pixels_inside.sum(0) / outside.sum(0).clamp(min=1)
+        drawn = torch.from_numpy(random.random(pixels_inside.shape, dtype=np.float32)) < share
+        negative = outside & (drawn | (similarity.detach() > HARD_COSINE))
+        total = total - (near * pixels_inside).sum() / pixels_inside.sum()
         total = total + (far.relu() * negative).sum() / negative.sum().clamp(min=1)
     return total
 
 
 def objects(
-    features: Float32[np.ndarray, "N C"], prototypes: Float32[np.ndarray, "m C"], radius: float, least: int
+    features: Float32[np.ndarray, "N C"],
+    prototypes: Float32[np.ndarray, "m C"],
+    radius: float,
+    min_masks: int,
 ) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " m"]]:
     """Return the object (a density cluster of prototypes) of each Gaussian and each mask, -1 for none.
 
-    Features and prototypes have unit length; `radius` and `least` are as in `density_clusters`.
+    Features and prototypes have unit length; `radius` and `min_masks` are as in `density_clusters`.
     """
-    of_mask = density_clusters(prototypes, radius, least)
+    of_mask = density_clusters(prototypes, radius, min_masks)
     has = of_mask != NONE
     if not has.any():
         return np.full(len(features), NONE, np.int64), of_mask
@@ -154,38 +156,38 @@ def object_latents(
     """
     vectors = as_vectors(latents, code)
     length = np.linalg.norm(vectors, axis=1)
-    found = np.zeros((int(of_mask.max(initial=NONE)) + 1, latents.shape[1]), np.float32)
-    for number in range(len(found)):
-        own = np.flatnonzero(of_mask == number)
-        weight = descriptor_weights(vectors[own] / length[own, None], seed) / length[own]
+    codes = np.zeros((int(of_mask.max(initial=NONE)) + 1, latents.shape[1]), np.float32)
+    for number in range(len(codes)):
+        members = np.flatnonzero(of_mask == number)
+        weight = descriptor_weights(vectors[members] / length[members, None], seed) / length[members]
         if weight.sum() > 0:
-            found[number] = weight @ latents[own] / weight.sum()
-    return found
+            codes[number] = weight @ latents[members] / weight.sum()
+    return codes
 
 
-def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
+def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train features, find objects at each level, and assign each object the code of its descriptors."""
     contributions, code = inputs.contributions, inputs.linear_code("laga")
-    views, found = labelled_views(inputs, settings.pixel_step), inputs.no_features()
-    trained = alike(contributions.num_gaussians, sum(SLICES), seed)
+    views, field = labelled_views(inputs, settings.pixel_step), inputs.no_features()
+    trained = initial_features(contributions.num_gaussians, sum(SLICES), seed)
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
-        weights, seen = of_seen(view.weights)
-        rendered = product(weights, unit_slices(trained[seen]))
+        weights, gaussians = nonempty_columns(view.weights)
+        rendered = product(weights, unit_slices(trained[gaussians]))
         return nested_loss(rendered, masks_of_pixels(view.labels), random)
 
     train(views, [trained], loss, settings, seed, PIXELS)
     features = unit_slices(trained.detach()).numpy()
-    A, least = contributions.matrix("A"), min(MIN_MASKS, len(contributions.views))
+    A, min_masks = contributions.matrix("A"), min(MIN_MASKS, len(contributions.views))
     image_px = np.array([np.prod(inputs.view_camera(view).size_hw) for view in contributions.views])
     large = (contributions.pixels > 0) & (contributions.area_px > MIN_SHARE * image_px[contributions.view])
     for level in LEVELS:
         rows = contributions.rows_of(level)
         rows = rows[large[rows]]
         prefix = slice(PREFIX[level.index])
-        shown = unit_slices(torch.from_numpy(A[rows] @ features)).numpy()[:, prefix]
-        own, prototypes = unit_rows(features[:, prefix]), unit_rows(shown)
-        group, of_mask = objects(own, prototypes, RADIUS[level.index], least)
+        prototypes_of_masks = unit_slices(torch.from_numpy(A[rows] @ features)).numpy()[:, prefix]
+        points, prototypes = unit_rows(features[:, prefix]), unit_rows(prototypes_of_masks)
+        group, of_mask = objects(points, prototypes, RADIUS[level.index], min_masks)
         latents = object_latents(of_mask, inputs.latents[rows], code, seed)
-        found[:, level.index] = features_of_groups(group, latents)
-    return found
+        field[:, level.index] = features_of_groups(group, latents)
+    return field

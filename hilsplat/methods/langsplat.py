@@ -5,7 +5,7 @@ every labelled pixel (minghanqin/LangSplat `train.py`). Geometry is frozen, so r
 fixed compositing weights, which we compute once per view.
 
 Departs from the published code:
-    - fewer steps, and a pixel grid instead of all pixels (`MethodSettings`);
+    - fewer steps, and a pixel grid instead of all pixels (`TrainedSettings`);
     - L1 is averaged over the labelled pixels of the grid; LangSplat averages over all pixels, counting
       unlabelled pixels as 0, so views with larger masks have more weight;
     - rendered codes are divided by alpha, as in queries, and pixels with alpha below `MIN_ALPHA` are ignored;
@@ -26,9 +26,9 @@ from cpusplat.compiled import compiled
 from cpusplat.lanes import QUAD, load_quad, splat, store
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
+from hilsplat.baselines import TrainedSettings
 from hilsplat.field.adam import Adam, in_random_order
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
-from hilsplat.settings import MethodSettings
 
 # Loops over the entries of a sparse matrix process four channels of a Gaussian as one vector: with sixteen,
 # codes with three channels would waste thirteen. Operations are neither fused nor reordered, so results are
@@ -71,7 +71,7 @@ def train_level(
     latents: Float32[np.ndarray, "M D"],
     level: Level,
     num_gaussians: int,
-    settings: MethodSettings,
+    settings: TrainedSettings,
     seed: int,
 ) -> Float32[np.ndarray, "N D"]:
     """Train with Adam from zeros, on one random view per step; each view is used once before a repeat."""
@@ -81,9 +81,9 @@ def train_level(
     adam = Adam(features, settings.rate)
     codes = [np.pad(latents[view.rows], ((0, 0), (0, wide - channels))).reshape(-1) for view in views]
     pairs, random = list(zip(views, codes, strict=True)), np.random.default_rng(seed)
-    for view, own in in_random_order(pairs, random, settings.steps):
+    for view, painted in in_random_order(pairs, random, settings.steps):
         rows = view.weights.indptr, view.weights.indices, view.weights.data
-        l1_gradient(*rows, view.labels[:, level.index], own, channels, wide, features, gradient)
+        l1_gradient(*rows, view.labels[:, level.index], painted, channels, wide, features, gradient)
         adam.step(gradient)
     return features.reshape(num_gaussians, wide)[:, :channels].copy()
 
@@ -121,7 +121,7 @@ def l1_gradient(indptr, indices, data, labels, codes, channels, wide, features, 
                 store(gradient, there, plus(load_quad(gradient, there), data[k], pull))
 
 
-def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
+def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train the three levels one after the other, each with its own seed."""
     views, features = labelled_views(inputs, settings.pixel_step), inputs.no_features()
     for level in track(list(LEVELS), "levels trained"):

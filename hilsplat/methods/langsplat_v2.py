@@ -6,7 +6,7 @@ maps them to CLIP vectors without an autoencoder. The loss is 1 - cosine; Adam s
 (ZhaoYujie2002/LangSplatV2 `train.py`, `scene/gaussian_model.py`, `utils/vq_utils.py`).
 
 Departs from the published code:
-    - fewer and larger steps, and a pixel grid instead of all pixels (`MethodSettings`);
+    - fewer and larger steps, and a pixel grid instead of all pixels (`TrainedSettings`);
     - codebook entries, and therefore their mixtures, are vectors m + U z of the scene's linear code; d = 64
       reproduces the masks' vectors with a mean cosine of 0.9998 on the development scenes;
     - the loss is averaged over the labelled pixels of the grid, rendered mixtures are divided by alpha,
@@ -21,18 +21,18 @@ from jaxtyping import Float32, Int64
 from cpusplat.compiled import compiled
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
+from hilsplat.baselines import TrainedSettings
 from hilsplat.field.adam import Adam, in_random_order
 from hilsplat.field.code import LinearCode, unit_rows
 from hilsplat.methods.common.groups import kmeans
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
-from hilsplat.settings import MethodSettings
 
 ENTRIES = 64  # codebook entries per level (LangSplatV2)
-KEPT = 4  # non-zero coefficients per Gaussian and level (LangSplatV2)
+SHARES = 4  # non-zero coefficients per Gaussian and level (LangSplatV2)
 
 
 def largest_shares(
-    logits: Float32[np.ndarray, "N E"], kept: int = KEPT
+    logits: Float32[np.ndarray, "N E"], kept: int = SHARES
 ) -> tuple[Int64[np.ndarray, "N K"], Float32[np.ndarray, "N K"]]:
     """Return each softmax's largest entries and their shares, which sum to 1; lower entries win ties."""
     chosen = np.zeros((len(logits), kept), np.int64)
@@ -44,8 +44,8 @@ def largest_shares(
 def as_vectors(latents: Float32[np.ndarray, "B D"], code: LinearCode) -> Float32[np.ndarray, "B D+1"]:
     """Return m + U z in D + 1 coordinates that preserve lengths and angles: D along U, one for the rest."""
     along = code.basis @ code.mean
-    rest = np.linalg.norm(code.mean - along @ code.basis)
-    return np.column_stack([latents + along, np.full(len(latents), rest)]).astype(np.float32)
+    across = np.linalg.norm(code.mean - along @ code.basis)
+    return np.column_stack([latents + along, np.full(len(latents), across)]).astype(np.float32)
 
 
 def cosine_loss(
@@ -67,8 +67,8 @@ def step(
 ) -> tuple[float, Float32[np.ndarray, "N E"], Float32[np.ndarray, "E D"]]:
     """Return the loss over a view's labelled pixels and its gradients with respect to logits and codebook."""
     chosen, shares = largest_shares(logits)
-    kept = np.arange(0, chosen.size + 1, chosen.shape[1])
-    mixture = sp.csr_matrix((shares.ravel(), chosen.ravel(), kept), shape=logits.shape)
+    starts = np.arange(0, chosen.size + 1, chosen.shape[1])
+    mixture = sp.csr_matrix((shares.ravel(), chosen.ravel(), starts), shape=logits.shape)
     mixed = (weights @ mixture).toarray()
     vectors = unit_rows(as_vectors(targets, code))
     entries = as_vectors(codebook, code)
@@ -86,9 +86,9 @@ def train_level(
     latents: Float32[np.ndarray, "M D"],
     level: Level,
     num_gaussians: int,
-    codebook: Float32[np.ndarray, "E D"],  # initial entries, at least `KEPT`
+    codebook: Float32[np.ndarray, "E D"],  # initial entries, at least `SHARES`
     code: LinearCode,
-    settings: MethodSettings,
+    settings: TrainedSettings,
     seed: int,
 ) -> Float32[np.ndarray, "N D"]:
     """Train the logits (from zero) and the codebook; return the mixture of every Gaussian."""
@@ -104,7 +104,7 @@ def train_level(
     return np.einsum("nk,nkd->nd", shares, entries[chosen])
 
 
-def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
+def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train the three levels one after the other; Gaussians in no mask of a level get zeros."""
     latents, code = inputs.latents, inputs.linear_code("langsplat_v2")
     views, features = labelled_views(inputs, settings.pixel_step), inputs.no_features()

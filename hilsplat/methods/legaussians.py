@@ -31,10 +31,17 @@ from torch import Tensor, nn
 from torch.nn.functional import cross_entropy
 
 from hilsplat.base.levels import LEVELS
+from hilsplat.baselines import TrainedSettings
 from hilsplat.methods.common.groups import kmeans, standardised
-from hilsplat.methods.common.training import alike, of_seen, one_torch_thread, product, train, unit
+from hilsplat.methods.common.training import (
+    initial_features,
+    nonempty_columns,
+    one_torch_thread,
+    product,
+    train,
+    unit,
+)
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
-from hilsplat.settings import MethodSettings
 
 ENTRIES = 128
 CHANNELS = 8
@@ -50,7 +57,6 @@ PIXELS = 1024
 
 
 def network(sizes: tuple[int, ...]) -> nn.Sequential:
-    """Return linear layers with ReLUs between them."""
     layers: list[nn.Module] = []
     for inward, outward in itertools.pairwise(sizes):
         layers += [nn.Linear(inward, outward), nn.ReLU()]
@@ -74,7 +80,7 @@ def smoothing_loss(
     return follow + ((predicted.detach() - codes).square().mean(1) * weight).mean()
 
 
-def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
+def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Quantise the codes, train, and look up the entries; Gaussians in no mask of a level get zeros."""
     contributions, latents = inputs.contributions, inputs.latents
     codebooks, entry = [], np.zeros(len(latents), np.int64)
@@ -83,7 +89,7 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
         codebook, entry[rows] = kmeans(latents[rows], ENTRIES, seed + level.index)
         codebooks.append(codebook)
     views, num, levels = labelled_views(inputs, settings.pixel_step), contributions.num_gaussians, len(LEVELS)
-    codes = alike(num, levels * CHANNELS, seed)
+    codes = initial_features(num, levels * CHANNELS, seed)
     doubt = torch.full((num, levels), float(np.log(FIRST_UNCERTAINTY / (1 - FIRST_UNCERTAINTY))))
     doubt.requires_grad_()
     with torch.random.fork_rng(devices=()):
@@ -93,9 +99,9 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     places = torch.from_numpy(standardised(contributions.means()))
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
-        weights, seen = of_seen(view.weights)
-        rendered = product(weights, codes[seen]).reshape(-1, levels, CHANNELS)
-        uncertainty = product(weights, doubt[seen].sigmoid())
+        weights, gaussians = nonempty_columns(view.weights)
+        rendered = product(weights, codes[gaussians]).reshape(-1, levels, CHANNELS)
+        uncertainty = product(weights, doubt[gaussians].sigmoid())
         chosen = torch.from_numpy(random.integers(num, size=min(SAMPLES, num)))
         total = SMOOTHING * smoothing_loss(
             codes[chosen].reshape(-1, CHANNELS),
@@ -110,7 +116,7 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
                 total = total + index_loss(logits, target, uncertainty[inside, level.index])
         return total
 
-    networks = [weight for each in (*decoders, position) for weight in each.parameters()]
+    networks = [weight for part in (*decoders, position) for weight in part.parameters()]
     groups = [
         {"params": [codes]},
         {"params": networks, "lr": NETWORK_RATE * settings.rate},
@@ -118,6 +124,6 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     ]
     train(views, groups, loss, settings, seed, PIXELS)
     with one_torch_thread(), torch.no_grad():
-        own = unit(codes.reshape(num, levels, CHANNELS))
-        features = [book[decoders[k](own[:, k]).argmax(1).numpy()] for k, book in enumerate(codebooks)]
+        unit_codes = unit(codes.reshape(num, levels, CHANNELS))
+        features = [book[decoders[k](unit_codes[:, k]).argmax(1).numpy()] for k, book in enumerate(codebooks)]
     return np.where(inputs.seen()[..., None], np.stack(features, axis=1), np.float32(0))

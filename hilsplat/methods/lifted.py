@@ -7,9 +7,9 @@ linear code (pca, 64) instead of 512 numbers.
 import numpy as np
 from jaxtyping import Float32
 
+from hilsplat.baselines import MethodSettings
 from hilsplat.contributions.mask_operator import MaskOperator, lifted_average
 from hilsplat.methods.method import MethodInputs
-from hilsplat.settings import MethodSettings
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -16,18 +17,18 @@ from jaxtyping import Bool, Float32, Int32, Int64
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.lineage import require_made_from, sha256_of_file
+from hilsplat.base.plugins import load
 from hilsplat.base.progress import stage_log, track
+from hilsplat.baselines import MethodSettings, method_of
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.rows import Contributions
 from hilsplat.contributions.view_matrices import label_maps
 from hilsplat.field.code import LanguageField, LinearCode, autoencoder_file, load_code, load_latents
-from hilsplat.methods.registry import method_of
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import digests_in, load_masks
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.settings import MethodSettings
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 
@@ -56,8 +57,8 @@ class MethodInputs:
     def view_weights(self, view: str) -> sp.csr_matrix:
         """Return a view's compositing weights (pixels x Gaussians); rows sum to 1, or 0 if uncovered."""
         gaussians, scene = self._loaded
-        least = self.contributions.min_weight
-        weights = pixel_weights(gaussians, scene.cameras[view], min_weight=least, threads=self.threads)
+        min_weight = self.contributions.min_weight
+        weights = pixel_weights(gaussians, scene.cameras[view], min_weight=min_weight, threads=self.threads)
         return normalised_weights(weights)
 
     def view_masks(self, view: str) -> HierarchicalMasks:
@@ -69,11 +70,9 @@ class MethodInputs:
         return label_maps(self.view_masks(view))
 
     def view_camera(self, view: str) -> Camera:
-        """Return a view's camera."""
         return self._loaded[1].cameras[view]
 
     def no_features(self) -> Float32[np.ndarray, "N 3 D"]:
-        """Return a field of zeros."""
         return np.zeros((self.contributions.num_gaussians, len(LEVELS), self.latents.shape[1]), np.float32)
 
     def seen(self) -> Bool[np.ndarray, "N 3"]:
@@ -105,7 +104,7 @@ class MethodInputs:
         return load_ply(self.gaussians_ply), scene
 
 
-Fit = Callable[[MethodInputs, MethodSettings, int], np.ndarray]
+Fit = Callable[[MethodInputs, Any, int], np.ndarray]
 """A baseline: maps inputs, settings and a seed to the features of every Gaussian and level, (N, 3, D)."""
 
 
@@ -116,7 +115,8 @@ def run_method(inputs: MethodInputs, out: Path, settings: MethodSettings, seed: 
         SettingsError: there is no such method.
         ArtifactError: the method returned features of the wrong shape or non-finite values.
     """
-    fit, contributions = method_of(settings.name), inputs.contributions
+    method, contributions = method_of(settings.name), inputs.contributions
+    fit: Fit = load(method.fit)
     with stage_log(f"method {settings.name}", Path(inputs.scene_folder).parent.name) as counts:
         features = np.asarray(fit(inputs, settings, seed), dtype=np.float32)
         expected = (contributions.num_gaussians, len(LEVELS), inputs.latents.shape[1])
@@ -125,7 +125,7 @@ def run_method(inputs: MethodInputs, out: Path, settings: MethodSettings, seed: 
                 f"method {settings.name} did not return a language field",
                 expected=f"finite features of shape {expected}",
                 found=f"shape {features.shape}, {np.count_nonzero(~np.isfinite(features))} non-finite",
-                fix=f"correct hilsplat/methods/{settings.name}.py",
+                fix=f"correct {method.fit}",
             )
         digest = sha256_of_file(autoencoder_file(inputs.autoencoder_folder))
         LanguageField(features, contributions.gaussians_sha256, digest).save(out)
@@ -144,11 +144,9 @@ class LabelledView:
     xy: Int64[np.ndarray, "p 2"]  # column and row of each pixel, px
 
     def chosen(self, pixels: Int64[np.ndarray, " q"]) -> "LabelledView":
-        """Return the given pixels, in that order."""
         return replace(self, weights=self.weights[pixels], labels=self.labels[pixels], xy=self.xy[pixels])
 
     def at(self, level: Level) -> Int64[np.ndarray, " q"]:
-        """Return the pixels labelled at a level, in order."""
         return np.flatnonzero(self.labels[:, level.index] >= 0)
 
 
@@ -158,7 +156,7 @@ def labelled_views(inputs: MethodInputs, pixel_step: int) -> list[LabelledView]:
     Raises:
         ArtifactError: no view has a labelled pixel.
     """
-    found = []
+    views = []
     rows = inputs.contributions.rows_of_views()
     for number, name in enumerate(track(list(inputs.contributions.views), "weights of views")):
         weights, labels = inputs.view_weights(name), inputs.view_labels(name)
@@ -168,10 +166,10 @@ def labelled_views(inputs: MethodInputs, pixel_step: int) -> list[LabelledView]:
         pixels = grid[covered & (labels[grid] >= 0).any(axis=1)]
         if len(pixels):
             xy = np.stack([pixels % width, pixels // width], axis=1)
-            found.append(LabelledView(number, rows[number], weights[pixels], labels[pixels], xy))
-    if not found:
+            views.append(LabelledView(number, rows[number], weights[pixels], labels[pixels], xy))
+    if not views:
         raise ArtifactError(
             f"no training view has a labelled pixel on a {pixel_step} px grid",
             fix="reduce method.pixel_step, or loosen masks.predicted_iou_min and rerun the masks stage",
         )
-    return found
+    return views

@@ -15,17 +15,17 @@ from jaxtyping import Float, Float32, Int64
 
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import track
+from hilsplat.baselines import MethodSettings
 from hilsplat.methods.method import MethodInputs
 from hilsplat.scene.cameras import Camera
-from hilsplat.settings import MethodSettings
 
 
 def centre_pixels(means: Float[np.ndarray, "N 3"], camera: Camera) -> Int64[np.ndarray, " N"]:
     """Return each centre's row-major pixel index; -1 if behind the camera or outside the image."""
     height, width = camera.size_hw
-    seen = means @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
-    in_front = seen[:, 2] > 0
-    projected = seen @ camera.K.T
+    in_camera = means @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    in_front = in_camera[:, 2] > 0
+    projected = in_camera @ camera.K.T
     x, y = (np.floor(projected[:, axis] / np.where(in_front, projected[:, 2], 1)) for axis in (0, 1))
     inside = in_front & (x >= 0) & (x < width) & (y >= 0) & (y < height)
     return np.where(inside, y * width + x, -1).astype(np.int64)
@@ -43,11 +43,11 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
         if not len(gaussians):
             continue
         weights = np.asarray(inputs.view_weights(view)[pixel[gaussians], gaussians], np.float32).ravel()
-        labels, own = inputs.view_labels(view)[pixel], latents[rows]
+        labels, codes = inputs.view_labels(view)[pixel], latents[rows]
         for level in LEVELS:
             label = labels[gaussians, level.index]
-            shown = (label >= 0) & (weights > 0)
-            weight = weights[shown]
-            sums[gaussians[shown], level.index] += weight[:, None] * own[label[shown]]
-            total[gaussians[shown], level.index] += weight
+            painted = (label >= 0) & (weights > 0)
+            weight = weights[painted]
+            sums[gaussians[painted], level.index] += weight[:, None] * codes[label[painted]]
+            total[gaussians[painted], level.index] += weight
     return np.where(total[..., None] > 0, sums / np.maximum(total, 1e-12)[..., None], np.float32(0))

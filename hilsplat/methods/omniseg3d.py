@@ -13,7 +13,7 @@ authors' unless stated otherwise; they use `steps` 10,000 and `rate` 0.01.
 Departs:
     - larger masks do not first absorb smaller ones; patches come from our painted masks;
     - fewer steps, each on 4096 (not 32,768) pixels of a view; prototypes of at least 3 (not 20) pixels;
-    - initial vectors are almost identical instead of independent (see `training.alike`);
+    - initial vectors are almost identical instead of independent (see `training.initial_features`);
     - pixel vectors are divided by their length instead of constrained by a penalty of weight 100;
     - the authors threshold the cosine with a clicked pixel and don't support text: here 256 k-means centres
       are merged by average cosine down to the threshold.
@@ -26,16 +26,15 @@ from torch import Tensor
 from torch.nn.functional import log_softmax
 
 from hilsplat.base.levels import LEVELS
-from hilsplat.methods.common.groups import cluster_field, clusters, thresholds_of
-from hilsplat.methods.common.training import alike, product, segment_means, train, unit
+from hilsplat.baselines import OmniSeg3DSettings
+from hilsplat.methods.common.groups import cluster_field, clusters
+from hilsplat.methods.common.training import initial_features, product, segment_means, train, unit
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
-from hilsplat.settings import MethodSettings
 
 CHANNELS = 16
 MIN_PATCH_PX = 3
 LEVEL_WEIGHT = 0.2  # factor on a patch's weight for each mask fewer that it shares
 SPREAD, MIN_TEMPERATURE, MAX_TEMPERATURE = 10.0, 0.5, 1.0
-THRESHOLDS = (0.5, 0.8, 0.95)
 
 
 def patches(labels: Int32[np.ndarray, "p 3"]) -> tuple[Int64[np.ndarray, " p"], Int64[np.ndarray, "k k"]]:
@@ -71,12 +70,12 @@ def hierarchical_loss(
     spread, _ = segment_means(apart, patch, num)
     temperature = (SPREAD * spread[:, 0]).clamp(MIN_TEMPERATURE, MAX_TEMPERATURE)
     surprise = -log_softmax(rendered @ unit(prototypes).T / temperature, dim=1)
-    own = surprise.gather(1, patch[:, None])
-    total = own.mean()
+    own_patch = surprise.gather(1, patch[:, None])
+    total = own_patch.mean()
     missing = shared.diagonal()[:, None] - shared
     distance = missing.clamp(min=1).masked_fill(shared == 0, 0)
     distance.fill_diagonal_(0)
-    floor = own
+    floor = own_patch
     for step in range(1, len(LEVELS)):
         near = (distance == step)[patch]
         has = near.any(dim=1)
@@ -89,11 +88,10 @@ def hierarchical_loss(
     return total
 
 
-def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
+def fit(inputs: MethodInputs, settings: OmniSeg3DSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train features, cluster them at three increasing cosines, and assign clusters the codes of masks."""
-    thresholds = thresholds_of(settings, THRESHOLDS)
     views = labelled_views(inputs, settings.pixel_step)
-    features = alike(inputs.contributions.num_gaussians, CHANNELS, seed)
+    features = initial_features(inputs.contributions.num_gaussians, CHANNELS, seed)
 
     def loss(view: LabelledView, _: np.random.Generator, __: float) -> Tensor:
         patch, shared = patches(view.labels)
@@ -104,5 +102,5 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
         return hierarchical_loss(rendered, torch.from_numpy(patch[inside]), torch.from_numpy(shared))
 
     train(views, [features], loss, settings, seed)
-    distances = tuple(1 - least for least in thresholds)
+    distances = tuple(1 - cosine for cosine in settings.thresholds)
     return cluster_field(inputs, clusters(unit(features.detach()).numpy(), distances, seed, "cosine"))

@@ -26,10 +26,10 @@ from jaxtyping import Float, Float32, Int64
 from torch import Tensor
 
 from hilsplat.base.levels import LEVELS, NONE
+from hilsplat.baselines import OpenGaussianSettings
 from hilsplat.methods.common.groups import associated_codes, kmeans, standardised
 from hilsplat.methods.common.training import product, segment_means, train, unit
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
-from hilsplat.settings import MethodSettings
 
 CHANNELS = 6
 SMOOTHING = 0.1
@@ -67,7 +67,7 @@ def contrast_loss(means: Float[Tensor, "m D"], done: float) -> Float[Tensor, ""]
 
 
 def instance_features(
-    inputs: MethodInputs, settings: MethodSettings, seed: int
+    inputs: MethodInputs, settings: OpenGaussianSettings, seed: int
 ) -> Float32[np.ndarray, "N 3 D"]:
     """Return trained instance features of all levels: unit vectors mapped to [0, 1]."""
     views, contributions = labelled_views(inputs, settings.pixel_step), inputs.contributions
@@ -84,14 +84,14 @@ def instance_features(
         level = contributions.level[view.rows]
         used = contributions.pixels[view.rows] > 0
         total = shown.sum() * 0
-        for each in LEVELS:
-            label = torch.from_numpy(view.labels[:, each.index].astype(np.int64))
+        for at_level in LEVELS:
+            label = torch.from_numpy(view.labels[:, at_level.index].astype(np.int64))
             inside = label >= 0
             total = total + SMOOTHING * smoothing_loss(
-                rendered[inside, each.index], means[:, each.index], label[inside]
+                rendered[inside, at_level.index], means[:, at_level.index], label[inside]
             )
-            own = torch.from_numpy(np.flatnonzero((level == int(each)) & used))
-            total = total + contrast_loss(means[own, each.index], done)
+            masks = torch.from_numpy(np.flatnonzero((level == int(at_level)) & used))
+            total = total + contrast_loss(means[masks, at_level.index], done)
         return total
 
     train(views, [features], loss, settings, seed)
@@ -118,18 +118,20 @@ def instances(
     return leaf
 
 
-def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
+def fit(inputs: MethodInputs, settings: OpenGaussianSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train instance features, and assign each level's instances the codes of the masks that fit them.
 
     Gaussians get 0 if no mask fits their instance.
     """
-    features, found = instance_features(inputs, settings, seed), inputs.no_features()
-    contributions, seen, means = inputs.contributions, inputs.seen(), inputs.contributions.means()
+    features, field = instance_features(inputs, settings, seed), inputs.no_features()
+    contributions, visible, means = inputs.contributions, inputs.seen(), inputs.contributions.means()
     for level in LEVELS:
-        own, rows = features[:, level.index], contributions.rows_of(level)
-        shown = np.flatnonzero(seen[:, level.index])
-        if len(shown):
-            leaf = np.full(len(own), NONE, np.int64)
-            leaf[shown] = instances(own[shown], means[shown], settings.codebook, seed + level.index)
-            found[:, level.index] = associated_codes(inputs, leaf, rows, own)
-    return found
+        of_level, rows = features[:, level.index], contributions.rows_of(level)
+        gaussians = np.flatnonzero(visible[:, level.index])
+        if len(gaussians):
+            leaf = np.full(len(of_level), NONE, np.int64)
+            leaf[gaussians] = instances(
+                of_level[gaussians], means[gaussians], settings.codebook, seed + level.index
+            )
+            field[:, level.index] = associated_codes(inputs, leaf, rows, of_level)
+    return field

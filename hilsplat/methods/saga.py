@@ -26,11 +26,11 @@ from jaxtyping import Bool, Float, Float32, Float64, Int32
 from torch import Tensor
 
 from hilsplat.base.levels import LEVELS, NONE
+from hilsplat.baselines import TrainedSettings
 from hilsplat.contributions.rows import Contributions
 from hilsplat.methods.common.groups import cluster_field, clusters, nearest
-from hilsplat.methods.common.training import alike, of_seen, product, train, unit
+from hilsplat.methods.common.training import initial_features, nonempty_columns, product, train, unit
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
-from hilsplat.settings import MethodSettings
 
 CHANNELS = 32
 NEIGHBOURS = 16
@@ -58,7 +58,7 @@ def drawn_scales(scales: Float64[np.ndarray, " m"], random: np.random.Generator)
     return ends[chosen] + (ends[chosen + 1] - ends[chosen]) * random.random(len(chosen))
 
 
-def together(
+def grouped_at(
     labels: Int32[np.ndarray, "p 3"], scales: Float64[np.ndarray, "p 3"], scale: float
 ) -> Bool[np.ndarray, "p p"]:
     """Return whether two pixels share a mask at or below the scale, or the smallest mask above the scale.
@@ -67,8 +67,8 @@ def together(
     """
     above = (labels >= 0) & (scales > scale)
     smallest = np.where(above, scales, np.inf).argmin(axis=1)
-    kept = np.where(above & (np.arange(labels.shape[1]) != smallest[:, None]), -1, labels)
-    return ((kept[:, None] == kept[None]) & (kept >= 0)[None]).any(axis=2)
+    groups = np.where(above & (np.arange(labels.shape[1]) != smallest[:, None]), -1, labels)
+    return ((groups[:, None] == groups[None]) & (groups >= 0)[None]).any(axis=2)
 
 
 def pair_weights(area_px: Float64[np.ndarray, " p"]) -> Float32[np.ndarray, "p p"]:
@@ -98,11 +98,11 @@ def affinity_loss(
     easy = mixed.sum() / 2
     draw = torch.from_numpy(random.random(mixed.shape, dtype=np.float32))
     pair = torch.ones_like(mixed).triu(1)
-    found = cosine.detach()
+    values = cosine.detach()
     positive = mixed | (always & (draw < easy / always.sum().clamp(min=1)))
-    positive = (positive | (grouped & (found < EASY_POSITIVE)).any(0)) & pair
+    positive = (positive | (grouped & (values < EASY_POSITIVE)).any(0)) & pair
     negative = mixed | (never & (draw < easy / never.sum().clamp(min=1)))
-    negative = (negative | (~grouped & (found > HARD_NEGATIVE)).any(0)) & pair
+    negative = (negative | (~grouped & (values > HARD_NEGATIVE)).any(0)) & pair
     weights = torch.from_numpy(weight)
     total = (1 - rendered.norm(dim=1).mean()).square()
     attract = weights * (positive & grouped) / (len(gates) * positive.sum().clamp(min=1))
@@ -118,12 +118,12 @@ def neighbour_mean(means: Float32[np.ndarray, "N 3"]) -> sp.csr_matrix:
     return sp.csr_matrix((data, (np.repeat(np.arange(num), count), near.ravel())), shape=(num, num))
 
 
-def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
+def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train features, cluster them at each level's median scale, and assign clusters the codes of masks."""
     contributions = inputs.contributions
     scales = mask_scales(contributions)
     views = labelled_views(inputs, settings.pixel_step)
-    features = alike(contributions.num_gaussians, CHANNELS, seed)
+    features = initial_features(contributions.num_gaussians, CHANNELS, seed)
     draw = torch.Generator().manual_seed(seed)
     gate = (2 * torch.rand(2, CHANNELS, generator=draw) - 1).requires_grad_()  # slope and offset
     smooth = neighbour_mean(contributions.means())
@@ -134,21 +134,21 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
         return (share[:, None] * gate[0] + gate[1]).sigmoid()
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
-        own, has = view.rows, view.labels >= 0
-        scale = np.where(has, scales[own][view.labels], 0)
-        area = np.where(has, contributions.area_px[own][view.labels], 0).sum(axis=1) / has.sum(axis=1)
-        at = drawn_scales(scales[own], random)
-        same = np.stack([together(view.labels, scale, each) for each in at])
-        weights, seen = of_seen(view.weights @ smooth)
-        rendered = product(weights, unit(features[seen]))
+        rows, has = view.rows, view.labels >= 0
+        scale = np.where(has, scales[rows][view.labels], 0)
+        area = np.where(has, contributions.area_px[rows][view.labels], 0).sum(axis=1) / has.sum(axis=1)
+        at = drawn_scales(scales[rows], random)
+        same = np.stack([grouped_at(view.labels, scale, scale_limit) for scale_limit in at])
+        weights, gaussians = nonempty_columns(view.weights @ smooth)
+        rendered = product(weights, unit(features[gaussians]))
         return affinity_loss(rendered, gates(at), same, pair_weights(area), random)
 
     train(views, [features, gate], loss, settings, seed, PIXELS)
-    found = [level for level in LEVELS if len(contributions.rows_of(level))]
-    medians = np.array([np.median(scales[contributions.rows_of(level)]) for level in found])
+    levels = [level for level in LEVELS if len(contributions.rows_of(level))]
+    medians = np.array([np.median(scales[contributions.rows_of(level)]) for level in levels])
     with torch.no_grad():
         gated = unit(product(smooth, unit(features))[None] * gates(medians)[:, None]).numpy()
     group = np.full((contributions.num_gaussians, len(LEVELS)), NONE, np.int64)
-    for level, own in zip(found, gated, strict=True):
-        group[:, level.index] = clusters(own, (1 - COSINE,), seed, "cosine")[:, 0]
+    for level, of_level in zip(levels, gated, strict=True):
+        group[:, level.index] = clusters(of_level, (1 - COSINE,), seed, "cosine")[:, 0]
     return cluster_field(inputs, group)

@@ -13,7 +13,7 @@ hardyho/ultrametric_feature_fields. The constants below are the authors'; they u
 Departs:
     - vectors of 16 numbers on frozen Gaussians, not an instant-NGP field of 128 with its own density;
     - unit length by division, without a penalty on the norm; depth is not smoothed;
-    - a parent contains 0.9 of a mask, as in our coverage tree, not 0.95 with an IoU below 0.9;
+    - a parent contains `theta` (0.9) of a mask, as in our coverage tree, not 0.95 with an IoU below 0.9;
     - components consist of Gaussians, not of 0.002 voxels; all but the 200 largest join the nearest of these;
     - the authors don't support text.
 """
@@ -29,11 +29,12 @@ from torch.nn.functional import softplus
 
 from cpusplat.compiled import compiled
 from hilsplat.base.levels import NONE
-from hilsplat.methods.common.groups import cluster_field, nearest, thresholds_of
-from hilsplat.methods.common.training import alike, product, train, unit
+from hilsplat.baselines import VchSettings
+from hilsplat.methods.common.groups import cluster_field, nearest
+from hilsplat.methods.common.training import initial_features, product, train, unit
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 from hilsplat.segment.coverage import coverage_tree
-from hilsplat.settings import CoverageTreeSettings, MethodSettings
+from hilsplat.settings import CoverageTreeSettings
 
 CHANNELS = 16
 TEMPERATURE = 0.1
@@ -41,8 +42,7 @@ PAIRS = 64  # triplets per mask and step
 PIXEL_NEIGHBOURS = 10
 BORDER = 10.0  # added to edges across mask borders, per level, when the spanning tree is chosen
 NEIGHBOURS = 16
-LARGEST = 200
-THRESHOLDS = (0.6, 0.5, 0.45)
+MAX_COMPONENTS = 200
 
 
 @compiled
@@ -91,21 +91,21 @@ def ultrametric(
     pair without a path, and 0 for a pixel and itself.
     """
     num = len(vectors)
-    held = vectors.detach().numpy()
-    length = np.sqrt(np.square(held[edges[0]] - held[edges[1]]).sum(axis=1))
+    values = vectors.detach().numpy()
+    length = np.sqrt(np.square(values[edges[0]] - values[edges[1]]).sum(axis=1))
     graph = sp.csr_matrix((length + penalty + 1e-6, (edges[0], edges[1])), shape=(num, num))  # 0 is no edge
     tree = minimum_spanning_tree(graph).tocoo()
     a, b = tree.row.astype(np.int64), tree.col.astype(np.int64)
-    order = np.argsort(np.square(held[a] - held[b]).sum(axis=1), kind="stable")
+    order = np.argsort(np.square(values[a] - values[b]).sum(axis=1), kind="stable")
     a, b = a[order], b[order]
     edge = joining_edges(num, a, b, pairs[0], pairs[1])
-    found = torch.from_numpy(edge >= 0)
+    has_path = torch.from_numpy(edge >= 0)
     edge = np.maximum(edge, 0)
-    apart = torch.from_numpy(np.where(pairs[0] == pairs[1], 0.0, 2.0).astype(held.dtype))
+    apart = torch.from_numpy(np.where(pairs[0] == pairs[1], 0.0, 2.0).astype(values.dtype))
     if not len(a):
         return apart
     distance = ((vectors[a[edge]] - vectors[b[edge]]).square().sum(1) + 1e-12).sqrt()
-    return torch.where(found, distance, apart)
+    return torch.where(has_path, distance, apart)
 
 
 def neighbouring_pixels(xy: Int64[np.ndarray, "p 2"]) -> Int64[np.ndarray, "2 e"]:
@@ -125,15 +125,15 @@ def triplets(
 
     `labels` contains the mask row at each pixel and level; `parent` contains each mask's parent row, or -1.
     """
-    found = []
+    drawn = []
     for mask in np.unique(labels[labels >= 0]):
         inside = labels[:, level[mask] - 1] == mask
         above = parent[mask]
         around = np.ones(len(labels), bool) if above == NONE else labels[:, level[above] - 1] == above
-        own, other = np.flatnonzero(inside), np.flatnonzero(around & ~inside)
-        if len(own) > 1 and len(other):
-            found.append(np.stack([random.choice(each, PAIRS) for each in (own, own, other)]))
-    return np.concatenate(found, axis=1) if found else np.zeros((3, 0), np.int64)
+        inner, outer = np.flatnonzero(inside), np.flatnonzero(around & ~inside)
+        if len(inner) > 1 and len(outer):
+            drawn.append(np.stack([random.choice(pixels, PAIRS) for pixels in (inner, inner, outer)]))
+    return np.concatenate(drawn, axis=1) if drawn else np.zeros((3, 0), np.int64)
 
 
 def components(
@@ -149,29 +149,29 @@ def components(
     near = nearest(means, NEIGHBOURS + 1)
     a, b = np.repeat(np.arange(num), near.shape[1]), near.ravel()
     apart = np.sqrt(np.square(features[a] - features[b]).sum(axis=1))
-    found = []
-    for most in thresholds:
-        kept = apart < most
-        graph = sp.csr_matrix((np.ones(kept.sum()), (a[kept], b[kept])), shape=(num, num))
+    ranks = []
+    for threshold in thresholds:
+        joined = apart < threshold
+        graph = sp.csr_matrix((np.ones(joined.sum()), (a[joined], b[joined])), shape=(num, num))
         number, part = connected_components(graph, directed=False)
         order = np.argsort(-np.bincount(part, minlength=number), kind="stable")
         rank = np.argsort(order)[part]
-        large, small = np.flatnonzero(rank < LARGEST), np.flatnonzero(rank >= LARGEST)
+        large, small = np.flatnonzero(rank < MAX_COMPONENTS), np.flatnonzero(rank >= MAX_COMPONENTS)
         rank[small] = rank[large[cKDTree(means[large]).query(means[small])[1]]]
-        found.append(rank)
-    return np.stack(found, axis=1)
+        ranks.append(rank)
+    return np.stack(ranks, axis=1)
 
 
-def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
+def fit(inputs: MethodInputs, settings: VchSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train vectors, connect Gaussians at decreasing distances, and assign components the codes of masks."""
-    thresholds = thresholds_of(settings, THRESHOLDS)
+    theta = settings.theta or CoverageTreeSettings().theta
     contributions = inputs.contributions
     views = labelled_views(inputs, settings.pixel_step)
     trees = {}  # level and parent of the masks, by view number
     for view in views:
         masks = inputs.view_masks(contributions.views[view.number])
-        trees[view.number] = (masks.level, coverage_tree(masks, CoverageTreeSettings().theta)[0])
-    features = alike(contributions.num_gaussians, CHANNELS, seed)
+        trees[view.number] = (masks.level, coverage_tree(masks, theta)[0])
+    features = initial_features(contributions.num_gaussians, CHANNELS, seed)
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
         a, b, c = chosen = triplets(view.labels, *trees[view.number], random)
@@ -188,4 +188,4 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
 
     train(views, [features], loss, settings, seed)
     trained = unit(features.detach()).numpy()
-    return cluster_field(inputs, components(trained, contributions.means(), thresholds))
+    return cluster_field(inputs, components(trained, contributions.means(), settings.thresholds))

@@ -41,7 +41,7 @@ APART_DEG = 30.0
 MIN_NEW = 0.1
 """Share of a crop's score that remains if a higher-ranked crop has the same direction."""
 
-RANKED = 32
+MAX_RANKED = 32
 """Number of crops ranked per node."""
 
 MIN_IOU = 1e-3
@@ -63,21 +63,21 @@ def crop_ranks(
         directions: unit vectors from nodes to cameras.
 
     Returns:
-        rank of each mask within its node, 0 for the best; -1 for masks without a node or beyond `RANKED`.
+        rank of each mask within its node, 0 for the best; -1 for masks without a node or beyond `MAX_RANKED`.
     """
     rank = np.full(len(node), NONE, np.int32)
     order = np.argsort(node, kind="stable")
     starts = np.flatnonzero(np.diff(node[order], prepend=NONE))
     for rows in np.split(order, starts)[1:]:
-        left = score[rows].astype(np.float64)
+        remaining = score[rows].astype(np.float64)
         new = np.ones(len(rows))
-        for place in range(min(RANKED, len(rows))):
-            best = int((left * new).argmax())
-            rank[rows[best]] = place
+        for number in range(min(MAX_RANKED, len(rows))):
+            best = int((remaining * new).argmax())
+            rank[rows[best]] = number
             cosine = np.clip(directions[rows] @ directions[rows[best]], -1, 1)
             apart = np.rad2deg(np.arccos(cosine)) / APART_DEG
             new = np.minimum(new, np.clip(apart, MIN_NEW, 1))
-            left[best] = -1
+            remaining[best] = -1
     return rank
 
 
@@ -99,51 +99,48 @@ def build_tree(
     view = contributions.view
     total_mass = mass.sum(axis=0, dtype=np.float64)
 
-    level: list[int] = []
+    level_of_node: list[int] = []
     quality: list[float] = []
     cluster_of_mask = np.full(len(contributions), NONE, np.int64)
     node_of_gaussian = np.full((S.shape[1], len(LEVELS)), NONE, np.int32)
     membership = np.zeros((S.shape[1], len(LEVELS)), np.float32)
     nearest = None if of_levels else nearest_gaussians(means, threads)
-    rows_of_levels = [contributions.rows_of(each) for each in LEVELS]
+    rows_of_levels = [contributions.rows_of(level) for level in LEVELS]
     of_levels = of_levels or linked_nodes(S, mass, view, rows_of_levels, settings, threads)
-    for each, rows, found in zip(LEVELS, rows_of_levels, of_levels, strict=True):
-        if join_wholes and each is Level.WHOLE:
-            whole = joined_regions(found.of_gaussian, len(found.quality), means, mass, settings.whole_side)
-            found = found.joined(whole)
-        renumber = np.append(len(level) + np.arange(len(found.quality)), NONE)
-        of_gaussian = found.of_gaussian
+    for level, rows, nodes in zip(LEVELS, rows_of_levels, of_levels, strict=True):
+        if join_wholes and level is Level.WHOLE:
+            whole = joined_regions(nodes.of_gaussian, len(nodes.quality), means, mass, settings.whole_side)
+            nodes = nodes.joined(whole)
+        renumber = np.append(len(level_of_node) + np.arange(len(nodes.quality)), NONE)
+        of_gaussian = nodes.of_gaussian
         if nearest is not None:
             of_gaussian = without_strays(of_gaussian, nearest, total_mass)
-        node_of_gaussian[:, each.index] = renumber[of_gaussian]
-        membership[:, each.index] = np.where(of_gaussian == NONE, 0, found.membership)
-        cluster_of_mask[rows] = renumber[found.of_mask]
-        level += [int(each)] * len(found.quality)
-        quality += found.quality.tolist()
+        node_of_gaussian[:, level.index] = renumber[of_gaussian]
+        membership[:, level.index] = np.where(of_gaussian == NONE, 0, nodes.membership)
+        cluster_of_mask[rows] = renumber[nodes.of_mask]
+        level_of_node += [int(level)] * len(nodes.quality)
+        quality += nodes.quality.tolist()
 
-    levels = np.array(level, np.uint8)
-    num = len(levels)
+    levels = np.array(level_of_node, np.uint8)
     parent = node_parents(node_of_gaussian, levels, total_mass, settings.parent_coverage)
     nested = nest_nodes(node_of_gaussian, levels, parent)
     membership[nested != node_of_gaussian] = 0
-    node_of_gaussian = nested
-    renumber = renumbered_without_empty(node_of_gaussian, num)
-    kept = np.flatnonzero(renumber[:num] != NONE)
-    node_of_gaussian, cluster_of_mask = renumber[node_of_gaussian], renumber[cluster_of_mask]
-    levels, parent, num = levels[kept], renumber[parent[kept]], len(kept)
+    renumber = renumbered_without_empty(nested, len(levels))
+    occupied = np.flatnonzero(renumber[:-1] != NONE)
+    node_of_gaussian, linked_node = renumber[nested], renumber[cluster_of_mask]
+    levels, parent, num = levels[occupied], renumber[parent[occupied]], len(occupied)
     view_area = np.zeros((num, len(contributions.views)), np.float64)
-    own = np.flatnonzero(cluster_of_mask >= 0)
-    np.add.at(view_area, (cluster_of_mask[own], view[own]), contributions.area_px[own])
+    linked = np.flatnonzero(linked_node != NONE)
+    np.add.at(view_area, (linked_node[linked], view[linked]), contributions.area_px[linked])
     centroid, box, oriented = node_boxes(node_of_gaussian, levels, means, total_mass)
-    fits, iou = mask_fits(node_of_gaussian, S, mass, view, contributions.level, cluster_of_mask)
+    fits, iou = mask_fits(node_of_gaussian, S, mass, view, contributions.level, linked_node)
     # Nesting may remove the Gaussians that a node's masks show; the node still needs a crop.
-    fit = np.where(cluster_of_mask == NONE, 0.0, np.maximum(iou, MIN_IOU))
+    fit = np.where(linked_node == NONE, 0.0, np.maximum(iou, MIN_IOU))
     score = (np.sqrt(contributions.area_px) * fit).astype(np.float32)
     if join_wholes:  # a piece's mask has a low IoU with the joined whole, but still shows the whole
         pieces = contributions.rows_of(Level.WHOLE)
-        fits[pieces] = cluster_of_mask[pieces]
-    linked = cluster_of_mask.astype(np.int32)
-    towards = contributions.centres()[view] - centroid[linked] if num else np.zeros((len(linked), 3))
+        fits[pieces] = linked_node[pieces]
+    towards = contributions.centres()[view] - centroid[linked_node] if num else np.zeros((len(view), 3))
     towards = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
     return SemanticTree(
         level=levels,
@@ -152,14 +149,14 @@ def build_tree(
         centroid=centroid,
         box=box,
         oriented_box=oriented,
-        quality=np.array(quality, np.float32)[kept],
+        quality=np.array(quality, np.float32)[occupied],
         views=(view_area > 0).sum(axis=1).astype(np.int32),
         node_of_gaussian=node_of_gaussian,
         membership=membership,
         node_of_mask=fits,
-        linked_node=linked,
+        linked_node=linked_node,
         crop_score=score,
-        crop_rank=crop_ranks(linked, score, towards),
+        crop_rank=crop_ranks(linked_node, score, towards),
         view_area_px=view_area.astype(np.float32),
         view_names=contributions.views,
         gaussians_sha256=contributions.gaussians_sha256,

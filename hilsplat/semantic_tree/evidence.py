@@ -67,10 +67,10 @@ def mask_evidence(
     everywhere = np.zeros((num, len(visible)))  # size of each mask as seen from each view
     edges = [0, *range(ROWS_AT_A_TIME, num, ROWS_AT_A_TIME), num]
     over_edges(_seen_sizes, edges, threads, *rows, sizes, flags, everywhere)
-    own = everywhere[np.arange(num), view]
-    seen = np.where(everywhere < min_covisible * own[:, None], 0.0, everywhere)
+    full = everywhere[np.arange(num), view]
+    seen = np.where(everywhere < min_covisible * full[:, None], 0.0, everywhere)
     pairs = (*rows, weighted, *by_column, view, seen, everywhere)
-    parts = [list(each) for each in zip(*over_edges(_shared_pairs, edges, threads, *pairs), strict=True)]
+    parts = [list(arrays) for arrays in zip(*over_edges(_shared_pairs, edges, threads, *pairs), strict=True)]
     # Each list is freed once it is concatenated, because two copies of all pairs would need much memory.
     counts, indices, inter, union = (np.concatenate(parts.pop(0)) for _ in range(4))
     indptr = np.concatenate(([0], np.cumsum(counts)))

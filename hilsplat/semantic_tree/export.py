@@ -13,7 +13,6 @@ from hilsplat.semantic_tree.tree import SemanticTree
 
 
 def readable_nodes(tree: SemanticTree) -> list[dict]:
-    """Return one human-readable entry per node."""
     members = [np.bincount(column[column >= 0], minlength=len(tree)) for column in tree.node_of_gaussian.T]
     return [
         {

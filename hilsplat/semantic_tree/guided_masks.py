@@ -67,20 +67,20 @@ def guided_points(
     The middle is the pixel farthest from the border of the node's region. `labels` contains the node of each
     pixel at each level, -1 for none; `grid` contains points in the unit square.
     """
-    found = []
+    middles = []
     for node_of_pixel in labels.values():
-        for number, place in enumerate(find_objects(node_of_pixel + 1)):
-            if place is None:
+        for number, window in enumerate(find_objects(node_of_pixel + 1)):
+            if window is None:
                 continue
-            region = node_of_pixel[place] == number
+            region = node_of_pixel[window] == number
             if region.sum() < min_area_px:
                 continue
             depth = cv2.distanceTransform(np.pad(region, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
             y, x = np.unravel_index(depth.argmax(), depth.shape)
-            found.append((place[1].start + x + 0.5, place[0].start + y + 0.5))
+            middles.append((window[1].start + x + 0.5, window[0].start + y + 0.5))
     height, width = labels[Level.WHOLE].shape
     on_grid = grid * (width, height)
     x, y = on_grid.astype(np.int64).T
     unexplained = labels[Level.SUBPART][y, x] == NONE
-    points = np.concatenate([np.array(found, np.float64).reshape(-1, 2), on_grid[unexplained]])
+    points = np.concatenate([np.array(middles, np.float64).reshape(-1, 2), on_grid[unexplained]])
     return points if len(points) else on_grid

@@ -86,11 +86,11 @@ def linked_nodes(
 
     def evidence(rows: Int64[np.ndarray, " m"]) -> Evidence:
         weights, view = S[rows], view_of_mask[rows]
-        place = view[_row_of(weights)], weights.indices
+        entries = view[_row_of(weights)], weights.indices
         shares = weights.astype(np.float64)
-        shares.data /= np.where(visible[place], mass[place], np.inf)
+        shares.data /= np.where(visible[entries], mass[entries], np.inf)
         shares.eliminate_zeros()
-        del weights, place
+        del weights, entries
         return mask_evidence(shares, importance, visible, view, MIN_COVISIBLE, threads)
 
     def nodes(
@@ -98,24 +98,24 @@ def linked_nodes(
     ) -> LevelNodes:
         weights, view = S[rows], view_of_mask[rows]
         pairs = np.unique(np.stack([cluster, view.astype(np.int64)], axis=1), axis=0)
-        kept = np.flatnonzero(np.bincount(pairs[:, 0], minlength=len(quality)) >= settings.min_views)
+        with_views = np.flatnonzero(np.bincount(pairs[:, 0], minlength=len(quality)) >= settings.min_views)
 
-        def winners(kept: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        def winners(with_views: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             of_cluster = np.full(len(quality) + 1, NONE, np.int64)
-            of_cluster[kept] = np.arange(len(kept))
+            of_cluster[with_views] = np.arange(len(with_views))
             return of_cluster, *gaussian_nodes(
-                of_cluster[cluster], len(kept), weights, view, mass, total_mass
+                of_cluster[cluster], len(with_views), weights, view, mass, total_mass
             )
 
-        of_cluster, node, share = winners(kept)
+        of_cluster, node, share = winners(with_views)
         fits, iou = best_fits(level_ious(node, weights, mass, view))
-        is_best = np.bincount(fits[iou > MIN_FIT], minlength=len(kept)) >= settings.min_views
+        is_best = np.bincount(fits[iou > MIN_FIT], minlength=len(with_views)) >= settings.min_views
         if not is_best.all():
-            kept = kept[is_best]
-            of_cluster, node, share = winners(kept)
-        renumber = renumbered_without_empty(node, len(kept))
+            with_views = with_views[is_best]
+            of_cluster, node, share = winners(with_views)
+        renumber = renumbered_without_empty(node, len(with_views))
         of_mask = renumber[of_cluster[cluster]].astype(np.int64)
-        return LevelNodes(of_mask, renumber[node], share, quality[kept[renumber[:-1] != NONE]])
+        return LevelNodes(of_mask, renumber[node], share, quality[with_views[renumber[:-1] != NONE]])
 
     with ThreadPoolExecutor(1, "linkage") as linker:
         linked: list[Future] = []
@@ -156,9 +156,9 @@ def gaussian_nodes(
     """
     inside = np.flatnonzero(cluster >= 0)
     ones = np.ones(len(inside))
-    seen, of_pair = np.unique(cluster[inside] * len(mass) + view[inside], return_inverse=True)
-    pair_node, pair_view = np.divmod(seen, max(len(mass), 1))
-    in_pair = sp.csr_matrix((ones, (of_pair, inside)), shape=(len(seen), len(cluster)))
+    node_views, of_pair = np.unique(cluster[inside] * len(mass) + view[inside], return_inverse=True)
+    pair_node, pair_view = np.divmod(node_views, max(len(mass), 1))
+    in_pair = sp.csr_matrix((ones, (of_pair, inside)), shape=(len(node_views), len(cluster)))
     per_view = (in_pair @ weights.astype(np.float64)).tocoo()
     capped = np.minimum(per_view.data, mass[pair_view[per_view.row], per_view.col])
     shape = (num_nodes, weights.shape[1])
@@ -202,9 +202,9 @@ def without_strays(
     Two Gaussians of a node are connected if one is among the other's nearest (`nearest_gaussians`).
     """
     num = len(node_of_gaussian)
-    row, other = np.repeat(np.arange(num), nearest.shape[1]), nearest.ravel()
-    joined = (node_of_gaussian[row] == node_of_gaussian[other]) & (node_of_gaussian[row] != NONE)
-    graph = sp.csr_matrix((np.ones(joined.sum()), (row[joined], other[joined])), shape=(num, num))
+    row, neighbour = np.repeat(np.arange(num), nearest.shape[1]), nearest.ravel()
+    joined = (node_of_gaussian[row] == node_of_gaussian[neighbour]) & (node_of_gaussian[row] != NONE)
+    graph = sp.csr_matrix((np.ones(joined.sum()), (row[joined], neighbour[joined])), shape=(num, num))
     _, piece = sp.csgraph.connected_components(graph, directed=False)
     piece_mass = np.bincount(piece, total_mass)
     largest = np.zeros(int(node_of_gaussian.max(initial=NONE)) + 2)
@@ -227,15 +227,15 @@ def node_parents(
     num = len(level)
     parent = np.full(num, NONE, np.int32)
     for child_level in LEVELS[1:]:
-        own = node_of_gaussian[:, child_level.index]
-        size = np.bincount(own[own >= 0], mass[own >= 0], minlength=num)
+        child = node_of_gaussian[:, child_level.index]
+        size = np.bincount(child[child >= 0], mass[child >= 0], minlength=num)
         for coarser in reversed(LEVELS[: child_level.index]):
-            other = node_of_gaussian[:, coarser.index]
-            both = (own >= 0) & (other >= 0)
-            shared = sp.csr_matrix((mass[both], (own[both], other[both])), shape=(num, num))
+            coarse = node_of_gaussian[:, coarser.index]
+            in_both = (child >= 0) & (coarse >= 0)
+            shared = sp.csr_matrix((mass[in_both], (child[in_both], coarse[in_both])), shape=(num, num))
             best, weight = best_fits(shared)
-            found = (level == int(child_level)) & (parent == NONE) & (weight > min_coverage * size)
-            parent[found] = best[found]
+            adopted = (level == int(child_level)) & (parent == NONE) & (weight > min_coverage * size)
+            parent[adopted] = best[adopted]
     return parent
 
 
@@ -257,9 +257,9 @@ def mask_fits(
         linked node, 0 if there is none.
     """
     fits, of_linked = np.full(len(view), NONE, np.int32), np.zeros(len(view))
-    for each in LEVELS:
-        rows = np.flatnonzero(level == int(each))
-        iou = level_ious(node_of_gaussian[:, each.index], S[rows], mass, view[rows])
+    for of_level in LEVELS:
+        rows = np.flatnonzero(level == int(of_level))
+        iou = level_ious(node_of_gaussian[:, of_level.index], S[rows], mass, view[rows])
         fits[rows], _ = best_fits(iou)
         inside = linked[rows] != NONE
         of_linked[rows[inside]] = np.asarray(iou[np.flatnonzero(inside), linked[rows[inside]]]).ravel()
@@ -282,7 +282,7 @@ def level_ious(
     member = sp.csr_matrix((np.ones(len(has)), (has, node)), shape=(len(node_of_gaussian), num_nodes))
     inter = (weights.astype(np.float64) @ member).tocsr()
     area = np.asarray(weights.sum(axis=1, dtype=np.float64)).ravel()
-    size = np.stack([np.bincount(node, seen[has], num_nodes) for seen in mass])  # [view, node]
+    size = np.stack([np.bincount(node, in_view[has], num_nodes) for in_view in mass])  # [view, node]
     row = _row_of(inter)
     inter.data /= area[row] + size[view[row], inter.indices] - inter.data
     return inter
@@ -311,10 +311,10 @@ def nest_nodes(
     nested = node_of_gaussian.copy()
     index_of = level.astype(np.int64) - 1
     for child_level in LEVELS[1:]:
-        own = nested[:, child_level.index]
-        members = np.flatnonzero(own >= 0)
-        members = members[parent[own[members]] != NONE]
-        above = parent[own[members]]
+        child = nested[:, child_level.index]
+        members = np.flatnonzero(child >= 0)
+        members = members[parent[child[members]] != NONE]
+        above = parent[child[members]]
         holds = nested[members, index_of[above]]
         grand = np.where(parent[above] != NONE, parent[above], NONE)
         held_above = np.where(grand != NONE, nested[members, index_of[np.maximum(grand, 0)]], NONE)
@@ -322,8 +322,8 @@ def nest_nodes(
         joins = (holds == NONE) & fits_above
         leaves = (holds != above) & ~joins
         nested[members[joins], index_of[above[joins]]] = above[joins]
-        both = joins & (grand != NONE)
-        nested[members[both], index_of[grand[both]]] = grand[both]
+        joins_grand = joins & (grand != NONE)
+        nested[members[joins_grand], index_of[grand[joins_grand]]] = grand[joins_grand]
         nested[members[leaves], child_level.index] = NONE
     return nested
 
@@ -349,11 +349,11 @@ def node_means(
 ) -> Float32[np.ndarray, "T D"]:
     """Return the mean feature of each node's Gaussians at its level, ignoring features that are all zeros."""
     sums = np.zeros((len(level), features.shape[2]))
-    for each in LEVELS:
-        own = node_of_gaussian[:, each.index]
-        seen = (own >= 0) & (features[:, each.index] != 0).any(axis=1)
-        counts = np.bincount(own[seen], minlength=len(level))
+    for of_level in LEVELS:
+        node = node_of_gaussian[:, of_level.index]
+        has_feature = (node >= 0) & (features[:, of_level.index] != 0).any(axis=1)
+        counts = np.bincount(node[has_feature], minlength=len(level))
         for channel in range(features.shape[2]):
-            total = np.bincount(own[seen], features[seen, each.index, channel], len(level))
+            total = np.bincount(node[has_feature], features[has_feature, of_level.index, channel], len(level))
             sums[:, channel] += total / np.maximum(counts, 1)
     return sums.astype(np.float32)

@@ -44,7 +44,6 @@ class OrientedBox:
         return OrientedBox(centre, (first, second, third), size)
 
     def corners(self) -> Float[np.ndarray, "8 3"]:
-        """Return the eight corners."""
         signs = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3, indexing="ij"), axis=-1).reshape(8, 3)
         return np.asarray(self.centre) + (signs * np.asarray(self.size)) @ np.asarray(self.axes)
 
@@ -101,14 +100,14 @@ class SemanticTree:
 
     def _require_whole(self, path: Path) -> None:
         """Raise ArtifactError if an array refers to a missing node or a parent isn't coarser than a child."""
-        most = len(self) - 1
+        last = len(self) - 1
         rows = {"parent": self.parent, "node_of_gaussian": self.node_of_gaussian}
         rows |= {"node_of_mask": self.node_of_mask, "linked_node": self.linked_node}
         for name, values in rows.items():
-            if values.size and (values.min() < NONE or values.max() > most):
+            if values.size and (values.min() < NONE or values.max() > last):
                 raise ArtifactError(
                     f"{path}: array {name} refers to nodes that do not exist",
-                    expected=f"-1 to {most}",
+                    expected=f"-1 to {last}",
                     found=f"{values.min()} to {values.max()}",
                     fix=rebuild_command(path),
                 )
@@ -119,22 +118,20 @@ class SemanticTree:
             )
 
     def nodes_of(self, level: Level) -> Int64[np.ndarray, " t"]:
-        """Return the nodes of a level, in order."""
         return np.flatnonzero(self.level == int(level))
 
     def children_of(self, nodes: Int64[np.ndarray, " t"]) -> Int64[np.ndarray, " c"]:
-        """Return the direct children of the nodes."""
         return np.flatnonzero(np.isin(self.parent, nodes))
 
     def ancestors(self) -> Int32[np.ndarray, "T 3"]:
         """Return the node that contains each node at each level: itself at its own level, -1 for none."""
-        found = np.full((len(self), len(LEVELS)), NONE, np.int32)
+        containing = np.full((len(self), len(LEVELS)), NONE, np.int32)
         rows, above = np.arange(len(self)), np.arange(len(self), dtype=np.int32)
         while len(rows):
-            found[rows, self.level[above] - 1] = above
+            containing[rows, self.level[above] - 1] = above
             above = self.parent[above]
             rows, above = rows[above != NONE], above[above != NONE]
-        return found
+        return containing
 
     def with_vectors(self, vectors: Float32[np.ndarray, "M C"]) -> "SemanticTree":
         """Return the tree with node vectors: the normalised sum of mask vectors, weighted by `crop_score`.
@@ -157,9 +154,9 @@ class SemanticTree:
         """
         folder, names = Path(folder), ("gaussians_sha256", "cameras_sha256", "min_weight")
         index = read_index(folder, *names)
-        known = {"view_names": tuple(index["views"]), **{name: index[name] for name in names}}
+        values = {"view_names": tuple(index["views"]), **{name: index[name] for name in names}}
         path = sealed(folder, "tree.npz")
-        tree = build_checked(SemanticTree, read_npz(path), known, path, LIMITS)
+        tree = build_checked(SemanticTree, read_npz(path), values, path, LIMITS)
         tree._require_whole(path)
         if clip_folder is None:
             return tree
@@ -214,8 +211,8 @@ def node_boxes(
     order = np.argsort(node_of_gaussian, axis=0, kind="stable")
     ids = np.arange(len(level) + 1)
     starts = [np.searchsorted(node_of_gaussian[rows, k], ids) for k, rows in enumerate(order.T)]
-    for node, each in enumerate(level):
-        index = Level(int(each)).index
+    for node, node_level in enumerate(level):
+        index = Level(int(node_level)).index
         members = order[starts[index][node] : starts[index][node + 1], index]
         weight = mass[members] / mass[members].sum()
         points = means[members]
@@ -276,8 +273,8 @@ class ViewNodes:
     def labels(self, size_hw: tuple[int, int]) -> Int32[np.ndarray, "H W"]:
         """Return the node with a share above 0.5 in each pixel, -1 for none."""
         out = np.full(len(self.covered), NONE, np.int32)
-        most = np.flatnonzero(self.shares > 0.5)
-        out[np.searchsorted(self.indptr, most, side="right") - 1] = self.nodes[most]
+        dominant = np.flatnonzero(self.shares > 0.5)
+        out[np.searchsorted(self.indptr, dominant, side="right") - 1] = self.nodes[dominant]
         return out.reshape(size_hw)
 
 

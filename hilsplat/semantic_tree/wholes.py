@@ -29,29 +29,30 @@ def joined_regions(
     num_regions: int,
     means: Float32[np.ndarray, "N 3"],
     mass: Float32[np.ndarray, "V N"],
-    most: float,
+    max_cost: float,
 ) -> Int64[np.ndarray, " T"]:
-    """Join regions that touch, cheapest pair first, until every pair costs `most` or more.
+    """Join regions that touch, cheapest pair first, until every pair costs `max_cost` or more.
 
     The cost of a pair is `side(both) * sqrt(touch of the smaller / touch of the pair)`. Side is the square
     root of a region's mean area share in the views that show it. Touch is the number of pairs of neighbouring
     Gaussians between a pair of regions, or between a region and all others. Two regions that touch only
-    each other are therefore joined up to a side of `most`, and others up to a smaller side.
+    each other are therefore joined up to a side of `max_cost`, and others up to a smaller side.
 
     Args:
         region_of_gaussian: region of each Gaussian, -1 for none.
         means: centres of the Gaussians, scene units.
         mass: visible mass of each Gaussian in each view, px.
-        most: limit of the cost, as a share of a view's side.
+        max_cost: limit of the cost, as a share of a view's side.
 
     Returns:
         whole of each region, numbered by first appearance.
     """
-    seen = np.stack([np.bincount(region_of_gaussian + 1, each, num_regions + 1)[1:] for each in mass], axis=1)
-    shares = seen / np.maximum(mass.sum(axis=1, dtype=np.float64), 1e-12)
+    region, num = region_of_gaussian + 1, num_regions + 1
+    region_mass = np.stack([np.bincount(region, in_view, num)[1:] for in_view in mass], axis=1)
+    shares = region_mass / np.maximum(mass.sum(axis=1, dtype=np.float64), 1e-12)
     firm = np.flatnonzero((region_of_gaussian != NONE) & (mass.sum(axis=0) > MIN_MASS_PX))
     touch = touching(region_of_gaussian[firm], num_regions, means[firm])
-    return joined(touch, shares, most)
+    return joined(touch, shares, max_cost)
 
 
 def touching(
@@ -67,11 +68,13 @@ def touching(
     return counts + counts.T
 
 
-def joined(touch: sp.csr_matrix, shares: Float64[np.ndarray, "T V"], most: float) -> Int64[np.ndarray, " T"]:
+def joined(
+    touch: sp.csr_matrix, shares: Float64[np.ndarray, "T V"], max_cost: float
+) -> Int64[np.ndarray, " T"]:
     """Compute `joined_regions` from touches and view shares; on a tie, the lowest regions join first."""
     num = len(shares)
     share = list(shares)
-    side = [_side(each) for each in share]
+    side = [_side(of_region) for of_region in share]
     beside = [
         dict(zip(touch.indices[slice(*ends)].tolist(), touch.data[slice(*ends)].tolist(), strict=True))
         for ends in zip(touch.indptr[:-1], touch.indptr[1:], strict=True)
@@ -85,7 +88,7 @@ def joined(touch: sp.csr_matrix, shares: Float64[np.ndarray, "T V"], most: float
     queue = [(cost(a, b), a, b) for a in range(num) for b in beside[a] if a < b]
     heapq.heapify(queue)
     alive = [True] * num
-    while queue and queue[0][0] < most:
+    while queue and queue[0][0] < max_cost:
         _, a, b = heapq.heappop(queue)
         if not (alive[a] and alive[b]):
             continue
@@ -96,19 +99,19 @@ def joined(touch: sp.csr_matrix, shares: Float64[np.ndarray, "T V"], most: float
         side.append(_side(share[new]))
         beside.append({})
         for old in (a, b):
-            for other, count in beside[old].items():
-                if other not in (a, b):
-                    beside[new][other] = beside[new].get(other, 0.0) + count
-                    beside[other][new] = beside[new][other]
-                    del beside[other][old]
+            for neighbour, count in beside[old].items():
+                if neighbour not in (a, b):
+                    beside[new][neighbour] = beside[new].get(neighbour, 0.0) + count
+                    beside[neighbour][new] = beside[new][neighbour]
+                    del beside[neighbour][old]
         whole[np.isin(whole, (a, b))] = new
-        for other in beside[new]:
-            heapq.heappush(queue, (cost(other, new), other, new))
+        for neighbour in beside[new]:
+            heapq.heappush(queue, (cost(neighbour, new), neighbour, new))
     _, first, inverse = np.unique(whole, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(first))[inverse]
 
 
 def _side(share: Float64[np.ndarray, " V"]) -> float:
     """Return the square root of a region's mean area share in the views that show it; 0 if unseen."""
-    shown = share > MIN_SHARE
-    return float(np.sqrt(share.sum() / max(shown.sum(), 1)))
+    visible = share > MIN_SHARE
+    return float(np.sqrt(share.sum() / max(visible.sum(), 1)))

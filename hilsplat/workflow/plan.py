@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.files import INSTALLED, project_path
+from hilsplat.baselines import method_of
 from hilsplat.configuration import SECTIONS, RunSettings, StageSettings, parse_run, require_known
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.datasets.sources import unlisted
-from hilsplat.methods.registry import METHODS, require_method
 from hilsplat.models.store import AUTO, model_digest, model_path, read_model
 from hilsplat.scene.finished import KEY_VIEWS
 from hilsplat.scene.sheet import (
@@ -85,8 +85,6 @@ class Plan:
         """Read the sheet; raise HilsplatError if it or the configuration is invalid, or no scene is left."""
         self.run = run = parse_run(dict(config))
         self.results = Path(run.results)
-        for name in run.every_variant():
-            require_method(run.stages(name).method.name)
         require_variant_sections(run)
         sheet = project_path(run.scenes)
         rows = read_sheet(sheet, run.groups, run.data_root)
@@ -457,7 +455,7 @@ class Plan:
         )
 
     def baseline(self, job: VariantJob) -> tuple[str, ...]:
-        return (METHODS.places[self.stages(job).method.name],)
+        return (method_of(self.stages(job).method.name).fit,)
 
     def names(self, *_: object) -> str:
         """Return each variant's name in tables and figures, as JSON; Snakemake would expand plain text."""

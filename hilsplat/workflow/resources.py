@@ -22,6 +22,7 @@ from hilsplat.base.errors import ImageError, ModelError
 from hilsplat.base.images import opened_image
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.lineage import version_of
+from hilsplat.baselines import TrainedSettings
 from hilsplat.datasets.generators import GENERATORS
 from hilsplat.models.store import model_path, read_model
 from hilsplat.scene.layouts import vertex_count
@@ -68,8 +69,6 @@ PREVIEWED, GUIDED = 0.65, 0.25
 
 MASKS, NODES = 230, 400
 """Typical numbers of masks per photograph and nodes per room, from `plush_bedroom` (docs/benchmarks.md)."""
-
-UNTRAINED = ("lifted", "occam", "dr_splat")  # baselines without training
 
 UNKNOWN_MP = 0.5  # megapixels assumed per view if no image header can be read before the run
 
@@ -197,11 +196,11 @@ class JobResources:
                 return views * _sam_s(stages.masks)
             crops = NODES * stages.clip.crops_per_node
             return CROP_S * (views * MASKS if stages.clip.crops == "masks" else crops)
-        if rule == "method" and stages.method.name in UNTRAINED:
-            return COSTS["field"]["core_s_per_mp"] * views * view_mp
-        if rule == "method":
+        if rule == "method" and isinstance(stages.method, TrainedSettings):
             pixels_mp = view_mp / stages.method.pixel_step**2
             return TRAINED_S_PER_MP * len(LEVELS) * stages.method.steps * pixels_mp
+        if rule == "method":
+            return COSTS["field"]["core_s_per_mp"] * views * view_mp
         if rule == "field" and stages.field.trainer == "literal":
             return LITERAL_S_PER_MP * len(LEVELS) * stages.field.iterations * view_mp
         if rule == "autoencoder" and stages.autoencoder.code == "network":

@@ -8,6 +8,7 @@ import pytest
 from jsonschema import Draft202012Validator
 
 from hilsplat.base.errors import SettingsError
+from hilsplat.baselines import BASELINES, OURS, TrainedSettings
 from hilsplat.configuration import (
     SECTIONS,
     config_schema,
@@ -17,8 +18,6 @@ from hilsplat.configuration import (
     parse_section,
     read_config,
 )
-from hilsplat.methods.registry import METHODS, OURS
-from hilsplat.settings import MethodSettings
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "paper.yaml", "ci.yaml", "comparison.yaml"])
@@ -47,6 +46,11 @@ def test_shipped_configurations_are_valid(project: Path, name: str) -> None:
         ({"masks": {"predicted_iou_min": float("inf")}}, r"masks\.predicted_iou_min"),
         ({"masks": {"predicted_iou_min": float("nan")}}, r"masks\.predicted_iou_min"),
         ({"masks": {"graph_scales": [float("-inf")] * 3}}, r"masks\.graph_scales"),
+        ({"method": {"name": "lifted", "steps": 1}}, r"method\.steps: unknown key; known keys: name"),
+        (
+            {"variants": {"x": {"method": {"name": "opengaussian", "codebok": [1, 1]}}}},
+            r"variants\.x\.method\.codebok: unknown key; did you mean 'codebook'\?",
+        ),
         ({"seed": 2**31}, "less than or equal to 2000000000"),
         ({"poses": {"single_camera": True}}, "YAML reads yes, no, on and off"),
         ({"masks": {"points_per_batch": True}}, "YAML reads yes, no, on and off"),
@@ -130,6 +134,7 @@ def test_the_manual_lists_the_choices_or_the_range_of_a_setting() -> None:
     manual = knob_table()
     assert "poses.mapper = 'incremental'  (incremental|global; origin: COLMAP)" in manual
     assert "poses.test_every = 8  (>= 0; views; origin: 3DGS)" in manual
+    assert "method.codebook = (64, 10)" in manual and "    opengaussian: number of groups" in manual
 
 
 def test_the_schema_for_editors_accepts_the_shipped_configuration_and_refuses_a_misspelt_key(
@@ -158,5 +163,21 @@ def test_a_single_name_is_read_as_a_list() -> None:
 
 
 def test_only_our_solver_and_plain_averages_are_independent_of_the_seed() -> None:
-    fixed = {name for name in (OURS, *METHODS) if not MethodSettings(name=name).is_random}
-    assert fixed == {"hilsplat", "lifted", "occam"}
+    variants = {name: {"method": {"name": name}} for name in (OURS, *BASELINES)}
+    run = parse_run({"variants": variants})
+    assert {name for name in variants if not run.stages(name).method.is_random} == {OURS, "lifted", "occam"}
+
+
+def test_a_method_has_its_own_settings() -> None:
+    trained = {"method": {"name": "langsplat", "steps": 5}}
+    run = parse_run({"overrides": {"g": trained}, "variants": {"v": {"method": {"name": "vch"}}}})
+    assert run.stages(scopes=("g",)).method == TrainedSettings(name="langsplat", steps=5)
+    vch = run.stages("v", scopes=("g",)).method
+    assert (vch.name, vch.steps, vch.theta) == ("vch", 1800, None)  # not those of a different method
+
+
+def test_theta_of_the_coverage_tree_reaches_the_methods_that_build_one() -> None:
+    variants = {"vch": {"coverage_tree": {"theta": 0.8}, "method": {"name": "vch"}}}
+    assert parse_run({"variants": variants}).stages("vch").with_models().method.theta == 0.8
+    variants["vch"]["method"]["theta"] = 0.95
+    assert parse_run({"variants": variants}).stages("vch").with_models().method.theta == 0.95

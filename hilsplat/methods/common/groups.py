@@ -11,12 +11,10 @@ from scipy.cluster.vq import kmeans2, vq
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.field.code import unit_rows
 from hilsplat.methods.method import MethodInputs
 from hilsplat.semantic_tree.nodes import level_ious
-from hilsplat.settings import MethodSettings
 
 ROUNDS = 20  # Lloyd iterations; more would reduce the error by less than 1 %
 CENTRES = 256  # k-means centres that `clusters` merges
@@ -39,8 +37,8 @@ def kmeans(
     starts = _distant_rows(data, count, np.random.default_rng(seed))
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "One of the clusters is empty")
-        found, _ = kmeans2(data, starts, iter=rounds, minit="matrix")
-    return found.astype(np.float32), vq(data, found, check_finite=False)[0].astype(np.int64)
+        centroids, _ = kmeans2(data, starts, iter=rounds, minit="matrix")
+    return centroids.astype(np.float32), vq(data, centroids, check_finite=False)[0].astype(np.int64)
 
 
 def _distant_rows(
@@ -49,12 +47,12 @@ def _distant_rows(
     """Draw k-means++ starts, in proportion to squared distance; scipy's function takes E times as long."""
     chosen = np.full(count, -1, np.int64)
     square, chances = np.full(len(data), np.inf), np.arange(1.0, len(data) + 1)
-    for place in range(count):
+    for number in range(count):
         if chances[-1] == 0:
             break  # every row is already a start
         draw = random.random() * chances[-1]
-        chosen[place] = min(int(np.searchsorted(chances, draw, side="right")), len(data) - 1)
-        np.minimum(square, np.square(data - data[chosen[place]]).sum(axis=1), out=square)
+        chosen[number] = min(int(np.searchsorted(chances, draw, side="right")), len(data) - 1)
+        np.minimum(square, np.square(data - data[chosen[number]]).sum(axis=1), out=square)
         chances = square.cumsum()
     return data[np.where(chosen < 0, chosen[0], chosen)]
 
@@ -119,8 +117,8 @@ def associated_codes(
     first = order[np.flatnonzero(np.diff(key, prepend=-1))]
     best = first[score[first] > MIN_SCORE]
     means, counts = group_means(inputs.latents[rows[mask[best]]], of[best], num_groups)
-    found = counts >= min(MIN_VIEWS, len(mass))
-    return features_of_groups(group, np.where(found[:, None], means, 0).astype(np.float32))
+    has_code = counts >= min(MIN_VIEWS, len(mass))
+    return features_of_groups(group, np.where(has_code[:, None], means, 0).astype(np.float32))
 
 
 def cluster_field(inputs: MethodInputs, group: Int64[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3 D"]:
@@ -154,37 +152,22 @@ def clusters(
     if metric == "cosine":
         means = unit_rows(means)
     joined = scipy.cluster.hierarchy.linkage(means, "average", metric)
-    cut = [scipy.cluster.hierarchy.fcluster(joined, most, "distance") - 1 for most in distances]
+    cut = [scipy.cluster.hierarchy.fcluster(joined, distance, "distance") - 1 for distance in distances]
     return np.stack(cut, axis=1)[centre].astype(np.int64)
 
 
 def density_clusters(
-    points: Float32[np.ndarray, "n D"], radius: float, least: int
+    points: Float32[np.ndarray, "n D"], radius: float, min_points: int
 ) -> Int64[np.ndarray, " n"]:
     """Return each point's cluster, -1 for none: dense points within the radius are connected (DBSCAN*).
 
-    A point is dense if at least `least` points, including itself, are within the radius. Clusters are
+    A point is dense if at least `min_points` points, including itself, are within the radius. Clusters are
     numbered in the order of their first points (Campello et al., PAKDD 2013).
     """
-    dense = cKDTree(points).query_ball_point(points, radius, return_length=True) >= least
-    found = np.full(len(points), NONE, np.int64)
+    dense = cKDTree(points).query_ball_point(points, radius, return_length=True) >= min_points
+    cluster = np.full(len(points), NONE, np.int64)
     where = np.flatnonzero(dense)
     pairs = cKDTree(points[where]).query_pairs(radius, output_type="ndarray")
     graph = sp.csr_matrix((np.ones(len(pairs), bool), pairs.T), shape=(len(where), len(where)))
-    found[where] = connected_components(graph, directed=False)[1]
-    return found
-
-
-def thresholds_of(settings: MethodSettings, own: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return the configured thresholds or the method's; raise `SettingsError` if their order is wrong."""
-    if settings.thresholds == "auto":
-        return own
-    grow = own[0] < own[-1]
-    if list(settings.thresholds) != sorted(set(settings.thresholds), reverse=not grow):
-        raise SettingsError(
-            f"method.thresholds: {settings.name} cannot nest levels with these thresholds",
-            expected=f"numbers that {'rise' if grow else 'fall'} from whole to subpart, such as {list(own)}",
-            found=str(list(settings.thresholds)),
-            fix="reorder the numbers",
-        )
-    return settings.thresholds
+    cluster[where] = connected_components(graph, directed=False)[1]
+    return cluster

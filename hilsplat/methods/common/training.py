@@ -15,9 +15,9 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from hilsplat.base.progress import track
+from hilsplat.baselines import TrainedSettings
 from hilsplat.field.adam import in_random_order
 from hilsplat.methods.method import LabelledView
-from hilsplat.settings import MethodSettings
 
 PIXELS = 4096  # maximum per step; published codes use 4096 (VCH), 32,768 (OmniSeg3D) or whole views
 START_NOISE = 0.1  # standard deviation of initial features about their common value
@@ -55,10 +55,10 @@ def product(matrix: sp.csr_matrix, features: Float[Tensor, "N D"]) -> Float[Tens
     return _Product.apply(features, matrix)
 
 
-def of_seen(matrix: sp.csr_matrix) -> tuple[sp.csr_matrix, Int64[Tensor, " s"]]:
+def nonempty_columns(matrix: sp.csr_matrix) -> tuple[sp.csr_matrix, Int64[Tensor, " s"]]:
     """Return the matrix without empty columns, and the indices of the others; a step shows few Gaussians."""
-    columns, place = np.unique(matrix.indices, return_inverse=True)
-    parts = matrix.data, place.reshape(-1), matrix.indptr
+    columns, column_of_entry = np.unique(matrix.indices, return_inverse=True)
+    parts = matrix.data, column_of_entry.reshape(-1), matrix.indptr
     small = sp.csr_matrix(parts, shape=(matrix.shape[0], len(columns)))
     return small, torch.from_numpy(columns.astype(np.int64))
 
@@ -68,7 +68,7 @@ def unit(rows: Float[Tensor, "*n D"]) -> Float[Tensor, "*n D"]:
     return rows / rows.norm(dim=-1, keepdim=True).clamp(min=1e-9)
 
 
-def alike(num_gaussians: int, channels: int, seed: int) -> Float[Tensor, "N D"]:
+def initial_features(num_gaussians: int, channels: int, seed: int) -> Float[Tensor, "N D"]:
     """Return trainable initial features that are almost the same for all Gaussians.
 
     Gaussians with equal features stay together unless a mask separates them; with independent starts, each
@@ -87,7 +87,7 @@ def train(
     views: list[LabelledView],
     parameters: list[Any],  # tensors, or parameter groups of `torch.optim.Adam` with their own rates
     loss: Loss,
-    settings: MethodSettings,
+    settings: TrainedSettings,
     seed: int,  # for the order of views and the pixels
     pixels: int = PIXELS,  # maximum per step
 ) -> None:

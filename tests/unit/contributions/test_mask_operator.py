@@ -21,8 +21,8 @@ def test_products_have_the_bytes_of_plain_loops_on_any_number_of_threads(channel
     values = rng.normal(size=(14, channels)).astype(np.float32)
     means, spread = np.zeros_like(values), np.zeros_like(features)
     for mask, level in enumerate(operator.level_index):
-        for k in range(operator.indptr[mask], operator.indptr[mask + 1]):
-            gaussian, weight = operator.indices[k], operator.data[k]
+        for k in range(A.indptr[mask], A.indptr[mask + 1]):
+            gaussian, weight = A.indices[k], A.data[k]
             means[mask] += weight * features[gaussian, level]
             spread[gaussian, level] += weight * values[mask]
     assert operator.means(features).tobytes() == means.tobytes()
@@ -30,30 +30,16 @@ def test_products_have_the_bytes_of_plain_loops_on_any_number_of_threads(channel
     assert operator.spread(values).tobytes() == spread.tobytes()
 
 
-def one_gaussian(latents: list[list[float]], weights: list[float]):
-    """Return masks of level whole that all show one Gaussian, its mass, their pixels and latents."""
-    count = len(latents)
-    A = sp.csr_matrix(np.array(weights, np.float32)[:, None])
-    masks = MaskOperator.of(A, np.ones(count, np.uint8))
-    pixels = np.ones(count, np.float32)
-    mass = np.array([[sum(weights), 0, 0]], np.float32)
-    return masks, mass, pixels, np.array(latents, np.float32)
-
-
-def test_the_median_ignores_a_wrong_mask():
-    masks, mass, pixels, latents = one_gaussian([[0, 1], [0, 1], [1, 0]], [1, 1, 1])
-    average = lifted_average(masks, mass, pixels, latents)
-    assert average[0, 0] == pytest.approx([1 / 3, 2 / 3])
-    median = lifted_median(masks, pixels, latents, average)
-    assert median[0, 0] == pytest.approx([0, 1], abs=1e-3)
-    assert np.array_equal(median[0, 1:], average[0, 1:])  # levels that no mask shows keep the start
-
-
 def test_the_median_of_a_triangle_is_its_fermat_point():
     # an isosceles triangle: seen from (0, y), the two lower corners are 120 degrees apart, so y = 1 / sqrt(3)
-    masks, mass, pixels, latents = one_gaussian([[-1, 0], [1, 0], [0, 3]], [1, 1, 1])
-    median = lifted_median(masks, pixels, latents, lifted_average(masks, mass, pixels, latents), steps=200)
+    latents = np.array([[-1, 0], [1, 0], [0, 3]], np.float32)
+    masks = MaskOperator.of(sp.csr_matrix(np.ones((3, 1), np.float32)), np.ones(3, np.uint8))
+    pixels, mass = np.ones(3, np.float32), np.array([[3, 0, 0]], np.float32)
+    average = lifted_average(masks, mass, pixels, latents)
+    assert average[0, 0] == pytest.approx([0, 1])
+    median = lifted_median(masks, pixels, latents, average, steps=200)
     assert median[0, 0] == pytest.approx([0, 1 / np.sqrt(3)], abs=1e-4)
+    assert np.array_equal(median[0, 1:], average[0, 1:])  # levels that no mask shows keep the start
 
 
 def test_a_share_of_the_training_views_is_chosen_in_camera_order(two_boxes, monkeypatch):

@@ -77,7 +77,7 @@ def without_statistics(model: Autoencoder) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("channels", [16, 300])
 def test_gradients_are_those_of_autograd(channels):
     vectors, weight = unit_vectors(24, channels), 0.3
-    parameters = without_statistics(Autoencoder.drawn(channels, 3, np.random.RandomState(1)))
+    parameters = without_statistics(Autoencoder.initial(channels, 3, np.random.RandomState(1)))
     found = {name: np.full_like(values, np.nan) for name, values in parameters.items()}
     loss_gradients(parameters, vectors, 3, weight, found)
     model = TorchAutoencoder(parameters, channels, 3)
@@ -91,7 +91,7 @@ def test_gradients_are_those_of_autograd(channels):
 
 def test_a_trained_network_equals_torch_with_the_statistics_of_all_vectors():
     vectors = unit_vectors(50, 16)
-    model = Autoencoder.drawn(16, 3, np.random.RandomState(2))
+    model = Autoencoder.initial(16, 3, np.random.RandomState(2))
     model.arrays |= statistics(without_statistics(model), vectors, 3)
     reference = TorchAutoencoder(model.arrays, 16, 3)
     for module in reference.modules():
@@ -124,7 +124,7 @@ def test_compiled_layers_equal_matrix_products_with_relu(rows, widths):
 
 @pytest.mark.parametrize("latent", [1, 2, 3])
 def test_pieces_decode_what_the_network_decodes(latent):
-    random, code = np.random.default_rng(0), Autoencoder.drawn(40, latent, np.random.RandomState(0))
+    random, code = np.random.default_rng(0), Autoencoder.initial(40, latent, np.random.RandomState(0))
     centres = random.normal(size=(12, latent)).astype(np.float32)
     near = random.normal(scale=1e-3, size=(1500, latent)).astype(np.float32)
     latents = np.concatenate([centres[random.integers(0, 12, 1500)] + near, near * 1e3])
@@ -139,7 +139,7 @@ def test_pieces_decode_what_the_network_decodes(latent):
 def test_missing_files_and_weights_are_reported(tmp_path):
     with pytest.raises(ArtifactError, match=r"autoencoder\.safetensors cannot be read"):
         load_code(tmp_path)
-    model = Autoencoder.drawn(16, 3, np.random.RandomState(0))
+    model = Autoencoder.initial(16, 3, np.random.RandomState(0))
     del model.arrays["encoder.4.running_var"]
     model.save(autoencoder_file(tmp_path))
     with pytest.raises(ArtifactError, match=r"encoder.4.running_var of shape \(16,\) is missing"):

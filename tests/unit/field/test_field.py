@@ -14,10 +14,9 @@ from hilsplat.base.errors import MisalignedArtifactError, SettingsError
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.quadratic import StackedWeights
 from hilsplat.contributions.view_matrices import painted_indicator
-from hilsplat.field import solver
 from hilsplat.field.autoencoder import run_autoencoder
 from hilsplat.field.code import LanguageField
-from hilsplat.field.contrast import Contrast, ViewRelations, compared, distinct
+from hilsplat.field.contrast import Contrast, ViewRelations, distinct, num_compared
 from hilsplat.field.field import run_field
 from hilsplat.field.literal_trainer import ViewTargets, view_losses
 from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
@@ -154,21 +153,6 @@ def test_the_first_step_of_lbfgs_starts_at_the_conjugate_gradient_and_lowers_the
     assert "after_lbfgs" not in solve_field(toy.problem, toy.contrast(without))[1]
 
 
-def test_lbfgs_gets_the_conjugate_gradient_and_the_curvature_of_the_quadratic_part(monkeypatch):
-    toy, first_steps = Toy((1.0, 0.3, 0.1)), []
-
-    def unchanged(objective, start, steps, first_step):
-        first_steps.append(first_step)
-        return start
-
-    monkeypatch.setattr(solver, "lbfgs", unchanged)
-    settings = FieldSettings(weight_instance=0.5, weight_part=0.1, cg_steps=3, lbfgs_steps=1)
-    features, _ = solve_field(toy.problem, toy.contrast(settings))
-    shown = toy.problem.mass > 0
-    assert features[shown] == pytest.approx(conjugate_gradient(toy.problem, 3)[shown], rel=1e-5, abs=1e-7)
-    assert first_steps == [pytest.approx(toy.problem.total_pixels / (2 * 1.4))]
-
-
 @pytest.mark.parametrize("length", range(9))
 def test_dot_products_contain_every_element(length):
     a, b = np.random.default_rng(length).normal(size=(2, length)).astype(np.float32)
@@ -218,7 +202,7 @@ def test_the_literal_trainer_has_the_objective_of_the_solver(readings):
     settings = FieldSettings(**readings, **weights)
     toy = Toy((0.7, 0.4, 0.0))
     contrast = toy.contrast(settings)
-    shares = 1, toy.problem.total_pixels, *compared(contrast.relations)
+    shares = 1, toy.problem.total_pixels, *num_compared(contrast.relations)
     W = toy.W.astype(np.float64)
     maps = np.einsum("pg,gld->pld", W, toy.features)
     losses, by_maps = view_losses(maps, toy.view(settings), toy.latents, settings, shares)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from hilsplat.base.levels import NONE
 from hilsplat.field.contrast import ViewRelations
-from hilsplat.field.losses import SHORTEST, SOFTENING
+from hilsplat.field.losses import MIN_LENGTH, SOFTENING
 from hilsplat.settings import FieldSettings
 
 
@@ -20,7 +20,7 @@ def log_distance_loss(means: Tensor, log_wanted: Tensor) -> Tensor:
 def similarity_without_parent(anchors: Tensor, others: Tensor, parent: Tensor) -> Tensor:
     """Cosine of anchor - parent and other - parent, with softened lengths; the parent gets no gradient."""
     own, far = anchors - parent.detach(), others[None] - parent.detach()[:, None]
-    lengths = [(each.square().sum(-1) + SHORTEST**2).sqrt() for each in (own, far)]
+    lengths = [(each.square().sum(-1) + MIN_LENGTH**2).sqrt() for each in (own, far)]
     return (own[:, None] * far).sum(-1) / lengths[0][:, None] / lengths[1]
 
 

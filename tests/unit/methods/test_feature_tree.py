@@ -8,7 +8,7 @@ import pytest
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.contributions.rows import Contributions
-from hilsplat.methods.feature_tree import farthest_alike, nested_clusters, run_feature_tree
+from hilsplat.methods.feature_tree import merge_distances, nested_clusters, run_feature_tree
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import FieldSettings, SemanticTreeSettings
 from tests.unit.two_boxes_world import reverse_masks
@@ -39,7 +39,7 @@ def test_the_distance_is_half_the_median_between_masks_of_one_parent():
     contributions = Contributions(Path(), ("a", "b"), 3, "", "", 0.0, view, mask, level, sizes, sizes, sizes)
     parents = {"a": np.array([-1, -1, 0, 0, 1]), "b": np.array([-1])}
     means = np.array([[0, 0], [4, 0], [1, 0], [1, 1], [9, 0], [50, 0]], np.float32)
-    assert farthest_alike(means, contributions, parents) == (2.0, 0.5, np.inf)
+    assert merge_distances(means, contributions, parents) == (2.0, 0.5, np.inf)
 
 
 def test_finer_clusters_are_inside_coarser_ones_and_unseen_gaussians_have_none():

@@ -1,6 +1,7 @@
 """Methods that group Gaussians: losses worked by hand or by plain loops, groups known by construction."""
 
 import inspect
+import json
 import types
 
 import numpy as np
@@ -10,30 +11,29 @@ import torch
 from torch.nn.functional import cross_entropy
 
 from hilsplat.base.errors import ArtifactError, SettingsError
+from hilsplat.baselines import TrainedSettings
+from hilsplat.configuration import parse_section
 from hilsplat.field.code import LinearCode
-from hilsplat.methods import laga, legaussians, omniseg3d, saga, vch
+from hilsplat.methods import laga, legaussians, saga, vch
 from hilsplat.methods.common import groups
-from hilsplat.methods.common.groups import associated_codes, clusters, density_clusters, kmeans, thresholds_of
+from hilsplat.methods.common.groups import associated_codes, clusters, density_clusters, kmeans
 from hilsplat.methods.common.training import product, train, unit
 from hilsplat.methods.gaussian_grouping import neighbour_loss
 from hilsplat.methods.method import LabelledView, labelled_views
 from hilsplat.methods.omniseg3d import hierarchical_loss, patches
 from hilsplat.methods.opengaussian import contrast_loss, instances, smoothing_loss
 from hilsplat.methods.vch import components, triplets, ultrametric
-from hilsplat.settings import MethodSettings
 
 RNG = np.random.default_rng(0)
 
 
 @pytest.mark.parametrize(
-    ("method", "wrong", "direction"), [(omniseg3d, (0.9, 0.7, 0.5), "rise"), (vch, (0.1, 0.2, 0.2), "fall")]
+    ("name", "thresholds", "direction"),
+    [("omniseg3d", [0.9, 0.7, 0.5], "rise"), ("vch", [0.1, 0.2, 0.2], "fall")],
 )
-def test_thresholds_out_of_order_are_refused(method, wrong, direction):
-    settings = MethodSettings(name=method.__name__.rpartition(".")[2], thresholds=wrong)
-    with pytest.raises(
-        SettingsError, match=rf"method.thresholds: {settings.name} .*\n.*numbers that {direction}"
-    ):
-        thresholds_of(settings, method.THRESHOLDS)
+def test_thresholds_out_of_order_are_refused(name, thresholds, direction):
+    with pytest.raises(SettingsError, match=rf"method\.thresholds: .*{direction} from whole to subpart"):
+        parse_section("method", json.dumps({"name": name, "thresholds": thresholds}))
 
 
 def test_labelled_pixels_are_covered_and_have_their_coordinates():
@@ -74,7 +74,7 @@ def test_a_step_uses_distinct_pixels_of_a_view(most, expected):
         shares.append(done)
         return product(view.weights, feature).sum()
 
-    train([view], [feature], loss, MethodSettings(name="saga", steps=20), 0, most)
+    train([view], [feature], loss, TrainedSettings(name="saga", steps=20), 0, most)
     assert shares == [step / 20 for step in range(20)]
     assert {len(set(pixels)) for pixels in seen} == {len(pixels) for pixels in seen} == {expected}
     assert set().union(*seen) == set(range(5))
@@ -232,7 +232,7 @@ def test_components_split_where_features_jump_and_small_ones_join_the_nearest_la
     found = components(features, means, (1.5, 0.95, 0.1))
     assert [len(np.unique(level)) for level in found.T] == [1, 2, 3]
     assert found[0, 2] == 0 and found[30, 2] == 1 and found[50, 2] == 2  # largest first
-    monkeypatch.setattr(vch, "LARGEST", 2)
+    monkeypatch.setattr(vch, "MAX_COMPONENTS", 2)
     assert (components(features, means, (1.5, 0.95, 0.1))[50:, 2] == 1).all()
 
 
@@ -350,11 +350,11 @@ def test_pixels_share_masks_up_to_a_scale_and_the_smallest_one_above_it():
     # whole 0 (scale 4) holds parts 1 and 2 (scale 2); pixel 3 is in the whole alone, pixel 4 in another
     labels = np.int32([[0, 1, -1], [0, 1, -1], [0, 2, -1], [0, -1, -1], [5, -1, -1]])
     scales = np.where(labels >= 0, np.where(labels % 5 == 0, 4.0, 2.0), 0)
-    large = saga.together(labels, scales, 5.0)
+    large = saga.grouped_at(labels, scales, 5.0)
     assert large[:4, :4].all() and not large[4, :4].any()
-    between = saga.together(labels, scales, 3.0)
+    between = saga.grouped_at(labels, scales, 3.0)
     assert (between == large).all()  # parts stay masks of their own, and the whole is the smallest above
-    small = saga.together(labels, scales, 1.0)
+    small = saga.grouped_at(labels, scales, 1.0)
     assert small[0].tolist() == [True, True, False, False, False]
     assert small[3].tolist() == [False, False, False, True, False]
 

@@ -9,6 +9,7 @@ import scipy.sparse as sp
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import Level
+from hilsplat.baselines import MethodSettings, TrainedSettings
 from hilsplat.field.adam import Adam, in_random_order
 from hilsplat.field.code import Autoencoder, LinearCode
 from hilsplat.methods import dr_splat, langsplat_v2, lifted, occam
@@ -16,7 +17,6 @@ from hilsplat.methods.langsplat import train_level
 from hilsplat.methods.langsplat_v2 import as_vectors, cosine_loss, largest_shares
 from hilsplat.methods.method import LabelledView, MethodInputs
 from hilsplat.scene.cameras import Camera
-from hilsplat.settings import MethodSettings
 
 
 def unit(vectors):
@@ -52,7 +52,7 @@ def test_training_has_the_bytes_of_products_in_scipy(channels):
         weights = sp.random(40, 9, 0.4, "csr", np.float32, rng)
         labels = rng.integers(-1, 5, (40, 3)).astype(np.int32)
         views.append(LabelledView(number, np.arange(5), weights, labels, np.zeros((40, 2), int)))
-    settings = MethodSettings(name="langsplat", steps=50)
+    settings = TrainedSettings(name="langsplat", steps=50)
     features = np.zeros((9, channels), np.float32)
     adam = Adam(features, settings.rate)
     for view in in_random_order(views, np.random.default_rng(4), settings.steps):

@@ -2,28 +2,31 @@
 
 import csv
 import inspect
+import json
 import re
 import sys
+import tomllib
 import types
 from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 import pytest
-import scipy.sparse as sp
 import torch
 import yaml
+from hilsplat.workflow.stages import stage_code
 
+from hilsplat import baselines
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.configuration import parse_run
+from hilsplat.base.plugins import load
+from hilsplat.baselines import BASELINES, OURS, MethodSettings, method_of, own_settings
+from hilsplat.configuration import config_schema, knob_table, parse_run, parse_section
 from hilsplat.contributions.compositing import normalised_weights
-from hilsplat.field.code import LinearCode
-from hilsplat.methods import laga, method, registry
+from hilsplat.field.code import LanguageField, LinearCode
+from hilsplat.methods import laga, method
 from hilsplat.methods.method import MethodInputs
-from hilsplat.methods.registry import METHODS, OURS, method_of, require_method
 from hilsplat.scene.cameras import Camera
-from hilsplat.settings import MethodSettings
 from tests.conftest import PROJECT
 from tests.unit.two_boxes_world import (
     HEIGHT,
@@ -96,12 +99,13 @@ def inputs_of(tmp_path_factory):
 def fit_of(name, inputs, **changed):
     """Return the features of a method."""
     settings = {"steps": 150, "rate": 0.05, "pixel_step": 1, "codebook": (2, 2), **FITS[name][0], **changed}
-    features = method_of(name)(inputs, MethodSettings(name=name, **settings), 0)
+    settings = {key: settings[key] for key in own_settings()[name] if key in settings}
+    features = load(method_of(name).fit)(inputs, method_of(name).settings(name=name, **settings), 0)
     assert features.dtype == np.float32 and np.isfinite(features).all()
     return features
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", BASELINES)
 def test_regions_of_every_level_get_their_own_code(inputs_of, monkeypatch, name):
     monkeypatch.setattr(laga, "MIN_MASKS", 3)  # some regions have masks in three of the four views
     features = fit_of(name, inputs_of())
@@ -113,7 +117,7 @@ def test_regions_of_every_level_get_their_own_code(inputs_of, monkeypatch, name)
         assert np.mean(right) > least, REGIONS[row][0]
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", BASELINES)
 def test_fits_are_identical_on_any_number_of_threads(inputs_of, name):
     before, made = torch.get_num_threads(), []
     try:
@@ -137,24 +141,23 @@ THIN = {
 
 
 @pytest.mark.parametrize("regions", THIN.values(), ids=THIN)
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", BASELINES)
 def test_levels_with_masks_get_features_and_the_others_zeros(inputs_of, name, regions):
     present = {REGIONS[row][1] for view in regions for row in view}
-    features = fit_of(name, inputs_of(regions), steps=30, thresholds="auto")
+    features = fit_of(name, inputs_of(regions), steps=30)
     assert features.any(axis=(0, 2)).tolist() == [int(level) in present for level in LEVELS]
 
 
 def test_unknown_methods_name_those_that_exist():
-    with pytest.raises(SettingsError, match=rf"one of hilsplat, .*{', '.join(METHODS)}"):
-        require_method("langsplatt")
-    require_method(OURS)
+    with pytest.raises(SettingsError, match=rf"'langsplatt'.*\n.*one of hilsplat, {', '.join(BASELINES)}"):
+        parse_run({"variants": {"x": {"method": {"name": "langsplatt"}}}})
     with pytest.raises(SettingsError, match="is not a baseline"):
         method_of(OURS)
 
 
 @pytest.mark.parametrize("features", [np.zeros((2, 3, 2)), np.full((2, 3, 1), np.nan)])
 def test_a_method_that_returns_no_field_is_refused(tmp_path, monkeypatch, features):
-    monkeypatch.setattr(method, "method_of", lambda name: lambda inputs, settings, seed: features)
+    monkeypatch.setattr(method, "load", lambda place: lambda inputs, settings, seed: features)
     inputs = types.SimpleNamespace(
         scene_folder=tmp_path / "scene",
         contributions=types.SimpleNamespace(num_gaussians=2),
@@ -165,25 +168,52 @@ def test_a_method_that_returns_no_field_is_refused(tmp_path, monkeypatch, featur
         run_method(inputs, tmp_path / "field.safetensors", MethodSettings(name="lifted"), 0)
 
 
-def test_the_example_in_the_documentation_runs_as_written(monkeypatch):
+@pytest.fixture
+def nearest_mask(tmp_path, monkeypatch):
+    """The example package of docs/extending.md, as if installed."""
     page = (PROJECT / "docs" / "extending.md").read_text()
-    code = re.search(r"```python\n(# hilsplat/methods/nearest_mask\.py.*?)```", page, re.S)
-    assert '`"nearest_mask"` to `NAMES` in `hilsplat/methods/registry.py`' in page
-    module = types.ModuleType("hilsplat.methods.nearest_mask")
-    exec(compile(code[1], "nearest_mask.py", "exec"), module.__dict__)
-    monkeypatch.setitem(sys.modules, module.__name__, module)
-    monkeypatch.setitem(registry.METHODS.places, "nearest_mask", "hilsplat.methods.nearest_mask:fit")
+    code = re.search(r"```python\n(# nearest_mask/__init__\.py.*?)```", page, re.S)[1]
+    points = tomllib.loads(re.search(r"```toml\n(.*?)```", page, re.S)[1])["project"]["entry-points"]
+    (tmp_path / "nearest_mask").mkdir()
+    (tmp_path / "nearest_mask/__init__.py").write_text(code)
+    (tmp_path / "nearest_mask-1.0.dist-info").mkdir()
+    lines = [f"{name} = {place}" for name, place in points[baselines.GROUP].items()]
+    text = "\n".join([f"[{baselines.GROUP}]", *lines, ""])
+    (tmp_path / "nearest_mask-1.0.dist-info/entry_points.txt").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    baselines.installed.cache_clear()
+    yield tmp_path
+    baselines.installed.cache_clear()
+    sys.modules.pop("nearest_mask", None)
 
-    contributions = types.SimpleNamespace(
-        num_gaussians=2,
-        matrix=lambda _: sp.csr_matrix(np.array([[0.9, 0.1], [0.2, 0.3]], np.float32)),
-        pixels=np.array([1, 4]),
-        rows_of=lambda level: np.array([0, 1]),
-    )
-    inputs = types.SimpleNamespace(contributions=contributions, latents=np.eye(2, dtype=np.float32))
-    features = method_of("nearest_mask")(inputs, MethodSettings(name="nearest_mask"), 0)
-    # Gaussian 0: 0.9 px in mask 0, 0.8 px in mask 1; Gaussian 1: 0.1 px and 1.2 px
-    assert features[:, 0].tolist() == [[1.0, 0.0], [0.0, 1.0]]
+
+def test_the_package_in_the_documentation_adds_a_method_with_two_settings(inputs_of, nearest_mask):
+    run = parse_run({"variants": {"mine": {"method": {"name": "nearest_mask", "min_mass_px": 0.5}}}})
+    settings = run.stages("mine").method
+    assert (settings.min_mask_px, settings.min_mass_px) == (1, 0.5)
+    assert not run.stages("mine").depends_on_seed("evaluate")
+    assert "method.min_mass_px" in knob_table() and "min_mass_px" in json.dumps(config_schema())
+    with pytest.raises(SettingsError, match=r"method\.min_mas_px: unknown key; did you mean 'min_mass_px'"):
+        parse_section("method", '{"name": "nearest_mask", "min_mas_px": 1}')
+    assert stage_code("method", (method_of("nearest_mask").fit,)) != stage_code("method")
+
+    inputs, out = inputs_of(), nearest_mask / "field.safetensors"
+    (inputs.autoencoder_folder / "autoencoder.safetensors").touch()
+    method.run_method(inputs, out, settings, 0)
+    features = LanguageField.load(out).features
+    for row in EVERY:
+        inside = np.flatnonzero(region_mask(row).ravel())
+        assert (features[inside, Level(REGIONS[row][1]).index, row] == 1).mean() > 0.8, REGIONS[row][0]
+
+
+@pytest.mark.parametrize(
+    ("code", "problem"),
+    [("import no_such_module", "cannot be imported: No module named"), ("METHOD = 1", "is not a method")],
+)
+def test_a_broken_package_is_reported(nearest_mask, code, problem):
+    (nearest_mask / "nearest_mask/__init__.py").write_text(code)
+    with pytest.raises(SettingsError, match=f"method nearest_mask: nearest_mask:METHOD {problem}"):
+        parse_section("method", '{"name": "nearest_mask"}')
 
 
 def test_methods_of_the_papers_tables_run_or_are_explained_in_the_documentation():
@@ -205,5 +235,5 @@ def test_methods_yaml_has_a_variant_of_every_method():
     names = {**own["variants"], **more["variants"]}
     variants = {name: own["variants"].get(name, {}) | more["variants"].get(name, {}) for name in names}
     listed = {variants.get(name, {}).get("method", {}).get("name", OURS) for name in more["main_variants"]}
-    assert listed == {OURS, *METHODS}
+    assert listed == {OURS, *BASELINES}
     parse_run(own | more | {"variants": variants, "labels": own["labels"] | more["labels"]})

@@ -9,7 +9,7 @@ from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.base.lineage import sha256_of_file
 from hilsplat.segment.sam import point_grid
-from hilsplat.semantic_tree.build import RANKED, crop_ranks
+from hilsplat.semantic_tree.build import MAX_RANKED, crop_ranks
 from hilsplat.semantic_tree.export import write_selection_ply, write_tree_ply
 from hilsplat.semantic_tree.guided_masks import guided_points
 from hilsplat.semantic_tree.nodes import nest_nodes, renumbered_without_empty
@@ -130,7 +130,7 @@ def test_crops_are_ranked_by_score_and_side(node, score, degrees, ranks):
 
 def test_a_node_has_a_limited_number_of_ranks():
     ranks = crop_ranks(np.zeros(50, np.int32), np.ones(50, np.float32), towards(*range(50)))
-    assert sorted(ranks[ranks >= 0]) == list(range(RANKED))
+    assert sorted(ranks[ranks >= 0]) == list(range(MAX_RANKED))
 
 
 def test_nodes_are_prompted_in_their_middle_and_the_grid_elsewhere():

@@ -18,36 +18,12 @@ def on_a_line(*x: float) -> np.ndarray:
     return np.array([[each, 0, 0] for each in x], np.float32)
 
 
-def symmetric(num: int, **touches: int) -> sp.csr_matrix:
-    """Touches by pair, such as `_01=3`."""
-    dense = np.zeros((num, num))
-    for pair, count in touches.items():
-        a, b = map(int, pair.removeprefix("_"))
-        dense[a, b] = dense[b, a] = count
-    return sp.csr_matrix(dense)
-
-
 def test_regions_touch_where_gaussians_are_neighbours(monkeypatch):
     monkeypatch.setattr(wholes, "NEIGHBOURS", 2)  # itself and one other
     region = np.array([0, 0, 1, 1, 2, 2], np.int32)
     # 0.0-1.0-1.5: the middle one is nearest to region 1, and is the nearest of its Gaussian at 1.5, too
     touch = touching(region, 3, on_a_line(0, 1, 1.5, 2.1, 9, 9.5)).toarray()
     assert touch.tolist() == [[0, 2, 0], [2, 0, 0], [0, 0, 0]]
-
-
-def test_regions_are_joined_while_the_pair_costs_less_than_the_limit():
-    # one view: 0 and 1 make up 0.04 and 0.05, 2 makes up 0.64
-    shares = np.array([[0.04], [0.05], [0.64]])
-    touch = symmetric(3, _01=6, _12=2)
-    # 0 touches 1 alone: side 0.3, factor 1. 1 with 2: side 0.83, factor root of 8 / 2
-    assert joined(touch, shares, 0.29).tolist() == [0, 1, 2]
-    assert joined(touch, shares, 0.31).tolist() == [0, 0, 1]
-    # both with 2: side 0.854, and the pair touches nothing else
-    assert joined(touch, shares, 0.85).tolist() == [0, 0, 1]
-    assert joined(touch, shares, 0.86).tolist() == [0, 0, 0]
-    # a weak touch costs more: 0 touches 1 nine times as often as 2
-    shares = np.array([[0.04], [0.05], [0.05]])
-    assert joined(symmetric(3, _01=9, _02=1), shares, 0.33).tolist() == [0, 0, 1]
 
 
 def joined_by_search(touch: np.ndarray, shares: np.ndarray, most: float) -> list[list[int]]:
