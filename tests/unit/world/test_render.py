@@ -14,7 +14,7 @@ from hilsplat_world.render import label_view, render_and_label, render_view
 from hilsplat_world.scenes.kinds import build_scene, scene_cameras
 from hilsplat_world.scenes.scene import Style
 from hilsplat_world.shapes import box, joined
-from hilsplat_world.textures import fractal_noise, grains
+from hilsplat_world.texture_kernels import fractal_noise, grains
 from hilsplat_world.truth import true_depth
 from hilsplat_world.views import square_camera
 from tests.unit.world.scenes import scene_of
