@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from jaxtyping import Float, Float32, Int64, UInt8
 
 from cpusplat.lanes import WIDTH
-from hilsplat.base.processes import over_edges
+from cpusplat.threads import over_edges
 from hilsplat.contributions.compositing import padded
 from hilsplat.contributions.kernels import mask_means, median_step, spread_rows, wide_mask_means
 

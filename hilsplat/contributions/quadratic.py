@@ -12,8 +12,8 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float32
 
+from cpusplat.threads import over_edges
 from hilsplat.base.levels import LEVELS
-from hilsplat.base.processes import over_edges
 from hilsplat.contributions.compositing import padded
 from hilsplat.contributions.kernels import gram_product
 

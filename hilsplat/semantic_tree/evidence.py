@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float64, Int32
 
-from hilsplat.base.processes import over_edges
+from cpusplat.threads import over_edges
 from hilsplat.semantic_tree.kernels import seen_sizes, shared_pairs
 
 ROWS_AT_A_TIME = 64

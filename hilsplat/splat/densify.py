@@ -17,12 +17,13 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int, Int32
 from scipy.special import comb, expit, logit
 
+from cpusplat.threads import over_ranges
 from hilsplat.base.rotations import rotate, unit_quaternions
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.gaussians import FIELDS
 from hilsplat.splat.kernels import noise_rows
 from hilsplat.splat.optimise import Adam
-from hilsplat.splat.rasterise.cpu import Gradients, over_ranges
+from hilsplat.splat.rasterise.views import Gradients
 
 SMALL = 0.01
 """Gaussians whose largest axis exceeds this (in units of the extent) are split; others are cloned (3DGS)."""

@@ -3,7 +3,7 @@
 import numpy as np
 
 from cpusplat.compiled import compiled
-from hilsplat.base.rotations import matrix_entries
+from cpusplat.project import matrix_entries
 
 NOISE_SHARPNESS = 100.0
 """Rate at which noise decreases with opacity (paper: k = 100): the noise factor at opacity 0.1 is e^-9.5."""

@@ -12,13 +12,11 @@ from typing import Literal
 
 from hilsplat.base.cache import forget, remembered
 from hilsplat.base.errors import DeviceError, first_line
+from hilsplat.splat.rasterise.parity import KIND, cuda_disagreement
+from hilsplat.splat.rasterise.views import Device
 
 logger = logging.getLogger(__name__)
 
-Device = Literal["cpu", "cuda"]
-
-KIND = "cuda"
-"""Kind of `remembered` results about CUDA."""
 UNBUILT = "the CUDA kernels of gsplat cannot be compiled"
 ABSENT = ("gsplat is not installed", "no NVIDIA driver is installed", "torch ")
 """Beginnings of the problems of machines on which CUDA is not expected to work."""
@@ -93,8 +91,6 @@ def choose_device(requested: Literal["auto", "cpu", "cuda"]) -> Device:
             "device: auto or cpu; after a change, run `hilsplat doctor`",
         )
     if requested == "auto" and problem is None:
-        from hilsplat.splat.rasterise.parity import cuda_disagreement
-
         try:
             problem = cuda_disagreement()
         except Exception as error:  # drivers, torch and gsplat raise several types

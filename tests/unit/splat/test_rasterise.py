@@ -11,8 +11,8 @@ import torch
 from hilsplat.base.errors import HilsplatError
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise.api import draw, pixel_weights, render
-from hilsplat.splat.rasterise.cpu import Gradients
 from hilsplat.splat.rasterise.device import Device, cuda_problem
+from hilsplat.splat.rasterise.views import Gradients
 from tests.unit.splat.gsplat_on_cpu import render_reference
 from tests.unit.splat.rasterise_scenes import (
     camera,

@@ -9,9 +9,10 @@ import gsplat
 import numpy as np
 import pytest
 
+from cpusplat import binning
 from hilsplat.base.errors import DeviceError
 from hilsplat.splat.gaussians import Gaussians
-from hilsplat.splat.rasterise import binning, cuda, device, parity
+from hilsplat.splat.rasterise import cuda, device, parity
 from hilsplat.splat.rasterise.api import draw, pixel_weights
 from hilsplat.splat.rasterise.device import choose_device
 from tests.unit.splat import gsplat_on_cpu

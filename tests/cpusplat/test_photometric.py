@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from hilsplat.splat.photometric import photometric_loss, psnr, ssim
+from cpusplat.photometric import photometric_loss, psnr, ssim
 
 
 def torch_ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
