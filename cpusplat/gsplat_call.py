@@ -1,6 +1,7 @@
 """gsplat's `rasterization` on the CPU: NumPy arrays, or torch tensors with gradients."""
 
 import os
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -102,48 +103,44 @@ def rasterization(
         raise ValueError(f"render_mode is {render_mode!r}; expected one of {', '.join(RENDER_MODES)}")
     viewmats = as_array("viewmats", _constant("viewmats", viewmats), None, 4, 4, dtype=np.float64)
     Ks = as_array("Ks", _constant("Ks", Ks), len(viewmats), 3, 3, dtype=np.float64)
-    view = (height, width), near_plane, far_plane, eps2d
-    images: Any
-    alphas: Any
-    means2d: Any
-    depths: Any
-    from_numpy: Any
-    join: Any
-    cameras = [pack_camera(viewmat, K, *view) for viewmat, K in zip(viewmats, Ks, strict=True)]
+    sizes = (height, width), near_plane, far_plane, eps2d
+    cameras = [pack_camera(viewmat, K, *sizes) for viewmat, K in zip(viewmats, Ks, strict=True)]
     gaussians = means, quats, scales, opacities, colors if "RGB" in render_mode else None
     views = ActivatedViews(*gaussians, cameras, sh_degree, "D" in render_mode, threads or os.cpu_count() or 1)
-    if hasattr(means, "detach"):
-        from cpusplat import torch_call
-
-        from_numpy, join = torch_call.from_numpy, torch_call.join
-        images, alphas, means2d, depths = torch_call.draw(views, *gaussians)
-    else:
-        from_numpy, join, opacities = np.asarray, np.concatenate, views.opacities
-        means2d, depths = views.project()
-        images, alphas = views.blend()
-    images, depth = images[..., : images.shape[-1] - views.has_depth], images[..., -views.has_depth :]
-    if backgrounds is not None:
+    is_torch = hasattr(means, "detach")
+    library: Any = import_module("torch" if is_torch else "numpy")
+    draw = import_module("cpusplat.torch_call").draw if is_torch else _draw_arrays
+    images, alphas, means2d, depths = draw(views, *gaussians)
+    num_colours = images.shape[-1] - int(views.has_depth)
+    images, depth = images[..., :num_colours], images[..., num_colours:]
+    if backgrounds is not None and "RGB" in render_mode:
         images = images + (1 - alphas) * backgrounds[:, None, None, :]
     if render_mode.endswith("ED"):
         depth = depth / alphas.clip(1e-10)
     meta = {
         "means2d": means2d,
         "depths": depths,
-        "radii": from_numpy(views.radii()),
-        "opacities": join([opacities[None]] * len(cameras)),
+        "radii": library.asarray(views.radii()),
+        "opacities": library.concatenate([opacities[None]] * len(cameras)),
         "width": width,
         "height": height,
         "n_cameras": len(cameras),
     }
-    return join([images, depth], -1) if views.has_depth else images, alphas, meta
+    return library.concatenate([images, depth], -1), alphas, meta
+
+
+def _draw_arrays(views: ActivatedViews, *_: Any) -> tuple[np.ndarray, ...]:
+    means2d, depths = views.project()
+    return *views.blend(), means2d, depths
 
 
 def _refuse_unsupported(arguments: dict[str, Any]) -> None:
     for name, value in arguments.items():
         if name not in SUPPORTED and name not in IGNORED:
             raise TypeError(f"rasterization() got an unexpected keyword argument {name!r}")
-        if name in SUPPORTED and value is not SUPPORTED[name] and value != SUPPORTED[name]:
-            raise NotImplementedError(f"{name} = {value!r} is not supported, only {SUPPORTED[name]!r}")
+        only = SUPPORTED.get(name)
+        if name in SUPPORTED and value is not only and (only is None or value != only):
+            raise NotImplementedError(f"{name} = {value!r} is not supported, only {only!r}")
 
 
 def _constant(name: str, values: Any) -> Any:

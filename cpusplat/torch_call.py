@@ -7,9 +7,6 @@ from torch import Tensor
 
 from cpusplat.activated import ActivatedViews
 
-join = torch.cat
-from_numpy = torch.from_numpy
-
 
 def draw(
     views: ActivatedViews,
@@ -48,8 +45,9 @@ class _Projection(torch.autograd.Function):
 class _Blending(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, views: ActivatedViews, *inputs: Tensor | None) -> tuple[Tensor, ...]:
-        ctx.views, ctx.has_colours = views, inputs[3] is not None
-        ctx.has_shared_colours = ctx.has_colours and inputs[3].ndim == 2
+        colours = inputs[3]
+        ctx.views, ctx.has_colours = views, colours is not None
+        ctx.has_shared_colours = colours is not None and colours.ndim == 2
         return tuple(map(torch.from_numpy, views.blend()))
 
     @staticmethod

@@ -15,7 +15,7 @@ from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.rasterise import cuda, device, parity
 from hilsplat.splat.rasterise.api import draw, pixel_weights
 from hilsplat.splat.rasterise.device import choose_device
-from tests.unit.splat import gsplat_on_cpu
+from tests.cpusplat import gsplat_on_cpu
 from tests.unit.splat.rasterise_scenes import camera, random_gaussians
 
 
