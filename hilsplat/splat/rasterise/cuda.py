@@ -26,6 +26,13 @@ TILE = 16  # side of a gsplat tile, px
 EVERYTHING = 2**31 - 1  # a number larger than any tile's batch index
 
 
+def run_a_kernel() -> None:
+    """Evaluate spherical harmonics of one Gaussian."""
+    import gsplat
+
+    gsplat.spherical_harmonics(0, torch.ones(1, 3, device=DEVICE), torch.ones(1, 1, 3, device=DEVICE))
+
+
 def on_device(gaussians: Gaussians) -> dict[str, Tensor]:
     """Copy the fields of Gaussians to the device; raise an error if one cannot be drawn (`refuse_broken`)."""
     g = {name: torch.from_numpy(getattr(gaussians, name)).to(DEVICE) for name in FIELDS}
