@@ -54,7 +54,7 @@ def _folder_of(package: str) -> str:
     """
     own = Path(__file__).parent
     root = Path(next(iter(getattr(sys.modules.get(package), "__path__", [own]))))
-    files = sorted({*own.glob("*.py"), *root.rglob("*kernels.py")})
+    files = sorted({*own.glob("*.py"), *_kernel_modules(root)})
     digest = hashlib.sha256()
     for file in files:
         # with the time: if a file is edited while a process starts, and restored later, it counts as new
@@ -74,6 +74,12 @@ def _folder_of(package: str) -> str:
             if _FOLDER.fullmatch(other.name) and idle_days > MAX_IDLE_DAYS:
                 shutil.rmtree(other, ignore_errors=True)
     return str(folder)
+
+
+def _kernel_modules(root: Path) -> Iterator[Path]:
+    for folder, folders, files in os.walk(root):
+        folders[:] = [name for name in folders if name != "__pycache__"]  # it has thousands of files
+        yield from (Path(folder, name) for name in files if name.endswith("kernels.py"))
 
 
 @contextmanager
