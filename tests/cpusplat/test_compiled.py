@@ -101,9 +101,7 @@ def test_machine_code_of_other_versions_is_deleted_once_unused(package, monkeypa
     assert left == {own.name, "kernels-fedcba9876543210", "kernels-mine"}
 
 
-def test_machine_code_of_a_read_only_package_is_in_the_users_cache(
-    package, monkeypatch, tmp_path
-):
+def test_machine_code_of_a_read_only_package_is_in_the_users_cache(package, monkeypatch, tmp_path):
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     assert folder_of(monkeypatch, package).parent == tmp_path / "cache/cpusplat"
