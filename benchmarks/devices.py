@@ -24,8 +24,8 @@ from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.initial import TrainingView
 from hilsplat.splat.optimise import Adam
 from hilsplat.splat.rasterise.api import draw, pixel_weights
+from hilsplat.splat.rasterise.drawn import Device
 from hilsplat.splat.rasterise.parity import disagreement
-from hilsplat.splat.rasterise.views import Device
 
 SIZES_TIMED = {**SIZES, "1M 986x728": (1_000_000, (728, 986))}
 WARM_UP_S, TIMED_S, MIN_ROUNDS = 0.5, 2.0, 3

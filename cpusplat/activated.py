@@ -4,9 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from cpusplat.project import LN_2, LOG2_E, LOG2_MIN_ALPHA
+from cpusplat.project import LN_2, LOG2_E, LOG2_MIN_ALPHA, MOMENTS
 from cpusplat.views import (
-    MOMENTS,
     Parameters,
     Projected,
     blend_forward,

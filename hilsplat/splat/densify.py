@@ -23,7 +23,7 @@ from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.gaussians import FIELDS
 from hilsplat.splat.kernels import noise_rows
 from hilsplat.splat.optimise import Adam
-from hilsplat.splat.rasterise.views import Gradients
+from hilsplat.splat.rasterise.drawn import Gradients
 
 SMALL = 0.01
 """Gaussians whose largest axis exceeds this (in units of the extent) are split; others are cloned (3DGS)."""

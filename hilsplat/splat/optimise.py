@@ -7,7 +7,7 @@ import numpy as np
 from cpusplat.adam import adam_step
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.gaussians import FIELDS, Gaussians
-from hilsplat.splat.rasterise.views import Gradients
+from hilsplat.splat.rasterise.drawn import Gradients
 
 OPACITY_RATE = 0.05  # 3DGS
 SH_REST_SHARE = 1 / 20

@@ -5,20 +5,11 @@ from jaxtyping import Float32
 from scipy.sparse import csr_matrix
 
 from cpusplat import views
-from cpusplat.project import pack_camera
-from cpusplat.views import (
-    MOMENTS,
-    Parameters,
-    Projected,
-    blend_forward,
-    blend_gradients,
-    project_gradients,
-    sparse_weights,
-)
+from cpusplat.project import MOMENTS, pack_camera
 from hilsplat.base.errors import HilsplatError
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
-from hilsplat.splat.rasterise.views import Device, Drawn, Gradients, refuse_broken, weight_matrix
+from hilsplat.splat.rasterise.drawn import Device, Drawn, Gradients, refuse_broken, weight_matrix
 
 
 def render(
@@ -65,20 +56,20 @@ def draw(
     channels = view.colours
     if features is not None:
         channels = np.concatenate([channels, features], axis=1)
-    image, alpha = blend_forward(view, channels, threads)
+    image, alpha = views.blend_forward(view, channels, threads)
 
     def gradients(grad_image: np.ndarray, grad_alpha: np.ndarray) -> Gradients:
-        sums = blend_gradients(view, channels, image, alpha, grad_image, grad_alpha, threads)
-        by_parameter, by_mean_px = project_gradients(view, sums, threads)
+        sums = views.blend_gradients(view, channels, image, alpha, grad_image, grad_alpha, threads)
+        by_parameter, by_mean_px = views.project_gradients(view, sums, threads)
         by_feature = sums[: len(gaussians), MOMENTS + 3 : MOMENTS + channels.shape[1]].copy()
         return Gradients(**by_parameter._asdict(), features=by_feature, means_px=by_mean_px)
 
     return Drawn(image, alpha, view.drawn, gradients)
 
 
-def project_gaussians(gaussians: Gaussians, camera: Camera, degree: int, threads: int) -> Projected:
+def project_gaussians(gaussians: Gaussians, camera: Camera, degree: int, threads: int) -> views.Projected:
     """Project all Gaussians into a view on the CPU; raise the errors of `draw`."""
-    parameters = Parameters(*(getattr(gaussians, name) for name in FIELDS))
+    parameters = views.Parameters(*(getattr(gaussians, name) for name in FIELDS))
     row = pack_camera(camera.cam_from_world, camera.K, camera.size_hw)
     view = views.project_gaussians(parameters, row, degree, threads)
     refuse_broken(view.broken, len(gaussians))
@@ -98,4 +89,4 @@ def pixel_weights(
 
         return cuda.pixel_weights(gaussians, camera, min_weight)
     view = project_gaussians(gaussians, camera, 0, threads)
-    return weight_matrix(*sparse_weights(view, min_weight, threads), len(gaussians))
+    return weight_matrix(*views.sparse_weights(view, min_weight, threads), len(gaussians))

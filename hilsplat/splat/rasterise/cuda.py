@@ -18,7 +18,7 @@ from cpusplat.blend import MAX_ALPHA
 from cpusplat.project import LOW_PASS_PX2, NEAR
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
-from hilsplat.splat.rasterise.views import Drawn, Gradients, refuse_broken, weight_matrix
+from hilsplat.splat.rasterise.drawn import Drawn, Gradients, refuse_broken, weight_matrix
 
 DEVICE = "cuda"  # tests set this to `cpu` and use gsplat's reference implementation in torch
 

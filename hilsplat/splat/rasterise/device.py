@@ -12,8 +12,8 @@ from typing import Literal
 
 from hilsplat.base.cache import forget, remembered
 from hilsplat.base.errors import DeviceError, first_line
+from hilsplat.splat.rasterise.drawn import Device
 from hilsplat.splat.rasterise.parity import KIND, cuda_disagreement
-from hilsplat.splat.rasterise.views import Device
 
 logger = logging.getLogger(__name__)
 

@@ -7,7 +7,7 @@ from hilsplat.base.code import code_digest
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise import api
-from hilsplat.splat.rasterise.views import Device
+from hilsplat.splat.rasterise.drawn import Device
 
 KIND = "cuda"
 """Kind of `remembered` results about CUDA."""

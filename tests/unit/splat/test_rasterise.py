@@ -12,7 +12,7 @@ from hilsplat.base.errors import HilsplatError
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise.api import draw, pixel_weights, render
 from hilsplat.splat.rasterise.device import Device, cuda_problem
-from hilsplat.splat.rasterise.views import Gradients
+from hilsplat.splat.rasterise.drawn import Gradients
 from tests.unit.splat.rasterise_scenes import (
     camera,
     leaves,
