@@ -26,6 +26,7 @@ SUPPORTED: dict[str, Any] = {
     "tangential_coeffs": None,
     "thin_prism_coeffs": None,
     "ftheta_coeffs": None,
+    "rolling_shutter": None,
     "viewmats_rs": None,
 }
 """The only value that each of these arguments of gsplat's may have."""
@@ -114,9 +115,12 @@ def rasterization(
     num_colours = images.shape[-1] - int(views.has_depth)
     images, depth = images[..., :num_colours], images[..., num_colours:]
     if backgrounds is not None and "RGB" in render_mode:
-        images = images + (1 - alphas) * backgrounds[:, None, None, :]
+        behind = as_array("backgrounds", backgrounds, len(cameras), num_colours)
+        behind = backgrounds.to(images.dtype) if is_torch else behind
+        images = images + (1 - alphas) * behind[:, None, None, :]
     if render_mode.endswith("ED"):
         depth = depth / alphas.clip(1e-10)
+    images = library.concatenate([images, depth], -1) if views.has_depth else images
     meta = {
         "means2d": means2d,
         "depths": depths,
@@ -126,7 +130,7 @@ def rasterization(
         "height": height,
         "n_cameras": len(cameras),
     }
-    return library.concatenate([images, depth], -1), alphas, meta
+    return images, alphas, meta
 
 
 def _draw_arrays(views: ActivatedViews, *_: Any) -> tuple[np.ndarray, ...]:

@@ -110,6 +110,8 @@ def test_no_gaussians_render_the_background():
         ({"rasterize_mode": "antialiased"}, NotImplementedError, "rasterize_mode = 'antialiased'"),
         ({"camera_model": "fisheye"}, NotImplementedError, "camera_model = 'fisheye'"),
         ({"radius_clip": 3.0}, NotImplementedError, "radius_clip = 3.0"),
+        ({"rolling_shutter": "GLOBAL"}, NotImplementedError, "rolling_shutter"),
+        ({"backgrounds": np.ones(3)}, ValueError, r"backgrounds has the shape \[3\]; expected \[1, 3\]"),
         ({"covars": np.eye(3)}, NotImplementedError, "covars"),
         ({"tile_sise": 8}, TypeError, "tile_sise"),
         ({"render_mode": "depth"}, ValueError, "render_mode is 'depth'; expected one of RGB, D, ED"),
