@@ -62,9 +62,7 @@ class ActivatedViews:
         n = len(self.means)
         self.scales, self.opacities = as_array("scales", scales, n, 3), as_array("opacities", opacities, n)
         if not (self.scales >= 0).all() or not ((self.opacities >= 0) & (self.opacities <= 1)).all():
-            raise ValueError(
-                "scales must not be negative; opacities must be from 0 to 1; NaN is neither"
-            )
+            raise ValueError("scales must not be negative; opacities must be from 0 to 1; NaN is neither")
         self.quats = as_array("quats", quats, n, 4)
         self.cameras, self.degree, self.has_depth, self.threads = cameras, degree, has_depth, threads
         self.sh, self.colours = np.zeros((n, 1, 3), np.float32), None
