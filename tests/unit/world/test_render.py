@@ -97,7 +97,7 @@ def test_omitted_shadow_rays_do_not_change_the_image(monkeypatch):
     camera = camera_at((-2.0, 0, 0.9))
     image = render_view(scene, camera, 3)
     # Every hit then receives light and sky.
-    monkeypatch.setattr(render, "_receivers", lambda prim, *_: (np.flatnonzero(prim >= 0),) * 2)
+    monkeypatch.setattr(render, "receivers", lambda prim, *_: (np.flatnonzero(prim >= 0),) * 2)
     assert np.array_equal(image, render_view(scene, camera, 3))
 
 
