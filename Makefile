@@ -42,7 +42,7 @@ lint: $(STAMP)
 	snakemake --lint --configfile config/ci.yaml
 
 test: lint
-	python -m pytest --numprocesses $(CORES) --dist loadfile --no-loadscope-reorder tests/workflow tests/browser tests/bad_inputs tests/damage tests/published_models tests/imports tests/unit
+	python -m pytest --numprocesses $(CORES) --dist loadfile --no-loadscope-reorder tests/workflow tests/browser tests/bad_inputs tests/damage tests/published_models tests/imports tests/unit tests/cpusplat
 
 # The variable turns off mkdocs-material's notice about MkDocs 2, which pyproject.toml excludes.
 docs: $(STAMP)

@@ -24,7 +24,7 @@ from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.initial import TrainingView
 from hilsplat.splat.optimise import Adam
 from hilsplat.splat.rasterise.api import draw, pixel_weights
-from hilsplat.splat.rasterise.device import Device
+from hilsplat.splat.rasterise.drawn import Device
 from hilsplat.splat.rasterise.parity import disagreement
 
 SIZES_TIMED = {**SIZES, "1M 986x728": (1_000_000, (728, 986))}

@@ -24,7 +24,8 @@ def peaks_mib(num_gaussians: int, size_hw: tuple[int, int], channels: int) -> tu
 
 def _measure(num_gaussians: int, size_hw: tuple[int, int], channels: int) -> tuple[float, float]:
     from benchmarks.scenes import random_scene
-    from hilsplat.splat.rasterise.cpu import blend_forward, blend_gradients, project_gaussians
+    from cpusplat.views import blend_forward, blend_gradients, project_gradients
+    from hilsplat.splat.rasterise.api import project_gaussians
 
     def passes(num: int, size_hw: tuple[int, int]) -> tuple[float, float]:
         gaussians, camera = random_scene(num, size_hw)
@@ -37,7 +38,7 @@ def _measure(num_gaussians: int, size_hw: tuple[int, int], channels: int) -> tup
         values = np.concatenate([view.colours, features], axis=1) if channels > 3 else view.colours
         image, alpha = blend_forward(view, values, 1)
         forward = status_mib("VmHWM") - before
-        blend_gradients(gaussians, view, values, image, alpha, *grad, 1)
+        project_gradients(view, blend_gradients(view, values, image, alpha, *grad, 1), 1)
         return forward, status_mib("VmHWM") - before
 
     passes(1000, (32, 32))  # load the kernels before measuring

@@ -14,19 +14,15 @@ import pytest
 from benchmarks.goals import Goal
 from benchmarks.memory import peaks_mib
 from benchmarks.scenes import SIZES, random_scene
+from cpusplat.photometric import photometric_loss
+from cpusplat.views import blend_forward, blend_gradients, project_gradients
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.densify import ScreenGradients
 from hilsplat.splat.fit import FitState, fit_step
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.initial import TrainingView
 from hilsplat.splat.optimise import Adam
-from hilsplat.splat.photometric import photometric_loss
-from hilsplat.splat.rasterise.cpu import (
-    blend_forward,
-    blend_gradients,
-    project_gaussians,
-    sparse_weights,
-)
+from hilsplat.splat.rasterise.api import pixel_weights, project_gaussians
 
 LARGE = "100k 800x600"
 HALF_WAY = 500_000
@@ -61,7 +57,7 @@ def name(what: str, scene: str, threads: int, channels: int | None = None) -> st
 def scene_of(scene: str) -> tuple:
     """Return camera, Gaussians, and number of hits (Gaussians blended at pixels) of a scene."""
     gaussians, camera = random_scene(*SIZES[scene])
-    hits = sparse_weights(project_gaussians(gaussians, camera, 3, 2), 0.0, 2)
+    hits = pixel_weights(gaussians, camera, min_weight=0.0, threads=2)
     return camera, gaussians, hits.nnz
 
 
@@ -100,7 +96,8 @@ def test_backward(benchmark, scene, channels, threads):
     grads = [rng.normal(size=shown.shape).astype(np.float32) for shown in (image, alpha)]
 
     def backward():
-        return blend_gradients(gaussians, view, values, image, alpha, *grads, threads)
+        sums = blend_gradients(view, values, image, alpha, *grads, threads)
+        return project_gradients(view, sums, threads)[0]
 
     benchmark.extra_info |= {"case": name("backward", scene, threads, channels), "threads": threads}
     benchmark.extra_info |= {"count": hits, "of": "hits", "flop": hits * (40 + 4 * channels)}

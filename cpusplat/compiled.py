@@ -1,14 +1,111 @@
-"""Loops compiled by numba, with the GIL released and cached on disk."""
+"""Loops compiled by numba, with the GIL released and cached on disk; compiling is announced in the log.
 
+numba recompiles a cached loop if the loop's own file changes, but not if a loop that it calls, from another
+file, changes. Machine code is therefore kept in a folder whose name is a digest of all files with loops: the
+modules of this package, and the modules of the loop's own package whose names end in `kernels`.
+"""
+
+import functools
+import hashlib
 import inspect
-from collections.abc import Callable
+import logging
+import os
+import re
+import shutil
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import numba
+from numba.core import event
+
+logger = logging.getLogger(__name__)
+config: Any = numba.config
+
+MAX_IDLE_DAYS = 30.0
+"""Machine code of other versions is deleted if no process has used it for this long."""
+
+_FOLDER = re.compile(r"kernels-[0-9a-f]{16}")
+_lock = threading.Lock()
+_packages = set[str]()  # with loops of this kind
 
 
 def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     """Apply `numba.njit` with the GIL released, and cache the machine code on disk."""
     if function is None:
         return lambda later: compiled(later, **options)
-    return numba.njit(nogil=True, cache=True, **options)(inspect.unwrap(function))
+    function = inspect.unwrap(function)  # type checkers of tests wrap functions
+    package = function.__module__.partition(".")[0]
+    _packages.add(package)
+    with _cache_in(_folder_of(package)):
+        return numba.njit(nogil=True, cache=True, **options)(function)
+
+
+@functools.cache
+def _folder_of(package: str) -> str:
+    """Return the folder for a package's machine code; delete folders that have long been unused.
+
+    It is in `NUMBA_CACHE_DIR` if that is set, else in the package if it can be written, else in the user's
+    cache folder.
+    """
+    own = Path(__file__).parent
+    root = Path(next(iter(getattr(sys.modules.get(package), "__path__", [own]))))
+    files = sorted({*own.glob("*.py"), *_kernel_modules(root)})
+    digest = hashlib.sha256()
+    for file in files:
+        # with the time: if a file is edited while a process starts, and restored later, it counts as new
+        stamp = f"{file.parent.name}/{file.name} {file.stat().st_mtime_ns}\n"
+        digest.update(stamp.encode() + file.read_bytes())
+    parent = root / "__pycache__"
+    if config.CACHE_DIR:
+        parent = Path(config.CACHE_DIR)
+    elif not os.access(parent if parent.exists() else root, os.W_OK):
+        parent = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "cpusplat"
+    folder = parent / f"kernels-{digest.hexdigest()[:16]}"
+    with suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        os.utime(folder)
+        for other in parent.iterdir():
+            idle_days = (time.time() - other.stat().st_mtime) / 86400
+            if _FOLDER.fullmatch(other.name) and idle_days > MAX_IDLE_DAYS:
+                shutil.rmtree(other, ignore_errors=True)
+    return str(folder)
+
+
+def _kernel_modules(root: Path) -> Iterator[Path]:
+    for folder, folders, files in os.walk(root):
+        folders[:] = [name for name in folders if name != "__pycache__"]  # it has thousands of files
+        yield from (Path(folder, name) for name in files if name.endswith("kernels.py"))
+
+
+@contextmanager
+def _cache_in(folder: str) -> Iterator[None]:
+    """Let numba choose a folder for the loops that are declared in the block."""
+    with _lock:
+        before, config.CACHE_DIR = config.CACHE_DIR, folder
+        try:
+            yield
+        finally:
+            config.CACHE_DIR = before
+
+
+class _Notice(event.Listener):
+    """Logs one notice when loops are compiled; loading them from the cache raises no event."""
+
+    is_given = False
+
+    def on_start(self, happening: Any) -> None:
+        module = happening.data["dispatcher"].py_func.__module__ or ""
+        if not self.is_given and module.partition(".")[0] in _packages:
+            self.is_given = True
+            logger.info("compiling kernels, which takes about 15 s; later runs load them from disk")
+
+    def on_end(self, happening: Any) -> None:
+        pass
+
+
+event.register("numba:compile", _Notice())

@@ -46,7 +46,7 @@ class LanesType(types.Type):
 LANES = LanesType(types.float32)
 WIDE = LanesType(types.float64)
 QUAD = LanesType(types.float32, 4)
-"""Four lanes, for rows of a few numbers; the only functions for them here are `load_quad` and `store`."""
+"""Four lanes, for rows of a few numbers: `quad`, `load_quad`, `store`, `plus` and `signs_of_difference`."""
 _OF = {types.float32: LANES, types.float64: WIDE}
 
 
@@ -138,6 +138,12 @@ def lanes(builder, scalar):
     return splat(builder, scalar)
 
 
+@_operation(QUAD, types.float32)
+def quad(builder, scalar):
+    """Return four lanes that all contain the same float32 number."""
+    return splat(builder, scalar, 4)
+
+
 @intrinsic
 def load(typingctx, array, index):
     """Load 16 consecutive numbers from a flat float32 or float64 array."""
@@ -175,6 +181,49 @@ def store(typingctx, array, index, value):
         return context.get_dummy_value()
 
     return types.void(array, types.intp, value), codegen
+
+
+@intrinsic
+def plus(typingctx, total, scales, values):
+    """Return total + scales * values; each product is rounded before it is added, as in plain loops."""
+
+    def codegen(context, builder, sig, args):
+        return builder.fadd(args[0], builder.fmul(args[1], args[2]))  # without flags, so never fused
+
+    return total(total, total, total), codegen
+
+
+@_operation(QUAD, QUAD, QUAD, types.float32)
+def signs_of_difference(builder, a, b, scale):
+    """Return scale where a > b, -scale where a < b, and 0 where a == b; NaN is preserved."""
+    zeros = ir.Constant(QUAD.vector, None)
+    apart, up = builder.fsub(a, b), splat(builder, scale, 4)
+    above = builder.fcmp_ordered(">", apart, zeros)
+    below = builder.fcmp_ordered("<", apart, zeros)
+    return builder.select(above, up, builder.select(below, builder.fneg(up), apart))
+
+
+@intrinsic
+def add_products(typingctx, sums, at, a, b, c, scale):
+    """Add scale * (a, b, c, 0) to four float64 sums from index `at`, as one vector and never fused.
+
+    Returns the previous value of the first sum.
+    """
+
+    def codegen(context, builder, sig, args):
+        number, lane = ir.DoubleType(), ir.IntType(32)
+        four = ir.VectorType(number, 4)
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        place = builder.bitcast(builder.gep(data, [args[1]]), four.as_pointer())
+        weights = ir.Constant(four, [ir.Constant(number, 0.0)] * 4)
+        for index, value in enumerate(args[2:5]):
+            weights = builder.insert_element(weights, value, ir.Constant(lane, index))
+        before = builder.load(place, align=8)
+        products = builder.fmul(weights, splat(builder, args[5], 4))
+        builder.store(builder.fadd(before, products), place, align=8)
+        return builder.extract_element(before, ir.Constant(lane, 0))
+
+    return types.float64(sums, types.intp, *[types.float64] * 4), codegen
 
 
 @_operation(WIDE, LANES)

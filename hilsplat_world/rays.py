@@ -13,27 +13,14 @@ from functools import cache
 import llvmlite.binding
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
-from numba import types
 
-from cpusplat.compiled import compiled
-
-LANES = 16
-"""Number of rays in a packet."""
+from hilsplat_world.kernels import blocked_rays, nearest_hits
 
 # Constants from Embree's headers (rtcore_scene.h, rtcore_geometry.h, rtcore_buffer.h, rtcore_common.h).
 _ROBUST_SCENE = 4
 _TRIANGLES = 0
 _INDICES, _VERTICES = 0, 1
 _THREE_UINTS, _THREE_FLOATS = 0x5003, 0x9003
-_COHERENT = 1 << 16
-
-# Rows of RTCRayHit16: 12 for the rays and 9 for the hits.
-_DIRECTION, _FAR, _MASK, _U, _V, _TRIANGLE, _GEOMETRY = 4, 8, 9, 15, 16, 17, 18
-_RAY_ROWS, _ROWS = 12, 21
-
-_call = types.void(types.intp, types.intp, types.intp, types.intp)  # valid lanes, scene, packet, arguments
-_intersect = types.ExternalFunction("rtcIntersect16", _call)
-_occluded = types.ExternalFunction("rtcOccluded16", _call)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +73,7 @@ class RayCaster:
         """
         count = len(directions)
         hits = Hits(np.empty(count, np.int32), *(np.empty(count, np.float32) for _ in range(3)))
-        _nearest(self._scene, *_rows(origins, directions), hits.triangle, hits.u, hits.v, hits.distance)
+        nearest_hits(self._scene, *_rows(origins, directions), hits.triangle, hits.u, hits.v, hits.distance)
         return hits
 
     def blocked(
@@ -97,7 +84,7 @@ class RayCaster:
     ) -> Bool[np.ndarray, " R"]:
         """Return whether each ray hits something within `reach`, a multiple of its direction's length."""
         found = np.empty(len(directions), np.bool_)
-        _blocked(self._scene, *_rows(origins, directions), reach, found)
+        blocked_rays(self._scene, *_rows(origins, directions), reach, found)
         return found
 
 
@@ -130,66 +117,3 @@ def _embree() -> tuple[ctypes.CDLL, int]:
         function = getattr(embree, name)
         function.restype, function.argtypes = result, taken
     return embree, embree.rtcNewDevice(b"threads=1")
-
-
-@compiled
-def _aligned(rows):
-    """Return an uninitialised packet aligned to 64 bytes, as Embree requires."""
-    space = np.empty((rows + 1) * LANES, np.float32)
-    skipped = (-space.ctypes.data // 4) % LANES
-    return space[skipped : skipped + rows * LANES].reshape(rows, LANES)
-
-
-@compiled
-def _new_packet(rows):
-    """Return a packet of rays that start at distance 0, its lane mask, and arguments for coherent rays."""
-    packet, valid, arguments = _aligned(rows), _aligned(1), np.zeros(8, np.int64)
-    packet[:] = 0
-    packet.view(np.int32)[_MASK] = -1
-    if rows > _RAY_ROWS:
-        packet.view(np.int32)[_TRIANGLE:] = -1
-    arguments.view(np.int32)[0], arguments.view(np.int32)[1] = _COHERENT, -1  # all features
-    return packet, valid.view(np.int32)[0], arguments
-
-
-@compiled(forceinline=True)
-def _load(packet, valid, origins, directions, first):
-    """Load the next rays into a packet and return their number."""
-    step = 1 if len(origins) > 1 else 0
-    count = min(LANES, len(directions) - first)
-    for lane in range(count):
-        row = first + lane
-        for axis in range(3):
-            packet[axis, lane] = origins[row * step, axis]
-            packet[_DIRECTION + axis, lane] = directions[row, axis]
-    for lane in range(LANES):
-        valid[lane] = -1 if lane < count else 0
-    return count
-
-
-@compiled
-def _nearest(scene, origins, directions, triangle, u, v, distance):
-    packet, valid, arguments = _new_packet(_ROWS)
-    ids = packet.view(np.int32)
-    for first in range(0, len(directions), LANES):
-        count = _load(packet, valid, origins, directions, first)
-        packet[_FAR] = np.inf
-        ids[_TRIANGLE] = -1
-        ids[_GEOMETRY] = -1
-        _intersect(valid.ctypes.data, scene, packet.ctypes.data, arguments.ctypes.data)
-        for lane in range(count):
-            triangle[first + lane] = ids[_TRIANGLE, lane]
-            u[first + lane], v[first + lane] = packet[_U, lane], packet[_V, lane]
-            distance[first + lane] = packet[_FAR, lane]
-
-
-@compiled
-def _blocked(scene, origins, directions, reach, found):
-    packet, valid, arguments = _new_packet(_RAY_ROWS)
-    for first in range(0, len(directions), LANES):
-        count = _load(packet, valid, origins, directions, first)
-        for lane in range(count):
-            packet[_FAR, lane] = reach[first + lane]
-        _occluded(valid.ctypes.data, scene, packet.ctypes.data, arguments.ctypes.data)
-        for lane in range(count):
-            found[first + lane] = packet[_FAR, lane] < 0  # Embree marks a hit with -inf

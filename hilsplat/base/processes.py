@@ -3,7 +3,6 @@
 import ctypes
 import functools
 import hashlib
-import itertools
 import logging
 import os
 import secrets
@@ -220,18 +219,6 @@ def _begin_alone(parent: int, stderr: Path) -> None:
     end_with_parent(parent)
     with stderr.open("wb") as stream:
         os.dup2(stream.fileno(), 2)
-
-
-@functools.cache
-def _threads(number: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(number, thread_name_prefix="ranges")
-
-
-def over_edges(work: Callable[..., Any], edges: list[int], threads: int, *arguments: Any) -> list[Any]:
-    """Call `work(begin, end, *arguments)` for each adjacent pair of `edges` in threads; keep their order."""
-    if threads <= 1:
-        return [work(begin, end, *arguments) for begin, end in itertools.pairwise(edges)]
-    return list(_threads(threads).map(lambda begin, end: work(begin, end, *arguments), edges[:-1], edges[1:]))
 
 
 def in_order(work: Callable[[Item], Result], items: Sequence[Item], threads: int) -> Iterator[Result]:

@@ -1,31 +1,10 @@
 """Quaternions (wxyz), rotation matrices and conversions between them."""
 
-from typing import no_type_check
-
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from cpusplat.compiled import compiled
-
 RIGID_TOLERANCE = 1e-3
 """Maximum deviation of a camera's R R' from the identity; poses in text files may have only four digits."""
-
-
-@compiled(inline="always")
-@no_type_check
-def matrix_entries(w, x, y, z):
-    """Return the nine entries of a unit quaternion's rotation matrix, row by row; for compiled loops."""
-    return (
-        1.0 - 2.0 * (y * y + z * z),
-        2.0 * (x * y - w * z),
-        2.0 * (x * z + w * y),
-        2.0 * (x * y + w * z),
-        1.0 - 2.0 * (x * x + z * z),
-        2.0 * (y * z - w * x),
-        2.0 * (x * z - w * y),
-        2.0 * (y * z + w * x),
-        1.0 - 2.0 * (x * x + y * y),
-    )
 
 
 def unit_quaternions(quats: Float[np.ndarray, "N 4"]) -> Float64[np.ndarray, "N 4"]:

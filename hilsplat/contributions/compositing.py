@@ -3,10 +3,9 @@
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float32
-from numba.extending import intrinsic
 
-from cpusplat.compiled import compiled
-from cpusplat.lanes import LANES, WIDTH, lanes, load, store
+from cpusplat.lanes import WIDTH
+from hilsplat.contributions.kernels import add_columns, normalise, render_rows
 
 MIN_ALPHA = 0.5
 """Pixels with a smaller alpha are ignored, because their features would be extrapolated."""
@@ -22,39 +21,16 @@ def normalised_weights(weights: sp.csr_matrix) -> sp.csr_matrix:
     below `MIN_ALPHA` become empty rows. The sum excludes weights that the rasteriser dropped as too small.
     """
     weights.sort_indices()
-    kept = _normalise(weights.indptr, weights.indices, weights.data, MIN_ALPHA)
+    kept = normalise(weights.indptr, weights.indices, weights.data, MIN_ALPHA)
     arrays = (weights.data[:kept], weights.indices[:kept], weights.indptr)
     return sp.csr_matrix(arrays, shape=weights.shape, copy=False)
-
-
-@compiled
-def _normalise(indptr, indices, data, min_alpha):
-    done, begin = np.uint64(0), np.uint64(indptr[0])  # unsigned: skips the check for negative indices
-    for row in range(len(indptr) - 1):
-        end = np.uint64(indptr[row + 1])
-        alpha = 0.0
-        for k in range(begin, end):
-            alpha += data[k]
-        if alpha >= min_alpha:
-            for k in range(begin, end):
-                indices[done] = indices[k]
-                data[done] = data[k] / alpha
-                done += np.uint64(1)
-        begin, indptr[row + 1] = end, done
-    return done
 
 
 def visible_mass(weights: sp.csr_matrix) -> Float32[np.ndarray, " N"]:
     """Return each Gaussian's sum of weights over all pixels (px), computed in float64."""
     out = np.zeros(weights.shape[1], np.float64)
-    _add_columns(weights.indices, weights.data, out)
+    add_columns(weights.indices, weights.data, out)
     return out.astype(np.float32)
-
-
-@compiled
-def _add_columns(indices, data, out):
-    for k in range(len(indices)):
-        out[indices[k]] += data[k]
 
 
 def rendered_latents(
@@ -73,21 +49,9 @@ def rendered_latents(
         wide = padded(features[:, level])
         latents = np.empty((len(pixels), wide.shape[1]), np.float32)
         share = shares[pixels, level]
-        _render(*rows, pixels, share, wide.reshape(-1), wide.shape[1], latents.reshape(-1))
+        render_rows(*rows, pixels, share, wide.reshape(-1), wide.shape[1], latents.reshape(-1))
         levels.append((pixels, latents[:, : features.shape[2]]))
     return levels
-
-
-@compiled
-def _render(indptr, indices, data, pixels, share, features, wide, out):
-    for row in range(len(pixels)):
-        p = pixels[row]
-        begin, end = np.uint64(indptr[p]), np.uint64(indptr[p + 1])
-        for c in range(0, wide, WIDTH):
-            total = lanes(np.float32(0))
-            for k in range(begin, end):
-                total = plus(total, lanes(data[k]), load(features, np.int64(indices[k]) * wide + c))
-            store(out, row * wide + c, total / lanes(share[row]))
 
 
 def padded(rows: Float32[np.ndarray, "*rows D"]) -> Float32[np.ndarray, "*rows E"]:
@@ -96,13 +60,3 @@ def padded(rows: Float32[np.ndarray, "*rows D"]) -> Float32[np.ndarray, "*rows E
     if missing:
         rows = np.concatenate([rows, np.zeros((*rows.shape[:-1], missing), np.float32)], axis=-1)
     return np.ascontiguousarray(rows)
-
-
-@intrinsic
-def plus(typingctx, total, scales, row):
-    """Return total + scales * row; each product is rounded before it is added, as in plain loops."""
-
-    def codegen(context, builder, sig, args):
-        return builder.fadd(args[0], builder.fmul(args[1], args[2]))  # without flags, so never fused
-
-    return LANES(LANES, LANES, LANES), codegen

@@ -1,12 +1,9 @@
 """Compiled loops that sum weights of Gaussians over masks, and products of weights over pixels."""
 
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
 
 from cpusplat.compiled import compiled
-from cpusplat.lanes import prefetch, splat
+from cpusplat.lanes import WIDTH, add_products, lanes, load, plus, prefetch, store
 
 SUMS = 4
 """Number of sums per pair that are stored as one vector: one per level, plus padding."""
@@ -16,6 +13,12 @@ AHEAD = 8
 
 PLACE = np.uint64(2**32 - 1)
 """Bits of a cell (see `transpose`) that contain its place; the higher bits contain its row."""
+
+MEDIAN_SOFTENING = 1e-4
+"""Minimum distance between a latent and the median, to avoid division by zero."""
+
+BLOCK = 2**15
+"""Number of Gaussians per pass of a wide product with A: their features fit into the processor's cache."""
 
 
 @compiled
@@ -96,29 +99,6 @@ def transpose(indptr, indices, begins, cells):
             at = np.uint64(filled[j])
             cells[at] = (np.uint64(p) << np.uint64(32)) | k
             filled[j] = np.uint32(at + np.uint64(1))
-
-
-@intrinsic
-def add_products(typingctx, sums, at, whole, part, subpart, value):
-    """Add `value` times three numbers to the sums at `at`, as one vector and without fused operations.
-
-    Returns the previous value of the first sum.
-    """
-
-    def codegen(context, builder, sig, args):
-        number, lane = ir.DoubleType(), ir.IntType(32)
-        four = ir.VectorType(number, SUMS)
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        place = builder.bitcast(builder.gep(data, [args[1]]), four.as_pointer())
-        weights = ir.Constant(four, [ir.Constant(number, 0.0)] * SUMS)
-        for index, each in enumerate(args[2:5]):
-            weights = builder.insert_element(weights, each, ir.Constant(lane, index))
-        before = builder.load(place, align=8)
-        products = builder.fmul(weights, splat(builder, args[5], SUMS))
-        builder.store(builder.fadd(before, products), place, align=8)
-        return builder.extract_element(before, ir.Constant(lane, 0))
-
-    return types.float64(sums, types.intp, *[types.float64] * 4), codegen
 
 
 @compiled
@@ -244,3 +224,140 @@ def merge_rows(indptr, indices, values, late_indptr, late_indices, late_values):
                 indices[at] = late_indices[t]
                 values[at] = late_values[t]
                 t -= 1
+
+
+@compiled
+def normalise(indptr, indices, data, min_alpha):
+    done, begin = np.uint64(0), np.uint64(indptr[0])  # unsigned: skips the check for negative indices
+    for row in range(len(indptr) - 1):
+        end = np.uint64(indptr[row + 1])
+        alpha = 0.0
+        for k in range(begin, end):
+            alpha += data[k]
+        if alpha >= min_alpha:
+            for k in range(begin, end):
+                indices[done] = indices[k]
+                data[done] = data[k] / alpha
+                done += np.uint64(1)
+        begin, indptr[row + 1] = end, done
+    return done
+
+
+@compiled
+def add_columns(indices, data, out):
+    for k in range(len(indices)):
+        out[indices[k]] += data[k]
+
+
+@compiled
+def render_rows(indptr, indices, data, pixels, share, features, wide, out):
+    for row in range(len(pixels)):
+        p = pixels[row]
+        begin, end = np.uint64(indptr[p]), np.uint64(indptr[p + 1])
+        for c in range(0, wide, WIDTH):
+            total = lanes(np.float32(0))
+            for k in range(begin, end):
+                total = plus(total, lanes(data[k]), load(features, np.int64(indices[k]) * wide + c))
+            store(out, row * wide + c, total / lanes(share[row]))
+
+
+@compiled
+def mask_means(first, last, indptr, indices, data, level_index, features, out):
+    for m in range(first, last):
+        level = level_index[m]
+        for k in range(indptr[m], indptr[m + 1]):
+            g, weight = indices[k], data[k]
+            for c in range(out.shape[1]):
+                out[m, c] += weight * features[g, level, c]
+
+
+@compiled
+def wide_mask_means(first, last, indptr, indices, data, level_index, features, width, out):
+    """Compute `mask_means` for flat features and `out`, with `width` channels per row."""
+    num_gaussians = len(features) // (3 * width)
+    at = indptr[first:last].copy()
+    for begin in range(0, num_gaussians, BLOCK):
+        for m in range(first, last):
+            some = at[m - first]
+            stop = at[m - first] = columns_below(begin + BLOCK, some, indptr[m + 1], indices)
+            for c in range(0, width if some < stop else 0, WIDTH):
+                place = level_index[m] * width + c
+                total = load(out, m * width + c)
+                for k in range(some, stop):
+                    there = np.int64(indices[k]) * 3 * width + place
+                    total = plus(total, lanes(data[k]), load(features, there))
+                store(out, m * width + c, total)
+
+
+@compiled
+def spread_rows(begin, end, indptr, indices, data, level_index, values, width, out):
+    """Add columns begin..end of A' x to `out`; values and `out` are flat, with `width` channels per row."""
+    masks = len(level_index)
+    at = np.empty(masks, np.int64)
+    for m in range(masks):
+        at[m] = indptr[m] + np.searchsorted(indices[indptr[m] : indptr[m + 1]], begin)
+    for block in range(begin, end, BLOCK):
+        for m in range(masks):
+            some = at[m]
+            stop = at[m] = columns_below(min(block + BLOCK, end), some, indptr[m + 1], indices)
+            for c in range(0, width if some < stop else 0, WIDTH):
+                place = level_index[m] * width + c
+                value = load(values, m * width + c)
+                for k in range(some, stop):
+                    there = np.int64(indices[k]) * 3 * width + place
+                    store(out, there, plus(load(out, there), lanes(data[k]), value))
+
+
+@compiled
+def columns_below(limit, begin, end, indices):
+    """Return the end of the columns below `limit` in a row (begin..end of the sorted `indices`)."""
+    while begin < end and indices[begin] < limit:
+        begin += 1
+    return begin
+
+
+@compiled
+def median_step(indptr, indices, data, level_index, pixels, latents, features, sums, weights):
+    for m in range(len(level_index)):
+        level = level_index[m]
+        for k in range(indptr[m], indptr[m + 1]):
+            g = indices[k]
+            square = 0.0
+            for c in range(latents.shape[1]):
+                apart = np.float64(latents[m, c]) - features[g, level, c]
+                square += apart * apart
+            weight = np.float64(pixels[m]) * data[k] / max(np.sqrt(square), MEDIAN_SOFTENING)
+            weights[g, level] += weight
+            for c in range(latents.shape[1]):
+                sums[g, level, c] += weight * latents[m, c]
+
+
+@compiled
+def gram_product(begin, end, indptr, indices, values, features, width, out):
+    """Multiply rows begin..end of the upper triangle and their mirror images; `out` starts at row `begin`.
+
+    Features and `out` are flat, with `width` padded channels per row. In a plain loop over channels, numba's
+    code keeps sums in memory and checks in every pass that arrays do not overlap. Here the sums stay in
+    registers: 62 instead of 168 ms at d = 16 and 6.7 million pairs.
+    """
+    row, origin = 3 * width, 3 * width * begin
+    for i in range(begin, end):
+        for c in range(0, width, WIDTH):
+            here = i * row + c
+            a, b, d = load(features, here), load(features, here + width), load(features, here + 2 * width)
+            own = here - origin
+            whole, part, subpart = load(out, own), load(out, own + width), load(out, own + 2 * width)
+            for k in range(indptr[i], indptr[i + 1]):
+                there = np.int64(indices[k]) * row + c
+                u, v, w = lanes(values[k, 0]), lanes(values[k, 1]), lanes(values[k, 2])
+                whole = plus(whole, u, load(features, there))
+                part = plus(part, v, load(features, there + width))
+                subpart = plus(subpart, w, load(features, there + 2 * width))
+                if there != here:
+                    other = there - origin
+                    store(out, other, plus(load(out, other), u, a))
+                    store(out, other + width, plus(load(out, other + width), v, b))
+                    store(out, other + 2 * width, plus(load(out, other + 2 * width), w, d))
+            store(out, own, whole)
+            store(out, own + width, part)
+            store(out, own + 2 * width, subpart)

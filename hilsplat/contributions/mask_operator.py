@@ -9,16 +9,10 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Float32, Int64, UInt8
 
-from cpusplat.compiled import compiled
-from cpusplat.lanes import WIDTH, lanes, load, store
-from hilsplat.base.processes import over_edges
-from hilsplat.contributions.compositing import padded, plus
-
-MEDIAN_SOFTENING = 1e-4
-"""Minimum distance between a latent and the median, to avoid division by zero."""
-
-BLOCK = 2**15
-"""Number of Gaussians per pass of a wide product with A: their features fit into the processor's cache."""
+from cpusplat.lanes import WIDTH
+from cpusplat.threads import over_edges
+from hilsplat.contributions.compositing import padded
+from hilsplat.contributions.kernels import mask_means, median_step, spread_rows, wide_mask_means
 
 SPREAD_PARTS = 4
 """Number of Gaussian ranges per thread; several balance the load, as the mask count per Gaussian varies."""
@@ -49,9 +43,9 @@ class MaskOperator:
         edges = [0, *shares.tolist(), len(out)]
         if out.dtype == np.float32 and out.shape[1] % WIDTH == 0:
             flat = features.reshape(-1), out.shape[1], out.reshape(-1)
-            over_edges(_wide_means, edges, self.threads, *A, *flat)
+            over_edges(wide_mask_means, edges, self.threads, *A, *flat)
         else:
-            over_edges(_means, edges, self.threads, *A, features, out)
+            over_edges(mask_means, edges, self.threads, *A, features, out)
         return out
 
     def spread(self, values: Float32[np.ndarray, "M D"]) -> Float32[np.ndarray, "N 3 D"]:
@@ -63,7 +57,7 @@ class MaskOperator:
         parts = 1 if self.threads == 1 else SPREAD_PARTS * self.threads
         edges = np.linspace(0, num_gaussians, parts + 1).astype(np.int64).tolist()
         flat = wide.reshape(-1), width, out.reshape(-1)
-        over_edges(_spread, edges, self.threads, *self._arrays(), *flat)
+        over_edges(spread_rows, edges, self.threads, *self._arrays(), *flat)
         return np.ascontiguousarray(out[:, :, : values.shape[1]])
 
     def _arrays(self) -> tuple[np.ndarray, ...]:
@@ -101,78 +95,7 @@ def lifted_median(
     for _ in range(steps):
         sums = np.zeros(features.shape, np.float64)
         weights = np.zeros(features.shape[:2], np.float64)
-        _median_step(*masks._arrays(), pixels, latents, features, sums, weights)
+        median_step(*masks._arrays(), pixels, latents, features, sums, weights)
         seen = weights > 0
         features[seen] = sums[seen] / weights[seen][:, None]
     return features
-
-
-@compiled
-def _means(first, last, indptr, indices, data, level_index, features, out):
-    for m in range(first, last):
-        level = level_index[m]
-        for k in range(indptr[m], indptr[m + 1]):
-            g, weight = indices[k], data[k]
-            for c in range(out.shape[1]):
-                out[m, c] += weight * features[g, level, c]
-
-
-@compiled
-def _wide_means(first, last, indptr, indices, data, level_index, features, width, out):
-    """Compute `_means` for flat features and `out`, with `width` channels per row."""
-    num_gaussians = len(features) // (3 * width)
-    at = indptr[first:last].copy()
-    for begin in range(0, num_gaussians, BLOCK):
-        for m in range(first, last):
-            some = at[m - first]
-            stop = at[m - first] = _columns_below(begin + BLOCK, some, indptr[m + 1], indices)
-            for c in range(0, width if some < stop else 0, WIDTH):
-                place = level_index[m] * width + c
-                total = load(out, m * width + c)
-                for k in range(some, stop):
-                    there = np.int64(indices[k]) * 3 * width + place
-                    total = plus(total, lanes(data[k]), load(features, there))
-                store(out, m * width + c, total)
-
-
-@compiled
-def _spread(begin, end, indptr, indices, data, level_index, values, width, out):
-    """Add columns begin..end of A' x to `out`; values and `out` are flat, with `width` channels per row."""
-    masks = len(level_index)
-    at = np.empty(masks, np.int64)
-    for m in range(masks):
-        at[m] = indptr[m] + np.searchsorted(indices[indptr[m] : indptr[m + 1]], begin)
-    for block in range(begin, end, BLOCK):
-        for m in range(masks):
-            some = at[m]
-            stop = at[m] = _columns_below(min(block + BLOCK, end), some, indptr[m + 1], indices)
-            for c in range(0, width if some < stop else 0, WIDTH):
-                place = level_index[m] * width + c
-                value = load(values, m * width + c)
-                for k in range(some, stop):
-                    there = np.int64(indices[k]) * 3 * width + place
-                    store(out, there, plus(load(out, there), lanes(data[k]), value))
-
-
-@compiled
-def _columns_below(limit, begin, end, indices):
-    """Return the end of the columns below `limit` in a row (begin..end of the sorted `indices`)."""
-    while begin < end and indices[begin] < limit:
-        begin += 1
-    return begin
-
-
-@compiled
-def _median_step(indptr, indices, data, level_index, pixels, latents, features, sums, weights):
-    for m in range(len(level_index)):
-        level = level_index[m]
-        for k in range(indptr[m], indptr[m + 1]):
-            g = indices[k]
-            square = 0.0
-            for c in range(latents.shape[1]):
-                apart = np.float64(latents[m, c]) - features[g, level, c]
-                square += apart * apart
-            weight = np.float64(pixels[m]) * data[k] / max(np.sqrt(square), MEDIAN_SOFTENING)
-            weights[g, level] += weight
-            for c in range(latents.shape[1]):
-                sums[g, level, c] += weight * latents[m, c]

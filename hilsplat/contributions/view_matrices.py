@@ -6,8 +6,8 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Int32
 
+from cpusplat.threads import over_edges
 from hilsplat.base.levels import LEVELS
-from hilsplat.base.processes import over_edges
 from hilsplat.contributions.compositing import visible_mass
 from hilsplat.contributions.kernels import move_to_front, summed_masks
 from hilsplat.contributions.quadratic import StackedWeights

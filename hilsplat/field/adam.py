@@ -2,14 +2,11 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TypeVar, no_type_check
+from typing import TypeVar
 
 import numpy as np
 
-from cpusplat.compiled import compiled
-
-BETA1, BETA2 = 0.9, 0.999  # decay rates of the moments, as in torch
-LEAST_MOMENT = np.float32(1e-36)  # smaller moments are set to 0
+from hilsplat.field.kernels import BETA1, BETA2, adam_step
 
 View = TypeVar("View")
 
@@ -41,18 +38,4 @@ class Adam:
         rate = np.float32(self.rate / (1 - BETA1**self.steps))
         scale = np.float32((1 - BETA2**self.steps) ** -0.5)
         flat = np.ascontiguousarray(gradient, np.float32).reshape(-1)
-        _step(self.values.reshape(-1), flat, *self._moments, rate, scale, np.float32(self.eps))
-
-
-@compiled(error_model="numpy")
-@no_type_check  # the shape checks of the test suite cannot be compiled
-def _step(values, gradient, first, second, rate, scale, eps):
-    """Take one step in place; `rate` is divided by 1 - beta1^t, and `scale` is 1 / sqrt(1 - beta2^t)."""
-    for k in range(len(values)):
-        g = gradient[k]
-        m = np.float32(BETA1) * first[k] + np.float32(1 - BETA1) * g
-        v = np.float32(BETA2) * second[k] + np.float32(1 - BETA2) * g * g
-        # Processors are many times slower with subnormal numbers, which moments of unused units reach.
-        first[k] = m if abs(m) > LEAST_MOMENT else np.float32(0)
-        second[k] = v if v > LEAST_MOMENT else np.float32(0)
-        values[k] -= rate * first[k] / (np.sqrt(second[k]) * scale + eps)
+        adam_step(self.values.reshape(-1), flat, *self._moments, rate, scale, np.float32(self.eps))

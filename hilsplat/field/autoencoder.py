@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from cpusplat.compiled import compiled
 from hilsplat.base.artifacts import read_index, write_index, write_npz
 from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.lineage import sha256_of_file
@@ -28,6 +27,7 @@ from hilsplat.field.code import (
     layers_of,
     unit_rows,
 )
+from hilsplat.field.kernels import swap
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, require_same_masks
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import AutoencoderSettings
@@ -132,16 +132,8 @@ def train_autoencoder(
 def torch_order(count: int, twister: np.random.RandomState) -> Int64[np.ndarray, " n"]:
     """Return the order that `torch.randperm(count)` returns for this generator state."""
     order = np.arange(count)
-    _swap(order, twister.randint(0, 2**32, max(count - 1, 0), np.uint32))
+    swap(order, twister.randint(0, 2**32, max(count - 1, 0), np.uint32))
     return order
-
-
-@compiled
-def _swap(order, drawn):
-    """Swap each element with itself or a later element, chosen by random draws."""
-    for place in range(len(drawn)):
-        other = place + np.int64(drawn[place]) % (len(order) - place)
-        order[place], order[other] = order[other], order[place]
 
 
 def _as_arrays(flat: Float32[np.ndarray, " P"], like: Arrays) -> Arrays:

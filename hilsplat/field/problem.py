@@ -18,9 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from cpusplat.compiled import compiled
 from hilsplat.contributions.mask_operator import MaskOperator, lifted_average, lifted_median
 from hilsplat.contributions.quadratic import Quadratic, level_mass
+from hilsplat.field.kernels import add_by_channel, add_scaled, channel_dots, pull, redirect, scaled_squares
 
 
 @dataclass(frozen=True)
@@ -129,84 +129,3 @@ def _ratio(
 ) -> Float32[np.ndarray, "3 D"]:
     """Return the quotient, or 0 where a channel is already solved."""
     return np.where(below > 0, above / np.where(below > 0, below, 1), 0).astype(np.float32)
-
-
-# One-pass updates and sums over a whole field, without temporaries of that size. They are memory-bound: three
-# levels of sixteen numbers for a million Gaussians take 192 MB, and NumPy reads and writes that much for each
-# operator of an expression. Sums are computed in float64 in a fixed order.
-
-
-@compiled
-def channel_dots(a, b):
-    """Sum the products of two fields (N, 3, D) over Gaussians, per level and channel."""
-    out = np.zeros(a.shape[1:])
-    for n in range(len(a)):
-        for level in range(a.shape[1]):
-            for c in range(a.shape[2]):
-                out[level, c] += np.float64(a[n, level, c]) * np.float64(b[n, level, c])
-    return out
-
-
-@compiled
-def scaled_squares(scale, a):
-    """Return `channel_dots` of a field with itself times scale (N, 3)."""
-    out = np.zeros(a.shape[1:])
-    for n in range(len(a)):
-        for level in range(a.shape[1]):
-            for c in range(a.shape[2]):
-                value = a[n, level, c]
-                out[level, c] += np.float64(value) * np.float64(scale[n, level] * value)
-    return out
-
-
-@compiled
-def add_scaled(factor, scale, a, out):
-    """Add factor times scale (N, 3) times a field to `out`."""
-    for n in range(len(a)):
-        for level in range(a.shape[1]):
-            weight = factor * scale[n, level]
-            for c in range(a.shape[2]):
-                out[n, level, c] += weight * a[n, level, c]
-
-
-@compiled
-def add_by_channel(factors, a, out):
-    """Add a field times the factor (3, D) of each level and channel to `out`."""
-    for n in range(len(a)):
-        for level in range(a.shape[1]):
-            for c in range(a.shape[2]):
-                out[n, level, c] += factors[level, c] * a[n, level, c]
-
-
-@compiled
-def redirect(scale, residual, ratio, direction):
-    """Update the conjugate direction: scale (N, 3) times residual plus ratio (3, D) times the last one."""
-    for n in range(len(residual)):
-        for level in range(residual.shape[1]):
-            for c in range(residual.shape[2]):
-                step = scale[n, level] * residual[n, level, c]
-                direction[n, level, c] = step + ratio[level, c] * direction[n, level, c]
-
-
-@compiled
-def add_slope(factor, curved, right, scale, out):
-    """Add a quadratic form's slope, factor * (curved - right), to `out`; multiply the sum by scale (N, 3)."""
-    for n in range(len(out)):
-        for level in range(out.shape[1]):
-            for c in range(out.shape[2]):
-                slope = factor * (curved[n, level, c] - right[n, level, c])
-                out[n, level, c] = (out[n, level, c] + slope) * scale[n, level]
-
-
-@compiled
-def pull(mass, features, start):
-    """Return the sum of mass (N, 3) times the squared distance between two fields."""
-    total = 0.0
-    for n in range(len(features)):
-        for level in range(features.shape[1]):
-            square = 0.0
-            for c in range(features.shape[2]):
-                apart = np.float64(features[n, level, c]) - np.float64(start[n, level, c])
-                square += apart * apart
-            total += mass[n, level] * square
-    return total

@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Float32
 
-from cpusplat.compiled import compiled
 from hilsplat.field.contrast import Contrast
-from hilsplat.field.problem import QuadraticProblem, add_slope, conjugate_gradient
+from hilsplat.field.kernels import add_multiple, add_slope, flat_dot
+from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
 
 LBFGS_MEMORY = 8
 SUFFICIENT_DECREASE = 1e-4
@@ -111,28 +111,7 @@ def lbfgs(objective: Objective, point: np.ndarray, steps: int, first_step: float
 
 def dot(a: np.ndarray, b: np.ndarray) -> float:
     """Return the dot product in float64, without BLAS, whose summation order varies with the thread count."""
-    return float(_dot(np.ascontiguousarray(a).reshape(-1), np.ascontiguousarray(b).reshape(-1)))
-
-
-@compiled
-def _dot(a, b):
-    s, t, u, v = 0.0, 0.0, 0.0, 0.0
-    fours = len(a) // 4 * 4
-    for i in range(0, fours, 4):
-        s += np.float64(a[i]) * np.float64(b[i])
-        t += np.float64(a[i + 1]) * np.float64(b[i + 1])
-        u += np.float64(a[i + 2]) * np.float64(b[i + 2])
-        v += np.float64(a[i + 3]) * np.float64(b[i + 3])
-    for i in range(fours, len(a)):
-        s += np.float64(a[i]) * np.float64(b[i])
-    return (s + t) + (u + v)
-
-
-@compiled
-def _add(factor, vector, out):
-    """Add a multiple of a flat vector to `out`, in float32, without a temporary."""
-    for i in range(len(out)):
-        out[i] += factor * vector[i]
+    return float(flat_dot(np.ascontiguousarray(a).reshape(-1), np.ascontiguousarray(b).reshape(-1)))
 
 
 def _two_loops(
@@ -143,12 +122,12 @@ def _two_loops(
     flat, factors = result.reshape(-1), []
     for moved, turned, curvature in reversed(memory):
         factor = dot(moved, result) / curvature
-        _add(np.float32(-factor), turned.reshape(-1), flat)
+        add_multiple(np.float32(-factor), turned.reshape(-1), flat)
         factors.append(factor)
     if memory:
         _, turned, curvature = memory[-1]
         first_step = curvature / dot(turned, turned)
     result *= np.float32(first_step)
     for (moved, turned, curvature), factor in zip(memory, reversed(factors), strict=True):
-        _add(np.float32(factor - dot(turned, result) / curvature), moved.reshape(-1), flat)
+        add_multiple(np.float32(factor - dot(turned, result) / curvature), moved.reshape(-1), flat)
     return result

@@ -18,52 +18,13 @@ Departs from the published code:
 
 import numpy as np
 from jaxtyping import Float32
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
 
-from cpusplat.compiled import compiled
-from cpusplat.lanes import QUAD, load_quad, splat, store
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
 from hilsplat.baselines import TrainedSettings
 from hilsplat.field.adam import Adam, in_random_order
+from hilsplat.methods.kernels import WIDTH, l1_gradient
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
-
-# Loops over the entries of a sparse matrix process four channels of a Gaussian as one vector: with sixteen,
-# codes with three channels would waste thirteen. Operations are neither fused nor reordered, so results are
-# bit-identical to plain loops over the channels.
-WIDTH = 4
-ZEROS = ir.Constant(QUAD.vector, None)
-
-
-@intrinsic
-def plus(typingctx, total, scale, row):
-    """Return total + scale * row; each product is rounded before the addition."""
-
-    def codegen(context, builder, sig, args):
-        return builder.fadd(args[0], builder.fmul(splat(builder, args[1], WIDTH), args[2]))
-
-    return QUAD(QUAD, types.float32, QUAD), codegen
-
-
-@intrinsic
-def zeros(typingctx):
-    """Return four zeros."""
-    return QUAD(), lambda context, builder, sig, args: ZEROS
-
-
-@intrinsic
-def signs_of_difference(typingctx, a, b, scale):
-    """Return scale where a > b, -scale where a < b, and 0 where a == b; NaN is preserved."""
-
-    def codegen(context, builder, sig, args):
-        apart, up = builder.fsub(args[0], args[1]), splat(builder, args[2], WIDTH)
-        above = builder.fcmp_ordered(">", apart, ZEROS)
-        below = builder.fcmp_ordered("<", apart, ZEROS)
-        return builder.select(above, up, builder.select(below, builder.fneg(up), apart))
-
-    return QUAD(QUAD, QUAD, types.float32), codegen
 
 
 def train_level(
@@ -86,39 +47,6 @@ def train_level(
         l1_gradient(*rows, view.labels[:, level.index], painted, channels, wide, features, gradient)
         adam.step(gradient)
     return features.reshape(num_gaussians, wide)[:, :channels].copy()
-
-
-@compiled
-def l1_gradient(indptr, indices, data, labels, codes, channels, wide, features, gradient):
-    """Write the features' gradient of the mean absolute difference between rendered and painted codes.
-
-    A row of weights is read once for its sum and, while still in the fastest cache, once for its gradient.
-    Sums have the same order as products with the matrix and its transpose; one thread is used.
-
-    Args:
-        indptr, indices, data: weights (pixels x Gaussians), CSR.
-        labels: row of the code painted at each pixel, -1 for none.
-        codes, features, gradient: float32, flat, `wide` numbers per row or Gaussian; `gradient` is written.
-        channels: size of a code; the padding after each code is 0.
-        wide: multiple of `WIDTH`.
-    """
-    gradient[:] = 0
-    labelled = 0
-    for p in range(len(labels)):
-        labelled += labels[p] >= 0
-    share = np.float32(1 / max(labelled * channels, 1))
-    for p in range(len(labels)):
-        if labels[p] < 0:
-            continue
-        begin, end = np.uint64(indptr[p]), np.uint64(indptr[p + 1])  # unsigned: skips negative-index checks
-        for c in range(0, wide, WIDTH):
-            total = zeros()
-            for k in range(begin, end):
-                total = plus(total, data[k], load_quad(features, np.int64(indices[k]) * wide + c))
-            pull = signs_of_difference(total, load_quad(codes, np.int64(labels[p]) * wide + c), share)
-            for k in range(begin, end):
-                there = np.int64(indices[k]) * wide + c
-                store(gradient, there, plus(load_quad(gradient, there), data[k], pull))
 
 
 def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:

@@ -18,13 +18,13 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float32, Int64
 
-from cpusplat.compiled import compiled
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
 from hilsplat.baselines import TrainedSettings
 from hilsplat.field.adam import Adam, in_random_order
 from hilsplat.field.code import LinearCode, unit_rows
 from hilsplat.methods.common.groups import kmeans
+from hilsplat.methods.kernels import largest_entries, share_gradients
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 
 ENTRIES = 64  # codebook entries per level (LangSplatV2)
@@ -37,7 +37,7 @@ def largest_shares(
     """Return each softmax's largest entries and their shares, which sum to 1; lower entries win ties."""
     chosen = np.zeros((len(logits), kept), np.int64)
     shares = np.zeros(chosen.shape, np.float32)
-    _largest(logits, chosen, shares)
+    largest_entries(logits, chosen, shares)
     return chosen, shares
 
 
@@ -75,7 +75,7 @@ def step(
     loss, by_rendered = cosine_loss(mixed @ entries, vectors)
     by_mixed = by_rendered @ entries.T
     by_share, by_logits = np.zeros_like(shares), np.zeros_like(logits)
-    _pull(weights.indptr, weights.indices, weights.data, chosen, by_mixed, by_share)
+    share_gradients(weights.indptr, weights.indices, weights.data, chosen, by_mixed, by_share)
     by_kept = shares * (by_share - (shares * by_share).sum(axis=1, keepdims=True))
     np.put_along_axis(by_logits, chosen, by_kept, axis=1)
     return loss, by_logits, (mixed.T @ by_rendered)[:, :-1]
@@ -116,36 +116,3 @@ def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[n
                 labelled, latents, level, len(features), codebook, code, settings, own_seed
             )
     return np.where(inputs.seen()[..., None], features, np.float32(0))
-
-
-@compiled
-def _largest(logits, chosen, shares):
-    kept = chosen.shape[1]
-    for g in range(len(logits)):
-        row, best = logits[g], chosen[g]
-        held = 0
-        for e in range(len(row)):
-            at = held
-            while at > 0 and row[e] > row[best[at - 1]]:
-                at -= 1
-            if at < kept:
-                held = min(held + 1, kept)
-                for k in range(held - 1, at, -1):
-                    best[k] = best[k - 1]
-                best[at] = e
-        total = np.float32(0)
-        for k in range(kept):
-            shares[g, k] = np.exp(row[best[k]] - row[best[0]])
-            total += shares[g, k]
-        for k in range(kept):
-            shares[g, k] /= total
-
-
-@compiled
-def _pull(indptr, indices, data, chosen, by_mixed, by_share):
-    """Write the gradient of each Gaussian's kept shares."""
-    for p in range(len(indptr) - 1):
-        for j in range(indptr[p], indptr[p + 1]):
-            g = indices[j]
-            for k in range(chosen.shape[1]):
-                by_share[g, k] += data[j] * by_mixed[p, chosen[g, k]]

@@ -27,11 +27,11 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from cpusplat.compiled import compiled
 from hilsplat.base.levels import NONE
 from hilsplat.baselines import VchSettings
 from hilsplat.methods.common.groups import cluster_field, nearest
 from hilsplat.methods.common.training import initial_features, product, train, unit
+from hilsplat.methods.kernels import joining_edges
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 from hilsplat.segment.coverage import coverage_tree
 from hilsplat.settings import CoverageTreeSettings
@@ -43,40 +43,6 @@ PIXEL_NEIGHBOURS = 10
 BORDER = 10.0  # added to edges across mask borders, per level, when the spanning tree is chosen
 NEIGHBOURS = 16
 MAX_COMPONENTS = 200
-
-
-@compiled
-def joining_edges(num, edge_a, edge_b, first, second):
-    """Return the edge that first connects each pair of pixels if edges are added in this order, or -1."""
-    top = np.arange(num)  # union-find over pixels
-    node = np.arange(num)  # dendrogram node of the root's component
-    up = np.full(num + len(edge_a), -1, np.int64)
-    for k in range(len(edge_a)):
-        a, b = edge_a[k], edge_b[k]
-        while top[a] != a:
-            top[a] = top[top[a]]
-            a = top[a]
-        while top[b] != b:
-            top[b] = top[top[b]]
-            b = top[b]
-        if a != b:
-            up[node[a]] = num + k
-            up[node[b]] = num + k
-            top[b] = a
-            node[a] = num + k
-    out = np.full(len(first), -1, np.int64)
-    for pair in range(len(first)):
-        a, b = first[pair], second[pair]
-        while a != b:  # parents have larger numbers
-            if a < b:
-                a = up[a]
-            else:
-                b = up[b]
-            if a < 0 or b < 0:
-                break
-        if a == b and a >= num:
-            out[pair] = a - num
-    return out
 
 
 def ultrametric(

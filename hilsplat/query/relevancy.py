@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int16
 
+from cpusplat.threads import over_edges
 from hilsplat.base.errors import SettingsError
-from hilsplat.base.processes import over_edges
 from hilsplat.field.code import CHUNK_ROWS, Code, LinearCode
 from hilsplat.query.relevancy_kernels import lengths_and_generic, texts_relevancy
 

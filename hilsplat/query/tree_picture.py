@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
+from cpusplat.views import blend_forward
 from hilsplat.base.artifacts import write_json
 from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.images import write_png
@@ -15,7 +16,7 @@ from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.semantic_tree.export import readable_nodes, write_tree_ply
-from hilsplat.splat.rasterise.cpu import blend_forward, project_gaussians
+from hilsplat.splat.rasterise.api import project_gaussians
 
 CELL_PX = 84
 GAP_PX = 6

@@ -10,16 +10,15 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import no_type_check
 
 import numpy as np
 import onnxruntime
 from jaxtyping import Float64, Int8, Int32, UInt8, UInt32
 
-from cpusplat.compiled import compiled
 from hilsplat.models.network import one_thread_session
 from hilsplat.models.onnx_graph import Graph
 from hilsplat.scene.colmap import pycolmap
+from hilsplat.scene.kernels import two_nearest
 
 MAX_ANGLE = 0.7
 """Maximum angle between matching descriptors, radians (as in COLMAP)."""
@@ -114,7 +113,7 @@ def mutual_matches(one: ViewFeatures, other: ViewFeatures) -> UInt32[np.ndarray,
     best_of_column, second_of_column, row_of_column = (np.full(columns, -1, np.int32) for _ in range(3))
     for first in range(0, rows, _BLOCK):
         products = products_of(one.descriptors[first : first + _BLOCK])
-        _nearest(products, first, best, second, column, best_of_column, second_of_column, row_of_column)
+        two_nearest(products, first, best, second, column, best_of_column, second_of_column, row_of_column)
     clear = _is_clear(best, second)
     clear &= _is_clear(best_of_column, second_of_column)[column]
     clear &= row_of_column[column] == np.arange(rows)
@@ -159,27 +158,3 @@ def _integer_products() -> onnxruntime.InferenceSession | None:
     columns = np.repeat(np.array([[-128, 127]], np.int8), _CHANNELS, axis=0)
     found = session.run(None, {"rows": rows, "columns": columns})[0]
     return session if (found == [0, 255 * 255 * _CHANNELS]).all() else None
-
-
-@compiled
-@no_type_check  # the test suite's shape checks cannot be compiled
-def _nearest(products, first, best, second, column, best_of_column, second_of_column, row_of_column):
-    """Update the two largest products per row and column with a block that starts at row `first`."""
-    columns = products.shape[1]
-    for r in range(len(products)):
-        row, i = products[r], np.int32(first + r)
-        largest = np.int32(-1)
-        for j in range(columns):
-            value, before = np.int32(row[j]), best_of_column[j]
-            second_of_column[j] = max(second_of_column[j], min(before, value))
-            row_of_column[j] = i if value > before else row_of_column[j]
-            best_of_column[j] = max(before, value)
-            largest = max(largest, value)
-        below, place, ties = np.int32(-1), np.int32(columns), np.int32(0)
-        for j in range(columns):
-            value = np.int32(row[j])
-            is_largest = value == largest
-            below = max(below, np.int32(-1) if is_largest else value)
-            place = min(place, np.int32(j) if is_largest else np.int32(columns))
-            ties = np.int32(ties + (np.int32(1) if is_largest else np.int32(0)))
-        best[i], second[i], column[i] = largest, largest if ties > 1 else below, place

@@ -9,9 +9,8 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float64, Int32
 
-from cpusplat.compiled import compiled
-from hilsplat.base.processes import over_edges
-from hilsplat.contributions.kernels import enlarged
+from cpusplat.threads import over_edges
+from hilsplat.semantic_tree.kernels import seen_sizes, shared_pairs
 
 ROWS_AT_A_TIME = 64
 """Number of masks per thread task."""
@@ -66,11 +65,11 @@ def mask_evidence(
     flags = np.ascontiguousarray(visible.T).view(np.uint8)
     everywhere = np.zeros((num, len(visible)))  # size of each mask as seen from each view
     edges = [0, *range(ROWS_AT_A_TIME, num, ROWS_AT_A_TIME), num]
-    over_edges(_seen_sizes, edges, threads, *rows, sizes, flags, everywhere)
+    over_edges(seen_sizes, edges, threads, *rows, sizes, flags, everywhere)
     full = everywhere[np.arange(num), view]
     seen = np.where(everywhere < min_covisible * full[:, None], 0.0, everywhere)
     pairs = (*rows, weighted, *by_column, view, seen, everywhere)
-    parts = [list(arrays) for arrays in zip(*over_edges(_shared_pairs, edges, threads, *pairs), strict=True)]
+    parts = [list(arrays) for arrays in zip(*over_edges(shared_pairs, edges, threads, *pairs), strict=True)]
     # Each list is freed once it is concatenated, because two copies of all pairs would need much memory.
     counts, indices, inter, union = (np.concatenate(parts.pop(0)) for _ in range(4))
     indptr = np.concatenate(([0], np.cumsum(counts)))
@@ -78,55 +77,3 @@ def mask_evidence(
         sp.csr_matrix((values, indices, indptr), shape=(num, num)) for values in (inter, union)
     )
     return Evidence(intersections, unions, seen, view)
-
-
-@compiled
-def _seen_sizes(begin, end, indptr, indices, sizes, visible, out):
-    """Write to `out` the size of each mask on the Gaussians visible in each view."""
-    for a in range(begin, end):
-        for k in range(indptr[a], indptr[a + 1]):
-            g = indices[k]
-            for v in range(visible.shape[1]):
-                out[a, v] += sizes[k] * visible[g, v]
-
-
-@compiled
-def _shared_pairs(
-    begin, end, indptr, indices, weighted, col_indptr, col_rows, col_shares, view, seen, everywhere
-):
-    """Return the pairs a < b that share Gaussians: number per row, b, intersections and unions."""
-    num = len(indptr) - 1
-    touched_by = np.full(num, -1, np.int64)
-    sums = np.zeros(num)
-    found = np.empty(num, np.int32)
-    counts = np.zeros(end - begin, np.int64)
-    out, out_sums = np.empty(1024, np.int32), np.empty((1024, 2))
-    done = 0
-    for a in range(begin, end):
-        count = 0
-        for k in range(indptr[a], indptr[a + 1]):
-            g = indices[k]
-            for t in range(col_indptr[g + 1] - 1, col_indptr[g] - 1, -1):
-                b = col_rows[t]
-                if b <= a:
-                    break
-                if view[b] != view[a]:
-                    if touched_by[b] != a:
-                        touched_by[b] = a
-                        sums[b] = 0.0
-                        found[count] = b
-                        count += 1
-                    sums[b] += weighted[k] * col_shares[t]
-        found[:count] = np.sort(found[:count])
-        if done + count > len(out):
-            out, out_sums = enlarged(out, out_sums, done, 2 * (done + count))
-        for place in range(count):
-            b = found[place]
-            if seen[a, view[b]] == 0.0 and seen[b, view[a]] == 0.0:
-                continue
-            out[done] = b
-            out_sums[done, 0] = sums[b]
-            out_sums[done, 1] = everywhere[a, view[b]] + everywhere[b, view[a]] - sums[b]
-            counts[a - begin] += 1
-            done += 1
-    return counts, out[:done].copy(), out_sums[:done, 0].copy(), out_sums[:done, 1].copy()

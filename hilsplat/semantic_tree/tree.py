@@ -7,12 +7,12 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float32, Int32, Int64, UInt8
 
-from cpusplat.compiled import compiled
 from hilsplat.base.arrays import build_checked
 from hilsplat.base.artifacts import read_index, read_npz, rebuild_command, sealed
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.embed.vectors import mask_embeddings
+from hilsplat.semantic_tree.kernels import blend_nodes, mask_of_nodes, summed_by_node
 
 LIMITS = {"level": (1, 3), "quality": (0, 1), "membership": (0, 1 + 1e-5), "views": (0, 2**31 - 1)}
 """Valid range of each array in a stored tree."""
@@ -244,7 +244,7 @@ class ViewNodes:
     @staticmethod
     def of(weights: sp.csr_matrix, node_of_gaussian: Int32[np.ndarray, " N"]) -> "ViewNodes":
         """Sum normalised weights (rows sum to 1 or are empty) by node."""
-        indptr, nodes, shares = _summed_by_node(
+        indptr, nodes, shares = summed_by_node(
             weights.indptr, weights.indices, weights.data, np.ascontiguousarray(node_of_gaussian)
         )
         return ViewNodes(indptr, nodes, shares, np.diff(weights.indptr) > 0)
@@ -261,13 +261,13 @@ class ViewNodes:
         Uncovered pixels get the lowest value of the covered pixels. The result is written to `out` if given.
         """
         out = np.empty(len(self.covered), np.float32) if out is None else out
-        _blend(self.indptr, self.nodes, self.shares, self.covered, values, np.float32(without), out)
+        blend_nodes(self.indptr, self.nodes, self.shares, self.covered, values, np.float32(without), out)
         return out
 
     def mask(self, chosen: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " P"]:
         """Return the pixels in which the chosen nodes have a total share above 0.5."""
         out = np.zeros(len(self.covered), np.bool_)
-        _mask(self.indptr, self.nodes, self.shares, chosen, out)
+        mask_of_nodes(self.indptr, self.nodes, self.shares, chosen, out)
         return out
 
     def labels(self, size_hw: tuple[int, int]) -> Int32[np.ndarray, "H W"]:
@@ -276,56 +276,3 @@ class ViewNodes:
         dominant = np.flatnonzero(self.shares > 0.5)
         out[np.searchsorted(self.indptr, dominant, side="right") - 1] = self.nodes[dominant]
         return out.reshape(size_hw)
-
-
-@compiled
-def _summed_by_node(indptr, indices, data, node_of_gaussian):
-    out_indptr = np.zeros(len(indptr), np.int64)
-    # untouched pages of these arrays take no memory
-    nodes, shares = np.empty(len(indices), np.int32), np.empty(len(indices), np.float32)
-    done = 0
-    for p in range(len(indptr) - 1):
-        first = done
-        for k in range(indptr[p], indptr[p + 1]):
-            node = node_of_gaussian[indices[k]]
-            if node < 0:
-                continue
-            place = first
-            while place < done and nodes[place] != node:
-                place += 1
-            if place == done:
-                nodes[place], shares[place] = node, np.float32(0)
-                done += 1
-            shares[place] += data[k]
-        out_indptr[p + 1] = done
-    return out_indptr, nodes[:done].copy(), shares[:done].copy()
-
-
-@compiled
-def _blend(indptr, nodes, shares, covered, values, without, out):
-    least = np.float32(np.inf)
-    for p in range(len(covered)):
-        if not covered[p]:
-            continue
-        total, left = np.float32(0), np.float32(1)
-        for k in range(indptr[p], indptr[p + 1]):
-            total += shares[k] * values[nodes[k]]
-            left -= shares[k]
-        total += max(left, np.float32(0)) * without
-        out[p] = total
-        least = min(least, total)
-    if not least < np.inf:
-        least = np.float32(0)
-    for p in range(len(covered)):
-        if not covered[p]:
-            out[p] = least
-
-
-@compiled
-def _mask(indptr, nodes, shares, chosen, out):
-    for p in range(len(out)):
-        total = np.float32(0)
-        for k in range(indptr[p], indptr[p + 1]):
-            if chosen[nodes[k]]:
-                total += shares[k]
-        out[p] = total > 0.5

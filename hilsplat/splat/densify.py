@@ -17,12 +17,13 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int, Int32
 from scipy.special import comb, expit, logit
 
-from cpusplat.compiled import compiled
-from hilsplat.base.rotations import matrix_entries, rotate, unit_quaternions
+from cpusplat.threads import over_ranges
+from hilsplat.base.rotations import rotate, unit_quaternions
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.gaussians import FIELDS
+from hilsplat.splat.kernels import noise_rows
 from hilsplat.splat.optimise import Adam
-from hilsplat.splat.rasterise.cpu import Gradients, over_ranges
+from hilsplat.splat.rasterise.drawn import Gradients
 
 MAX_CLONED_SCALE = 0.01
 """Gaussians whose largest axis exceeds this (in units of the extent) are split; others are cloned (3DGS)."""
@@ -36,9 +37,6 @@ RESET_OPACITY = 0.01  # 3DGS
 MAX_TOGETHER = 51
 """Maximum number of coincident Gaussians, as in the paper's code; a higher limit would change little."""
 MAX_OPACITY = 1 - 1e-6  # maximum opacity; opacity 1 has no logit
-NOISE_SHARPNESS = 100.0
-"""Rate at which noise decreases with opacity (paper: k = 100): the noise factor at opacity 0.1 is e^-9.5."""
-MIN_GATE = 1e-6  # Gaussians whose noise factor is smaller than this get no noise
 
 
 @dataclass
@@ -155,38 +153,6 @@ def scale_factor(
     return opacity / total
 
 
-@compiled(error_model="numpy")
-def _noise_rows(begin, end, means, log_scales, quats, logits, normal, dead_below, weight, extent):
-    """Add weight x gate x covariance x normal, in units of the extent, to the means of rows begin..end.
-
-    The gate is 1/2 at the opacity threshold of dead Gaussians, and 0 for opaque ones (paper, Eq. 8).
-    """
-    turn, local = np.empty((3, 3)), np.empty(3)
-    for row in range(begin, end):
-        opacity = 1.0 / (1.0 + np.exp(-np.float64(logits[row])))
-        gate = 1.0 / (1.0 + np.exp(NOISE_SHARPNESS * (opacity - dead_below)))
-        if gate < MIN_GATE:
-            continue
-        w, x = np.float64(quats[row, 0]), np.float64(quats[row, 1])
-        y, z = np.float64(quats[row, 2]), np.float64(quats[row, 3])
-        norm = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
-        entries = matrix_entries(w * norm, x * norm, y * norm, z * norm)
-        for axis in range(3):
-            for k in range(3):
-                turn[axis, k] = entries[3 * axis + k]
-        for axis in range(3):
-            along = 0.0
-            for k in range(3):
-                along += turn[k, axis] * normal[row, k]
-            local[axis] = along * np.exp(2.0 * np.float64(log_scales[row, axis])) / (extent * extent)
-        square = local[0] ** 2 + local[1] ** 2 + local[2] ** 2  # rotation preserves the length
-        # without this limit, a Gaussian far wider than the scene would jump out of it
-        factor = extent * weight * gate / max(weight * gate * np.sqrt(square), 1.0)
-        for axis in range(3):
-            step = turn[axis, 0] * local[0] + turn[axis, 1] * local[1] + turn[axis, 2] * local[2]
-            means[row, axis] += factor * step
-
-
 def add_noise(
     adam: Adam,
     settings: GaussiansSettings,
@@ -206,7 +172,7 @@ def add_noise(
     normal = generator.standard_normal(p["means"].shape, dtype=np.float32)
     arrays = (p["means"], p["log_scales"], p["quats"], p["opacity_logits"], normal)
     weight = settings.mcmc_noise * rate_of_means
-    over_ranges(_noise_rows, len(adam), threads, *arrays, settings.min_opacity, weight, extent)
+    over_ranges(noise_rows, len(adam), threads, *arrays, settings.min_opacity, weight, extent)
 
 
 def add_regularisers(adam: Adam, gradients: Gradients, settings: GaussiansSettings, extent: float) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, UInt8
 
+from cpusplat.photometric import photometric_loss, psnr, ssim
 from hilsplat.base.artifacts import read_npz, write_arrays, write_index, write_json
 from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.code import code_digest
@@ -26,7 +27,6 @@ from hilsplat.splat.flyaround import contact_sheet, write_flyaround
 from hilsplat.splat.gaussians import FIELDS, Gaussians, morton_order
 from hilsplat.splat.initial import TrainingView, camera_extent, first_gaussians, load_views
 from hilsplat.splat.optimise import Adam, means_rate
-from hilsplat.splat.photometric import photometric_loss, psnr, ssim
 from hilsplat.splat.ply import save_ply
 from hilsplat.splat.rasterise.api import draw, render
 from hilsplat.splat.rasterise.device import choose_device

@@ -1,16 +1,13 @@
-"""Fused Adam for the Gaussians' parameters, with the step sizes of 3DGS."""
+"""Adam for the Gaussians' parameters, with the step sizes of 3DGS."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from cpusplat.compiled import compiled
-from cpusplat.lanes import WIDTH, lanes, load, root, store
+from cpusplat.adam import adam_step
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.gaussians import FIELDS, Gaussians
-from hilsplat.splat.rasterise.cpu import Gradients, over_ranges
-
-BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15  # 3DGS
+from hilsplat.splat.rasterise.drawn import Gradients
 
 OPACITY_RATE = 0.05  # 3DGS
 SH_REST_SHARE = 1 / 20
@@ -20,39 +17,6 @@ SH_REST_SHARE = 1 / 20
 def means_rate(settings: GaussiansSettings, progress: float) -> float:
     """Return the step size of the means in units of the extent; it falls exponentially with progress."""
     return settings.means_rate ** (1 - progress) * settings.means_rate_last**progress
-
-
-@compiled
-def _adam_chunks(begin, end, values, gradients, first, second, rates, root_of_rest2):
-    """Take an Adam step, in place, for chunks begin..end, which contain 16 numbers each.
-
-    `rates` (divided by 1 - beta1^t) is cyclic: chunk k uses the rates from index 16 k. `root_of_rest2` is
-    sqrt(1 - beta2^t).
-    """
-    beta1, rest1 = lanes(np.float32(BETA1)), lanes(np.float32(1.0 - BETA1))
-    beta2, rest2 = lanes(np.float32(BETA2)), lanes(np.float32(1.0 - BETA2))
-    epsilon, scale = lanes(np.float32(EPSILON)), lanes(np.float32(1.0 / root_of_rest2))
-    for chunk in range(begin, end):
-        at = chunk * WIDTH
-        g = load(gradients, at)
-        m = beta1 * load(first, at) + rest1 * g
-        v = beta2 * load(second, at) + rest2 * g * g
-        store(first, at, m)
-        store(second, at, v)
-        store(values, at, load(values, at) - load(rates, at % len(rates)) * m / (root(v) * scale + epsilon))
-
-
-def _adam(arrays: list[np.ndarray], rates: list[float], t: int, threads: int) -> None:
-    """Take Adam step `t` for flat arrays (values, gradients, moments), in place; `rates` is cyclic."""
-    repeated = np.array(WIDTH * rates, np.float32) / np.float32(1 - BETA1**t)
-    root_of_rest2 = float(np.sqrt(1 - BETA2**t))
-    whole, rest = divmod(len(arrays[0]), WIDTH)
-    over_ranges(_adam_chunks, whole, threads, *arrays, repeated, root_of_rest2)
-    if rest:
-        last = [np.concatenate([array[-rest:], np.zeros(WIDTH - rest, np.float32)]) for array in arrays]
-        _adam_chunks(0, 1, *last, np.roll(repeated, -WIDTH * whole), root_of_rest2)
-        for array, chunk in zip(arrays, last, strict=True):
-            array[-rest:] = chunk[:rest]
 
 
 @dataclass
@@ -92,7 +56,8 @@ class Adam:
         }
         for name, rate in rates.items():
             arrays = (self.parameters[name], getattr(gradients, name), self.first[name], self.second[name])
-            _adam([array.reshape(-1) for array in arrays], rate, self.steps, threads)
+            values, gradient, first, second = (array.reshape(-1) for array in arrays)
+            adam_step(values, gradient, first, second, rate, self.steps, threads)
 
     def keep(self, rows: np.ndarray) -> None:
         """Keep the given rows (mask or indices) and their moments."""

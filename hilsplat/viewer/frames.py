@@ -7,14 +7,15 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 from scipy.special import logit
 
+from cpusplat.blend import MAX_ALPHA, MIN_TRANSMITTANCE
+from cpusplat.project import MIN_ALPHA
+from cpusplat.views import blend_forward
 from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.query.scene_views import heaviest_node
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import Gaussians
-from hilsplat.splat.rasterise.blend import MAX_ALPHA, MIN_TRANSMITTANCE
-from hilsplat.splat.rasterise.cpu import blend_forward, project_gaussians
-from hilsplat.splat.rasterise.project import MIN_ALPHA
+from hilsplat.splat.rasterise.api import project_gaussians
 from hilsplat.viewer.wire import Style, rows_of
 
 GREY = np.array([0.299, 0.587, 0.114], np.float32)

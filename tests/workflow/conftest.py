@@ -1,6 +1,7 @@
 """Whole runs in copies of the project: edits there never touch the checkout."""
 
 import fcntl
+import hashlib
 import os
 import shutil
 import subprocess
@@ -111,7 +112,7 @@ class Project:
 def copy_project(source: Path, target: Path, *, results: bool) -> Project:
     """Copy the project's own files and, on request, results with Snakemake's records.
 
-    Modification times are kept, so that the copied kernels of numba remain valid.
+    Copied kernels of numba remain valid: modification times are kept, and folders in caches are renamed.
     """
     target.mkdir(parents=True)
     parts = [*PARTS, *(["results", ".snakemake"] if results else [])]
@@ -121,11 +122,22 @@ def copy_project(source: Path, target: Path, *, results: bool) -> Project:
             shutil.copytree(origin, target / part, symlinks=True, ignore=UNFINISHED)
         elif origin.exists():
             shutil.copy2(origin, target / part)
+    for cache in target.glob("*/__pycache__/kernels-*"):
+        _rename_folders_of_kernels(cache, source, target)
     if not results:  # rows that a user added to the sheet do not belong in tests
         sheet = target / "config/scenes.tsv"
         rows = sheet.read_text().splitlines(keepends=True)
         sheet.write_text("".join(row for row in rows if not row.startswith("photos\t")))
     return Project(target)
+
+
+def _rename_folders_of_kernels(cache: Path, source: Path, target: Path) -> None:
+    """Give the folders in a copied cache, named after the paths of modules, the names for the copy."""
+    for folder in {path.parent for path in cache.parents[1].rglob("*.py")}:
+        paths = (source / folder.relative_to(target), folder)
+        before, after = (f"{folder.name}_{hashlib.sha1(str(path).encode()).hexdigest()}" for path in paths)
+        if (cache / before).exists():
+            (cache / before).rename(cache / after)
 
 
 DECOY = "open(__file__ + '.ran', 'w')\nraise SystemExit('a file of the user ran')\n"

@@ -4,18 +4,12 @@ import numpy as np
 from jaxtyping import Float32
 from scipy.sparse import csr_matrix
 
+from cpusplat import views
+from cpusplat.project import MOMENTS, pack_camera
 from hilsplat.base.errors import HilsplatError
 from hilsplat.scene.cameras import Camera
-from hilsplat.splat.gaussians import Gaussians
-from hilsplat.splat.rasterise.cpu import (
-    Drawn,
-    Gradients,
-    blend_forward,
-    blend_gradients,
-    project_gaussians,
-    sparse_weights,
-)
-from hilsplat.splat.rasterise.device import Device
+from hilsplat.splat.gaussians import FIELDS, Gaussians
+from hilsplat.splat.rasterise.drawn import Device, Drawn, Gradients, refuse_broken, weight_matrix
 
 
 def render(
@@ -47,7 +41,7 @@ def draw(
     Args:
         features: any number of additional channels to blend in the same pass.
         threads: CPU threads; the result is byte-identical for any number.
-        device: backend; see `device.choose_device`.
+        device: backend; see `choose_device`.
 
     Raises:
         HilsplatError: if parameters are not finite, quaternions are zero, or the degree is above 3.
@@ -62,12 +56,24 @@ def draw(
     channels = view.colours
     if features is not None:
         channels = np.concatenate([channels, features], axis=1)
-    image, alpha = blend_forward(view, channels, threads)
+    image, alpha = views.blend_forward(view, channels, threads)
 
     def gradients(grad_image: np.ndarray, grad_alpha: np.ndarray) -> Gradients:
-        return blend_gradients(gaussians, view, channels, image, alpha, grad_image, grad_alpha, threads)
+        sums = views.blend_gradients(view, channels, image, alpha, grad_image, grad_alpha, threads)
+        by_parameter, by_mean_px = views.project_gradients(view, sums, threads)
+        by_feature = sums[: len(gaussians), MOMENTS + 3 : MOMENTS + channels.shape[1]].copy()
+        return Gradients(**by_parameter._asdict(), features=by_feature, means_px=by_mean_px)
 
-    return Drawn(image, alpha, view.box[:, 1] >= view.box[:, 0], gradients)
+    return Drawn(image, alpha, view.drawn, gradients)
+
+
+def project_gaussians(gaussians: Gaussians, camera: Camera, degree: int, threads: int) -> views.Projected:
+    """Project all Gaussians into a view on the CPU; raise the errors of `draw`."""
+    parameters = views.Parameters(*(getattr(gaussians, name) for name in FIELDS))
+    row = pack_camera(camera.cam_from_world, camera.K, camera.size_hw)
+    view = views.project_gaussians(parameters, row, degree, threads)
+    refuse_broken(view.broken, len(gaussians))
+    return view
 
 
 def pixel_weights(
@@ -83,4 +89,4 @@ def pixel_weights(
 
         return cuda.pixel_weights(gaussians, camera, min_weight)
     view = project_gaussians(gaussians, camera, 0, threads)
-    return sparse_weights(view, min_weight, threads)
+    return weight_matrix(*views.sparse_weights(view, min_weight, threads), len(gaussians))

@@ -14,16 +14,23 @@ from jaxtyping import Float, Float32
 from scipy.sparse import csr_matrix
 from torch import Tensor
 
+from cpusplat.blend import MAX_ALPHA
+from cpusplat.project import LOW_PASS_PX2, NEAR
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
-from hilsplat.splat.rasterise.blend import MAX_ALPHA
-from hilsplat.splat.rasterise.cpu import Drawn, Gradients, refuse_broken, weight_matrix
-from hilsplat.splat.rasterise.project import LOW_PASS_PX2, NEAR
+from hilsplat.splat.rasterise.drawn import Drawn, Gradients, refuse_broken, weight_matrix
 
 DEVICE = "cuda"  # tests set this to `cpu` and use gsplat's reference implementation in torch
 
 TILE = 16  # side of a gsplat tile, px
 EVERYTHING = 2**31 - 1  # a number larger than any tile's batch index
+
+
+def run_a_kernel() -> None:
+    """Evaluate spherical harmonics of one Gaussian."""
+    import gsplat
+
+    gsplat.spherical_harmonics(0, torch.ones(1, 3, device=DEVICE), torch.ones(1, 1, 3, device=DEVICE))
 
 
 def on_device(gaussians: Gaussians) -> dict[str, Tensor]:
@@ -110,7 +117,7 @@ def pixel_weights(gaussians: Gaussians, camera: Camera, min_weight: float) -> cs
         row_start = np.zeros(height * width + 1, np.int64)
         row_start[1:] = torch.bincount(pixel, minlength=height * width).cumsum(0).cpu().numpy()
         columns, weights = who[order].int().cpu().numpy(), weight[order].float().cpu().numpy()
-    return weight_matrix(row_start, columns, weights, len(gaussians))
+    return weight_matrix(weights, columns, row_start, len(gaussians))
 
 
 def _light_before(alpha: Float[Tensor, " E"], count: Tensor) -> Float[Tensor, " E"]:

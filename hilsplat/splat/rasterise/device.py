@@ -12,13 +12,11 @@ from typing import Literal
 
 from hilsplat.base.cache import forget, remembered
 from hilsplat.base.errors import DeviceError, first_line
+from hilsplat.splat.rasterise.drawn import Device
+from hilsplat.splat.rasterise.parity import KIND, cuda_disagreement
 
 logger = logging.getLogger(__name__)
 
-Device = Literal["cpu", "cuda"]
-
-KIND = "cuda"
-"""Kind of `remembered` results about CUDA."""
 UNBUILT = "the CUDA kernels of gsplat cannot be compiled"
 ABSENT = ("gsplat is not installed", "no NVIDIA driver is installed", "torch ")
 """Beginnings of the problems of machines on which CUDA is not expected to work."""
@@ -43,24 +41,25 @@ def cuda_problem() -> str | None:
         versions = [torch.__version__, str(torch.version.cuda), gsplat.__version__]
         paths = [os.environ.get(name, "") for name in ("PATH", "CUDA_HOME")]
         # a compilation that fails takes minutes, and each stage runs in its own process
-        if failure := remembered(KIND, ["build", *versions, *paths, socket.gethostname()], _build_failure):
-            return failure
-        from gsplat.cuda import _backend
-
-        if getattr(_backend, "_C", None) is None:
-            return f"{UNBUILT}, because no CUDA toolkit (nvcc) is installed"
-        return None
+        key = ["build", *versions, *paths, socket.gethostname()]
+        return remembered(KIND, key, _build_failure) or None
     except Exception as error:  # a broken installation can raise anything
         return f"gsplat cannot be imported: {first_line(error)}"
 
 
 def _build_failure() -> str:
-    """Load gsplat's kernels, which compiles them on first use; return why that fails, or an empty text."""
+    """Run one of gsplat's kernels, which compiles all on first use; return why it fails, or an empty text."""
+    from torch.utils.cpp_extension import CUDA_HOME
+
+    from hilsplat.splat.rasterise import cuda
+
     logger.info("loading the CUDA kernels of gsplat, which are compiled on first use, in several minutes")
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # it prints what is reported here
-            from gsplat.cuda import _backend  # noqa: F401
+            cuda.run_a_kernel()
     except Exception as error:  # compilers, linkers and torch raise several types
+        if CUDA_HOME is None:
+            return f"{UNBUILT}, because no CUDA toolkit (nvcc) is installed"
         return f"{UNBUILT}: {first_line(error)}"
     return ""
 
@@ -93,8 +92,6 @@ def choose_device(requested: Literal["auto", "cpu", "cuda"]) -> Device:
             "device: auto or cpu; after a change, run `hilsplat doctor`",
         )
     if requested == "auto" and problem is None:
-        from hilsplat.splat.rasterise.parity import cuda_disagreement
-
         try:
             problem = cuda_disagreement()
         except Exception as error:  # drivers, torch and gsplat raise several types

@@ -7,7 +7,10 @@ from hilsplat.base.code import code_digest
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise import api
-from hilsplat.splat.rasterise.device import KIND, Device
+from hilsplat.splat.rasterise.drawn import Device
+
+KIND = "cuda"
+"""Kind of `remembered` results about CUDA."""
 
 MAX_DIFFERENCES = {"image": 1e-3, "alpha": 1e-3, "weights": 1e-3, "gradients": 1e-2}
 """Maximum differences caused by rounding. The limit for gradients is relative and covers all Gaussians."""

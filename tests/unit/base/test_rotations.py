@@ -5,9 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cpusplat.compiled import compiled
+from cpusplat.project import matrix_entries
 from hilsplat.base.rotations import (
     are_rotations,
-    matrix_entries,
     multiply,
     quaternion_of,
     rotate,

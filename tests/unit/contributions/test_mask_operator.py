@@ -5,8 +5,9 @@ import pytest
 import scipy.sparse as sp
 
 from hilsplat.contributions import key_views as module
+from hilsplat.contributions.kernels import BLOCK
 from hilsplat.contributions.key_views import key_views
-from hilsplat.contributions.mask_operator import BLOCK, MaskOperator, lifted_average, lifted_median
+from hilsplat.contributions.mask_operator import MaskOperator, lifted_average, lifted_median
 from hilsplat.scene.scene import Scene
 from tests.unit.two_boxes_world import two_boxes_weights
 

@@ -5,7 +5,8 @@ import pytest
 import scipy.sparse as sp
 
 from hilsplat.semantic_tree.evidence import Evidence, mask_evidence
-from hilsplat.semantic_tree.linkage import ROWS_OF_A_BLOCK, pooled_linkage
+from hilsplat.semantic_tree.kernels import ROWS_OF_A_BLOCK
+from hilsplat.semantic_tree.linkage import pooled_linkage
 
 
 def dense_evidence(intersection, union):

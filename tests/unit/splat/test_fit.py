@@ -29,7 +29,7 @@ from hilsplat.splat.gaussians import morton_order
 from hilsplat.splat.initial import RANDOM_POINTS, first_gaussians
 from hilsplat.splat.optimise import Adam, means_rate
 from hilsplat.splat.ply import load_ply
-from hilsplat.splat.rasterise.cpu import Gradients
+from hilsplat.splat.rasterise.drawn import Gradients
 from tests.unit.round_gaussians import round_gaussians
 from tests.unit.splat.three_gaussians_world import mean_psnr, three_gaussians_scene
 

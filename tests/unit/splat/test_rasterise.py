@@ -11,9 +11,8 @@ import torch
 from hilsplat.base.errors import HilsplatError
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise.api import draw, pixel_weights, render
-from hilsplat.splat.rasterise.cpu import Gradients
 from hilsplat.splat.rasterise.device import Device, cuda_problem
-from tests.unit.splat.gsplat_on_cpu import render_reference
+from hilsplat.splat.rasterise.drawn import Gradients
 from tests.unit.splat.rasterise_scenes import (
     camera,
     leaves,
@@ -22,6 +21,7 @@ from tests.unit.splat.rasterise_scenes import (
     rows,
     straight_camera,
 )
+from tests.unit.splat.render_reference import render_reference
 
 
 @pytest.fixture(params=get_args(Device))

@@ -3,18 +3,20 @@
 import logging
 import subprocess
 import sys
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import gsplat
 import numpy as np
 import pytest
 
+from cpusplat import binning
 from hilsplat.base.errors import DeviceError
 from hilsplat.splat.gaussians import Gaussians
-from hilsplat.splat.rasterise import binning, cuda, device, parity
+from hilsplat.splat.rasterise import cuda, device, parity
 from hilsplat.splat.rasterise.api import draw, pixel_weights
 from hilsplat.splat.rasterise.device import choose_device
-from tests.unit.splat import gsplat_on_cpu
+from tests.cpusplat import gsplat_on_cpu
 from tests.unit.splat.rasterise_scenes import camera, random_gaussians
 
 
@@ -38,27 +40,6 @@ def test_threads_bands_of_tiles_and_memory_order_do_not_change_the_bytes(monkeyp
     monkeypatch.setattr(binning, "MAX_ENTRIES", max_entries)
     for one, other in zip(whole, everything(threads, "F"), strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-# ---- compiling ------------------------------------------------------------------------------------
-
-COMPILE_ONE_LOOP = """
-import logging, sys
-import scipy.sparse as sp
-from hilsplat.contributions.compositing import visible_mass
-logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(message)s")
-visible_mass(sp.eye(2, dtype="f4", format="csr"))
-"""
-
-
-def test_compiling_is_announced_once_and_only_when_it_happens(tmp_path):
-    def log() -> str:
-        environment = {"NUMBA_CACHE_DIR": str(tmp_path), "PATH": ""}
-        command = [sys.executable, "-c", COMPILE_ONE_LOOP]
-        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
-
-    assert log().count("compiling kernels, which takes") == 1
-    assert "compiling" not in log()
 
 
 # ---- device ---------------------------------------------------------------------------------------
@@ -95,33 +76,21 @@ def card(monkeypatch, tmp_path):
     monkeypatch.setattr("torch.cuda.get_device_name", lambda: "a card")
     monkeypatch.setattr("ctypes.CDLL", lambda name: None)
     monkeypatch.setattr("platformdirs.user_cache_path", lambda name: tmp_path)
-    gsplat = SimpleNamespace(__version__="1.5.3")
-    monkeypatch.setitem(sys.modules, "gsplat", gsplat)
+    monkeypatch.setattr(cuda, "DEVICE", "cpu")
+    monkeypatch.setattr("torch.utils.cpp_extension.CUDA_HOME", "/usr/local/cuda")
 
-    def with_kernels(module: object) -> None:
-        monkeypatch.setitem(sys.modules, "gsplat.cuda", module)
-        monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", getattr(module, "_backend", None))
+    def with_kernels(spherical_harmonics: Callable[..., object]) -> None:
+        module = SimpleNamespace(__version__="1.5.3", spherical_harmonics=spherical_harmonics)
+        monkeypatch.setitem(sys.modules, "gsplat", module)
         device.forget_cuda()
 
     yield with_kernels
     device.forget_cuda()
 
 
-class Failing:
-    """A module whose import of the kernels fails."""
-
-    def __init__(self, error: Exception) -> None:
-        self.error = error
-        self.tries = 0
-
-    @property
-    def _backend(self) -> object:
-        self.tries += 1
-        raise self.error
-
-
-def test_a_card_without_a_toolkit_selects_the_cpu_with_a_warning(card, caplog):
-    card(SimpleNamespace(_backend=SimpleNamespace(_C=None)))
+def test_a_card_without_a_toolkit_selects_the_cpu_with_a_warning(card, caplog, monkeypatch):
+    monkeypatch.setattr("torch.utils.cpp_extension.CUDA_HOME", None)
+    card(None)
     assert choose_device("auto") == "cpu"
     (line,) = [each.message for each in caplog.records if each.levelname == "WARNING"]
     assert line.startswith("rasterising on cpu") and "no CUDA toolkit (nvcc) is installed" in line
@@ -139,28 +108,30 @@ def test_a_card_without_a_toolkit_selects_the_cpu_with_a_warning(card, caplog):
     ],
 )
 def test_a_failing_build_of_gsplat_is_tried_once_and_selects_the_cpu(card, caplog, error):
-    kernels = Failing(error)
-    card(SimpleNamespace())
-    sys.modules["gsplat.cuda"] = kernels
-    sys.modules.pop("gsplat.cuda._backend")
+    tries = []
+
+    def fail(*arguments: object) -> None:
+        tries.append(arguments)
+        raise error
+
+    card(fail)
     assert choose_device("auto") == "cpu"
     assert "the CUDA kernels of gsplat cannot be compiled: " in caplog.text
-    tries = kernels.tries
     device.cuda_problem.cache_clear()  # as in the next stage's process
     choose_device.cache_clear()
-    assert choose_device("auto") == "cpu" and kernels.tries == tries
+    assert choose_device("auto") == "cpu" and len(tries) == 1
     device.forget_cuda()  # as `hilsplat doctor` does
-    assert choose_device("auto") == "cpu" and kernels.tries > tries
+    assert choose_device("auto") == "cpu" and len(tries) == 2
 
 
 def test_a_self_test_that_fails_selects_the_cpu(card, caplog):
-    card(SimpleNamespace(_backend=SimpleNamespace(_C=object())))
+    card(lambda *arguments: None)
     assert choose_device("auto") == "cpu"  # this gsplat cannot render
     assert "the self-test on CUDA failed: " in caplog.text
 
 
 def test_a_broken_driver_selects_the_cpu(card, monkeypatch, caplog):
-    card(SimpleNamespace(_backend=SimpleNamespace(_C=object())))
+    card(lambda *arguments: None)
 
     def fail() -> bool:
         raise RuntimeError("Unexpected error from cudaGetDeviceCount()\ndriver too old")

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
+from cpusplat.photometric import psnr
 from hilsplat.base.artifacts import write_json
 from hilsplat.base.images import write_png
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.splat.gaussians import Gaussians
-from hilsplat.splat.photometric import psnr
 from hilsplat.splat.rasterise.api import render
 from hilsplat_world.views import numbered_cameras
 

@@ -10,7 +10,7 @@ from hilsplat_world.objects.catalogue import CLASSES, TABLETOP, build_object
 from hilsplat_world.paints import COLOURS, KINDS, TEXTURES, colour_word, lab_from_srgb, srgb_from_linear
 from hilsplat_world.scenes.kinds import build_scene
 from hilsplat_world.shapes import Mesh, box, cylinder, extrude, loft, ring, sphere, sweep
-from hilsplat_world.textures import pattern
+from hilsplat_world.texture_kernels import pattern
 
 SIZES = {"tabletop": (0.0, np.inf), "room": (0.3, 2.7), "street": (0.5, 16)}
 """Smallest and largest objects by kind of scene; full size in metres, no larger than a house."""

@@ -14,7 +14,7 @@ from hilsplat_world.render import label_view, render_and_label, render_view
 from hilsplat_world.scenes.kinds import build_scene, scene_cameras
 from hilsplat_world.scenes.scene import Style
 from hilsplat_world.shapes import box, joined
-from hilsplat_world.textures import fractal_noise, grains
+from hilsplat_world.texture_kernels import fractal_noise, grains
 from hilsplat_world.truth import true_depth
 from hilsplat_world.views import square_camera
 from tests.unit.world.scenes import scene_of
@@ -97,7 +97,7 @@ def test_omitted_shadow_rays_do_not_change_the_image(monkeypatch):
     camera = camera_at((-2.0, 0, 0.9))
     image = render_view(scene, camera, 3)
     # Every hit then receives light and sky.
-    monkeypatch.setattr(render, "_receivers", lambda prim, *_: (np.flatnonzero(prim >= 0),) * 2)
+    monkeypatch.setattr(render, "receivers", lambda prim, *_: (np.flatnonzero(prim >= 0),) * 2)
     assert np.array_equal(image, render_view(scene, camera, 3))
 
 

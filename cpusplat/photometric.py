@@ -5,11 +5,10 @@ channel, with zeros beyond the border and the constants 0.01^2 and 0.03^2 for va
 """
 
 import numpy as np
-from jaxtyping import Float32
 
 from cpusplat.compiled import compiled
 from cpusplat.lanes import lanes, load, reciprocal, store
-from hilsplat.splat.rasterise.cpu import over_ranges
+from cpusplat.threads import over_ranges
 
 RADIUS = 5
 SIGMA_PX = 1.5
@@ -124,7 +123,7 @@ def _gradient_rows(begin, end, num, stride, image, target, slopes, l1_weight, ss
                 gradient[y, group * _LANES + lane] = sign - ssim_weight * out[lane]
 
 
-def _padded(image: Float32[np.ndarray, "H W 3"]) -> tuple[np.ndarray, int]:
+def _padded(image: np.ndarray) -> tuple[np.ndarray, int]:
     """Return the image padded with zeros, as a flat array, and the padded length of a row."""
     height, width, _ = image.shape
     stride = -(-3 * width // _LANES) * _LANES + 2 * _SIDE
@@ -134,15 +133,15 @@ def _padded(image: Float32[np.ndarray, "H W 3"]) -> tuple[np.ndarray, int]:
 
 
 def photometric_loss(
-    image: Float32[np.ndarray, "H W 3"],
-    target: Float32[np.ndarray, "H W 3"],
+    image: np.ndarray,
+    target: np.ndarray,
     *,
     ssim_weight: float,
     threads: int = 1,
-) -> tuple[float, Float32[np.ndarray, "H W 3"]]:
+) -> tuple[float, np.ndarray]:
     """Return L = (1 - w) mean |image - target| + w (1 - SSIM), and dL/dimage (3DGS, Eq. 7: w = 0.2).
 
-    Images are RGB in [0, 1]. The result is byte-identical for any number of threads.
+    Images are float32 [H, W, 3], RGB in [0, 1]. The result is byte-identical for any number of threads.
     """
     height, width, _ = image.shape
     num = 3 * width
@@ -159,7 +158,7 @@ def photometric_loss(
     return float(loss), gradient.reshape(height, width, 3)
 
 
-def ssim(image: Float32[np.ndarray, "H W 3"], target: Float32[np.ndarray, "H W 3"]) -> float:
+def ssim(image: np.ndarray, target: np.ndarray) -> float:
     """Return the mean structural similarity of two RGB images in [0, 1], as computed by 3DGS."""
     height, width, _ = image.shape
     x, stride = _padded(image)
@@ -169,7 +168,7 @@ def ssim(image: Float32[np.ndarray, "H W 3"], target: Float32[np.ndarray, "H W 3
     return float(ssim_sums.sum() / (3 * width * height))
 
 
-def psnr(image: Float32[np.ndarray, "H W 3"], target: Float32[np.ndarray, "H W 3"]) -> float:
+def psnr(image: np.ndarray, target: np.ndarray) -> float:
     """Return the peak signal-to-noise ratio in dB of two RGB images in [0, 1]; infinite if they are equal."""
     error = np.square(image.astype(np.float64) - target).mean()
     return float("inf") if error == 0 else float(-10 * np.log10(error))

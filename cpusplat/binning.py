@@ -3,11 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Int32, Int64
 
 from cpusplat.compiled import compiled
 from cpusplat.lanes import bits_ge, lanes, larger, load, prefetch, smaller
-from hilsplat.splat.rasterise.project import MIN_ALPHA
+from cpusplat.project import MIN_ALPHA
 
 TILE = 16
 """Side of a tile, px."""
@@ -36,8 +35,8 @@ class Tiles:
     """
 
     tiles_x: int
-    order: Int32[np.ndarray, " M"]  # rows of the drawn Gaussians, front to back; ties in row order
-    tile_start: Int64[np.ndarray, " num_tiles_plus_1"]  # number of entries in all preceding tiles
+    order: np.ndarray  # int32 [M], rows of the drawn Gaussians, front to back; ties in row order
+    tile_start: np.ndarray  # int64 [tiles + 1], number of entries in all preceding tiles
 
     def bands(self) -> list[tuple[int, int]]:
         """Return ranges that cover all tiles, each with at most `MAX_ENTRIES` entries or a single tile."""
@@ -154,10 +153,11 @@ def fill_lists(begin, end, base, tiles_x, order, tile_start, box, geometry, gaus
                 tile_end[tile] += np.int64(bits != 0)
 
 
-def bin_gaussians(box: Int32[np.ndarray, "N 4"], depths: np.ndarray, size_hw: tuple[int, int]) -> Tiles:
+def bin_gaussians(box: np.ndarray, depths: np.ndarray, size_hw: tuple[int, int]) -> Tiles:
     """Sort the drawn Gaussians by depth (positive float32) and count them per tile.
 
-    `box` contains the first and last pixel columns, then rows; last < first for Gaussians that are not drawn.
+    `box` (int32 [N, 4]) contains the first and last pixel columns, then rows; last < first for Gaussians that
+    are not drawn.
     """
     tiles_y, tiles_x = ((side + TILE - 1) // TILE for side in size_hw)
     # positive floats and their bits have the same order

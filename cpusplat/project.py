@@ -11,7 +11,6 @@ log2 alpha = peak - (a dx^2 + b dx dy + c dy^2), where (dx, dy) = mean - pixel c
 import math
 
 import numpy as np
-from jaxtyping import Float
 
 from cpusplat.compiled import compiled
 from cpusplat.lanes import (
@@ -31,13 +30,11 @@ from cpusplat.lanes import (
     transpose,
     wide,
 )
-from hilsplat.base.rotations import matrix_entries
-from hilsplat.scene.cameras import Camera
 
-NEAR = 0.01
-"""Gaussians with a smaller depth (scene units) are not drawn (gsplat: 0.01)."""
+NEAR, FAR = 0.01, 1e10
+"""Default range of depths (scene units) that are drawn (gsplat: 0.01 and 1e10)."""
 LOW_PASS_PX2 = 0.3
-"""Variance added to the projected covariance, px^2 (3DGS, gsplat: 0.3)."""
+"""Default variance added to the projected covariance, px^2 (3DGS, gsplat: 0.3)."""
 MIN_ALPHA = 1.0 / 255.0
 """Smaller alphas are not drawn (3DGS, gsplat: 1 / 255)."""
 MAX_LOG_SCALE = np.float32(20.0)
@@ -73,21 +70,46 @@ _C30, _C31, _C32 = 0.5900435899266435, 2.890611442640554, 0.4570457994644658
 _C33, _C35 = 0.3731763325901154, 1.445305721320277
 
 
-def pack_camera(camera: Camera) -> Float[np.ndarray, " 25"]:
-    """Return a camera as one row.
+def pack_camera(
+    viewmat: np.ndarray,
+    K: np.ndarray,
+    size_hw: tuple[int, int],
+    near: float = NEAR,
+    far: float = FAR,
+    low_pass_px2: float = LOW_PASS_PX2,
+) -> np.ndarray:
+    """Return a camera as one row of float64.
 
-    In order: rotation (9), translation (3), fx, fy, cx, cy, centre (3), ray limits (4), height, width.
+    In order: rotation (9), translation (3), fx, fy, cx, cy, centre (3), ray limits (4), height, width, near,
+    far, low-pass variance.
 
     Ray limits are the range of x/z and y/z to which the Jacobian's ray is clamped: the image widened
     by 0.3 of its half field of view on each side (gsplat).
     """
-    height, width = camera.size_hw
-    fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
+    height, width = size_hw
+    rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     margin_x, margin_y = 0.3 * 0.5 * width / fx, 0.3 * 0.5 * height / fy
     limits_x = -cx / fx - margin_x, (width - cx) / fx + margin_x
     limits_y = -cy / fy - margin_y, (height - cy) / fy + margin_y
-    row = (*camera.cam_from_world[:3, :3].ravel(), *camera.cam_from_world[:3, 3], fx, fy, cx, cy)
-    return np.array((*row, *camera.centre, *limits_x, *limits_y, height, width), dtype=np.float64)
+    row = (*rotation.ravel(), *translation, fx, fy, cx, cy, *(-rotation.T @ translation))
+    return np.array((*row, *limits_x, *limits_y, height, width, near, far, low_pass_px2), dtype=np.float64)
+
+
+@compiled(inline="always")
+def matrix_entries(w, x, y, z):
+    """Return the nine entries of a unit quaternion's rotation matrix, row by row."""
+    return (
+        1.0 - 2.0 * (y * y + z * z),
+        2.0 * (x * y - w * z),
+        2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z),
+        1.0 - 2.0 * (x * x + z * z),
+        2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y),
+        2.0 * (y * z + w * x),
+        1.0 - 2.0 * (x * x + y * y),
+    )
 
 
 @compiled(inline="always")
@@ -215,7 +237,7 @@ def _write(columns, width, rows, table, first, count, last):
 
 @compiled(inline="always")
 def _exp(value):
-    """Return exp of lanes clipped to [-60, MAX_LOG_SCALE]; exp(-60) is negligible next to LOW_PASS_PX2."""
+    """Return exp of lanes clipped to [-60, MAX_LOG_SCALE]; exp(-60) is negligible next to the low pass."""
     exponent = wide(smaller(larger(value, lanes(_LEAST_LOG)), lanes(MAX_LOG_SCALE))) * LOG2_E - 32.0
     near = narrow(exponent)
     return wide(exp2_negative(near)) * (1.0 + (exponent - wide(near)) * LN_2) * 2.0**32
@@ -279,6 +301,7 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
         number of Gaussians with a non-finite number or a zero quaternion.
     """
     height, width = int(camera[23]), int(camera[24])
+    near, far, low_pass = camera[25], camera[26], camera[27]
     fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
     rows, columns, basis = aligned(LANES * ROW), aligned(LANES * ROW), aligned(16 * LANES)
     rows[:] = 0.0
@@ -311,9 +334,9 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
         three = _axis(camera, _exp(load(columns, 5 * LANES)), r02, r12, r22)
         u1, u2, u3 = one[0] - ray_x * one[2], two[0] - ray_x * two[2], three[0] - ray_x * three[2]
         v1, v2, v3 = one[1] - ray_y * one[2], two[1] - ray_y * two[2], three[1] - ray_y * three[2]
-        xx = jx * jx * (u1 * u1 + u2 * u2 + u3 * u3) + LOW_PASS_PX2
+        xx = jx * jx * (u1 * u1 + u2 * u2 + u3 * u3) + low_pass
         xy = jx * jy * (u1 * v1 + u2 * v2 + u3 * v3)
-        yy = jy * jy * (v1 * v1 + v2 * v2 + v3 * v3) + LOW_PASS_PX2
+        yy = jy * jy * (v1 * v1 + v2 * v2 + v3 * v3) + low_pass
         determinant = xx * yy - xy * xy
         inverse = 1.0 / determinant
         px, py = jx * x + cx, jy * y + cy
@@ -350,7 +373,7 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
             if found[LANES + lane] != 0.0:  # includes NaN
                 broken += 1
                 continue
-            if not (found[lane] > NEAR and 0.0 < found[2 * LANES + lane] < np.inf):
+            if not (near < found[lane] < far and 0.0 < found[2 * LANES + lane] < np.inf):
                 continue
             x, y = found[3 * LANES + lane], found[4 * LANES + lane]
             half_x, half_y = found[5 * LANES + lane], found[6 * LANES + lane]

@@ -21,6 +21,7 @@ of tile t is gaussian[tile_start[t] - base] .. gaussian[tile_end[t] - base]; geo
 
 import numpy as np
 
+from cpusplat.binning import AHEAD, BLOCK_X, BLOCK_Y, TILE
 from cpusplat.compiled import compiled
 from cpusplat.lanes import (
     aligned,
@@ -41,8 +42,7 @@ from cpusplat.lanes import (
     store,
     store_sums,
 )
-from hilsplat.splat.rasterise.binning import AHEAD, BLOCK_X, BLOCK_Y, TILE
-from hilsplat.splat.rasterise.project import MIN_ALPHA, MOMENTS
+from cpusplat.project import MIN_ALPHA, MOMENTS
 
 MAX_ALPHA = 0.999
 """Maximum alpha of a Gaussian at a pixel; clipped alphas pass no gradient (gsplat: 0.999)."""

@@ -5,34 +5,10 @@ They replace gsplat's kernels on machines without a device, and in float64 they 
 
 import torch
 from gsplat.cuda import _torch_impl as reference
-from jaxtyping import Float
 from torch import Tensor
-
-from hilsplat.scene.cameras import Camera
-from hilsplat.splat.gaussians import Gaussians
 
 LEAST_ALPHA, MOST_ALPHA, LEAST_LIGHT = 1 / 255, 0.999, 1e-4
 """Constants of gsplat's CUDA kernels."""
-
-
-def render_reference(
-    gaussians: Gaussians | list[Tensor],
-    camera: Camera,
-    degree: int,
-    features: Float[Tensor, "N D"] | None = None,
-) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W"]]:
-    """Premultiplied RGB (+ features) and alpha; every Gaussian is evaluated at every pixel, in float64."""
-    fields = gaussians if isinstance(gaussians, list) else vars(gaussians).values()
-    means, log_scales, quats, logits, sh = (torch.as_tensor(field).double() for field in fields)
-    pose, K, centre = map(torch.from_numpy, (camera.cam_from_world, camera.K, camera.centre))
-    channels = (spherical_harmonics(degree, means - centre, sh) + 0.5).clamp(min=0)
-    if features is not None:
-        channels = torch.cat([channels, features.double()], dim=1)
-    height, width = camera.size_hw
-    given = means, quats, log_scales.exp(), logits.sigmoid(), channels, pose[None], K[None], width, height
-    options = {"radius_clip": 0, "rasterize_mode": "classic", "packed": False, "sh_degree": None}
-    image, alpha, _ = rasterization(*given, near_plane=0.01, eps2d=0.3, **options)
-    return image[0], alpha[0, ..., 0]
 
 
 def spherical_harmonics(degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
@@ -50,7 +26,8 @@ def rasterization(
     radii, means2d, depths, conics, _ = reference._fully_fused_projection(
         means, covariances, viewmats, Ks, width, height, eps2d=eps2d, near_plane=near_plane
     )
-    notes = {"means2d": means2d, "conics": conics, "opacities": opacities[None], "radii": radii}
+    notes = {"means2d": means2d, "depths": depths, "conics": conics, "radii": radii}
+    notes["opacities"] = opacities[None]
     order = torch.argsort(depths[0], stable=True)
     order = order[(radii[0, order] > 0).all(dim=-1)]
     notes["flatten_ids"] = order

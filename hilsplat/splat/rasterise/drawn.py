@@ -1,0 +1,57 @@
+"""Views of Gaussians as both backends draw them, and the errors of Gaussians that cannot be drawn."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float32
+from scipy.sparse import csr_matrix
+
+from hilsplat.base.errors import HilsplatError
+
+Device = Literal["cpu", "cuda"]
+
+
+@dataclass(frozen=True)
+class Gradients:
+    """Gradients with respect to each parameter, and to the projected means in pixels."""
+
+    means: Float32[np.ndarray, "N 3"]
+    log_scales: Float32[np.ndarray, "N 3"]
+    quats: Float32[np.ndarray, "N 4"]
+    opacity_logits: Float32[np.ndarray, " N"]
+    sh: Float32[np.ndarray, "N K 3"]
+    features: Float32[np.ndarray, "N D"]
+    means_px: Float32[np.ndarray, "N 2"]
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """One view as drawn by either backend."""
+
+    image: Float32[np.ndarray, "H W C"]  # premultiplied RGB, then features, without background
+    alpha: Float32[np.ndarray, "H W"]  # coverage in [0, 1], the sum of the blending weights
+    drawn: Bool[np.ndarray, " N"]  # whether each Gaussian reaches a pixel of the view
+    # maps gradients of image and alpha to gradients of the parameters
+    gradients: Callable[[np.ndarray, np.ndarray], Gradients]
+
+
+def refuse_broken(broken: int, total: int) -> None:
+    """Raise HilsplatError if any Gaussian cannot be drawn."""
+    if broken:
+        raise HilsplatError(
+            f"{broken} of {total} Gaussians cannot be drawn: non-finite parameters or a zero quaternion",
+            expected="finite means, log_scales, quats, opacity_logits and sh",
+            fix="drop these Gaussians, or rerun the gaussians stage",
+        )
+
+
+def weight_matrix(
+    weights: np.ndarray, columns: np.ndarray, row_start: np.ndarray, num_gaussians: int
+) -> csr_matrix:
+    """Build a matrix from CSR arrays with sorted columns; scipy converts row starts to int32 if they fit."""
+    shape = (len(row_start) - 1, num_gaussians)
+    matrix = csr_matrix((weights, columns, row_start), shape=shape, copy=False)
+    matrix.has_sorted_indices = True
+    return matrix

@@ -1,0 +1,180 @@
+"""`rasterization` on tensors: against gsplat's reference in float64, and in a training loop."""
+
+import numpy as np
+import pytest
+
+from cpusplat import psnr, rasterization
+from tests.cpusplat.scenes import looking_at_origin, random_gaussians, two_cameras
+
+torch = pytest.importorskip("torch", reason="torch is not installed")
+
+NAMES = ("means", "quats", "scales", "opacities", "colors")
+MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+
+
+def tensors(arrays: dict, dtype: type | None = None) -> dict:
+    """The arrays as tensors that gather gradients; cameras and numbers as they are."""
+    return {
+        name: torch.tensor(value, dtype=dtype).requires_grad_() if name in NAMES else value
+        for name, value in arrays.items()
+    }
+
+
+def reference(gaussians: dict, cameras: dict, mode: str, sh_degree: int | None, backgrounds: np.ndarray):
+    """As `rasterization`, by gsplat's functions in float64; also means2d of each view."""
+    gsplat_on_cpu = pytest.importorskip("tests.cpusplat.gsplat_on_cpu", reason="gsplat is not installed")
+    means, quats, scales, opacities, colors = (gaussians[name] for name in NAMES)
+    viewmats, Ks = (torch.tensor(cameras[name]).double() for name in ("viewmats", "Ks"))
+    images, alphas, means2d = [], [], []
+    for number, (viewmat, K) in enumerate(zip(viewmats, Ks, strict=True)):
+        if sh_degree is None:
+            channels = colors if colors.ndim == 2 else colors[number]
+        else:
+            centre = -viewmat[:3, :3].T @ viewmat[:3, 3]
+            channels = gsplat_on_cpu.spherical_harmonics(sh_degree, means - centre, colors) + 0.5
+            channels = channels.clamp(min=0)
+        depth = means @ viewmat[2, :3] + viewmat[2, 3]
+        channels = torch.cat([channels, depth[:, None]], dim=1)
+        rows = means, quats, scales, opacities, channels, viewmat[None], K[None]
+        options = {"radius_clip": 0, "rasterize_mode": "classic", "packed": False, "sh_degree": None}
+        image, alpha, meta = gsplat_on_cpu.rasterization(
+            *rows, cameras["width"], cameras["height"], near_plane=0.01, eps2d=0.3, **options
+        )
+        shown = image[..., :-1] + (1 - alpha) * torch.tensor(backgrounds[number]).double()
+        depth = image[..., -1:] / alpha.clamp(min=1e-10) if "ED" in mode else image[..., -1:]
+        parts = ([shown] if "RGB" in mode else []) + ([depth] if "D" in mode else [])
+        images.append(torch.cat(parts, dim=-1))
+        alphas.append(alpha)
+        meta["means2d"].retain_grad()
+        means2d.append(meta["means2d"])
+    return torch.cat(images), torch.cat(alphas), means2d
+
+
+@pytest.mark.parametrize("colours", ["shared", "of each view", "harmonics"])
+@pytest.mark.parametrize("mode", MODES)
+def test_images_and_gradients_agree_with_gsplats_reference(mode, colours):
+    rng, n = np.random.default_rng(1), 60
+    arrays, cameras = random_gaussians(n, seed=3), two_cameras()
+    sh_degree = 2 if colours == "harmonics" else None
+    if colours == "of each view":
+        arrays["colors"] = rng.normal(size=(2, n, 4)).astype(np.float32)
+    elif colours == "harmonics":
+        arrays["colors"] = (0.4 * rng.normal(size=(n, 16, 3))).astype(np.float32)
+    channels = 4 if colours == "of each view" else 3
+    backgrounds = rng.random((2, channels), np.float32)
+    ours, exact = tensors(arrays), tensors(arrays, torch.float64)
+    options = {"render_mode": mode, "sh_degree": sh_degree}
+    found, alphas, meta = rasterization(**ours, **cameras, **options, backgrounds=torch.tensor(backgrounds))
+    expected, expected_alphas, means2d = reference(exact, cameras, mode, sh_degree, backgrounds)
+    assert found.dtype == torch.float32 and found.shape == expected.shape
+    for a, b in ((found, expected), (alphas, expected_alphas)):
+        difference = (a - b).detach().abs().flatten()
+        assert difference.quantile(0.999) < 1e-5 * max(1, b.abs().max().item())
+    weight, of_alphas = (torch.tensor(rng.normal(size=shape)) for shape in (found.shape, alphas.shape))
+    if "ED" in mode:  # depth is undefined where nothing is
+        weight = weight * (expected_alphas.detach() > 0.1)
+    meta["means2d"].retain_grad()
+    for image, alpha in ((found, alphas), (expected, expected_alphas)):
+        ((image * weight).sum() + (alpha * of_alphas).sum()).backward()
+    used = NAMES if "RGB" in mode else NAMES[:4]
+    for name in used:
+        error = (ours[name].grad - exact[name].grad).norm() / exact[name].grad.norm()
+        assert error < 2e-4, name
+    for own, other in zip(meta["means2d"].grad, means2d, strict=True):
+        assert (own - other.grad[0]).norm() / other.grad.norm() < 2e-4
+
+
+def test_losses_on_projected_means_and_depths_reach_the_means():
+    arrays, cameras = random_gaussians(40, seed=5), two_cameras()
+    rng = np.random.default_rng(2)
+    of_means, of_depths = torch.tensor(rng.normal(size=(2, 40, 2))), torch.tensor(rng.normal(size=(2, 40)))
+    ours = tensors(arrays)
+    _, alphas, meta = rasterization(**ours, **cameras)
+    drawn = (meta["radii"] > 0).all(dim=-1)
+    ((meta["means2d"] * of_means).sum() + (meta["depths"] * of_depths).sum() + alphas.sum()).backward()
+    blended = tensors(arrays)
+    rasterization(**blended, **cameras)[1].sum().backward()
+    means = torch.tensor(arrays["means"]).double().requires_grad_()
+    total = 0
+    for number in range(2):
+        viewmat, K = (torch.tensor(cameras[name][number]).double() for name in ("viewmats", "Ks"))
+        at = means @ viewmat[:3, :3].T + viewmat[:3, 3]
+        pixels = at[:, :2] / at[:, 2:] * torch.stack([K[0, 0], K[1, 1]])
+        by_view = (pixels * of_means[number]).sum(dim=1) + at[:, 2] * of_depths[number]
+        total = total + by_view[drawn[number]].sum()
+    total.backward()
+    torch.testing.assert_close(
+        ours["means"].grad, blended["means"].grad + means.grad.float(), rtol=1e-4, atol=1e-3
+    )
+
+
+def test_tensors_and_arrays_give_the_same_bytes():
+    arrays, cameras = random_gaussians(80), two_cameras()
+    by_tensor = rasterization(**tensors(arrays), **cameras, render_mode="RGB+ED")
+    by_array = rasterization(**arrays, **cameras, render_mode="RGB+ED")
+    for a, b in zip(by_tensor[:2], by_array[:2], strict=True):
+        np.testing.assert_array_equal(a.detach().numpy(), b)
+    assert by_tensor[2].keys() == by_array[2].keys()
+
+
+def test_gradients_of_cameras_are_refused():
+    cameras = two_cameras()
+    cameras["viewmats"] = torch.tensor(cameras["viewmats"]).requires_grad_()
+    with pytest.raises(NotImplementedError, match=r"viewmats are not supported.*viewmats.detach\(\)"):
+        rasterization(**tensors(random_gaussians(3)), **cameras)
+
+
+def test_a_training_loop_in_the_style_of_gsplats_examples_reaches_30_db():
+    generator = np.random.default_rng(0)
+    angles = np.linspace(0, 2 * np.pi, 8, endpoint=False)
+    viewmats = np.stack([looking_at_origin(np.array([3 * np.cos(a), 3 * np.sin(a), 1.2])) for a in angles])
+    Ks = np.tile(np.array([[58.0, 0, 24], [0, 58, 24], [0, 0, 1]]), (8, 1, 1))
+    size = {"width": 48, "height": 48}
+    truth = {
+        "means": np.array([[0.4, 0, 0], [-0.4, 0.2, 0.1], [0, -0.4, 0.3]]),
+        "quats": np.array([[1.0, 0.2, 0, 0], [1, 0, 0.3, 0], [1, 0, 0, 0]]),
+        "scales": np.array([[0.3, 0.2, 0.2], [0.15, 0.3, 0.2], [0.2, 0.2, 0.35]]),
+        "opacities": np.full(3, 0.95),
+        "colors": np.array([[0.9, 0.2, 0.2], [0.2, 0.9, 0.2], [0.2, 0.2, 0.9]]),
+    }
+    targets, _, _ = rasterization(**truth, viewmats=viewmats, Ks=Ks, **size)
+
+    n = 100
+    start = {
+        "means": (generator.uniform(-0.8, 0.8, (n, 3)), 1e-2),
+        "scales": (np.full((n, 3), np.log(0.15)), 2e-2),
+        "quats": (generator.normal(size=(n, 4)), 1e-2),
+        "opacities": (np.full(n, -2.0), 5e-2),
+        "colors": (generator.normal(size=(n, 3)), 5e-2),
+    }
+    params = {name: torch.nn.Parameter(torch.tensor(value).float()) for name, (value, _) in start.items()}
+    optimizers = [torch.optim.Adam([params[name]], lr=rate) for name, (_, rate) in start.items()]
+    gathered = torch.zeros(n)
+
+    def render(rows: slice | list[int]):
+        return rasterization(
+            means=params["means"],
+            quats=params["quats"],
+            scales=torch.exp(params["scales"]),
+            opacities=torch.sigmoid(params["opacities"]),
+            colors=torch.sigmoid(params["colors"]),
+            viewmats=torch.tensor(viewmats[rows]).float(),
+            Ks=torch.tensor(Ks[rows]).float(),
+            packed=False,
+            **size,
+        )
+
+    for step in range(200):
+        row = [step % 8]
+        colors, _, info = render(row)
+        info["means2d"].retain_grad()
+        loss = torch.nn.functional.l1_loss(colors, torch.tensor(targets[row]))
+        loss.backward()
+        gathered += info["means2d"].grad[0].norm(dim=-1)
+        for optimizer in optimizers:
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+    assert (gathered > 0).any()
+    with torch.no_grad():
+        fitted = render(slice(None))[0].numpy()
+    assert np.mean([psnr(*pair) for pair in zip(fitted, targets, strict=True)]) > 30
