@@ -18,6 +18,7 @@ from hilsplat.base.files import NAME_RULE, name_problem, project_path, regular
 from hilsplat.base.levels import path_of
 from hilsplat.models.store import AUTO, EMBEDDED, read_model, real_model
 from hilsplat.settings import LARGEST, Section, knob
+from hilsplat_world.settings import PerturbSettings, WorldSettings
 
 CONFIG = Path("config/config.yaml")
 """The project's configuration; files given with `--configfile` override it."""
@@ -28,11 +29,11 @@ LONGEST_SHOWN = 120  # maximum number of characters of a value in a message
 class StageSettings(Section):
     """All sections by name."""
 
-    world: settings.WorldSettings = settings.WorldSettings()
+    world: WorldSettings = WorldSettings()
     poses: settings.PosesSettings = settings.PosesSettings()
     gaussians: settings.GaussiansSettings = settings.GaussiansSettings()
     masks: settings.MasksSettings = settings.MasksSettings()
-    perturb: settings.PerturbSettings = settings.PerturbSettings()
+    perturb: PerturbSettings = PerturbSettings()
     coverage_tree: settings.CoverageTreeSettings = settings.CoverageTreeSettings()
     clip: settings.ClipSettings = settings.ClipSettings()
     contributions: settings.ContributionsSettings = settings.ContributionsSettings()

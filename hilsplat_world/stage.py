@@ -14,12 +14,12 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.processes import in_processes
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.hierarchy import write_hierarchy
-from hilsplat.settings import WorldSettings
 from hilsplat_world.lidar import scan_street
 from hilsplat_world.objects.catalogue import GENERATOR_VERSION
 from hilsplat_world.render import render_and_label
 from hilsplat_world.scenes.kinds import KINDS, build_scene, scene_cameras
 from hilsplat_world.seeds import TRAINING_SEEDS, split_of_seed
+from hilsplat_world.settings import WorldSettings
 from hilsplat_world.truth import MIN_SUBPART_AREA, annotated_nodes, write_mesh
 
 logger = logging.getLogger(__name__)

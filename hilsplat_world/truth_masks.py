@@ -33,7 +33,7 @@ from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import index_entry
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.stage import train_views
-from hilsplat.settings import PerturbSettings
+from hilsplat_world.settings import PerturbSettings
 
 logger = logging.getLogger(__name__)
 

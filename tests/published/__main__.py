@@ -22,7 +22,7 @@ from pathlib import Path
 import yaml
 
 from hilsplat.evaluate.tables.build import TABLES
-from hilsplat.settings import WorldSettings
+from hilsplat_world.settings import WorldSettings
 from hilsplat_world.stage import run_world
 from tests.conftest import PROJECT
 from tests.unit.datasets.writers.labelled import (

@@ -12,9 +12,10 @@ from hilsplat.datasets.sources import export_images
 from hilsplat.datasets.waymo import reader as waymo
 from hilsplat.scene.poses import run_poses
 from hilsplat.scene.scene import Scene
-from hilsplat.settings import GaussiansSettings, PosesSettings, WorldSettings
+from hilsplat.settings import GaussiansSettings, PosesSettings
 from hilsplat.splat.fit import fit_gaussians
 from hilsplat_world.labels import labelled_points
+from hilsplat_world.settings import WorldSettings
 from hilsplat_world.stage import run_world
 from tests.unit.datasets.writers.points import (
     LabelledMesh,

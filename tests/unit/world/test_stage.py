@@ -12,11 +12,11 @@ from hilsplat.base.images import read_image
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.hierarchy import AnnotatedNode, HierarchyAnnotations
 from hilsplat.scene.cameras import Cameras
-from hilsplat.settings import WorldSettings
 from hilsplat_world.objects.catalogue import GENERATOR_VERSION, TABLETOP
 from hilsplat_world.pictures import show_world, tree_lines
 from hilsplat_world.render import label_view
 from hilsplat_world.scenes.kinds import build_scene
+from hilsplat_world.settings import WorldSettings
 from hilsplat_world.stage import parse_source, run_world
 from hilsplat_world.truth import annotated_nodes
 from tests.conftest import PROJECT

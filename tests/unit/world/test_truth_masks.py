@@ -19,7 +19,7 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat.cli import stage_commands
 from hilsplat.datasets.hierarchy import AnnotatedNode, write_hierarchy
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.settings import PerturbSettings
+from hilsplat_world.settings import PerturbSettings
 from hilsplat_world.truth_masks import (
     FAULTS,
     Draws,
