@@ -99,13 +99,13 @@ def shared_points(
     x, y = low.T
     upper = inverse[y, x] * (1 - share_x) + inverse[y, x + 1] * share_x
     lower = inverse[y + 1, x] * (1 - share_x) + inverse[y + 1, x + 1] * share_x
-    shown = upper * (1 - share_y) + lower * share_y
-    visible = np.abs(shown * in_b[:, 2] - 1) <= tolerance
+    inverse_here = upper * (1 - share_y) + lower * share_y
+    visible = np.abs(inverse_here * in_b[:, 2] - 1) <= tolerance
     x, y = np.floor(xy[visible]).astype(np.int64).T
     pixel_a, pixel_b = pixel[visible], y * width + x
     if len(pixel_a) > max_points:
-        kept = np.linspace(0, len(pixel_a) - 1, max_points).astype(np.int64)
-        pixel_a, pixel_b = pixel_a[kept], pixel_b[kept]
+        rows = np.linspace(0, len(pixel_a) - 1, max_points).astype(np.int64)
+        pixel_a, pixel_b = pixel_a[rows], pixel_b[rows]
     return pixel_a, pixel_b
 
 
@@ -131,9 +131,10 @@ def pair_disagreement(
     cells = np.bincount((rows * max(1, len(names)) + columns)[in_mask])
     together_a = _pairs(np.bincount(rows[labels_a != NONE]))
     together_b = _pairs(np.bincount(columns[labels_b != NONE]))
-    both = _pairs(cells)
-    differ, all_pairs = together_a + together_b - 2 * both, _pairs(np.array([len(labels_a)]))
-    either = differ + both
+    together_in_both = _pairs(cells)
+    differ = together_a + together_b - 2 * together_in_both
+    all_pairs = _pairs(np.array([len(labels_a)]))
+    either = differ + together_in_both
     return differ / all_pairs if all_pairs else np.nan, differ / either if either else np.nan
 
 
@@ -229,11 +230,9 @@ def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> s
     annotations = HierarchyAnnotations.load(truth)
     pairs = neighbours(cameras, views, count)
 
-    depth_of = lru_cache(maxsize=2 * count + 2)(lambda view: true_depth(surface, cameras[view]))
-
-    @lru_cache(maxsize=2 * count + 2)
-    def loaded(view: str) -> HierarchicalMasks:
-        return load_masks(masks_folder, view, cameras[view].size_hw)
+    remembered = lru_cache(maxsize=2 * count + 2)
+    depth_of = remembered(lambda view: true_depth(surface, cameras[view]))
+    loaded = remembered(lambda view: load_masks(masks_folder, view, cameras[view].size_hw))
 
     def masks_of(view: str, level: Level) -> Bool[np.ndarray, "M H W"]:
         masks = loaded(view)
@@ -244,18 +243,18 @@ def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> s
         return labels[None] == np.unique(labels[labels >= 0])[:, None, None]
 
     sources = {masks_label(masks_folder): masks_of, TRUTH: regions_of}
-    found = defaultdict[tuple[str, Level], list[Agreement]](list)
+    agreements = defaultdict[tuple[str, Level], list[Agreement]](list)
     for a, b in pairs:
         pixel_a, pixel_b = shared_points(cameras[a], depth_of(a), cameras[b], depth_of(b))
         for name, of_level in sources.items():
             for level in LEVELS:
                 agreement = view_agreement(of_level(a, level), of_level(b, level), pixel_a, pixel_b)
-                found[name, level].append(agreement)
+                agreements[name, level].append(agreement)
     rows = []
-    for (name, level), parts in found.items():
-        one = mean_agreement(parts)
-        shares = [f"{share:.4f}" for share in (one.best_iou, one.disagreement, one.joined_disagreement)]
-        rows.append([index["scene"], name, level.label, str(len(parts)), str(one.masks), *shares])
+    for (name, level), of_pairs in agreements.items():
+        mean = mean_agreement(of_pairs)
+        shares = [f"{share:.4f}" for share in (mean.best_iou, mean.disagreement, mean.joined_disagreement)]
+        rows.append([index["scene"], name, level.label, str(len(of_pairs)), str(mean.masks), *shares])
     write_csv(out, COLUMNS, rows)
     return markdown_table(COLUMNS, rows, 3)
 
@@ -299,7 +298,7 @@ def measure_world_consistency(
                 if union:
                     value = iou(seen_a[None], seen_b[None])
                     yield a, Measured(method, query.text, level, "view_consistency", protocol, value, union)
-        for view in {a, b} - {each for later in pairs[number + 1 :] for each in later}:
+        for view in {a, b}.difference(*pairs[number + 1 :]):
             scene.forget(view)
 
 

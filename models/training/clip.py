@@ -95,6 +95,6 @@ def contrastive_loss(
     """
     logits = scale * image @ text.T
     by_image = -(valid * torch.log_softmax(logits, dim=1)).sum(dim=1) / valid.sum(dim=1)
-    shown = valid.sum(dim=0)
-    by_text = -(valid * torch.log_softmax(logits, dim=0)).sum(dim=0) / shown.clamp(min=1.0)
-    return (by_image.mean() + by_text.sum() / (shown > 0).sum()) / 2
+    num_crops = valid.sum(dim=0)
+    by_text = -(valid * torch.log_softmax(logits, dim=0)).sum(dim=0) / num_crops.clamp(min=1.0)
+    return (by_image.mean() + by_text.sum() / (num_crops > 0).sum()) / 2

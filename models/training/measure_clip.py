@@ -125,11 +125,11 @@ def common_texts(text: np.ndarray, level: np.ndarray) -> np.ndarray:
 
     `text` is the row of each mask's text. Masks of level 0 are not counted.
     """
-    kept = []
+    common = []
     for at in LEVELS:
         rows, counts = np.unique(text[level == int(at)], return_counts=True)
-        kept.append(rows[np.argsort(-counts, kind="stable")[:COMMON]])
-    return np.unique(np.concatenate(kept))
+        common.append(rows[np.argsort(-counts, kind="stable")[:COMMON]])
+    return np.unique(np.concatenate(common))
 
 
 def measure_queries(
@@ -150,7 +150,7 @@ def measure_queries(
     """
     crops = list_segmented(views, masks)
     vectors = embedded_crops(vision, crops, np.arange(len(crops)))
-    found: dict[str, list[tuple[float, float, float]]] = {level.label: [] for level in LEVELS}
+    overlaps: dict[str, list[tuple[float, float, float]]] = {level.label: [] for level in LEVELS}
     for view in range(len(views)):
         nodes = views.nodes[view]
         for level in LEVELS:
@@ -164,12 +164,12 @@ def measure_queries(
                 continue
             rows = masks[view].rows_of(level)
             if not len(rows):
-                found[level.label] += [(0.0, 0.0, 0.0)] * len(by_text)
+                overlaps[level.label] += [(0.0, 0.0, 0.0)] * len(by_text)
                 continue
             guesses = masks[view].dense(rows).reshape(len(rows), labels.size)
-            own = np.flatnonzero(crops.view == view)
-            own = own[np.searchsorted(crops.segmented[own], rows)]
-            similarity = vectors[own] @ embedded_texts(text, tokenizer, list(by_text)).T
+            in_view = np.flatnonzero(crops.view == view)
+            in_view = in_view[np.searchsorted(crops.segmented[in_view], rows)]
+            similarity = vectors[in_view] @ embedded_texts(text, tokenizer, list(by_text)).T
             for column, ids in enumerate(by_text.values()):
                 truths = labels.reshape(1, -1) == np.array(ids)[:, None]
                 truths = np.concatenate([truths, truths.any(axis=0, keepdims=True)]).astype(np.float32)
@@ -177,7 +177,7 @@ def measure_queries(
                 union = guesses.sum(axis=1)[:, None] + truths.sum(axis=1)[None] - shared
                 iou = shared / union
                 pick = int(similarity[:, column].argmax())
-                found[level.label].append((float(iou[pick, -1]), float(iou[pick].max()), float(iou.max())))
+                overlaps[level.label].append((float(iou[pick, -1]), float(iou[pick].max()), float(iou.max())))
     return {
         label: {
             "iou": mean_or_zero([row[0] for row in rows]),
@@ -185,5 +185,5 @@ def measure_queries(
             "best": mean_or_zero([row[2] for row in rows]),
             "n": len(rows),
         }
-        for label, rows in found.items()
+        for label, rows in overlaps.items()
     }

@@ -144,14 +144,9 @@ def _make_sam(out: Path, recipe: Recipe) -> None:
     settings, threads = recipe.settings, recipe.threads
     budget = Budget(settings.sam_minutes, settings.sam_steps)
     with stage_log("train", "sam-tiny") as counts:
+        name = recipe.state_name("sam")
         encoder, decoder, curve = train_sam(
-            recipe.training,
-            recipe.unseen,
-            budget,
-            recipe.seed,
-            recipe.cache,
-            recipe.state_name("sam"),
-            device=settings.device,
+            recipe.training, recipe.unseen, budget, recipe.seed, recipe.cache, name, device=settings.device
         )
         with atomic_folder(out / "sam-tiny") as folder:
             export_sam(encoder, decoder, folder)
@@ -184,8 +179,8 @@ def _make_clip(out: Path, recipe: Recipe) -> None:
         )
         metrics: dict[str, Any] = {}
         for background in ("black", "keep"):
-            found = measure_clip(vision, text, tokenizer, others, background=background)
-            for (kind, level), value in found.items():
+            accuracies = measure_clip(vision, text, tokenizer, others, background=background)
+            for (kind, level), value in accuracies.items():
                 metrics.setdefault(background, {}).setdefault(kind, {})[level] = value
         metrics["queries"] = measure_queries(vision, text, tokenizer, unseen, unseen_masks)
         counts.update({level: f"{v['top1']:.3f}" for level, v in metrics["black"]["exact"].items()})

@@ -49,7 +49,6 @@ class CropDraw:
         self.last = np.searchsorted(key[self.order], key, side="right")
 
     def draw(self, rng: np.random.Generator) -> np.ndarray:
-        """Draw the rows of a batch."""
         seeds = np.searchsorted(self.ends, rng.random(self.batch) * self.ends[-1], side="right")
         seeds = np.minimum(seeds, len(self.ends) - 1)
         rows = list(seeds[: round(self.batch * (1 - THING_SHARE))])
@@ -131,8 +130,8 @@ def train_clip(
         return loss, {"contrastive": loss.item()}
 
     def measure() -> dict[str, float]:
-        found = measure_clip(vision, text, tokenizer, validation, quick)
-        return {f"{kind}_{level}": value["top1"] for (kind, level), value in found.items()}
+        accuracies = measure_clip(vision, text, tokenizer, validation, quick)
+        return {f"{kind}_{level}": value["top1"] for (kind, level), value in accuracies.items()}
 
     curve = training.run(make, loss_of, measure, budget)
     return vision.cpu().eval(), text.cpu().eval(), tokenizer, curve
