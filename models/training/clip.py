@@ -1,6 +1,7 @@
 """A small CLIP: crops of masked regions and short phrases in a common space of 128 dimensions."""
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int64
@@ -81,6 +82,14 @@ class ClipText(nn.Module):
         x = x + self.hidden(x)
         pooled = (x * present[..., None]).sum(dim=1) / present.sum(dim=1, keepdim=True).clamp(min=1.0)
         return functional.normalize(self.project(pooled), dim=-1)
+
+
+class Clip(NamedTuple):
+    """A complete small CLIP."""
+
+    vision: ClipVision
+    text: ClipText
+    tokenizer: Tokenizer
 
 
 def contrastive_loss(
