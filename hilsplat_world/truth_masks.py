@@ -342,9 +342,10 @@ def faulty_masks(
                 counts["split"] += len(pieces) - 1
             for number, piece in enumerate(pieces):
                 name = (view, lead, number)
-                field = draws.generator("boundary", *name)
-                mask = displaced(piece, settings.boundary_px, settings.boundary_smooth_px, field)
-                mask_level = level
+                mask, mask_level = piece, level
+                if settings.boundary_px:
+                    field = draws.generator("boundary", *name)
+                    mask = displaced(piece, settings.boundary_px, settings.boundary_smooth_px, field)
                 if draws.chance("wrong level", *name) < settings.wrong_level:
                     mask_level = beside(level, up=draws.chance("which level", *name) < 0.5)
                     counts["wrong_level"] += 1

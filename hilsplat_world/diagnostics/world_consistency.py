@@ -5,9 +5,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int32, Int64
+from jaxtyping import Bool, Float, Int, Int64
 
 from hilsplat.base.artifacts import read_index
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
@@ -144,34 +145,29 @@ def _pairs(counts: Int[np.ndarray, " n"]) -> int:
     return int((counts * (counts - 1) // 2).sum())
 
 
-def painted(inside: Bool[np.ndarray, "M P"], area_px: Int[np.ndarray, " M"]) -> Int32[np.ndarray, " P"]:
-    """Return the mask at each point, or -1, painting masks from large to small as in a label map.
+class Regions(NamedTuple):
+    """Masks of one level in a view, and the row of the smallest mask at each pixel (-1: none)."""
 
-    Of two equally large masks, the one with the lower row index is painted last.
-    """
-    labels = np.full(inside.shape[1], NONE, dtype=np.int32)
-    for row in np.lexsort((-np.arange(len(area_px)), -area_px)):
-        labels[inside[row]] = row
-    return labels
+    masks: Bool[np.ndarray, "M H W"]
+    labels: Int[np.ndarray, "H W"]
+
+    def at(self, pixels: Int64[np.ndarray, " P"]) -> tuple[Bool[np.ndarray, "M P"], Int[np.ndarray, " P"]]:
+        """Return the masks and labels at some row-major pixels."""
+        flat = self.masks.reshape(len(self.masks), self.labels.size)
+        return flat[:, pixels], self.labels.reshape(-1)[pixels]
 
 
 def view_agreement(
-    masks_a: Bool[np.ndarray, "Ma Ha Wa"],
-    masks_b: Bool[np.ndarray, "Mb Hb Wb"],
-    pixel_a: Int64[np.ndarray, " P"],
-    pixel_b: Int64[np.ndarray, " P"],
+    a: Regions, b: Regions, pixel_a: Int64[np.ndarray, " P"], pixel_b: Int64[np.ndarray, " P"]
 ) -> Agreement:
     """Return the agreement of the masks of one level between two views, at shared points.
 
     Masks of a view may overlap. `best_iou` uses them unchanged; the disagreements use the smallest mask at
-    each point (`painted`), like the language field.
+    each point, like the language field.
     """
-    inside_a = masks_a.reshape(len(masks_a), np.prod(masks_a.shape[1:], dtype=int))[:, pixel_a]
-    inside_b = masks_b.reshape(len(masks_b), np.prod(masks_b.shape[1:], dtype=int))[:, pixel_b]
+    (inside_a, labels_a), (inside_b, labels_b) = a.at(pixel_a), b.at(pixel_b)
     ious = best_ious(inside_a, inside_b)
-    all_pairs, joined = pair_disagreement(
-        painted(inside_a, masks_a.sum(axis=(1, 2))), painted(inside_b, masks_b.sum(axis=(1, 2)))
-    )
+    all_pairs, joined = pair_disagreement(labels_a, labels_b)
     return Agreement(len(ious), float(ious.mean()) if len(ious) else np.nan, all_pairs, joined)
 
 
@@ -234,13 +230,13 @@ def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> s
     depth_of = remembered(lambda view: true_depth(surface, cameras[view]))
     loaded = remembered(lambda view: load_masks(masks_folder, view, cameras[view].size_hw))
 
-    def masks_of(view: str, level: Level) -> Bool[np.ndarray, "M H W"]:
+    def masks_of(view: str, level: Level) -> Regions:
         masks = loaded(view)
-        return masks.dense(masks.rows_of(level))
+        return Regions(masks.dense(masks.rows_of(level)), masks.label_map(level))
 
-    def regions_of(view: str, level: Level) -> Bool[np.ndarray, "M H W"]:
+    def regions_of(view: str, level: Level) -> Regions:
         labels = annotations.label_image(view, level)  # surroundings are nodes too
-        return labels[None] == np.unique(labels[labels >= 0])[:, None, None]
+        return Regions(labels[None] == np.unique(labels[labels >= 0])[:, None, None], labels)
 
     sources = {masks_label(masks_folder): masks_of, TRUTH: regions_of}
     agreements = defaultdict[tuple[str, Level], list[Agreement]](list)

@@ -314,8 +314,8 @@ def _thing_spot(work: _Furnishing, radius: float, height: float) -> tuple[np.nda
                 support.stand.append((spot, radius))
                 return spot, support.height_at(spot, 0.6 * radius)
     size = np.array([2 * radius, 2 * radius, height])
-    spot = work.plan.wall_spot(work.rng, size, 0.0, 0.2, gap=WALL_GAP + 0.05)
-    return None if spot is None else (spot[0], 0.0)
+    at_wall = work.plan.wall_spot(work.rng, size, 0.0, 0.2, gap=WALL_GAP + 0.05)
+    return None if at_wall is None else (at_wall[0], 0.0)
 
 
 def _add_shell(assembly: Assembly, room: Room, rng: np.random.Generator) -> None:

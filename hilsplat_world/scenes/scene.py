@@ -143,18 +143,12 @@ class Assembly:
     def finished(self, asked: int, placed: Sequence[PlacedObject], style: Style) -> WorldScene:
         """Return the scene with everything added so far."""
         columns = [np.concatenate(column) for column in zip(*self.pieces, strict=True)]
-        return WorldScene(
-            self.kind,
-            self.seed,
-            asked,
-            tuple(placed),
-            *(column.astype(np.float32) for column in columns[:3]),
-            *(column.astype(np.int32) for column in columns[3:]),
-            np.stack(self.materials).astype(np.float32),
-            tuple(self.nodes),
-            frozenset(self.background),
-            style,
-        )
+        triangles, normals, coords = (column.astype(np.float32) for column in columns[:3])
+        node_ids, material_ids = (column.astype(np.int32) for column in columns[3:])
+        materials = np.stack(self.materials).astype(np.float32)
+        arrays = (triangles, normals, coords, node_ids, material_ids, materials)
+        nodes, background = tuple(self.nodes), frozenset(self.background)
+        return WorldScene(self.kind, self.seed, asked, tuple(placed), *arrays, nodes, background, style)
 
 
 def footprint_of(triangles: Float[np.ndarray, "F 3 3"]) -> tuple[Float[np.ndarray, " 2"], float]:

@@ -53,7 +53,7 @@ def sam(tmp_path_factory):
     return encoder, decoder, folder
 
 
-@pytest.mark.parametrize(("batch", "prompts", "points"), [(1, 1, 1), (1, 5, 1), (2, 3, 2)])
+@pytest.mark.parametrize(("batch", "prompts", "points"), [(1, 1, 1), (2, 3, 2)])
 def test_exported_sam_equals_torch(sam, batch, prompts, points):
     encoder, decoder, folder = sam
     generator = torch.Generator().manual_seed(batch)

@@ -16,7 +16,7 @@ from hilsplat.settings import GaussiansSettings, PosesSettings
 from hilsplat.splat.fit import fit_gaussians
 from hilsplat_world.labels import labelled_points
 from hilsplat_world.settings import WorldSettings
-from hilsplat_world.stage import run_world
+from hilsplat_world.stage import MESH_EDGE, run_world
 from tests.unit.datasets.writers.points import (
     LabelledMesh,
     posed_images,
@@ -41,7 +41,9 @@ def street(tmp_path_factory):
 
 def make_world(kind, tmp_path_factory):
     folder = tmp_path_factory.mktemp(kind)
-    run_world(f"world:{kind}:100", SETTINGS, folder, threads=1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(MESH_EDGE, "room", 0.5)  # a coarse mesh has a thirtieth of the vertices
+        run_world(f"world:{kind}:100", SETTINGS, folder, threads=1)
     return folder
 
 

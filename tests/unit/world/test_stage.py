@@ -98,6 +98,7 @@ def test_the_manual_lists_all_tabletop_classes():
 
 def test_pictures_of_the_manual_are_drawn(tmp_path):
     script = run_path(str(PROJECT / "docs/draw_world.py"))
+    script["draw_scenes"].__globals__["SCENE_PX"] = 64
     script["draw_classes"](tmp_path / "classes.png", ("burger",))
     # The ground and the page are grey.
     colourful = np.ptp(read_image(tmp_path / "classes.png").astype(int), axis=2) > 60
