@@ -13,8 +13,7 @@ from hilsplat.datasets.classes import NYU40, REPLICA_NAMES, SCANNET200, WAYMO_22
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
 from hilsplat.datasets.points.labelled_points import LabelledPoints, PlyMesh
 
-OTHERPROP = 40
-"""NYU40's class for small objects without a class of their own."""
+OTHERPROP = 40  # NYU40's class for small objects without a class of their own
 SCANNET200_WORDS = {"sofa": "couch", "television": "tv", "bear": "stuffed animal", "mug": "cup"}
 REPLICA_WORDS = {
     "bookshelf": "shelf",

@@ -14,20 +14,14 @@ from hilsplat.base.levels import NONE
 from hilsplat_world.scenes.scene import WorldScene
 
 BEAMS = 64
-INCLINATION_DEG = (-17.6, 2.4)
-"""Inclinations of the lowest and highest beams, as in Waymo's top lidar."""
-AZIMUTH_STEPS = 400
-"""Number of directions per turn; Waymo's lidar has 2650."""
-POSES = 5
-"""Number of positions along the drive at which a turn is recorded."""
+INCLINATION_DEG = (-17.6, 2.4)  # inclinations of the lowest and highest beams, as in Waymo's top lidar
+AZIMUTH_STEPS = 400  # number of directions per turn; Waymo's lidar has 2650
+POSES = 5  # number of positions along the drive at which a turn is recorded
 ABOVE_CAMERA_M = 0.35
 MAX_RANGE_M = 75.0
-RANGE_NOISE_M = 0.015
-"""Standard deviation of the measured range."""
-LOST_SHARE = 0.05
-"""Share of returns that are dropped at random."""
-GLANCING_COSINE = 0.03
-"""Minimum cosine between a beam and the surface normal for a return."""
+RANGE_NOISE_M = 0.015  # standard deviation of the measured range
+LOST_SHARE = 0.05  # share of returns that are dropped at random
+GLANCING_COSINE = 0.03  # minimum cosine between a beam and the surface normal for a return
 
 
 @dataclass(frozen=True, eq=False)

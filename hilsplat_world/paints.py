@@ -35,8 +35,7 @@ TEXTURES: dict[str, Texture] = {
 }
 """Solid textures by kind."""
 
-KINDS = tuple(TEXTURES)
-"""Kinds of texture, in the order of the shader's kind numbers."""
+KINDS = tuple(TEXTURES)  # kinds of texture, in the order of the shader's kind numbers
 
 COLOURS: dict[str, Colour] = {
     "red": (0.78, 0.14, 0.12),
@@ -74,8 +73,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], float, float]] = {
 PATTERNS = ("stripes", "checks", "spots")
 """Kinds of texture whose second colour need not be a shade of the first."""
 
-PATTERN_CONTRAST = 22.0
-"""Minimum distance between the two colours of a pattern, in L*a*b*."""
+PATTERN_CONTRAST = 22.0  # minimum distance between the two colours of a pattern, in L*a*b*
 
 WOOD_COLOURS = ("brown", "beige", "orange")
 

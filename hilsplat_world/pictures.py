@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 VIEWS_SHOWN = 4
-LINES_SHOWN = 52
-"""Maximum number of tree lines in a column, for legibility."""
+LINES_SHOWN = 52  # maximum number of tree lines in a column, for legibility
 
 
 def show_panel(

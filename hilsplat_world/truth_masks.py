@@ -37,17 +37,14 @@ from hilsplat_world.settings import PerturbSettings
 
 logger = logging.getLogger(__name__)
 
-SEGMENTER = "truth-perturbed"
-"""Name of the segmenter, and label prefix of its masks."""
+SEGMENTER = "truth-perturbed"  # name of the segmenter, and label prefix of its masks
 
 FAULTS = ("boundary_px", "merge", "split", "missing", "wrong_level", "systematic_merge", "systematic_missing")
 """Settings that change masks; if all are 0, the masks are exact."""
 
-REACH = 3.0
-"""Maximum displacement of a boundary, in standard deviations."""
+REACH = 3.0  # maximum displacement of a boundary, in standard deviations
 
-WAVES = 48
-"""Number of plane waves that are summed for a boundary's displacement."""
+WAVES = 48  # number of plane waves that are summed for a boundary's displacement
 
 Borders = dict[int, Counter[int]]
 """Node -> adjacent sibling -> length of their common border, px."""

@@ -22,8 +22,7 @@ from hilsplat.segment.origin import masks_label
 from hilsplat.segment.pictures import paint_level
 from hilsplat_world.diagnostics.world_consistency import load_masks
 
-MIN_PX = 100
-"""Smaller ground-truth regions are not scored."""
+MIN_PX = 100  # smaller ground-truth regions are not scored
 FIT_IOU = 0.5
 COLUMNS = ("scene", "masks", "level", "views", "regions", "best_iou", "recall", "masks_a_view", "precision")
 COLOURS = "RdYlGn"

@@ -39,14 +39,11 @@ COLUMNS = (
 DEPTH_TOLERANCE = 0.01
 """Maximum relative difference in depth at which two views are taken to show the same surface point."""
 
-MIN_POINTS = 16
-"""Masks with fewer shared points are not compared."""
+MIN_POINTS = 16  # masks with fewer shared points are not compared
 
-MAX_POINTS = 50_000
-"""Maximum number of shared points per pair of views; more are evenly subsampled."""
+MAX_POINTS = 50_000  # maximum number of shared points per pair of views; more are evenly subsampled
 
-TEXTS_PER_LEVEL = 4
-"""Number of texts per level and view; each is queried in two views."""
+TEXTS_PER_LEVEL = 4  # number of texts per level and view; each is queried in two views
 
 
 @dataclass(frozen=True)

@@ -15,14 +15,12 @@ from hilsplat_world.shapes import Mesh, joined
 
 Word = TypeVar("Word")
 
-PARENT_CONTRAST = 24.0
-"""Minimum distance in L*a*b* between a subpart and its part."""
+PARENT_CONTRAST = 24.0  # minimum distance in L*a*b* between a subpart and its part
 
 NEIGHBOUR_CONTRAST = 11.0
 """Minimum distance in L*a*b* between other adjacent parts and subparts of an object."""
 
-CORNERS = ((-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0))
-"""Signs of x and y, for legs and wheels."""
+CORNERS = ((-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0))  # signs of x and y, for legs and wheels
 
 _SHADES = (1.0, 0.85, 1.15, 0.72, 1.3, 0.6, 1.45, 0.5, 1.6)
 _TOUCH = 0.03  # maximum gap between touching boxes, relative to the object's size

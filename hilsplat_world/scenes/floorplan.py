@@ -7,8 +7,7 @@ from jaxtyping import Float
 
 from hilsplat_world.shapes import rotation_about
 
-WALL_GAP = 0.03
-"""Distance between furniture and wall, m, which leaves space for the skirting."""
+WALL_GAP = 0.03  # distance between furniture and wall, m, which leaves space for the skirting
 PIECE_GAP = 0.05
 PATH_GAP = 0.28
 """Minimum horizontal distance between the camera path and objects taller than `PATH_LOW`, m."""

@@ -54,13 +54,11 @@ THING_SIZES: dict[str, tuple[float, float]] = {
     "lantern": (0.3, 0.36), "clock": (0.26, 0.32), "backpack": (0.4, 0.46), "plant": (0.42, 0.55),
 }  # fmt: skip
 """Heights of some things, m; slightly oversized, so that subparts are visible across a room."""
-TOY_SIZE = (0.34, 0.44)
-"""Heights of all other things, m."""
+TOY_SIZE = (0.34, 0.44)  # heights of all other things, m
 MAX_THING_RADIUS = 0.21
 EDGE = 0.03
 """Minimum distance between things and the edge of their support, or the wall behind a counter, m."""
-MAX_FLAT = 0.05
-"""Maximum height of a flat item above its board for things to be placed on the item, m."""
+MAX_FLAT = 0.05  # maximum height of a flat item above its board for things to be placed on the item, m
 
 WALL_PALE, FLOOR_PALE, CEILING_PALE = 0.6, 0.4, 0.2
 """Shares of grey mixed into the colours of walls, floor and ceiling, so that objects stand out."""
@@ -68,8 +66,7 @@ WALL_PALE, FLOOR_PALE, CEILING_PALE = 0.6, 0.4, 0.2
 FOV_DEG = 62.0
 EYE_HEIGHTS = (1.34, 1.7)
 """Alternating camera heights, m; the difference adds parallax that the loop alone lacks."""
-PATH_SHARE = 0.27
-"""Semi-axes of the camera loop, as shares of the room's width and depth."""
+PATH_SHARE = 0.27  # semi-axes of the camera loop, as shares of the room's width and depth
 LOOK_AT_Z = 0.78
 
 

@@ -34,10 +34,8 @@ GAP = 0.12
 TRIES = 200
 
 LANE = 3.2
-KERB = 5.7
-"""Half the width of the road, m: one lane and one parking strip."""
-FRONT = 8.7
-"""Distance between the house fronts and the middle of the road, m."""
+KERB = 5.7  # half the width of the road, m: one lane and one parking strip
+FRONT = 8.7  # distance between the house fronts and the middle of the road, m
 WALK_Z = 0.14
 SCALE = 4.0
 """Value of `Style.scale`: textures and occlusion distance are four times as large as on a table."""
@@ -46,16 +44,12 @@ DOME_RADIUS = 115.0
 DOME_HEIGHT = 62.0
 CROSSING_X = (14.2, 16.8)
 
-LANE_Y = -LANE / 2
-"""Middle of the driver's lane, m (traffic keeps to the right)."""
+LANE_Y = -LANE / 2  # middle of the driver's lane, m (traffic keeps to the right)
 DRIVE_X = (-13.0, 10.5)
 CAMERA_Z = 1.8
-MAX_STEP = 0.51
-"""Maximum distance between neighbouring views along the street, m."""
-SWEEP_VIEWS = 16
-"""Number of views in which the camera sweeps from left to right and back."""
-SWEEP_DEG = 36.0
-"""Amplitude of the sweep to either side of straight ahead."""
+MAX_STEP = 0.51  # maximum distance between neighbouring views along the street, m
+SWEEP_VIEWS = 16  # number of views in which the camera sweeps from left to right and back
+SWEEP_DEG = 36.0  # amplitude of the sweep to either side of straight ahead
 SWAY_M = 0.8
 """Lateral amplitude of the camera about the lane's middle in one sweep. Without this sway, the error of
 structure from motion was 2.5 m instead of 0.04 m: views that rotate on a straight path have little parallax,

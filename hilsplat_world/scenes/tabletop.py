@@ -25,8 +25,7 @@ MAX_FOOTPRINT = 0.36
 MAX_HEIGHT_TO_FOOTPRINT = 2.7
 GAP = 0.015
 WALL_GROUPS = ("brick", "collage", "stone", "plain", "cloth")
-ROOM_PALE = 0.5
-"""Share of grey mixed into walls and floor, so that the objects stand out."""
+ROOM_PALE = 0.5  # share of grey mixed into walls and floor, so that the objects stand out
 FOV_DEG = 50.0
 ELEVATIONS_DEG = (24.0, 46.0)
 DISTANCE = 2.15 * TABLE_RADIUS
