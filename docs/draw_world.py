@@ -111,10 +111,10 @@ if __name__ == "__main__":
     parser.add_argument("what", choices=("classes", *KINDS), help="classes, or a kind of scene")
     parser.add_argument("out", type=Path, help="PNG to write")
     parser.add_argument("seeds", type=int, nargs="*", help="seeds of the scenes")
-    given = parser.parse_args()
-    if given.what == "classes":
-        draw_classes(given.out)
-    elif not given.seeds:
+    options = parser.parse_args()
+    if options.what == "classes":
+        draw_classes(options.out)
+    elif not options.seeds:
         parser.error("scenes need seeds, such as 100 101")
     else:
-        draw_scenes(given.what, given.seeds, given.out)
+        draw_scenes(options.what, options.seeds, options.out)

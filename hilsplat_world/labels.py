@@ -13,8 +13,7 @@ from hilsplat.datasets.classes import NYU40, REPLICA_NAMES, SCANNET200, WAYMO_22
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
 from hilsplat.datasets.points.labelled_points import LabelledPoints, PlyMesh
 
-OTHERPROP = 40
-"""NYU40's class for small objects without a class of their own."""
+OTHERPROP = 40  # NYU40's class for small objects without a class of their own
 SCANNET200_WORDS = {"sofa": "couch", "television": "tv", "bear": "stuffed animal", "mug": "cup"}
 REPLICA_WORDS = {
     "bookshelf": "shelf",
@@ -46,16 +45,15 @@ COUNTABLE = frozenset({"car", "truck", "bus", "bicyclist", "pedestrian"})
 
 def scannet_ids(text: str) -> tuple[int, int]:
     """Return the ScanNet200 id (0 for none) and NYU40 id of a world class."""
-    name = SCANNET200_WORDS.get(text, text)
     fine = dict(zip(SCANNET200.texts, SCANNET200.ids, strict=True))
     broad = {query: number for number, query in NYU40.items()}
-    return fine.get(name, 0), broad.get(text, OTHERPROP)
+    return fine.get(SCANNET200_WORDS.get(text, text), 0), broad.get(text, OTHERPROP)
 
 
 def replica_id(text: str) -> int:
     """Return Replica's class id for a world class, or 0 if there is none."""
-    name = REPLICA_WORDS.get(text, text)
-    return {query: number for number, query in REPLICA_NAMES.items()}.get(name, 0)
+    ids = {query: number for number, query in REPLICA_NAMES.items()}
+    return ids.get(REPLICA_WORDS.get(text, text), 0)
 
 
 def waymo_labels(node_ids: Int32[np.ndarray, "P 3"], texts: Sequence[str]) -> Int32[np.ndarray, "P 2"]:

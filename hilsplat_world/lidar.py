@@ -14,41 +14,26 @@ from hilsplat.base.levels import NONE
 from hilsplat_world.scenes.scene import WorldScene
 
 BEAMS = 64
-INCLINATION_DEG = (-17.6, 2.4)
-"""Inclinations of the lowest and highest beams, as in Waymo's top lidar."""
-AZIMUTH_STEPS = 400
-"""Number of directions per turn; Waymo's lidar has 2650."""
-POSES = 5
-"""Number of positions along the drive at which a turn is recorded."""
+INCLINATION_DEG = (-17.6, 2.4)  # inclinations of the lowest and highest beams, as in Waymo's top lidar
+AZIMUTH_STEPS = 400  # number of directions per turn; Waymo's lidar has 2650
+POSES = 5  # number of positions along the drive at which a turn is recorded
 ABOVE_CAMERA_M = 0.35
 MAX_RANGE_M = 75.0
-RANGE_NOISE_M = 0.015
-"""Standard deviation of the measured range."""
-LOST_SHARE = 0.05
-"""Share of returns that are dropped at random."""
-GLANCING_COSINE = 0.03
-"""Minimum cosine between a beam and the surface normal for a return."""
+RANGE_NOISE_M = 0.015  # standard deviation of the measured range
+LOST_SHARE = 0.05  # share of returns that are dropped at random
+GLANCING_COSINE = 0.03  # minimum cosine between a beam and the surface normal for a return
 
 
 @dataclass(frozen=True, eq=False)
 class LidarScan:
-    """P measured points and the nodes that they belong to.
+    """P measured points and the nodes that they belong to."""
 
-    Attributes:
-        points: positions in the frame of the ground-truth cameras, with noise, metres.
-        node_ids: whole, part and subpart of each point; -1 for none.
-        pose_index: row in `origins` of the position from which each point was measured.
-        range_m: measured distance to that position.
-        beam: number of the beam, from 0 (lowest) to 63.
-        origins: positions of the scanner.
-    """
-
-    points: Float32[np.ndarray, "P 3"]
-    node_ids: Int32[np.ndarray, "P 3"]
-    pose_index: Int32[np.ndarray, " P"]
-    range_m: Float32[np.ndarray, " P"]
-    beam: Int32[np.ndarray, " P"]
-    origins: Float[np.ndarray, "S 3"]
+    points: Float32[np.ndarray, "P 3"]  # positions in the frame of the ground-truth cameras, with noise
+    node_ids: Int32[np.ndarray, "P 3"]  # whole, part and subpart of each point; -1 for none
+    pose_index: Int32[np.ndarray, " P"]  # row in `origins` of the position from which each was measured
+    range_m: Float32[np.ndarray, " P"]  # measured distance to that position
+    beam: Int32[np.ndarray, " P"]  # number of the beam, from 0 (lowest) to 63
+    origins: Float[np.ndarray, "S 3"]  # positions of the scanner
 
 
 def beam_directions() -> Float[np.ndarray, "R 3"]:
@@ -82,11 +67,11 @@ def scan_street(scene: WorldScene, camera_centres: Float[np.ndarray, "V 3"]) -> 
         # Both numbers are drawn for every ray, so that a lost point does not change the others' noise.
         noise, luck = rng.normal(0.0, 1.0, len(directions)), rng.random(len(directions))
         ids = np.where((prim >= 0)[:, None], scene.node_ids[prim], NONE)
-        kept = (prim >= 0) & ~np.isin(ids[:, 0], sky) & (away < MAX_RANGE_M)
-        kept &= (facing > GLANCING_COSINE) & (luck >= LOST_SHARE)
-        measured = away[kept] + RANGE_NOISE_M * noise[kept]
-        points = origin + measured[:, None] * directions[kept]
-        rows.append((points, ids[kept], np.full(kept.sum(), pose), measured, beams[kept]))
+        returned = (prim >= 0) & ~np.isin(ids[:, 0], sky) & (away < MAX_RANGE_M)
+        returned &= (facing > GLANCING_COSINE) & (luck >= LOST_SHARE)
+        measured = away[returned] + RANGE_NOISE_M * noise[returned]
+        points = origin + measured[:, None] * directions[returned]
+        rows.append((points, ids[returned], np.full(returned.sum(), pose), measured, beams[returned]))
     points, ids, pose_index, ranges, beam = (np.concatenate(column) for column in zip(*rows, strict=True))
     ids, pose_index, beam = (column.astype(np.int32) for column in (ids, pose_index, beam))
     return LidarScan(points.astype(np.float32), ids, pose_index, ranges.astype(np.float32), beam, origins)

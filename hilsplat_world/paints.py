@@ -12,17 +12,11 @@ Colour = tuple[float, float, float]
 
 
 class Texture(NamedTuple):
-    """A kind of solid texture.
+    """A kind of solid texture."""
 
-    Attributes:
-        adjective: adjective for an object with the texture, or None.
-        second_share: average share of the second colour in the texture (measured by a test).
-        cells: typical number of pattern cells per scene unit.
-    """
-
-    adjective: str | None
-    second_share: float
-    cells: float
+    adjective: str | None  # for an object with the texture
+    second_share: float  # average share of the second colour in the texture (measured by a test)
+    cells: float  # typical number of pattern cells per scene unit
 
 
 TEXTURES: dict[str, Texture] = {
@@ -41,8 +35,7 @@ TEXTURES: dict[str, Texture] = {
 }
 """Solid textures by kind."""
 
-KINDS = tuple(TEXTURES)
-"""Kinds of texture, in the order of the shader's kind numbers."""
+KINDS = tuple(TEXTURES)  # kinds of texture, in the order of the shader's kind numbers
 
 COLOURS: dict[str, Colour] = {
     "red": (0.78, 0.14, 0.12),
@@ -80,43 +73,28 @@ GROUPS: dict[str, tuple[tuple[str, ...], float, float]] = {
 PATTERNS = ("stripes", "checks", "spots")
 """Kinds of texture whose second colour need not be a shade of the first."""
 
-PATTERN_CONTRAST = 22.0
-"""Minimum distance between the two colours of a pattern, in L*a*b*."""
+PATTERN_CONTRAST = 22.0  # minimum distance between the two colours of a pattern, in L*a*b*
 
 WOOD_COLOURS = ("brown", "beige", "orange")
 
 
 @dataclass(frozen=True)
 class Paint:
-    """One solid material: a two-colour texture, evaluated in object coordinates.
+    """One solid material: a two-colour texture, evaluated in object coordinates."""
 
-    Attributes:
-        colour: word for the prevailing (first) colour.
-        kind: texture, one of `KINDS`.
-        first: sRGB of the prevailing colour, in [0, 1].
-        second: sRGB of the pattern's other colour.
-        scale: cells of the pattern per scene unit.
-        specular: strength of the highlight.
-        shininess: Blinn-Phong exponent.
-        grain: relative amplitude of the fine grain, which structure from motion needs.
-        offset: shift of the texture, scene units; keeps cell borders off object faces.
-        choices: allowed colour words; empty for any.
-    """
-
-    colour: str
-    kind: str
-    first: Colour
-    second: Colour
-    scale: float
-    specular: float
-    shininess: float
-    grain: float
-    offset: tuple[float, float, float]
-    choices: tuple[str, ...] = ()
+    colour: str  # word for the prevailing (first) colour
+    kind: str  # texture, one of `KINDS`
+    first: Colour  # sRGB of the prevailing colour, in [0, 1]
+    second: Colour  # sRGB of the pattern's other colour
+    scale: float  # cells of the pattern per scene unit
+    specular: float  # strength of the highlight
+    shininess: float  # Blinn-Phong exponent
+    grain: float  # relative amplitude of the fine grain, which structure from motion needs
+    offset: tuple[float, float, float]  # shift of the texture, scene units; keeps borders off object faces
+    choices: tuple[str, ...] = ()  # allowed colour words; empty for any
 
     @property
     def adjective(self) -> str | None:
-        """Adjective for the texture, or None."""
         return TEXTURES[self.kind].adjective
 
     @property
@@ -141,7 +119,6 @@ class Paint:
         return replace(self, colour=word, first=COLOURS[word], second=_relative(np.array(COLOURS[word])))
 
     def _changed(self, change: Callable[[float], float]) -> "Paint":
-        """Return the paint with each channel of both colours changed, and the matching colour word."""
         first, second = each_channel(self.first, change), each_channel(self.second, change)
         paint = replace(self, first=first, second=second)
         return replace(paint, colour=colour_word(paint.seen))

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 VIEWS_SHOWN = 4
-LINES_SHOWN = 52
-"""Maximum number of tree lines in a column, for legibility."""
+LINES_SHOWN = 52  # maximum number of tree lines in a column, for legibility
 
 
 def show_panel(
@@ -71,10 +70,10 @@ def show_world(world_folder: Path, out: Path) -> None:
         axes.set_axis_off()
         axes.set(xlim=(0, 1), ylim=(per_column, 0))
         for row, (depth, node) in enumerate(lines[column * per_column : (column + 1) * per_column]):
-            shown = node.text if node.id in scored else f"[{node.text}]"
+            text = node.text if node.id in scored else f"[{node.text}]"
             y, x = row + 0.5, 0.06 + 0.09 * depth
             axes.plot(x - 0.025, y, "s", color=colours[node.id] / 255, markersize=6)
-            axes.text(x, y, shown, fontsize=9, va="center", weight="bold" if depth == 0 else "normal")
+            axes.text(x, y, text, fontsize=9, va="center", weight="bold" if depth == 0 else "normal")
     figure.suptitle(
         f"{record['source']} (generator {record['generator_version']}, {record['split']} seed): "
         f"{record['objects_placed']} of {record['objects_asked']} objects placed, {len(images)} views",

@@ -1,7 +1,6 @@
 """Scene seeds reserved for training the small models, for development, and for the benchmark."""
 
-TRAINING_SEEDS = range(1_000_000, 2_000_000)
-"""Scenes on which the small embedded models are trained."""
+TRAINING_SEEDS = range(1_000_000, 2_000_000)  # scenes on which the small embedded models are trained
 
 SPLITS = {"training": TRAINING_SEEDS, "development": range(100, 200), "benchmark": range(200, 300)}
 """Scenes for training, for choosing settings, and for reported results; no scene has two of these uses."""

@@ -17,21 +17,15 @@ SMOOTH_BELOW_DEG = 40.0
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A mesh of F triangles with a shading normal per corner; z is up.
+    """A mesh of F triangles with a shading normal per corner; z is up."""
 
-    Attributes:
-        triangles: corner positions.
-        normals: unit normals at the corners, pointing outwards.
-    """
-
-    triangles: Float[np.ndarray, "F 3 3"]
-    normals: Float[np.ndarray, "F 3 3"]
+    triangles: Float[np.ndarray, "F 3 3"]  # corner positions
+    normals: Float[np.ndarray, "F 3 3"]  # unit normals at the corners, pointing outwards
 
     def __len__(self) -> int:
         return len(self.triangles)
 
     def moved(self, x: Number = 0.0, y: Number = 0.0, z: Number = 0.0) -> "Mesh":
-        """Shift the mesh."""
         return Mesh(self.triangles + np.array([x, y, z]), self.normals)
 
     def both_sides(self, x: Number, y: Number, z: Number) -> "Mesh":
@@ -62,8 +56,8 @@ def rotation_about(axis: str, degrees: Number) -> Float[np.ndarray, "3 3"]:
 
 def joined(*meshes: Mesh) -> Mesh:
     """Join several meshes into one."""
-    triangles, normals = zip(*((mesh.triangles, mesh.normals) for mesh in meshes), strict=True)
-    return Mesh(np.concatenate(triangles), np.concatenate(normals))
+    triangles = np.concatenate([mesh.triangles for mesh in meshes])
+    return Mesh(triangles, np.concatenate([mesh.normals for mesh in meshes]))
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
@@ -150,10 +144,10 @@ def lathe(profile: Sequence[tuple[Number, Number]], segments: int = 28) -> Mesh:
     triangles: list[np.ndarray] = []
     shading: list[np.ndarray] = []
     for i, (low, high) in enumerate(pairwise(points)):
-        own = normals[i]
-        below = normals[i - 1] if i > 0 and normals[i - 1] @ own > smooth else own
-        above = normals[i + 1] if i + 1 < len(normals) and normals[i + 1] @ own > smooth else own
-        normal_low, normal_high = _unit(own + below), _unit(own + above)
+        normal = normals[i]
+        below = normals[i - 1] if i > 0 and normals[i - 1] @ normal > smooth else normal
+        above = normals[i + 1] if i + 1 < len(normals) and normals[i + 1] @ normal > smooth else normal
+        normal_low, normal_high = _unit(normal + below), _unit(normal + above)
 
         def around(value: np.ndarray) -> np.ndarray:
             return np.column_stack([ring * value[0], np.full(len(ring), value[1])])  # (segments + 1, 3)
@@ -182,7 +176,6 @@ def ellipsoid(radii: Point, centre: Point = (0.0, 0.0, 0.0), segments: int = 24,
 
 
 def sphere(radius: Number, centre: Point = (0.0, 0.0, 0.0), segments: int = 24) -> Mesh:
-    """Return a sphere."""
     return ellipsoid((radius, radius, radius), centre, segments)
 
 

@@ -74,9 +74,8 @@ def run_world(source: str, settings: WorldSettings, images: Path, truth: Path, t
         labels, annotated = {}, {}
         size = {"height": settings.image_px, "width": settings.image_px}
         with atomic_folder(images) as folder:
-            jobs = [(kind, seed, settings, row) for row in range(settings.views)]
-            results = in_processes(_render, jobs, threads)
-            views = zip(cameras.names, results, strict=True)
+            jobs = [(kind, seed, settings, name) for name in cameras.names]
+            views = zip(cameras.names, in_processes(_render, jobs, threads), strict=True)
             for name, (image, label) in track(views, "rendered views", total=len(cameras)):
                 write_png(folder / name, image)
                 labels[name] = {level: label[level.index] for level in LEVELS}
@@ -102,8 +101,8 @@ def run_world(source: str, settings: WorldSettings, images: Path, truth: Path, t
                 "style": asdict(scene.style),
             }
             write_json(folder / "scene.json", record)
-            index = {name: {"annotated": len(ids)} for name, ids in annotated.items()}
-            write_index(folder, index, source=source)
+            counted = {name: {"annotated": len(ids)} for name, ids in annotated.items()}
+            write_index(folder, counted, source=source)
         counts.update(views=len(cameras), objects=f"{len(scene.placed)} of {scene.asked}")
         counts.update(nodes=len(scene.nodes), triangles=len(scene.triangles))
 
@@ -111,8 +110,8 @@ def run_world(source: str, settings: WorldSettings, images: Path, truth: Path, t
 _scene = lru_cache(maxsize=1)(build_scene)
 
 
-def _render(kind: str, seed: int, settings: WorldSettings, row: int) -> tuple[np.ndarray, np.ndarray]:
+def _render(kind: str, seed: int, settings: WorldSettings, view: str) -> tuple[np.ndarray, np.ndarray]:
     """Render one view and its labels in a worker process."""
     scene = _scene(kind, seed, settings.objects)
     cameras = scene_cameras(scene, settings.views, settings.image_px, settings.arc_deg)
-    return render_and_label(scene, cameras[cameras.names[row]], settings.samples)
+    return render_and_label(scene, cameras[view], settings.samples)

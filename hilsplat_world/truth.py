@@ -39,7 +39,7 @@ def annotated_nodes(
         background: ids that are never scored (table, floor, walls).
         smallest: minimum area of a scored query by level, px.
     """
-    kept: list[int] = []
+    annotated: list[int] = []
     for level in LEVELS:
         area_px: dict[str, int] = defaultdict(int)
         visible: dict[str, list[int]] = defaultdict(list)
@@ -50,8 +50,8 @@ def annotated_nodes(
                 visible[text].append(int(node_id))
         for text, ids in visible.items():
             if area_px[text] >= smallest[level]:
-                kept.extend(ids)
-    return tuple(sorted(kept))
+                annotated.extend(ids)
+    return tuple(sorted(annotated))
 
 
 def write_mesh(path: Path, scene: WorldScene, cameras: Cameras, longest_edge: float | None = None) -> None:
@@ -81,6 +81,7 @@ def write_mesh(path: Path, scene: WorldScene, cameras: Cameras, longest_edge: fl
     faces["corners"] = index.reshape(-1, 3)
     for level in LEVELS:
         faces[level.label] = ids[:, level.index]
+    # plyfile writes a list property row by row, which takes ten times as long.
     id_lines = [f"property int {level.label}" for level in LEVELS]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
     header += [*(f"property float {axis}" for axis in "xyz"), *id_lines, "property uchar views"]
@@ -153,9 +154,8 @@ def refined(
                 2: [(ab, b, bc), (a, ab, bc), (a, bc, c)],
                 3: [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)],
             }[number]
-            for corners in split:
-                pieces.append(np.stack(corners, axis=1))
-                owners.append(owner[rows])
+            pieces += [np.stack(corners, axis=1) for corners in split]
+            owners += [owner[rows]] * len(split)
         triangles, owner = np.concatenate(pieces), np.concatenate(owners)
     return np.concatenate(done), np.concatenate(done_owner)
 

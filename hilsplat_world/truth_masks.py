@@ -39,17 +39,14 @@ from hilsplat_world.settings import PerturbSettings
 
 logger = logging.getLogger(__name__)
 
-SEGMENTER = "truth-perturbed"
-"""Name of the segmenter, and label prefix of its masks."""
+SEGMENTER = "truth-perturbed"  # name of the segmenter, and label prefix of its masks
 
 FAULTS = ("boundary_px", "merge", "split", "missing", "wrong_level", "systematic_merge", "systematic_missing")
 """Settings that change masks; if all are 0, the masks are exact."""
 
-REACH = 3.0
-"""Maximum displacement of a boundary, in standard deviations."""
+REACH = 3.0  # maximum displacement of a boundary, in standard deviations
 
-WAVES = 48
-"""Number of plane waves that are summed for a boundary's displacement."""
+WAVES = 48  # number of plane waves that are summed for a boundary's displacement
 
 Borders = dict[int, Counter[int]]
 """Node -> adjacent sibling -> length of their common border, px."""
@@ -94,8 +91,8 @@ def run_truth_masks(
 
         index: dict[str, Any] = {}
         with atomic_folder(out) as folder:
-            found = in_order(segment, views, threads)
-            for view, (masks, faults) in zip(views, track(found, "masks of views", len(views)), strict=True):
+            results = track(in_order(segment, views, threads), "masks of views", len(views))
+            for view, (masks, faults) in zip(views, results, strict=True):
                 masks.save(folder / f"{view}.npz")
                 index[view] = {**index_entry(masks), "faults": faults}
             made_by = {"segmenter": SEGMENTER, "model": None, "model_sha256": None, "label": label}
@@ -120,7 +117,7 @@ def faults_label(settings: PerturbSettings) -> str:
         return f"{SEGMENTER} (exact)"
     changed = []
     for name, value in settings.model_dump(exclude_defaults=True).items():
-        text = "/".join(f"{each:g}" for each in value) if isinstance(value, tuple) else f"{value}"
+        text = "/".join(f"{share:g}" for share in value) if isinstance(value, tuple) else f"{value}"
         changed.append(f"{name} {text}")
     return f"{SEGMENTER} ({', '.join(changed)})" if changed else SEGMENTER
 
@@ -146,16 +143,13 @@ class Draws:
 class TrueNodes:
     """Scene-wide data that the faults depend on.
 
-    Attributes:
-        nodes: all nodes by id.
-        background: ids of the surroundings, which are never merged.
-        partner: maps each node to the sibling with which it shares the longest border over all views; a
-            systematic merge joins these two. Nodes without an adjacent sibling are absent.
+    A systematic merge joins a node and its partner, the sibling with which it shares the longest border over
+    all views.
     """
 
-    nodes: tuple[AnnotatedNode, ...]
-    background: frozenset[int]
-    partner: Mapping[int, int]
+    nodes: tuple[AnnotatedNode, ...]  # by id
+    background: frozenset[int]  # ids of the surroundings, which are never merged
+    partner: Mapping[int, int]  # of each node that has an adjacent sibling
 
     @staticmethod
     def of(
@@ -327,7 +321,7 @@ def faulty_masks(
         The masks in `content_order`, and the number of faults of each kind.
     """
     counts = dict.fromkeys(("merged", "missing", "split", "wrong_level"), 0)
-    found: list[tuple[np.ndarray, Level, float, float]] = []
+    rows: list[tuple[np.ndarray, Level, float, float]] = []
     for level in LEVELS:
         of_level = labels[level.index]
         areas = zip(*np.unique(of_level, return_counts=True), strict=True)
@@ -347,21 +341,20 @@ def faulty_masks(
                 counts["split"] += len(pieces) - 1
             for number, piece in enumerate(pieces):
                 name = (view, lead, number)
-                mask = piece
+                mask, mask_level = piece, level
                 if settings.boundary_px:
                     field = draws.generator("boundary", *name)
                     mask = displaced(piece, settings.boundary_px, settings.boundary_smooth_px, field)
-                mask_level = level
                 if draws.chance("wrong level", *name) < settings.wrong_level:
                     mask_level = beside(level, up=draws.chance("which level", *name) < 0.5)
                     counts["wrong_level"] += 1
                 quality = max(_iou(mask, of_level == node) for node in group)
-                found.append((mask, mask_level, *_scores(quality, draws, settings, name)))
+                rows.append((mask, mask_level, *_scores(quality, draws, settings, name)))
     masks = HierarchicalMasks.from_dense(
-        np.array([each[0] for each in found], bool).reshape(len(found), *labels.shape[1:]),
-        np.array([int(each[1]) for each in found], np.uint8),
-        np.array([each[2] for each in found], np.float32),
-        np.array([each[3] for each in found], np.float32),
+        np.array([mask for mask, *_ in rows], bool).reshape(len(rows), *labels.shape[1:]),
+        np.array([int(row[1]) for row in rows], np.uint8),
+        np.array([row[2] for row in rows], np.float32),
+        np.array([row[3] for row in rows], np.float32),
     )
     return masks.take(masks.content_order()), counts
 
@@ -370,11 +363,9 @@ def _scores(
     quality: float, draws: Draws, settings: PerturbSettings, name: tuple[str | int, ...]
 ) -> tuple[float, float]:
     """Return the predicted IoU and stability of a mask whose true IoU is `quality`."""
-    predicted, stability = quality, (1 + quality) / 2
-    if settings.score_noise:
-        noise = settings.score_noise * draws.generator("scores", *name).standard_normal(2)
-        predicted, stability = predicted + noise[0], stability + noise[1]
-    return min(1.0, max(0.0, predicted)), min(1.0, max(0.0, stability))
+    noise = settings.score_noise * draws.generator("scores", *name).standard_normal(2)
+    predicted, stability = np.clip(np.array([quality, (1 + quality) / 2]) + noise, 0, 1).tolist()
+    return predicted, stability
 
 
 def _iou(mask: Bool[np.ndarray, "H W"], region: Bool[np.ndarray, "H W"]) -> float:

@@ -22,8 +22,7 @@ from hilsplat.segment.origin import masks_label
 from hilsplat.segment.pictures import paint_level
 from hilsplat_world.diagnostics.world_consistency import load_masks
 
-MIN_PX = 100
-"""Smaller ground-truth regions are not scored."""
+MIN_PX = 100  # smaller ground-truth regions are not scored
 FIT_IOU = 0.5
 COLUMNS = ("scene", "masks", "level", "views", "regions", "best_iou", "recall", "masks_a_view", "precision")
 COLOURS = "RdYlGn"
@@ -41,15 +40,15 @@ class ViewFit:
 
 def fit_of_view(masks: HierarchicalMasks, truth: HierarchyAnnotations, view: str) -> dict[Level, ViewFit]:
     """Compare masks with the ground-truth regions, level by level."""
-    found = {}
+    fits = {}
     for level in LEVELS:
         labels, rows = truth.label_image(view, level), masks.rows_of(level)
         ids, areas, ious = region_ious(labels, masks.dense(rows))
         scored = areas >= MIN_PX
         best = ious[scored].max(axis=1, initial=0)
         fitting = int((ious.max(axis=0, initial=0) >= FIT_IOU).sum())
-        found[level] = ViewFit(ids[scored], best, len(rows), fitting)
-    return found
+        fits[level] = ViewFit(ids[scored], best, len(rows), fitting)
+    return fits
 
 
 def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, out: Path) -> str:
@@ -69,13 +68,13 @@ def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, o
         counts["views"] = len(fits)
         rows = []
         for level in LEVELS:  # means are over regions, not over views
-            own = [fit[level] for fit in fits.values()]
-            best = np.concatenate([fit.best for fit in own])
-            number = sum(fit.masks for fit in own)
+            of_level = [fit[level] for fit in fits.values()]
+            best = np.concatenate([fit.best for fit in of_level])
+            num_masks = sum(fit.masks for fit in of_level)
             iou, recall = (best.mean(), (best >= FIT_IOU).mean()) if len(best) else (np.nan, np.nan)
-            precision = sum(fit.fitting for fit in own) / number if number else np.nan
-            numbers = [str(len(own)), str(len(best)), f"{iou:.4f}", f"{recall:.4f}"]
-            numbers += [f"{number / len(own):.1f}", f"{precision:.4f}"]
+            precision = sum(fit.fitting for fit in of_level) / num_masks if num_masks else np.nan
+            numbers = [str(len(of_level)), str(len(best)), f"{iou:.4f}", f"{recall:.4f}"]
+            numbers += [f"{num_masks / len(of_level):.1f}", f"{precision:.4f}"]
             rows.append([scene.name, masks_label(masks_folder), level.label, *numbers])
         save_png_and_pdf(draw_fits(scene, truth, masks_folder, fits), out)
         write_csv(Path(out).with_suffix(".csv"), COLUMNS, rows)

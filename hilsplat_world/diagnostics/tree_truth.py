@@ -70,13 +70,13 @@ def measure_tree(
         if inside.size:
             main_of[nodes] = np.where(inside.max(axis=1) > 0, inside.argmax(axis=1), NONE)
 
-    found = {}
+    measures = {}
     for level in LEVELS:
         overlap, nodes = overlaps[level], tree.nodes_of(level)
         ids = np.flatnonzero((true_level == int(level)) & (overlap[:, :-1].sum(axis=0) > 0))
-        both = overlap[np.ix_(nodes, ids)]
-        union = overlap[nodes].sum(axis=1)[:, None] + overlap[:, ids].sum(axis=0)[None] - both
-        iou = both / np.maximum(union, 1e-12)
+        intersection = overlap[np.ix_(nodes, ids)]
+        union = overlap[nodes].sum(axis=1)[:, None] + overlap[:, ids].sum(axis=0)[None] - intersection
+        iou = intersection / np.maximum(union, 1e-12)
         row, column = linear_sum_assignment(-iou)
         good = iou[row, column] > MATCH_IOU
         matched, partner = nodes[row[good]], ids[column[good]]
@@ -85,7 +85,7 @@ def measure_tree(
         parent_main = np.where(parent != NONE, main_of[np.maximum(parent, 0)], NONE)
         right = parent_main == true_parent[partner[has_parent]]
         size = overlap[nodes].sum()
-        found[level] = TreeMeasure(
+        measures[level] = TreeMeasure(
             nodes=len(nodes),
             true_nodes=len(ids),
             precision=float(good.sum() / max(len(nodes), 1)),
@@ -96,7 +96,7 @@ def measure_tree(
             view_consistency=float(tree.quality[nodes].mean()) if len(nodes) else 0.0,
             pairs=tuple(zip(matched.tolist(), partner.tolist(), strict=True)),
         )
-    return found
+    return measures
 
 
 def true_votes(
@@ -130,11 +130,10 @@ def run_tree_truth(
     scene, annotations = Scene.load(scene_folder), HierarchyAnnotations.load(truth)
     tree = SemanticTree.load(semantic_tree)
     votes = true_votes(scene, gaussians_ply, annotations, scene.views("train"), tree.min_weight, threads)
-    measured = measure_tree(tree, votes, annotations)
     rows = []
-    for level, one in measured.items():
-        values = [getattr(one, name) for name in COLUMNS[2:]]
-        shown = [str(value) if isinstance(value, int) else f"{value:.4f}" for value in values]
-        rows.append([scene.name, level.label, *shown])
+    for level, measure in measure_tree(tree, votes, annotations).items():
+        values = [getattr(measure, name) for name in COLUMNS[2:]]
+        texts = [str(value) if isinstance(value, int) else f"{value:.4f}" for value in values]
+        rows.append([scene.name, level.label, *texts])
     write_csv(out, COLUMNS, rows)
     return markdown_table(COLUMNS, rows, 2)

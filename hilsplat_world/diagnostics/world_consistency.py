@@ -5,9 +5,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int32, Int64
+from jaxtyping import Bool, Float, Int, Int64
 
 from hilsplat.base.artifacts import read_index
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
@@ -38,14 +39,11 @@ COLUMNS = (
 DEPTH_TOLERANCE = 0.01
 """Maximum relative difference in depth at which two views are taken to show the same surface point."""
 
-MIN_POINTS = 16
-"""Masks with fewer shared points are not compared."""
+MIN_POINTS = 16  # masks with fewer shared points are not compared
 
-MAX_POINTS = 50_000
-"""Maximum number of shared points per pair of views; more are evenly subsampled."""
+MAX_POINTS = 50_000  # maximum number of shared points per pair of views; more are evenly subsampled
 
-TEXTS_PER_LEVEL = 4
-"""Number of texts per level and view; each is queried in two views."""
+TEXTS_PER_LEVEL = 4  # number of texts per level and view; each is queried in two views
 
 
 @dataclass(frozen=True)
@@ -99,13 +97,13 @@ def shared_points(
     x, y = low.T
     upper = inverse[y, x] * (1 - share_x) + inverse[y, x + 1] * share_x
     lower = inverse[y + 1, x] * (1 - share_x) + inverse[y + 1, x + 1] * share_x
-    shown = upper * (1 - share_y) + lower * share_y
-    visible = np.abs(shown * in_b[:, 2] - 1) <= tolerance
+    inverse_here = upper * (1 - share_y) + lower * share_y
+    visible = np.abs(inverse_here * in_b[:, 2] - 1) <= tolerance
     x, y = np.floor(xy[visible]).astype(np.int64).T
     pixel_a, pixel_b = pixel[visible], y * width + x
     if len(pixel_a) > max_points:
-        kept = np.linspace(0, len(pixel_a) - 1, max_points).astype(np.int64)
-        pixel_a, pixel_b = pixel_a[kept], pixel_b[kept]
+        rows = np.linspace(0, len(pixel_a) - 1, max_points).astype(np.int64)
+        pixel_a, pixel_b = pixel_a[rows], pixel_b[rows]
     return pixel_a, pixel_b
 
 
@@ -131,9 +129,10 @@ def pair_disagreement(
     cells = np.bincount((rows * max(1, len(names)) + columns)[in_mask])
     together_a = _pairs(np.bincount(rows[labels_a != NONE]))
     together_b = _pairs(np.bincount(columns[labels_b != NONE]))
-    both = _pairs(cells)
-    differ, all_pairs = together_a + together_b - 2 * both, _pairs(np.array([len(labels_a)]))
-    either = differ + both
+    together_in_both = _pairs(cells)
+    differ = together_a + together_b - 2 * together_in_both
+    all_pairs = _pairs(np.array([len(labels_a)]))
+    either = differ + together_in_both
     return differ / all_pairs if all_pairs else np.nan, differ / either if either else np.nan
 
 
@@ -143,34 +142,29 @@ def _pairs(counts: Int[np.ndarray, " n"]) -> int:
     return int((counts * (counts - 1) // 2).sum())
 
 
-def painted(inside: Bool[np.ndarray, "M P"], area_px: Int[np.ndarray, " M"]) -> Int32[np.ndarray, " P"]:
-    """Return the mask at each point, or -1, painting masks from large to small as in a label map.
+class Regions(NamedTuple):
+    """Masks of one level in a view, and the row of the smallest mask at each pixel (-1: none)."""
 
-    Of two equally large masks, the one with the lower row index is painted last.
-    """
-    labels = np.full(inside.shape[1], NONE, dtype=np.int32)
-    for row in np.lexsort((-np.arange(len(area_px)), -area_px)):
-        labels[inside[row]] = row
-    return labels
+    masks: Bool[np.ndarray, "M H W"]
+    labels: Int[np.ndarray, "H W"]
+
+    def at(self, pixels: Int64[np.ndarray, " P"]) -> tuple[Bool[np.ndarray, "M P"], Int[np.ndarray, " P"]]:
+        """Return the masks and labels at some row-major pixels."""
+        flat = self.masks.reshape(len(self.masks), self.labels.size)
+        return flat[:, pixels], self.labels.reshape(-1)[pixels]
 
 
 def view_agreement(
-    masks_a: Bool[np.ndarray, "Ma Ha Wa"],
-    masks_b: Bool[np.ndarray, "Mb Hb Wb"],
-    pixel_a: Int64[np.ndarray, " P"],
-    pixel_b: Int64[np.ndarray, " P"],
+    a: Regions, b: Regions, pixel_a: Int64[np.ndarray, " P"], pixel_b: Int64[np.ndarray, " P"]
 ) -> Agreement:
     """Return the agreement of the masks of one level between two views, at shared points.
 
     Masks of a view may overlap. `best_iou` uses them unchanged; the disagreements use the smallest mask at
-    each point (`painted`), like the language field.
+    each point, like the language field.
     """
-    inside_a = masks_a.reshape(len(masks_a), np.prod(masks_a.shape[1:], dtype=int))[:, pixel_a]
-    inside_b = masks_b.reshape(len(masks_b), np.prod(masks_b.shape[1:], dtype=int))[:, pixel_b]
+    (inside_a, labels_a), (inside_b, labels_b) = a.at(pixel_a), b.at(pixel_b)
     ious = best_ious(inside_a, inside_b)
-    all_pairs, joined = pair_disagreement(
-        painted(inside_a, masks_a.sum(axis=(1, 2))), painted(inside_b, masks_b.sum(axis=(1, 2)))
-    )
+    all_pairs, joined = pair_disagreement(labels_a, labels_b)
     return Agreement(len(ious), float(ious.mean()) if len(ious) else np.nan, all_pairs, joined)
 
 
@@ -229,33 +223,31 @@ def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> s
     annotations = HierarchyAnnotations.load(truth)
     pairs = neighbours(cameras, views, count)
 
-    depth_of = lru_cache(maxsize=2 * count + 2)(lambda view: true_depth(surface, cameras[view]))
+    remembered = lru_cache(maxsize=2 * count + 2)
+    depth_of = remembered(lambda view: true_depth(surface, cameras[view]))
+    loaded = remembered(lambda view: load_masks(masks_folder, view, cameras[view].size_hw))
 
-    @lru_cache(maxsize=2 * count + 2)
-    def loaded(view: str) -> HierarchicalMasks:
-        return load_masks(masks_folder, view, cameras[view].size_hw)
-
-    def masks_of(view: str, level: Level) -> Bool[np.ndarray, "M H W"]:
+    def masks_of(view: str, level: Level) -> Regions:
         masks = loaded(view)
-        return masks.dense(masks.rows_of(level))
+        return Regions(masks.dense(masks.rows_of(level)), masks.label_map(level))
 
-    def regions_of(view: str, level: Level) -> Bool[np.ndarray, "M H W"]:
+    def regions_of(view: str, level: Level) -> Regions:
         labels = annotations.label_image(view, level)  # surroundings are nodes too
-        return labels[None] == np.unique(labels[labels >= 0])[:, None, None]
+        return Regions(labels[None] == np.unique(labels[labels >= 0])[:, None, None], labels)
 
     sources = {masks_label(masks_folder): masks_of, TRUTH: regions_of}
-    found = defaultdict[tuple[str, Level], list[Agreement]](list)
+    agreements = defaultdict[tuple[str, Level], list[Agreement]](list)
     for a, b in pairs:
         pixel_a, pixel_b = shared_points(cameras[a], depth_of(a), cameras[b], depth_of(b))
         for name, of_level in sources.items():
             for level in LEVELS:
                 agreement = view_agreement(of_level(a, level), of_level(b, level), pixel_a, pixel_b)
-                found[name, level].append(agreement)
+                agreements[name, level].append(agreement)
     rows = []
-    for (name, level), parts in found.items():
-        one = mean_agreement(parts)
-        shares = [f"{share:.4f}" for share in (one.best_iou, one.disagreement, one.joined_disagreement)]
-        rows.append([index["scene"], name, level.label, str(len(parts)), str(one.masks), *shares])
+    for (name, level), of_pairs in agreements.items():
+        mean = mean_agreement(of_pairs)
+        shares = [f"{share:.4f}" for share in (mean.best_iou, mean.disagreement, mean.joined_disagreement)]
+        rows.append([index["scene"], name, level.label, str(len(of_pairs)), str(mean.masks), *shares])
     write_csv(out, COLUMNS, rows)
     return markdown_table(COLUMNS, rows, 3)
 
@@ -299,7 +291,7 @@ def measure_world_consistency(
                 if union:
                     value = iou(seen_a[None], seen_b[None])
                     yield a, Measured(method, query.text, level, "view_consistency", protocol, value, union)
-        for view in {a, b} - {each for later in pairs[number + 1 :] for each in later}:
+        for view in {a, b}.difference(*pairs[number + 1 :]):
             scene.views.cache.forget(view)
 
 

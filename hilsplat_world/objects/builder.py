@@ -1,6 +1,7 @@
 """Construction of a synthetic object as a ground-truth tree of whole, parts and subparts."""
 
 from collections import defaultdict
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
@@ -12,16 +13,14 @@ from hilsplat.datasets.hierarchy import AnnotatedNode
 from hilsplat_world.paints import COLOURS, Paint, PaintBox, difference
 from hilsplat_world.shapes import Mesh, joined
 
-Word = TypeVar("Word", bound="str | None")
+Word = TypeVar("Word")
 
-PARENT_CONTRAST = 24.0
-"""Minimum distance in L*a*b* between a subpart and its part."""
+PARENT_CONTRAST = 24.0  # minimum distance in L*a*b* between a subpart and its part
 
 NEIGHBOUR_CONTRAST = 11.0
 """Minimum distance in L*a*b* between other adjacent parts and subparts of an object."""
 
-CORNERS = ((-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0))
-"""Signs of x and y, for legs and wheels."""
+CORNERS = ((-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0))  # signs of x and y, for legs and wheels
 
 _SHADES = (1.0, 0.85, 1.15, 0.72, 1.3, 0.6, 1.45, 0.5, 1.6)
 _TOUCH = 0.03  # maximum gap between touching boxes, relative to the object's size
@@ -29,40 +28,32 @@ _TOUCH = 0.03  # maximum gap between touching boxes, relative to the object's si
 
 @dataclass(frozen=True, eq=False)
 class ObjectModel:
-    """One object in its own frame, with its lowest point at z = 0 and its front towards +x.
-
-    Attributes:
-        nodes: tree of the object, with ids and parents as rows; row 0 is the whole.
-        triangles: corner positions; `normals` are the shading normals at the corners.
-        node_ids: rows in `nodes` for each triangle (whole, part, subpart; -1: none).
-        material_ids: row in `materials` for each triangle.
-        materials: shader parameters (`Paint.row`).
-    """
+    """One object in its own frame, with its lowest point at z = 0 and its front towards +x."""
 
     name: str
-    nodes: tuple[AnnotatedNode, ...]
-    triangles: Float[np.ndarray, "F 3 3"]
-    normals: Float[np.ndarray, "F 3 3"]
-    node_ids: Int32[np.ndarray, "F 3"]
-    material_ids: Int32[np.ndarray, " F"]
-    materials: Float[np.ndarray, "M 14"]
+    nodes: tuple[AnnotatedNode, ...]  # tree, with ids and parents as rows; row 0 is the whole
+    triangles: Float[np.ndarray, "F 3 3"]  # corner positions
+    normals: Float[np.ndarray, "F 3 3"]  # shading normals at the corners
+    node_ids: Int32[np.ndarray, "F 3"]  # whole, part and subpart of each triangle; -1 for none
+    material_ids: Int32[np.ndarray, " F"]  # row in `materials` for each triangle
+    materials: Float[np.ndarray, "M 14"]  # shader parameters (`Paint.row`)
 
 
 class Node(NamedTuple):
-    """A node of an unfinished object.
-
-    Attributes:
-        word: name of the node without the object's name.
-        at: preposition before the parent, as in "knob on the kettle lid".
-    """
+    """A node of an unfinished object."""
 
     builder: "Builder"
     row: int
     level: int
     parent: int
-    word: str
+    word: str  # name without the object's name
     aliases: tuple[str, ...]
-    at: str = "on"
+    at: str = "on"  # preposition before the parent, as in "knob on the kettle lid"
+
+    @property
+    def ids(self) -> tuple[int, int, int]:
+        """Rows of the whole, part and subpart that the node is or belongs to; -1 for none."""
+        return 0, *{1: (NONE, NONE), 2: (self.row, NONE), 3: (self.parent, self.row)}[self.level]
 
     def subpart(self, names: str, paint: Paint | str = "", *meshes: Mesh, at: str = "on") -> "Node":
         """Add a subpart and return it; for the arguments, see `Builder.part`."""
@@ -91,15 +82,12 @@ class Builder:
         self.added(1, NONE, names)
 
     def paints(self, *specs: str) -> list[Paint]:
-        """Draw one paint for each specification (see `PaintBox.draw`)."""
         return [self.paint(spec) for spec in specs]
 
     def between(self, low: float | int, high: float | int) -> float:
-        """Draw a uniform random number."""
         return float(self.rng.uniform(low, high))
 
     def chance(self, probability: float) -> bool:
-        """Return True with the given probability."""
         return bool(self.rng.random() < probability)
 
     def part(self, names: str, paint: Paint | str = "", *meshes: Mesh) -> Node:
@@ -113,7 +101,6 @@ class Builder:
         return self.added(2, 0, names).put(paint, *meshes)
 
     def added(self, level: int, parent: int, names: str, at: str = "on") -> Node:
-        """Add a node and return it."""
         word, *aliases = names.split(", ")
         self.nodes.append(Node(self, len(self.nodes), level, parent, word, tuple(aliases), at))
         return self.nodes[-1]
@@ -124,23 +111,18 @@ class Builder:
 
     def build(self) -> ObjectModel:
         """Return the object, with its lowest point at z = 0 and contrast between touching parts."""
-        triples = []
-        for node in self.nodes:
-            part, subpart = {1: (NONE, NONE), 2: (node.row, NONE), 3: (node.parent, node.row)}[node.level]
-            triples.append((0, part, subpart))
-        node_ids = np.array(triples, np.int32)
+        node_ids = np.array([node.ids for node in self.nodes], np.int32)
         pieces = self._contrasted()
         paints = list(dict.fromkeys(paint for _, _, paint in pieces))
-        area: dict[int, dict[Paint, float]] = defaultdict(lambda: defaultdict(float))
+        areas: dict[int, dict[Paint, float]] = defaultdict(lambda: defaultdict(float))
         for row, mesh, paint in pieces:
-            for owner in triples[row]:
-                if owner != NONE:
-                    area[owner][paint] += _surface(mesh)
+            for ancestor in self.nodes[row].ids:
+                areas[ancestor][paint] += _surface(mesh)
         triangles = np.concatenate([mesh.triangles for _, mesh, _ in pieces])
         triangles[..., 2] -= triangles[..., 2].min()
         return ObjectModel(
             self.nodes[0].word,
-            tuple(self._described(node, area[node.row]) for node in self.nodes),
+            tuple(self._described(node, areas[node.row]) for node in self.nodes),
             triangles,
             np.concatenate([mesh.normals for _, mesh, _ in pieces]),
             np.concatenate([np.tile(node_ids[row], (len(mesh), 1)) for row, mesh, _ in pieces]),
@@ -155,43 +137,36 @@ class Builder:
         creation. Each group's main paint is replaced by a shade of itself, or by another colour if no shade
         suffices, so that the group differs from its parent and from earlier neighbours.
         """
-        groups: dict[tuple[int, str, str], list[int]] = {}
-        surface: dict[int, dict[Paint, float]] = defaultdict(lambda: defaultdict(float))
+        areas: dict[int, dict[Paint, float]] = defaultdict(lambda: defaultdict(float))
         corners: dict[int, list[np.ndarray]] = defaultdict(list)
-        for node in self.nodes[1:]:
-            groups.setdefault((node.level, self.nodes[node.parent].word, node.word), []).append(node.row)
         for row, mesh, paint in self.pieces:
-            surface[row][paint] += _surface(mesh)
+            areas[row][paint] += _surface(mesh)
             corners[row].append(mesh.triangles.reshape(-1, 3))
         boxes = {}
-        for row, parts in corners.items():
-            points = np.concatenate(parts)
+        for row, meshes in corners.items():
+            points = np.concatenate(meshes)
             boxes[row] = np.stack([points.min(axis=0), points.max(axis=0)])
         reach = _TOUCH * float(np.ptp(np.concatenate(list(boxes.values())), axis=0).max())
-        settled: dict[tuple[int, str, str], Paint] = {}
-        repaint: dict[tuple[int, Paint], Paint] = {}
-        for key, rows in groups.items():
-            rows = [row for row in rows if row in boxes]
-            if not rows:
-                continue
-            own: dict[Paint, float] = defaultdict(float)
-            for row in rows:
-                for paint, size in surface[row].items():
-                    own[paint] += size
-            main = max(own, key=own.__getitem__)
+        groups: dict[tuple[int, str, str], list[int]] = defaultdict(list)
+        for node in self.nodes[1:]:
+            if node.row in boxes:
+                groups[node.level, self.nodes[node.parent].word, node.word].append(node.row)
+        settled: list[tuple[list[int], Paint]] = []
+        repainted: dict[tuple[int, Paint], Paint] = {}
+        for rows in groups.values():
+            sizes = _totals((paint, size) for row in rows for paint, size in areas[row].items())
+            main = max(sizes, key=sizes.__getitem__)
             parents = {self.nodes[row].parent for row in rows}
             rivals = []
-            for other, paint in settled.items():
-                if parents & set(groups[other]):
+            for neighbours, paint in settled:
+                if parents & set(neighbours):
                     rivals.append((paint, PARENT_CONTRAST))
-                    continue
-                near = [boxes[other_row] for other_row in groups[other] if other_row in boxes]
-                if any(_touch(boxes[row], box, reach) for row in rows for box in near):
+                elif any(_touch(boxes[row], boxes[other], reach) for row in rows for other in neighbours):
                     rivals.append((paint, NEIGHBOUR_CONTRAST))
-            settled[key] = _distinct(main, rivals)
-            for row in rows:
-                repaint[row, main] = settled[key]
-        return [(row, mesh, repaint.get((row, paint), paint)) for row, mesh, paint in self.pieces]
+            contrasting = _distinct(main, rivals)
+            settled.append((rows, contrasting))
+            repainted |= {(row, main): contrasting for row in rows}
+        return [(row, mesh, repainted.get((row, paint), paint)) for row, mesh, paint in self.pieces]
 
     def _described(self, node: Node, area: dict[Paint, float]) -> AnnotatedNode:
         """Return a node with its queries: the canonical name, then aliases, relations and attributes."""
@@ -205,13 +180,13 @@ class Builder:
         if node.level == 3:
             others.append(f"{node.word} {node.at} the {whole.word} {self.nodes[node.parent].word}")
         share = 0.5 if node.level == 1 else 0.6
-        colour, coloured = _prevailing([(paint.colour, size) for paint, size in area.items()], share)
-        material, made = _prevailing([(paint.adjective, size) for paint, size in area.items()], share)
-        if coloured:
+        colour, is_coloured = _prevailing(((paint.colour, size) for paint, size in area.items()), share)
+        material, is_uniform = _prevailing(((paint.adjective, size) for paint, size in area.items()), share)
+        if is_coloured:
             others.append(f"{colour} {text}")
-        if made and material is not None:
+        if is_uniform and material is not None:
             others.append(f"{material} {text}")
-            if coloured:
+            if is_coloured:
                 others.append(f"{colour} {material} {text}")
         return AnnotatedNode(node.row, node.level, node.parent, text, tuple(dict.fromkeys(others)))
 
@@ -230,7 +205,6 @@ def _distinct(paint: Paint, rivals: list[tuple[Paint, float]]) -> Paint:
     """Return the least changed version of a paint that keeps the minimum distance to every rival."""
 
     def short(candidate: Paint) -> float:
-        """Return the largest shortfall in a candidate's distance to a rival, or 0 if there is none."""
         return max([0.0, *(minimum - difference(candidate, rival) for rival, minimum in rivals)])
 
     shades = [paint if factor == 1 else paint.shaded(factor) for factor in _SHADES]
@@ -240,10 +214,15 @@ def _distinct(paint: Paint, rivals: list[tuple[Paint, float]]) -> Paint:
     return min(tried or [paint], key=short)  # the first, which is the smallest change, wins ties
 
 
-def _prevailing(sizes: list[tuple[Word, float]], share: float) -> tuple[Word, bool]:
-    """Return the word for most of a surface, and whether it covers at least `share` of the surface."""
-    per_word: dict[Word, float] = defaultdict(float)
+def _totals(sizes: Iterable[tuple[Word, float]]) -> dict[Word, float]:
+    totals: dict[Word, float] = defaultdict(float)
     for word, size in sizes:
-        per_word[word] += size
-    word = max(per_word, key=per_word.__getitem__)
-    return word, per_word[word] >= share * sum(per_word.values())
+        totals[word] += size
+    return totals
+
+
+def _prevailing(sizes: Iterable[tuple[Word, float]], share: float) -> tuple[Word, bool]:
+    """Return the word for most of a surface, and whether it covers at least `share` of the surface."""
+    totals = _totals(sizes)
+    word = max(totals, key=totals.__getitem__)
+    return word, totals[word] >= share * sum(totals.values())

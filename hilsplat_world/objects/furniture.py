@@ -130,10 +130,10 @@ def desk(b: Builder) -> None:
     y = width / 2 - unit_w / 2 - 0.03
     shape = box((depth - 0.08, unit_w, height - 0.05), (0, y, (height - 0.045) / 2), 0.01)
     unit = b.part("drawers, drawer unit", "wood", shape)
-    each = (height - 0.1) / 3
+    drawer_h = (height - 0.1) / 3
     for i in range(3):
-        z = 0.04 + each * (i + 0.5)
-        shape = box((0.03, unit_w - 0.05, each - 0.03), (depth / 2 - 0.03, y, z), 0.008)
+        z = 0.04 + drawer_h * (i + 0.5)
+        shape = box((0.03, unit_w - 0.05, drawer_h - 0.03), (depth / 2 - 0.03, y, z), 0.008)
         unit.subpart("drawer, drawer front", front, shape)
         shape = box((0.035, 0.16, 0.035), (depth / 2 - 0.005, y, z + 0.02), 0.008)
         unit.subpart("handle, pull", metal, shape)
@@ -150,10 +150,10 @@ def nightstand(b: Builder) -> None:
     body = b.part("body, case", wood, box((depth, width, height - 0.16), (0, 0, height / 2 + 0.05), 0.01))
     shape = box((depth + 0.05, width + 0.05, 0.045), (0, 0, height - 0.022), 0.012)
     body.subpart("top, board", "stone", shape)
-    each = (height - 0.2) / 2
+    drawer_h = (height - 0.2) / 2
     for i in range(2):
-        z = 0.155 + each * (i + 0.5)
-        shape = box((0.03, width - 0.07, each - 0.025), (depth / 2 + 0.012, 0, z), 0.008)
+        z = 0.155 + drawer_h * (i + 0.5)
+        shape = box((0.03, width - 0.07, drawer_h - 0.025), (depth / 2 + 0.012, 0, z), 0.008)
         drawer = b.part("drawer", front, shape)
         shape = box((0.04, width * 0.36, 0.045), (depth / 2 + 0.04, 0, z), 0.01)
         drawer.subpart("handle, pull", metal, shape)
@@ -349,7 +349,6 @@ def _book_row(b: Builder, depth: float, width: float, bottom: float, clear: floa
 
 
 def _crates(b: Builder, depth: float, width: float, bottom: float, gap: float) -> None:
-    """Add two boxes side by side, each with a label."""
     cloth, label = b.paints("cloth", "plain")
     crate_w, crate_h = (width - 0.16) / 2, gap * b.between(0.62, 0.76)
     for side in (-1, 1):
@@ -388,8 +387,8 @@ def refrigerator(b: Builder) -> None:
 def counter(b: Builder) -> None:
     front, metal, case = b.paints("plain", "metal", "wood")
     depth, units, height = b.between(0.54, 0.6), 3, b.between(0.84, 0.9)
-    each = b.between(0.46, 0.52)
-    width = units * each
+    unit_w = b.between(0.46, 0.52)
+    width = units * unit_w
     shape = box((depth - 0.05, width, height - 0.14), (-0.025, 0, 0.1 + (height - 0.14) / 2), 0.01)
     body = b.part("body, base cabinet", case, shape)
     body.subpart("plinth, kickboard", "stone", box((depth - 0.1, width - 0.02, 0.1), (-0.04, 0, 0.05)))
@@ -399,21 +398,21 @@ def counter(b: Builder) -> None:
     top.subpart("backsplash, splashback", "ceramic", shape)
     drawer_paint = b.paint("plain")
     for i in range(units):
-        y = (i - (units - 1) / 2) * each
+        y = (i - (units - 1) / 2) * unit_w
         low = 0.12
         if i == 0:
             for k in range(2):
                 tall = (height - 0.18 - low) / 2
                 z = low + (k + 0.5) * (tall + 0.02)
-                shape = box((0.03, each - 0.03, tall), (depth / 2 - 0.04, y, z), 0.008)
+                shape = box((0.03, unit_w - 0.03, tall), (depth / 2 - 0.04, y, z), 0.008)
                 drawer = b.part("drawer", drawer_paint, shape)
                 shape = box((0.035, 0.2, 0.035), (depth / 2 - 0.01, y, z + 0.04), 0.008)
                 drawer.subpart("drawer handle, drawer pull", metal, shape)
         else:
             tall = height - 0.16 - low
-            shape = box((0.03, each - 0.03, tall), (depth / 2 - 0.04, y, low + tall / 2), 0.008)
+            shape = box((0.03, unit_w - 0.03, tall), (depth / 2 - 0.04, y, low + tall / 2), 0.008)
             door = b.part("door", front, shape)
-            shape = box((0.035, 0.04, 0.2), (depth / 2 - 0.01, y - each * 0.33, low + tall * 0.72), 0.008)
+            shape = box((0.035, 0.04, 0.2), (depth / 2 - 0.01, y - unit_w * 0.33, low + tall * 0.72), 0.008)
             door.subpart("door handle, door knob", metal, shape)
 
 

@@ -268,7 +268,6 @@ def building(b: Builder) -> None:
 
 
 def _awning(b: Builder, low: Node, front: float, y: float, pitch: float) -> None:
-    """Add a sloping cloth awning over a shop window."""
     node = low.subpart("awning, canopy")
     first = plain(b, "white")
     second = b.paint("plain red green blue orange")
@@ -350,7 +349,6 @@ def _wheels(b: Builder, places: list[float], half_width: float, radius: float, w
 
 
 def _lights_and_plates(b: Builder, node: Node, front: float, back: float, w: float, z: float) -> None:
-    """Add headlights, tail lights and licence plates to the two ends of a body."""
     head = node.subpart("headlights, front lights")
     tail = node.subpart("tail lights, rear lights")
     bright, red = lit(plain(b, "white")), plain(b, "red")
@@ -403,7 +401,6 @@ def car(b: Builder) -> None:
 
 
 def _contrasting(b: Builder, paint: Paint) -> Paint:
-    """Return a paint that contrasts with the given paint."""
     return lacquer(b, "red blue green purple" if sum(paint.first) > 1.5 else "white yellow beige")
 
 

@@ -7,8 +7,7 @@ from jaxtyping import Float
 
 from hilsplat_world.shapes import rotation_about
 
-WALL_GAP = 0.03
-"""Distance between furniture and wall, m, which leaves space for the skirting."""
+WALL_GAP = 0.03  # distance between furniture and wall, m, which leaves space for the skirting
 PIECE_GAP = 0.05
 PATH_GAP = 0.28
 """Minimum horizontal distance between the camera path and objects taller than `PATH_LOW`, m."""
@@ -30,7 +29,6 @@ class Room:
     height: float
 
     def wall_length(self, wall: int) -> float:
-        """Return the length of a wall, m."""
         return self.depth if wall % 2 == 0 else self.width
 
     def at_wall(self, wall: int, along: float, away: float) -> Float[np.ndarray, " 2"]:
@@ -48,7 +46,6 @@ class Space:
 
     @staticmethod
     def of(corners: Float[np.ndarray, "N 3"]) -> "Space":
-        """Return the bounding box of points."""
         return Space(tuple(corners.min(axis=0).tolist()), tuple(corners.max(axis=0).tolist()))
 
     def meets(self, other: "Space", gap: float) -> bool:
@@ -94,7 +91,7 @@ class FloorPlan:
         base_z: float,
         clear: float,
         gap: float = WALL_GAP,
-    ) -> tuple[float, Float[np.ndarray, " 2"]] | None:
+    ) -> tuple[Float[np.ndarray, " 2"], float] | None:
         """Occupy a random free place against a wall for an object that faces the room.
 
         Args:
@@ -104,7 +101,7 @@ class FloorPlan:
             gap: distance from the wall, m.
 
         Returns:
-            The object's yaw in degrees and its centre in x and y; None if no place is found.
+            The object's centre in x and y and its yaw in degrees; None if no place is found.
         """
         for _ in range(TRIES):
             wall = int(rng.choice((0, 1, 2, 3)))
@@ -112,14 +109,13 @@ class FloorPlan:
             if slack <= 0:
                 continue
             along, yaw = float(rng.uniform(-slack, slack)), 90.0 * wall
-            deeper = np.array([size[0] + clear, size[1], size[2]])
+            deeper = size + np.array([clear, 0, 0])
             middle = self.room.at_wall(wall, along, gap + deeper[0] / 2)
             front = turned_space(middle, deeper, yaw, base_z)
             spot = self.room.at_wall(wall, along, gap + size[0] / 2)
-            if any(front.meets(other, 0.0) for other in self.taken):
-                continue
-            if self.claim(turned_space(spot, size, yaw, base_z)):
-                return yaw, spot
+            is_clear = not any(front.meets(other, 0.0) for other in self.taken)
+            if is_clear and self.claim(turned_space(spot, size, yaw, base_z)):
+                return spot, yaw
         return None
 
 
@@ -127,8 +123,6 @@ def turned_space(
     spot: Float[np.ndarray, " 2"], size: Float[np.ndarray, " 3"], yaw_deg: float | int, base_z: float | int
 ) -> Space:
     """Return the space of an object centred at `spot` in x and y; `yaw_deg` is a multiple of 90."""
-    depth, width = (size[0], size[1]) if round(yaw_deg / 90) % 2 == 0 else (size[1], size[0])
-    return Space(
-        (float(spot[0] - depth / 2), float(spot[1] - width / 2), float(base_z)),
-        (float(spot[0] + depth / 2), float(spot[1] + width / 2), float(base_z + size[2])),
-    )
+    depth_width = size[:2] if round(yaw_deg / 90) % 2 == 0 else size[1::-1]
+    low, high = spot - depth_width / 2, spot + depth_width / 2
+    return Space((*low.tolist(), float(base_z)), (*high.tolist(), float(base_z + size[2])))

@@ -12,13 +12,11 @@ from hilsplat_world.views import Sight, numbered_cameras
 class SceneKind(NamedTuple):
     """One kind of scene.
 
-    Attributes:
-        build: builds a scene from (seed, objects).
-        sights: returns cameras and their field of view in degrees for (scene, views, arc_deg). The cameras
-            are jittered with the scene's seed, and close enough together for structure from motion.
+    `sights` returns cameras and their field of view in degrees for (scene, views, arc_deg). The cameras are
+    jittered with the scene's seed, and close enough together for structure from motion.
     """
 
-    build: Callable[[int, int], WorldScene]
+    build: Callable[[int, int], WorldScene]  # from (seed, objects)
     sights: Callable[[WorldScene, int, float | int], tuple[list[Sight], float]]
 
 

@@ -25,19 +25,12 @@ PATTERN_FACTOR = 2.0
 
 
 class Piece(NamedTuple):
-    """Placement of a class of furniture.
-
-    Attributes:
-        name: class of the piece.
-        above: height kept free above the piece for things on it, m.
-        clear: depth kept free in front of the piece, m.
-        partners: classes placed with the piece if they fit, and where ("before", "beside", "on").
-    """
+    """Placement of a class of furniture."""
 
     name: str
-    above: float
-    clear: float
-    partners: tuple[tuple[str, str], ...] = ()
+    above: float  # height kept free above the piece for things on it, m
+    clear: float  # depth kept free in front of the piece, m
+    partners: tuple[tuple[str, str], ...] = ()  # classes placed with the piece if they fit, and where
 
 
 LARGE: tuple[Piece, ...] = (
@@ -61,13 +54,11 @@ THING_SIZES: dict[str, tuple[float, float]] = {
     "lantern": (0.3, 0.36), "clock": (0.26, 0.32), "backpack": (0.4, 0.46), "plant": (0.42, 0.55),
 }  # fmt: skip
 """Heights of some things, m; slightly oversized, so that subparts are visible across a room."""
-TOY_SIZE = (0.34, 0.44)
-"""Heights of all other things, m."""
+TOY_SIZE = (0.34, 0.44)  # heights of all other things, m
 MAX_THING_RADIUS = 0.21
 EDGE = 0.03
 """Minimum distance between things and the edge of their support, or the wall behind a counter, m."""
-MAX_FLAT = 0.05
-"""Maximum height of a flat item above its board for things to be placed on the item, m."""
+MAX_FLAT = 0.05  # maximum height of a flat item above its board for things to be placed on the item, m
 
 WALL_PALE, FLOOR_PALE, CEILING_PALE = 0.6, 0.4, 0.2
 """Shares of grey mixed into the colours of walls, floor and ceiling, so that objects stand out."""
@@ -75,8 +66,7 @@ WALL_PALE, FLOOR_PALE, CEILING_PALE = 0.6, 0.4, 0.2
 FOV_DEG = 62.0
 EYE_HEIGHTS = (1.34, 1.7)
 """Alternating camera heights, m; the difference adds parallax that the loop alone lacks."""
-PATH_SHARE = 0.27
-"""Semi-axes of the camera loop, as shares of the room's width and depth."""
+PATH_SHARE = 0.27  # semi-axes of the camera loop, as shares of the room's width and depth
 LOOK_AT_Z = 0.78
 
 
@@ -97,27 +87,22 @@ class _Furnishing:
         middle = (low + high)[:2] / 2
         xy = spot - rotation_about("z", yaw_deg)[:2, :2] @ middle
         node = self.assembly.add_object(model, scale, xy, yaw_deg, base_z)
-        added = self.assembly.pieces[-1][0]
-        (x, y), radius = footprint_of(added)
-        space = Space.of(added.reshape(-1, 3))
-        size = (radius, space.high[2] - base_z)
-        self.placed.append(PlacedObject(model.name, node, (float(x), float(y)), *size, yaw_deg, base_z))
+        triangles = self.assembly.pieces[-1][0]
+        (x, y), radius = footprint_of(triangles)
+        height = float(triangles[..., 2].max()) - base_z
+        self.placed.append(
+            PlacedObject(model.name, node, (float(x), float(y)), radius, height, yaw_deg, base_z)
+        )
         if model.name in SUPPORTS:
-            self.supports.append(_support(model, added))
+            self.supports.append(_support(model, triangles))
 
 
 class Support(NamedTuple):
-    """Top of a piece of furniture.
+    """Top of a piece of furniture."""
 
-    Attributes:
-        top: space of the board.
-        flat: spaces of flat items on the board, such as a table runner.
-        stand: centres and radii of the footprints already on the board.
-    """
-
-    top: Space
-    flat: list[Space]
-    stand: list[tuple[np.ndarray, float]]
+    top: Space  # of the board
+    flat: list[Space]  # of flat items on the board, such as a table runner
+    stand: list[tuple[np.ndarray, float]]  # centres and radii of the footprints already on the board
 
     def height_at(self, spot: np.ndarray, radius: float) -> float:
         """Return the base height for a footprint: the board's, or that of the highest flat item below it."""
@@ -127,17 +112,13 @@ class Support(NamedTuple):
 
 
 def _support(model: ObjectModel, triangles: np.ndarray) -> Support:
-    """Return the support provided by the top of an object that was added as `triangles`."""
-    node = next(row for row, found in enumerate(model.nodes) if found.text == f"{model.name} top")
-    own = model.node_ids[:, model.nodes[node].level - 1] == node
-    board = own & (model.node_ids[:, 2] == NONE) if model.nodes[node].level == 2 else own
+    node = next(node for node in model.nodes if node.text == f"{model.name} top")
+    in_top, subparts = model.node_ids[:, node.level - 1] == node.id, model.node_ids[:, 2]
+    board = in_top & (subparts == NONE) if node.level == 2 else in_top
     top = Space.of(triangles[board].reshape(-1, 3))
-    flat = []
-    for row in np.unique(model.node_ids[own & ~board, 2]):
-        space = Space.of(triangles[model.node_ids[:, 2] == row].reshape(-1, 3))
-        if space.high[2] < top.high[2] + MAX_FLAT:
-            flat.append(space)
-    return Support(top, flat, [])
+    rows = np.unique(subparts[in_top & ~board])
+    items = [Space.of(triangles[subparts == row].reshape(-1, 3)) for row in rows]
+    return Support(top, [item for item in items if item.high[2] < top.high[2] + MAX_FLAT], [])
 
 
 def size_of(model: ObjectModel) -> Float[np.ndarray, " 3"]:
@@ -173,7 +154,6 @@ def build_room(seed: int, objects: int) -> WorldScene:
 
 
 def _add_fixtures(work: _Furnishing) -> None:
-    """Add a door, and a window with a curtain on another wall."""
     room, plan = work.plan.room, work.plan
     door_wall, window_wall = (int(wall) for wall in work.rng.permutation(4)[:2])
     model = work.assembly.draw("door")
@@ -185,10 +165,10 @@ def _add_fixtures(work: _Furnishing) -> None:
     # The entrance and the swing of the door stay free.
     entrance = room.at_wall(door_wall, along, 0.4)
     plan.taken.append(turned_space(entrance, np.array([0.8, size[1], 2.1]), yaw, 0.0))
-    window, curtain = work.assembly.draw("window"), work.assembly.draw("curtain")
     yaw = 90.0 * window_wall
     along = float(work.rng.uniform(-0.3, 0.3))
-    for model, base_z in ((window, 0.92), (curtain, 0.84)):
+    for name, base_z in (("window", 0.92), ("curtain", 0.84)):
+        model = work.assembly.draw(name)
         size = size_of(model)
         spot = room.at_wall(window_wall, along, size[0] / 2)
         work.put(model, spot, yaw, base_z)
@@ -233,12 +213,10 @@ def _put_at_wall(work: _Furnishing, piece: Piece, base_z: float = 0.0, gap: floa
     """Place a piece against a wall, and return whether it fits."""
     model = work.assembly.draw(piece.name)
     size = size_of(model) + np.array([0, 0, piece.above])
-    found = work.plan.wall_spot(work.rng, size, base_z, piece.clear, gap)
-    if found is None:
-        return False
-    yaw, spot = found
-    work.put(model, spot, yaw, base_z)
-    return True
+    spot = work.plan.wall_spot(work.rng, size, base_z, piece.clear, gap)
+    if spot is not None:
+        work.put(model, *spot, base_z)
+    return spot is not None
 
 
 ON_TOP: dict[str, float] = {"television": -0.03, "monitor": -0.12, "sink": 0.0}
@@ -250,10 +228,7 @@ def _put_partner(work: _Furnishing, owner_row: int, name: str, where: str) -> bo
     model = work.assembly.draw(name)
     size = size_of(model)
     owner = work.placed[owner_row]
-    turn = rotation_about("z", owner.yaw_deg)[:2, :2]
-    corners = np.concatenate(work.assembly.pieces[owner_row][0])
-    middle = np.array(owner.centre_xy)
-    half_depth, half_width = np.ptp((corners[:, :2] - middle) @ turn, axis=0) / 2
+    turn, middle = rotation_about("z", owner.yaw_deg)[:2, :2], np.array(owner.centre_xy)
     if where == "on":
         support = work.supports[-1]
         spot = middle + turn @ np.array([ON_TOP[name], 0.0])
@@ -261,6 +236,8 @@ def _put_partner(work: _Furnishing, owner_row: int, name: str, where: str) -> bo
         support.stand.append((spot, radius))
         work.put(model, spot, owner.yaw_deg, support.height_at(spot, 0.4 * radius))
         return True
+    corners = np.concatenate(work.assembly.pieces[owner_row][0])
+    half_depth, half_width = np.ptp((corners[:, :2] - middle) @ turn, axis=0) / 2
     for side in work.rng.permutation([-1.0, 1.0]):
         if where == "before":
             offset, yaw = np.array([half_depth + size[0] / 2 + 0.06, -0.1 * half_width]), owner.yaw_deg + 180
@@ -310,11 +287,11 @@ def _add_thing(work: _Furnishing, name: str) -> bool:
     pattern = model.materials.copy()
     pattern[:, 7] *= PATTERN_FACTOR  # texture cells per metre, see Paint.row
     model = replace(model, materials=pattern)
-    found = _thing_spot(work, radius, height * scale)
-    if found is None:
+    position = _thing_spot(work, radius, height * scale)
+    if position is None:
         logger.warning("scene room:%d: no space left for the %s", work.assembly.seed, name)
         return False
-    spot, base_z = found
+    spot, base_z = position
     yaw = float(np.degrees(np.arctan2(-spot[1], -spot[0])) + work.rng.uniform(-50, 50))
     # The footprint is a circle that rotates about its centre, so the yaw does not move it.
     work.put(model, spot, yaw, base_z, scale)
@@ -323,7 +300,7 @@ def _add_thing(work: _Furnishing, name: str) -> bool:
 
 def _thing_spot(work: _Furnishing, radius: float, height: float) -> tuple[np.ndarray, float] | None:
     """Return a spot and base height on the emptiest support with free space, else on the floor by a wall."""
-    for support in sorted(work.supports, key=lambda each: (len(each.stand), work.rng.random())):
+    for support in sorted(work.supports, key=lambda support: (len(support.stand), work.rng.random())):
         low = np.array(support.top.low[:2]) + radius + EDGE
         high = np.array(support.top.high[:2]) - radius - EDGE
         if (high <= low).any():
@@ -334,8 +311,8 @@ def _thing_spot(work: _Furnishing, radius: float, height: float) -> tuple[np.nda
                 support.stand.append((spot, radius))
                 return spot, support.height_at(spot, 0.6 * radius)
     size = np.array([2 * radius, 2 * radius, height])
-    found = work.plan.wall_spot(work.rng, size, 0.0, 0.2, gap=WALL_GAP + 0.05)
-    return None if found is None else (found[1], 0.0)
+    at_wall = work.plan.wall_spot(work.rng, size, 0.0, 0.2, gap=WALL_GAP + 0.05)
+    return None if at_wall is None else (at_wall[0], 0.0)
 
 
 def _add_shell(assembly: Assembly, room: Room, rng: np.random.Generator) -> None:
@@ -374,14 +351,12 @@ def _style(room: Room, rng: np.random.Generator) -> Style:
     The lamp does not light the ceiling, which would be overexposed around the lamp.
     """
     warm = rng.uniform(-1, 1)
-    place = rng.uniform(-0.4, 0.4, 2)
+    position = np.array([*rng.uniform(-0.4, 0.4, 2), room.height - 0.02])
     light = np.array([1.0 + 0.05 * warm, 0.97, 0.92 - 0.08 * warm]) * rng.uniform(0.27, 0.33)
     sky = np.array([0.50 - 0.04 * warm, 0.51, 0.53 + 0.04 * warm]) * rng.uniform(0.92, 1.05)
-    position = (float(place[0]), float(place[1]), room.height - 0.02)
     radius = float(rng.uniform(0.5, 0.7))
     ground = sky * np.array([1.12, 1.06, 0.98])
-    lamp, above, below = (tuple(colour.tolist()) for colour in (light, sky, ground))
-    return Style(position, radius, lamp, above, below, float(rng.uniform(1.05, 1.2)))
+    return Style.of(position, radius, light, sky, ground, float(rng.uniform(1.05, 1.2)))
 
 
 def path_points(room: Room, azimuths_deg: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 2"]:

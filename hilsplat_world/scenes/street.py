@@ -34,10 +34,8 @@ GAP = 0.12
 TRIES = 200
 
 LANE = 3.2
-KERB = 5.7
-"""Half the width of the road, m: one lane and one parking strip."""
-FRONT = 8.7
-"""Distance between the house fronts and the middle of the road, m."""
+KERB = 5.7  # half the width of the road, m: one lane and one parking strip
+FRONT = 8.7  # distance between the house fronts and the middle of the road, m
 WALK_Z = 0.14
 SCALE = 4.0
 """Value of `Style.scale`: textures and occlusion distance are four times as large as on a table."""
@@ -46,16 +44,12 @@ DOME_RADIUS = 115.0
 DOME_HEIGHT = 62.0
 CROSSING_X = (14.2, 16.8)
 
-LANE_Y = -LANE / 2
-"""Middle of the driver's lane, m (traffic keeps to the right)."""
+LANE_Y = -LANE / 2  # middle of the driver's lane, m (traffic keeps to the right)
 DRIVE_X = (-13.0, 10.5)
 CAMERA_Z = 1.8
-MAX_STEP = 0.51
-"""Maximum distance between neighbouring views along the street, m."""
-SWEEP_VIEWS = 16
-"""Number of views in which the camera sweeps from left to right and back."""
-SWEEP_DEG = 36.0
-"""Amplitude of the sweep to either side of straight ahead."""
+MAX_STEP = 0.51  # maximum distance between neighbouring views along the street, m
+SWEEP_VIEWS = 16  # number of views in which the camera sweeps from left to right and back
+SWEEP_DEG = 36.0  # amplitude of the sweep to either side of straight ahead
 SWAY_M = 0.8
 """Lateral amplitude of the camera about the lane's middle in one sweep. Without this sway, the error of
 structure from motion was 2.5 m instead of 0.04 m: views that rotate on a straight path have little parallax,
@@ -65,7 +59,7 @@ SUN_DISTANCE = 1000.0
 
 
 class _Spot(NamedTuple):
-    """Place for an object: (x, y), base height and rotation."""
+    """Place for an object; `z` is its base height."""
 
     x: float
     y: float
@@ -91,26 +85,22 @@ class _Street:
 
     def put(self, model: ObjectModel, spot: _Spot) -> PlacedObject | None:
         """Place an object at a spot and return it, or return None if it would intersect another object."""
-        turned = model.triangles @ rotation_about("z", spot.yaw_deg).T + np.array([spot.x, spot.y, spot.z])
+        turned = model.triangles @ rotation_about("z", spot.yaw_deg).T + np.array(spot[:3])
         low, high = part_boxes(turned, model.node_ids[:, 1])
         apart = (low[:, None] - GAP > self.high) | (high[:, None] + GAP < self.low)
         if not apart.any(axis=2).all():
             return None
         self.low, self.high = np.concatenate([self.low, low]), np.concatenate([self.high, high])
-        node = self.assembly.add_object(model, 1.0, np.array([spot.x, spot.y]), spot.yaw_deg, spot.z)
-        centre, radius = footprint_of(turned)
+        node = self.assembly.add_object(model, 1.0, np.array(spot[:2]), spot.yaw_deg, spot.z)
+        (x, y), radius = footprint_of(turned)
         height = float(model.triangles[..., 2].max())
-        xy = (float(centre[0]), float(centre[1]))
-        return PlacedObject(model.name, node, xy, radius, height, spot.yaw_deg, spot.z)
+        return PlacedObject(model.name, node, (float(x), float(y)), radius, height, spot.yaw_deg, spot.z)
 
     def try_spots(self, name: str, spot: Callable[[ObjectModel], _Spot]) -> PlacedObject | None:
         """Place an object at the first free spot among `TRIES` random spots, or return None."""
         model = self.assembly.draw(name)
-        for _ in range(TRIES):
-            placed = self.put(model, spot(model))
-            if placed is not None:
-                return placed
-        return None
+        attempts = (self.put(model, spot(model)) for _ in range(TRIES))
+        return next((placed for placed in attempts if placed is not None), None)
 
     def vehicle_spot(self, model: ObjectModel) -> _Spot:
         """Draw a spot: parked at either kerb, oncoming, or ahead in the driver's lane."""
@@ -146,16 +136,12 @@ class _Street:
     def furniture_spot(self, side: int, model: ObjectModel) -> _Spot:
         """Draw a spot beside the kerb, on the sidewalk."""
         rng = self.rng
-        x = float(rng.uniform(*THINGS_X))
-        y = side * (KERB + 0.62)
-        toward_road = -90.0 * side
+        x, y = float(rng.uniform(*THINGS_X)), side * (KERB + (0.4 if model.name == "fence" else 0.62))
         if model.name == "traffic sign":
             return _Spot(x, y, WALK_Z, 180 + float(rng.uniform(-18, 18)))
         if model.name == "traffic light":
             return _Spot(float(rng.uniform(9.5, 13.0)), y, WALK_Z, 180 + float(rng.uniform(-8, 8)))
-        if model.name == "fence":
-            return _Spot(x, side * (KERB + 0.4), WALK_Z, toward_road)
-        return _Spot(x, y, WALK_Z, toward_road)
+        return _Spot(x, y, WALK_Z, -90.0 * side)
 
 
 def build_street(seed: int, objects: int) -> WorldScene:
@@ -168,7 +154,7 @@ def build_street(seed: int, objects: int) -> WorldScene:
     street = _Street(seed)
     rng = street.rng
     houses = _add_buildings(street)
-    placed: list[PlacedObject] = []
+    placed = []
     order = np.concatenate([rng.permutation(len(COUNTED)) for _ in range(1 + objects // len(COUNTED))])
     for i in range(objects):
         name = COUNTED[order[i]]
@@ -198,23 +184,26 @@ def build_street(seed: int, objects: int) -> WorldScene:
 
 
 def _add_buildings(street: _Street) -> int:
-    """Add rows of houses on both sides and across both ends; return the number of houses."""
-    rng, count = street.rng, 0
+    rng = street.rng
+    houses = []
+
+    def house() -> tuple[ObjectModel, float]:
+        model = street.assembly.draw("building")
+        return model, float(np.ptp(model.triangles[..., 1])) + 2 * GAP
+
     for side in (-1, 1):
         x = STREET_X[0] + float(rng.uniform(0, 2))
         while x < STREET_X[1] - 4:
-            model = street.assembly.draw("building")
-            width = float(np.ptp(model.triangles[..., 1])) + 2 * GAP
-            count += street.put(model, _Spot(x + width / 2, side * FRONT, WALK_Z, -90.0 * side)) is not None
+            model, width = house()
+            houses.append(street.put(model, _Spot(x + width / 2, side * FRONT, WALK_Z, -90.0 * side)))
             x += width + (float(rng.uniform(1.5, 3.0)) if rng.random() < 0.25 else 0.0)
     for x, yaw in ((STREET_X[1] + 8, 180.0), (STREET_X[0] - 8, 0.0)):
         y = -16.0
         while y < 12:
-            model = street.assembly.draw("building")
-            width = float(np.ptp(model.triangles[..., 1])) + 2 * GAP
-            count += street.put(model, _Spot(x, y + width / 2, WALK_Z, yaw)) is not None
+            model, width = house()
+            houses.append(street.put(model, _Spot(x, y + width / 2, WALK_Z, yaw)))
             y += width
-    return count
+    return sum(placed is not None for placed in houses)
 
 
 def _add_ground(assembly: Assembly, rng: np.random.Generator) -> None:
@@ -256,7 +245,6 @@ def _paint(
 
 
 def _patches(rng: np.random.Generator) -> Mesh:
-    """Return repaired patches and manhole covers of the road."""
     pieces = []
     for _ in range(14):
         size = (float(rng.uniform(0.6, 2.2)), float(rng.uniform(0.5, 1.6)), 0.02)
@@ -301,17 +289,15 @@ def _daylight(rng: np.random.Generator) -> Style:
     """Draw the sun and sky; the sun is distant, so its light is nearly constant along the street."""
     azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(38, 62))
     warm = rng.uniform(0, 1)
-    toward = np.array(
-        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
-    )
+    level = np.cos(elevation)
+    toward = np.array([np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation)])
     sun = np.array([1.0, 0.97 - 0.05 * warm, 0.90 - 0.14 * warm]) * rng.uniform(1.1, 1.35)
     # The shader's light falls off as 13 / distance^2, which is about 1 above a table.
     sun *= SUN_DISTANCE**2 / 13.0
     sky = np.array([0.40, 0.45, 0.54]) * rng.uniform(0.9, 1.1)
     ground = sky * np.array([0.62, 0.56, 0.48])
-    vectors = (SUN_DISTANCE * toward, sun, sky, ground)
-    position, light, above, below = (tuple(vector.tolist()) for vector in vectors)
-    return Style(position, 14.0, light, above, below, float(rng.uniform(1.0, 1.15)), SCALE, 45.0)
+    exposure = float(rng.uniform(1.0, 1.15))
+    return Style.of(SUN_DISTANCE * toward, 14.0, sun, sky, ground, exposure, SCALE, 45.0)
 
 
 def drive_sights(scene: WorldScene, views: int, arc_deg: float | int) -> tuple[list[Sight], float]:

@@ -25,8 +25,7 @@ MAX_FOOTPRINT = 0.36
 MAX_HEIGHT_TO_FOOTPRINT = 2.7
 GAP = 0.015
 WALL_GROUPS = ("brick", "collage", "stone", "plain", "cloth")
-ROOM_PALE = 0.5
-"""Share of grey mixed into walls and floor, so that the objects stand out."""
+ROOM_PALE = 0.5  # share of grey mixed into walls and floor, so that the objects stand out
 FOV_DEG = 50.0
 ELEVATIONS_DEG = (24.0, 46.0)
 DISTANCE = 2.15 * TABLE_RADIUS
@@ -67,8 +66,7 @@ def build_tabletop(seed: int, objects: int) -> WorldScene:
         placed.append(PlacedObject(model.name, node, (float(spot[0]), float(spot[1])), radius, height, yaw))
     logger.info("scene tabletop:%d: %d of %d objects placed", seed, len(placed), objects)
     _add_room(assembly, np.random.default_rng([seed, 3]))
-    style = Style.draw(np.random.default_rng([seed, 4]))
-    return assembly.finished(objects, placed, style)
+    return assembly.finished(objects, placed, _lamplight(np.random.default_rng([seed, 4])))
 
 
 def _layout(rng: np.random.Generator, radii: list[float]) -> list[Float[np.ndarray, " 2"] | None]:
@@ -76,7 +74,7 @@ def _layout(rng: np.random.Generator, radii: list[float]) -> list[Float[np.ndarr
 
     Each place is redrawn, at most `TRIES` times, until its footprint overlaps no earlier footprint.
     """
-    best: list[np.ndarray | None] = []
+    fullest: list[np.ndarray | None] = []
     most = -1
     for _ in range(LAYOUTS):
         spots: list[np.ndarray | None] = []
@@ -92,19 +90,18 @@ def _layout(rng: np.random.Generator, radii: list[float]) -> list[Float[np.ndarr
                     spots[-1] = spot
                     break
         if len(taken) > most:
-            best, most = spots, len(taken)
+            fullest, most = spots, len(taken)
         if most == len(radii):
             break
-    return best
+    return fullest
 
 
 def _add_room(assembly: Assembly, rng: np.random.Generator) -> None:
     """Add a richly textured table, floor and walls, and sometimes a cloth, a rug or pictures."""
     paints = PaintBox(rng)
     _add_table(assembly, rng, paints)
-    half = ROOM_HALF
     floor = paints.draw(str(rng.choice(["wood", "collage", "stone", "tiles"])), scale=0.35).paled(ROOM_PALE)
-    ground = box((2 * half, 2 * half, 0.1), (0, 0, FLOOR_Z - 0.05))
+    ground = box((2 * ROOM_HALF, 2 * ROOM_HALF, 0.1), (0, 0, FLOOR_Z - 0.05))
     assembly.add_surroundings("floor", ("ground", f"{floor.colour} floor"), [(ground, floor)])
     if rng.random() < 0.5:
         woven = _fabric(paints, 0.35).paled(0.35)
@@ -121,14 +118,14 @@ def _add_room(assembly: Assembly, rng: np.random.Generator) -> None:
             group = str(rng.choice(WALL_GROUPS))
             drawn = _fabric(paints, 0.35) if group == "cloth" else paints.draw(group, scale=0.35)
             paint = drawn.paled(ROOM_PALE)
-        wall = box((0.1, 2 * half + 0.2, WALL_HEIGHT), (half + 0.05, 0, FLOOR_Z + WALL_HEIGHT / 2))
+        wall = box((0.1, 2 * ROOM_HALF + 0.2, WALL_HEIGHT), (ROOM_HALF + 0.05, 0, FLOOR_Z + WALL_HEIGHT / 2))
         walls.append((wall.turned("z", 90 * turn), paint))
         for side in (-1, 1):
             if rng.random() < 0.3:
                 wide, high = rng.uniform(0.7, 1.3), rng.uniform(0.6, 1.0)
-                place = side * rng.uniform(0.9, 1.9), FLOOR_Z + rng.uniform(1.2, 2.1)
-                frame = box((0.05, wide + 0.16, high + 0.16), (half - 0.02, *place), 0.01)
-                canvas = box((0.03, wide, high), (half - 0.04, *place))
+                centre = side * rng.uniform(0.9, 1.9), FLOOR_Z + rng.uniform(1.2, 2.1)
+                frame = box((0.05, wide + 0.16, high + 0.16), (ROOM_HALF - 0.02, *centre), 0.01)
+                canvas = box((0.03, wide, high), (ROOM_HALF - 0.04, *centre))
                 pictures.append((frame.turned("z", 90 * turn), paints.draw("wood").paled(0.3)))
                 group = str(rng.choice(["collage", "plain", "stone", "plastic"]))
                 pictures.append((canvas.turned("z", 90 * turn), paints.draw(group, scale=0.5).paled(0.35)))
@@ -179,6 +176,18 @@ def _fabric(paints: PaintBox, scale: float) -> Paint:
     """Draw cloth with a pattern of the given scale; a weave stays fine, because a coarse weave looks wavy."""
     paint = paints.draw("cloth", scale=scale)
     return replace(paint, scale=paint.scale * 2.2 / scale * 0.5) if paint.kind == "weave" else paint
+
+
+def _lamplight(rng: np.random.Generator) -> Style:
+    azimuth, away = rng.uniform(0, 2 * np.pi), rng.uniform(0.8, 2.2)
+    warm = rng.uniform(-1.3, 1.3)
+    light = np.array([1.0 + 0.06 * warm, 0.97, 0.92 - 0.12 * warm]) * rng.uniform(0.8, 1.2)
+    sky = np.array([0.44 - 0.05 * warm, 0.46, 0.50 + 0.05 * warm]) * rng.uniform(0.75, 1.2)
+    position = np.array([away * np.cos(azimuth), away * np.sin(azimuth), rng.uniform(3.2, 4.2)])
+    radius = float(rng.uniform(0.25, 0.75))
+    ground = sky * np.array([0.58, 0.5, 0.42])
+    exposure = float(rng.uniform(1.15, 1.5))
+    return Style.of(position, radius, light, sky, ground, exposure)
 
 
 def ring_sights(scene: WorldScene, views: int, arc_deg: float | int) -> tuple[list[Sight], float]:

@@ -83,11 +83,11 @@ def draw_level_prompts(
             flat = targets[0].reshape(-1)
         order = np.argsort(flat, kind="stable")
         ids, starts, areas = np.unique(flat[order], return_index=True, return_counts=True)
-        known = np.flatnonzero(ids >= 0)
-        if not len(known) or not len(rows):
+        present = np.flatnonzero(ids >= 0)
+        if not len(present) or not len(rows):
             continue
-        chance = areas[known] ** 0.25
-        regions = rng.choice(known, len(rows), p=chance / chance.sum())
+        chance = areas[present] ** 0.25
+        regions = rng.choice(present, len(rows), p=chance / chance.sum())
         pixels[rows] = order[(starts[regions] + rng.random(len(rows)) * areas[regions]).astype(np.int64)]
     return np.stack([pixels % width, pixels // width], axis=1).astype(np.int64)
 
@@ -114,9 +114,9 @@ def compared_pixels(
     boxes = np.empty((len(chosen), 4, 4), np.int64)
     boxes[:, 0] = whole
     for head in range(len(HEADS)):
-        known = boxes_of(blocks[head, :, :, 0])
+        region_boxes = boxes_of(blocks[head, :, :, 0])
         for row, node in enumerate(chosen[:, head].tolist()):
-            x0, y0, x1, y1 = known.get(node, whole) if node >= 0 else whole
+            x0, y0, x1, y1 = region_boxes.get(node, whole) if node >= 0 else whole
             boxes[row, head + 1] = (
                 max(0, x0 - MARGIN), max(0, y0 - MARGIN), min(width, x1 + MARGIN), min(height, y1 + MARGIN)
             )  # fmt: skip

@@ -41,7 +41,7 @@ def _room_sight(scene: WorldScene, rng: np.random.Generator) -> tuple[Sight, flo
     """
     shell = room_of(scene)
     if rng.random() < 1 / 3:
-        spot = path_points(shell, np.array([rng.uniform(0, 360)]))[0]
+        spot = path_points(shell, rng.uniform(0, 360, 1))[0]
         centre = np.array([*spot, rng.uniform(1.3, 1.78)])
         target = np.array([*(-0.5 * spot), room.LOOK_AT_Z]) + rng.uniform(-0.3, 0.3, 3)
     else:
@@ -68,12 +68,10 @@ def _free_centre(
         ):
             return centre
     # No free position near the object was found; the loop is always free.
-    spot = path_points(shell, np.array([rng.uniform(0, 360)]))[0]
-    return np.array([*spot, rng.uniform(1.3, 1.75)])
+    return np.array([*path_points(shell, rng.uniform(0, 360, 1))[0], rng.uniform(1.3, 1.75)])
 
 
 def _street_sight(scene: WorldScene, rng: np.random.Generator) -> tuple[Sight, float]:
-    """Draw a camera: a view from the road, or a close-up of a visible object."""
     fov_deg = float(rng.uniform(56, 66))
     sight = _close_up(scene, rng) if rng.random() < 0.5 else None
     if sight is None:

@@ -68,12 +68,12 @@ def draw_masks(folder: Path, encoder: SamEncoder, decoder: SamDecoder, views: La
         y, x = fine[int(rng.integers(len(fine)))]
         image = views.images[view]
         _, logits = predict_masks(encoder, decoder, image, np.array([[x + 0.5, y + 0.5]]))
-        shown = image.copy()
-        cv2.circle(shown, (int(x), int(y)), 4, (255, 0, 0), -1)
+        marked = image.copy()
+        cv2.circle(marked, (int(x), int(y)), 4, (255, 0, 0), -1)
         size = image.shape[1::-1]
-        masks = [cv2.resize(each, size, interpolation=cv2.INTER_LINEAR) > 0 for each in logits[0]]
-        masks += [each == each[y, x] for each in target]
-        cells = [shown, *(np.where(mask[..., None], image, image // 5) for mask in masks)]
+        masks = [cv2.resize(mask, size, interpolation=cv2.INTER_LINEAR) > 0 for mask in logits[0]]
+        masks += [mask == mask[y, x] for mask in target]
+        cells = [marked, *(np.where(mask[..., None], image, image // 5) for mask in masks)]
         lines.append(
             np.hstack([cv2.resize(cell, (160, 160), interpolation=cv2.INTER_AREA) for cell in cells])
         )
@@ -104,14 +104,14 @@ def write_sam_card(
     points, automatic = [], []
     for kind in metrics["points"]:
         for level in LEVELS:
-            found = metrics["points"][kind][level.label]
-            scores = [f"{found['iou']:.2f}", f"{found['best']:.2f}", f"{100 * found['above_75']:.0f} %"]
-            scores += [f"{found['correlation']:.2f}", f"{found['n']:.0f}"]
-            scores += [f"{found[f'iou_{size}']:.2f} ({found[f'n_{size}']})" for size in SIZES]
+            score = metrics["points"][kind][level.label]
+            scores = [f"{score['iou']:.2f}", f"{score['best']:.2f}", f"{100 * score['above_75']:.0f} %"]
+            scores += [f"{score['correlation']:.2f}", f"{score['n']:.0f}"]
+            scores += [f"{score[f'iou_{size}']:.2f} ({score[f'n_{size}']})" for size in SIZES]
             points.append((kind, level.label, *scores))
-            found = metrics["automatic"][kind][level.label]
-            scores = [f"{found['recall']:.2f}", f"{found['iou']:.2f}", f"{found['masks']:.0f}"]
-            automatic.append((kind, level.label, *scores, f"{found['precision']:.2f}", f"{found['n']:.0f}"))
+            score = metrics["automatic"][kind][level.label]
+            scores = [f"{score['recall']:.2f}", f"{score['iou']:.2f}", f"{score['masks']:.0f}"]
+            automatic.append((kind, level.label, *scores, f"{score['precision']:.2f}", f"{score['n']:.0f}"))
     parameters = sum(p.numel() for module in (encoder, decoder) for p in module.parameters())
     mask_px = FRAME_PX // MASK_STRIDE
     point_columns = ("scenes", "level", "mean IoU", "best head", "IoU above 0.75", "correlation", "regions")
@@ -161,16 +161,16 @@ def write_clip_card(
     draw_curve(folder, curve, "exact_", "top-1, exact")
     shares = ("top1", "top3", "top1_of_level", "top1_of_common", "coloured", "above_canonical")
     rows = [
-        (background, kind, level.label, *(f"{100 * found[name]:.0f} %" for name in shares), found["n"])
+        (background, kind, level.label, *(f"{100 * score[name]:.0f} %" for name in shares), score["n"])
         for background in ("black", "keep")
         for kind in ("exact", "rough")
         for level in LEVELS
-        if (found := metrics[background].get(kind, {}).get(level.label))
+        if (score := metrics[background].get(kind, {}).get(level.label))
     ]
     columns = ("background", "masks", "level", "top-1", "top-3", "of level", f"of {3 * COMMON}")
     together = [
-        (label, f"{found['iou']:.2f}", f"{found['instance']:.2f}", f"{found['best']:.2f}", found["n"])
-        for label, found in metrics["queries"].items()
+        (label, f"{score['iou']:.2f}", f"{score['instance']:.2f}", f"{score['best']:.2f}", score["n"])
+        for label, score in metrics["queries"].items()
     ]
     body = f"""# clip-tiny
 

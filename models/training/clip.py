@@ -1,6 +1,7 @@
 """A small CLIP: crops of masked regions and short phrases in a common space of 128 dimensions."""
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int64
@@ -83,6 +84,14 @@ class ClipText(nn.Module):
         return functional.normalize(self.project(pooled), dim=-1)
 
 
+class Clip(NamedTuple):
+    """A complete small CLIP."""
+
+    vision: ClipVision
+    text: ClipText
+    tokenizer: Tokenizer
+
+
 def contrastive_loss(
     image: Float[Tensor, "B D"],  # unit vectors of crops
     text: Float[Tensor, "T D"],  # unit vectors of texts
@@ -95,6 +104,6 @@ def contrastive_loss(
     """
     logits = scale * image @ text.T
     by_image = -(valid * torch.log_softmax(logits, dim=1)).sum(dim=1) / valid.sum(dim=1)
-    shown = valid.sum(dim=0)
-    by_text = -(valid * torch.log_softmax(logits, dim=0)).sum(dim=0) / shown.clamp(min=1.0)
-    return (by_image.mean() + by_text.sum() / (shown > 0).sum()) / 2
+    num_crops = valid.sum(dim=0)
+    by_text = -(valid * torch.log_softmax(logits, dim=0)).sum(dim=0) / num_crops.clamp(min=1.0)
+    return (by_image.mean() + by_text.sum() / (num_crops > 0).sum()) / 2

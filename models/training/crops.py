@@ -57,8 +57,8 @@ class CropTable:
         x0, y0 = max(0, x0 - margin), max(0, y0 - margin)
         x1, y1 = min(image.shape[1], x1 + margin), min(image.shape[0], y1 + margin)
         if self.segmented[row] >= 0:
-            found = self.masks[self.view[row]]
-            mask = found.dense(np.array([self.segmented[row]]))[0, y0:y1, x0:x1]
+            masks = self.masks[self.view[row]]
+            mask = masks.dense(np.array([self.segmented[row]]))[0, y0:y1, x0:x1]
         else:
             labels = self.views.labels[self.view[row], self.level[row] - 1, y0:y1, x0:x1]
             mask = labels == self.node[row]
@@ -91,7 +91,7 @@ def roughen(rng: np.random.Generator, mask: Bool[np.ndarray, "H W"]) -> Bool[np.
     noise = cv2.GaussianBlur(rng.normal(0, 1, mask.shape).astype(np.float32), (0, 0), 2 + sigma)
     noise = noise / (noise.std() + 1e-6)
     blurred = cv2.GaussianBlur(rough, (0, 0), sigma)
-    found = blurred + rng.uniform(0.05, 0.3) * noise * (blurred > 0.02) > rng.uniform(0.25, 0.65)
+    result = blurred + rng.uniform(0.05, 0.3) * noise * (blurred > 0.02) > rng.uniform(0.25, 0.65)
     for chance, value in ((0.25, False), (0.2, True)):
         if rng.random() < chance:
             rows, columns = np.nonzero(mask)
@@ -99,9 +99,9 @@ def roughen(rng: np.random.Generator, mask: Bool[np.ndarray, "H W"]) -> Bool[np.
             blob = np.zeros(mask.shape, np.uint8)
             radius = int(area**0.5 * rng.uniform(0.12, 0.35)) + 1
             cv2.circle(blob, (int(columns[pick]), int(rows[pick])), radius, 1, -1)
-            found = np.where(blob > 0, value, found)
+            result = np.where(blob > 0, value, result)
     # A mask that covers too little of its region is not a valid example.
-    return found if (found & mask).sum() > 0.5 * (found | mask).sum() else mask
+    return result if (result & mask).sum() > 0.5 * (result | mask).sum() else mask
 
 
 def best_node(
@@ -147,10 +147,10 @@ def list_crops(views: LabelledViews, masks: Sequence[HierarchicalMasks] = ()) ->
                     boxes.append(box)
         if view >= len(masks):
             continue
-        found = masks[view]
-        for index in range(len(found)):
-            mask = found.dense(np.array([index]))[0]
-            node, iou = best_node(mask, int(found.level[index]), labels, len(nodes))
+        segmented_masks = masks[view]
+        for index in range(len(segmented_masks)):
+            mask = segmented_masks.dense(np.array([index]))[0]
+            node, iou = best_node(mask, int(segmented_masks.level[index]), labels, len(nodes))
             if iou > SHOWS and nodes[node].phrases:
                 caption = sets.setdefault(nodes[node].phrases, len(sets))
                 rows.append((view, node, nodes[node].level, root[node], index, caption))
@@ -158,7 +158,7 @@ def list_crops(views: LabelledViews, masks: Sequence[HierarchicalMasks] = ()) ->
                 rows.append((view, NONE, 0, NONE, index, NONE))
             else:
                 continue
-            boxes.append(found.box_xyxy[index].tolist())
+            boxes.append(segmented_masks.box_xyxy[index].tolist())
     columns = np.array(rows, np.int64).reshape(-1, 6).T
     of_view, of_node, levels, things, segmented, captions = map(np.ascontiguousarray, columns)
     box_xyxy = np.array(boxes, np.int64).reshape(-1, 4)
@@ -169,11 +169,11 @@ def list_crops(views: LabelledViews, masks: Sequence[HierarchicalMasks] = ()) ->
 
 def list_segmented(views: LabelledViews, masks: Sequence[HierarchicalMasks]) -> CropTable:
     """List all segmented masks in order, without captions and regardless of their content."""
-    view = np.repeat(np.arange(len(masks)), [len(found) for found in masks])
+    view = np.repeat(np.arange(len(masks)), [len(of_view) for of_view in masks])
     none, level = np.full(len(view), NONE, np.int64), np.zeros(len(view), np.int64)
     # A first empty array, because NumPy cannot concatenate nothing.
-    segmented = np.concatenate([none[:0], *(np.arange(len(found)) for found in masks)])
-    box = np.concatenate([np.zeros((0, 4), np.int64), *(found.box_xyxy for found in masks)])
+    segmented = np.concatenate([none[:0], *(np.arange(len(of_view)) for of_view in masks)])
+    box = np.concatenate([np.zeros((0, 4), np.int64), *(of_view.box_xyxy for of_view in masks)])
     return CropTable(views, masks, view, none, level, none, segmented, box, none, ())
 
 

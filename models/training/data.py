@@ -38,7 +38,6 @@ class LabelledViews:
         return self.chosen(np.unique(rows.round().astype(int)))
 
     def chosen(self, rows: Sequence[int] | Int[np.ndarray, " v"]) -> "LabelledViews":
-        """Return the given views."""
         return LabelledViews(self.images[rows], self.labels[rows], tuple(self.nodes[row] for row in rows))
 
 
@@ -139,9 +138,9 @@ def region_centres(
 
 def boxes_of(target: Shaped[np.ndarray, "H W"]) -> dict[int, tuple[int, int, int, int]]:
     """Return the box (x0, y0, x1, y1, end exclusive) of each region of a label image."""
-    found = ndimage.find_objects((target + 1).astype(np.int32))
+    slices = ndimage.find_objects((target + 1).astype(np.int32))
     return {
         index: (box[1].start, box[0].start, box[1].stop, box[0].stop)
-        for index, box in enumerate(found)
+        for index, box in enumerate(slices)
         if box is not None
     }

@@ -8,14 +8,13 @@ import numpy as np
 import onnx
 import torch
 from onnx import numpy_helper
-from tokenizers import Tokenizer
 from torch import Tensor, nn
 
 from hilsplat.base.artifacts import write_json
 from hilsplat.base.atomic import atomic_path
 from hilsplat.models.layouts import DECODER, PREVIEW
 from hilsplat.segment.sam import OWN, Thresholds
-from models.training.clip import CROP_PX, DIMENSIONS, ClipText, ClipVision
+from models.training.clip import CROP_PX, DIMENSIONS, Clip
 from models.training.sam import (
     FRAME_PX,
     MASK_STRIDE,
@@ -173,11 +172,11 @@ def export_sam(encoder: SamEncoder, decoder: SamDecoder, folder: Path) -> None:
     write_json(folder / "preprocessor_config.json", preprocessor)
 
 
-def export_clip(vision: ClipVision, text: ClipText, tokenizer: Tokenizer, folder: Path) -> None:
+def export_clip(clip: Clip, folder: Path) -> None:
     """Write the configuration, `tokenizer.json` and the two networks of CLIP's layout."""
     batch, words = {0: "batch"}, {0: "batch", 1: "words"}
     export_onnx(
-        vision,
+        clip.vision,
         {"pixel_values": torch.zeros(2, 3, CROP_PX, CROP_PX)},
         {"image_embeds": batch},
         {"pixel_values": batch},
@@ -185,14 +184,14 @@ def export_clip(vision: ClipVision, text: ClipText, tokenizer: Tokenizer, folder
     )
     ones = torch.ones(2, 3, dtype=torch.int64)
     export_onnx(
-        text,
+        clip.text,
         {"input_ids": ones, "attention_mask": ones.clone()},
         {"text_embeds": batch},
         {"input_ids": words, "attention_mask": words},
         folder / "onnx" / "text_model.onnx",
     )
     with atomic_path(folder / "tokenizer.json") as temporary:
-        temporary.write_text(tokenizer.to_str(pretty=False) + "\n", encoding="utf-8")
+        temporary.write_text(clip.tokenizer.to_str(pretty=False) + "\n", encoding="utf-8")
     config = {"model_type": "clip", "architectures": ["TinyClip"], "projection_dim": DIMENSIONS}
     write_json(folder / "config.json", config | {"world_only": True})
     side = {"height": CROP_PX, "width": CROP_PX}

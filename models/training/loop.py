@@ -51,7 +51,6 @@ class Budget:
             raise ValueError("training needs a limit: minutes or steps")
 
     def is_time_to_decay(self, step: int, minutes: float) -> bool:
-        """Return whether the learning rate decay should begin."""
         by_steps = self.steps > 0 and step >= int((1 - DECAY_SHARE) * self.steps)
         return by_steps or (self.minutes > 0 and minutes >= (1 - DECAY_SHARE) * self.minutes)
 
@@ -184,9 +183,9 @@ class Training:
                 progress.minutes, clock = progress.minutes + (now - clock) / 60, now
                 if progress.step % self.tuning.measure_every == 0 or progress.is_finished:
                     with self._averaged_weights():
-                        found = measure()
+                        quality = measure()
                     losses = {f"{key}_loss": value / since for key, value in sums.items()}
-                    values = {"step": progress.step, "minutes": progress.minutes, **losses, **found}
+                    values = {"step": progress.step, "minutes": progress.minutes, **losses, **quality}
                     progress.rows.append({key: float(f"{value:.5g}") for key, value in values.items()})
                     logger.info("  ".join(f"{key} {value:g}" for key, value in progress.rows[-1].items()))
                     sums, since = {}, 0
@@ -226,7 +225,6 @@ class Training:
 
     @contextmanager
     def _averaged_weights(self) -> Iterator[None]:
-        """Use the averaged weights inside the context."""
         before = {key: value.clone() for key, value in self.modules.state_dict().items()}
         self._load_averages()
         yield
@@ -255,10 +253,10 @@ class Training:
             tensors |= {f"optimiser.{row}.{key}": value for key, value in values.items()}
         plain = {key: value.detach().cpu().clone().contiguous() for key, value in tensors.items()}
         # The state before the decay must not contain the plan of one run's decay.
-        kept = self.progress if path == self.now else replace(self.progress, decay_from=-1, decay_steps=0)
+        progress = self.progress if path == self.now else replace(self.progress, decay_from=-1, decay_steps=0)
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary:
-            save_file(plain, temporary, metadata={"progress": json.dumps(asdict(kept))})
+            save_file(plain, temporary, metadata={"progress": json.dumps(asdict(progress))})
 
     def _load(self, path: Path) -> None:
         with safe_open(path, framework="pt") as file:

@@ -11,7 +11,7 @@ from torch import Tensor
 from hilsplat.base.levels import LEVELS
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat_world.paints import COLOURS
-from models.training.clip import CANONICAL, ClipText, ClipVision
+from models.training.clip import CANONICAL, Clip
 from models.training.crops import CropTable, list_segmented
 from models.training.data import LabelledViews, normalised
 from models.training.measure_sam import MIN_PX, mean_or_zero
@@ -30,11 +30,9 @@ def tokenised(tokenizer: Tokenizer, texts: Sequence[str]) -> tuple[Tensor, Tenso
 
 
 @torch.no_grad()
-def embedded_crops(
-    vision: ClipVision, crops: CropTable, rows: np.ndarray, background: str = "black"
-) -> np.ndarray:
+def embedded_crops(clip: Clip, crops: CropTable, rows: np.ndarray, background: str = "black") -> np.ndarray:
     """Return the unit vectors of some crops."""
-    vision.eval()
+    vision = clip.vision.eval()
     device = next(vision.parameters()).device
     parts = []
     for start in range(0, len(rows), CHUNK):
@@ -44,12 +42,12 @@ def embedded_crops(
 
 
 @torch.no_grad()
-def embedded_texts(text: ClipText, tokenizer: Tokenizer, texts: Sequence[str]) -> np.ndarray:
+def embedded_texts(clip: Clip, texts: Sequence[str]) -> np.ndarray:
     """Return the unit vectors of texts."""
-    text.eval()
-    device = next(text.parameters()).device
-    words, mask = tokenised(tokenizer, texts)
-    return text(words.to(device), mask.to(device)).cpu().numpy()
+    encoder = clip.text.eval()
+    device = next(encoder.parameters()).device
+    words, mask = tokenised(clip.tokenizer, texts)
+    return encoder(words.to(device), mask.to(device)).cpu().numpy()
 
 
 def coloured_text(phrases: Sequence[str]) -> str | None:
@@ -59,9 +57,7 @@ def coloured_text(phrases: Sequence[str]) -> str | None:
 
 
 def measure_clip(
-    vision: ClipVision,
-    text: ClipText,
-    tokenizer: Tokenizer,
+    clip: Clip,
     crops: CropTable,
     rows: np.ndarray | None = None,  # rows to measure; None measures all
     background: str = "black",
@@ -84,14 +80,11 @@ def measure_clip(
     hues = sorted({phrase for phrase in coloured if phrase})
     hue_row: dict[str | None, int] = {phrase: row for row, phrase in enumerate(hues)}
     hue_of_set = np.array([hue_row.get(phrase, -1) for phrase in coloured], np.int64)
-    vectors = embedded_crops(vision, crops, rows, background)
-    similarity = vectors @ embedded_texts(text, tokenizer, texts).T
-    canonical = (vectors @ embedded_texts(text, tokenizer, CANONICAL).T).max(axis=1)
+    vectors = embedded_crops(clip, crops, rows, background)
+    similarity = vectors @ embedded_texts(clip, texts).T
+    canonical = (vectors @ embedded_texts(clip, CANONICAL).T).max(axis=1)
     true_text, hue = of_set[crops.caption[rows]], hue_of_set[crops.caption[rows]]
-    if hues:
-        hue_found = (vectors @ embedded_texts(text, tokenizer, hues).T).argmax(axis=1)
-    else:
-        hue_found = np.full(len(rows), -2)
+    best_hue = (vectors @ embedded_texts(clip, hues).T).argmax(axis=1) if hues else np.full(len(rows), -2)
     level, rough = crops.level[rows], crops.rough[rows]
     mine = similarity[np.arange(len(rows)), true_text]
     rank = (similarity > mine[:, None]).sum(axis=1)
@@ -114,7 +107,7 @@ def measure_clip(
                 "top1_of_level": float((rank_of_level == 0).mean()),
                 "top1_of_common": mean_or_zero(rank_of_common[has_common] == 0),
                 "above_canonical": float((mine[group] > canonical[group]).mean()),
-                "coloured": mean_or_zero((hue_found == hue)[has_hue]),
+                "coloured": mean_or_zero((best_hue == hue)[has_hue]),
                 "n": int(group.sum()),
             }
     return report
@@ -125,19 +118,15 @@ def common_texts(text: np.ndarray, level: np.ndarray) -> np.ndarray:
 
     `text` is the row of each mask's text. Masks of level 0 are not counted.
     """
-    kept = []
+    common = []
     for at in LEVELS:
         rows, counts = np.unique(text[level == int(at)], return_counts=True)
-        kept.append(rows[np.argsort(-counts, kind="stable")[:COMMON]])
-    return np.unique(np.concatenate(kept))
+        common.append(rows[np.argsort(-counts, kind="stable")[:COMMON]])
+    return np.unique(np.concatenate(common))
 
 
 def measure_queries(
-    vision: ClipVision,
-    text: ClipText,
-    tokenizer: Tokenizer,
-    views: LabelledViews,
-    masks: Sequence[HierarchicalMasks],  # automatic masks of each view
+    clip: Clip, views: LabelledViews, masks: Sequence[HierarchicalMasks]
 ) -> dict[str, dict[str, float]]:
     """Measure both models together: each text's most similar automatic mask in a view, and its regions.
 
@@ -149,8 +138,8 @@ def measure_queries(
         same with the best mask of the level; `n`, the number of pairs of view and text.
     """
     crops = list_segmented(views, masks)
-    vectors = embedded_crops(vision, crops, np.arange(len(crops)))
-    found: dict[str, list[tuple[float, float, float]]] = {level.label: [] for level in LEVELS}
+    vectors = embedded_crops(clip, crops, np.arange(len(crops)))
+    overlaps: dict[str, list[tuple[float, float, float]]] = {level.label: [] for level in LEVELS}
     for view in range(len(views)):
         nodes = views.nodes[view]
         for level in LEVELS:
@@ -164,12 +153,12 @@ def measure_queries(
                 continue
             rows = masks[view].rows_of(level)
             if not len(rows):
-                found[level.label] += [(0.0, 0.0, 0.0)] * len(by_text)
+                overlaps[level.label] += [(0.0, 0.0, 0.0)] * len(by_text)
                 continue
             guesses = masks[view].dense(rows).reshape(len(rows), labels.size)
-            own = np.flatnonzero(crops.view == view)
-            own = own[np.searchsorted(crops.segmented[own], rows)]
-            similarity = vectors[own] @ embedded_texts(text, tokenizer, list(by_text)).T
+            in_view = np.flatnonzero(crops.view == view)
+            in_view = in_view[np.searchsorted(crops.segmented[in_view], rows)]
+            similarity = vectors[in_view] @ embedded_texts(clip, list(by_text)).T
             for column, ids in enumerate(by_text.values()):
                 truths = labels.reshape(1, -1) == np.array(ids)[:, None]
                 truths = np.concatenate([truths, truths.any(axis=0, keepdims=True)]).astype(np.float32)
@@ -177,7 +166,7 @@ def measure_queries(
                 union = guesses.sum(axis=1)[:, None] + truths.sum(axis=1)[None] - shared
                 iou = shared / union
                 pick = int(similarity[:, column].argmax())
-                found[level.label].append((float(iou[pick, -1]), float(iou[pick].max()), float(iou.max())))
+                overlaps[level.label].append((float(iou[pick, -1]), float(iou[pick].max()), float(iou.max())))
     return {
         label: {
             "iou": mean_or_zero([row[0] for row in rows]),
@@ -185,5 +174,5 @@ def measure_queries(
             "best": mean_or_zero([row[2] for row in rows]),
             "n": len(rows),
         }
-        for label, rows in found.items()
+        for label, rows in overlaps.items()
     }

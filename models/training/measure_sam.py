@@ -74,7 +74,7 @@ def measure_sam(
         `above_75` % IoU; `correlation` of predicted and true IoU; `n`; and for each of `SIZES` the mean
         `iou_<size>` (0 if there is none) and `n_<size>`.
     """
-    found: dict[Level, list[tuple[float, float, float, float]]] = {level: [] for level in LEVELS}
+    results: dict[Level, list[tuple[float, float, float, float]]] = {level: [] for level in LEVELS}
     for view in range(len(views)):
         drawn = draw_regions(np.random.default_rng((0, 2, view)), views.labels[view], PER_LEVEL)
         if not drawn:
@@ -88,11 +88,11 @@ def measure_sam(
             level = HEADS[head]
             truth, guess = views.labels[view][level.index] == node, enlarged[row] > 0
             iou = (truth & guess).sum(axis=(1, 2)) / (truth | guess).sum(axis=(1, 2))
-            found[level].append(
+            results[level].append(
                 (float(iou[head]), float(iou.max()), float(scores[row, head]), float(truth.sum()))
             )
     report = {}
-    for level, rows in found.items():
+    for level, rows in results.items():
         values = np.array(rows).reshape(-1, 4)
         spread = len(values) > 2 and values[:, [0, 2]].std(axis=0).min() > 0
         report[level.label] = {
@@ -162,9 +162,9 @@ def measure_everything(masks: list[HierarchicalMasks], views: LabelledViews) -> 
     for level in LEVELS:
         best: list[float] = []
         fits = count = 0
-        for view, found in enumerate(masks):
-            rows = found.rows_of(level)
-            _, areas, iou = region_ious(views.labels[view][level.index], found.dense(rows))
+        for view, of_view in enumerate(masks):
+            rows = of_view.rows_of(level)
+            _, areas, iou = region_ious(views.labels[view][level.index], of_view.dense(rows))
             scored = areas >= MIN_PX
             best += (iou[scored].max(axis=1) if len(rows) else np.zeros(int(scored.sum()))).tolist()
             if len(iou):

@@ -39,6 +39,15 @@ STEM = 24
 WIDTHS = (64, 128, 192, 256)  # channels at strides 4, 8, 16, 32
 DEPTHS = (2, 2, 3, 2)  # residual blocks at the same strides
 
+Embeddings = Float[Tensor, "B C s s"]  # output of the encoder
+Positional = Float[Tensor, "B D s s"]  # output of `positional_embeddings`
+Place = Float[Tensor, "B C_and_D s s"]  # embeddings and positional embeddings
+Shared = Float[Tensor, "B K_and_1 h w"]  # output of `shared_features`
+Points = Float[Tensor, "B P N 2"]  # x, y of the points of P prompts, in pixels of the encoder's frame
+PointLabels = Int64[Tensor, "B P N"]  # 1 inside the region, 0 outside, negative for padding
+Scores = Float[Tensor, "B P 3"]  # predicted IoU of one mask for each of `HEADS`
+Logits = Float[Tensor, "B P 3 h w"]  # mask logits at stride 2
+
 
 def convolution(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
     """Return a 3x3 convolution with batch normalisation and ReLU."""
@@ -60,7 +69,6 @@ class Residual(nn.Module):
         )
 
     def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C H W"]:
-        """Return a tensor of the input's shape."""
         return functional.relu(x + self.second(self.first(x)))
 
 
@@ -92,7 +100,7 @@ class SamEncoder(nn.Module):
         self.sharpen = convolution(24 + STEM, 32)
         self.pixel = nn.Conv2d(32, PIXEL, 1)
 
-    def forward(self, pixels: Float[Tensor, "B 3 S S"]) -> Float[Tensor, "B C s s"]:
+    def forward(self, pixels: Float[Tensor, "B 3 S S"]) -> Embeddings:
         """Return the embedding at stride 4."""
         return torch.cat(self.features(pixels)[:3], dim=1)
 
@@ -136,9 +144,7 @@ def positional_embeddings(windows: Float[Tensor, "B 3"], cells: int) -> Float[Te
     return torch.stack(channels, dim=1)
 
 
-def shared_features(
-    embeddings: Float[Tensor, "B C s s"], positional: Float[Tensor, "B D s s"]
-) -> Float[Tensor, "B K_and_1 h w"]:
+def shared_features(embeddings: Embeddings, positional: Positional) -> Shared:
     """Return the pixel features at stride 2 shared by all prompts of an image; the last is constant 1."""
     pixel = functional.pixel_shuffle(embeddings[:, :PACKED], STRIDE // MASK_STRIDE)
     side = int(embeddings.shape[-1]) * (STRIDE // MASK_STRIDE)
@@ -177,34 +183,16 @@ class SamDecoder(nn.Module):
             self.weights.bias[-len(HEADS) :] = -2.0
 
     def forward(
-        self,
-        points: Float[Tensor, "B P N 2"],
-        labels: Int64[Tensor, "B P N"],
-        embeddings: Float[Tensor, "B C s s"],
-        positional: Float[Tensor, "B D s s"],
-    ) -> tuple[Float[Tensor, "B P 3"], Float[Tensor, "B P 3 h w"]]:
-        """Return predicted IoU and mask logits at stride 2, one mask for each of `HEADS`.
-
-        Args:
-            points: x, y in pixels of the encoder's frame.
-            labels: 1 inside the region, 0 outside, negative for padding.
-            embeddings: from the encoder.
-            positional: from `positional_embeddings`.
-        """
+        self, points: Points, labels: PointLabels, embeddings: Embeddings, positional: Positional
+    ) -> tuple[Scores, Logits]:
+        """Return predicted IoU and mask logits."""
         place = torch.cat([embeddings, positional], dim=1)
         return self.masks(points, labels, place, shared_features(embeddings, positional))
 
     def masks(
-        self,
-        points: Float[Tensor, "B P N 2"],
-        labels: Int64[Tensor, "B P N"],
-        place: Float[Tensor, "B C_and_D s s"],
-        shared: Float[Tensor, "B K_and_1 h w"],
-    ) -> tuple[Float[Tensor, "B P 3"], Float[Tensor, "B P 3 h w"]]:
-        """Compute `forward` from inputs shared by an image's prompts, as in the exported decoder.
-
-        `place` is embeddings and positional embeddings, and `shared` the output of `shared_features`.
-        """
+        self, points: Points, labels: PointLabels, place: Place, shared: Shared
+    ) -> tuple[Scores, Logits]:
+        """Compute `forward` from inputs shared by an image's prompts, as in the exported decoder."""
         token, *written = self.written(points, labels, place)
         bands, seen = [], []
         for band in self.bands(written, points, shared, BAND):
@@ -214,12 +202,8 @@ class SamDecoder(nn.Module):
         return self.seen_iou(token, torch.cat(seen, dim=-1)), torch.cat(bands, dim=3)
 
     def preview(
-        self,
-        points: Float[Tensor, "B P N 2"],
-        labels: Int64[Tensor, "B P N"],
-        place: Float[Tensor, "B C_and_D s s"],
-        shared: Float[Tensor, "B K_and_1 h w"],
-    ) -> tuple[Float[Tensor, "B P 3"], Float[Tensor, "B P 3 half_h half_w"]]:
+        self, points: Points, labels: PointLabels, place: Place, shared: Shared
+    ) -> tuple[Scores, Float[Tensor, "B P 3 half_h half_w"]]:
         """Compute `masks` at every second row and column, in a quarter of the time.
 
         The predicted IoUs equal those of `masks`, which depend only on these pixels.
@@ -230,11 +214,7 @@ class SamDecoder(nn.Module):
         return self.seen_iou(token, logits.flatten(3)), logits
 
     def bands(
-        self,
-        written: Sequence[Tensor],
-        points: Float[Tensor, "B P N 2"],
-        shared: Float[Tensor, "B K_and_1 h w"],
-        rows: int,
+        self, written: Sequence[Tensor], points: Points, shared: Shared, rows: int
     ) -> Iterator[Float[Tensor, "B P 3 rows w"]]:
         """Yield mask logits in bands of `rows` rows, for generated weights from `written`.
 
@@ -250,21 +230,19 @@ class SamDecoder(nn.Module):
             logits = torch.matmul(second, hidden) + shift[..., None]  # (B, P, 3, rows * w)
             yield logits.reshape(*points.shape[:2], len(HEADS), -1, side)
 
-    def seen_iou(
-        self, token: Float[Tensor, "B P T"], sampled: Float[Tensor, "B P 3 n"]
-    ) -> Float[Tensor, "B P 3"]:
+    def seen_iou(self, token: Float[Tensor, "B P T"], sampled: Float[Tensor, "B P 3 n"]) -> Scores:
         """Return `predicted_iou` from every second row and column of a mask."""
         return self.predicted_iou(token, sampled, sampled.new_full((1, 1, 1), 4.0))
 
     def at_pixels(
         self,
-        points: Float[Tensor, "B P N 2"],
-        labels: Int64[Tensor, "B P N"],
-        embeddings: Float[Tensor, "B C s s"],
-        positional: Float[Tensor, "B D s s"],
+        points: Points,
+        labels: PointLabels,
+        embeddings: Embeddings,
+        positional: Positional,
         pixels: Int64[Tensor, "B P K"],
         weights: Float[Tensor, "B P K"],
-    ) -> tuple[Float[Tensor, "B P 3"], Float[Tensor, "B P 3 K"]]:
+    ) -> tuple[Scores, Float[Tensor, "B P 3 K"]]:
         """Compute `forward` at some pixels per prompt for training, in a fraction of the time.
 
         `pixels` are flat indices into the mask, and `weights` the number of mask pixels that each represents.
@@ -281,10 +259,7 @@ class SamDecoder(nn.Module):
         return self.predicted_iou(token, logits, weights), logits
 
     def written(
-        self,
-        points: Float[Tensor, "B P N 2"],
-        labels: Int64[Tensor, "B P N"],
-        place: Float[Tensor, "B C_and_D s s"],
+        self, points: Points, labels: PointLabels, place: Place
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Return each prompt's token and its generated weights: matrix and bias of both layers."""
         cells = int(place.shape[-1])  # constant in the exported graph
@@ -312,7 +287,7 @@ class SamDecoder(nn.Module):
         token: Float[Tensor, "B P T"],
         logits: Float[Tensor, "B P 3 n"],
         weights: Float[Tensor, "#B #P #n"],
-    ) -> Float[Tensor, "B P 3"]:
+    ) -> Scores:
         """Estimate each mask's IoU from its area, its confidence and the prompt; no gradient to the mask.
 
         `logits` are those of some pixels of the mask, and `weights` the number of mask pixels that each

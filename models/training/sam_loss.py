@@ -31,9 +31,9 @@ def segmentation_loss(
     entropy = (weights * entropy).sum(dim=-1) / (2 * area + 64)
     masks = ((dice + entropy) * known).sum() / known.sum().clamp(min=1.0)
     with torch.no_grad():
-        found, target = (logits > 0) * weights, truth > 0.5
-        overlap = (found * target).sum(dim=-1)
-        union = (found + target * weights).sum(dim=-1) - overlap
+        predicted, target = (logits > 0) * weights, truth > 0.5
+        overlap = (predicted * target).sum(dim=-1)
+        union = (predicted + target * weights).sum(dim=-1) - overlap
         iou = overlap / union.clamp(min=1e-6)
     quality = (scores - iou * known).square().mean()
     return masks, quality

@@ -146,14 +146,9 @@ def _make_sam(out: Path, recipe: Recipe) -> None:
     settings, threads = recipe.settings, recipe.threads
     budget = Budget(settings.sam_minutes, settings.sam_steps)
     with stage_log("train", "sam-tiny") as counts:
+        name = recipe.state_name("sam")
         encoder, decoder, curve = train_sam(
-            recipe.training,
-            recipe.unseen,
-            budget,
-            recipe.seed,
-            recipe.cache,
-            recipe.state_name("sam"),
-            device=settings.device,
+            recipe.training, recipe.unseen, budget, recipe.seed, recipe.cache, name, device=settings.device
         )
         with atomic_folder(out / "sam-tiny") as folder:
             export_sam(encoder, decoder, folder)
@@ -181,15 +176,15 @@ def _make_clip(out: Path, recipe: Recipe) -> None:
         crops, others = list_crops(views, masks), list_crops(unseen, unseen_masks)
         counts["masks"] = len(crops)
         name = recipe.state_name("clip", segmenter=digest, segmented_views=count)
-        vision, text, tokenizer, curve = train_clip(
+        clip, curve = train_clip(
             crops, others, budget, recipe.seed, recipe.cache, name, device=settings.device
         )
         metrics: dict[str, Any] = {}
         for background in ("black", "keep"):
-            found = measure_clip(vision, text, tokenizer, others, background=background)
-            for (kind, level), value in found.items():
+            accuracies = measure_clip(clip, others, background=background)
+            for (kind, level), value in accuracies.items():
                 metrics.setdefault(background, {}).setdefault(kind, {})[level] = value
-        metrics["queries"] = measure_queries(vision, text, tokenizer, unseen, unseen_masks)
+        metrics["queries"] = measure_queries(clip, unseen, unseen_masks)
         counts.update({level: f"{v['top1']:.3f}" for level, v in metrics["black"]["exact"].items()})
         description = recipe.description("clip", budget, curve) | {
             "segmenter": digest,
@@ -199,7 +194,7 @@ def _make_clip(out: Path, recipe: Recipe) -> None:
         }
         with atomic_folder(out / "clip-tiny") as folder:
             write_text(folder / "vocabulary.txt", world_vocabulary())
-            export_clip(vision, text, tokenizer, folder)
+            export_clip(clip, folder)
             write_clip_card(folder, description, curve, metrics)
 
 

@@ -4,11 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tokenizers import Tokenizer
 from torch import Tensor, nn
 
 from hilsplat.base.levels import LEVELS
-from models.training.clip import CANONICAL, ClipText, ClipVision, contrastive_loss, word_tokenizer
+from models.training.clip import CANONICAL, Clip, ClipText, ClipVision, contrastive_loss, word_tokenizer
 from models.training.crops import FRAMES, GENERIC_FRAMES, Captioner, CropTable
 from models.training.data import normalised
 from models.training.loop import Budget, Curve, Training, Tuning, has_fast_half
@@ -49,7 +48,6 @@ class CropDraw:
         self.last = np.searchsorted(key[self.order], key, side="right")
 
     def draw(self, rng: np.random.Generator) -> np.ndarray:
-        """Draw the rows of a batch."""
         seeds = np.searchsorted(self.ends, rng.random(self.batch) * self.ends[-1], side="right")
         seeds = np.minimum(seeds, len(self.ends) - 1)
         rows = list(seeds[: round(self.batch * (1 - THING_SHARE))])
@@ -93,7 +91,7 @@ def train_clip(
     batch: int = BATCH,
     tuning: Tuning = TUNING,
     device: str = "cpu",  # or "cuda"
-) -> tuple[ClipVision, ClipText, Tokenizer, Curve]:
+) -> tuple[Clip, Curve]:
     """Train the small CLIP, or resume a training with the same name."""
     torch.manual_seed(seed)
     where = torch.device(device)
@@ -131,11 +129,11 @@ def train_clip(
         return loss, {"contrastive": loss.item()}
 
     def measure() -> dict[str, float]:
-        found = measure_clip(vision, text, tokenizer, validation, quick)
-        return {f"{kind}_{level}": value["top1"] for (kind, level), value in found.items()}
+        accuracies = measure_clip(Clip(vision, text, tokenizer), validation, quick)
+        return {f"{kind}_{level}": value["top1"] for (kind, level), value in accuracies.items()}
 
     curve = training.run(make, loss_of, measure, budget)
-    return vision.cpu().eval(), text.cpu().eval(), tokenizer, curve
+    return Clip(vision.cpu().eval(), text.cpu().eval(), tokenizer), curve
 
 
 class Scale(nn.Module):

@@ -63,8 +63,8 @@ def train_sam(
         return training_loss(encoder, decoder, teacher, batch.to(where), generator, half)
 
     def measure() -> dict[str, float]:
-        found = measure_sam(encoder, decoder, quick)
-        return {level.label: found[level.label]["iou"] for level in LEVELS}
+        quality = measure_sam(encoder, decoder, quick)
+        return {level.label: quality[level.label]["iou"] for level in LEVELS}
 
     curve = training.run(make, loss_of, measure, budget)
     return encoder.cpu().eval(), decoder.cpu().eval(), curve

@@ -22,7 +22,7 @@ from pathlib import Path
 import yaml
 
 from hilsplat.evaluate.tables.build import TABLES
-from hilsplat.settings import WorldSettings
+from hilsplat_world.settings import WorldSettings
 from hilsplat_world.stage import run_world
 from tests.conftest import PROJECT
 from tests.unit.datasets.writers.labelled import (
@@ -83,7 +83,7 @@ LARGEST_FACTOR = 1.5
 def write_data(work: Path, root: Path) -> None:
     """Write one scene of each data set below the data root, from synthetic scenes in `work`."""
     for kind in ("tabletop", "room", "street"):
-        run_world(f"world:{kind}:{SEED}", WORLD, work / kind, threads=2)
+        run_world(f"world:{kind}:{SEED}", WORLD, work / kind / "images", work / kind / "truth", threads=2)
     table = TrueWorld.open(work / "tabletop")
     write_lerf_ovs(table, root / "lerf_ovs", "figurines", LABELLED)
     write_hi(table, root / "hi_lerf", root / "lerf_ovs", "figurines", LABELLED, LERF_STEMS)

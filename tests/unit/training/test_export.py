@@ -7,7 +7,7 @@ import torch
 from tokenizers import Tokenizer
 
 from hilsplat.models.layouts import DECODER, PREVIEW
-from models.training.clip import CANONICAL, CROP_PX, ClipText, ClipVision, word_tokenizer
+from models.training.clip import CANONICAL, CROP_PX, Clip, ClipText, ClipVision, word_tokenizer
 from models.training.export import export_clip, export_sam
 from models.training.sam import (
     EMBEDDING,
@@ -53,7 +53,7 @@ def sam(tmp_path_factory):
     return encoder, decoder, folder
 
 
-@pytest.mark.parametrize(("batch", "prompts", "points"), [(1, 1, 1), (1, 5, 1), (2, 3, 2)])
+@pytest.mark.parametrize(("batch", "prompts", "points"), [(1, 1, 1), (2, 3, 2)])
 def test_exported_sam_equals_torch(sam, batch, prompts, points):
     encoder, decoder, folder = sam
     generator = torch.Generator().manual_seed(batch)
@@ -107,7 +107,7 @@ def test_exported_clip_equals_torch(tmp_path):
     tokenizer = word_tokenizer(["bear", "head of the bear", *CANONICAL])
     vision = round_to_half(ClipVision())
     text = round_to_half(ClipText(tokenizer.get_vocab_size()))
-    export_clip(vision, text, tokenizer, tmp_path)
+    export_clip(Clip(vision, text, tokenizer), tmp_path)
     for batch in (1, 3):
         pixels = torch.randn(batch, 3, CROP_PX, CROP_PX)
         (found,) = run_network(tmp_path / "onnx/vision_model.onnx", pixel_values=pixels.numpy())

@@ -7,12 +7,13 @@ from hilsplat.base.artifacts import read_json
 from hilsplat.base.errors import SceneError, SettingsError
 from hilsplat.datasets.hierarchy import AnnotatedNode
 from hilsplat_world.render import label_view
-from hilsplat_world.scenes.kinds import KINDS, build_scene
+from hilsplat_world.scenes.kinds import KINDS
 from models.training.cameras import training_camera
 from models.training.card import RECORD, digests
 from models.training.render import phrases_of, scene_of_seed, training_seeds
 from models.training.settings import TrainingSettings
 from models.training.train import train_models
+from tests.unit.world.scenes import built
 
 
 def test_no_scene_is_both_trained_and_measured_on():
@@ -25,14 +26,14 @@ def test_no_scene_is_both_trained_and_measured_on():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_training_cameras_show_several_objects_and_half_are_close_ups(kind):
-    scene, rng = build_scene(kind, 100, 7), np.random.default_rng(0)
+    scene, rng = built(kind), np.random.default_rng(0)
     close = 0
-    for _ in range(40):
+    for _ in range(24):
         whole, part, _ = label_view(scene, training_camera(scene, rng, 32))
         # From inside a wall or an object, everything belongs to it.
         assert len(np.unique(whole)) > 1 and len(np.unique(part)) > 2
         close += np.isin(whole[10:22, 10:22], list(scene.background), invert=True).mean() > 0.3
-    assert close >= 15
+    assert close >= 9
 
 
 def test_a_part_may_be_named_without_its_object():

@@ -94,14 +94,12 @@ def test_clip_learns_and_is_measured(tmp_path):
     views, unseen = drawn_views(6, 64), drawn_views(2, 64, seed=9)
     masks = [drawn_masks((1, of[0] == 0), (1, of[0] == 3), (2, of[1] == 1)) for of in unseen.labels]
     crops, others = list_crops(views), list_crops(unseen, masks)
-    vision, text, tokenizer, curve = train_clip(
-        crops, others, Budget(steps=40), 0, tmp_path, batch=24, tuning=FAST
-    )
+    clip, curve = train_clip(crops, others, Budget(steps=40), 0, tmp_path, batch=24, tuning=FAST)
     assert curve[-1]["contrastive_loss"] < curve[0]["contrastive_loss"]
     assert curve[-1]["exact_whole"] > 0.5
-    found = measure_clip(vision, text, tokenizer, others)
+    found = measure_clip(clip, others)
     assert found[("rough", "whole")]["n"] == 4
-    queries = measure_queries(vision, text, tokenizer, unseen, masks)
+    queries = measure_queries(clip, unseen, masks)
     # the masks are ground truth, so a correct answer has IoU 1, and every text names one region
     assert queries["whole"]["best"] == 1.0
     assert queries["whole"]["iou"] > 0.5

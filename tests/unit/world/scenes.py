@@ -1,13 +1,21 @@
-"""Scenes built by hand from a mesh."""
+"""Scenes built by hand from a mesh, and scenes of the world that several tests read."""
+
+from functools import cache
 
 import numpy as np
 
 from hilsplat.datasets.hierarchy import AnnotatedNode
 from hilsplat_world.paints import Paint
+from hilsplat_world.scenes.kinds import build_scene
 from hilsplat_world.scenes.scene import Style, WorldScene
 from hilsplat_world.shapes import Mesh
 
 GREY = Paint("grey", "mottled", (0.5, 0.5, 0.5), (0.5, 0.5, 0.5), 9.0, 0.0, 10.0, 0.0, (5.0, 6.0, 7.0))
+
+
+@cache
+def built(kind: str, seed: int = 100, objects: int = 7) -> WorldScene:
+    return build_scene(kind, seed, objects)
 
 
 def scene_of(mesh: Mesh, paint: Paint = GREY, node_ids=None, style: Style | None = None) -> WorldScene:

@@ -11,10 +11,10 @@ from hilsplat.datasets.hierarchy import AnnotatedNode, write_hierarchy
 from hilsplat.scene.cameras import Camera
 from hilsplat_world.diagnostics.world_consistency import (
     Agreement,
+    Regions,
     best_ious,
     mean_agreement,
     neighbours,
-    painted,
     pair_disagreement,
     run_consistency,
     shared_points,
@@ -80,18 +80,23 @@ def columns(left, right):
     return box((0, HEIGHT), (left, right), (HEIGHT, WIDTH))
 
 
+def regions(*masks):
+    of_level = masks_of([columns(0, WIDTH), *masks], [1, *[2] * len(masks)])
+    return Regions(of_level.dense(of_level.rows_of(Level.PART)), of_level.label_map(Level.PART))
+
+
 def test_two_views_by_hand():
     pixels = shared_points(A, WALL, B, WALL)  # columns 2 to 9 of A are columns 0 to 7 of B, 5 rows
-    masks_a = np.stack([columns(2, 6), columns(6, 10)])  # 20 points each
-    none = np.zeros((0, HEIGHT, WIDTH), bool)
-    same = view_agreement(masks_a, np.stack([columns(0, 4), columns(4, 10)]), *pixels)
+    masks_a = regions(columns(2, 6), columns(6, 10))  # 20 points each
+    none = regions()
+    same = view_agreement(masks_a, regions(columns(0, 4), columns(4, 10)), *pixels)
     assert same == Agreement(2, 1.0, 0.0, 0.0)
     # B's border lies one column further right: 25 and 15 points. IoU 20/25 and 15/20
-    moved = view_agreement(masks_a, np.stack([columns(0, 5), columns(5, 10)]), *pixels)
+    moved = view_agreement(masks_a, regions(columns(0, 5), columns(5, 10)), *pixels)
     # together in A: 2 * 190 = 380; in B: 300 + 105 = 405; in both: 190 + 10 + 105 = 305; of 780 pairs
     expected = [2, (0.8 + 0.75) / 2, (380 + 405 - 2 * 305) / 780, 175 / 480]
     assert list(vars(moved).values()) == pytest.approx(expected)
-    merged = view_agreement(masks_a, columns(0, 10)[None], *pixels)
+    merged = view_agreement(masks_a, regions(columns(0, 10)), *pixels)
     assert list(vars(merged).values())[:3] == pytest.approx([2, 0.5, (780 - 380) / 780])
     absent = view_agreement(masks_a, none, *pixels)
     assert (absent.best_iou, absent.masks, absent.joined_disagreement) == (0, 2, 1)
@@ -114,11 +119,9 @@ def test_pairs_agree_with_counting_them_one_by_one():
     assert np.isnan(pair_disagreement(np.array([-1, -1]), np.array([-1, -1]))[1])
 
 
-def test_very_small_masks_are_not_compared_and_smaller_ones_are_painted_last():
+def test_very_small_masks_are_not_compared():
     inside = np.array([[1, 1, 1, 1], [0, 0, 1, 1], [0, 0, 0, 1]], bool)
     assert len(best_ious(inside, inside, min_points=2)) == 2
-    assert painted(inside, np.array([4, 2, 1])).tolist() == [0, 0, 1, 2]
-    assert painted(inside[:2], np.array([3, 3])).tolist() == [0, 0, 0, 0]
 
 
 def test_neighbours_are_the_nearest_cameras():

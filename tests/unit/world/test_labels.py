@@ -12,10 +12,11 @@ from hilsplat.datasets.sources import export_images
 from hilsplat.datasets.waymo import reader as waymo
 from hilsplat.scene.poses import run_poses
 from hilsplat.scene.scene import Scene
-from hilsplat.settings import GaussiansSettings, PosesSettings, WorldSettings
-from hilsplat.splat.fit import fit_gaussians
+from hilsplat.settings import GaussiansSettings, PosesSettings
+from hilsplat.splat.initial import first_gaussians
 from hilsplat_world.labels import labelled_points
-from hilsplat_world.stage import run_world
+from hilsplat_world.settings import WorldSettings
+from hilsplat_world.stage import MESH_EDGE, run_world
 from tests.unit.datasets.writers.points import (
     LabelledMesh,
     posed_images,
@@ -40,7 +41,9 @@ def street(tmp_path_factory):
 
 def make_world(kind, tmp_path_factory):
     folder = tmp_path_factory.mktemp(kind)
-    run_world(f"world:{kind}:100", SETTINGS, folder, threads=1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(MESH_EDGE, "room", 0.5)  # a coarse mesh has a thirtieth of the vertices
+        run_world(f"world:{kind}:100", SETTINGS, folder / "images", folder / "truth", threads=1)
     return folder
 
 
@@ -75,17 +78,18 @@ def test_a_room_reads_back_equal_and_is_labelled_where_a_camera_sees_it(room, da
     assert known["nyu40"].xyz is known["replica"].xyz  # one search for neighbours serves all labellings
 
 
-def test_gaussians_frozen_at_the_vertices_of_a_scan_are_its_points(data_root, tmp_path):
+def test_frozen_gaussians_start_at_the_vertices_of_a_scan(data_root, tmp_path):
     source = tmp_path / "source"
     export_images("scannet/scene0000_00", data_root, source)
     settings = PosesSettings(test_every=0)
     run_poses(source, tmp_path / "scene", "scannet/scene0000_00", "metre", False, settings, 0, 1)
     scene = Scene.load(tmp_path / "scene")
-    settings = GaussiansSettings(initial="frozen", iterations=2, max_gaussians=100)
-    gaussians, _ = fit_gaussians(scene, settings, seed=0)
+    cameras = [scene.cameras[view] for view in scene.views("train")]
+    settings = GaussiansSettings(initial="frozen", max_gaussians=100)
+    gaussians = first_gaussians(scene, cameras, settings, np.random.default_rng(0))
     truth = open_labels("scannet/scene0000_00", data_root).truth["nyu40"]
     places = truth.xyz @ scene.scene_from_source[:3, :3].T + scene.scene_from_source[:3, 3]
-    np.testing.assert_allclose(gaussians.means, places, atol=1e-5)
+    np.testing.assert_allclose(gaussians["means"], places, atol=1e-5)
 
 
 def test_a_street_reads_back_equal_and_a_table_has_no_labelled_points(street, tmp_path):

@@ -3,11 +3,10 @@
 from functools import partial
 
 import numpy as np
-import pytest
 
 from hilsplat.base.artifacts import write_index
 from hilsplat.base.images import read_image
-from hilsplat.segment.masks import HierarchicalMasks, region_ious
+from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat_world.diagnostics.mask_truth import fit_of_view, median_and_worst, run_mask_truth
 from tests.unit.evaluate.builders import box, masks_of
 
@@ -19,16 +18,6 @@ def found_masks() -> HierarchicalMasks:
     """The bear whole, the lower half of the chest and none of it elsewhere; three quarters of the head."""
     wholes = [part((8, 56), (8, 40)), part((44, 56), (44, 60)), part((0, 4), (0, 4))]
     return masks_of([*wholes, part((8, 24), (12, 30))], [1, 1, 1, 2])
-
-
-def test_ious_by_hand():
-    labels = np.array([[0, 0, 4, 4], [0, 0, 4, -1]])
-    masks = np.array([[[1, 1, 0, 0], [1, 1, 0, 0]], [[0, 1, 1, 1], [0, 1, 0, 1]]], dtype=bool)
-    ids, areas, ious = region_ious(labels, masks)
-    assert (ids.tolist(), areas.tolist()) == ([0, 4], [4, 3])
-    assert ious == pytest.approx(np.array([[1, 2 / 7], [0, 2 / 6]]), abs=1e-6)
-    assert region_ious(labels, masks[:0])[2].shape == (2, 0)
-    assert region_ious(np.full((2, 4), -1), masks)[2].shape == (0, 2)
 
 
 def test_table_and_picture(block_world, tmp_path):

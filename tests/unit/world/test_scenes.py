@@ -1,7 +1,6 @@
 """A seed determines its scene; objects do not intersect, are supported, and leave the cameras' path free."""
 
 import itertools
-from functools import cache
 
 import numpy as np
 import pytest
@@ -13,16 +12,12 @@ from hilsplat_world.scenes.room import room_of
 from hilsplat_world.scenes.scene import footprint_of
 from hilsplat_world.scenes.street import part_boxes
 from hilsplat_world.seeds import SPLITS, split_of_seed
-
-
-@cache
-def built(kind, seed=100, objects=4):
-    return build_scene(kind, seed, objects)
+from tests.unit.world.scenes import built
 
 
 @pytest.fixture(scope="module")
 def rooms():
-    return [built("room", seed, (9, 12, 15)[seed % 3]) for seed in range(100, 108)]
+    return [built("room", seed, (9, 12, 15)[seed % 3]) for seed in range(104, 108)]
 
 
 def box_of(scene, thing):
@@ -47,7 +42,7 @@ def test_splits_of_seeds_are_disjoint():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_same_seed_gives_the_same_scene_and_another_seed_another(kind):
-    first, again, other = built(kind), build_scene(kind, 100, 4), built(kind, 102)
+    first, again, other = built(kind), build_scene(kind, 100, 7), built(kind, 102)
     for name in ("triangles", "normals", "coords", "node_ids", "material_ids", "materials"):
         assert np.array_equal(getattr(first, name), getattr(again, name))
     assert first.nodes == again.nodes and first.placed == again.placed and first.style == again.style
@@ -85,7 +80,7 @@ def test_surroundings_are_wholes_in_the_background(kind, always, sometimes):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_objects_do_not_intersect(kind, rooms):
-    for scene in rooms if kind == "room" else [built(kind, seed, 7) for seed in (100, 101)]:
+    for scene in rooms if kind == "room" else [built(kind, seed) for seed in (100, 102)]:
         shapes = []
         for node in set(scene.node_ids[:, 0].tolist()) - scene.background:
             own = scene.node_ids[:, 0] == node
@@ -100,7 +95,7 @@ def test_objects_do_not_intersect(kind, rooms):
 
 
 def test_objects_stand_on_the_table_inside_their_footprints():
-    scene = built("tabletop", 100, 7)
+    scene = built("tabletop")
     for thing in scene.placed:
         points = scene.triangles[scene.node_ids[:, 0] == thing.node].reshape(-1, 3)
         away = np.linalg.norm(points[:, :2] - np.array(thing.centre_xy), axis=1)
@@ -116,11 +111,8 @@ def test_objects_that_do_not_fit_are_omitted_and_logged(monkeypatch, caplog):
     assert caplog.text.count("no space left") == 2
 
 
-def test_eight_rooms_contain_all_furniture(rooms):
+def test_rooms_contain_the_requested_objects_their_fixtures_and_together_all_furniture(rooms):
     assert {thing.name for scene in rooms for thing in scene.placed} >= CLASSES["room"].keys() - {"mirror"}
-
-
-def test_a_room_contains_the_requested_objects_and_its_fixtures(rooms):
     for scene in rooms:
         assert len(scene.placed) == scene.asked or scene.asked == 20  # 15 objects do not always fit
         assert len(scene.placed) >= scene.asked - 3

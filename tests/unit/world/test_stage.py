@@ -13,11 +13,11 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.lineage import sha256_of_path
 from hilsplat.datasets.hierarchy import AnnotatedNode, HierarchyAnnotations
 from hilsplat.scene.cameras import Cameras
-from hilsplat.settings import WorldSettings
 from hilsplat_world.objects.catalogue import GENERATOR_VERSION, TABLETOP
 from hilsplat_world.pictures import show_world, tree_lines
 from hilsplat_world.render import label_view
 from hilsplat_world.scenes.kinds import build_scene
+from hilsplat_world.settings import WorldSettings
 from hilsplat_world.stage import parse_source, run_world
 from hilsplat_world.truth import annotated_nodes
 from tests.conftest import PROJECT
@@ -28,7 +28,7 @@ SETTINGS = WorldSettings(views=3, image_px=64, arc_deg=30, objects=3, samples=1)
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene") / "world"
-    run_world("world:tabletop:100", SETTINGS, folder, threads=1)
+    run_world("world:tabletop:100", SETTINGS, folder / "images", folder / "truth", threads=1)
     return folder
 
 
@@ -54,7 +54,9 @@ def test_the_written_truth_is_that_of_the_scene(world):
 
 
 def test_reruns_with_any_number_of_threads_give_the_same_bytes(world, tmp_path):
-    run_world("world:tabletop:100", SETTINGS, tmp_path / "again", threads=2)
+    run_world(
+        "world:tabletop:100", SETTINGS, tmp_path / "again" / "images", tmp_path / "again" / "truth", threads=2
+    )
     for folder in ("images", "truth"):
         assert sha256_of_path(world / folder) == sha256_of_path(tmp_path / "again" / folder)
 
@@ -99,6 +101,7 @@ def test_the_manual_lists_all_tabletop_classes():
 
 def test_pictures_of_the_manual_are_drawn(tmp_path):
     script = run_path(str(PROJECT / "docs/draw_world.py"))
+    script["draw_scenes"].__globals__["SCENE_PX"] = 64
     script["draw_classes"](tmp_path / "classes.png", ("burger",))
     # The ground and the page are grey.
     colourful = np.ptp(read_image(tmp_path / "classes.png").astype(int), axis=2) > 60

@@ -8,16 +8,17 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat_world import lidar
 from hilsplat_world.lidar import ABOVE_CAMERA_M, BEAMS, INCLINATION_DEG, MAX_RANGE_M, scan_street
 from hilsplat_world.render import label_view, render_view
-from hilsplat_world.scenes.kinds import build_scene, scene_cameras
+from hilsplat_world.scenes.kinds import scene_cameras
 from hilsplat_world.scenes.scene import WorldScene
 from hilsplat_world.scenes.street import FRONT, KERB, LANE, LANE_Y, MAX_STEP, SWEEP_DEG, WALK_Z
 from hilsplat_world.truth import true_depth
 from hilsplat_world.views import square_camera
+from tests.unit.world.scenes import built
 
 
 @pytest.fixture(scope="module")
 def street() -> WorldScene:
-    return build_scene("street", 100, 7)
+    return built("street")
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from hilsplat.base.lineage import sha256_of_path
 from hilsplat.cli import stage_commands
 from hilsplat.datasets.hierarchy import AnnotatedNode, write_hierarchy
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.settings import PerturbSettings
+from hilsplat_world.settings import PerturbSettings
 from hilsplat_world.truth_masks import (
     FAULTS,
     Draws,
