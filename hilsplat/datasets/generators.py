@@ -7,7 +7,7 @@ stages read, and `<generator>/truth`, which only evaluation and figures read.
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.plugins import Plugins, entry_points
@@ -18,6 +18,7 @@ from hilsplat.scene.sheet import Generated, generated_of
 GENERATORS: Plugins["Generator"] = entry_points("hilsplat.generators")
 
 
+@runtime_checkable  # for the type checker of the tests
 class Truth(Protocol):
     """Ground truth of a generated scene; the folder has annotations in the format of `datasets.hierarchy`."""
 

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from hilsplat.workflow.stages import stage_code
 
 from hilsplat import baselines
 from hilsplat.base.errors import ArtifactError, SettingsError
@@ -27,6 +26,7 @@ from hilsplat.field.code import LanguageField, LinearCode
 from hilsplat.methods import laga, method
 from hilsplat.methods.method import MethodInputs
 from hilsplat.scene.cameras import Camera
+from hilsplat.stages import stage_of
 from tests.conftest import PROJECT
 from tests.unit.two_boxes_world import (
     HEIGHT,
@@ -195,7 +195,8 @@ def test_the_package_in_the_documentation_adds_a_method_with_two_settings(inputs
     assert "method.min_mass_px" in knob_table() and "min_mass_px" in json.dumps(config_schema())
     with pytest.raises(SettingsError, match=r"method\.min_mas_px: unknown key; did you mean 'min_mass_px'"):
         parse_section("method", '{"name": "nearest_mask", "min_mas_px": 1}')
-    assert stage_code("method", (method_of("nearest_mask").fit,)) != stage_code("method")
+    method = stage_of("method")
+    assert method.code_digest((method_of("nearest_mask").fit,)) != method.code_digest()
 
     inputs, out = inputs_of(), nearest_mask / "field.safetensors"
     (inputs.autoencoder_folder / "autoencoder.safetensors").touch()

@@ -1,5 +1,7 @@
 """Rows of labelled points: classes and instances, pooled and per scene, and of the block world."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -13,9 +15,10 @@ from hilsplat.datasets.classes import (
     ClassSet,
     splits_of,
 )
+from hilsplat.datasets.generators import GENERATORS
 from hilsplat.datasets.points.labelled_points import LabelledPoints
 from hilsplat.datasets.registry import DATASETS
-from hilsplat.evaluate.extra_protocols import WORLD_PROTOCOLS, ExtraProtocols
+from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.metrics.instances import average_precision, match_instances
 from hilsplat.evaluate.protocols.cards import card_of
 from hilsplat.evaluate.protocols.carry import gaussians_of_points
@@ -184,13 +187,12 @@ def test_cameras_on_a_line_still_fix_the_similarity(moved, error):
 
 
 def test_stand_ins_and_data_sets_name_protocols_that_exist():
-    for kind in WORLD_PROTOCOLS:
-        asked = ExtraProtocols.of_world(kind)
-        assert len(asked.flat) + len(asked.points) == len(WORLD_PROTOCOLS[kind])
-    assert not ExtraProtocols.of_world("").flat and not ExtraProtocols.of_world("").points
+    for name, kind in GENERATORS["world"].kinds.items():
+        _, asked = ExtraProtocols.generated(f"world:{name}:1", Path())
+        assert len(asked.flat) + len(asked.points) == len(kind.protocols)
     for dataset in DATASETS.values():
         asked = ExtraProtocols.of(dataset.protocols)
         assert len(asked.flat) + len(asked.points) == len(dataset.protocols)
         assert bool(asked.points) == (dataset.labels == "points" and bool(dataset.protocols))
-    with pytest.raises(SceneError, match="one of tabletop, room, street"):
-        ExtraProtocols.of_world("table")
+    with pytest.raises(SceneError, match="one of world:tabletop:<seed>, world:room:<seed>"):
+        ExtraProtocols.generated("world:table:1", Path())
