@@ -239,7 +239,9 @@ def test_a_long_last_job_is_not_divided_among_the_cores(screen, run):
     assert run.seconds_left() == 600
 
 
-@pytest.mark.parametrize("stage", [stage for stage in all_stages().values() if stage.loop], ids=str)
+@pytest.mark.parametrize(
+    "stage", [stage for stage in all_stages().values() if stage.loop], ids=lambda stage: stage.name
+)
 def test_the_loop_of_a_stage_is_one_that_it_runs(stage):
     texts = [(ROOT / f"{module.replace('.', '/')}.py").read_text() for module in stage.modules()]
     assert any("track(" in text and f'"{stage.loop}"' in text for text in texts)
