@@ -21,10 +21,8 @@ from hilsplat.base.removal import DIGEST, ENTRY, delete, is_tagged, tag
 
 logger = logging.getLogger(__name__)
 
-VIEW_CACHES = ("masks", "clip", "contributions")
-"""Caches of finished views: a missing entry costs time but does not change a result."""
-
-CHECKPOINTS = "gaussians"  # cache of fit checkpoints
+CHECKPOINTS = "gaussians"
+"""Cache of fit checkpoints; in the others, of finished views, a missing entry costs only time."""
 
 FIT_DAYS = 1.0
 """Checkpoints younger than this are kept, because fits save more often and may still be running."""
@@ -54,21 +52,23 @@ def prune_cache(
     Only files named like an entry (`ENTRY`), in a cache with our tag, are deleted.
 
     Args:
-        stages: caches to prune; if empty, the view caches, and also the checkpoints if `days` is set.
+        stages: caches to prune; if empty, all of finished views, and also the checkpoints if `days` is set.
         days: delete entries not used for this many days.
         max_mib: then delete the least recently used until the rest is at most this size.
     """
-    prunable = (*VIEW_CACHES, CHECKPOINTS)
+    prunable = [name for name in caches(folder) if is_tagged(folder / name)]
     if unknown := sorted(set(stages) - set(prunable)):
-        raise HilsplatError(f"unknown cache: {', '.join(unknown)}", expected=f"one of {', '.join(prunable)}")
+        raise HilsplatError(
+            f"unknown cache: {', '.join(unknown)}", expected=f"one of {', '.join(prunable) or 'none'}"
+        )
     # The cache is in the results folder, where killed jobs leave unfinished files beside their outputs.
     remove_leftovers(folder.parent if Path(folder).name == ".cache" else folder)
-    chosen = set(stages or (VIEW_CACHES if days is None else prunable))
+    chosen = set(stages or prunable) - ({CHECKPOINTS} if days is None and not stages else set())
     now, freed, deleted = time.time(), 0, 0
     used = {
         path: path.stat()
         for name, files in caches(folder).items()
-        if name in chosen and is_tagged(folder / name)
+        if name in chosen
         for path in files
         if ENTRY.fullmatch(path.relative_to(folder / name).as_posix())
     }

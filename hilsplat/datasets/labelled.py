@@ -285,7 +285,7 @@ def posed_images(folder: Path, dataset: str) -> dict[str, "KnownView"]:
             would misalign labels drawn on undistorted images.
     """
     from hilsplat.scene.colmap import is_pinhole
-    from hilsplat.scene.importers.known_views import read_source
+    from hilsplat.scene.importers.reading import read_source
 
     known = find_known_poses(folder)
     if known is None:

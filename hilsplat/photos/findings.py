@@ -74,7 +74,7 @@ def _poses(folder: Path, named: Path | None, parts: Parts) -> list[str]:
     if known is None:
         parts.lines.append("poses: structure from motion")
         return view_names(list_images(photo_folder(folder)))
-    from hilsplat.scene.importers.known_views import read_source  # pycolmap is slow to import
+    from hilsplat.scene.importers.reading import read_source  # pycolmap is slow to import
 
     source = read_source(known)
     source.require_most(PosesSettings().min_registered_share, known.files[0])

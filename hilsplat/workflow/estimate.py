@@ -12,6 +12,7 @@ from typing import NamedTuple
 from hilsplat.models.store import read_model
 from hilsplat.scene.finished import KEY_VIEWS
 from hilsplat.scene.sheet import PHOTOS, SceneRow
+from hilsplat.stages import stage_of
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.progress import duration
 from hilsplat.workflow.resources import GUIDED, NODES, PICTURE_S, START_S, JobResources, cost_name
@@ -136,7 +137,8 @@ def _forecast(plan: Plan, resources: JobResources, row: SceneRow, cores: int) ->
     base_s = view_s["image"] + PICTURE_S
     full_s, guided_s = base_s + prompts * prompt_s, base_s + GUIDED * prompts * prompt_s
     before_s = sum(resources.core_seconds(rule, row) for rule in ("poses", "gaussians"))
-    after_s = sum(resources.core_seconds(rule, row) for rule in ("contributions", "semantic_tree"))
+    linking = plan.identity("semantic_tree", "default", *plan.situation(row)).stages
+    after_s = sum(resources.core_seconds(name, row) for name in linking if stage_of(name).artifact != "masks")
     first_answer, rest_s = "", views * full_s
     if plan.first_answer(of_variant(row, "default")):
         settings = plan.stages(of_variant(row, KEY_VIEWS))

@@ -172,7 +172,7 @@ class Plan:
 
     def seeded(self, variant: str, row: SceneRow) -> list[str]:
         """Return a variant and, if it is random, its repetitions with other seeds."""
-        is_random = self.identity(SCORED, variant, *self._situation(row)).seed is not None
+        is_random = self.identity(SCORED, variant, *self.situation(row)).seed is not None
         return self.run.all_seeds(variant) if is_random else [variant]
 
     def seed(self, stage: Stage[..., Any], job: Job) -> int:
@@ -335,7 +335,7 @@ class Plan:
 
     def shared_variant(self, artifact: str, job: VariantJob) -> str:
         """Return the first variant whose artifact equals that of the job's variant."""
-        return self._first_alike(artifact, job.variant, *self._situation(self.row(job)))
+        return self._first_alike(artifact, job.variant, *self.situation(self.row(job)))
 
     def _first_with_equal_identity(self, artifact: str, variant: str, *situation: Any) -> str:
         identity = self.identity(artifact, variant, *situation)
@@ -344,7 +344,7 @@ class Plan:
             (name for name in names if self.identity(artifact, name, *situation) == identity), variant
         )
 
-    def _situation(self, row: SceneRow) -> tuple[tuple[str, ...], bool]:
+    def situation(self, row: SceneRow) -> tuple[tuple[str, ...], bool]:
         """Return what decides about a scene's artifacts besides the variant."""
         return self.scopes(row), row.features is not None
 
@@ -383,7 +383,7 @@ class Plan:
         kinds, scenes = kinds_of(stage_of(name).artifact), dict[tuple[str, ...], list[str]]()
         variants_of = functools.cache(functools.partial(self._variants_of, name, kinds))
         for row in self.rows:
-            variants = variants_of(*self._situation(row), self.first_answer(of_variant(row, "default")))
+            variants = variants_of(*self.situation(row), self.first_answer(of_variant(row, "default")))
             scenes.setdefault(variants, []).append(row.name)
         patterns = [
             f"({any_of(names) if len(scenes) > 1 else '[^/]+/[^/]+'})/({any_of(variants)})/"
@@ -441,7 +441,7 @@ class Plan:
         """Return the input of `field`: LangSplat's initial field; SettingsError if no variant computes it."""
         if self.stages(job).field.start != "langsplat":
             return []
-        situation, seed = self._situation(self.row(job)), self.run.seed_of(job.variant)
+        situation, seed = self.situation(self.row(job)), self.run.seed_of(job.variant)
         code = self.identity("autoencoder", job.variant, *situation)
         for name in self.run.every_variant():
             method = self.stages_of(name, situation[0]).method.name

@@ -6,7 +6,7 @@ import pytest
 
 from hilsplat.base.errors import HilsplatError
 from hilsplat.scene.importers.colmap_model import read_model
-from hilsplat.scene.importers.known_views import read_source
+from hilsplat.scene.importers.reading import read_source
 from hilsplat.scene.layouts import find_known_poses
 from tests.imports import analytic_world as world
 

@@ -12,7 +12,7 @@ from PIL import Image
 from hilsplat.base.errors import HilsplatError
 from hilsplat.photos.add import add_scene
 from hilsplat.scene.importers import phones
-from hilsplat.scene.importers.known_views import read_source
+from hilsplat.scene.importers.reading import read_source
 from hilsplat.scene.layouts import find_known_poses
 from tests.imports import analytic_world as world
 

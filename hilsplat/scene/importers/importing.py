@@ -23,7 +23,8 @@ from hilsplat.base.progress import track
 from hilsplat.scene.assemble import Posed, PosedView, photo_of, split_views, undistort
 from hilsplat.scene.colmap import Points, pycolmap, sparse_points
 from hilsplat.scene.features import find_matches, incremental_options
-from hilsplat.scene.importers.known_views import ASPECT_TOLERANCE, KnownView, Source, read_source
+from hilsplat.scene.importers.known_views import ASPECT_TOLERANCE, KnownView, Source
+from hilsplat.scene.importers.reading import read_source
 from hilsplat.scene.layouts import KnownPoses
 from hilsplat.scene.view_names import view_names
 from hilsplat.settings import PosesSettings
