@@ -295,7 +295,7 @@ def require_known(where: str, keys: Iterable[str], known: Collection[str]) -> No
             )
 
 
-class _UniqueKeys(yaml.SafeLoader):
+class _UniqueKeys(yaml.SafeLoader):  # type: ignore[misc]
     """YAML loader that refuses duplicate keys, because all but the last would be ignored."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:

@@ -56,7 +56,8 @@ stage = PIPELINE.stage
 
 def _source_files(arguments: Mapping[str, Any]) -> Reads:
     from hilsplat.datasets.registry import readers_of
-    from hilsplat.datasets.sources import DATA_PREFIX, image_files
+    from hilsplat.datasets.sources import image_files
+    from hilsplat.scene.sheet import DATA_PREFIX
 
     files = image_files(f"{DATA_PREFIX}{arguments['name']}", str(arguments["data_root"]))
     return Reads({"files": files}, readers_of([arguments["name"]]))

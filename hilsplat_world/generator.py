@@ -26,7 +26,9 @@ class WorldTruth:
     def cameras(self) -> Cameras:
         return Cameras.load(self.folder / "cameras.npz")
 
-    def consistency(self, selections: Any, truths: Any, masks: Any, settings: Any) -> Iterator[tuple]:
+    def consistency(
+        self, selections: Any, truths: Any, masks: Any, settings: Any
+    ) -> Iterator[tuple[str, Any]]:
         from hilsplat_world.diagnostics.world_consistency import measure_world_consistency
 
         return measure_world_consistency(selections, truths, masks, self.folder, settings)

@@ -90,8 +90,8 @@ def cache_prune(
     stage: Annotated[
         list[str] | None,
         typer.Option(
-            help="cache to prune, as listed by `hilsplat cache`; gaussians: fit checkpoints, kept for at least "
-            "a day; default: all caches, including gaussians only if --days is given"
+            help="cache to prune, as listed by `hilsplat cache`; gaussians: fit checkpoints, kept for at "
+            "least a day; default: all caches, including gaussians only if --days is given"
         ),
     ] = None,
 ) -> None:

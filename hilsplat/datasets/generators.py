@@ -31,7 +31,9 @@ class Truth(Protocol):
     def cameras(self) -> Cameras:
         """Return the true cameras."""
 
-    def consistency(self, selections: Any, truths: Any, masks: Any, settings: Any) -> Iterator[tuple]:
+    def consistency(
+        self, selections: Any, truths: Any, masks: Any, settings: Any
+    ) -> Iterator[tuple[str, Any]]:
         """Yield pairs of a view's name and a row of scores: how well answers agree between views."""
 
 

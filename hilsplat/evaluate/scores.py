@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hilsplat.base.artifacts import read_npz, rebuild_command, write_npz
 from hilsplat.base.errors import ArtifactError
@@ -84,7 +84,7 @@ def write_instances(scores: Path, matches: Mapping[tuple[str, ...], InstanceMatc
 
 def read_instances(scores: Iterable[Path]) -> dict[tuple[str, ...], InstanceMatches]:
     """Read the matches beside score files, keyed by (data set, scene, variant, masks, method)."""
-    found: dict[tuple[str, ...], dict] = {}
+    found: dict[tuple[str, ...], dict[str, Any]] = {}
     for path in scores:
         beside = Path(path).with_name(INSTANCES)
         for name, array in read_npz(beside).items() if beside.is_file() else ():

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -58,7 +58,7 @@ class LinearCode:
         """Decode latents to vectors of unit length."""
         return unit_rows(self.mean + latents @ self.basis)
 
-    def cosine_terms(self, vectors: Float32[np.ndarray, "V C"]) -> tuple:
+    def cosine_terms(self, vectors: Float32[np.ndarray, "V C"]) -> tuple[Any, ...]:
         """Return m.v and U v of each vector, |m|^2, and U m, so that e.v = (m.v + z.Uv) / |m + U z|."""
         return (
             (vectors @ self.mean).astype(np.float32),

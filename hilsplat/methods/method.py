@@ -29,6 +29,7 @@ from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import digests_in, load_masks
 from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 
@@ -97,7 +98,7 @@ class MethodInputs:
         return code
 
     @cached_property
-    def _loaded(self) -> tuple:
+    def _loaded(self) -> tuple[Gaussians, Scene]:
         scene = Scene.load(self.scene_folder)
         recorded, digest = self.contributions.gaussians_sha256, sha256_of_file(self.gaussians_ply)
         require_made_from(self.contributions.folder, self.gaussians_ply, recorded, digest)

@@ -42,9 +42,9 @@ class ViewStore:
 
     def __init__(self, max_mib: float = VIEW_CACHE_MIB) -> None:
         self._max_bytes = max_mib * 2**20
-        self._values: dict[tuple, tuple[Any, int]] = {}
+        self._values: dict[tuple[Any, ...], tuple[Any, int]] = {}
 
-    def get(self, key: tuple, compute: Callable[[], Any]) -> Any:
+    def get(self, key: tuple[Any, ...], compute: Callable[[], Any]) -> Any:
         """Return the cached value, or compute and cache it; the second item of a key is the view."""
         if key in self._values:
             self._values[key] = self._values.pop(key)

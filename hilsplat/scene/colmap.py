@@ -11,7 +11,7 @@ from jaxtyping import Float64, UInt8
 from PIL import Image  # noqa: F401
 
 # isort: split
-import pycolmap
+import pycolmap as pycolmap
 
 Points = tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]
 """Positions and colours."""

@@ -167,7 +167,7 @@ class HierarchicalMasks:
         file for any order of prompts.
         """
 
-        def key(row: int) -> tuple:
+        def key(row: int) -> tuple[Any, ...]:
             scores = -float(self.predicted_iou[row]), -float(self.stability[row])
             runs = self.runs[self.offsets[row] : self.offsets[row + 1]].tobytes()
             return int(self.level[row]), -int(self.area_px[row]), self.box_xyxy[row].tolist(), *scores, runs

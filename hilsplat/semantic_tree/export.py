@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int32, Int64
@@ -12,7 +13,7 @@ from hilsplat.base.lineage import require_made_from, sha256_of_file
 from hilsplat.semantic_tree.tree import SemanticTree
 
 
-def readable_nodes(tree: SemanticTree) -> list[dict]:
+def readable_nodes(tree: SemanticTree) -> list[dict[str, Any]]:
     members = [np.bincount(column[column >= 0], minlength=len(tree)) for column in tree.node_of_gaussian.T]
     return [
         {

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -118,7 +119,7 @@ def linked_nodes(
         return LevelNodes(of_mask, renumber[node], share, quality[with_views[renumber[:-1] != NONE]])
 
     with ThreadPoolExecutor(1, "linkage") as linker:
-        linked: list[Future] = []
+        linked: list[Future[Any]] = []
         for rows in rows_of_levels:
             linked.append(linker.submit(pooled_linkage, evidence(rows), settings.link_threshold))
             if threads == 1:

@@ -28,7 +28,7 @@ from hilsplat.web.server import as_json, read
 class SavedFiles:
     """Handlers of file requests; `static` contains the page's own files by name."""
 
-    def __init__(self, thread: SceneThread, static: dict[str, bytes]) -> None:
+    def __init__(self, thread: SceneThread[Any], static: dict[str, bytes]) -> None:
         self.thread, self.static = thread, static
         self.films = ThreadPoolExecutor(1, thread_name_prefix="film")
 

@@ -8,7 +8,7 @@ from hilsplat.datasets.generators import GENERATORS
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.datasets.sources import published
 from hilsplat.evaluate.scores import score_summary
-from hilsplat.evaluate.tables.build import TABLES
+from hilsplat.evaluate.tables.kinds import TABLES
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.workflow.plan import Plan, shorten_list
 from hilsplat.workflow.scene_data import of_variant

@@ -4,6 +4,7 @@ import numpy as np
 
 from hilsplat_world.objects.builder import CORNERS, Builder
 from hilsplat_world.shapes import (
+    Mesh,
     arc,
     box,
     cylinder,
@@ -444,7 +445,7 @@ def chest(b: Builder) -> None:
     lid, r = b.part("lid, cover"), d / 2
     half = [(r * np.cos(a), r * np.sin(a) * 0.8) for a in np.linspace(0, np.pi, 13)]
 
-    def opened(mesh):
+    def opened(mesh: Mesh) -> Mesh:
         """Rotate a mesh by 50 degrees about the hinge at the upper back edge."""
         return mesh.moved(r, 0, 0).turned("y", -50).moved(-d / 2, 0, h + 0.02)
 

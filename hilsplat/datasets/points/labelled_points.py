@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int32
@@ -69,7 +70,7 @@ def require_file(path: Path, fix: str = UNPACK_AGAIN) -> Path:
     return path
 
 
-def read_json_object(path: Path, keys: tuple[str, ...]) -> dict:
+def read_json_object(path: Path, keys: tuple[str, ...]) -> dict[str, Any]:
     """Read a JSON object that must have the given keys."""
     content = layouts.read_json_object(require_file(path), UNPACK_AGAIN)
     if not content.keys() >= set(keys):

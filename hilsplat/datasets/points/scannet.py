@@ -162,7 +162,7 @@ def read_truth(
 
 def _from_aggregation(
     folder: Path, scan: str, table: dict[str, int], num_points: int
-) -> tuple[Int32[np.ndarray, " P"], Int32[np.ndarray, " P"], Counter]:
+) -> tuple[Int32[np.ndarray, " P"], Int32[np.ndarray, " P"], Counter[str]]:
     """Return each vertex's ScanNet200 id and instance, and the raw categories missing from the table."""
     segments_path = folder / f"{scan}_vh_clean_2.0.010000.segs.json"
     segments = np.asarray(read_json_object(segments_path, ("segIndices",))["segIndices"])
@@ -175,7 +175,7 @@ def _from_aggregation(
         )
     path = folder / f"{scan}.aggregation.json"
     fine, instance = np.zeros((2, num_points), dtype=np.int32)
-    unknown: Counter = Counter()
+    unknown = Counter[str]()
     for row, group in enumerate(read_json_object(path, ("segGroups",))["segGroups"]):
         with decoding(f"{path}, group {row}", "objectId, label and a list of segments"):
             category, number = str(group["label"]), int(group["objectId"]) + 1

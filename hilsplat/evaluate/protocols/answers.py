@@ -1,7 +1,7 @@
 """Cached answers of a scene in one view, and their score rows."""
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int
@@ -62,7 +62,7 @@ class Selections:
 
     def __init__(self, scene: "LanguageScene") -> None:
         self.scene = scene
-        self._of: dict[tuple, np.ndarray] = {}
+        self._of: dict[tuple[Any, ...], np.ndarray] = {}
         self._masks: dict[str, PackedMasks] = {}
 
     def nodes(self, path: tuple[str, ...], level: Level | None, view: str | None) -> np.ndarray:

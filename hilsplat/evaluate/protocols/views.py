@@ -8,6 +8,7 @@ or empty prediction counts as 0.
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -61,7 +62,7 @@ def label_of(card: cards.ProtocolCard, method: str, settings: EvaluateSettings) 
     return card.labelled([*words, *relevancy_departures(settings)])
 
 
-def given_key(method: str, query: Query, settings: EvaluateSettings) -> tuple:
+def given_key(method: str, query: Query, settings: EvaluateSettings) -> tuple[Any, ...]:
     return (method, label_of(cards.LEVEL_GIVEN, method, settings), query.text, query.level)
 
 

@@ -1,6 +1,6 @@
 """Measured rows of labelled images: LERF, 3D-OVS, queries at three levels, and the scored frames."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hilsplat.evaluate.metrics.hierarchy import READINGS
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN, VIEW_CONSISTENCY
@@ -47,7 +47,7 @@ def hierarchy_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, C
 
 def frames_blocks(_: TableKind, sources: Sources) -> list[Block]:
     """Return the views queried at levels, with the number of texts in each."""
-    texts: dict[tuple[str, str, str], set] = {}
+    texts: dict[tuple[str, str, str], set[Any]] = {}
     for row in sources.scores.itertuples():
         if row.metric == "iou" and row.protocol.startswith(LEVEL_GIVEN.full_name):
             texts.setdefault((row.dataset, row.scene, row.view), set()).add((row.query, row.level))

@@ -6,7 +6,7 @@ A (view, query) pair without a prediction has a row with value 0 unless its prot
 import re
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hilsplat.base.levels import LEVELS
 from hilsplat.evaluate.protocols import cards
@@ -63,7 +63,7 @@ def measured_blocks(
         for data, of_data in of_methods.groupby("dataset", sort=True):
             selected = of_data[of_data["protocol"].str.startswith(protocols)]
             selected = selected.assign(label=selected["protocol"].map(label_of))
-            rows: list[tuple[tuple, Row]] = []
+            rows: list[tuple[tuple[Any, ...], Row]] = []
             groups = selected.groupby(["variant", "masks", "method", "label"], sort=True)
             for (variant, masks, method, label), part in groups:
                 seeds = [cells_of(scores, of_seed) for _, of_seed in part.groupby("seed", sort=True)]
@@ -121,7 +121,7 @@ def mean_over_seeds(seeds: Sequence[Mapping[str, Cell]]) -> dict[str, Cell]:
 
 def without_repeats(rows: Sequence[Row]) -> tuple[Row, ...]:
     """Remove duplicate rows: the annotations' row is the same for every variant."""
-    seen: dict[tuple, Row] = {}
+    seen: dict[tuple[Any, ...], Row] = {}
     for row in rows:
         seen.setdefault((*row.names.values(), *(cell.text for cell in row.cells.values())), row)
     return tuple(seen.values())

@@ -52,7 +52,7 @@ class _Product(torch.autograd.Function):
 
 def product(matrix: sp.csr_matrix, features: Float[Tensor, "N D"]) -> Float[Tensor, "p D"]:
     """Return rendered features W F or mask means A F; differentiable with respect to the features."""
-    return _Product.apply(features, matrix)
+    return _Product.apply(features, matrix)  # type: ignore[no-untyped-call]
 
 
 def nonempty_columns(matrix: sp.csr_matrix) -> tuple[sp.csr_matrix, Int64[Tensor, " s"]]:
