@@ -50,9 +50,9 @@ class CoreSettings(Section):
     def _of_named_method(cls, value: Any) -> Any:
         return value if isinstance(value, MethodSettings) else validated("method", value, "method")
 
-    def with_models(self) -> "CoreSettings":
+    def resolve_auto(self) -> "CoreSettings":
         """Return all sections after resolving values that depend on others: models, crops, theta."""
-        clip, masks, method = with_models(self.clip), with_models(self.masks), self.method
+        clip, masks, method = resolve_auto(self.clip), resolve_auto(self.masks), self.method
         theta = {"theta": self.coverage_tree.theta}
         if masks.levels == "tree" and masks.theta is None:
             masks = masks.model_copy(update=theta)
@@ -98,7 +98,7 @@ def validated(name: str, values: Any, where: str) -> Section:
 Settings = TypeVar("Settings", bound=Section)
 
 
-def with_models(section: Settings) -> Settings:
+def resolve_auto(section: Settings) -> Settings:
     """Replace `auto` in a section with existing models, so that records name the models that were used.
 
     `masks.segmenter: auto` selects the SAM model in `masks.model` or, if that is also auto, the best

@@ -5,7 +5,7 @@ import os
 import re
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -45,30 +45,33 @@ def size_table(folder: Path) -> str:
 
 
 def prune_cache(
-    folder: Path, stages: list[str], *, days: float | None = None, max_mib: float | None = None
+    folder: Path,
+    prunable: Sequence[str],
+    chosen: Sequence[str] = (),
+    *,
+    days: float | None = None,
+    max_mib: float | None = None,
 ) -> tuple[int, float]:
     """Delete unfinished files and old cache entries; return the number of entries and their size in MiB.
 
     Only files named like an entry (`ENTRY`), in a cache with our tag, are deleted.
 
     Args:
-        stages: caches to prune; if empty, all of finished views, and also the checkpoints if `days` is set.
+        prunable: names of the caches that may be pruned.
+        chosen: caches to prune; if empty, all of finished views, and also the checkpoints if `days` is set.
         days: delete entries not used for this many days.
         max_mib: then delete the least recently used until the rest is at most this size.
     """
-    prunable = [name for name in caches(folder) if is_tagged(folder / name)]
-    if unknown := sorted(set(stages) - set(prunable)):
-        raise HilsplatError(
-            f"unknown cache: {', '.join(unknown)}", expected=f"one of {', '.join(prunable) or 'none'}"
-        )
+    if unknown := sorted(set(chosen) - set(prunable)):
+        raise HilsplatError(f"unknown cache: {', '.join(unknown)}", expected=f"one of {', '.join(prunable)}")
     # The cache is in the results folder, where killed jobs leave unfinished files beside their outputs.
     remove_leftovers(folder.parent if Path(folder).name == ".cache" else folder)
-    chosen = set(stages or prunable) - ({CHECKPOINTS} if days is None and not stages else set())
+    names = set(chosen or prunable) - ({CHECKPOINTS} if days is None and not chosen else set())
     now, freed, deleted = time.time(), 0, 0
     used = {
         path: path.stat()
         for name, files in caches(folder).items()
-        if name in chosen
+        if name in names and is_tagged(folder / name)
         for path in files
         if ENTRY.fullmatch(path.relative_to(folder / name).as_posix())
     }

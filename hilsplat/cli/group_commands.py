@@ -7,7 +7,7 @@ import typer
 
 from hilsplat.cli.common import Results, cache_app, datasets_app, echo, models_app
 from hilsplat.stage import DEFAULT_CACHE, DataRoot, Threads
-from hilsplat.stages import label_fits
+from hilsplat.stages import all_stages, family_of, label_fits
 
 
 @models_app.command("get")
@@ -90,15 +90,17 @@ def cache_prune(
     stage: Annotated[
         list[str] | None,
         typer.Option(
-            help="cache to prune, as listed by `hilsplat cache`; gaussians: fit checkpoints, kept for at "
-            "least a day; default: all caches, including gaussians only if --days is given"
+            help="cache to prune, such as masks or clip; gaussians: fit checkpoints, kept for at least a day; "
+            "default: all caches, including gaussians only if --days is given"
         ),
     ] = None,
 ) -> None:
     """Delete unfinished files of killed jobs and, if a limit is given, cache entries (recomputed on use)."""
     from hilsplat.base.cache import prune_cache, size_table
 
-    number, freed_mib = prune_cache(context.obj, stage or [], days=days, max_mib=max_mib)
+    cached = [family_of(each) for each in all_stages().values() if "cache" in each.hints]
+    prunable = list(dict.fromkeys(cached))
+    number, freed_mib = prune_cache(context.obj, prunable, stage or [], days=days, max_mib=max_mib)
     echo(f"deleted {number} files, {freed_mib:.1f} MiB\n{size_table(context.obj)}")
 
 

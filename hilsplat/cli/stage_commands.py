@@ -10,7 +10,7 @@ from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.plugins import entry_points
 from hilsplat.cli.common import app, cache_app, datasets_app, echo, models_app, start_logging
-from hilsplat.configuration import parse_section, with_models
+from hilsplat.configuration import parse_section, resolve_auto
 from hilsplat.stage import Stage, metadata_of
 from hilsplat.stages import all_stages
 
@@ -32,7 +32,7 @@ def command_of(stage: Stage[..., Any]) -> Callable[..., None]:
     def command(**options: Any) -> None:
         values = {name: value for name, value in options.items() if name not in unused}
         for name, section in stage.sections.items():
-            values[name] = with_models(parse_section(section, values[name]))
+            values[name] = resolve_auto(parse_section(section, values[name]))
         for name in stage.json:
             values[name] = _json_of(name, values[name], stage.hints[name])
         start_logging(timestamps=True)

@@ -38,6 +38,22 @@ class Truth(Protocol):
 
 
 @dataclass(frozen=True)
+class Annotations:
+    """Annotations without exact geometry, in the format of `datasets.hierarchy`."""
+
+    folder: Path
+
+    def points(self) -> dict[str, LabelledPoints]:
+        return {}
+
+    def cameras(self) -> Cameras:
+        raise SceneError(f"{self.folder} has no true cameras", fix="name the scene's source")
+
+    def consistency(self, selections: Any, truths: Any, masks: Any, settings: Any) -> Iterator[Any]:
+        return iter(())
+
+
+@dataclass(frozen=True)
 class Kind:
     """One kind of generated scene: the protocols that score it, and the tables that show it (`evaluate`)."""
 

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,10 +73,13 @@ def write_posed_images(
 ) -> None:
     """Write `images/` and `transforms.json` (OpenGL axes, intrinsics per frame) as a source for `poses`.
 
-    Names must be unique. Images are copied byte for byte; distortion is kept, because `poses` undistorts
-    them. Points, if given, must be in the unit of the poses; `points.ply` stores them, and they become the
-    scene's sparse points in the same order. An existing folder is replaced.
+    Images are copied byte for byte; distortion is kept, because `poses` undistorts them. Points, if given,
+    must be in the unit of the poses; `points.ply` stores them, and they become the scene's sparse points in
+    the same order. An existing folder is replaced. SceneError is raised if two images have one name.
     """
+    counts = Counter(image.name for image in images)
+    if repeated := sorted(name for name, count in counts.items() if count > 1):
+        raise SceneError(f"several posed images have the same name: {', '.join(repeated)}")
     with atomic_folder(folder) as temporary:
         (temporary / "images").mkdir()
         frames = []

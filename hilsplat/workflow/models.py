@@ -67,5 +67,5 @@ def models_of_photographs(config: Path, scene: str, features: Path | None = None
     If `config` does not exist, the installed configuration is read.
     """
     run = parse_run(read_config(config if config.is_file() else INSTALLED / CONFIG))
-    stages = run.stages("default", (PHOTOS, f"{PHOTOS}/{scene}")).with_models()
+    stages = run.stages("default", (PHOTOS, f"{PHOTOS}/{scene}")).resolve_auto()
     return [line for line in (describe_models(stages, features), doubt_about_photographs(stages)) if line]

@@ -111,7 +111,7 @@ class Plan:
                 fix="select a scene (hilsplat run photos/desk) or other groups, or set data_root",
             )
         # A thousand scenes have tens of thousands of jobs, so settings are resolved and folders read once.
-        self.stages_of = functools.cache(lambda *which: run.stages(*which).with_models())
+        self.stages_of = functools.cache(lambda *which: run.stages(*which).resolve_auto())
         self.defaults = {name: getattr(self.stages_of("default", ()), name) for name in SECTIONS}
         self.options: dict[str, Option] = {
             "images": self.data.images,

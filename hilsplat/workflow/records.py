@@ -37,7 +37,10 @@ def outdated(plan: Plan, *, every_byte: bool = False) -> dict[str, str]:
     """
     records, artifacts = Records(plan.results, plan, every_byte=every_byte), records_in(plan.results)
     declared = [path for row in plan.scenes for path in plan.artifacts(row) if path.exists()]
-    states = {str(path): records.state(path) for path in dict.fromkeys([*artifacts, *declared])}
+    names = [Path(stage.file).name for stage in all_stages().values()]  # inputs come before what reads them
+    order = {name: number for number, name in enumerate(names)}
+    paths = sorted({*artifacts, *declared}, key=lambda path: (order.get(path.name, len(order)), path))
+    states = {str(path): records.state(path) for path in paths}
     return {path: reason for path, (state, reason) in states.items() if state != WHOLE}
 
 

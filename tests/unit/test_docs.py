@@ -101,7 +101,7 @@ def test_every_configuration_and_forced_rule_exists(page: Path) -> None:
         for name in re.findall(r"--(?:config|configfile|workflow-profile) ((?:config|profiles)/\S+)", line):
             assert (PROJECT / name).exists(), f"{line}: {name} is missing"
         for name in re.findall(r"--forcerun (\S+)", line):
-            assert f"rule {name}:" in rules, f"{line}: no such rule"
+            assert re.search(rf"rule (\w+ as )?{name}( with)?:", rules), f"{line}: no such rule"
 
 
 @of_every_page

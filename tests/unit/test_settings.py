@@ -35,10 +35,6 @@ def test_shipped_configurations_are_valid(project: Path, name: str) -> None:
             {"variants": {"x": {"coverage_tree": {"theta": 3}}}},
             r"variants\.x\.coverage_tree\.theta: Input should be less than 1",
         ),
-        (
-            {"variants": {"x": {"poses": {"mapper": "global"}}}},
-            r"variants\.x\.poses: variants cannot change this section",
-        ),
         ({"main_variants": ["nope"]}, "variant 'nope' is not defined"),
         ({"queries": {"synthetic": ["mug", " "]}}, r"empty text(.|\n)*queries\.synthetic"),
         ({"data_root": "</script>"}, "data_root: String should match pattern"),
@@ -110,18 +106,6 @@ def test_overrides_apply_in_order_group_then_scene_then_variant() -> None:
     assert run.stages("v", scopes=("g", "d/s")).coverage_tree.theta == 0.8
 
 
-def test_only_random_variants_are_repeated_per_seed() -> None:
-    network = {"autoencoder": {"code": "network"}}
-    variants = {"network": network, "langsplat": {"method": {"name": "langsplat"}}}
-    run = parse_run({"seeds": 3, "variants": variants, "overrides": {"photos": network}})
-    assert run.seeded("default") == ["default"]
-    assert run.seeded("langsplat") == ["langsplat", "langsplat.seed1", "langsplat.seed2"]
-    assert len(run.seeded("default", scopes=("photos",))) == 3
-    assert [run.seed_of(name) for name in run.seeded("network")] == [0, 1, 2]
-    assert not run.stages("langsplat").depends_on_seed("autoencoder")
-    assert not run.stages("network").depends_on_seed("semantic_tree")
-
-
 @pytest.mark.parametrize("name", SECTIONS)
 def test_a_section_describes_its_settings_and_round_trips_through_json(name: str) -> None:
     for knob, field in SECTIONS[name].model_fields.items():
@@ -178,6 +162,6 @@ def test_a_method_has_its_own_settings() -> None:
 
 def test_theta_of_the_coverage_tree_reaches_the_methods_that_build_one() -> None:
     variants = {"vch": {"coverage_tree": {"theta": 0.8}, "method": {"name": "vch"}}}
-    assert parse_run({"variants": variants}).stages("vch").with_models().method.theta == 0.8
+    assert parse_run({"variants": variants}).stages("vch").resolve_auto().method.theta == 0.8
     variants["vch"]["method"]["theta"] = 0.95
-    assert parse_run({"variants": variants}).stages("vch").with_models().method.theta == 0.95
+    assert parse_run({"variants": variants}).stages("vch").resolve_auto().method.theta == 0.95

@@ -17,6 +17,7 @@ from hilsplat.base.lineage import sha256_of_json
 from hilsplat.base.processes import host_token
 from hilsplat.base.removal import tag
 
+CACHES = ("masks", "clip", "contributions", "gaussians")
 MIB = 2**20
 
 
@@ -53,8 +54,8 @@ def test_the_table_names_each_cache(cache):
 
 
 def test_only_old_view_entries_are_deleted(cache, tmp_path):
-    assert prune_cache(tmp_path / "nowhere", [], days=0.0) == (0, 0)
-    assert prune_cache(cache, [], days=2.0) == (3, 3.0)
+    assert prune_cache(tmp_path / "nowhere", CACHES, [], days=0.0) == (0, 0)
+    assert prune_cache(cache, CACHES, [], days=2.0) == (3, 3.0)
     assert left(cache) == [
         "masks/.writing-00000000-01234567/new.npz",
         f"masks/00/{0:064}.npz",
@@ -65,7 +66,7 @@ def test_only_old_view_entries_are_deleted(cache, tmp_path):
 
 def test_an_unknown_cache_is_refused(cache):
     with pytest.raises(HilsplatError, match=r"models\n.*masks, clip, contributions, gaussians"):
-        prune_cache(cache, ["masks", "models"], days=0.0)
+        prune_cache(cache, CACHES, ["masks", "models"], days=0.0)
 
 
 @pytest.mark.parametrize(
@@ -87,7 +88,7 @@ def test_checkpoints_are_pruned_unless_their_fit_may_still_run(cache, options, e
         path.write_bytes(b"x" * MIB)
         written = time.time() - hours * 3600
         os.utime(path, (written, written))
-    prune_cache(cache, **options)
+    prune_cache(cache, CACHES, options.pop("stages"), **options)
     assert {names[path.stem] for path in (cache / "gaussians").glob("*.npz")} == expected
 
 
@@ -96,7 +97,7 @@ def test_without_a_limit_only_unfinished_files_of_dead_jobs_are_deleted(tmp_path
     leftover = results / f"photos/desk/.writing-{host_token()}-01234567"
     leftover.mkdir(parents=True)
     shutil.copytree(cache, results / ".cache")
-    assert prune_cache(results / ".cache", []) == (0, 0)
+    assert prune_cache(results / ".cache", CACHES, []) == (0, 0)
     assert not leftover.exists()
     assert left(results / ".cache") == left(cache)
 
@@ -114,9 +115,9 @@ def test_files_in_folders_named_like_a_cache_are_kept(cache, tmp_path_factory):
         (cache / "masks" / name).parent.mkdir(exist_ok=True)
         (cache / "masks" / name).touch()
     before = sorted(folder.rglob("*"))
-    assert prune_cache(folder, [], days=0.0, max_mib=0.0) == (0, 0)
+    assert prune_cache(folder, CACHES, [], days=0.0, max_mib=0.0) == (0, 0)
     assert sorted(folder.rglob("*")) == before
-    assert prune_cache(cache, [], days=0.0, max_mib=0.0) == (5, 5.0)
+    assert prune_cache(cache, CACHES, [], days=0.0, max_mib=0.0) == (5, 5.0)
     assert all((cache / "masks" / name).exists() for name in own)
 
 
@@ -124,7 +125,7 @@ def test_a_link_in_a_cache_is_deleted_without_its_target(cache, tmp_path_factory
     drawing = tmp_path_factory.mktemp("mine") / "drawing.npz"
     drawing.touch()
     (cache / f"masks/00/{5:064}.npz").symlink_to(drawing)
-    prune_cache(cache, ["masks"], days=0.0, max_mib=0.0)
+    prune_cache(cache, CACHES, ["masks"], days=0.0, max_mib=0.0)
     assert drawing.exists()
 
 

@@ -61,7 +61,7 @@ def numbers(frame, protocol, metrics):
 @pytest.mark.parametrize("packed", [False, True])
 def test_files_of_our_own_run_have_the_same_scores_and_make_a_table(block_world, tmp_path, packed):
     rows = write_answers(tmp_path / "theirs", block_world, packed)
-    frame = score(block_world, tmp_path / "theirs", tmp_path / "scores.csv", kind="tabletop")
+    frame = score(block_world, tmp_path / "theirs", tmp_path / "scores.csv", source="world:tabletop:1")
     flat, levelled = {"iou", "boundary_iou"}, "hierarchy/level-given"
     both = flat | {"hc_containment", "hc_literal"}
     for ours, theirs, metrics in (("lerf/tree-nodes", "lerf/langsplat", flat), (levelled, levelled, both)):

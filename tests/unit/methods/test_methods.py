@@ -191,12 +191,12 @@ def test_the_package_in_the_documentation_adds_a_method_with_two_settings(inputs
     run = parse_run({"variants": {"mine": {"method": {"name": "nearest_mask", "min_mass_px": 0.5}}}})
     settings = run.stages("mine").method
     assert (settings.min_mask_px, settings.min_mass_px) == (1, 0.5)
-    assert not run.stages("mine").depends_on_seed("evaluate")
+    assert not settings.is_random
     assert "method.min_mass_px" in knob_table() and "min_mass_px" in json.dumps(config_schema())
     with pytest.raises(SettingsError, match=r"method\.min_mas_px: unknown key; did you mean 'min_mass_px'"):
         parse_section("method", '{"name": "nearest_mask", "min_mas_px": 1}')
-    method = stage_of("method")
-    assert method.code_digest((method_of("nearest_mask").fit,)) != method.code_digest()
+    stage = stage_of("method")
+    assert stage.code_digest((method_of("nearest_mask").fit,)) != stage.code_digest()
 
     inputs, out = inputs_of(), nearest_mask / "field.safetensors"
     (inputs.autoencoder_folder / "autoencoder.safetensors").touch()

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from hilsplat.base.lineage import sha256_of_path
-from hilsplat.configuration import with_models
+from hilsplat.configuration import resolve_auto
 from hilsplat.models.store import model_digest, model_path, present_models, read_model, real_model
 from hilsplat.settings import ClipSettings, FieldSettings, MasksSettings
 
@@ -30,20 +30,20 @@ def models(tmp_path, monkeypatch) -> Path:
 
 
 def test_without_a_pretrained_model_photographs_use_the_graph_segmenter_and_the_embedded_clip(models):
-    assert with_models(AUTO) == MasksSettings(segmenter="graph", model="models/sam-tiny")
-    assert with_models(ClipSettings(model="auto")).model == "models/clip-tiny"
-    assert with_models(MasksSettings(segmenter="sam", model="auto")).model == "models/sam-tiny"
+    assert resolve_auto(AUTO) == MasksSettings(segmenter="graph", model="models/sam-tiny")
+    assert resolve_auto(ClipSettings(model="auto")).model == "models/clip-tiny"
+    assert resolve_auto(MasksSettings(segmenter="sam", model="auto")).model == "models/sam-tiny"
 
 
 def test_the_best_pretrained_model_is_used(models):
     write_model(models / "zebra-sam", "sam", network="vision_encoder.onnx")
-    assert with_models(AUTO) == MasksSettings(segmenter="sam", model="models/zebra-sam")
+    assert resolve_auto(AUTO) == MasksSettings(segmenter="sam", model="models/zebra-sam")
     for name in ("slimsam-77", "sam-vit-base"):
         write_model(models / name, "sam")
-    assert with_models(AUTO).model == "models/sam-vit-base"
+    assert resolve_auto(AUTO).model == "models/sam-vit-base"
     write_model(models / "clip-vit-base-patch16", "clip")
     write_model(models / "clip-vit-b-16-laion2b", "clip")
-    assert with_models(ClipSettings(model="auto")).model == "models/clip-vit-b-16-laion2b"
+    assert resolve_auto(ClipSettings(model="auto")).model == "models/clip-vit-b-16-laion2b"
     released = ["sam-vit-base", "slimsam-77", "clip-vit-b-16-laion2b", "clip-vit-base-patch16"]
     names = [model.folder.name for model in present_models()]
     assert names == [*released, "zebra-sam", "clip-tiny", "sam-tiny"]
@@ -52,14 +52,14 @@ def test_the_best_pretrained_model_is_used(models):
 def test_named_models_take_precedence(models):
     write_model(models / "sam-vit-huge", "sam")
     for section in (MasksSettings(), MasksSettings(segmenter="graph"), ClipSettings(), FieldSettings()):
-        assert with_models(section) == section
+        assert resolve_auto(section) == section
     write_model(models / "mine", "sam")
     named = MasksSettings(segmenter="auto", model="models/mine")
-    assert with_models(named) == MasksSettings(segmenter="sam", model="models/mine")
+    assert resolve_auto(named) == MasksSettings(segmenter="sam", model="models/mine")
     embedded = MasksSettings(segmenter="auto", model="models/sam-tiny")
-    assert with_models(embedded) == MasksSettings(segmenter="graph", model="models/sam-tiny")
+    assert resolve_auto(embedded) == MasksSettings(segmenter="graph", model="models/sam-tiny")
     lost = MasksSettings(segmenter="auto", model="models/lost")  # the stage reports that it is missing
-    assert with_models(lost).segmenter == "sam"
+    assert resolve_auto(lost).segmenter == "sam"
 
 
 def test_incomplete_and_unsupported_models_are_ignored(models):

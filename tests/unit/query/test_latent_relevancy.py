@@ -40,7 +40,7 @@ def blends(features, count):
 
 def pass_through(latent, channels):
     """A network that decodes to the positive part of a latent, then zeros, at unit length."""
-    code = Autoencoder.drawn(channels, latent, np.random.RandomState(0))
+    code = Autoencoder.initial(channels, latent, np.random.RandomState(0))
     for name, values in code.arrays.items():
         if name.startswith("decoder"):
             values[:] = np.eye(*values.shape) if values.ndim == 2 else 0

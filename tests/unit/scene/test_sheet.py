@@ -55,9 +55,9 @@ def test_named_scenes_are_chosen_alone_and_from_any_group(tmp_path):
         ("scene", ".desk", "it begins with '.'"),
         ("scene", "tür{1}", "it contains '{', '}', 'ü'"),
         ("scene", "x" * 101, "longer than 100"),
-        ("group", "paper", "'paper' is unknown"),
+        ("group", "benchmrk", r"'benchmrk' is unknown(.|\n)*did you mean 'benchmark'"),
         ("unit", "cm", "'cm' is unknown"),
-        ("source", "world:tabletop", "does not name a synthetic scene"),
+        ("source", "world:tabletop", "does not name a generated scene"),
         ("source", "gone", "gone is missing"),
         ("source", "", "it is empty"),
         ("source", "phone", r"has no images(.|\n)*1 files \(\.dng"),
@@ -104,7 +104,7 @@ def test_comments_are_skipped_optional_columns_may_be_missing_and_paths_start_at
     cells = [("theirs.ply", "-"), ("-", ""), ("", ""), ()]
     rows = [("photos", f"desk{row}", *DESK[2:], *more) for row, more in enumerate(cells)]
     world, *found = read_sheet(write_sheet(tmp_path, ("# a comment",), WORLD, *rows, columns=COLUMNS[:7]))
-    assert (world.name, world.world, world.folder) == ("world/a", ("tabletop", 1), None)
+    assert (world.name, world.generated, world.folder) == ("world/a", ("world", "tabletop", 1), None)
     assert {row.folder for row in found} == {tmp_path / "desk"}
     assert [row.gaussians for row in found] == [tmp_path / "theirs.ply", None, None, None]
     assert {row.features for row in found} == {None}
@@ -220,8 +220,8 @@ def test_nerfstudios_export_is_found_with_the_record_of_its_coordinates(tmp_path
     assert f"nerfstudio's, from {latest}" in report
     (row,) = read_sheet(sheet)
     data = SceneData([row], "", str)
-    assert data.existing_gaussians(row) == [str(row.gaussians), str(latest), str(folder / "transforms.json")]
-    assert f"--dataparser {latest}" in data.existing_gaussians_option(row)
+    assert data.gaussians_files(row) == [str(row.gaussians), str(latest), str(folder / "transforms.json")]
+    assert data.gaussians("dataparser")(row) == [str(latest)]
 
 
 def test_inspection_finds_damaged_turned_and_copied_photographs(tmp_path):

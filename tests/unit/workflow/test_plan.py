@@ -80,6 +80,21 @@ def test_an_unknown_method_stops_at_once(tmp_path, name):
         plan(tmp_path, main_variants=list(VARIANTS), variants=variants)
 
 
+def test_a_variant_cannot_change_what_all_share(tmp_path):
+    with pytest.raises(SettingsError, match=r"variants\.x\.poses: variants share this section"):
+        plan(tmp_path, variants={"x": {"poses": {"mapper": "global"}}}, main_variants=["default"])
+
+
+def test_only_random_variants_are_repeated_per_seed(tmp_path):
+    variants = {**VARIANTS, "langsplat": {"method": {"name": "langsplat"}}}
+    found = plan(tmp_path, variants=variants, seeds=3, overrides={"synthetic/two": {"autoencoder": NETWORK}})
+    one, two = found.rows[:2]
+    assert found.seeded("default", one) == ["default"]
+    assert found.seeded("langsplat", one) == ["langsplat", "langsplat.seed1", "langsplat.seed2"]
+    assert len(found.seeded("default", two)) == 3
+    assert [found.run.seed_of(name) for name in found.seeded("network", one)] == [0, 1, 2]
+
+
 def test_photographs_that_you_annotated_are_scored_without_replacing_the_tables(tmp_path):
     alone = targets.default(plan(tmp_path, groups=["photos"], data_root=str(tmp_path)))
     file = tmp_path / "annotated/photos/desk/1.json"

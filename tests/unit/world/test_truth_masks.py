@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 
 from hilsplat.base.artifacts import provenance_path, read_index, read_json, write_index, write_json
-from hilsplat.base.errors import HilsplatError, MisalignedArtifactError
+from hilsplat.base.errors import MisalignedArtifactError, SettingsError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.lineage import sha256_of_path
-from hilsplat.cli import stage_commands
 from hilsplat.datasets.hierarchy import AnnotatedNode, write_hierarchy
 from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.segment.stage import run_masks
+from hilsplat.settings import MasksSettings
 from hilsplat_world.settings import PerturbSettings
+from hilsplat_world.stages import truth_masks
 from hilsplat_world.truth_masks import (
     FAULTS,
     Draws,
@@ -263,23 +265,16 @@ def test_label_images_of_the_wrong_size_are_refused(world):
     assert not (world / "masks").exists()
 
 
-def command(world, settings, **options):
-    """Run `hilsplat masks`."""
-    stage_commands.masks(scene=world / "scene", out=world / "out", settings=settings, **options)
-
-
-def test_the_command_requires_the_truth_and_records_it(world):
-    asked = '{"segmenter": "truth-perturbed", "min_area_px": 1}'
-    with pytest.raises(HilsplatError, match=r"needs a synthetic scene(.|\n)*--truth results"):
-        command(world, asked)
-    command(world, asked, truth=world / "truth", perturb='{"seed": 3}')
+def test_the_stage_records_the_truth_and_the_faults(world):
+    settings = MasksSettings(segmenter="truth-perturbed", min_area_px=1)
+    truth_masks(world / "scene", world / "truth", world / "out", settings, PerturbSettings(seed=3))
     record = read_json(provenance_path(world / "out"))
-    assert record["stage"] == "truth_masks"
-    assert record["settings"]["perturb"]["seed"] == record["seed"] == 3
+    assert record["stage"] == "truth_masks" and record["settings"]["perturb"]["seed"] == 3
     assert set(record["inputs"]) == {"scene", "truth"}
 
 
-def test_other_segmenters_refuse_the_truth(world):
-    with pytest.raises(HilsplatError, match="the segmenter sam must not use the ground truth"):
-        command(world, '{"segmenter": "sam"}', truth=world / "truth")
+def test_the_stage_of_other_segmenters_refuses_the_diagnostic_one(world):
+    settings = MasksSettings(segmenter="truth-perturbed")
+    with pytest.raises(SettingsError, match="needs a generated scene's ground truth"):
+        run_masks(world / "scene", world / "out", world / "cache", settings, 1)
     assert not (world / "out").exists()

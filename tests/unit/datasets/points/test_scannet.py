@@ -163,5 +163,5 @@ def test_unusable_scans_are_refused_with_a_fix(root, damage, message):
 
 def test_two_images_of_one_name_are_refused(root, tmp_path):
     image = open_scan(root, SCAN).images[0]
-    with pytest.raises(SceneError, match=r"duplicate names: 0\.jpg"):
+    with pytest.raises(SceneError, match=r"same name: 0\.jpg"):
         write_posed_images(tmp_path / "posed", [image, image])
