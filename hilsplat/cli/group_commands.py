@@ -90,7 +90,7 @@ def cache_prune(
     stage: Annotated[
         list[str] | None,
         typer.Option(
-            help="cache to prune, such as masks or clip; gaussians: fit checkpoints, kept for at least a day; "
+            help="cache to prune, such as masks or clip; gaussians: fit checkpoints, kept for a day; "
             "default: all caches, including gaussians only if --days is given"
         ),
     ] = None,

@@ -40,8 +40,8 @@ PARTS = ("semantic_tree", "field", "autoencoder", "clip", "masks")
 SCORED = "evaluate"
 """The stage that reads everything that a variant may change."""
 
-Option = Callable[..., Any] | str
-"""An option of a stage's command: its value, or a function of the wildcards and the input."""
+Option = Callable[[Any], Any] | str
+"""An option of a stage's command: its value, or a function of the wildcards."""
 
 
 class Identity(NamedTuple):
@@ -62,14 +62,17 @@ def escape_json_for_report(text: str) -> str:
     return text.replace("<", "\\u003c")
 
 
-def words_of(name: str, value: Any, *, is_argument: bool) -> list[str]:
-    """Return an option or argument of a command line for each value; none for an empty value."""
-    option = [] if is_argument else [f"--{name.replace('_', '-')}"]
-    if value is True:
-        return option
-    values = value if isinstance(value, list | tuple) else [value]
-    words = [[*option, shlex.quote(str(item))] for item in values if item not in ("", None, False)]
-    return [" ".join(pair) for pair in words]
+def _words(stage: Stage[..., Any], values: Mapping[str, Any]) -> str:
+    """Return options and arguments of a stage's command: one for each value, none for an empty value."""
+    words: list[str] = []
+    for name, value in values.items():
+        option = [] if name in stage.arguments else [f"--{name.replace('_', '-')}"]
+        if value is True:
+            words += option
+            continue
+        items: list[str] = [value] if isinstance(value, str) else list(value or ())
+        words += [word for item in items if item for word in (*option, shlex.quote(item))]
+    return " ".join(words)
 
 
 class Plan:
@@ -114,19 +117,16 @@ class Plan:
         self.stages_of = functools.cache(lambda *which: run.stages(*which).resolve_auto())
         self.defaults = {name: getattr(self.stages_of("default", ()), name) for name in SECTIONS}
         self.options: dict[str, Option] = {
-            "images": self.data.images,
             "unit": self.data.unit,
             "render": self.data.is_render,
             "poses": self.data.poses,
             "source": self.data.generated_source,
-            "dataset": lambda job, *_: job.dataset,
-            "variant": lambda job, *_: job.variant,
+            "dataset": lambda job: job.dataset,
+            "variant": lambda job: job.variant,
             "labels": self.data.label_names,
             "data_root": str(Path(run.data_root)),
             "names": self.names,
             "queries": self.queries,
-            "folder": lambda job, input, _: str(Path(input.gaussians).parent),
-            "results": lambda job, _, output: str(Path(output.out).parent),
         }
         self._json = functools.cache(lambda section, *which: self._section(section, *which).model_dump_json())
         self.identity = functools.cache(self._identity)
@@ -216,14 +216,17 @@ class Plan:
         """
         stage = stage_of(name)
 
-        def command(wildcards: Any, input: Any, output: Any) -> str:
-            words = [stage.command]
-            for option, value in self._options(stage, wildcards, input, output, options).items():
-                words += words_of(option, value, is_argument=option in stage.arguments)
-            return " ".join(words)
+        def settings(wildcards: Any) -> str:
+            return _words(stage, self._values(stage, wildcards, options))
 
+        def command(wildcards: Any, input: Any, output: Any) -> str:
+            paths = _words(stage, self._paths(stage, wildcards, input, output))
+            return f"{stage.command} {settings(wildcards)} {paths}"
+
+        # Snakemake compares only parameters that don't derive from input and output.
         params: dict[str, Any] = {
             "command": command,
+            "settings": settings,
             "code": lambda wildcards: stage.code_digest(plugins(wildcards)),
         }
         if files is not None:
@@ -231,26 +234,35 @@ class Plan:
         models = [name for name in stage.sections.values() if hasattr(self.defaults[name], "model")]
         return params | ({"model": self.model(models[0])} if models else {})
 
-    def _options(
-        self, stage: Stage[..., Any], job: Any, input: Any, output: Any, options: Mapping[str, Option]
-    ) -> dict[str, Any]:
-        """Return the value of each option of a stage's command, in the order of the stage's parameters."""
-        depth = {"run": 0, "scene": 2, "variant": 3}[stage.scope]
+    def _values(self, stage: Stage[..., Any], job: Any, options: Mapping[str, Option]) -> dict[str, Any]:
+        """Return the values of a stage's parameters that don't depend on its rule's input and output."""
         values: dict[str, Any] = {}
         for name in stage.hints:
             if (option := options.get(name, self.options.get(name))) is not None:
-                values[name] = option(job, input, output) if callable(option) else option
-            elif name in stage.inputs:
-                paths = getattr(input, name, "")
-                values[name] = paths if isinstance(paths, str) else list(paths)
+                values[name] = option(job) if callable(option) else option
             elif name in stage.sections:
                 values[name] = self.settings(stage.sections[name], job)
-            elif name in stage.outputs[1:]:
-                values[name] = getattr(output, name)
             elif name == "seed":
                 values[name] = str(self.seed(stage, job))
-            elif name == "cache":  # in the results folder, whose path a module may prefix
-                values[name] = str(Path(output.out).parents[depth] / ".cache")
+        return values
+
+    def _paths(self, stage: Stage[..., Any], job: Any, input: Any, output: Any) -> dict[str, Any]:
+        """Return the paths of a stage's parameters, which a module may have prefixed."""
+        parents = Path(output.out).parents
+        paths: dict[str, Any] = {
+            "images": lambda: self.data.images(job, input),
+            "folder": lambda: str(Path(input.gaussians).parent),
+            "results": lambda: str(parents[0]),
+            "cache": lambda: str(parents[{"run": 0, "scene": 2, "variant": 3}[stage.scope]] / ".cache"),
+        }
+        values: dict[str, Any] = {}
+        for name in stage.hints:
+            if name in paths:
+                values[name] = paths[name]()
+            elif name in stage.inputs:
+                values[name] = getattr(input, name, "")
+            elif name in stage.outputs[1:]:
+                values[name] = getattr(output, name)
         return values
 
     def vocabulary(self, job: Job) -> list[str]:
@@ -457,11 +469,11 @@ class Plan:
     def baseline(self, job: VariantJob) -> tuple[str, ...]:
         return (method_of(self.stages(job).method.name).fit,)
 
-    def names(self, *_: object) -> str:
+    def names(self, _: object) -> str:
         """Return each variant's name in tables and figures, as JSON; Snakemake would expand plain text."""
         return escape_json_for_report(json.dumps(dict(self.run.labels)))
 
-    def queries(self, job: Job, *_: object) -> str:
+    def queries(self, job: Job) -> str:
         """Return the queries for the panel of a scene without labels on images, as JSON."""
         of_dataset = self.run.queries.get(job.dataset, ())
         queries = self.run.queries.get(f"{job.dataset}/{job.scene}", of_dataset)

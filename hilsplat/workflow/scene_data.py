@@ -62,7 +62,7 @@ class SceneData:
     def row(self, job: Job) -> SceneRow:
         return self._row_of[job.dataset, job.scene]
 
-    def images(self, job: Job, input: Sequence[str], _: object) -> str:
+    def images(self, job: Job, input: Sequence[str]) -> str:
         """Return the parameter of `poses`: the image folder."""
         row = self.row(job)
         return input[0] if row.generated or is_exported(row.source) else portable(row.folder)
@@ -84,14 +84,14 @@ class SceneData:
 
         return digest
 
-    def is_render(self, job: Job, *_: object) -> bool:
+    def is_render(self, job: Job) -> bool:
         return self.row(job).generated is not None
 
-    def poses(self, job: Job, *_: object) -> str:
+    def poses(self, job: Job) -> str:
         """Return the option of `poses`: the file of known poses, if the sheet names one."""
         return portable(self.row(job).poses)
 
-    def unit(self, job: Job, *_: object) -> str:
+    def unit(self, job: Job) -> str:
         return self.row(job).unit
 
     def require_no_braces(self, row: SceneRow) -> None:
@@ -109,7 +109,7 @@ class SceneData:
         """Return the input of `source`: a data set's files that contain the images and poses."""
         return [portable(path) for path in image_files(self.row(job).source, self.data_root)]
 
-    def source_name(self, job: Job, *_: object) -> str:
+    def source_name(self, job: Job) -> str:
         return self.row(job).source.removeprefix(DATA_PREFIX)
 
     def source_reader(self, job: Job) -> tuple[str, ...]:
@@ -146,7 +146,7 @@ class SceneData:
         folder = self.row(job).features
         return sorted(portable(path) for path in folder.glob("*_[sf].npy")) if folder is not None else []
 
-    def features_folder(self, job: Job, *_: object) -> str:
+    def features_folder(self, job: Job) -> str:
         return portable(self.row(job).features)
 
     def labels(self, row: SceneRow) -> tuple[str, ...]:
@@ -178,21 +178,21 @@ class SceneData:
             )
         return self.truth(job)
 
-    def name(self, job: Job, *_: object) -> str:
+    def name(self, job: Job) -> str:
         return self.row(job).name
 
-    def scene_name(self, job: Job, *_: object) -> str:
+    def scene_name(self, job: Job) -> str:
         return job.scene
 
-    def generated_source(self, job: Job, *_: object) -> str:
+    def generated_source(self, job: Job) -> str:
         row = self.row(job)
         return row.source if row.generated else ""
 
-    def label_names(self, job: Job, *_: object) -> tuple[str, ...]:
+    def label_names(self, job: Job) -> tuple[str, ...]:
         """Return the labels that a scene is scored against."""
         return self.labels(self.row(job))
 
-    def figure_labels(self, job: Job, *_: object) -> str:
+    def figure_labels(self, job: Job) -> str:
         """Return the labels for queries and outlines in figures, which must be on images, if any."""
         labels = [name for name in self.labels(self.row(job)) if not is_exported(f"{DATA_PREFIX}{name}")]
         return labels[-1] if labels else ""

@@ -25,11 +25,11 @@ PICTURES = {
 """Picture of a scene -> its title in the report."""
 
 
-def table_name(wildcards: Any, *_: object) -> str:
+def table_name(wildcards: Any) -> str:
     return str(wildcards.table)
 
 
-def sweep_name(wildcards: Any, *_: object) -> str:
+def sweep_name(wildcards: Any) -> str:
     return str(wildcards.sweep)
 
 
@@ -38,9 +38,9 @@ def scores_of(plan: Plan, name: str) -> Callable[[Any], list[str]]:
     return lambda wildcards: scores(plan, wildcards.table, name)
 
 
-def absent_of(plan: Plan) -> Callable[..., list[str]]:
+def absent_of(plan: Plan) -> Callable[[Any], list[str]]:
     """Return the option of `table` that lists what was not measured."""
-    return lambda wildcards, *_: absent(plan, wildcards.table)
+    return lambda wildcards: absent(plan, wildcards.table)
 
 
 def scores(plan: Plan, table: str, name: str = "scores.csv") -> list[str]:

@@ -54,7 +54,10 @@ def textured(folder: Path) -> None:
 
 
 SCENE_IN, CACHE = ("--scene", str(SCENE / "scene")), ("--cache", "disk/cache")
-WORLD = ("world", "make", "--source", "world:tabletop:1", "--settings", '{"views": 3, "image_px": 64}')
+WORLD = (
+    *("world", "make", "--source", "world:tabletop:1", "--settings", '{"views": 3, "image_px": 64}'),
+    *("--truth", "disk/truth"),
+)
 POSES = ("poses", "--images", "photos")
 FIT = ("gaussians", *SCENE_IN, "--settings", '{"iterations": 20}', *CACHE, "--report", "disk/gaussians")
 

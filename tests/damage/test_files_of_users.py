@@ -35,7 +35,11 @@ VALUES = {
     "--method": "mine",
     "--published": PROJECT / "config/published.csv",
     "--table": "table.csv",
-    "--variants": '["default"]',
+    "--scores": VARIANT / "scores.csv",
+    "--key-masks": VARIANT / "masks",
+    "--key-tree": VARIANT / "semantic_tree",
+    "--features": SCENE / "scene",
+    "--truth": "made/truth",
     "--source": "world:tabletop:1",
     "--data-root": ".",
     "--folder": SCENE,
@@ -47,7 +51,7 @@ WORDS = {
     "new": ("chair", "photos.zip"),
     "evaluate-files": ("predictions",),
     "table": ("lerf",),
-    "sweep": ("theta",),
+    "sweep-plot": ("theta",),
     "query": ("photos/desk", "mug"),
     "export": ("photos/desk",),
     "world masks": ("photos/desk",),
@@ -60,7 +64,7 @@ FAST = {
     "names": ("--settings", '{"vocabulary": "words.txt"}'),
     "world make": ("--settings", '{"views": 3, "image_px": 32}'),
 }
-OUTPUTS = {"out", "report", "cache", "folder", "sheet"}
+OUTPUTS = {"out", "report", "truth", "cache", "folder", "sheet"}
 NO_OUTPUTS = {"models check", "comparison", "cache"}
 """Commands whose `folder` is only read, and the one that runs in its own process below."""
 

@@ -214,8 +214,8 @@ def test_true_labels_make_masks_only_for_the_diagnostic_segmenter(tmp_path):
     command = found.params("truth_masks")["command"](
         truth, inputs, ["inner/results/synthetic/one/truth/masks"]
     )
-    words = "world perturb --scene inner/scene --truth inner/results/synthetic/one/world/truth --settings '{"
-    assert command.startswith(words) and " --perturb '{" in command
+    assert command.startswith("world perturb --settings '{") and " --perturb '{" in command
+    assert command.endswith(" --scene inner/scene --truth inner/results/synthetic/one/world/truth")
     with pytest.raises(SettingsError, match="photos/desk: masks"):
         found.data.required_truth(Job("photos", "desk", "truth"))
 
@@ -359,6 +359,7 @@ def test_commands_quote_what_they_contain(tmp_path):
         Job(), inputs, SimpleNamespace(out="results/synthetic/one/default/names")
     )
     words = shlex.split(command)
-    assert words[:5] == ["names", "--semantic-tree", "a b", "--clip", "$(c)"]
+    assert words[0] == "names"
+    assert words[words.index("--semantic-tree") :][:4] == ["--semantic-tree", "a b", "--clip", "$(c)"]
     assert json.loads(words[words.index("--settings") + 1])["vocabulary"] == "it's; rm -rf.txt"
     assert words[words.index("--cache") + 1] == "results/.cache"
