@@ -40,8 +40,10 @@ report: "workflow/report/overview.rst"
 LOCK = prepare_process()
 
 
-# This machine's cores if it runs the jobs, or None on a cluster, where --jobs applies instead.
-CORES = workflow.resource_settings.cores
+try:
+    CORES = workflow.cores  # of this machine, if it runs the jobs
+except WorkflowError:  # on a cluster, --jobs applies instead
+    CORES = None
 if CORES == 0:
     raise WorkflowError("with --cores 0, no job can start; expected at least 1")
 try:
