@@ -65,14 +65,14 @@ def test_a_scene_of_langsplat_answers_after_two_commands(
     labels = sorted((project.root / "annotated/photos/theirs").glob("*.json"))[0]
     replace_by_older(labels, labels.read_bytes() + b"\n")
     printed = project.hilsplat("run", "theirs", "--", "-n")
-    assert "rule evaluate:" in printed and "rule masks:" not in printed and "rule gaussians:" not in printed
+    assert "rule evaluate:" in printed and "rule imported_masks:" not in printed and "rule gaussians:" not in printed
     ply = theirs / "output/tiny/point_cloud/iteration_30000/point_cloud.ply"
     features = sorted((theirs / "language_features").glob("*_s.npy"))[0]
     for path in (ply, features):
         content = path.read_bytes()
         replace_by_older(path, content[:-1] + bytes([content[-1] ^ 1]))
     printed = project.hilsplat("run", "theirs", "--", "-n")
-    assert "rule masks:" in printed and "rule gaussians:" in printed and "rule poses:" not in printed
+    assert "rule imported_masks:" in printed and "rule gaussians:" in printed and "rule poses:" not in printed
 
 
 def replace_by_older(path: Path, content: bytes) -> None:
