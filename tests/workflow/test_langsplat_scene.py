@@ -65,7 +65,11 @@ def test_a_scene_of_langsplat_answers_after_two_commands(
     labels = sorted((project.root / "annotated/photos/theirs").glob("*.json"))[0]
     replace_by_older(labels, labels.read_bytes() + b"\n")
     printed = project.hilsplat("run", "theirs", "--", "-n")
-    assert "rule evaluate:" in printed and "rule imported_masks:" not in printed and "rule gaussians:" not in printed
+    assert (
+        "rule evaluate:" in printed
+        and "rule imported_masks:" not in printed
+        and "rule gaussians:" not in printed
+    )
     ply = theirs / "output/tiny/point_cloud/iteration_30000/point_cloud.ply"
     features = sorted((theirs / "language_features").glob("*_s.npy"))[0]
     for path in (ply, features):
