@@ -104,7 +104,7 @@ def contents(root: Path) -> dict[str, str]:
     data = SceneData([row], "", lambda job, *parts: "/".join(["results", job.dataset, job.scene, *parts]))
     inputs = {
         "poses": data.image_files,
-        "gaussians": data.existing_gaussians,
+        "gaussians": data.gaussians_files,
         "masks": data.features,
         "evaluate": data.label_files,
         "names": lambda job: ["words.txt"],
