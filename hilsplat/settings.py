@@ -1,5 +1,6 @@
-"""All settings, each defined once with its default, unit, range and origin.
+"""The settings of the pipeline, each defined once with its default, unit, range and origin.
 
+Baselines and plugins define their own in the same way (`baselines.py`, docs/extending.md).
 Configuration files choose values; this module defines the valid values. A section contains the settings of
 one stage or of related stages, so a changed setting reruns exactly the stages that read its section.
 `hilsplat settings` prints all settings, `hilsplat settings --schema` their JSON schema for editors.

@@ -91,7 +91,7 @@ class Stage(Generic[P, R]):
         artifact: name of the output; stages with an input of this name read it.
         file: name of the output's file or folder.
         command: words of the command after `hilsplat`; empty if none is derived.
-        scope: what has one output each: a run, a scene or a variant of a scene.
+        scope: number of outputs: one per run, per scene, or per variant of a scene.
         when: condition under which this stage makes the artifact, if several can; the first match counts.
         beside: further outputs, given the output.
         reads: further inputs of a call, given its arguments.

@@ -37,7 +37,6 @@ from hilsplat.stage import (
     Threads,
 )
 
-OptionalPath = Annotated[Path | None, typer.Option(show_default=False), Role.INPUT]
 Report = Annotated[Path, typer.Option(help="folder for the fit's report"), Role.OUTPUT]
 Truth = Annotated[Path | None, typer.Option(help="annotations of a generated scene"), Role.INPUT]
 Source = Annotated[str, typer.Option(help="source of a generated scene, such as world:tabletop:201")]

@@ -25,6 +25,7 @@ from hilsplat.base.artifacts import parse_json, write_text
 from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.errors import HilsplatError, SceneError, first_line, foreign
 from hilsplat.base.images import open_image
+from hilsplat.datasets.generators import GENERATORS
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
 from hilsplat.datasets.images.isat import fill_polygons, read_object, stated_size
 from hilsplat.scene.cameras import Camera, Cameras
@@ -63,9 +64,9 @@ def export_labels(scene: Scene, folder: Path, data_root: Path, out: Path) -> int
     Raises:
         SceneError: the scene has no labels.
     """
-    annotated, truth = data_root / "annotated" / scene.name, folder / "world" / "truth"
-    views = scene.views()
-    if truth.is_dir():
+    annotated, views = data_root / "annotated" / scene.name, scene.views()
+    truths = [folder / name / "truth" for name in GENERATORS]
+    if truth := next(filter(Path.is_dir, truths), None):
         known = labels_of_truth(HierarchyAnnotations.load(truth), views)
     else:
         known = known_labels(annotated, scene.cameras, views)

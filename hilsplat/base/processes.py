@@ -31,7 +31,7 @@ Result = TypeVar("Result")
 logger = logging.getLogger(__name__)
 
 PARENT = "HILSPLAT_PARENT"
-"""Environment variable with the id of the Snakemake process; jobs end with it (rules/common.smk)."""
+"""Environment variable with the id of the Snakemake process; jobs end with it (workflow/run.py)."""
 
 PR_SET_PDEATHSIG = 1  # from Linux's <sys/prctl.h>
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # from glibc's <malloc.h>

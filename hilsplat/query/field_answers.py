@@ -20,7 +20,7 @@ from hilsplat.settings import EvaluateSettings
 
 @dataclass(frozen=True)
 class FieldAnswers:
-    """Answers of a scene's language field, which `clip` compares with texts."""
+    """Relevancy from a scene's language field, which `clip` compares with texts."""
 
     views: SceneViews
     language: LanguageField

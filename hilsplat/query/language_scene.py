@@ -52,7 +52,7 @@ class LanguageScene:
     Attributes:
         views: the views, with the Gaussians and nodes that they show.
         clip: the model that embedded the scene's masks.
-        decoded_field: answers of the language field; None if the run has not computed it yet.
+        decoded_field: relevancy from the language field; None if the run has not computed it yet.
         names: the user's names for nodes, which are matched first.
         naming: vocabulary names of the nodes, and words for absent objects; None if the stage has not run.
     """
@@ -132,7 +132,7 @@ class LanguageScene:
 
     @property
     def field(self) -> FieldAnswers:
-        """Answers of the language field; raises ArtifactError if it is not computed yet."""
+        """Relevancy from the language field; raises ArtifactError if it is not computed yet."""
         if self.decoded_field is None:
             raise ArtifactError(
                 f"{self.scene.name} has no language field yet",

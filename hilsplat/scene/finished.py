@@ -9,6 +9,7 @@ from pydantic import ValidationError
 from hilsplat.base.artifacts import read_index, run_command
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.lineage import read_provenance
+from hilsplat.base.plugins import entry_points
 from hilsplat.settings import EvaluateSettings
 
 KEY_VIEWS = "key-views"
@@ -137,10 +138,11 @@ def refining(folder: Path) -> str:
 
 
 def is_drawn(scene: Path) -> bool:
-    """Return whether a `Scene` artifact was made from a synthetic world's renders (from its provenance)."""
+    """Return whether a `Scene` artifact was made from a generator's renders (from its provenance)."""
     record = read_provenance(scene)
     images = record.inputs.get("images") if record else None
-    return images is not None and Path(images.path).parts[-2:] == ("world", "images")
+    folder = Path(images.path) if images else Path()
+    return folder.name == "images" and folder.parent.name in entry_points("hilsplat.generators")
 
 
 def finished_variants(folder: Path) -> list[str]:

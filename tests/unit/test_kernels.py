@@ -1,4 +1,4 @@
-"""Compiled loops live in kernel modules, whose files alone decide whether cached machine code is valid."""
+"""Compiled loops are in kernel modules, whose files alone decide whether cached machine code is valid."""
 
 import ast
 from pathlib import Path

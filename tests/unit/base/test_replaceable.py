@@ -19,7 +19,7 @@ PIPELINE = Registry()
 
 @PIPELINE.stage(scope="run")
 def table(scores: PathIn, out: PathOut) -> None:
-    """Write a table, while somebody adds a file to its input."""
+    """Write a table, and add a file to its input, as a user might meanwhile."""
     out.write_text("text")
     (scores / "added.jpg").write_text("a photograph")
 
