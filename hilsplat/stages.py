@@ -482,7 +482,7 @@ def label_fits(
     """Measure how well masks and nodes fit annotated regions, by level and without queries."""
     from hilsplat.evaluate.label_fits import run_label_fits
 
-    return run_label_fits(scene.parent, masks.parent.name, labels, data_root, out, threads)
+    return run_label_fits(scene, gaussians, masks, semantic_tree, labels, data_root, out, threads)
 
 
 # ---- tables and pictures -------------------------------------------------------------------------

@@ -93,21 +93,25 @@ def masks_of_view(path: Path) -> dict[Level, Bool[np.ndarray, "M P"]]:
 
 
 def run_label_fits(
-    folder: Path, variant: str, labels: str, data_root: Path, out: Path, threads: int = 1
+    scene_folder: Path,
+    gaussians_ply: Path,
+    masks: Path,
+    semantic_tree: Path,
+    labels: str,
+    data_root: Path,
+    out: Path,
+    threads: int = 1,
 ) -> str:
     """Compare nodes and masks with the labels of annotated views; write and return a table.
 
-    The scene folder contains `scene`, `gaussians.ply` and the variant's `masks` and `semantic_tree`. The
-    labels, such as "annotated/photos/desk", must have levels. Without masks, only nodes are compared.
+    The labels, such as "annotated/photos/desk", must have levels. Views without masks compare only nodes.
 
     Raises:
         SceneError: the labels cannot be read or do not fit the scene.
     """
-    folder, scene = Path(folder), Scene.load(folder / "scene")
-    labelled, masks = open_labelled(labels, data_root), folder / variant / "masks"
+    scene, labelled = Scene.load(scene_folder), open_labelled(labels, data_root)
     views = list(truths_of(labelled, scene, 0))  # raises if they don't fit
-    tree = SemanticTree.load(folder / variant / "semantic_tree")
-    gaussians = load_ply(folder / "gaussians.ply")
+    tree, gaussians = SemanticTree.load(semantic_tree), load_ply(gaussians_ply)
     fits = defaultdict[tuple[str, str], dict[Level, Fits]](lambda: {level: Fits() for level in LEVELS})
     with stage_log("label_fits", scene.name) as counts:
         for view in track(views, "views compared"):

@@ -51,7 +51,10 @@ def test_a_finished_scene_is_measured_by_level_and_split(desk_project, tmp_path)
         folder = tmp_path / "annotated/photos/desk"
         write_labels(label_path(folder, view), view, (HEIGHT, WIDTH + NUM_VIEWS), labels, NO_FILE)
     out = tmp_path / "fits.csv"
-    run_label_fits(desk_project / SCENE, "default", "annotated/photos/desk", tmp_path, out)
+    folder = desk_project / SCENE
+    variant = folder / "default"
+    paths = (folder / "scene", folder / "gaussians.ply", variant / "masks", variant / "semantic_tree")
+    run_label_fits(*paths, "annotated/photos/desk", tmp_path, out)
     rows = list(csv.DictReader(out.open()))
     found = {(row["what"].split(",")[0], row["views"], row["level"]) for row in rows}
     places = [("nodes", "held out"), ("nodes", "training"), ("masks", "training")]  # held out: no masks
