@@ -27,6 +27,6 @@ def test_a_failed_job_is_shown_in_full_with_the_log_of_its_stage(copy_of_finishe
     failed = copy_of_finished.snakemake(f"{SCENE}/default/contributions", "--config", no_masks, check=False)
     assert failed.returncode != 0
     assert "Error in rule contributions:" in failed.stderr
-    assert "shell:" in failed.stderr and " contributions --scene" in failed.stderr
+    assert "shell:" in failed.stderr and " contributions --settings" in failed.stderr
     assert "Logfile" in failed.stderr  # profiles/default was found
     assert "has masks" in failed.stderr.partition("Logfile")[2]
