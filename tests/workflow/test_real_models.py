@@ -33,9 +33,10 @@ def serve(hub: LoopbackHub, project: Path, folder: Path) -> None:
 def test_get_new_run_and_query(project: Path, plain: Project, tmp_path: Path) -> None:
     (plain.root / "config/small.yaml").write_text(json.dumps({"overrides": {"photos": SMALL}}))
     world = {"views": 12, "image_px": 128, "arc_deg": 100, "objects": 3, "samples": 2}
-    source = ("--source", "world:tabletop:210", "--out", "drawn", "--settings", json.dumps(world))
-    plain.hilsplat("world", "make", *source)
-    (plain.root / "drawn/images").rename(plain.root / "photographs")
+    places = ("--out", "photographs", "--truth", "truth")
+    plain.hilsplat(
+        "world", "make", "--source", "world:tabletop:210", "--settings", json.dumps(world), *places
+    )
 
     without = plain.hilsplat("new", "before", "photographs")
     assert "text queries by clip-tiny" in without and "meaningless" in without
@@ -58,7 +59,7 @@ def test_get_new_run_and_query(project: Path, plain: Project, tmp_path: Path) ->
         index = json.loads((plain.root / DESK / "default" / stage / "index.json").read_text())
         assert index["model"] == f"models/{name}"
         record = json.loads((plain.root / DESK / f"default/{stage}.provenance.json").read_text())
-        assert record["settings"]["model"] == f"models/{name}"
+        assert record["settings"][stage]["model"] == f"models/{name}"
     answer = plain.hilsplat("query", "photos/desk", "mug")
     assert "to 'mug' in photos/desk" in answer and "meaningless" not in answer
 

@@ -211,9 +211,8 @@ def test_true_labels_make_masks_only_for_the_diagnostic_segmenter(tmp_path):
     assert found.kind("masks", Job()).name == "masks" and found.kind("masks", truth).name == "truth_masks"
     assert found.data.required_truth(truth) == ["results/synthetic/one/world/truth"]
     inputs = SimpleNamespace(scene="inner/scene", truth="inner/results/synthetic/one/world/truth")
-    command = found.params("truth_masks")["command"](
-        truth, inputs, ["inner/results/synthetic/one/truth/masks"]
-    )
+    outputs = SimpleNamespace(out="inner/results/synthetic/one/truth/masks")
+    command = found.params("truth_masks")["command"](truth, inputs, outputs)
     assert command.startswith("world perturb --settings '{") and " --perturb '{" in command
     assert command.endswith(" --scene inner/scene --truth inner/results/synthetic/one/world/truth")
     with pytest.raises(SettingsError, match="photos/desk: masks"):
