@@ -28,6 +28,7 @@ from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.evidence import mask_evidence
 from hilsplat.semantic_tree.linkage import pooled_linkage
 from hilsplat.semantic_tree.tree import SemanticTree
+from hilsplat.semantic_tree.view_pairs import view_pairs
 from hilsplat.settings import AutoencoderSettings
 from hilsplat.splat.rasterise.api import pixel_weights
 from tests.unit.assembled_scene import assembled
@@ -177,11 +178,12 @@ def test_linkage_of_a_synthetic_scene(benchmark):
         columns.append(seen)
     row, column = np.concatenate(rows), np.concatenate(columns)
     shares = sp.csr_matrix((rng.uniform(0.3, 1, len(row)), (row, column)), shape=(1000, 60_000))
+    visible = sp.csr_matrix(visible)
 
     def link_three_levels() -> int:
         found = 0
         for _ in LEVELS:
-            evidence = mask_evidence(shares, np.ones(60_000), visible, view, 0.2)
+            evidence = mask_evidence(shares, np.ones(60_000), visible, view, view_pairs(visible), 0.2)
             found += pooled_linkage(evidence, 0.3)[0].max() + 1
         return found
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
 from cpusplat.lanes import WIDTH
 from hilsplat.contributions.kernels import add_columns, normalise, render_rows
@@ -28,9 +28,14 @@ def normalised_weights(weights: sp.csr_matrix) -> sp.csr_matrix:
 
 def visible_mass(weights: sp.csr_matrix) -> Float32[np.ndarray, " N"]:
     """Return each Gaussian's sum of weights over all pixels (px), computed in float64."""
-    out = np.zeros(weights.shape[1], np.float64)
-    add_columns(weights.indices, weights.data, out)
-    return out.astype(np.float32)
+    return column_sums(weights).astype(np.float32)
+
+
+def column_sums(matrix: sp.csr_matrix) -> Float64[np.ndarray, " N"]:
+    """Return the sum of each column, entry by entry in float64."""
+    sums = np.zeros(matrix.shape[1])
+    add_columns(matrix.indices, matrix.data, sums)
+    return sums
 
 
 def rendered_latents(

@@ -46,16 +46,16 @@ class Contributions:
 
     def rows_of_views(self) -> list[Int64[np.ndarray, " m"]]:
         """Return the rows of each view, in the order of `views` and of the view's masks."""
-        return [np.flatnonzero(self.view == number) for number in range(len(self.views))]
+        starts = np.searchsorted(self.view, np.arange(1, len(self.views)))
+        return np.split(np.arange(len(self)), starts)
 
     def matrix(self, name: str) -> sp.csr_matrix:
-        """Memory-map `A`, `A_half` or `S` (M x N) from its files."""
-        parts = tuple(self._mapped(f"{name}/{part}") for part in ("data", "indices", "indptr"))
-        return sp.csr_matrix(parts, shape=(len(self), self.num_gaussians), copy=False)
+        """Memory-map `A`, `A_half` or `S` (M x N) from its files, or `mass` (V x N).
 
-    def mass(self) -> Float32[np.ndarray, "V N"]:
-        """Memory-map the visible mass of each Gaussian in each training view, px."""
-        return self._mapped("mass")
+        `mass` is the visible mass of each Gaussian in each training view, px.
+        """
+        parts = tuple(self._mapped(f"{name}/{part}") for part in ("data", "indices", "indptr"))
+        return sp.csr_matrix(parts, shape=(len(parts[2]) - 1, self.num_gaussians), copy=False)
 
     def means(self) -> Float32[np.ndarray, "N 3"]:
         """Read the centres of the Gaussians, in scene units."""

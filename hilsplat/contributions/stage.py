@@ -43,7 +43,7 @@ from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 from hilsplat.splat.rasterise.device import choose_device
 
-MATRICES = ("A", "A_half", "S")
+MATRICES = ("A", "A_half", "S", "mass")
 PARTS = {"data": np.float32, "indices": np.int32, "indptr": np.int64}
 
 WEIGHTS_PER_PIXEL = 40  # weights per pixel in a typical scene
@@ -53,29 +53,25 @@ MAX_WEIGHTS_TOGETHER = 2**25
 
 
 class ArrayStream:
-    """An .npy file written row by row, so that the stage never keeps all of its output in memory.
+    """An .npy file of numbers that grows, so that the stage never keeps all of its output in memory."""
 
-    `row_shape` is the shape of one row: () for an array of numbers.
-    """
-
-    def __init__(self, path: Path, dtype: type, row_shape: tuple[int, ...] = ()) -> None:
-        self._dtype, self._row_shape, self._rows = np.dtype(dtype), row_shape, 0
+    def __init__(self, path: Path, dtype: type) -> None:
+        self._dtype, self._length = np.dtype(dtype), 0
         path.parent.mkdir(parents=True, exist_ok=True)
         self._stream = path.open("wb")
         self._write_header()
 
     def _write_header(self) -> None:
-        # the header's size does not depend on the number of rows
-        shape = (self._rows, *self._row_shape)
-        header = {"descr": self._dtype.str, "fortran_order": False, "shape": shape}
+        # the header's size does not depend on the length
+        header = {"descr": self._dtype.str, "fortran_order": False, "shape": (self._length,)}
         np.lib.format.write_array_header_1_0(self._stream, header)
 
     def __len__(self) -> int:
-        return self._rows
+        return self._length
 
     def append(self, values: np.ndarray) -> None:
         values = np.ascontiguousarray(values, self._dtype)
-        self._rows += len(values)
+        self._length += len(values)
         self._stream.write(values.data)
 
     def close(self) -> None:
@@ -87,7 +83,7 @@ class ArrayStream:
 class Output:
     """The stage's files: matrices are written view by view, and one row per mask at the end."""
 
-    def __init__(self, folder: Path, num_gaussians: int) -> None:
+    def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._rows: dict[str, list[np.ndarray]] = {}
         self._streams = {
@@ -95,13 +91,12 @@ class Output:
             for name in MATRICES
             for part, dtype in PARTS.items()
         }
-        self._streams["mass"] = ArrayStream(folder / "mass.npy", np.float32, (num_gaussians,))
         for name in MATRICES:
             self._streams[f"{name}_indptr"].append(np.zeros(1))
 
     def append(self, number: int, masks: HierarchicalMasks, matrices: dict[str, np.ndarray]) -> None:
         """Add the matrices of view `number` (see `view_contributions`)."""
-        values = matrices | {"mass": matrices["mass"][None]}
+        values = dict(matrices)
         for name in MATRICES:
             values[f"{name}_indptr"] = matrices[f"{name}_indptr"][1:] + len(self._streams[f"{name}_data"])
         for name, stream in self._streams.items():
@@ -219,7 +214,7 @@ def run_contributions(
     with stage_log("contributions", scene.name) as counts, atomic_folder(out) as folder:
         builder = QuadraticBuilder(len(gaussians), settings.keep, threads)
         summed = checkpoint.resume(builder)
-        output = Output(folder, len(gaussians))
+        output = Output(folder)
         prepared = in_order(prepare, range(len(cameras)), together)
         prepared = track(prepared, "contributions of views", len(cameras))
         for number, (masks, matrices, labelled) in enumerate(prepared):

@@ -37,6 +37,7 @@ def view_contributions(
 ) -> dict[str, np.ndarray]:
     """Return all matrices of one view except W as plain arrays (`A_data`, `A_indices`, `A_indptr`, ...).
 
+    `mass` has one row: the Gaussians that the view shows at all.
     The view's name seeds the random halves; `weights` are normalised. `threads` does not affect the result.
     """
     total_px = np.concatenate([[0], np.cumsum(masks.area_px)])
@@ -49,7 +50,10 @@ def view_contributions(
     counts, sizes, columns, sums = (np.concatenate(part) for part in zip(*parts, strict=True))
     starts = np.concatenate([[0], np.cumsum(sizes)])
     painted, in_half = counts.T
-    arrays = {"pixels": painted.copy(), "half_pixels": in_half.copy(), "mass": visible_mass(weights)}
+    arrays = {"pixels": painted.copy(), "half_pixels": in_half.copy()}
+    mass = visible_mass(weights)
+    seen = np.flatnonzero(mass)
+    arrays |= {"mass_data": mass[seen], "mass_indices": seen, "mass_indptr": np.array([0, len(seen)])}
     areas = {"S": np.ones(len(masks)), "A": np.maximum(painted, 1), "A_half": np.maximum(in_half, 1)}
     for index, (name, area) in enumerate(areas.items()):
         present = sums[:, index] > 0

@@ -9,6 +9,7 @@ from hilsplat.base.artifacts import read_index, read_npz, sealed, write_json
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.lineage import require_made_from, sha256_of_file
 from hilsplat.base.progress import stage_log
+from hilsplat.contributions.compositing import column_sums
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.code import LanguageField, autoencoder_file, load_latents
@@ -68,7 +69,7 @@ def run_field(
             from hilsplat.field.literal_trainer import train_by_rendering
 
             features, report = train_by_rendering(problem, contrast, contributions, rendered, seed, threads)
-        total_mass = contributions.mass().sum(axis=0, dtype=np.float64)
+        total_mass = column_sums(contributions.matrix("mass"))
         features = keep_labelled(features, problem.mass, total_mass, settings.min_labelled_share)
         LanguageField(features, contributions.gaussians_sha256, code_sha256).save(out)
         unseen = int((problem.mass.max(axis=1) == 0).sum())

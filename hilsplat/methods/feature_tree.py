@@ -96,7 +96,7 @@ def run_feature_tree(
     farthest = merge_distances(problem.masks.means(features), contributions, parents)
     features = np.where((problem.mass > 0)[:, :, None], features, np.float32(np.nan))
     clusters = nested_clusters(features, farthest, seed)
-    S, mass = contributions.matrix("S"), contributions.mass()
+    S, mass = contributions.matrix("S"), contributions.matrix("mass")
 
     def nodes(level: Level) -> LevelNodes:
         rows = contributions.rows_of(level)

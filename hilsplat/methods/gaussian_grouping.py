@@ -42,9 +42,9 @@ SAMPLES = 1000
 
 def mask_identities(contributions: Contributions, threads: int) -> Int64[np.ndarray, " M"]:
     """Return each mask's identity at its level, by our default linking via shared Gaussians; -1 for none."""
-    S, mass = contributions.matrix("S"), contributions.mass()
+    S, mass = contributions.matrix("S"), contributions.matrix("mass")
     settings = SemanticTreeSettings()
-    settings = settings.model_copy(update={"min_views": min(settings.min_views, len(mass))})
+    settings = settings.model_copy(update={"min_views": min(settings.min_views, mass.shape[0])})
     rows_of_levels = [contributions.rows_of(level) for level in LEVELS]
     identity = np.full(len(contributions), NONE, np.int64)
     of_levels = linked_nodes(S, mass, contributions.view, rows_of_levels, settings, threads)

@@ -18,6 +18,7 @@ from hilsplat.base.artifacts import read_index, write_index, write_json, write_n
 from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.progress import stage_log
+from hilsplat.contributions.compositing import column_sums
 from hilsplat.contributions.rows import Contributions
 from hilsplat.segment.digests import require_same_masks
 from hilsplat.semantic_tree.export import readable_nodes
@@ -95,9 +96,9 @@ def build_tree(
         join_wholes: join regions that touch in 3D, for segmenters that detect only colour regions.
         of_levels: nodes of each level, to use instead of linked masks.
     """
-    S, mass, means = contributions.matrix("S"), contributions.mass(), contributions.means()
+    S, mass, means = contributions.matrix("S"), contributions.matrix("mass"), contributions.means()
     view = contributions.view
-    total_mass = mass.sum(axis=0, dtype=np.float64)
+    total_mass = column_sums(mass)
 
     level_of_node: list[int] = []
     quality: list[float] = []

@@ -1,19 +1,17 @@
 """Agreement of masks from different views on the Gaussians that both views see.
 
-Everything is sparse: only masks that share Gaussians are compared.
+Everything is sparse: only masks of partner views that share Gaussians are compared.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Bool, Float, Float64, Int32
+from jaxtyping import Float, Float64, Int32, Int64
 
-from cpusplat.threads import over_edges
+from cpusplat.threads import over_ranges
 from hilsplat.semantic_tree.kernels import seen_sizes, shared_pairs
-
-ROWS_AT_A_TIME = 64
-"""Number of masks per thread task."""
+from hilsplat.semantic_tree.view_pairs import ViewPairs
 
 
 @dataclass(frozen=True)
@@ -21,24 +19,32 @@ class Evidence:
     """Agreement of each pair of the M masks of a level on the Gaussians that both views see.
 
     Attributes:
-        intersection: soft intersection of pairs a < b from different views that share Gaussians.
-        union: soft union of the same pairs, in the same order.
-        seen: visible size of each mask in each of the V views: the full size in the mask's own view, 0 in
-            views that see too little of the mask. A pair that is not stored has intersection 0 and union
-            `seen[a, view[b]] + seen[b, view[a]]`.
+        indptr: where the pairs of each mask a begin.
+        indices: mask b > a of each pair, from a different view.
+        sums: intersection of each pair, and its union minus both visible sizes in `sizes`.
+        size_indptr: where the visible sizes of each mask begin.
+        size_views: partners of the mask's view, in ascending order.
+        sizes: visible size of the mask in that view, 0 if the view sees too little of the mask.
+        view: view of each mask.
+        num_views: number of views.
     """
 
-    intersection: sp.csr_matrix
-    union: sp.csr_matrix
-    seen: Float64[np.ndarray, "M V"]
+    indptr: Int64[np.ndarray, " M1"]
+    indices: Int32[np.ndarray, " E"]
+    sums: Float64[np.ndarray, "E 2"]
+    size_indptr: Int64[np.ndarray, " M1"]
+    size_views: Int32[np.ndarray, " F"]
+    sizes: Float64[np.ndarray, " F"]
     view: Int32[np.ndarray, " M"]
+    num_views: int
 
 
 def mask_evidence(
     shares: sp.csr_matrix,
     importance: Float[np.ndarray, " N"],
-    visible: Bool[np.ndarray, "V N"],
+    visible: sp.csr_matrix,
     view: Int32[np.ndarray, " M"],
+    pairs: ViewPairs,
     min_covisible: float,
     threads: int = 1,
 ) -> Evidence:
@@ -54,26 +60,32 @@ def mask_evidence(
     both full sizes). Masks that share Gaussians are ignored if each view shows less than `min_covisible` of
     the other mask. Of masks that share none, each counts if the other view shows at least that share of it.
 
-    `shares` has one row per mask of a level, and zeros for Gaussians not visible in the mask's view.
     The result does not depend on the number of threads.
+
+    Args:
+        shares: one row per mask of a level, view by view; zeros for Gaussians not visible in the mask's view.
+        visible: (V, N) with a stored entry for each Gaussian visible in each view.
+        view: ascending view of each mask.
+        pairs: partners of each view.
     """
-    num, share = len(view), shares.data.astype(np.float64)
+    num, (num_views, num_gaussians) = len(view), visible.shape
+    share = shares.data.astype(np.float64)
     weight = importance.astype(np.float64)[shares.indices]
-    sizes, weighted = weight * np.square(share), weight * share
-    columns = sp.csr_matrix((share, shares.indices, shares.indptr), shape=shares.shape, copy=False).tocsc()
-    rows, by_column = (shares.indptr, shares.indices), (columns.indptr, columns.indices, columns.data)
-    flags = np.ascontiguousarray(visible.T).view(np.uint8)
-    everywhere = np.zeros((num, len(visible)))  # size of each mask as seen from each view
-    edges = [0, *range(ROWS_AT_A_TIME, num, ROWS_AT_A_TIME), num]
-    over_edges(seen_sizes, edges, threads, *rows, sizes, flags, everywhere)
-    full = everywhere[np.arange(num), view]
-    seen = np.where(everywhere < min_covisible * full[:, None], 0.0, everywhere)
-    pairs = (*rows, weighted, *by_column, view, seen, everywhere)
-    parts = [list(arrays) for arrays in zip(*over_edges(shared_pairs, edges, threads, *pairs), strict=True)]
-    # Each list is freed once it is concatenated, because two copies of all pairs would need much memory.
-    counts, indices, inter, union = (np.concatenate(parts.pop(0)) for _ in range(4))
-    indptr = np.concatenate(([0], np.cumsum(counts)))
-    intersections, unions = (
-        sp.csr_matrix((values, indices, indptr), shape=(num, num)) for values in (inter, union)
-    )
-    return Evidence(intersections, unions, seen, view)
+    squares, weighted = weight * np.square(share), weight * share
+    starts = np.searchsorted(view, np.arange(num_views + 1))
+    row_start = np.concatenate([[0], np.cumsum(np.diff(pairs.indptr)[view])])
+    masks = starts, (shares.indptr, shares.indices), num_gaussians
+    partners = (pairs.indptr, pairs.partners, pairs.mirror), row_start
+    seen = np.zeros(row_start[-1])  # size of each mask as seen from each partner of its view
+    shown = visible.indptr, visible.indices
+    over_ranges(seen_sizes, num_views, threads, masks, squares, shown, partners, seen)
+    of_mask = np.repeat(np.arange(num), np.diff(row_start))
+    place = np.arange(len(seen)) - row_start[of_mask] + pairs.indptr[view[of_mask]]
+    seen_from = pairs.partners[place]
+    own = seen_from == view[of_mask]
+    least = min_covisible * seen[own]
+    parts = over_ranges(shared_pairs, num_views, threads, masks, share, weighted, partners, seen, least)
+    counts, indices, sums = (np.concatenate(part) for part in zip(*parts, strict=True))
+    indptr = np.concatenate([[0], np.cumsum(counts)])
+    sizes = np.where(seen < least[of_mask], 0.0, seen)
+    return Evidence(indptr, indices, sums, row_start, seen_from, sizes, view, num_views)

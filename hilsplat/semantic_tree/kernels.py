@@ -10,61 +10,183 @@ ROWS_OF_A_BLOCK = 256
 
 
 @compiled
-def seen_sizes(begin, end, indptr, indices, sizes, visible, out):
-    """Write to `out` the size of each mask on the Gaussians visible in each view."""
-    for a in range(begin, end):
-        for k in range(indptr[a], indptr[a + 1]):
-            g = indices[k]
-            for v in range(visible.shape[1]):
-                out[a, v] += sizes[k] * visible[g, v]
+def at_entries(mass, row_view, order, matrix, out):
+    """Write to `out` the mass of each stored entry's Gaussian in the view of its row.
+
+    `order` lists the rows view by view, so that the mass of a view is unpacked once.
+    """
+    mass_indptr, mass_indices, mass_data, num_gaussians = mass
+    indptr, indices = matrix
+    unpacked = np.zeros(num_gaussians, np.float32)
+    current = -1
+    for row in order:
+        if row_view[row] != current:
+            _unpack(current, mass_indptr, mass_indices, mass_data, unpacked, False)
+            current = row_view[row]
+            _unpack(current, mass_indptr, mass_indices, mass_data, unpacked, True)
+        for k in range(indptr[row], indptr[row + 1]):
+            out[k] = unpacked[indices[k]]
 
 
 @compiled
-def shared_pairs(
-    begin, end, indptr, indices, weighted, col_indptr, col_rows, col_shares, view, seen, everywhere
-):
-    """Return the pairs a < b that share Gaussians: number per row, b, intersections and unions."""
-    num = len(indptr) - 1
-    touched_by = np.full(num, -1, np.int64)
-    sums = np.zeros(num)
-    found = np.empty(num, np.int32)
-    counts = np.zeros(end - begin, np.int64)
+def _unpack(view, indptr, indices, data, out, fill):
+    """Write a view's values to their columns of `out`, or zeros if `fill` is false; no view if negative."""
+    if view >= 0:
+        for k in range(indptr[view], indptr[view + 1]):
+            out[indices[k]] = data[k] if fill else 0.0
+
+
+@compiled
+def add_views(mass, pair_view, pair_row, order, matrix, out):
+    """Add to the entries of row `pair_row` their Gaussians' mass in view `pair_view`, pair by pair."""
+    mass_indptr, mass_indices, mass_data, num_gaussians = mass
+    indptr, indices = matrix
+    unpacked = np.zeros(num_gaussians, np.float32)
+    current = -1
+    for pair in order:
+        if pair_view[pair] != current:
+            _unpack(current, mass_indptr, mass_indices, mass_data, unpacked, False)
+            current = pair_view[pair]
+            _unpack(current, mass_indptr, mass_indices, mass_data, unpacked, True)
+        row = pair_row[pair]
+        for k in range(indptr[row], indptr[row + 1]):
+            out[k] += unpacked[indices[k]]
+
+
+@compiled
+def divide_by_unions(mass, row_view, order, node, area, matrix, data):
+    """Divide intersections of rows with nodes by their unions: area plus the node's mass minus both."""
+    mass_indptr, mass_indices, mass_data, _ = mass
+    indptr, indices = matrix
+    size = np.zeros(node.max() + 1 if len(node) else 1)
+    current = -1
+    for row in order:
+        if row_view[row] != current:
+            current = row_view[row]
+            size[:] = 0.0
+            for k in range(mass_indptr[current], mass_indptr[current + 1]):
+                if node[mass_indices[k]] >= 0:
+                    size[node[mass_indices[k]]] += mass_data[k]
+        for k in range(indptr[row], indptr[row + 1]):
+            data[k] /= area[row] + size[indices[k]] - data[k]
+
+
+@compiled
+def _numbered(begin, end, indices, number):
+    """Number the columns of entries begin..end by first appearance in `number`; return how many they are."""
+    count = 0
+    for k in range(begin, end):
+        if number[indices[k]] < 0:
+            number[indices[k]] = count
+            count += 1
+    return count
+
+
+@compiled
+def seen_sizes(begin, end, masks, sizes, visible, pairs, out):
+    """Write to `out` the size of each mask of views begin..end on the Gaussians visible in each partner."""
+    starts, (indptr, indices), num_gaussians = masks
+    visible_indptr, visible_indices = visible
+    (pair_indptr, partners, _), row_start = pairs
+    number = np.full(num_gaussians, -1, np.int32)
+    for u in range(begin, end):
+        first, last = indptr[starts[u]], indptr[starts[u + 1]]
+        count = _numbered(first, last, indices, number)
+        width = pair_indptr[u + 1] - pair_indptr[u]
+        flags = np.zeros((count, width), np.uint8)
+        for p in range(width):
+            v = partners[pair_indptr[u] + p]
+            for k in range(visible_indptr[v], visible_indptr[v + 1]):
+                if number[visible_indices[k]] >= 0:
+                    flags[number[visible_indices[k]], p] = 1
+        for a in range(starts[u], starts[u + 1]):
+            sums = out[row_start[a] : row_start[a + 1]]
+            for k in range(indptr[a], indptr[a + 1]):
+                seen = flags[number[indices[k]]]
+                for p in range(width):
+                    sums[p] += sizes[k] * seen[p]
+        for k in range(first, last):
+            number[indices[k]] = -1
+
+
+@compiled
+def shared_pairs(begin, end, masks, share, weighted, pairs, seen, least):
+    """Return the pairs of masks a < b that share Gaussians, for masks a of views begin..end.
+
+    Returns:
+        number of pairs per mask a, masks b, and two sums per pair: the intersection, and the union minus the
+        sizes of both masks (0 for a mask of which the other view sees less than `least`).
+    """
+    starts, (indptr, indices), num_gaussians = masks
+    (pair_indptr, partners, mirror), row_start = pairs
+    number = np.full(num_gaussians, -1, np.int32)
+    counts = np.zeros(starts[end] - starts[begin], np.int64)
     out, out_sums = np.empty(1024, np.int32), np.empty((1024, 2))
     done = 0
-    for a in range(begin, end):
+    for u in range(begin, end):
+        first, last = indptr[starts[u]], indptr[starts[u + 1]]
+        lists = np.zeros(_numbered(first, last, indices, number) + 2, np.int64)
+        for k in range(first, last):
+            lists[number[indices[k]] + 2] += 1
+        lists = np.cumsum(lists)  # where the list of each Gaussian's masks ends, afterwards begins
+        of, of_weighted = np.empty(last - first, np.int32), np.empty(last - first)
+        for a in range(starts[u], starts[u + 1]):
+            for k in range(indptr[a], indptr[a + 1]):
+                at = lists[number[indices[k]] + 1]
+                of[at], of_weighted[at] = a - starts[u], weighted[k]
+                lists[number[indices[k]] + 1] += 1
+        from_a, to_b, sums = np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty((1024, 2))
         count = 0
-        for k in range(indptr[a], indptr[a + 1]):
-            g = indices[k]
-            for t in range(col_indptr[g + 1] - 1, col_indptr[g] - 1, -1):
-                b = col_rows[t]
-                if b <= a:
-                    break
-                if view[b] != view[a]:
-                    if touched_by[b] != a:
-                        touched_by[b] = a
-                        sums[b] = 0.0
-                        found[count] = b
+        for p in range(pair_indptr[u], pair_indptr[u + 1]):
+            v = partners[p]
+            if v <= u:
+                continue
+            shared = np.zeros((starts[v + 1] - starts[v], starts[u + 1] - starts[u]))
+            for b in range(starts[v], starts[v + 1]):
+                of_b = shared[b - starts[v]]
+                for k in range(indptr[b], indptr[b + 1]):
+                    n = number[indices[k]]
+                    if n >= 0:
+                        for t in range(lists[n], lists[n + 1]):
+                            of_b[of[t]] += of_weighted[t] * share[k]
+            if count + shared.size > len(to_b):
+                room = 2 * (count + shared.size)
+                from_a = np.concatenate((from_a, np.empty(room - len(from_a), np.int32)))
+                to_b, sums = enlarged(to_b, sums, count, room)
+            for b in range(starts[v], starts[v + 1]):
+                for a in range(starts[u], starts[u + 1]):
+                    both = shared[b - starts[v], a - starts[u]]
+                    if both == 0.0:
+                        continue
+                    size_a = seen[row_start[a] + p - pair_indptr[u]]
+                    size_b = seen[row_start[b] + mirror[p]]
+                    enough_a = size_a if size_a >= least[a] else 0.0
+                    enough_b = size_b if size_b >= least[b] else 0.0
+                    if enough_a > 0.0 or enough_b > 0.0:
+                        from_a[count], to_b[count], sums[count, 0] = a, b, both
+                        sums[count, 1] = size_a + size_b - both - (enough_a + enough_b)
                         count += 1
-                    sums[b] += weighted[k] * col_shares[t]
-        found[:count] = np.sort(found[:count])
+        for k in range(first, last):
+            number[indices[k]] = -1
         if done + count > len(out):
             out, out_sums = enlarged(out, out_sums, done, 2 * (done + count))
-        for place in range(count):
-            b = found[place]
-            if seen[a, view[b]] == 0.0 and seen[b, view[a]] == 0.0:
-                continue
-            out[done] = b
-            out_sums[done, 0] = sums[b]
-            out_sums[done, 1] = everywhere[a, view[b]] + everywhere[b, view[a]] - sums[b]
-            counts[a - begin] += 1
-            done += 1
-    return counts, out[:done].copy(), out_sums[:done, 0].copy(), out_sums[:done, 1].copy()
+        places = np.zeros(starts[u + 1] - starts[u] + 1, np.int64)
+        for k in range(count):
+            places[from_a[k] - starts[u] + 1] += 1
+        counts[starts[u] - starts[begin] : starts[u + 1] - starts[begin]] = places[1:]
+        places = done + np.cumsum(places)
+        for k in range(count):  # by mask a; masks b stay in order
+            at = places[from_a[k] - starts[u]]
+            out[at], out_sums[at] = to_b[k], sums[k]
+            places[from_a[k] - starts[u]] += 1
+        done += count
+    return counts, out[:done].copy(), out_sums[:done].copy()
 
 
 @compiled
-def initial_neighbours(indptr, indices, intersection, union, seen, view):
-    """Return the initial pool of neighbours for `link`, with 25 % spare room, and the bounds of each run."""
-    num = len(view)
+def neighbour_runs(indptr, indices, sums):
+    """Return runs of neighbours for `link` (start, stop, ids, values), with 25 % spare room."""
+    num = len(indptr) - 1
     start = np.zeros(num + 1, np.int64)
     for a in range(num):
         start[a + 1] += indptr[a + 1] - indptr[a]
@@ -73,21 +195,19 @@ def initial_neighbours(indptr, indices, intersection, union, seen, view):
     start = np.cumsum(start)[:num]
     stop = start.copy()
     room = 2 * len(indices) + len(indices) // 2 + 1024
-    neighbour = np.empty(room, np.int32)
-    inter, extra = np.empty(room), np.empty(room)
+    ids, values = np.empty(room, np.int32), np.empty((room, 2))
     for a in range(num):  # rows in order, so that each run's neighbours are also in order
         for k in range(indptr[a], indptr[a + 1]):
             b = np.int64(indices[k])
-            apart = seen[a, view[b]] + seen[b, view[a]]
             for own, other in ((a, b), (b, a)):
-                at = stop[own]
-                neighbour[at], inter[at], extra[at] = other, intersection[k], union[k] - apart
+                ids[stop[own]] = other
+                values[stop[own]] = sums[k]
                 stop[own] += 1
-    return start, stop, neighbour, inter, extra
+    return start, stop, ids, values
 
 
 @compiled
-def _merged_run(begin, end, first, neighbour, inter, extra, root, place_of, self_a, self_b):
+def _merged_run(begin, end, first, ids, values, root, place_of, self_a, self_b):
     """Copy a run of neighbours to position `first`, and sum entries merged after it was written.
 
     Entries copied there from an earlier run of the cluster are summed too. Entries that refer to the
@@ -96,77 +216,123 @@ def _merged_run(begin, end, first, neighbour, inter, extra, root, place_of, self
     own_inter, own_extra = 0.0, 0.0
     last = first
     for k in range(begin, end):
-        c = root[neighbour[k]]
-        value, more = inter[k], extra[k]
+        c = root[ids[k]]
+        value, more = values[k, 0], values[k, 1]
         if c in (self_a, self_b):
             own_inter += value
             own_extra += more
         elif place_of[c] < 0:
             place_of[c] = last
-            neighbour[last], inter[last], extra[last] = c, value, more
+            ids[last], values[last, 0], values[last, 1] = c, value, more
             last += 1
         else:
-            inter[place_of[c]] += value
-            extra[place_of[c]] += more
+            values[place_of[c], 0] += value
+            values[place_of[c], 1] += more
     return last, own_inter, own_extra
 
 
 @compiled
-def _plus_sizes(total, i, j, seen, members, shown, shows):
-    """For each view, add to `total` each cluster's size times the number of the other's members there."""
-    num_views = seen.shape[1]
-    at_i = at_j = 0
-    while at_i < shows[i] or at_j < shows[j]:
-        next_i = shown[i, at_i] if at_i < shows[i] else num_views
-        next_j = shown[j, at_j] if at_j < shows[j] else num_views
-        v = min(next_i, next_j)
-        at_i += next_i == v
-        at_j += next_j == v
-        total += seen[i, v] * members[j, v] + seen[j, v] * members[i, v]
+def _united_run(a, b, first, runs):
+    """Write the sum of two runs with ascending ids to `first` as the run of `a`, and return its end."""
+    start, stop, ids, values = runs
+    at_a, at_b, last = start[a], start[b], first
+    while at_a < stop[a] or at_b < stop[b]:
+        use_a = at_a < stop[a] and (at_b == stop[b] or ids[at_a] <= ids[at_b])
+        use_b = at_b < stop[b] and (at_a == stop[a] or ids[at_b] <= ids[at_a])
+        ids[last] = ids[at_a] if use_a else ids[at_b]
+        values[last, 0] = (values[at_a, 0] if use_a else 0.0) + (values[at_b, 0] if use_b else 0.0)
+        at_a += use_a
+        at_b += use_b
+        last += 1
+    start[a], stop[a] = first, last
+    return last
+
+
+@compiled
+def _unpack_sizes(i, sizes, out, fill):
+    """Write a cluster's sizes to their views in `out`, or zeros if `fill` is false."""
+    start, stop, views, values = sizes
+    for k in range(start[i], stop[i]):
+        out[views[k]] = values[k, 0] if fill else 0.0
+
+
+@compiled
+def _size_in(i, view, sizes):
+    """Return a cluster's size in a view."""
+    start, stop, views, values = sizes
+    at = start[i] + view - views[start[i]]  # where it is if no view is left out
+    if at >= stop[i] or views[at] != view:
+        at = start[i] + np.searchsorted(views[start[i] : stop[i]], view)
+        if at == stop[i] or views[at] != view:
+            return 0.0
+    return values[at, 0]
+
+
+@compiled
+def _plus_sizes(total, i, j, size_of_i, sizes, members):
+    """For each view, add to `total` each cluster's size times the number of the other's masks there."""
+    start, stop, views, counts = members
+    at_i, at_j, end_i, end_j = start[i], start[j], stop[i], stop[j]
+    while at_i < end_i or at_j < end_j:
+        in_i = at_i < end_i and (at_j == end_j or views[at_i] <= views[at_j])
+        in_j = at_j < end_j and (at_i == end_i or views[at_j] <= views[at_i])
+        more = 0.0
+        if in_j:
+            more = size_of_i[views[at_j]] * counts[at_j, 0]
+        if in_i:
+            more += _size_in(j, views[at_i], sizes) * counts[at_i, 0]
+        total += more
+        at_i += in_i
+        at_j += in_j
     return total
 
 
 @compiled
-def _best_neighbour(i, begin, end, neighbour, inter, extra, seen, members, shown, shows, place_of):
+def _best_neighbour(i, neighbours, size_of_i, sizes, members, place_of):
     """Return the neighbour with the best pooled IoU in a run of `_merged_run` (-1: none), and that IoU.
 
     On a tie, the lowest row is returned. The run's marks in `place_of` are cleared.
     """
+    start, stop, ids, values = neighbours
     best, score = -1, -1.0
-    for k in range(begin, end):
-        j = neighbour[k]
+    for k in range(start[i], stop[i]):
+        j = ids[k]
         place_of[j] = -1
-        union = _plus_sizes(extra[k], i, j, seen, members, shown, shows)
+        union = _plus_sizes(values[k, 1], i, j, size_of_i, sizes, members)
         if union > 0.0:
-            pooled = inter[k] / union
+            pooled = values[k, 0] / union
             if pooled > score or (pooled == score and j < best):
                 best, score = j, pooled
     return best, score
 
 
 @compiled
-def _compacted(needed, alive, start, stop, neighbour, inter, extra):
-    """Move the runs of existing clusters to the front of the pool or to a larger pool; update their bounds.
+def _with_room(needed, used, alive, runs):
+    """Return runs with room for `needed` entries after position `used`, and that position.
 
-    The new pool has room for `needed` more entries.
+    If there is none, runs of existing clusters are moved to the front, or to larger arrays.
     """
+    start, stop, ids, values = runs
+    if used + needed <= len(ids):
+        return runs, used
     living = 0
     for i in range(len(alive)):
         if alive[i]:
             living += stop[i] - start[i]
-    to_neighbour, to_inter, to_extra = neighbour, inter, extra
-    if living + needed > len(neighbour):
+    to_ids, to_values = ids, values
+    if living + needed > len(ids):
         room = 2 * (living + needed)
-        to_neighbour, to_inter, to_extra = np.empty(room, np.int32), np.empty(room), np.empty(room)
+        to_ids, to_values = np.empty(room, np.int32), np.empty((room, values.shape[1]))
     used = 0
-    for i in np.argsort(start):  # in pool order, so that no run overwrites one that has not been moved
+    for i in np.argsort(start):  # in the order of the runs, so that none overwrites one that isn't moved yet
         if alive[i]:
             begin, start[i] = start[i], used
             for k in range(begin, stop[i]):
-                to_neighbour[used], to_inter[used], to_extra[used] = neighbour[k], inter[k], extra[k]
+                to_ids[used] = ids[k]
+                to_values[used] = values[k]
                 used += 1
             stop[i] = used
-    return to_neighbour, to_inter, to_extra, used
+    return (start, stop, to_ids, to_values), used
 
 
 @compiled
@@ -191,45 +357,46 @@ def _best_row(score, block_best):
 
 
 @compiled
-def link(start, stop, neighbour, inter, extra, seen, view, threshold, root, within):
+def link(neighbours, sizes, members, num_views, threshold, root, within):
     """Merge clusters in place; afterwards `root` is the lowest row of each mask's cluster.
 
-    A pool stores the clusters' neighbours, one run per cluster: the neighbour, the sum of intersections
-    (`inter`), and the sum of the differences between the unions of stored pairs and `seen` (`extra`, never
-    positive, because sizes count the overlap of two masks twice). The union of two clusters is `extra` plus,
-    over views, the size of each cluster in the view times the number of the other cluster's members there.
-    Neighbours merged after a run was written are summed when it is next read. The run of a merged cluster is
-    written at the end of the pool, which is compacted when full.
+    Three sets of runs (start, stop, ids, values) describe the clusters. `neighbours`: the neighbour, the sum
+    of intersections, and the sum of the differences between the unions of stored pairs and `sizes` (never
+    positive, because sizes count the overlap of two masks twice). `sizes`: the view, and the cluster's size
+    there. `members`: the view, and the number of the cluster's masks there. The union of two clusters is the
+    second sum plus, over views, the size of each cluster in the view times the number of the other cluster's
+    masks there. Neighbours merged after a run was written are summed when it is next read. Runs of a merged
+    cluster are written at the end.
     """
-    num, num_views = seen.shape
-    used = stop[-1] if num else 0
-    members = np.zeros((num, num_views))
-    # Views of each cluster's members, in order, and the number of these views.
-    shown, shows = np.empty((num, num_views), np.int32), np.ones(num, np.int32)
-    for i in range(num):
-        members[i, view[i]] = 1.0
-        shown[i, 0] = view[i]
+    num = len(root)
     alive = np.ones(num, np.bool_)
+    used = used_sizes = used_members = 0
+    if num:
+        used, used_sizes, used_members = neighbours[1][-1], sizes[1][-1], members[1][-1]
     best = np.full(num, -1, np.int64)
     # Number of merges of each cluster, and of its best neighbour when the neighbour was found. If the
     # neighbour has merged since, the score is only an upper bound, because joining never creates a better
     # pair. A bound is recomputed only when it is the best score.
     merges, best_merges = np.zeros(num, np.int64), np.full(num, -1, np.int64)
+    # the masks of each cluster, as a chain from its root
+    following, final = np.full(num, -1, np.int64), np.arange(num)
     score = np.full(num, np.inf)
     block_best = np.full(num // ROWS_OF_A_BLOCK + 1, -np.inf)
     block_best[: -(-num // ROWS_OF_A_BLOCK)] = np.inf
     place_of = np.full(num, -1, np.int64)
+    size_of = np.zeros(num_views)
     while True:
         top = _best_row(score, block_best)
         if top < 0 or score[top] < threshold:
             break
+        start, stop, ids, values = neighbours
         if best[top] < 0 or not alive[best[top]] or merges[best[top]] != best_merges[top]:
             stop[top], _, _ = _merged_run(
-                start[top], stop[top], start[top], neighbour, inter, extra, root, place_of, top, top
+                start[top], stop[top], start[top], ids, values, root, place_of, top, top
             )
-            best[top], value = _best_neighbour(
-                top, start[top], stop[top], neighbour, inter, extra, seen, members, shown, shows, place_of
-            )
+            _unpack_sizes(top, sizes, size_of, True)
+            best[top], value = _best_neighbour(top, neighbours, size_of, sizes, members, place_of)
+            _unpack_sizes(top, sizes, size_of, False)
             _set_score(top, value, score, block_best)
             if best[top] >= 0:
                 best_merges[top] = merges[best[top]]
@@ -237,29 +404,32 @@ def link(start, stop, neighbour, inter, extra, seen, view, threshold, root, with
         a, b = min(top, best[top]), max(top, best[top])
 
         needed = stop[a] - start[a] + stop[b] - start[b]
-        if used + needed > len(neighbour):
-            neighbour, inter, extra, used = _compacted(needed, alive, start, stop, neighbour, inter, extra)
+        neighbours, used = _with_room(needed, used, alive, neighbours)
+        start, stop, ids, values = neighbours
         first = used
         used, joined_inter, joined_extra = _merged_run(
-            start[a], stop[a], used, neighbour, inter, extra, root, place_of, a, b
+            start[a], stop[a], used, ids, values, root, place_of, a, b
         )
-        used, _, _ = _merged_run(start[b], stop[b], used, neighbour, inter, extra, root, place_of, a, b)
+        used, _, _ = _merged_run(start[b], stop[b], used, ids, values, root, place_of, a, b)
         for k in range(first, used):
-            place_of[neighbour[k]] = -1
+            place_of[ids[k]] = -1
         start[a], stop[a] = first, used
         within[0, a] += within[0, b] + joined_inter
-        within[1, a] += within[1, b] + _plus_sizes(joined_extra, a, b, seen, members, shown, shows)
-        seen[a] += seen[b]
-        members[a] += members[b]
-        shows[a] = 0
-        for v in range(num_views):
-            if members[a, v] > 0:
-                shown[a, shows[a]] = v
-                shows[a] += 1
+        _unpack_sizes(a, sizes, size_of, True)
+        within[1, a] += within[1, b] + _plus_sizes(joined_extra, a, b, size_of, sizes, members)
+        _unpack_sizes(a, sizes, size_of, False)
+        needed = sizes[1][a] - sizes[0][a] + sizes[1][b] - sizes[0][b]
+        sizes, used_sizes = _with_room(needed, used_sizes, alive, sizes)
+        used_sizes = _united_run(a, b, used_sizes, sizes)
+        needed = members[1][a] - members[0][a] + members[1][b] - members[0][b]
+        members, used_members = _with_room(needed, used_members, alive, members)
+        used_members = _united_run(a, b, used_members, members)
         alive[b] = False
-        for i in range(num):
-            if root[i] == b:
-                root[i] = a
+        following[final[a]], final[a] = b, final[b]
+        mask = b
+        while mask >= 0:
+            root[mask] = a
+            mask = following[mask]
         merges[a] += 1
         best[a] = -1
         _set_score(a, max(score[a], score[b]), score, block_best)

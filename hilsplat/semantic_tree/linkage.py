@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from hilsplat.semantic_tree.evidence import Evidence
-from hilsplat.semantic_tree.kernels import initial_neighbours, link
+from hilsplat.semantic_tree.kernels import link, neighbour_runs
 
 
 def pooled_linkage(
@@ -25,12 +25,13 @@ def pooled_linkage(
         own pairs (0 for a single mask).
     """
     num = len(evidence.view)
-    pairs = evidence.intersection
-    values = pairs.data, evidence.union.data
-    pool = initial_neighbours(pairs.indptr, pairs.indices, *values, evidence.seen, evidence.view)
+    first, bounds = np.arange(num), evidence.size_indptr
+    sizes = bounds[:-1].copy(), bounds[1:].copy(), evidence.size_views, evidence.sizes[:, None]
+    members = first.copy(), first + 1, evidence.view, np.ones((num, 1))
+    neighbours = neighbour_runs(evidence.indptr, evidence.indices, evidence.sums)
     within = np.zeros((2, num))
     root = np.arange(num)
-    link(*pool, evidence.seen.copy(), evidence.view, float(threshold), root, within)
+    link(neighbours, sizes, members, evidence.num_views, float(threshold), root, within)
     # A root is the lowest row of its cluster, so sorting roots numbers clusters by first appearance.
     tops, cluster = np.unique(root, return_inverse=True)
     quality = within[0, tops] / np.where(within[1, tops] > 0, within[1, tops], 1.0)

@@ -10,8 +10,11 @@ import scipy.sparse as sp
 from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt8
 
 from hilsplat.base.levels import LEVELS, NONE
+from hilsplat.contributions.compositing import column_sums
 from hilsplat.semantic_tree.evidence import Evidence, mask_evidence
+from hilsplat.semantic_tree.kernels import add_views, at_entries, divide_by_unions
 from hilsplat.semantic_tree.linkage import pooled_linkage
+from hilsplat.semantic_tree.view_pairs import view_pairs
 from hilsplat.settings import SemanticTreeSettings
 
 MIN_VISIBLE_PX = 0.3
@@ -67,7 +70,7 @@ class LevelNodes:
 
 def linked_nodes(
     S: sp.csr_matrix,
-    mass: Float32[np.ndarray, "V N"],
+    mass: sp.csr_matrix,  # V x N
     view_of_mask: Int32[np.ndarray, " M"],
     rows_of_levels: Sequence[Int64[np.ndarray, " _"]],
     settings: SemanticTreeSettings,
@@ -79,20 +82,19 @@ def linked_nodes(
     cluster therefore becomes a node only if it is the best fit of at least `min_views` masks.
 
     Linking takes one thread; with several, the next levels are prepared at the same time. `S` and `mass`,
-    the visible mass of each Gaussian in each view, are in px.
+    the visible mass of each Gaussian in each view, are in px; masks are sorted by view.
     """
-    visible = mass > MIN_VISIBLE_PX
-    total_mass = mass.sum(axis=0, dtype=np.float64)
-    importance = np.einsum("vn,vn->n", mass, visible, dtype=np.float64) / np.maximum(visible.sum(axis=0), 1)
+    visible = visible_in(mass)
+    total_mass = column_sums(mass)
+    importance = column_sums(visible) / np.maximum(num_views_of(visible), 1)
+    pairs = view_pairs(visible)
 
     def evidence(rows: Int64[np.ndarray, " m"]) -> Evidence:
-        weights, view = S[rows], view_of_mask[rows]
-        entries = view[_row_of(weights)], weights.indices
-        shares = weights.astype(np.float64)
-        shares.data /= np.where(visible[entries], mass[entries], np.inf)
+        view, shares = view_of_mask[rows], S[rows].astype(np.float64)
+        there = mass_at_entries(shares, mass, view)
+        shares.data /= np.where(there > MIN_VISIBLE_PX, there, np.inf)
         shares.eliminate_zeros()
-        del weights, entries
-        return mask_evidence(shares, importance, visible, view, MIN_COVISIBLE, threads)
+        return mask_evidence(shares, importance, visible, view, pairs, MIN_COVISIBLE, threads)
 
     def nodes(
         rows: Int64[np.ndarray, " m"], cluster: Int64[np.ndarray, " m"], quality: Float64[np.ndarray, " k"]
@@ -133,12 +135,38 @@ def _row_of(matrix: sp.csr_matrix) -> Int64[np.ndarray, " E"]:
     return np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
 
 
+def visible_in(mass: sp.csr_matrix) -> sp.csr_matrix:
+    """Return the entries of Gaussians that are visible in a view."""
+    visible = mass.data > MIN_VISIBLE_PX
+    indptr = np.concatenate([[0], np.cumsum(visible)])[mass.indptr]
+    return sp.csr_matrix((mass.data[visible], mass.indices[visible], indptr), shape=mass.shape)
+
+
+def num_views_of(visible: sp.csr_matrix) -> Int64[np.ndarray, " N"]:
+    """Return the number of views in which each Gaussian is visible."""
+    return np.bincount(visible.indices, minlength=visible.shape[1])
+
+
+def mass_at_entries(
+    matrix: sp.csr_matrix, mass: sp.csr_matrix, view: Int32[np.ndarray, " m"] | Int64[np.ndarray, " m"]
+) -> Float32[np.ndarray, " E"]:
+    """Return the mass of each stored entry's Gaussian in the view of its row, px."""
+    out = np.empty(matrix.nnz, np.float32)
+    order = np.argsort(view, kind="stable")
+    at_entries(_mass_arrays(mass), view, order, (matrix.indptr, matrix.indices), out)
+    return out
+
+
+def _mass_arrays(mass: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    return mass.indptr, mass.indices, mass.data, mass.shape[1]
+
+
 def gaussian_nodes(
     cluster: Int64[np.ndarray, " M"],
     num_nodes: int,
     weights: sp.csr_matrix,
     view: Int32[np.ndarray, " M"],
-    mass: Float32[np.ndarray, "V N"],
+    mass: sp.csr_matrix,  # V x N
     total_mass: Float64[np.ndarray, " N"],
 ) -> tuple[Int32[np.ndarray, " N"], Float32[np.ndarray, " N"]]:
     """Assign each Gaussian to the node with the largest product of two shares of its visible weight.
@@ -157,23 +185,25 @@ def gaussian_nodes(
     """
     inside = np.flatnonzero(cluster >= 0)
     ones = np.ones(len(inside))
-    node_views, of_pair = np.unique(cluster[inside] * len(mass) + view[inside], return_inverse=True)
-    pair_node, pair_view = np.divmod(node_views, max(len(mass), 1))
+    num_views = mass.shape[0]
+    node_views, of_pair = np.unique(cluster[inside] * num_views + view[inside], return_inverse=True)
+    pair_node, pair_view = np.divmod(node_views, max(num_views, 1))
     in_pair = sp.csr_matrix((ones, (of_pair, inside)), shape=(len(node_views), len(cluster)))
-    per_view = (in_pair @ weights.astype(np.float64)).tocoo()
-    capped = np.minimum(per_view.data, mass[pair_view[per_view.row], per_view.col])
+    per_view = in_pair @ weights.astype(np.float64)
+    capped = np.minimum(per_view.data, mass_at_entries(per_view, mass, pair_view))
     shape = (num_nodes, weights.shape[1])
-    per_node = sp.csr_matrix((capped, (pair_node[per_view.row], per_view.col)), shape=shape)
-    del per_view, capped
+    entries = pair_node[_row_of(per_view)], per_view.indices
+    per_node = sp.csr_matrix((capped, entries), shape=shape)
+    del per_view, capped, entries
     per_node.data /= np.maximum(total_mass[per_node.indices], 1e-12)
     per_node.data[per_node.data <= MIN_MEMBER_SHARE] = 0
     per_node.eliminate_zeros()
     column, share = per_node.indices, per_node.data
     in_its_views = np.zeros(per_node.nnz)
-    for node, in_view in zip(pair_node, pair_view, strict=True):  # view by view, because mass is large
-        row = slice(per_node.indptr[node], per_node.indptr[node + 1])
-        in_its_views[row] += mass[in_view].take(column[row])
-    one_view = total_mass / np.maximum(np.count_nonzero(mass > MIN_VISIBLE_PX, axis=0), 1)
+    by_view = np.argsort(pair_view, kind="stable")
+    matrix = per_node.indptr, column
+    add_views(_mass_arrays(mass), pair_view, pair_node, by_view, matrix, in_its_views)
+    one_view = total_mass / np.maximum(num_views_of(visible_in(mass)), 1)
     share_there = share * total_mass[column] / (in_its_views + PRIOR_VIEWS * one_view[column])
     row_of = _row_of(per_node)
     ranked = np.lexsort((row_of, -share * share_there, column))
@@ -243,7 +273,7 @@ def node_parents(
 def mask_fits(
     node_of_gaussian: Int32[np.ndarray, "N 3"],
     S: sp.csr_matrix,
-    mass: Float32[np.ndarray, "V N"],
+    mass: sp.csr_matrix,  # V x N
     view: Int32[np.ndarray, " M"],
     level: UInt8[np.ndarray, " M"],
     linked: Int32[np.ndarray, " M"],
@@ -270,7 +300,7 @@ def mask_fits(
 def level_ious(
     node_of_gaussian: Int32[np.ndarray, " N"],
     weights: sp.csr_matrix,
-    mass: Float32[np.ndarray, "V N"],
+    mass: sp.csr_matrix,  # V x N
     view: Int32[np.ndarray, " m"],
 ) -> sp.csr_matrix:
     """Return each mask's soft IoU, in the mask's view, with each node that shares Gaussians with the mask.
@@ -283,9 +313,9 @@ def level_ious(
     member = sp.csr_matrix((np.ones(len(has)), (has, node)), shape=(len(node_of_gaussian), num_nodes))
     inter = (weights.astype(np.float64) @ member).tocsr()
     area = np.asarray(weights.sum(axis=1, dtype=np.float64)).ravel()
-    size = np.stack([np.bincount(node, in_view[has], num_nodes) for in_view in mass])  # [view, node]
-    row = _row_of(inter)
-    inter.data /= area[row] + size[view[row], inter.indices] - inter.data
+    order = np.argsort(view, kind="stable")
+    matrix = inter.indptr, inter.indices
+    divide_by_unions(_mass_arrays(mass), view, order, node_of_gaussian, area, matrix, inter.data)
     return inter
 
 

@@ -6,6 +6,7 @@ joined to the table, the walls or the floor, which are large.
 """
 
 import heapq
+from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sp
@@ -13,6 +14,7 @@ from jaxtyping import Float32, Float64, Int32, Int64
 from scipy.spatial import cKDTree
 
 from hilsplat.base.levels import NONE
+from hilsplat.contributions.compositing import column_sums
 
 NEIGHBOURS = 10
 """Number of nearest Gaussians (including itself) that are searched for neighbours in another region."""
@@ -28,7 +30,7 @@ def joined_regions(
     region_of_gaussian: Int32[np.ndarray, " N"],
     num_regions: int,
     means: Float32[np.ndarray, "N 3"],
-    mass: Float32[np.ndarray, "V N"],
+    mass: sp.csr_matrix,
     max_cost: float,
 ) -> Int64[np.ndarray, " T"]:
     """Join regions that touch, cheapest pair first, until every pair costs `max_cost` or more.
@@ -41,16 +43,19 @@ def joined_regions(
     Args:
         region_of_gaussian: region of each Gaussian, -1 for none.
         means: centres of the Gaussians, scene units.
-        mass: visible mass of each Gaussian in each view, px.
+        mass: visible mass of each Gaussian in each view (V x N), px.
         max_cost: limit of the cost, as a share of a view's side.
 
     Returns:
         whole of each region, numbered by first appearance.
     """
     region, num = region_of_gaussian + 1, num_regions + 1
-    region_mass = np.stack([np.bincount(region, in_view, num)[1:] for in_view in mass], axis=1)
-    shares = region_mass / np.maximum(mass.sum(axis=1, dtype=np.float64), 1e-12)
-    firm = np.flatnonzero((region_of_gaussian != NONE) & (mass.sum(axis=0) > MIN_MASS_PX))
+    entries = [slice(*ends) for ends in pairwise(mass.indptr)]
+    masses = [np.bincount(region[mass.indices[e]], mass.data[e], num)[1:] for e in entries]
+    shares = np.stack(masses, axis=1) / np.maximum(
+        [mass.data[e].sum(dtype=np.float64) for e in entries], 1e-12
+    )
+    firm = np.flatnonzero((region_of_gaussian != NONE) & (column_sums(mass) > MIN_MASS_PX))
     touch = touching(region_of_gaussian[firm], num_regions, means[firm])
     return joined(touch, shares, max_cost)
 

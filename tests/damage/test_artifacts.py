@@ -40,11 +40,11 @@ def _scene(folder: Path) -> Any:
 
 def _contributions(folder: Path) -> Any:
     found = Contributions.load(folder / "default/contributions")
-    matrices = [found.matrix(name) for name in ("A", "A_half", "S")]
+    matrices = [found.matrix(name) for name in ("A", "A_half", "S", "mass")]
     parts = [[matrix.data, matrix.indices, matrix.indptr] for matrix in matrices]
     form = found.quadratic()
     ones = np.ones((found.num_gaussians, 3, 2), np.float32)
-    return found, parts, found.mass(), found.means(), found.centres(), form.product(ones)
+    return found, parts, found.means(), found.centres(), form.product(ones)
 
 
 def _field(folder: Path) -> Any:

@@ -102,7 +102,7 @@ def associated_codes(
     fewer than `MIN_VIEWS` views get 0; in a scene with only one view, one is enough.
     """
     contributions = inputs.contributions
-    weights, mass = contributions.matrix("S")[rows].astype(np.float64), contributions.mass()
+    weights, mass = contributions.matrix("S")[rows].astype(np.float64), contributions.matrix("mass")
     iou = level_ious(group.astype(np.int32), weights, mass, contributions.view[rows]).tocoo()
     num_groups, score = iou.shape[1], iou.data
     mask, of = iou.row.astype(np.int64), iou.col.astype(np.int64)
@@ -117,7 +117,7 @@ def associated_codes(
     first = order[np.flatnonzero(np.diff(key, prepend=-1))]
     best = first[score[first] > MIN_SCORE]
     means, counts = group_means(inputs.latents[rows[mask[best]]], of[best], num_groups)
-    has_code = counts >= min(MIN_VIEWS, len(mass))
+    has_code = counts >= min(MIN_VIEWS, mass.shape[0])
     return features_of_groups(group, np.where(has_code[:, None], means, 0).astype(np.float32))
 
 

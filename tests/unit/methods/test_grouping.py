@@ -128,8 +128,11 @@ def test_a_group_has_the_average_code_of_its_best_mask_in_each_view(
     if far is not None:
         means[far, 2] = 0.9  # the mean feature of the mask, 0 in the group
     contributions = types.SimpleNamespace(
-        matrix={"S": sp.csr_matrix(shares), "A": sp.csr_matrix(means)}.get,
-        mass=lambda: np.ones((num_views, 3), np.float32),
+        matrix={
+            "S": sp.csr_matrix(shares),
+            "A": sp.csr_matrix(means),
+            "mass": sp.csr_matrix(np.ones((num_views, 3), np.float32)),
+        }.get,
         view=np.array([0, 0, 1], np.int32),
     )
     inputs = types.SimpleNamespace(contributions=contributions, latents=np.float32([[1], [5], [2]]))

@@ -7,29 +7,47 @@ import scipy.sparse as sp
 from hilsplat.semantic_tree.evidence import Evidence, mask_evidence
 from hilsplat.semantic_tree.kernels import ROWS_OF_A_BLOCK
 from hilsplat.semantic_tree.linkage import pooled_linkage
+from hilsplat.semantic_tree.view_pairs import view_pairs
 
 
 def dense_evidence(intersection, union):
     """Any intersections and unions of pairs: one view per mask, half a union seen from either side."""
-    shared = np.nonzero(np.triu(intersection))
-    shape = intersection.shape
+    num = len(union)
+    a, b = np.nonzero(np.triu(intersection))
+    sizes = union / 2
+    np.fill_diagonal(sizes, 1.0)
+    row, view = np.nonzero(sizes)
     return Evidence(
-        sp.csr_matrix((intersection[shared], shared), shape=shape),
-        sp.csr_matrix((union[shared], shared), shape=shape),
-        union / 2,
-        np.arange(len(union), dtype=np.int32),
+        indptr=np.searchsorted(a, np.arange(num + 1)),
+        indices=b.astype(np.int32),
+        sums=np.stack([intersection[a, b], np.zeros(len(a))], axis=1),
+        size_indptr=np.searchsorted(row, np.arange(num + 1)),
+        size_views=view.astype(np.int32),
+        sizes=sizes[row, view],
+        view=np.arange(num, dtype=np.int32),
+        num_views=num,
     )
 
 
 def pair(evidence: Evidence, a: int, b: int) -> tuple[float, float]:
     """Intersection and union of two masks."""
     a, b = min(a, b), max(a, b)
-    row = slice(evidence.intersection.indptr[a], evidence.intersection.indptr[a + 1])
-    found = np.flatnonzero(evidence.intersection.indices[row] == b)
-    if len(found):
-        at = row.start + int(found[0])
-        return float(evidence.intersection.data[at]), float(evidence.union.data[at])
-    return 0.0, float(evidence.seen[a, evidence.view[b]] + evidence.seen[b, evidence.view[a]])
+
+    def size(mask: int, view: int) -> float:
+        row = slice(*evidence.size_indptr[mask : mask + 2])
+        return evidence.sizes[row][evidence.size_views[row] == view].sum()
+
+    sizes = size(a, evidence.view[b]) + size(b, evidence.view[a])
+    row = slice(*evidence.indptr[a : a + 2])
+    intersection, extra = evidence.sums[row][evidence.indices[row] == b].sum(axis=0)
+    return float(intersection), float(sizes + extra)
+
+
+def evidence_of(shares, importance, visible, view, min_covisible, threads=1) -> Evidence:
+    """`mask_evidence` of dense arrays, in which all pairs of views are compared."""
+    visible = sp.csr_matrix(visible.astype(np.float32))
+    pairs = view_pairs(visible)
+    return mask_evidence(sp.csr_matrix(shares), importance, visible, view, pairs, min_covisible, threads)
 
 
 FOUR_OF_ELEVEN = np.array([[1] * 5 + [0] * 6, [0] * 4 + [1] * 7], bool)
@@ -53,7 +71,7 @@ FOUR_OF_ELEVEN = np.array([[1] * 5 + [0] * 6, [0] * 4 + [1] * 7], bool)
 def test_evidence_of_two_masks(shares, visible, view, min_covisible, expected):
     shares, visible = np.array(shares, float), np.array(visible, bool)
     importance, view = np.ones(shares.shape[1]), np.array(view, np.int32)
-    evidence = mask_evidence(sp.csr_matrix(shares), importance, visible, view, min_covisible)
+    evidence = evidence_of(shares, importance, visible, view, min_covisible)
     assert pair(evidence, 0, 1) == pair(evidence, 1, 0) == pytest.approx(expected)
 
 
@@ -134,7 +152,7 @@ def test_evidence_equals_the_rule_pair_by_pair(threads):
     visible = rng.random((4, 30)) < 0.6
     shares = rng.random((12, 30)) * (rng.random((12, 30)) < 0.25) * visible[view]
     importance = rng.uniform(0.5, 2.0, 30)
-    found = mask_evidence(sp.csr_matrix(shares), importance, visible, view, 0.4, threads)
+    found = evidence_of(shares, importance, visible, view, 0.4, threads)
     intersection, union = dense_rule(shares, importance, visible, view, 0.4)
     assert (intersection > 0).sum() > 20
     for a in range(12):

@@ -29,7 +29,7 @@ def test_gaussians_join_the_node_with_the_largest_share(monkeypatch):
         monkeypatch.setattr(nodes, "MIN_MEMBER_SHARE", min_share)
         S, mass = sp.csr_matrix(np.array(weights, np.float32)), np.array(mass, np.float32)
         masks = np.array(cluster), 2, S, np.array(view, np.int32)
-        node, membership = gaussian_nodes(*masks, mass, mass.sum(axis=0, dtype=np.float64))
+        node, membership = gaussian_nodes(*masks, sp.csr_matrix(mass), mass.sum(axis=0, dtype=np.float64))
         return node.tolist(), membership.tolist()
 
     # Gaussian 0 has 9 of 10 px in node 0 and 2 in node 1; Gaussian 1 has too little (2 of 10) in any
@@ -65,22 +65,20 @@ def test_small_pieces_apart_from_their_node_leave_it():
 def test_a_duplicate_cluster_is_not_a_node():
     # Four views of ten Gaussians: one mask of all (two views miss Gaussian 3), and in three of the views
     # one of the first four. Those are a cluster of their own and win Gaussian 3 alone, which none shows.
-    whole = np.ones((4, 10))
-    whole[:2, 3] = 0
-    double = np.repeat((np.arange(10) < 4)[None], 3, axis=0)
-    weights = sp.csr_matrix(np.concatenate([whole, double]).astype(np.float32))
-    view = np.array([0, 1, 2, 3, 0, 1, 2], np.int32)
-    mass, rows = np.ones((4, 10), np.float32), np.arange(7)
+    view = np.array([0, 0, 1, 1, 2, 2, 3], np.int32)
+    double = np.array([0, 1, 0, 1, 0, 1, 0], bool)
+    masks = np.where(double[:, None], np.arange(10) < 4, np.ones((7, 1))).astype(np.float32)
+    masks[:4, 3][~double[:4]] = 0
+    mass, rows = sp.csr_matrix(np.ones((4, 10), np.float32)), np.arange(7)
 
-    (found,) = linked_nodes(weights, mass, view, [rows], SemanticTreeSettings(), 1)
-    assert found.of_mask.tolist() == [0, 0, 0, 0, -1, -1, -1]
+    (found,) = linked_nodes(sp.csr_matrix(masks), mass, view, [rows], SemanticTreeSettings(), 1)
+    assert found.of_mask.tolist() == [0, -1, 0, -1, 0, -1, 0]
     assert found.of_gaussian.tolist() == [0] * 10
     assert found.membership == pytest.approx(np.where(np.arange(10) == 3, 0.5, 1.0))
     assert len(found.quality) == 1
 
-    whole[:2, :4] = 0  # now it wins all four, and is a node
-    weights = sp.csr_matrix(np.concatenate([whole, double]).astype(np.float32))
-    (found,) = linked_nodes(weights, mass, view, [rows], SemanticTreeSettings(), 1)
+    masks[np.ix_([0, 2], range(4))] = 0  # now it wins all four, and is a node
+    (found,) = linked_nodes(sp.csr_matrix(masks), mass, view, [rows], SemanticTreeSettings(), 1)
     assert found.of_gaussian.tolist() == [1] * 4 + [0] * 6
 
 
