@@ -25,6 +25,8 @@ class Evidence:
         size_indptr: where the visible sizes of each mask begin.
         size_views: partners of the mask's view, in ascending order.
         sizes: visible size of the mask in that view, 0 if the view sees too little of the mask.
+        best: each mask's partner with the highest IoU, the lowest on a tie; -1 for none.
+        score: IoU of that pair, -1 for none.
         view: view of each mask.
         num_views: number of views.
     """
@@ -35,6 +37,8 @@ class Evidence:
     size_indptr: Int64[np.ndarray, " M1"]
     size_views: Int32[np.ndarray, " F"]
     sizes: Float64[np.ndarray, " F"]
+    best: Int64[np.ndarray, " M"]
+    score: Float64[np.ndarray, " M"]
     view: Int32[np.ndarray, " M"]
     num_views: int
 
@@ -85,7 +89,10 @@ def mask_evidence(
     own = seen_from == view[of_mask]
     least = min_covisible * seen[own]
     parts = over_ranges(shared_pairs, num_views, threads, masks, share, weighted, partners, seen, least)
-    counts, indices, sums = (np.concatenate(part) for part in zip(*parts, strict=True))
+    *of_pairs, best, score = (list(part) for part in zip(*parts, strict=True))
+    counts, indices, sums = (np.concatenate(part) for part in of_pairs)
+    top = np.argmax(score, axis=0), np.arange(num)  # the first of equal parts has the lowest partners
     indptr = np.concatenate([[0], np.cumsum(counts)])
     sizes = np.where(seen < least[of_mask], 0.0, seen)
-    return Evidence(indptr, indices, sums, row_start, seen_from, sizes, view, num_views)
+    best_of = np.stack(best)[top], np.stack(score)[top]
+    return Evidence(indptr, indices, sums, row_start, seen_from, sizes, *best_of, view, num_views)

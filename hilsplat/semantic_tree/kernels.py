@@ -115,13 +115,15 @@ def shared_pairs(begin, end, masks, share, weighted, pairs, seen, least):
 
     Returns:
         number of pairs per mask a, masks b, and two sums per pair: the intersection, and the union minus the
-        sizes of both masks (0 for a mask of which the other view sees less than `least`).
+        sizes of both masks (0 for a mask of which the other view sees less than `least`); and, of all masks,
+        the best partner and IoU among these pairs (-1 for none; on a tie, the lowest partner).
     """
     starts, (indptr, indices), num_gaussians = masks
     (pair_indptr, partners, mirror), row_start = pairs
     number = np.full(num_gaussians, -1, np.int32)
     counts = np.zeros(starts[end] - starts[begin], np.int64)
     out, out_sums = np.empty(1024, np.int32), np.empty((1024, 2))
+    best, score = np.full(starts[-1], -1, np.int64), np.full(starts[-1], -1.0)
     done = 0
     for u in range(begin, end):
         first, last = indptr[starts[u]], indptr[starts[u + 1]]
@@ -162,10 +164,16 @@ def shared_pairs(begin, end, masks, share, weighted, pairs, seen, least):
                     size_b = seen[row_start[b] + mirror[p]]
                     enough_a = size_a if size_a >= least[a] else 0.0
                     enough_b = size_b if size_b >= least[b] else 0.0
-                    if enough_a > 0.0 or enough_b > 0.0:
-                        from_a[count], to_b[count], sums[count, 0] = a, b, both
-                        sums[count, 1] = size_a + size_b - both - (enough_a + enough_b)
-                        count += 1
+                    if enough_a == 0.0 and enough_b == 0.0:
+                        continue
+                    extra = size_a + size_b - both - (enough_a + enough_b)
+                    from_a[count], to_b[count], sums[count, 0], sums[count, 1] = a, b, both, extra
+                    count += 1
+                    pooled = both / (extra + enough_b + enough_a)  # summed as in `_plus_sizes`
+                    if pooled > score[a]:
+                        best[a], score[a] = b, pooled
+                    if pooled > score[b]:
+                        best[b], score[b] = a, pooled
         for k in range(first, last):
             number[indices[k]] = -1
         if done + count > len(out):
@@ -180,30 +188,7 @@ def shared_pairs(begin, end, masks, share, weighted, pairs, seen, least):
             out[at], out_sums[at] = to_b[k], sums[k]
             places[from_a[k] - starts[u]] += 1
         done += count
-    return counts, out[:done].copy(), out_sums[:done].copy()
-
-
-@compiled
-def neighbour_runs(indptr, indices, sums):
-    """Return runs of neighbours for `link` (start, stop, ids, values), with 25 % spare room."""
-    num = len(indptr) - 1
-    start = np.zeros(num + 1, np.int64)
-    for a in range(num):
-        start[a + 1] += indptr[a + 1] - indptr[a]
-        for k in range(indptr[a], indptr[a + 1]):
-            start[indices[k] + 1] += 1
-    start = np.cumsum(start)[:num]
-    stop = start.copy()
-    room = 2 * len(indices) + len(indices) // 2 + 1024
-    ids, values = np.empty(room, np.int32), np.empty((room, 2))
-    for a in range(num):  # rows in order, so that each run's neighbours are also in order
-        for k in range(indptr[a], indptr[a + 1]):
-            b = np.int64(indices[k])
-            for own, other in ((a, b), (b, a)):
-                ids[stop[own]] = other
-                values[stop[own]] = sums[k]
-                stop[own] += 1
-    return start, stop, ids, values
+    return counts, out[:done].copy(), out_sums[:done].copy(), best, score
 
 
 @compiled
@@ -257,15 +242,38 @@ def _unpack_sizes(i, sizes, out, fill):
 
 
 @compiled
-def _size_in(i, view, sizes):
+def _size_in(i, view, num_views, sizes):
     """Return a cluster's size in a view."""
     start, stop, views, values = sizes
-    at = start[i] + view - views[start[i]]  # where it is if no view is left out
-    if at >= stop[i] or views[at] != view:
+    at = start[i] + view
+    if stop[i] - start[i] < num_views:
         at = start[i] + np.searchsorted(views[start[i] : stop[i]], view)
         if at == stop[i] or views[at] != view:
             return 0.0
     return values[at, 0]
+
+
+@compiled
+def neighbour_runs(indptr, indices, sums):
+    """Return runs of neighbours for `link` (start, stop, ids, values), with 25 % spare room."""
+    num = len(indptr) - 1
+    start = np.zeros(num + 1, np.int64)
+    for a in range(num):
+        start[a + 1] += indptr[a + 1] - indptr[a]
+        for k in range(indptr[a], indptr[a + 1]):
+            start[indices[k] + 1] += 1
+    start = np.cumsum(start)[:num]
+    stop = start.copy()
+    room = 2 * len(indices) + len(indices) // 2 + 1024
+    ids, values = np.empty(room, np.int32), np.empty((room, 2))
+    for a in range(num):  # rows in order, so that each run's neighbours are also in order
+        for k in range(indptr[a], indptr[a + 1]):
+            b = np.int64(indices[k])
+            for own, other in ((a, b), (b, a)):
+                ids[stop[own]] = other
+                values[stop[own]] = sums[k]
+                stop[own] += 1
+    return start, stop, ids, values
 
 
 @compiled
@@ -280,7 +288,7 @@ def _plus_sizes(total, i, j, size_of_i, sizes, members):
         if in_j:
             more = size_of_i[views[at_j]] * counts[at_j, 0]
         if in_i:
-            more += _size_in(j, views[at_i], sizes) * counts[at_i, 0]
+            more += _size_in(j, views[at_i], len(size_of_i), sizes) * counts[at_i, 0]
         total += more
         at_i += in_i
         at_j += in_j
@@ -357,7 +365,7 @@ def _best_row(score, block_best):
 
 
 @compiled
-def link(neighbours, sizes, members, num_views, threshold, root, within):
+def link(neighbours, best, score, sizes, members, num_views, threshold, root, within):
     """Merge clusters in place; afterwards `root` is the lowest row of each mask's cluster.
 
     Three sets of runs (start, stop, ids, values) describe the clusters. `neighbours`: the neighbour, the sum
@@ -373,16 +381,15 @@ def link(neighbours, sizes, members, num_views, threshold, root, within):
     used = used_sizes = used_members = 0
     if num:
         used, used_sizes, used_members = neighbours[1][-1], sizes[1][-1], members[1][-1]
-    best = np.full(num, -1, np.int64)
     # Number of merges of each cluster, and of its best neighbour when the neighbour was found. If the
     # neighbour has merged since, the score is only an upper bound, because joining never creates a better
     # pair. A bound is recomputed only when it is the best score.
-    merges, best_merges = np.zeros(num, np.int64), np.full(num, -1, np.int64)
+    merges, best_merges = np.zeros(num, np.int64), np.zeros(num, np.int64)
     # the masks of each cluster, as a chain from its root
     following, final = np.full(num, -1, np.int64), np.arange(num)
-    score = np.full(num, np.inf)
     block_best = np.full(num // ROWS_OF_A_BLOCK + 1, -np.inf)
-    block_best[: -(-num // ROWS_OF_A_BLOCK)] = np.inf
+    for row in range(num):
+        block_best[row // ROWS_OF_A_BLOCK] = max(block_best[row // ROWS_OF_A_BLOCK], score[row])
     place_of = np.full(num, -1, np.int64)
     size_of = np.zeros(num_views)
     while True:

@@ -25,13 +25,16 @@ def pooled_linkage(
         own pairs (0 for a single mask).
     """
     num = len(evidence.view)
-    first, bounds = np.arange(num), evidence.size_indptr
-    sizes = bounds[:-1].copy(), bounds[1:].copy(), evidence.size_views, evidence.sizes[:, None]
-    members = first.copy(), first + 1, evidence.view, np.ones((num, 1))
+    first, starts = np.arange(num), evidence.size_indptr
+    # the bounds of both runs of a cluster, side by side because they are read together, in random order
+    bounds = np.stack([starts[:-1], starts[1:], first, first + 1], axis=1)
+    sizes = bounds[:, 0], bounds[:, 1], evidence.size_views, evidence.sizes[:, None]
+    members = bounds[:, 2], bounds[:, 3], evidence.view, np.ones((num, 1))
     neighbours = neighbour_runs(evidence.indptr, evidence.indices, evidence.sums)
     within = np.zeros((2, num))
     root = np.arange(num)
-    link(neighbours, sizes, members, evidence.num_views, float(threshold), root, within)
+    best = evidence.best.copy(), evidence.score.copy()
+    link(neighbours, *best, sizes, members, evidence.num_views, float(threshold), root, within)
     # A root is the lowest row of its cluster, so sorting roots numbers clusters by first appearance.
     tops, cluster = np.unique(root, return_inverse=True)
     quality = within[0, tops] / np.where(within[1, tops] > 0, within[1, tops], 1.0)

@@ -17,6 +17,8 @@ def dense_evidence(intersection, union):
     sizes = union / 2
     np.fill_diagonal(sizes, 1.0)
     row, view = np.nonzero(sizes)
+    pooled = np.where(intersection > 0, intersection / np.where(union > 0, union, 1), -1)
+    best = pooled.argmax(axis=1)
     return Evidence(
         indptr=np.searchsorted(a, np.arange(num + 1)),
         indices=b.astype(np.int32),
@@ -24,6 +26,8 @@ def dense_evidence(intersection, union):
         size_indptr=np.searchsorted(row, np.arange(num + 1)),
         size_views=view.astype(np.int32),
         sizes=sizes[row, view],
+        best=np.where(pooled.max(axis=1) > 0, best, -1),
+        score=pooled.max(axis=1),
         view=np.arange(num, dtype=np.int32),
         num_views=num,
     )
