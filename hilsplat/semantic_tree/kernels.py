@@ -169,7 +169,7 @@ def shared_pairs(begin, end, masks, share, weighted, pairs, seen, least):
                     extra = size_a + size_b - both - (enough_a + enough_b)
                     from_a[count], to_b[count], sums[count, 0], sums[count, 1] = a, b, both, extra
                     count += 1
-                    pooled = both / (extra + enough_b + enough_a)  # summed as in `_plus_sizes`
+                    pooled = both / (extra + enough_b + enough_a)  # summed as in `_unions`
                     if pooled > score[a]:
                         best[a], score[a] = b, pooled
                     if pooled > score[b]:
@@ -242,15 +242,37 @@ def _unpack_sizes(i, sizes, out, fill):
 
 
 @compiled
-def _size_in(i, view, num_views, sizes):
-    """Return a cluster's size in a view."""
-    start, stop, views, values = sizes
-    at = start[i] + view
-    if stop[i] - start[i] < num_views:
-        at = start[i] + np.searchsorted(views[start[i] : stop[i]], view)
-        if at == stop[i] or views[at] != view:
-            return 0.0
-    return values[at, 0]
+def _unions(i, ids, extra, size_of_i, sizes, members):
+    """Return the unions of a cluster with others.
+
+    A union is `extra` plus, for each view in order, each cluster's size times the number of the other's masks
+    there. One call serves all neighbours, because this is the innermost loop of the linkage.
+    """
+    start, stop, size_views, size_values = sizes
+    member_start, member_stop, views, counts = members
+    num_views = len(size_of_i)
+    begin_i, end_i = member_start[i], member_stop[i]
+    unions = extra.copy()
+    for k in range(len(ids)):
+        j = ids[k]
+        first, last = start[j], stop[j]
+        at_i, at_j, end_j = begin_i, member_start[j], member_stop[j]
+        while at_i < end_i or at_j < end_j:
+            view_i = views[at_i] if at_i < end_i else num_views
+            view_j = views[at_j] if at_j < end_j else num_views
+            more = 0.0
+            if view_j <= view_i:
+                more = size_of_i[view_j] * counts[at_j, 0]
+                at_j += 1
+            if view_i <= view_j:
+                at = first + view_i
+                if last - first < num_views:  # some views are left out
+                    at = first + np.searchsorted(size_views[first:last], view_i)
+                if at < last and size_views[at] == view_i:
+                    more += size_values[at, 0] * counts[at_i, 0]
+                at_i += 1
+            unions[k] += more
+    return unions
 
 
 @compiled
@@ -277,38 +299,20 @@ def neighbour_runs(indptr, indices, sums):
 
 
 @compiled
-def _plus_sizes(total, i, j, size_of_i, sizes, members):
-    """For each view, add to `total` each cluster's size times the number of the other's masks there."""
-    start, stop, views, counts = members
-    at_i, at_j, end_i, end_j = start[i], start[j], stop[i], stop[j]
-    while at_i < end_i or at_j < end_j:
-        in_i = at_i < end_i and (at_j == end_j or views[at_i] <= views[at_j])
-        in_j = at_j < end_j and (at_i == end_i or views[at_j] <= views[at_i])
-        more = 0.0
-        if in_j:
-            more = size_of_i[views[at_j]] * counts[at_j, 0]
-        if in_i:
-            more += _size_in(j, views[at_i], len(size_of_i), sizes) * counts[at_i, 0]
-        total += more
-        at_i += in_i
-        at_j += in_j
-    return total
-
-
-@compiled
 def _best_neighbour(i, neighbours, size_of_i, sizes, members, place_of):
     """Return the neighbour with the best pooled IoU in a run of `_merged_run` (-1: none), and that IoU.
 
     On a tie, the lowest row is returned. The run's marks in `place_of` are cleared.
     """
     start, stop, ids, values = neighbours
+    run = slice(start[i], stop[i])
+    unions = _unions(i, ids[run], values[run, 1], size_of_i, sizes, members)
     best, score = -1, -1.0
-    for k in range(start[i], stop[i]):
-        j = ids[k]
+    for k in range(len(unions)):
+        j = ids[start[i] + k]
         place_of[j] = -1
-        union = _plus_sizes(values[k, 1], i, j, size_of_i, sizes, members)
-        if union > 0.0:
-            pooled = values[k, 0] / union
+        if unions[k] > 0.0:
+            pooled = values[start[i] + k, 0] / unions[k]
             if pooled > score or (pooled == score and j < best):
                 best, score = j, pooled
     return best, score
@@ -423,7 +427,8 @@ def link(neighbours, best, score, sizes, members, num_views, threshold, root, wi
         start[a], stop[a] = first, used
         within[0, a] += within[0, b] + joined_inter
         _unpack_sizes(a, sizes, size_of, True)
-        within[1, a] += within[1, b] + _plus_sizes(joined_extra, a, b, size_of, sizes, members)
+        union = _unions(a, np.array([b]), np.array([joined_extra]), size_of, sizes, members)
+        within[1, a] += within[1, b] + union[0]
         _unpack_sizes(a, sizes, size_of, False)
         needed = sizes[1][a] - sizes[0][a] + sizes[1][b] - sizes[0][b]
         sizes, used_sizes = _with_room(needed, used_sizes, alive, sizes)
