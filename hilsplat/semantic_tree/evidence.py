@@ -88,7 +88,8 @@ def mask_evidence(
     seen_from = pairs.partners[place]
     own = seen_from == view[of_mask]
     least = min_covisible * seen[own]
-    parts = over_ranges(shared_pairs, num_views, threads, masks, share, weighted, partners, seen, least)
+    rest = partners, seen, least, pairs.min_iou
+    parts = over_ranges(shared_pairs, num_views, threads, masks, share, weighted, *rest)
     *of_pairs, best, score = (list(part) for part in zip(*parts, strict=True))
     counts, indices, sums = (np.concatenate(part) for part in of_pairs)
     top = np.argmax(score, axis=0), np.arange(num)  # the first of equal parts has the lowest partners

@@ -110,8 +110,8 @@ def seen_sizes(begin, end, masks, sizes, visible, pairs, out):
 
 
 @compiled
-def shared_pairs(begin, end, masks, share, weighted, pairs, seen, least):
-    """Return the pairs of masks a < b that share Gaussians, for masks a of views begin..end.
+def shared_pairs(begin, end, masks, share, weighted, pairs, seen, least, min_iou):
+    """Return the pairs of masks a < b with an IoU of at least `min_iou`, for masks a of views begin..end.
 
     Returns:
         number of pairs per mask a, masks b, and two sums per pair: the intersection, and the union minus the
@@ -167,9 +167,11 @@ def shared_pairs(begin, end, masks, share, weighted, pairs, seen, least):
                     if enough_a == 0.0 and enough_b == 0.0:
                         continue
                     extra = size_a + size_b - both - (enough_a + enough_b)
+                    pooled = both / (extra + enough_b + enough_a)  # summed as in `_unions`
+                    if pooled < min_iou:
+                        continue
                     from_a[count], to_b[count], sums[count, 0], sums[count, 1] = a, b, both, extra
                     count += 1
-                    pooled = both / (extra + enough_b + enough_a)  # summed as in `_unions`
                     if pooled > score[a]:
                         best[a], score[a] = b, pooled
                     if pooled > score[b]:

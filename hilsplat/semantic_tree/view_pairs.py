@@ -16,6 +16,9 @@ NEAREST = 24
 SPREAD = 24
 """Number of further partners, at equal steps among the remaining views that share Gaussians with it."""
 
+MIN_IOU = 0.01
+"""Minimum IoU of a pair of masks in a larger scene; most pairs that share Gaussians only touch."""
+
 MAX_SHARED = 2**29
 """Gaussians are sampled so that at most this many pairs (two views that show a Gaussian) are counted."""
 
@@ -31,11 +34,13 @@ class ViewPairs:
         indptr: where each view's partners begin.
         partners: views.
         mirror: for partner v of u, the position of u among the partners of v.
+        min_iou: pairs of masks with a smaller IoU are treated as if they shared no Gaussians.
     """
 
     indptr: Int64[np.ndarray, " V1"]
     partners: Int32[np.ndarray, " E"]
     mirror: Int64[np.ndarray, " E"]
+    min_iou: float
 
 
 def view_pairs(visible: sp.csr_matrix) -> ViewPairs:
@@ -65,7 +70,8 @@ def view_pairs(visible: sp.csr_matrix) -> ViewPairs:
     place = np.empty(len(row), np.int64)
     place[np.lexsort((row, pattern.indices))] = np.arange(len(row))
     mirror = place - pattern.indptr[pattern.indices]
-    return ViewPairs(pattern.indptr.astype(np.int64), pattern.indices.astype(np.int32), mirror)
+    partners, min_iou = pattern.indices.astype(np.int32), 0.0 if num <= MAX_ALL else MIN_IOU
+    return ViewPairs(pattern.indptr.astype(np.int64), partners, mirror, min_iou)
 
 
 def _shared(visible: sp.csr_matrix) -> Iterator[Int32[np.ndarray, " V"]]:
