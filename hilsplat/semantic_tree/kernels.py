@@ -5,6 +5,9 @@ import numpy as np
 from cpusplat.compiled import compiled
 from hilsplat.contributions.kernels import enlarged
 
+ROUNDING = 1e-9
+"""Bounds are raised by this share, which is far more than the rounding errors of sums."""
+
 ROWS_OF_A_BLOCK = 256
 """Rows per block; the best score of each block is stored, so finding the best row requires few reads."""
 
@@ -167,7 +170,7 @@ def shared_pairs(begin, end, masks, share, weighted, pairs, seen, least, min_iou
                     if enough_a == 0.0 and enough_b == 0.0:
                         continue
                     extra = size_a + size_b - both - (enough_a + enough_b)
-                    pooled = both / (extra + enough_b + enough_a)  # summed as in `_unions`
+                    pooled = both / (extra + enough_b + enough_a)  # summed as in `_union`
                     if pooled < min_iou:
                         continue
                     from_a[count], to_b[count], sums[count, 0], sums[count, 1] = a, b, both, extra
@@ -244,37 +247,29 @@ def _unpack_sizes(i, sizes, out, fill):
 
 
 @compiled
-def _unions(i, ids, extra, size_of_i, sizes, members):
-    """Return the unions of a cluster with others.
-
-    A union is `extra` plus, for each view in order, each cluster's size times the number of the other's masks
-    there. One call serves all neighbours, because this is the innermost loop of the linkage.
-    """
+def _union(i, j, extra, size_of_i, sizes, members):
+    """Return `extra` plus, view by view, each cluster's size times the number of the other's masks there."""
     start, stop, size_views, size_values = sizes
     member_start, member_stop, views, counts = members
-    num_views = len(size_of_i)
-    begin_i, end_i = member_start[i], member_stop[i]
-    unions = extra.copy()
-    for k in range(len(ids)):
-        j = ids[k]
-        first, last = start[j], stop[j]
-        at_i, at_j, end_j = begin_i, member_start[j], member_stop[j]
-        while at_i < end_i or at_j < end_j:
-            view_i = views[at_i] if at_i < end_i else num_views
-            view_j = views[at_j] if at_j < end_j else num_views
-            more = 0.0
-            if view_j <= view_i:
-                more = size_of_i[view_j] * counts[at_j, 0]
-                at_j += 1
-            if view_i <= view_j:
-                at = first + view_i
-                if last - first < num_views:  # some views are left out
-                    at = first + np.searchsorted(size_views[first:last], view_i)
-                if at < last and size_views[at] == view_i:
-                    more += size_values[at, 0] * counts[at_i, 0]
-                at_i += 1
-            unions[k] += more
-    return unions
+    num_views, first, last = len(size_of_i), start[j], stop[j]
+    at_i, end_i, at_j, end_j = member_start[i], member_stop[i], member_start[j], member_stop[j]
+    union = extra
+    while at_i < end_i or at_j < end_j:
+        view_i = views[at_i] if at_i < end_i else num_views
+        view_j = views[at_j] if at_j < end_j else num_views
+        more = 0.0
+        if view_j <= view_i:
+            more = size_of_i[view_j] * counts[at_j, 0]
+            at_j += 1
+        if view_i <= view_j:
+            at = first + view_i
+            if last - first < num_views:  # some views are left out
+                at = first + np.searchsorted(size_views[first:last], view_i)
+            if at < last and size_views[at] == view_i:
+                more += size_values[at, 0] * counts[at_i, 0]
+            at_i += 1
+        union += more
+    return union
 
 
 @compiled
@@ -305,16 +300,29 @@ def _best_neighbour(i, neighbours, size_of_i, sizes, members, place_of):
     """Return the neighbour with the best pooled IoU in a run of `_merged_run` (-1: none), and that IoU.
 
     On a tie, the lowest row is returned. The run's marks in `place_of` are cleared.
+
+    A union is at least its terms that need no size of the neighbour. This bounds the IoU of most neighbours
+    below the best, so that their sizes, which are far apart in memory, aren't read.
     """
     start, stop, ids, values = neighbours
-    run = slice(start[i], stop[i])
-    unions = _unions(i, ids[run], values[run, 1], size_of_i, sizes, members)
-    best, score = -1, -1.0
-    for k in range(len(unions)):
+    member_start, member_stop, views, counts = members
+    bound = np.empty(stop[i] - start[i])
+    for k in range(len(bound)):
         j = ids[start[i] + k]
         place_of[j] = -1
-        if unions[k] > 0.0:
-            pooled = values[start[i] + k, 0] / unions[k]
+        least = values[start[i] + k, 1]
+        for m in range(member_start[j], member_stop[j]):
+            least += size_of_i[views[m]] * counts[m, 0]
+        bound[k] = values[start[i] + k, 0] / least * (1 + ROUNDING) if least > 0.0 else np.inf
+    best, score = -1, -1.0
+    for k in range(-1, len(bound)):
+        entry = np.argmax(bound) if k < 0 < len(bound) else k  # the most promising first
+        if entry < 0 or bound[entry] < score:
+            continue
+        j = ids[start[i] + entry]
+        union = _union(i, j, values[start[i] + entry, 1], size_of_i, sizes, members)
+        if union > 0.0:
+            pooled = values[start[i] + entry, 0] / union
             if pooled > score or (pooled == score and j < best):
                 best, score = j, pooled
     return best, score
@@ -429,8 +437,7 @@ def link(neighbours, best, score, sizes, members, num_views, threshold, root, wi
         start[a], stop[a] = first, used
         within[0, a] += within[0, b] + joined_inter
         _unpack_sizes(a, sizes, size_of, True)
-        union = _unions(a, np.array([b]), np.array([joined_extra]), size_of, sizes, members)
-        within[1, a] += within[1, b] + union[0]
+        within[1, a] += within[1, b] + _union(a, b, joined_extra, size_of, sizes, members)
         _unpack_sizes(a, sizes, size_of, False)
         needed = sizes[1][a] - sizes[0][a] + sizes[1][b] - sizes[0][b]
         sizes, used_sizes = _with_room(needed, used_sizes, alive, sizes)
