@@ -1,5 +1,6 @@
 """Key views: training views that are segmented first and together show most of the scene."""
 
+import heapq
 import math
 from pathlib import Path
 
@@ -46,20 +47,33 @@ def key_views(scene: Scene, gaussians_ply: Path, share: float, threads: int = 1)
     """
     names, gaussians = train_views(scene), load_ply(gaussians_ply)
 
-    def mass(name: str) -> np.ndarray:
+    def shown(name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return the Gaussians that a view shows, and their mass there."""
         camera = scene.cameras[name]
         scale = min(1.0, SIDE_PX / max(camera.size_hw))
         height, width = (max(1, round(side * scale)) for side in camera.size_hw)
-        return visible_mass(pixel_weights(gaussians, camera.scaled((height, width)), min_weight=MIN_WEIGHT))
+        weights = pixel_weights(gaussians, camera.scaled((height, width)), min_weight=MIN_WEIGHT)
+        mass = visible_mass(weights)
+        rows = np.flatnonzero(mass > MIN_VISIBLE_PX)
+        return rows, mass[rows]
 
-    masses = np.stack(list(in_order(mass, names, threads)))
-    shows = masses > MIN_VISIBLE_PX
-    importance = np.where(shows, masses, 0).sum(axis=0, dtype=np.float64) / np.maximum(shows.sum(axis=0), 1)
+    total, views_of = np.zeros(len(gaussians)), np.zeros(len(gaussians))
+    rows_of = []
+    for rows, mass in in_order(shown, names, threads):
+        total[rows] += mass
+        views_of[rows] += 1
+        rows_of.append(rows)
+    importance = total / np.maximum(views_of, 1)
+    # Gains only fall, so a view whose gain is still the highest after an update is the best of all.
+    queue = [(-importance[rows].sum(), number) for number, rows in enumerate(rows_of)]
+    heapq.heapify(queue)
     chosen: list[int] = []
-    for _ in range(math.ceil(share * len(names))):
-        gains = shows @ importance
-        gains[chosen] = -1
-        best = int(gains.argmax())
-        chosen.append(best)
-        importance[shows[best]] /= 2
+    while len(chosen) < math.ceil(share * len(names)):
+        _, number = heapq.heappop(queue)
+        gain = importance[rows_of[number]].sum()
+        if queue and (-gain, number) > queue[0]:
+            heapq.heappush(queue, (-gain, number))
+            continue
+        chosen.append(number)
+        importance[rows_of[number]] /= 2
     return [names[number] for number in sorted(chosen)]

@@ -81,7 +81,7 @@ def linked_nodes(
     A cluster whose Gaussians all belong to other clusters, such as a duplicate, would select no Gaussians. A
     cluster therefore becomes a node only if it is the best fit of at least `min_views` masks.
 
-    Linking takes one thread; with several, the next levels are prepared at the same time. `S` and `mass`,
+    Linking takes one thread; with several, the next level is prepared at the same time. `S` and `mass`,
     the visible mass of each Gaussian in each view, are in px; masks are sorted by view.
     """
     visible = visible_in(mass)
@@ -124,8 +124,7 @@ def linked_nodes(
         linked: list[Future[Any]] = []
         for rows in rows_of_levels:
             linked.append(linker.submit(pooled_linkage, evidence(rows), settings.link_threshold))
-            if threads == 1:
-                wait(linked)
+            wait(linked if threads == 1 else linked[:-1])  # one level ahead, because pairs need much memory
         for rows, clusters in zip(rows_of_levels, linked, strict=True):
             yield nodes(rows, *clusters.result())
 

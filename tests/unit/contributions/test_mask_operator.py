@@ -9,7 +9,7 @@ from hilsplat.contributions.kernels import BLOCK
 from hilsplat.contributions.key_views import key_views
 from hilsplat.contributions.mask_operator import MaskOperator, lifted_average, lifted_median
 from hilsplat.scene.scene import Scene
-from tests.unit.two_boxes_world import two_boxes_weights
+from tests.unit.two_boxes_world import NUM_GAUSSIANS, two_boxes_weights
 
 
 @pytest.mark.parametrize("threads", [1, 3])
@@ -52,7 +52,7 @@ def test_a_share_of_the_training_views_is_chosen_in_camera_order(two_boxes, monk
         matrix[:, : 8 * first] = matrix[:, 8 * last :] = 0
         return matrix.tocsr()
 
-    monkeypatch.setattr(module, "load_ply", lambda path: None)
+    monkeypatch.setattr(module, "load_ply", lambda path: range(NUM_GAUSSIANS))
     monkeypatch.setattr(module, "pixel_weights", weights)
     scene = Scene.load(two_boxes.scene)
     assert key_views(scene, two_boxes.ply, 0.25) == ["000.png"]
