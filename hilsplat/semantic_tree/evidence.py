@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from jaxtyping import Float, Float64, Int32, Int64
 
 from cpusplat.threads import over_ranges
-from hilsplat.semantic_tree.kernels import seen_sizes, shared_pairs
+from hilsplat.semantic_tree.kernels import drop_small, seen_sizes, shared_pairs
 from hilsplat.semantic_tree.view_pairs import ViewPairs
 
 
@@ -67,33 +67,28 @@ def mask_evidence(
     The result does not depend on the number of threads.
 
     Args:
-        shares: one row per mask of a level, view by view; zeros for Gaussians not visible in the mask's view.
+        shares: float64, one row per mask of a level, view by view; zeros for Gaussians that are not visible
+            in the mask's view.
         visible: (V, N) with a stored entry for each Gaussian visible in each view.
         view: ascending view of each mask.
         pairs: partners of each view.
     """
-    num, (num_views, num_gaussians) = len(view), visible.shape
-    share = shares.data.astype(np.float64)
-    weight = importance.astype(np.float64)[shares.indices]
-    squares, weighted = weight * np.square(share), weight * share
+    num, num_views = len(view), visible.shape[0]
     starts = np.searchsorted(view, np.arange(num_views + 1))
     row_start = np.concatenate([[0], np.cumsum(np.diff(pairs.indptr)[view])])
-    masks = starts, (shares.indptr, shares.indices), num_gaussians
+    masks = starts, (shares.indptr, shares.indices, shares.data), importance.astype(np.float64)
     partners = (pairs.indptr, pairs.partners, pairs.mirror), row_start
-    seen = np.zeros(row_start[-1])  # size of each mask as seen from each partner of its view
+    sizes, full = np.zeros(row_start[-1]), np.zeros(num)
+    size_views = np.empty(row_start[-1], np.int32)
     shown = visible.indptr, visible.indices
-    over_ranges(seen_sizes, num_views, threads, masks, squares, shown, partners, seen)
-    of_mask = np.repeat(np.arange(num), np.diff(row_start))
-    place = np.arange(len(seen)) - row_start[of_mask] + pairs.indptr[view[of_mask]]
-    seen_from = pairs.partners[place]
-    own = seen_from == view[of_mask]
-    least = min_covisible * seen[own]
-    rest = partners, seen, least, pairs.min_iou
-    parts = over_ranges(shared_pairs, num_views, threads, masks, share, weighted, *rest)
+    over_ranges(seen_sizes, num_views, threads, masks, shown, partners, sizes, size_views, full)
+    least = min_covisible * full
+    rest = partners, sizes, least, pairs.min_iou
+    parts = over_ranges(shared_pairs, num_views, threads, masks, *rest)
+    drop_small(row_start, least, sizes)
     *of_pairs, best, score = (list(part) for part in zip(*parts, strict=True))
     counts, indices, sums = (np.concatenate(part) for part in of_pairs)
-    top = np.argmax(score, axis=0), np.arange(num)  # the first of equal parts has the lowest partners
     indptr = np.concatenate([[0], np.cumsum(counts)])
-    sizes = np.where(seen < least[of_mask], 0.0, seen)
+    top = np.argmax(score, axis=0), np.arange(num)  # the first of equal parts has the lowest partners
     best_of = np.stack(best)[top], np.stack(score)[top]
-    return Evidence(indptr, indices, sums, row_start, seen_from, sizes, *best_of, view, num_views)
+    return Evidence(indptr, indices, sums, row_start, size_views, sizes, *best_of, view, num_views)

@@ -86,12 +86,15 @@ def _numbered(begin, end, indices, number):
 
 
 @compiled
-def seen_sizes(begin, end, masks, sizes, visible, pairs, out):
-    """Write to `out` the size of each mask of views begin..end on the Gaussians visible in each partner."""
-    starts, (indptr, indices), num_gaussians = masks
+def seen_sizes(begin, end, masks, visible, pairs, out, out_views, full):
+    """Write to `out` the size of each mask of views begin..end on the Gaussians visible in each partner.
+
+    The partners are written to `out_views`, and the size in the mask's own view to `full`.
+    """
+    starts, (indptr, indices, share), importance = masks
     visible_indptr, visible_indices = visible
     (pair_indptr, partners, _), row_start = pairs
-    number = np.full(num_gaussians, -1, np.int32)
+    number = np.full(len(importance), -1, np.int32)
     for u in range(begin, end):
         first, last = indptr[starts[u]], indptr[starts[u + 1]]
         count = _numbered(first, last, indices, number)
@@ -106,14 +109,28 @@ def seen_sizes(begin, end, masks, sizes, visible, pairs, out):
             sums = out[row_start[a] : row_start[a + 1]]
             for k in range(indptr[a], indptr[a + 1]):
                 seen = flags[number[indices[k]]]
+                size = importance[indices[k]] * (share[k] * share[k])
                 for p in range(width):
-                    sums[p] += sizes[k] * seen[p]
+                    sums[p] += size * seen[p]
+            for p in range(width):
+                out_views[row_start[a] + p] = partners[pair_indptr[u] + p]
+                if partners[pair_indptr[u] + p] == u:
+                    full[a] = sums[p]
         for k in range(first, last):
             number[indices[k]] = -1
 
 
 @compiled
-def shared_pairs(begin, end, masks, share, weighted, pairs, seen, least, min_iou):
+def drop_small(row_start, least, sizes):
+    """Set sizes below each mask's least to zero."""
+    for a in range(len(least)):
+        for k in range(row_start[a], row_start[a + 1]):
+            if sizes[k] < least[a]:
+                sizes[k] = 0.0
+
+
+@compiled
+def shared_pairs(begin, end, masks, pairs, seen, least, min_iou):
     """Return the pairs of masks a < b with an IoU of at least `min_iou`, for masks a of views begin..end.
 
     Returns:
@@ -121,9 +138,9 @@ def shared_pairs(begin, end, masks, share, weighted, pairs, seen, least, min_iou
         sizes of both masks (0 for a mask of which the other view sees less than `least`); and, of all masks,
         the best partner and IoU among these pairs (-1 for none; on a tie, the lowest partner).
     """
-    starts, (indptr, indices), num_gaussians = masks
+    starts, (indptr, indices, share), importance = masks
     (pair_indptr, partners, mirror), row_start = pairs
-    number = np.full(num_gaussians, -1, np.int32)
+    number = np.full(len(importance), -1, np.int32)
     counts = np.zeros(starts[end] - starts[begin], np.int64)
     out, out_sums = np.empty(1024, np.int32), np.empty((1024, 2))
     best, score = np.full(starts[-1], -1, np.int64), np.full(starts[-1], -1.0)
@@ -138,7 +155,7 @@ def shared_pairs(begin, end, masks, share, weighted, pairs, seen, least, min_iou
         for a in range(starts[u], starts[u + 1]):
             for k in range(indptr[a], indptr[a + 1]):
                 at = lists[number[indices[k]] + 1]
-                of[at], of_weighted[at] = a - starts[u], weighted[k]
+                of[at], of_weighted[at] = a - starts[u], importance[indices[k]] * share[k]
                 lists[number[indices[k]] + 1] += 1
         from_a, to_b, sums = np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty((1024, 2))
         count = 0
@@ -343,7 +360,7 @@ def _with_room(needed, used, alive, runs):
             living += stop[i] - start[i]
     to_ids, to_values = ids, values
     if living + needed > len(ids):
-        room = 2 * (living + needed)
+        room = (living + needed) * 5 // 4
         to_ids, to_values = np.empty(room, np.int32), np.empty((room, values.shape[1]))
     used = 0
     for i in np.argsort(start):  # in the order of the runs, so that none overwrites one that isn't moved yet
