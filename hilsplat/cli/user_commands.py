@@ -110,6 +110,21 @@ def show_masks(
 
 
 @app.command()
+def scenes(
+    pattern: Annotated[str, typer.Argument(help="scenes to list, such as 'photos/*'")] = "*",
+    results: Results = Path("results"),
+    out: Annotated[Path | None, typer.Option(help="CSV to write as well")] = None,
+    protocol: Annotated[
+        str, typer.Option(help="protocol of the IoU of the tree's answers; default: lerf/tree-nodes")
+    ] = "",
+) -> None:
+    """Print a table of all scenes: views, Gaussians, PSNR, nodes at three levels, and IoU if labelled."""
+    from hilsplat.evaluate.scenes import PROTOCOL, run_scenes
+
+    echo(run_scenes(results, pattern, out, protocol or PROTOCOL))
+
+
+@app.command()
 def verify(
     results: Annotated[Path, typer.Argument(help="results folder, or a copy of it")] = Path("results"),
 ) -> None:
