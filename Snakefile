@@ -65,8 +65,8 @@ pathvars:
 
 
 wildcard_constraints:
-    dataset=any_of(row.dataset for row in PLAN.rows),
-    scene=any_of(row.scene for row in PLAN.rows),
+    dataset=PLAN.datasets(),
+    scene="[^/]+",
     variant=any_of(PLAN.run.every_variant()),
 
 

@@ -5,6 +5,8 @@
     scene = hilsplat.open_scene("results/photos/desk")
     for hit in scene.query("mug > handle"):
         print(hit.score, hit.level.label, hit.gaussians)
+    for hit in hilsplat.open_scenes("results").query("mug"):  # the scenes that match best
+        print(hit.score, hit.scene, hit.picture)
 
 The names in `__all__` are the public interface (docs/python.md); everything else may change. Importing the
 package loads no large library.
@@ -18,9 +20,21 @@ if TYPE_CHECKING:
     from hilsplat.base.levels import Level
     from hilsplat.query.hits import Doubt, Hit
     from hilsplat.query.language_scene import LanguageScene, open_scene
+    from hilsplat.query.scenes import SceneHit, Scenes, open_scenes
     from hilsplat.viewer.app import show
 
-__all__ = ["Doubt", "HilsplatError", "Hit", "LanguageScene", "Level", "open_scene", "show"]
+__all__ = [
+    "Doubt",
+    "HilsplatError",
+    "Hit",
+    "LanguageScene",
+    "Level",
+    "SceneHit",
+    "Scenes",
+    "open_scene",
+    "open_scenes",
+    "show",
+]
 
 _MODULES = {
     "HilsplatError": "hilsplat.base.errors",
@@ -28,7 +42,10 @@ _MODULES = {
     "Doubt": "hilsplat.query.hits",
     "Hit": "hilsplat.query.hits",
     "LanguageScene": "hilsplat.query.language_scene",
+    "SceneHit": "hilsplat.query.scenes",
+    "Scenes": "hilsplat.query.scenes",
     "open_scene": "hilsplat.query.language_scene",
+    "open_scenes": "hilsplat.query.scenes",
     "show": "hilsplat.viewer.app",
 }
 

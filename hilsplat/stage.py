@@ -182,7 +182,7 @@ class Stage(Generic[P, R]):
         text = repr((code.co_code, code.co_names, code_digest(*self.imports, *plugins)))
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
-    @property
+    @cached_property
     def imports(self) -> list[str]:
         """Names of the modules that the function itself imports."""
         steps = dis.get_instructions(inspect.unwrap(self.function).__code__)

@@ -72,22 +72,27 @@ def digests_of(paths: Collection[str], memo: Path) -> dict[str, str]:
 
     Programs cannot set the status change time, so it reveals a replacement of the same size and time.
     """
-    old = read_memo(memo, dict[str, str])
-
-    def entry(path: str) -> str:
-        with suppress(OSError, HilsplatError):  # the stage reports them
+    old, entries = read_memo(memo, dict[str, str]), dict[str, str]()
+    changed: dict[str, str] = {}
+    for path in paths:
+        with suppress(OSError):  # the stage reports it
             stat = Path(path).stat()
             stamp = f"{stat.st_size} {stat.st_mtime_ns} {stat.st_ctime_ns} "
-            is_unchanged = old.get(path, "").startswith(stamp)
-            return old[path] if is_unchanged else stamp + sha256_of_file(Path(path))
-        return "unreadable"
+            if old.get(path, "").startswith(stamp):
+                entries[path] = old[path]
+            else:
+                changed[path] = stamp
 
-    with ThreadPoolExecutor() as threads:
-        entries = dict(zip(paths, threads.map(entry, paths), strict=True))
-    if not entries.items() <= old.items():
+    def read(path: str) -> None:
+        with suppress(OSError, HilsplatError):
+            entries[path] = changed[path] + sha256_of_file(Path(path))
+
+    if changed:  # a run of thousands of scenes would otherwise start as many pools
+        with ThreadPoolExecutor() as threads:
+            list(threads.map(read, changed))
         with suppress(OSError):  # a read-only folder of results
             write_json(memo, old | entries)
-    return {path: entry.split()[-1] for path, entry in entries.items()}
+    return {path: entries.get(path, "unreadable").split()[-1] for path in paths}
 
 
 def visible_files(folder: Path) -> list[Path]:

@@ -24,7 +24,7 @@ def init(folder: Annotated[Path, typer.Argument(help="folder of the project")] =
 def run_command(
     targets: Annotated[
         list[str] | None,
-        typer.Argument(metavar="TARGET", help="scenes (photos/desk or desk), tables or files; default: all"),
+        typer.Argument(metavar="TARGET", help="scenes (photos/desk, desk or 'photos/*'), tables or files"),
     ] = None,
     config: Annotated[
         list[Path] | None, typer.Option(help="file that overrides config/config.yaml; may be repeated")

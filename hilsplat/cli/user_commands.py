@@ -19,7 +19,14 @@ SceneName = Annotated[str, typer.Argument(help="scene in results/, such as desk 
 @app.command()
 def query(
     scene: SceneName,
-    text: Annotated[str, typer.Argument(help="what to look for; 'bear > nose' finds the noses of bears")],
+    text: Annotated[
+        str | None, typer.Argument(help="what to look for; 'bear > nose' finds the noses of bears")
+    ] = None,
+    all_scenes: Annotated[
+        bool, typer.Option("--all", help="rank all finished scenes: --all TEXT, or --all 'photos/*' TEXT")
+    ] = False,
+    limit: Annotated[int, typer.Option(min=1, help="with --all: maximum number of scenes")] = 10,
+    as_json: Annotated[bool, typer.Option("--json", help="with --all: print the answers as JSON")] = False,
     level: Annotated[str, typer.Option(help="level of the answers: auto, whole, part, subpart")] = "auto",
     variant: Annotated[str, typer.Option(help="variant to query")] = "default",
     results: Results = Path("results"),
@@ -39,8 +46,19 @@ def query(
     """Find the objects or parts that match a text in a finished scene.
 
     Prints the score, level, position, size and best views of each answer. Writes a picture (panel.png) and
-    the answers' Gaussians (selection.ply).
+    the answers' Gaussians (selection.ply). With --all, prints the best answer of each of the best scenes.
     """
+    if all_scenes:
+        from hilsplat.query.scenes import open_scenes, report_of
+
+        pattern, wanted = ("*", scene) if text is None else (scene, text)
+        scenes = open_scenes(results, pattern, variant)
+        hits = scenes.query(wanted, level, threshold=threshold, limit=limit)
+        rows = [hit.as_json() for hit in hits]
+        echo(json.dumps(rows, indent=1) if as_json else report_of(scenes, wanted, hits))
+        return
+    if text is None:
+        raise SettingsError(f"there is no text to search for in {scene}", fix="hilsplat query SCENE TEXT")
     gc.disable()  # garbage collection would take two seconds, a tenth of the query time
     try:
         from hilsplat.query.answer import answer
@@ -89,6 +107,21 @@ def show_masks(
     from hilsplat.segment.pictures import masks_overview
 
     echo(f"wrote {out}, view {masks_overview(scene, masks, out, view, coverage_tree)}")
+
+
+@app.command()
+def scenes(
+    pattern: Annotated[str, typer.Argument(help="scenes to list, such as 'photos/*'")] = "*",
+    results: Results = Path("results"),
+    out: Annotated[Path | None, typer.Option(help="CSV to write as well")] = None,
+    protocol: Annotated[
+        str, typer.Option(help="protocol of the IoU of the tree's answers; default: lerf/tree-nodes")
+    ] = "",
+) -> None:
+    """Print a table of all scenes: views, Gaussians, PSNR, nodes at three levels, and IoU if labelled."""
+    from hilsplat.evaluate.scenes import PROTOCOL, run_scenes
+
+    echo(run_scenes(results, pattern, out, protocol or PROTOCOL))
 
 
 @app.command()

@@ -12,22 +12,22 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int64, UInt8
+from jaxtyping import Float32, Int64, UInt8
 
 from hilsplat.base.errors import ArtifactError, SettingsError
-from hilsplat.base.levels import LEVELS, NONE, Level, path_of
+from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.lineage import require_made_from, sha256_of_file
 from hilsplat.embed.clip import ClipModel, open_clip_of
 from hilsplat.field.code import LanguageField, autoencoder_file, load_code
-from hilsplat.models.store import is_embedded, meaningless
 from hilsplat.query.field_answers import FieldAnswers
 from hilsplat.query.hits import Doubt, Hit, doubts_of
 from hilsplat.query.names import NodeNames, read_names
 from hilsplat.query.node_names import NodeNaming
-from hilsplat.query.node_search import NodeHits, TextAnswer, search
-from hilsplat.query.relevancy import margin_of_relevancy, margins, relevancy_of_margins
+from hilsplat.query.node_queries import NodeQueries, caution_of
+from hilsplat.query.node_search import NodeHits
+from hilsplat.query.relevancy import relevancy_of_margins
 from hilsplat.query.scene_views import Opened, SceneViews, ViewStore
-from hilsplat.scene.finished import FinishedScene, SceneParts, is_drawn
+from hilsplat.scene.finished import FinishedScene, SceneParts
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import OrientedBox, SemanticTree
 from hilsplat.settings import EvaluateSettings
@@ -36,17 +36,12 @@ from hilsplat.splat.ply import load_ply
 
 logger = logging.getLogger(__name__)
 
-NAMED = 2.0
-"""Cosine margin of a node for its user-given name: the maximum, so that the node is ranked first."""
-
 BEST_VIEWS = 3
 """Maximum number of best views of an answer."""
 
-ANSWERERS = ("tree", "field")
-
 
 @dataclass(frozen=True)
-class LanguageScene:
+class LanguageScene(NodeQueries):
     """A finished scene that accepts text queries.
 
     Attributes:
@@ -142,10 +137,7 @@ class LanguageScene:
 
     @cached_property
     def caution(self) -> str:
-        """Reason why CLIP's answers are meaningless for this scene, as a sentence; empty if they are not."""
-        model = self.clip.model
-        is_meaningless = is_embedded(model.config) and not is_drawn(self.scene.folder)
-        return meaningless(model.folder.name) if is_meaningless else ""
+        return caution_of(self.clip, self.scene.folder)
 
     # -- answers ----------------------------------------------------------------------------------
 
@@ -245,88 +237,10 @@ class LanguageScene:
 
         For arguments and errors, see `query`; level None means "auto".
         """
-        path = path_of(path) if isinstance(path, str) else tuple(path)
-        if answerer not in ANSWERERS:
-            raise SettingsError(
-                f"answerer {answerer!r} is unknown", expected=" or ".join(ANSWERERS), found=answerer
-            )
-        if isinstance(level, str):
-            levels = {"auto": None} | {known.label: known for known in LEVELS}
-            if level not in levels:
-                raise SettingsError(f"level {level!r} is unknown", expected=", ".join(levels), found=level)
-            level = levels[level]
-        every_node = np.ones(len(self.tree), np.bool_)
-        visible = every_node if view is None else self.views.visible_nodes(view)
-        nodes = search(
-            self.tree,
-            self.node_margins(path, answerer),
-            self.node_vectors(answerer),
-            path,
-            threshold=self.settings.node_select if threshold is None else 0.0,  # 0 selects the whole level
-            ancestors=self.settings.ancestors,
-            visible=visible,
-            level=level,
-        )
-        if threshold is not None:
-            is_above = nodes.values >= margin_of_relevancy(threshold, self.settings.relevancy_scale)
-            nodes = replace(nodes, ids=nodes.ids[is_above], values=nodes.values[is_above])
-        return replace(nodes, texts=tuple(self._doubted(text, answerer, visible) for text in nodes.texts))
-
-    def _doubted(self, answer: TextAnswer, answerer: str, visible: Bool[np.ndarray, " n"]) -> TextAnswer:
-        """Add to a text's answer the share of words for absent objects that score at least as high."""
-        if self.names.nodes_of(answer.text):
-            return answer
-        chance = None
-        if self.naming is not None and len(self.naming.rivals):
-            if answer.margin < answer.anywhere:  # only one level was searched
-                visible = visible & (self.tree.level == int(answer.level))
-            if answerer not in self._rival_margins:
-                self._rival_margins[answerer] = self._margins(self.naming.rivals, answerer)
-            best = self._rival_margins[answerer][:, visible].max(axis=1, initial=-np.inf)
-            chance = (1 + int((best >= answer.margin).sum())) / (1 + len(best))
-        return replace(answer, chance=chance, unknown=tuple(self.clip.unknown_words(answer.text)))
-
-    def name_of(self, node: int) -> str:
-        """Return the user's name for a node, otherwise its vocabulary name; empty if no name fits.
-
-        The name of the whole is appended to a part's vocabulary name that lacks it, as in "wheel of car".
-        """
-        name, parent = self.own_name_of(node), int(self.tree.parent[node])
-        if not name or parent == NONE or node in self.names.of_node:
-            return name
-        while int(self.tree.parent[parent]) != NONE:
-            parent = int(self.tree.parent[parent])
-        whole = self.name_of(parent)
-        return name if not whole or whole in name else f"{name} of {whole}"
-
-    def own_name_of(self, node: int) -> str:
-        """Return `name_of` without the name of the whole that a part belongs to."""
-        vocabulary_name = self.naming.of_node[node] if self.naming is not None else ""
-        return self.names.of_node.get(node, "") or vocabulary_name
+        visible = None if view is None else self.views.visible_nodes(view)
+        return self.find(path, level=level, answerer=answerer, threshold=threshold, visible=visible)
 
     # -- relevancy --------------------------------------------------------------------------------
-
-    def node_margins(self, texts: Sequence[str], answerer: str = "tree") -> Float32[np.ndarray, "T n"]:
-        """Return each node's cosine margin for each text, relative to this scene's canonical phrases.
-
-        A node's margin for the name that the user gave it is `NAMED`.
-        """
-        of_texts = self._margins(self.clip.embed_texts(list(texts)), answerer)
-        for row, text in zip(of_texts, texts, strict=True):
-            row[self.names.nodes_of(text)] = NAMED
-        return of_texts
-
-    def _margins(self, vectors: Float32[np.ndarray, "T C"], answerer: str) -> Float32[np.ndarray, "T n"]:
-        canonical = self.clip.embed_texts(list(self.settings.canonical))
-        return margins(self.node_vectors(answerer), vectors, canonical)
-
-    def caution_about(self, text: str) -> str:
-        """Return `caution`, or "" if every text of a query is a user-given name, which needs no CLIP."""
-        return "" if all(self.names.nodes_of(part) for part in path_of(text)) else self.caution
-
-    def node_relevancy(self, texts: Sequence[str], answerer: str = "tree") -> Float32[np.ndarray, "T n"]:
-        """Return the relevancy of each node to each text."""
-        return relevancy_of_margins(self.node_margins(texts, answerer), self.settings.relevancy_scale)
 
     def node_vectors(self, answerer: str = "tree") -> Float32[np.ndarray, "n C"]:
         """Return the nodes' unit vectors: those of the tree, or those decoded from their Gaussians' field."""

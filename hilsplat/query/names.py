@@ -57,7 +57,8 @@ def read_names(folder: Path, semantic_tree: Path) -> NodeNames:
     """
     path = Path(folder) / FILE
     version = version_of(path)  # before the names: if these change in between, they cannot be replaced
-    names = _stored(path).trees.get(tree_digest(semantic_tree), {})
+    trees = _stored(path).trees
+    names = trees.get(tree_digest(semantic_tree), {}) if trees else {}
     num_nodes = len(read_npz(Path(semantic_tree) / "tree.npz")["level"]) if names else 0
     if beyond := [node for node in names if node >= num_nodes]:
         raise ArtifactError(

@@ -30,6 +30,7 @@ from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel, open_clip_of
 from hilsplat.models.store import AUTO
 from hilsplat.query.names import NAME_RULE, checked_name, tree_digest
+from hilsplat.query.node_index import NodeIndex
 from hilsplat.query.relevancy import margins
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import EvaluateSettings, QuerySettings
@@ -148,7 +149,9 @@ def run_names(
     settings: QuerySettings,
     evaluate: EvaluateSettings,
 ) -> None:
-    """Name the nodes of a tree; write `names.json`, `rivals.npy` and an index to `out`.
+    """Name the nodes of a tree, and index them for queries of many scenes (`node_index`).
+
+    Writes `names.json`, `rivals.npy`, `nodes.safetensors` and an index to `out`.
 
     Args:
         clip_folder: CLIP vectors of the masks.
@@ -183,6 +186,7 @@ def run_names(
         rows = named(tree, vocabulary, margin)
         write_json(folder / "names.json", rows)
         write_npy(folder / "rivals.npy", of(rivals).astype(np.float16))
+        NodeIndex.of(tree).save(folder)
         write_index(
             folder,
             {},

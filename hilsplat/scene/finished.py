@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from hilsplat.base.artifacts import read_index, run_command
+from hilsplat.base.artifacts import provenance_path, read_index, run_command
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.lineage import read_provenance
 from hilsplat.base.plugins import entry_points
@@ -97,17 +97,18 @@ class FinishedScene:
     def evaluate_settings(self) -> EvaluateSettings:
         """Return the query settings of the run that made the scene, from the provenance of its scores.
 
-        A scene without labels has no scores, but its panel was drawn with the same settings.
+        A scene without labels has no scores, but its nodes were named, and its panel drawn, with the same
+        settings.
         """
-        scores, scene = self.folder / self.variant / "scores.csv", self.folder.resolve()
+        own, scene = self.folder / self.variant, self.folder.resolve()
         panel = scene.parent.parent / "figures" / scene.parent.name / scene.name / "panel.png"
-        if (record := read_provenance(scores)) is not None:
-            settings = record.settings
-        elif (record := read_provenance(panel)) is not None:
-            settings = record.settings.get("evaluate", {})
-        else:
+        records = map(read_provenance, (own / "scores.csv", own / "names", panel))
+        settings = next((record.settings.get("evaluate", {}) for record in records if record), None)
+        if settings is None:
+            logger.warning(
+                "%s: no scores, names or panel record the settings; using the defaults", self.folder
+            )
             settings = {}
-            logger.warning("%s: no scores or panel record the settings; using the defaults", self.folder)
         values = {name: settings[name] for name in EvaluateSettings.model_fields if name in settings}
         try:
             return EvaluateSettings(**values)
@@ -158,6 +159,31 @@ def _unfinished(folder: Path, missing: Path) -> ArtifactError:
 def _input_of(artifact: Path, name: str, folder: Path) -> Path:
     """Return the path of an artifact's input from its provenance or, if not recorded, beside the artifact."""
     return _recorded_input(artifact, name, folder) or artifact.parent / name
+
+
+def changed_input(artifact: Path, folder: Path) -> str:
+    """Return the name of an artifact from which another was made and which was rebuilt or removed since.
+
+    The provenance records of the scene are followed from `artifact` to its poses. The result is empty if no
+    recorded input has changed; artifacts without a record are not compared.
+    """
+    waiting, seen = [read_provenance(artifact)], set[Path]()
+    while waiting:
+        record = waiting.pop()
+        for read in record.inputs.values() if record else ():
+            if read.sha256 is None:
+                continue  # files of a user, which only the workflow compares
+            places = [folder / Path(*Path(read.path).parts[-count:]) for count in (2, 1)]
+            path = next((place for place in places if provenance_path(place).is_file()), None)
+            if path is None or path in seen:
+                continue
+            made = read_provenance(path)
+            written = made.outputs.get(path.name) if made else None
+            if not path.exists() or (written is not None and written.sha256 != read.sha256):
+                return path.name
+            seen.add(path)
+            waiting.append(made)
+    return ""
 
 
 def _recorded_input(artifact: Path, name: str, folder: Path) -> Path | None:

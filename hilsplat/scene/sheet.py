@@ -4,9 +4,10 @@ The workflow imports this module at start-up, so it does not import slow modules
 """
 
 import difflib
+import fnmatch
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -158,23 +159,39 @@ def choose_scenes(
 ) -> tuple[SceneRow, ...]:
     """Return the scenes of a run in the order of the sheet: all scenes of the groups, or only named scenes.
 
-    A name (`table-1` or `synthetic/table-1`) selects scenes in the groups or, if none matches, in any group.
+    A name (`table-1` or `synthetic/table-1`) or pattern (`synthetic/*`) selects scenes in the groups or, if
+    none matches, in any group.
     """
     in_groups = [row for row in rows if row.group in groups]
     if not only:
         return tuple(in_groups)
     chosen: set[str] = set()
+    of_groups, of_all = matches_of(in_groups, only), matches_of(rows, only)
     for name in only:
-        matches = [row.name for row in in_groups if name in (row.scene, row.name)]
-        matches = matches or [row.name for row in rows if name in (row.scene, row.name)]
+        matches = of_groups[name] or of_all[name]
         if not matches:
             raise SceneError(
                 f"setting `only`: no scene is named {name!r}",
                 expected=", ".join(row.name for row in in_groups or rows),
                 fix="correct the name, or add a row to the scene sheet",
             )
-        chosen.update(matches)
+        chosen.update(row.name for row in matches)
     return tuple(row for row in rows if row.name in chosen)
+
+
+def matches_of(rows: Iterable[SceneRow], names: Iterable[str]) -> dict[str, list[SceneRow]]:
+    """Map each name or pattern to the scenes whose name or `<dataset>/<scene>` it matches (`fnmatch`)."""
+    by_name: dict[str, list[SceneRow]] = {}
+    for row in rows:
+        for name in (row.scene, row.name):
+            by_name.setdefault(name, []).append(row)
+    found = {name: fnmatch.filter(by_name, name) if is_pattern(name) else [name] for name in names}
+    return {name: [row for each in same for row in by_name.get(each, ())] for name, same in found.items()}
+
+
+def is_pattern(name: str) -> bool:
+    """Return whether a name has wildcards, which the names of scenes cannot contain."""
+    return any(letter in name for letter in "*?[")
 
 
 def content_lines(path: Path) -> list[tuple[int, str]]:
@@ -227,8 +244,8 @@ def _row(
     if cells["unit"] not in UNITS:
         problem, expected = f"{cells['unit']!r} is unknown", f"one of {', '.join(UNITS)}"
         raise fault("unit", problem, "correct column unit of that line", expected=expected)
-    near = difflib.get_close_matches(cells["group"], GROUPS, n=1, cutoff=0.8)
-    if near and cells["group"] not in GROUPS:
+    near = [] if cells["group"] in GROUPS else difflib.get_close_matches(cells["group"], GROUPS, 1, 0.8)
+    if near:
         problem, expected = f"{cells['group']!r} is unknown", f"did you mean {near[0]!r}?"
         raise fault("group", problem, "correct the group, or choose another name", expected=expected)
     source = cells["source"]

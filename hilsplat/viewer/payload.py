@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float32, Float64, Int64
 from typing_extensions import TypedDict  # pydantic needs this class before Python 3.12
 
 from hilsplat.base.levels import LEVELS, path_of
@@ -22,9 +22,6 @@ from hilsplat.web.server import view_name
 
 CHUNK = 65_536
 """Gaussians per chunk: 32 rows of the page's textures."""
-
-MAX_NODES = 65_534
-"""Maximum number of nodes: they are numbered from 1 in 16 bits, and 0 means no node."""
 
 LISTED = 24
 """Maximum number of answers in the list."""
@@ -42,9 +39,11 @@ def arrival_order(gaussians: Gaussians) -> Int64[np.ndarray, " N"]:
 
 
 def packed_nodes(tree: SemanticTree, order: Int64[np.ndarray, " N"]) -> bytes:
-    """Return gzipped RGBA16UI texels: one node per Gaussian and level, numbered from 1, or 0 if none."""
-    assert len(tree) <= MAX_NODES, f"{len(tree)} nodes"
-    texels = np.zeros((len(order), 4), np.uint16)
+    """Return gzipped RGBA texels: one node per Gaussian and level, numbered from 1, or 0 if none.
+
+    A number has 16 bits or, if these are too few, 32; the page distinguishes them by the number of bytes.
+    """
+    texels = np.zeros((len(order), 4), np.uint16 if len(tree) <= np.iinfo(np.uint16).max else np.uint32)
     texels[:, :3] = tree.node_of_gaussian[order] + 1
     return gzip.compress(texels.tobytes(), 1, mtime=0)
 
@@ -98,6 +97,7 @@ def described_nodes(scene: LanguageScene) -> dict[str, Any]:
     """Describe the nodes for the page's outline: one entry per node, in row order."""
     tree, names, naming = scene.tree, scene.names, scene.naming
     members = np.bincount(tree.node_of_gaussian.ravel() + 1, minlength=len(tree) + 1)[1:]
+    corners = box_corners(tree.oriented_box)
     return {
         "version": names.version,
         "levels": [level.label for level in LEVELS],
@@ -112,7 +112,7 @@ def described_nodes(scene: LanguageScene) -> dict[str, Any]:
                 "views": int(tree.views[node]),
                 "quality": round(float(tree.quality[node]), 3),
                 "centroid": [round(value, 5) for value in tree.centroid[node].tolist()],
-                "corners": box_corners(tree.oriented_box[node]),
+                "corners": corners[node],
                 "size": [round(value, 5) for value in tree.oriented_box[node][4].tolist()],
                 "best_view": tree.view_names[int(tree.view_area_px[node].argmax())],
             }
@@ -121,9 +121,12 @@ def described_nodes(scene: LanguageScene) -> dict[str, Any]:
     }
 
 
-def box_corners(rows: np.ndarray) -> list[list[float]]:
-    """Return the eight corners of a stored oriented box."""
-    return np.round(OrientedBox.from_array(rows).corners(), 5).tolist()
+def box_corners(rows: Float32[np.ndarray, "n 5 3"]) -> list[list[list[float]]]:
+    """Return the eight corners of each stored oriented box (`OrientedBox.corners`, many at once)."""
+    unit = OrientedBox.from_array(np.vstack([np.zeros(3), np.eye(3), np.ones(3)])).corners()
+    boxes = rows.astype(np.float64)
+    corners = boxes[:, :1] + (unit * boxes[:, 4:]) @ boxes[:, 1:4]
+    return np.round(corners, 5).tolist()
 
 
 class FoundNode(TypedDict):
@@ -226,7 +229,7 @@ def boxes(scene: LanguageScene, groups: Sequence[Group]) -> dict[str, Any]:
                 "centre": tree.oriented_box[node][0].tolist(),
                 "axes": tree.oriented_box[node][1:4].tolist(),
                 "size": tree.oriented_box[node][4].tolist(),
-                "corners": box_corners(tree.oriented_box[node]),
+                "corners": box_corners(tree.oriented_box[[node]])[0],
                 "lower": tree.box[node][0].tolist(),
                 "upper": tree.box[node][1].tolist(),
                 "centroid": tree.centroid[node].tolist(),

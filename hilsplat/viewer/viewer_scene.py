@@ -26,7 +26,7 @@ from hilsplat.splat.rasterise.api import pixel_weights
 from hilsplat.splat.spz import fractional_bits, spz_bytes
 from hilsplat.viewer import payload
 from hilsplat.viewer.frames import Paint, painted, pick
-from hilsplat.viewer.wire import Style
+from hilsplat.viewer.wire import MAX_NODES, Style
 from hilsplat.web.scene_thread import ShownScene
 
 VIEWS_MIB = 256.0
@@ -108,8 +108,13 @@ class ViewerScene(ShownScene):
                 finished = FinishedScene.locate(self.folder, variant)
                 self.note(finished.parts.as_inputs().values())
                 scene = LanguageScene.of(finished, threads=self.threads, opened=self.opened)
-            if len(scene.tree) > payload.MAX_NODES:
-                raise ArtifactError(f"the tree of {variant} has {len(scene.tree)} nodes, too many to show")
+            if len(scene.tree) > MAX_NODES:
+                raise ArtifactError(
+                    f"the semantic tree {finished.parts.semantic_tree} is too large for the page",
+                    expected=f"at most {MAX_NODES} nodes",
+                    found=f"{len(scene.tree)}",
+                    fix="query the scene with hilsplat query, or raise semantic_tree.min_views",
+                )
             self._variants[variant] = finished.parts, scene
         return scene
 

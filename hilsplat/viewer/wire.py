@@ -15,7 +15,11 @@ from hilsplat.web.messages import MAX_SIDE_PX, Message
 Row3 = tuple[float, float, float]
 Row4 = tuple[float, float, float, float]
 LevelName = Literal["auto", "whole", "part", "subpart"]
-Nodes = Annotated[list[Annotated[int, Field(ge=0)]], Field(max_length=65_534)]
+
+MAX_NODES = 131_071
+"""Maximum number of nodes that the page shows: the table of a style must fit into a request of 1 MiB."""
+
+Nodes = Annotated[list[Annotated[int, Field(ge=0)]], Field(max_length=MAX_NODES)]
 
 
 class WireCamera(Message):
@@ -55,7 +59,7 @@ class Style(Message):
         ramp: base64 of 256 RGB colours; if given, colours show the field's relevancy to `text` at `level`.
     """
 
-    table: Annotated[str, Field(max_length=400_000)] = ""
+    table: Annotated[str, Field(max_length=6 * (MAX_NODES + 1))] = ""
     use: tuple[bool, bool, bool] = (True, True, True)
     mode: Literal["plain", "tint", "ghost", "isolate"] = "plain"
     ramp: Annotated[str, Field(max_length=1024)] = ""

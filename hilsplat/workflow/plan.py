@@ -53,8 +53,27 @@ class Identity(NamedTuple):
 
 
 def any_of(names: Iterable[str]) -> str:
-    """Return a regular expression that matches exactly the given names."""
-    return "|".join(sorted({re.escape(name) for name in names})) or "(?!)"
+    """Return a regular expression that matches exactly the given names.
+
+    Names with the same beginning share it, because Snakemake matches the names of thousands of scenes for
+    each file, and Python would try one after the other.
+    """
+    tails: dict[str, set[str]] = {}
+    for name in names:
+        tails.setdefault(name[:1], set()).add(name[1:])
+    is_end = tails.pop("", None) is not None
+    branches: dict[str, list[str]] = {}  # first letters, by what may follow them
+    for letter, following in sorted(tails.items()):
+        branches.setdefault(any_of(following), []).append(re.escape(letter))
+    if not branches:
+        return "" if is_end else "(?!)"
+    parts = [
+        (letters[0] if len(letters) == 1 else f"[{''.join(letters)}]") + following
+        for following, letters in branches.items()
+    ]
+    if len(parts) == 1 and not is_end:
+        return parts[0]
+    return f"(?:{'|'.join(parts)})" + ("?" if is_end else "")
 
 
 def escape_json_for_report(text: str) -> str:
@@ -130,6 +149,12 @@ class Plan:
         }
         self._json = functools.cache(lambda section, *which: self._section(section, *which).model_dump_json())
         self.identity = functools.cache(self._identity)
+        self._variants = run.every_variant()
+        self._files = [(stage.scope, stage.file) for stage in all_stages().values()]
+        names = {row.name for row in self.rows}
+        places = [self.results / dataset for dataset in sorted({row.dataset for row in self.rows})]
+        inside = [path for place in places if place.is_dir() for path in place.iterdir()]
+        self._unlisted = {f"{path.parent.name}/{path.name}" for path in inside} - names
         self._first_alike = functools.cache(self._first_with_equal_identity)
         for row in self.scenes:
             self.data.require_no_braces(row)
@@ -329,14 +354,12 @@ class Plan:
         return self.path(job, *variant, stage.file)
 
     def artifacts(self, row: SceneRow) -> list[Path]:
-        """Return the paths at which the stages of a scene may write their artifacts."""
-        files = [(stage.scope, stage.file) for stage in all_stages().values()]
-        of_scene = [self.path(row, file) for scope, file in files if scope == "scene"]
-        variants = self.run.every_variant()
-        of_variants = [
-            self.path(row, name, file) for name in variants for scope, file in files if scope == "variant"
-        ]
-        return [Path(path) for path in dict.fromkeys(of_scene + of_variants)]
+        """Return the existing artifacts of a scene's stages, whatever variants a run computes."""
+        folder = Path(self.path(row))
+        inside = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+        places = {"scene": [folder], "variant": [folder / name for name in self._variants if name in inside]}
+        paths = [place / file for scope, file in self._files for place in places.get(scope, ())]
+        return [path for path in dict.fromkeys(paths) if path.exists()]
 
     def compared_scores(self, job: Job) -> list[str]:
         """Return the input of `comparison`: the scores of each variant in the main tables."""
@@ -387,6 +410,13 @@ class Plan:
         facts = Facts(self.stages(job), row.features is not None, self.first_answer(job))
         return _first_kind(kinds_of(artifact), facts)
 
+    def datasets(self) -> str:
+        """Return a pattern of the wildcard `dataset`; it rejects results of scenes that are not in the sheet.
+
+        It doesn't list the run's scenes, because Snakemake copies the pattern for each file of each job.
+        """
+        return f"(?!(?:{any_of(self._unlisted)})/)(?:{any_of(row.dataset for row in self.rows)})"
+
     def jobs_of(self, name: str) -> str:
         """Return a pattern of the wildcard `dataset` of the jobs for which this stage makes its artifact.
 
@@ -397,10 +427,11 @@ class Plan:
         for row in self.rows:
             variants = variants_of(*self.situation(row), self.first_answer(of_variant(row, "default")))
             scenes.setdefault(variants, []).append(row.name)
-        patterns = [
-            f"({any_of(names) if len(scenes) > 1 else '[^/]+/[^/]+'})/({any_of(variants)})/"
-            for variants, names in scenes.items()
-        ]
+        # Of the scenes with equal variants, the most are those that are not listed (see `datasets`).
+        most, *others = sorted(scenes, key=lambda variants: -len(scenes[variants]))
+        listed = any_of(self._unlisted.union(*(scenes[variants] for variants in others)))
+        patterns = [f"(?!(?:{listed})/)[^/]+/[^/]+/({any_of(most)})/"]
+        patterns += [f"({any_of(scenes[variants])})/({any_of(variants)})/" for variants in others]
         return f"(?={'|'.join(patterns)})[^/]+"
 
     def _variants_of(

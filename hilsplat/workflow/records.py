@@ -36,7 +36,7 @@ def outdated(plan: Plan, *, every_byte: bool = False) -> dict[str, str]:
     its record; otherwise, sizes are compared.
     """
     records, artifacts = Records(plan.results, plan, every_byte=every_byte), records_in(plan.results)
-    declared = [path for row in plan.scenes for path in plan.artifacts(row) if path.exists()]
+    declared = [path for row in plan.scenes for path in plan.artifacts(row)]
     names = [Path(stage.file).name for stage in all_stages().values()]  # inputs come before what reads them
     order = {name: number for number, name in enumerate(names)}
     paths = sorted({*artifacts, *declared}, key=lambda path: (order.get(path.name, len(order)), path))

@@ -29,7 +29,7 @@ from hilsplat.base.files import INSTALLED, project_path
 from hilsplat.base.processes import PARENT, end_with_workflow, lock, remove_leftovers
 from hilsplat.base.removal import delete
 from hilsplat.configuration import CONFIG, first_unusable, merged_config, parse_run
-from hilsplat.scene.sheet import DEFAULT_SHEET, SceneRow, read_sheet
+from hilsplat.scene.sheet import DEFAULT_SHEET, SceneRow, is_pattern, matches_of, read_sheet
 from hilsplat.workflow.estimate import forecasts
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.records import outdated
@@ -137,7 +137,7 @@ def run(
     """Run the workflow in the working folder, and return Snakemake's exit status.
 
     Args:
-        targets: scenes (`photos/desk`, `desk`), rules (`tables`) or files; empty for everything.
+        targets: scenes (`photos/desk`, `desk`, `photos/*`), rules (`tables`) or files; empty for everything.
         configs: files that override config/config.yaml, in order.
         options: passed to Snakemake unchanged.
         every_byte: read all results of earlier runs, and rebuild those that are damaged.
@@ -165,8 +165,8 @@ def run(
     except SettingsError as error:
         error.add_line("in", first_unusable(configs))
         raise
-    rows = read_sheet(project_path(chosen.scenes), chosen.groups, chosen.data_root)
-    scenes = [target for target in targets if any(target in (row.name, row.scene) for row in rows)]
+    rows = read_sheet(project_path(chosen.scenes), (), chosen.data_root)  # the plan checks the folders
+    scenes = [target for target, found in matches_of(rows, targets).items() if found]
     files = f"{chosen.results}/"
     named = [each for each in targets if each not in scenes and not each.startswith(files)]
     _require_known(named, rows, chosen.scenes)
@@ -203,7 +203,7 @@ def _require_known(targets: Sequence[str], rows: Sequence[SceneRow], sheet: str)
     known = [*TARGET_RULES, *(name for row in rows for name in (row.scene, row.name))]
     for target in targets:
         near = difflib.get_close_matches(target, known, n=1)
-        if target not in TARGET_RULES and (near or "/" not in target):
+        if target not in TARGET_RULES and (near or is_pattern(target) or "/" not in target):
             raise HilsplatError(
                 f"no scene, rule or file is named {target!r}",
                 expected=f"did you mean {near[0]!r}?" if near else f"a scene of {sheet}, or a file",

@@ -4,6 +4,7 @@ A *job* is any object with the attributes `dataset` and `scene` and, in a varian
 wildcards of a rule, or a row of the sheet. Only evaluation and figures read labels.
 """
 
+import difflib
 import functools
 import os
 from collections.abc import Callable, Iterable, Sequence
@@ -56,11 +57,23 @@ class SceneData:
         # A thousand scenes have tens of thousands of jobs, so folders are read once.
         self.absence = functools.cache(lambda row: absence(row.source, data_root))
         self._folder_files = functools.cache(lambda row: [*map(portable, photo_files(row.folder, row.poses))])
-        self._digest = functools.cache(lambda memo, *files: sha256_of_json(digests_of(files, memo)))
+        self._digest = functools.cache(
+            lambda memo, *files: sha256_of_json(digests_of(files, memo) if files else {})
+        )
         self._labels = functools.cache(lambda row: label_sets(row.source, data_root, row.name))
 
     def row(self, job: Job) -> SceneRow:
-        return self._row_of[job.dataset, job.scene]
+        """Return the row of a job's scene; raise SettingsError if it is not in the sheet."""
+        row = self._row_of.get((job.dataset, job.scene))
+        if row is None:
+            name = f"{job.dataset}/{job.scene}"
+            near = difflib.get_close_matches(name, [row.name for row in self._row_of.values()], n=1)
+            raise SettingsError(
+                f"no scene is named {name!r}",
+                expected=f"did you mean {near[0]!r}?" if near else "a scene of the sheet",
+                fix="correct the path, or add the scene to the sheet",
+            )
+        return row
 
     def images(self, job: Job, input: Sequence[str]) -> str:
         """Return the parameter of `poses`: the image folder."""
@@ -79,8 +92,10 @@ class SceneData:
 
         def digest(job: Job) -> str:
             found = files(job)
+            if isinstance(found, str):
+                found = []  # a folder that a rule writes
             memo = Path(self.path(job)).parents[1] / ".cache/inputs" / job.dataset / f"{job.scene}.json"
-            return self._digest(memo, *(() if isinstance(found, str) else found))  # a rule writes a folder
+            return self._digest(memo if found else None, *found)
 
         return digest
 

@@ -24,6 +24,7 @@ from tests.browser.conftest import (
     wire_camera,
 )
 from tests.unit.artifact_changes import change_index
+from tests.unit.many_nodes import add_nodes
 
 both = pytest.mark.parametrize("painter", ["gl", "server"])
 
@@ -250,3 +251,29 @@ def test_a_rewritten_scene_is_reported_and_reloaded_without_the_old_choice(opene
     answers(page).first.wait_for()  # the question is asked again
     assert page.locator("#text").input_value() == "mug > handle"
     assert not page.locator("#overlay path.chosen").count()
+
+
+def test_a_tree_of_70000_nodes_looks_like_a_small_one(opened, served, own_desk, desk_address):
+    add_nodes(own_desk, 70_000)
+    found = []
+    for page, unfold in ((served(own_desk), ("ArrowRight",)), (opened(desk_address), ())):
+        ask(page, "mug > handle")
+        answers(page).first.wait_for()
+        page.wait_for_timeout(800)
+        picture = pixels(page)
+        items = page.locator("[role=treeitem]").count()
+        (place,) = on_page(page, (6, 6, 0))  # a yellow pixel of the rim
+        page.mouse.click(*place.tolist())
+        chosen = page.locator("#overlay path.chosen").first
+        chosen.wait_for(state="attached")
+        node = int(chosen.get_attribute("data-node"))
+        item = page.locator(f"[role=treeitem][data-node='{node}']")
+        assert item.get_attribute("aria-selected") == "true" and item.is_visible()
+        for key in (*unfold, "ArrowRight"):
+            item.press(key)
+        below = int(page.evaluate("document.activeElement.dataset.node"))
+        found.append((picture, items, node, below))
+    (many, items, node, below), (few, own_items, own_node, own_below) = found
+    np.testing.assert_array_equal(many, few)
+    assert (items, own_items) == (702, 5)  # parts of a folded whole are not made
+    assert (node, below) == (own_node + 70_000, own_below + 70_000)

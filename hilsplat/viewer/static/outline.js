@@ -1,4 +1,5 @@
-// The semantic tree as a tree widget with names and crops; keys follow the ARIA practices, and a large tree is folded.
+// The semantic tree as a tree widget with names and crops; keys follow the ARIA practices. A large tree is folded, and
+// the items below a node are made when it is unfolded.
 
 import * as api from "./api.js";
 import { $, counted, inOrder, LEVELS, make, nameOf } from "./elements.js";
@@ -25,44 +26,60 @@ export class Outline {
   show(outline) {
     this.outline = outline;
     this.items.clear();
-    const children = new Map();
-    outline.nodes.forEach((node, row) => children.set(node.parent, [...(children.get(node.parent) ?? []), row]));
-    for (const rows of children.values()) rows.sort(inOrder(outline));
-    const folded = outline.nodes.length >= FOLD_FROM;
-    const item = (row) => {
-      const node = outline.nodes[row], kids = children.get(row) ?? [];
-      const element = make("li", { role: "treeitem", tabindex: "-1", "data-node": row, "aria-selected": "false", "aria-level": node.level + 1,
-        "aria-expanded": kids.length ? String(!folded) : null, "aria-label": `${nameOf(outline, row)}, ${LEVELS[node.level]}` },
-      make("div", { class: "row" },
-        make("span", { class: "fold", "aria-hidden": "true" }, kids.length ? "▶" : ""),
-        picture(api.cropUrl(outline.variant, row), { width: 48, height: 48 }),
-        make("span", { class: "label" }, nameOf(outline, row)),
-        make("small", {}, counted(node.views, "view"))));
-      if (kids.length) element.append(make("ul", { role: "group" }, ...kids.map(item)));
-      this.items.set(row, element);
-      return element;
-    };
-    this.root.replaceChildren(...(children.get(-1) ?? []).map(item));
+    this.answers = new Set();
+    this.children = new Map();
+    outline.nodes.forEach(({ parent }, row) => this.children.has(parent) ? this.children.get(parent).push(row) : this.children.set(parent, [row]));
+    for (const rows of this.children.values()) rows.sort(inOrder(outline));
+    this.folded = outline.nodes.length >= FOLD_FROM;
+    this.root.replaceChildren(...(this.children.get(-1) ?? []).map((row) => this.item(row)));
     const first = this.root.querySelector("[role=treeitem]");
     if (first) first.tabIndex = 0;
     $("outline-section").hidden = !outline.nodes.length;
     $("outline-title").textContent = `Outline: ${LEVELS.map((level, k) => counted(outline.nodes.filter((n) => n.level === k).length, level)).join(", ")}`;
   }
 
+  item(row) {
+    const { outline } = this, node = outline.nodes[row], kids = this.children.has(row);
+    const element = make("li", { role: "treeitem", tabindex: "-1", "data-node": row, "aria-selected": "false", "aria-level": node.level + 1,
+      "aria-expanded": kids ? String(!this.folded) : null, "aria-label": `${nameOf(outline, row)}, ${LEVELS[node.level]}` },
+    make("div", { class: "row" },
+      make("span", { class: "fold", "aria-hidden": "true" }, kids ? "▶" : ""),
+      picture(api.cropUrl(outline.variant, row), { width: 48, height: 48 }),
+      make("span", { class: "label" }, nameOf(outline, row)),
+      make("small", {}, counted(node.views, "view"))));
+    element.classList.toggle("answered", this.answers.has(row));
+    this.items.set(row, element);
+    if (kids && !this.folded) this.fill(element);
+    return element;
+  }
+
+  // Make the items below a node, unless they exist.
+  fill(item) {
+    if (!item.querySelector("[role=group]")) item.append(make("ul", { role: "group" }, ...this.children.get(Number(item.dataset.node)).map((row) => this.item(row))));
+  }
+
+  // Return the item of a node, or undefined; the items above it are made first.
+  itemOf(row) {
+    const parent = this.outline.nodes[row]?.parent ?? -1;
+    if (!this.items.has(row) && parent >= 0) this.fill(this.itemOf(parent));
+    return this.items.get(row);
+  }
+
   renamed(row) {
-    const item = this.items.get(row);
+    const item = this.itemOf(row);
     item.querySelector(".label").textContent = nameOf(this.outline, row);
     item.setAttribute("aria-label", `${nameOf(this.outline, row)}, ${LEVELS[this.outline.nodes[row].level]}`);
   }
 
   answered(nodes) {
     for (const item of this.root.querySelectorAll(".answered")) item.classList.remove("answered");
+    this.answers = new Set(nodes);
     for (const node of nodes) this.items.get(node)?.classList.add("answered");
   }
 
   select(node) {
     for (const item of this.root.querySelectorAll("[aria-selected=true]")) item.setAttribute("aria-selected", "false");
-    const item = this.items.get(node);
+    const item = this.itemOf(node);
     if (!item) return;
     item.setAttribute("aria-selected", "true");
     for (let above = item.parentElement.closest("[role=treeitem]"); above; above = above.parentElement.closest("[role=treeitem]")) above.setAttribute("aria-expanded", "true");
@@ -83,7 +100,11 @@ export class Outline {
     this.handlers.choose(Number(item.dataset.node));
   }
 
-  fold(item, open) { if (item.hasAttribute("aria-expanded")) item.setAttribute("aria-expanded", String(open)); }
+  fold(item, open) {
+    if (!item.hasAttribute("aria-expanded")) return;
+    if (open) this.fill(item);
+    item.setAttribute("aria-expanded", String(open));
+  }
 
   get visible() {
     return [...this.root.querySelectorAll("[role=treeitem]")].filter((item) => !item.parentElement.closest("[aria-expanded=false]"));

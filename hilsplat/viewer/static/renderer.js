@@ -67,11 +67,15 @@ export class Renderer {
     this.sorted.row = null;
   }
 
-  async loadNodes(variant) { this.putNodes(variant, new Uint16Array(await unzipped(await api.nodes(variant)))); }
+  // Node numbers have 16 bits or, in a large tree, 32.
+  async loadNodes(variant) {
+    const bytes = await unzipped(await api.nodes(variant));
+    this.putNodes(variant, bytes.byteLength > 8 * this.count ? new Uint32Array(bytes) : new Uint16Array(bytes));
+  }
 
   putNodes(variant, values) {
-    const gl = this.gl, texture = this.texture(gl.RGBA16UI, this.count);
-    this.fill(texture, values, 0, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT);
+    const gl = this.gl, long = values instanceof Uint32Array, texture = this.texture(long ? gl.RGBA32UI : gl.RGBA16UI, this.count);
+    this.fill(texture, values, 0, gl.RGBA_INTEGER, long ? gl.UNSIGNED_INT : gl.UNSIGNED_SHORT);
     this.nodeTextures.set(variant, texture);
     (this.nodeValues ??= new Map()).set(variant, values);
   }

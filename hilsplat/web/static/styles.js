@@ -49,7 +49,7 @@ export function styleOf({ outline, answer, colour, mode, level, chosen, hover, f
   if (colour === "nodes" || (colour === "relevancy" && answer)) {
     use = [0, 1, 2].map((each) => each === level);
     const own = nodes.map((_, node) => node).filter((node) => nodes[node].level === level);
-    const values = own.map((node) => answer?.relevancy[node] ?? 0), low = Math.min(...values), high = Math.max(...values);
+    const values = own.map((node) => answer?.relevancy[node] ?? 0), [low, high] = values.reduce(([least, most], value) => [Math.min(least, value), Math.max(most, value)], [Infinity, -Infinity]);
     Object.assign(range, { low, high });
     own.forEach((node, k) => {
       if (colour === "relevancy" && threshold !== null && values[k] < threshold) return;

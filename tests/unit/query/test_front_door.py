@@ -58,13 +58,14 @@ def test_importing_the_package_loads_nothing_heavy(project):
     assert not loaded & {"torch", "numba", "numpy", "snakemake", "onnxruntime", "matplotlib"}
 
 
-def test_public_names_are_the_types_that_open_returns(desk):
-    scene = hilsplat.open_scene(desk)
-    (hit, *_) = scene.query("unicorn")
-    made = {type(each).__name__ for each in (scene, hit, hit.level, hit.doubts[0])}
-    assert made == {"LanguageScene", "Hit", "Level", "Doubt"}
+def test_public_names_are_the_types_that_open_returns(desk, named_desk):
+    scene, scenes = hilsplat.open_scene(desk), hilsplat.open_scenes(named_desk.parents[1])
+    (hit, *_), (scene_hit,) = scene.query("unicorn"), scenes.query("unicorn")
+    made = {type(each).__name__ for each in (scene, hit, hit.level, hit.doubts[0], scenes, scene_hit)}
+    assert made == {"LanguageScene", "Hit", "Level", "Doubt", "Scenes", "SceneHit"}
     assert {name for name in hilsplat.__all__ if getattr(hilsplat, name)} == made | {
         "open_scene",
+        "open_scenes",
         "show",
         "HilsplatError",
     }
@@ -122,15 +123,14 @@ def test_the_embedded_clip_warns_that_it_does_not_know_photographs(copied, caplo
         assert hilsplat.open_scene(copied).caution == expected
 
 
-def test_the_example_of_the_docs_runs(desk_project, project, monkeypatch, capsys):
-    monkeypatch.chdir(desk_project)
+def test_the_example_of_the_docs_runs(named_desk, project, monkeypatch, capsys):
+    monkeypatch.chdir(named_desk.parents[2])
     blocks = re.findall(r"```python\n(.*?)```", (project / "docs/python.md").read_text(), re.DOTALL)
     assert len(blocks) == 2
     names: dict = {}
     for block in blocks:
         exec(compile(block, "docs/python.md", "exec"), names)
     assert names["mask"].shape == names["photograph"].shape[:2]
-    assert names["best"].keys() == {"desk"}
     printed = capsys.readouterr().out
     assert "'unicorn' may not be in the scene: the model's vocabulary lacks 'unicorn'" in printed
     assert "has no view 'no such view'" in printed

@@ -14,24 +14,15 @@ from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.embed.clip import open_clip_of
 from hilsplat.query.answer import answer
 from hilsplat.query.names import write_names
-from hilsplat.query.node_names import COMMON, NodeNaming, Vocabulary, named, run_names
+from hilsplat.query.node_names import COMMON, NodeNaming, Vocabulary, named
 from hilsplat.query.relevancy import margins
-from hilsplat.settings import EvaluateSettings, QuerySettings
 from tests.unit.artifact_changes import change_index
-from tests.unit.finished_desk import SCENE
 from tests.unit.query.test_search_scales import tree_of
 
 
-@pytest.fixture(scope="module")
-def desk(desk_project, tmp_path_factory) -> Path:
-    """A copy of the finished desk whose nodes are named by the words that its CLIP knows."""
-    project = shutil.copytree(desk_project, tmp_path_factory.mktemp("named") / "project")
-    words = "[things]\nmug, book\n[parts]\nhandle, rim\n"
-    (project / "models/colours/vocabulary.txt").write_text(words)
-    default = project / SCENE / "default"
-    places = (default / "semantic_tree", default / "clip", default / "names", project / "cache")
-    run_names(*places, QuerySettings(), EvaluateSettings())
-    return project / SCENE
+@pytest.fixture
+def desk(named_desk) -> Path:
+    return named_desk
 
 
 def test_sections_comments_and_repeated_texts_of_a_file(tmp_path):

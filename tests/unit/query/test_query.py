@@ -247,7 +247,9 @@ def test_a_scene_opens_with_the_settings_of_its_evaluation_or_panel(tmp_path, ca
     write_record(panel, settings={"figures": {}, "evaluate": {"template": "a photo of a {}"}})
     assert FinishedScene.locate(folder).evaluate_settings().template == "a photo of a {}"
     scores.touch()
-    write_record(scores, settings={"canonical": ["thing"], "node_select": 0.9, "a knob of old": 1})
+    write_record(
+        scores, settings={"evaluate": {"canonical": ["thing"], "node_select": 0.9, "a knob of old": 1}}
+    )
     found = FinishedScene.locate(folder).evaluate_settings()
     assert (found.canonical, found.node_select) == (("thing",), 0.9)
     assert "using the defaults" not in caplog.text

@@ -1,15 +1,23 @@
 """Data of the page: chunks of Gaussians, their nodes, the initial focus point."""
 
+import base64
 import gzip
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from hilsplat.base.errors import ArtifactError
 from hilsplat.viewer import payload
+from hilsplat.viewer.frames import painted
 from hilsplat.viewer.payload import arrival_order, crossing, packed_nodes, upright
+from hilsplat.viewer.viewer_scene import ViewerScene
+from hilsplat.viewer.wire import Question, Style
 from tests.unit.evaluate.builders import cameras_of
+from tests.unit.many_nodes import add_nodes
 from tests.unit.round_gaussians import round_gaussians
+
+MANY = 70_000
 
 
 def test_the_first_chunk_has_the_most_visible_gaussians():
@@ -49,3 +57,43 @@ def test_the_focus_of_parallel_cameras_is_in_front_of_them(shown):
     cameras = shown.scene.cameras
     ahead = cameras.cam_from_world[0, 2, :3]
     assert (crossing(cameras) - cameras[cameras.names[0]].centre) @ ahead > 0
+
+
+def test_more_nodes_than_16_bits_can_number(own_desk, desk):
+    """The page gets the same nodes, answers and colours, with other numbers."""
+    few = ViewerScene(desk)
+    few_tree = few.answering("default").tree
+    add_nodes(own_desk, MANY)
+    shown = ViewerScene(own_desk)
+    scene = shown.answering("default")
+    data = gzip.decompress(packed_nodes(scene.tree, shown.order))
+    assert len(data) == 16 * len(shown.order)
+    nodes = np.frombuffer(data, np.uint32).reshape(-1, 4)[:, :3].astype(int) - 1
+    own = few_tree.node_of_gaussian[few.order]
+    np.testing.assert_array_equal(nodes, np.where(own >= 0, own + MANY, -1))
+    described = shown.described_variant("default")["nodes"]
+    expected = few.described_variant("default")["nodes"]
+    assert len(described) == MANY + len(expected)
+    for found, node in zip(described[MANY:], expected, strict=True):
+        parent = node["parent"] + MANY if node["parent"] >= 0 else -1
+        assert found == {**node, "parent": parent}
+    assert described[0]["corners"] == [[0.0, 0.0, 0.0]] * 8
+    (hit,) = payload.answer(scene, Question(text="mug > handle"))["hits"]
+    (other,) = payload.answer(few.answering("default"), Question(text="mug > handle"))["hits"]
+    assert hit == {**other, "node": other["node"] + MANY}
+    pictures = []
+    for each, chosen in ((shown, hit), (few, other)):
+        table = np.zeros((len(each.answering("default").tree) + 1, 4), np.uint8)
+        table[chosen["node"] + 1] = 255, 122, 0, 180
+        style = Style(table=base64.b64encode(table).decode(), mode="ghost")
+        camera = each.scene.cameras[each.scene.cameras.names[0]]
+        pictures.append(painted(each.gaussians, camera, each.paint("default", style)))
+    np.testing.assert_array_equal(*pictures)
+    assert (np.ptp(pictures[0], axis=2) > 90).any()
+
+
+def test_too_many_nodes_are_refused(desk, monkeypatch):
+    monkeypatch.setattr("hilsplat.viewer.viewer_scene.MAX_NODES", 4)
+    with pytest.raises(ArtifactError, match="is too large for the page") as caught:
+        ViewerScene(desk).answering("default")
+    assert "at most 4 nodes" in str(caught.value) and "hilsplat query" in str(caught.value)

@@ -15,7 +15,7 @@ from hilsplat.scene.sheet import read_sheet
 from hilsplat.stages import stage_of
 from hilsplat.workflow import targets
 from hilsplat.workflow.models import models_of_photographs
-from hilsplat.workflow.plan import Plan, without_scene
+from hilsplat.workflow.plan import Plan, any_of, without_scene
 from tests.conftest import PROJECT
 from tests.unit.models.test_store import write_model
 from tests.unit.workflow.plans import BENCHMARK, Job, plan_of
@@ -136,13 +136,15 @@ def test_a_variant_shares_stages_up_to_the_first_that_it_changes(tmp_path, stage
     assert found.shared_variant(stage, Job(variant=variant)) == owner
 
 
-def test_shared_files_keep_their_path_when_the_tables_change(tmp_path):
+def test_shared_files_keep_their_path_when_the_tables_change(tmp_path, monkeypatch):
     variants = {**VARIANTS, "langsplat": {"autoencoder": NETWORK, "method": {"name": "langsplat"}}}
     found = plan(tmp_path, main_variants=["langsplat"], variants=variants)
     job = Job(variant="langsplat")
     code = "results/synthetic/one/network/autoencoder"
     assert found.shared_path("autoencoder", job) == code
-    assert Path(code) in found.artifacts(found.row(job))
+    monkeypatch.chdir(tmp_path)
+    Path(code).mkdir(parents=True)
+    assert found.artifacts(found.row(job)) == [Path(code)]
     assert "results/synthetic/one/network/scores.csv" not in targets.default(found)
 
 
@@ -362,3 +364,39 @@ def test_commands_quote_what_they_contain(tmp_path):
     assert words[words.index("--semantic-tree") :][:4] == ["--semantic-tree", "a b", "--clip", "$(c)"]
     assert json.loads(words[words.index("--settings") + 1])["vocabulary"] == "it's; rm -rf.txt"
     assert words[words.index("--cache") + 1] == "results/.cache"
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        [],
+        ["a"],
+        ["table-1", "table-10", "table-2", "tab"],
+        ["a.b", "a-b", "axb", "x[1]", "^", "]", "-"],
+        [f"scene{number:04d}_{take:02d}" for number in range(0, 3000, 7) for take in range(3)],
+    ],
+)
+def test_a_pattern_of_names_matches_exactly_these(names):
+    pattern = any_of(names)
+    others = {name[:-1] for name in names} | {f"{name}0" for name in names} | {"a_b", "scene", "", "["}
+    for name in others | {*names}:
+        assert bool(re.fullmatch(pattern, name)) == (name in names), name
+    assert len(pattern) <= len(re.escape("|".join(names))) + 4
+
+
+def test_patterns_of_wildcards_do_not_grow_with_the_scenes_but_reject_results_of_others(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    rows = [
+        f"synthetic scene{number * 7919 % 10**6:06d} benchmark world:room:1 metre" for number in range(300)
+    ]
+    for name in ("old", "scene000000"):
+        Path(f"results/synthetic/{name}").mkdir(parents=True)
+    found = plan_of(tmp_path, rows, variants=VARIANTS, main_variants=["default", *VARIANTS])
+    for pattern in (found.datasets(), found.jobs_of("field"), found.jobs_of("masks")):
+        assert len(pattern) < 500
+        assert re.match(pattern, "synthetic/scene000000/default/field.safetensors")
+        assert not re.match(pattern, "synthetic/old/default/field.safetensors")
+    with pytest.raises(SettingsError, match=r"no scene is named 'synthetic/scene00000'(.|\n)*scene000000'\?"):
+        found.row(Job("synthetic", "scene00000"))

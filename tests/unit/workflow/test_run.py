@@ -85,11 +85,15 @@ def test_scenes_become_a_configuration_and_other_targets_stay(folder, started):
     assert value(command, "--cores") == "1" and "--keep-going" in command
     runs.run(["synthetic/two"], [], [])
     assert 'only=["synthetic/two"]' in started[-1]
+    runs.run(["synthetic/*", "tables"], [], [])
+    assert 'only=["synthetic/*"]' in started[-1] and started[-1][-2:] == ["--", "tables"]
 
 
 def test_a_misspelt_scene_is_refused(folder, started):
     with pytest.raises(HilsplatError, match="did you mean 'two'"):
         runs.run(["twoo"], [], [])
+    with pytest.raises(HilsplatError, match=r"no scene, rule or file is named 'photo/\*'"):
+        runs.run(["photo/*"], [], [])
     with pytest.raises(HilsplatError, match="no scene, rule or file is named 'desk'"):
         runs.run(["desk"], [], [])
     assert started == []

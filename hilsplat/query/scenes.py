@@ -1,0 +1,265 @@
+"""One query of all finished scenes in a results folder, from the index that the stage `names` writes."""
+
+import shlex
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+
+from hilsplat.base.artifacts import read_index, run_command
+from hilsplat.base.errors import ArtifactError, HilsplatError, first_line
+from hilsplat.base.levels import Level
+from hilsplat.embed.clip import ClipModel, open_clip_of
+from hilsplat.query.hits import Doubt, counted, doubts_of
+from hilsplat.query.names import NodeNames, read_names
+from hilsplat.query.node_index import FILE, NodeIndex
+from hilsplat.query.node_names import NodeNaming
+from hilsplat.query.node_queries import NodeQueries, caution_of
+from hilsplat.query.node_search import NodeHits
+from hilsplat.query.relevancy import relevancy_of_margins
+from hilsplat.scene.finished import FinishedScene, changed_input
+from hilsplat.semantic_tree.tree import SemanticTree
+from hilsplat.settings import EvaluateSettings
+
+
+@dataclass(frozen=True)
+class SceneHit:
+    """One answer in one of many scenes; lengths are in the scene's units.
+
+    Attributes:
+        scene: name, `<dataset>/<scene>`.
+        folder: the scene's folder, for `hilsplat.open_scene`.
+        node: row of the scene's semantic tree.
+        score: as in `Hit`; a query of the scene alone gives the same score.
+        name: the user's name for the node, otherwise its vocabulary name; empty if no name fits.
+        gaussians: number of the node's Gaussians.
+        size: lengths of the oriented box's sides.
+        picture: the undistorted photograph in which the node is largest.
+        doubts: texts of the query that may match nothing in this scene.
+        caution: as `LanguageScene.caution`, but empty if the query needed no model.
+    """
+
+    scene: str
+    folder: Path
+    node: int
+    level: Level
+    score: float
+    name: str
+    gaussians: int
+    centroid: tuple[float, float, float]
+    size: tuple[float, float, float]
+    picture: Path
+    route: str
+    doubts: tuple[Doubt, ...]
+    caution: str
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the fields as JSON values."""
+        plain = {"folder": str(self.folder), "picture": str(self.picture), "level": self.level.label}
+        return asdict(self) | plain | {"doubts": [str(doubt) for doubt in self.doubts]}
+
+
+@dataclass(frozen=True)
+class IndexedScene(NodeQueries):
+    """A scene as the index stores it: nodes and vectors, without Gaussians and views."""
+
+    folder: Path
+    index: NodeIndex
+    clip: ClipModel
+    settings: EvaluateSettings
+    names: NodeNames
+    naming: NodeNaming | None = None
+    _rival_margins: dict[str, np.ndarray] = field(default_factory=dict, repr=False, kw_only=True)
+
+    @property
+    def tree(self) -> SemanticTree:
+        return self.index.tree
+
+    @property
+    def caution(self) -> str:
+        return caution_of(self.clip, self.folder / "scene")
+
+    def node_vectors(self, answerer: str = "tree") -> Float32[np.ndarray, "n C"]:
+        return self.tree.clip
+
+
+@dataclass(frozen=True)
+class FoundScene:
+    """A finished scene whose index matches its artifacts; the index is read at each query."""
+
+    name: str
+    finished: FinishedScene
+    clip: ClipModel
+    settings: EvaluateSettings
+
+    @property
+    def index(self) -> Path:
+        """The artifact of the stage `names`."""
+        return self.finished.parts.clip.parent / "names"
+
+    def opened(self, naming: NodeNaming | None = None) -> IndexedScene:
+        folder, index = self.finished.folder, NodeIndex.load(self.index)
+        names = read_names(folder, self.finished.parts.semantic_tree)
+        return IndexedScene(folder, index, self.clip, self.settings, names, naming)
+
+    def naming(self) -> NodeNaming:
+        """Return the vocabulary names; raise ArtifactError if the index is of another tree."""
+        parts = self.finished.parts
+        naming = NodeNaming.load(self.index, parts.semantic_tree, parts.clip)
+        if naming is None:
+            raise ArtifactError(f"{self.index} was not made from the current semantic tree and CLIP vectors")
+        return naming
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """The finished scenes of a results folder, which accept text queries together.
+
+    Attributes:
+        found: scenes that are searched.
+        skipped: scene -> why it is not searched; a query adds scenes whose artifacts have changed since.
+    """
+
+    found: tuple[FoundScene, ...]
+    skipped: dict[str, str]
+
+    def query(
+        self,
+        text: str,
+        level: str = "auto",
+        *,
+        threshold: float | None = None,
+        limit: int = 10,
+        each: int = 1,
+    ) -> list[SceneHit]:
+        """Return the best answers of the best scenes, best scene first.
+
+        Scores of different scenes are comparable if one CLIP model embedded them.
+
+        Args:
+            text, level, threshold: as in `LanguageScene.query`.
+            limit: maximum number of scenes.
+            each: maximum number of answers in each scene.
+
+        Raises:
+            SettingsError: as in `LanguageScene.query`.
+        """
+
+        def answers(scene: IndexedScene) -> NodeHits:
+            return scene.find(text, level=level, threshold=threshold)
+
+        best: list[tuple[float, str, FoundScene]] = []
+        for found in self.found:
+            with self._skipping(found.name):
+                best += [(-score, found.name, found) for score in _scores(answers(found.opened()), found, 1)]
+        hits: dict[str, list[SceneHit]] = {}
+        for _, name, found in sorted(best, key=lambda each: each[:2]):
+            if len(hits) < limit:
+                with self._skipping(name):
+                    scene = found.opened(found.naming())
+                    hits[name] = _hits_of(found, scene, answers(scene), scene.caution_about(text), each)
+        return [hit for of_scene in hits.values() for hit in of_scene]
+
+    @contextmanager
+    def _skipping(self, name: str) -> Iterator[None]:
+        """Skip a scene that was changed, rebuilt or deleted since the scenes were opened."""
+        try:
+            yield
+        except ArtifactError as error:
+            self.skipped[name] = first_line(error)
+
+
+def _scores(nodes: NodeHits, found: FoundScene, limit: int) -> list[float]:
+    return relevancy_of_margins(nodes.values[:limit], found.settings.relevancy_scale).tolist()
+
+
+def _hits_of(
+    found: FoundScene, scene: IndexedScene, nodes: NodeHits, caution: str, each: int
+) -> list[SceneHit]:
+    index, folder, doubts = scene.index, found.finished.folder, doubts_of(nodes)
+    return [
+        SceneHit(
+            found.name,
+            folder,
+            node,
+            Level(int(scene.tree.level[node])),
+            score,
+            scene.name_of(node),
+            int(index.gaussians[node]),
+            tuple(scene.tree.centroid[node].tolist()),
+            tuple(scene.tree.oriented_box[node, 4].tolist()),
+            folder / "scene/images" / index.views[index.best_view[node]],
+            nodes.route,
+            doubts,
+            caution,
+        )
+        for node, score in zip(nodes.ids[:each].tolist(), _scores(nodes, found, each), strict=True)
+    ]
+
+
+def open_scenes(results: Path | str = "results", pattern: str = "*", variant: str = "default") -> Scenes:
+    """Open the finished scenes of a results folder for queries of all of them.
+
+    A scene is skipped, with the reason, if its stage `names` has not finished, if one of the artifacts behind
+    its index was rebuilt or removed since, or if its CLIP model is not found.
+
+    Args:
+        pattern: scenes to search, such as `photos/*` or `kitchen-?`; the data set may be omitted.
+
+    Raises:
+        ArtifactError: no scene matches, or none is finished.
+    """
+    results, skipped, found = Path(results), dict[str, str](), list[FoundScene]()
+    models: dict[tuple[str, str], ClipModel] = {}
+    for folder in sorted(path.parent for path in results.glob("*/*/scene")):
+        name = f"{folder.parent.name}/{folder.name}"
+        if not (fnmatchcase(name, pattern) or fnmatchcase(folder.name, pattern)):
+            continue
+        try:
+            finished = FinishedScene.locate(folder, variant)
+            clip, settings = finished.parts.clip, finished.evaluate_settings()
+            key = read_index(clip, "model_sha256")["model_sha256"], settings.template
+            if key not in models:
+                models[key] = open_clip_of(clip, settings.template)
+            scene = FoundScene(name, finished, models[key], settings)
+            if not (scene.index / FILE).is_file():
+                raise ArtifactError(f"{scene.index / FILE} is missing", fix=run_command(scene.index))
+            if changed := changed_input(scene.index, folder):
+                raise ArtifactError(f"{scene.index} was not made from the current {changed}")
+            found.append(scene)
+        except HilsplatError as error:
+            skipped[name] = first_line(error)
+    if not found:
+        raise ArtifactError(
+            f"{results} has no finished scene" + (f" that matches {pattern!r}" if pattern != "*" else ""),
+            found="; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3]) or None,
+            fix="run the workflow, or specify the results folder",
+        )
+    return Scenes(tuple(found), skipped)
+
+
+def report_of(scenes: Scenes, text: str, hits: Sequence[SceneHit]) -> str:
+    """Return answers, doubts and skipped scenes as text."""
+    asked = counted(len(scenes.found), "scene")
+    lines = [f"{counted(len(hits), 'answer')} to {text!r} in {asked}"]
+    if hits:
+        names = max(len(hit.name or "?") for hit in hits)
+        width = max(len(hit.scene) for hit in hits)
+        lines.append(
+            f"{'score':>5}  {'scene':<{width}}  {'node':>5}  {'level':<8} {'name':<{names}}  picture"
+        )
+        lines += [
+            f"{hit.score:>5.2f}  {hit.scene:<{width}}  {hit.node:>5}  {hit.level.label:<8} "
+            f"{hit.name or '?':<{names}}  {hit.picture}"
+            for hit in hits
+        ]
+        lines.append(f"more about the best: {shlex.join(['hilsplat', 'query', str(hits[0].folder), text])}")
+    lines += [f"doubtful: {doubt}" for hit in hits[:1] for doubt in hit.doubts]
+    lines += dict.fromkeys(hit.caution for hit in hits if hit.caution)
+    lines += [f"{name} is skipped: {reason}" for name, reason in sorted(scenes.skipped.items())]
+    return "\n".join(lines)

@@ -1,0 +1,159 @@
+"""One query of many finished scenes: copies of the desk whose scores differ by their settings."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+import hilsplat
+from hilsplat.base.artifacts import read_json
+from hilsplat.base.errors import ArtifactError, SettingsError
+from hilsplat.base.lineage import read_provenance
+from hilsplat.cli.main import app
+from hilsplat.query.names import write_names
+from tests.unit.artifact_changes import write_record
+
+SCENES = 50
+
+
+@pytest.fixture(scope="module")
+def results(named_desk, tmp_path_factory) -> Path:
+    """Results of 50 scenes in two data sets, with scores that grow with the number of the scene."""
+    project = tmp_path_factory.mktemp("many")
+    shutil.copytree(named_desk.parents[2] / "models", project / "models")
+    for number in range(SCENES):
+        copy = project / "results" / ("photos", "rooms")[number % 2] / f"desk-{number:02d}"
+        shutil.copytree(named_desk, copy)
+        settings = {"relevancy_scale": 5.0 + number}
+        write_record(copy / "default/scores.csv", settings={"evaluate": settings})
+    return project / "results"
+
+
+@pytest.fixture(scope="module")
+def opened(results) -> dict[str, hilsplat.LanguageScene]:
+    """Each scene, opened alone."""
+    folders = results.glob("*/desk-*")
+    return {f"{folder.parent.name}/{folder.name}": hilsplat.open_scene(folder) for folder in folders}
+
+
+@pytest.fixture
+def changed(results, tmp_path) -> Path:
+    """A scene to change in a copy of the results of three scenes, beside the models."""
+    shutil.copytree(results.parent / "models", tmp_path / "models")
+    for name in ("photos/desk-48", "photos/desk-46", "rooms/desk-49"):
+        shutil.copytree(results / name, tmp_path / "results" / name)
+    return tmp_path / "results/rooms/desk-49"
+
+
+@pytest.mark.parametrize(
+    ("text", "level"), [("mug", "auto"), ("handle", "part"), ("book", "subpart"), ("mug > handle", "auto")]
+)
+def test_answers_are_those_of_each_scene_alone_best_scene_first(results, opened, text, level):
+    hits = hilsplat.open_scenes(results).query(text, level, limit=SCENES, each=2)
+    alone = {name: scene.query(text, level, limit=2) for name, scene in opened.items()}
+    assert len(alone) == SCENES and sum(map(len, alone.values())) == len(hits)
+    best = sorted(alone, key=lambda name: (-alone[name][0].score, name))
+    expected = [(name, hit) for name in best for hit in alone[name]]
+    for found, (name, hit) in zip(hits, expected, strict=True):
+        assert (found.scene, found.node, found.level, found.name) == (name, hit.node, hit.level, hit.name)
+        assert (found.score, found.route, found.doubts) == (hit.score, hit.route, hit.doubts)
+        assert (found.gaussians, found.centroid) == (len(hit.gaussians), hit.centroid)
+        assert found.size == hit.oriented_box.size
+        assert found.picture.is_file() and found.picture.name == hit.best_views[0]
+
+
+def test_a_pattern_a_limit_and_a_threshold_restrict_the_answers(results):
+    rooms = hilsplat.open_scenes(results, "rooms/*")
+    assert {hit.scene.partition("/")[0] for hit in rooms.query("mug", limit=SCENES)} == {"rooms"}
+    assert len(rooms.query("mug", limit=3)) == 3
+    assert [found.name for found in hilsplat.open_scenes(results, "desk-07").found] == ["rooms/desk-07"]
+    high = rooms.query("mug", threshold=0.99, limit=SCENES)
+    assert high and len(high) < SCENES // 2 and min(hit.score for hit in high) >= 0.99
+    with pytest.raises(SettingsError, match="level 'piece' is unknown"):
+        rooms.query("mug", "piece")
+    with pytest.raises(ArtifactError, match="has no finished scene that matches 'cellar'"):
+        hilsplat.open_scenes(results, "cellar")
+
+
+def delete(scene: Path) -> None:
+    shutil.rmtree(scene)
+
+
+def begin_to_rebuild_the_masks(scene: Path) -> None:
+    shutil.rmtree(scene / "default/masks")
+
+
+def rebuild_the_masks(scene: Path) -> None:
+    outputs = {"masks": {"sha256": "another", "bytes": {}}}
+    write_record(scene / "default/masks", outputs=outputs)
+
+
+def rebuild_the_gaussians(scene: Path) -> None:
+    write_record(scene / "gaussians.ply", outputs={"gaussians.ply": {"sha256": "another", "bytes": {}}})
+
+
+def lose_the_index(scene: Path) -> None:
+    (scene / "default/names/nodes.safetensors").unlink()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [delete, begin_to_rebuild_the_masks, rebuild_the_masks, rebuild_the_gaussians, lose_the_index],
+)
+def test_a_changed_scene_does_not_answer(changed, change):
+    assert hilsplat.open_scenes(changed.parents[1]).query("mug")[0].scene == "rooms/desk-49"
+    change(changed)
+    scenes = hilsplat.open_scenes(changed.parents[1])
+    assert [hit.scene for hit in scenes.query("mug")] == ["photos/desk-48", "photos/desk-46"]
+    assert [*scenes.skipped] == (["rooms/desk-49"] if changed.exists() else [])
+
+
+def replace_the_tree(scene: Path) -> None:
+    tree = scene / "default/semantic_tree/tree.npz"
+    tree.write_bytes(tree.read_bytes() + b"0")
+
+
+def damage_the_index(scene: Path) -> None:
+    (scene / "default/names/nodes.safetensors").write_bytes(b"nothing")
+
+
+@pytest.mark.parametrize("change", [delete, lose_the_index, replace_the_tree, damage_the_index])
+def test_a_scene_changed_after_opening_does_not_answer(changed, change):
+    scenes = hilsplat.open_scenes(changed.parents[1])
+    change(changed)
+    assert [hit.scene for hit in scenes.query("mug", limit=2)] == ["photos/desk-48", "photos/desk-46"]
+    assert [*scenes.skipped] == ["rooms/desk-49"]
+
+
+def test_a_name_given_by_hand_is_found_first(changed):
+    scene = changed.parents[1] / "photos/desk-46"
+    tree = scene / "default/semantic_tree"
+    write_names(scene, tree, {2: "my mug"}, 5, hilsplat.open_scene(scene).names.version)
+    (first, *_) = hilsplat.open_scenes(changed.parents[1]).query("My mug")
+    assert (first.scene, first.node, first.name, first.doubts) == ("photos/desk-46", 2, "my mug", ())
+
+
+def test_the_command_prints_a_table_or_json(changed, capsys):
+    shutil.rmtree(changed / "default/semantic_tree")
+    place = ("--results", str(changed.parents[1]))
+    app(["query", "--all", "mug", *place], standalone_mode=False)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "2 answers to 'mug' in 2 scenes"
+    assert lines[2].split()[1:5] == ["photos/desk-48", "0", "whole", "mug"]
+    assert lines[4] == f"more about the best: hilsplat query {changed.parents[1] / 'photos/desk-48'} mug"
+    assert lines[5].startswith("rooms/desk-49 is skipped: ")
+    app(["query", "--all", "*-46", "unicorn", "--json", *place], standalone_mode=False)
+    (row,) = json.loads(capsys.readouterr().out)
+    assert (row["scene"], row["level"]) == ("photos/desk-46", "whole")
+    assert row["doubts"] == ["'unicorn' may not be in the scene: the model's vocabulary lacks 'unicorn'"]
+    with pytest.raises(SettingsError, match="there is no text to search for in mug"):
+        app(["query", "mug", *place], standalone_mode=False)
+
+
+def test_the_index_is_recorded_and_small(results):
+    names = results / "rooms/desk-49/default/names"
+    record = read_provenance(names)
+    assert record is not None and "nodes.safetensors" in record.outputs["names"].bytes
+    nodes, vector_bytes = len(read_json(names / "names.json")), 4 * 3
+    assert (names / "nodes.safetensors").stat().st_size < nodes * (vector_bytes + 200) + 3000
