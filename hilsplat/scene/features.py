@@ -27,8 +27,8 @@ from hilsplat.settings import PosesSettings
 
 logger = logging.getLogger(__name__)
 
-EXHAUSTIVE_UP_TO = 100
-"""Maximum number of views for which matcher "auto" tries every pair instead of only likely ones."""
+LARGE_CAPTURE = 100
+"""Number of views above which matcher "auto" tries likely pairs only, and mapping refines all poses less."""
 
 MIN_INLIERS = 12
 """Minimum number of verified matches per pair (COLMAP: 15)."""
@@ -58,8 +58,8 @@ Lens = tuple[list[str], str, list[float] | None]
 class WorkImage:
     """Upright, downscaled PNG of a photograph (`source`) for structure from motion, named after the view.
 
-    `focal_px` is the focal length from EXIF, in px of the copy, or None; `taken` is the time from EXIF, as text
-    in chronological order, or empty.
+    `focal_px` is the focal length from EXIF, in px of the copy, or None. `taken` is the time from EXIF, or ""
+    (`exif_time`).
     """
 
     view: str
@@ -123,9 +123,7 @@ def prepare_images(
         pixels = resize_to_fit(pixels, max_side_px)
         size_hw = (pixels.shape[0], pixels.shape[1])
         write_png(folder / view, pixels, WORK_COMPRESSION)
-        images.append(
-            WorkImage(view, source, size_hw, exif_focal_px(source, size_hw), exif_time(source))
-        )
+        images.append(WorkImage(view, source, size_hw, exif_focal_px(source, size_hw), exif_time(source)))
     if damaged and len(images) < min_share * len(sources):
         if len(damaged) == 1:
             raise ImageError(*damaged.values())
@@ -169,8 +167,8 @@ def find_matches(
     settings: PosesSettings,
     seed: int,
     threads: int,
-) -> tuple[str, str]:
-    """Add images to a new database, extract features and match them; return the matcher and the mapper to use.
+) -> str:
+    """Add images to a new database, extract features and match them; return the matcher that was used.
 
     Features are extracted on the CPU; the result does not depend on `threads`. `taken` orders views in time
     (`WorkImage.taken`); views at the same time, or without one, are in name order. Call this in a separate
@@ -180,13 +178,13 @@ def find_matches(
     pycolmap.Database.open(database).close()  # creates the file
     # Import first: extraction would add images as its threads finish, so results would depend on timing.
     names: list[str] = []
-    for views, camera_model, params in lenses:
+    for lens_views, camera_model, params in lenses:
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = camera_model
         if params is not None:
             reader.camera_params = ", ".join(map(repr, params))
-        pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE, views, reader)
-        names += views
+        pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE, lens_views, reader)
+        names += lens_views
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = threads
     options.use_gpu = False
@@ -199,14 +197,16 @@ def find_matches(
     verification.ransac.random_seed = seed
     verification.ransac.num_threads = 1
     verification.ransac.max_num_trials = MAX_TRIALS
-    matcher, mapper = methods_for(len(names), settings)
-    verification.compute_relative_pose = mapper == "global"
+    verification.compute_relative_pose = settings.mapper == "global"
+    matcher = settings.matcher
+    if matcher == "auto":
+        matcher = "exhaustive" if len(names) <= LARGE_CAPTURE else "retrieval"
     names.sort()  # in the order of `read_features`
     with pycolmap.Database.open(database) as opened:
         views = read_features(opened)
         if matcher == "exhaustive":
             match_pairs(opened, views, list(combinations(range(len(views)), 2)), verification, threads)
-            return matcher, mapper
+            return matcher
         verification.ransac.min_num_trials = MIN_TRIALS
         vectors = appearance_vectors([view.descriptors for view in views], seed)
         likeness = vectors @ vectors.T
@@ -215,15 +215,7 @@ def find_matches(
         verified = match_pairs(opened, views, sorted(pairs), verification, threads)
         more = joining_pairs(likeness, pairs, verified)
         match_pairs(opened, views, sorted(more), verification, threads)
-    return matcher, mapper
-
-
-def methods_for(num_views: int, settings: PosesSettings) -> tuple[str, str]:
-    """Return the matcher and the mapper for a number of views; "auto" depends on the number."""
-    matcher, mapper = settings.matcher, settings.mapper
-    if matcher == "auto":
-        matcher = "exhaustive" if num_views <= EXHAUSTIVE_UP_TO else "retrieval"
-    return matcher, mapper
+    return matcher
 
 
 def incremental_options(seed: int) -> pycolmap.IncrementalPipelineOptions:

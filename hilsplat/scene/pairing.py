@@ -66,16 +66,21 @@ def appearance_vectors(
 ) -> Float32[np.ndarray, "V WD"]:
     """Return the appearance vector of each view, given its descriptors; 0 for views without features."""
     rng = np.random.default_rng(seed)
-    each = max(1, WORDS * SAMPLE_PER_WORD // len(descriptors))
-    sample = [rows[rng.permutation(len(rows))[:each]] for rows in descriptors]
+    each = max(1, WORDS * SAMPLE_PER_WORD // max(1, len(descriptors)))
+    sample = [rows[rng.permutation(len(rows))[:each]] for rows in descriptors if len(rows)]
+    if not sample:
+        return np.zeros((len(descriptors), 1), np.float32)
     words = visual_words(np.concatenate(sample), seed)
     vectors = np.zeros((len(descriptors), words.size), np.float32)
     for vector, rows in zip(vectors, descriptors, strict=True):
+        if not len(rows):
+            continue
         sums, counts = _sums_per_word(rows, words)
         residuals = sums.astype(np.float64) - counts[:, None] * words.astype(np.float64)
         lengths = np.sqrt((residuals**2).sum(axis=1, keepdims=True))
-        residuals /= np.maximum(lengths, 1) * np.sqrt(max(1, np.count_nonzero(lengths)))
-        vector[:] = np.round(LENGTH * residuals.ravel())
+        used = max(1, int((lengths > 0).sum()))
+        residuals *= LENGTH / np.sqrt(used) / np.maximum(lengths, 1)
+        vector[:] = np.round(residuals.ravel())
     return vectors
 
 

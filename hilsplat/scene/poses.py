@@ -20,6 +20,7 @@ from hilsplat.base.removal import delete
 from hilsplat.scene.assemble import Posed, PosedView, split_views, write_scene
 from hilsplat.scene.colmap import camera_of, pose_matrix, pycolmap, reprojection_errors, sparse_points
 from hilsplat.scene.features import (
+    LARGE_CAPTURE,
     MIN_INLIERS,
     WorkImage,
     count_matches,
@@ -40,6 +41,11 @@ INIT_MIN_INLIERS = 50
 
 POSE_MIN_INLIERS = 15
 """Minimum number of visible points needed to pose each additional view (COLMAP: 30)."""
+
+GLOBAL_RATIO = 1.4
+GLOBAL_REFINEMENTS = 2
+"""In a large capture, all poses are refined whenever the model has grown by this factor, in at most this many
+passes (COLMAP: 1.1 and 5); local refinement after each view is unchanged."""
 
 LOST_PICTURE = "not_registered.png"
 """Picture written beside the scene folder if too few photographs were registered."""
@@ -146,13 +152,13 @@ def _reconstruct(
     logger.info("%s: extracting and matching the features of %d images", name, len(work_images))
     taken = {image.view: image.taken for image in work_images}
     arguments = (lenses, taken, settings, seed, threads)
-    matcher, mapper = in_own_process(find_matches, database, work / "images", *arguments)
+    matcher = in_own_process(find_matches, database, work / "images", *arguments)
     shared, counts = count_matches(database)
-    logger.info("%s: %s mapping", name, mapper)
-    models = map_views(database, work / "images", work / "models", mapper, seed)
+    logger.info("%s: %s mapping", name, settings.mapper)
+    models = map_views(database, work / "images", work / "models", settings.mapper, seed)
     report = registration_report(work_images, counts, models)
     name_neighbours(shared, report["views"])
-    how = f"structure from motion, {mapper} mapper, {matcher} matching, {camera_model}"
+    how = f"structure from motion, {settings.mapper} mapper, {matcher} matching, {camera_model}"
     report = {"scene": name, "poses": how, "seed": seed, **report}
     plot_lost(work / LOST_PICTURE, work / "images", report)
     report["images"] += len(unreadable)
@@ -181,6 +187,11 @@ def map_views(
         options.min_model_size = MIN_PHOTOS
         options.mapper.init_min_num_inliers = INIT_MIN_INLIERS
         options.mapper.abs_pose_min_num_inliers = POSE_MIN_INLIERS
+        with pycolmap.Database.open(database) as opened:
+            is_large = opened.num_images() > LARGE_CAPTURE
+        if is_large:
+            options.ba_global_frames_ratio = options.ba_global_points_ratio = GLOBAL_RATIO
+            options.ba_global_max_refinements = GLOBAL_REFINEMENTS
         models = pycolmap.incremental_mapping(database, images, folder, options)
     else:
         models = pycolmap.global_mapping(database, images, folder, _global_options(seed))
@@ -282,10 +293,14 @@ def _why_not(
     if num_features < FEW_FEATURES:
         return f"few features ({num_features}): the image is flat, dark or out of focus"
     if entry["matched_views"] == 0:
-        return f"too few matches: none of {num_tried} views tried shares {MIN_INLIERS} verified matches with it"
+        return (
+            f"too few matches: none of {num_tried} views tried shares {MIN_INLIERS} verified matches with it"
+        )
     if entry["group"] != main_group:
         size = groups[entry["group"]]
-        return f"another place: it belongs to {size} photographs that share no verified matches with the others"
+        return (
+            f"another place: it belongs to {size} photographs that share no verified matches with the others"
+        )
     for number, names in enumerate(members[1:], start=2):
         if view in names:
             return f"in model {number} ({len(names)} views), not in the largest model"

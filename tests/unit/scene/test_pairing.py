@@ -34,6 +34,12 @@ def test_products_of_appearance_vectors_are_exact():
     assert np.diag(exact)[:-1] == pytest.approx(pairing.LENGTH**2, rel=0.02)
 
 
+@pytest.mark.parametrize("count", [0, 3])
+def test_captures_without_features_have_empty_vectors(count):
+    vectors = appearance_vectors([np.zeros((0, 128), np.uint8)] * count, seed=0)
+    assert len(vectors) == count and not vectors.any()
+
+
 def test_words_are_the_centres_of_clusters(monkeypatch):
     monkeypatch.setattr(pairing, "WORDS", 2)
     cluster = np.array([[0, 2], [2, 0], [2, 2], [0, 0]], np.uint8)

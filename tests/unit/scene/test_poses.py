@@ -216,7 +216,7 @@ def test_captures_of_one_place_join_and_photographs_of_another_place_are_named(t
     assert "2 groups of photographs share no verified matches (9, 3 views)" in report["warnings"]
     lost = {view: entry["why_not"] for view, entry in report["views"].items() if not entry["registered"]}
     assert list(lost) == ["c000.png", "c001.png", "c002.png"]
-    assert all(reason.startswith("another place: it belongs to 3 photographs") for reason in lost.values())
+    assert all(reason.startswith("another place: its group of 3 photographs") for reason in lost.values())
     for file in first.rglob("*.*"):
         assert file.read_bytes() == (tmp_path / "second" / file.relative_to(first)).read_bytes(), file
 
@@ -224,7 +224,9 @@ def test_captures_of_one_place_join_and_photographs_of_another_place_are_named(t
 def test_the_time_orders_photographs(tmp_path):
     """A burst has one time per second and a fraction; without a time, a photograph comes first."""
     moments = [("2026:05:17 12:30:59", "5"), ("2026:05:17 12:30:59", "25"), ("2026:05:17 09:00:00", None)]
-    tags = [{"DateTimeOriginal": time, **({"SubsecTimeOriginal": part} if part else {})} for time, part in moments]
+    tags = [
+        {"DateTimeOriginal": time, **({"SubsecTimeOriginal": part} if part else {})} for time, part in moments
+    ]
     times = [exif_time(photograph(tmp_path / "a.jpg", **given)) for given in (*tags, {})]
     assert sorted(range(4), key=times.__getitem__) == [3, 2, 1, 0]
 
