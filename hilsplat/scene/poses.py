@@ -293,14 +293,10 @@ def _why_not(
     if num_features < FEW_FEATURES:
         return f"few features ({num_features}): the image is flat, dark or out of focus"
     if entry["matched_views"] == 0:
-        return (
-            f"too few matches: none of {num_tried} views tried shares {MIN_INLIERS} verified matches with it"
-        )
+        return f"too few matches: none of {num_tried} views compared shares {MIN_INLIERS} verified matches"
     if entry["group"] != main_group:
-        size = groups[entry["group"]]
-        return (
-            f"another place: it belongs to {size} photographs that share no verified matches with the others"
-        )
+        rest = f"its group of {groups[entry['group']]} photographs shares no verified matches with the others"
+        return f"another place, or too little overlap: {rest}"
     for number, names in enumerate(members[1:], start=2):
         if view in names:
             return f"in model {number} ({len(names)} views), not in the largest model"

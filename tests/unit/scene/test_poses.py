@@ -216,7 +216,7 @@ def test_captures_of_one_place_join_and_photographs_of_another_place_are_named(t
     assert "2 groups of photographs share no verified matches (9, 3 views)" in report["warnings"]
     lost = {view: entry["why_not"] for view, entry in report["views"].items() if not entry["registered"]}
     assert list(lost) == ["c000.png", "c001.png", "c002.png"]
-    assert all(reason.startswith("another place: its group of 3 photographs") for reason in lost.values())
+    assert all("another place" in why and "group of 3 photographs" in why for why in lost.values())
     for file in first.rglob("*.*"):
         assert file.read_bytes() == (tmp_path / "second" / file.relative_to(first)).read_bytes(), file
 
