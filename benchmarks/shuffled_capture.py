@@ -134,7 +134,10 @@ def run(folder: Path, settings: PosesSettings, threads: int) -> dict[str, str]:
     started, database = _clocks(), work / "features.db"
     if not database.exists():
         lenses = lenses_of(images, "simple_pinhole", "auto")
-        in_own_process(find_matches, database, work / "images", lenses, {}, settings, 0, threads)
+        unfinished = work / "unfinished.db"  # a killed run leaves no matches that a later run would reuse
+        unfinished.unlink(missing_ok=True)
+        in_own_process(find_matches, unfinished, work / "images", lenses, {}, settings, 0, threads)
+        unfinished.rename(database)
     matched = _clocks()
     models = map_views(database, work / "images", work / "models", settings.mapper, 0)
     mapped = _clocks()
@@ -177,6 +180,7 @@ def main() -> None:
     parser.add_argument("--matcher", default="auto")
     parser.add_argument("--mapper", default="incremental")
     given = parser.parse_args()
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
     os.environ["OMP_NUM_THREADS"] = "1"  # for processes started below, as the hilsplat command does
     if not (given.folder / "cameras.npz").exists():
         render(given.folder, given.source, given.views, given.px, given.threads)
