@@ -73,8 +73,10 @@ class PosesSettings(Section):
     single_camera: Literal["auto", "yes", "no"] = knob(
         "auto", "one camera for all photographs; auto: one per size and EXIF focal length", origin="COLMAP"
     )
-    matcher: Literal["auto", "exhaustive", "sequential"] = knob(
-        "auto", "pairs of views to match; auto: exhaustive up to 200 views, else sequential", origin="COLMAP"
+    matcher: Literal["auto", "exhaustive", "retrieval"] = knob(
+        "auto",
+        "pairs of views to match; retrieval: by appearance and time; auto: exhaustive up to 100 views",
+        origin="COLMAP",
     )
     mapper: Literal["incremental", "global"] = knob("incremental", "structure from motion", origin="COLMAP")
     max_features: int = knob(4096, "SIFT features per image", ge=100, le=32768, origin="COLMAP: 8192")

@@ -1,8 +1,9 @@
 """Features and verified matches of photographs: upright work images, initial cameras, SIFT, pairs."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -19,17 +20,15 @@ from hilsplat.base.images import (
 )
 from hilsplat.base.progress import track
 from hilsplat.scene.colmap import pycolmap
-from hilsplat.scene.matching import match_pairs
+from hilsplat.scene.matching import match_pairs, read_features
+from hilsplat.scene.pairing import appearance_vectors, groups_of, joining_pairs, likely_pairs
 from hilsplat.scene.view_names import view_names
 from hilsplat.settings import PosesSettings
 
 logger = logging.getLogger(__name__)
 
-EXHAUSTIVE_UP_TO = 200
-"""Maximum number of views for which matcher "auto" tries every pair instead of only neighbours by name."""
-
-SEQUENTIAL_STEPS = sorted({*range(1, 11), *(2**power for power in range(10))})
-"""Offsets, in name order, between the views that sequential matching pairs."""
+LARGE_CAPTURE = 100
+"""Number of views above which matcher "auto" tries likely pairs only, and mapping refines all poses less."""
 
 MIN_INLIERS = 12
 """Minimum number of verified matches per pair (COLMAP: 15)."""
@@ -39,6 +38,9 @@ PEAK_THRESHOLD = 0.02 / 3 / 2
 
 MAX_TRIALS = 1000
 """Maximum RANSAC trials per pair (COLMAP: 10000); pairs without overlap use all of them."""
+
+MIN_TRIALS = 30
+"""Minimum RANSAC trials per pair of matcher "retrieval" (COLMAP: 100); most of its pairs overlap."""
 
 WORK_COMPRESSION = 1
 """zlib compression level of work images, a third faster than level 6; COLMAP reads each image only once."""
@@ -56,13 +58,15 @@ Lens = tuple[list[str], str, list[float] | None]
 class WorkImage:
     """Upright, downscaled PNG of a photograph (`source`) for structure from motion, named after the view.
 
-    `focal_px` is the focal length from EXIF, in px of the copy, or None.
+    `focal_px` is the focal length from EXIF, in px of the copy, or None. `taken` is the time from EXIF, or ""
+    (`exif_time`).
     """
 
     view: str
     source: Path
     size_hw: tuple[int, int]
     focal_px: float | None
+    taken: str = ""
 
 
 def exif_focal_px(path: Path, size_hw: tuple[int, int]) -> float | None:
@@ -90,6 +94,14 @@ def exif_focal_px(path: Path, size_hw: tuple[int, int]) -> float | None:
     return number(ExifTags.Base.FocalLength) * pixels_per_mm * max(size_hw) / stored_px or None
 
 
+def exif_time(path: Path) -> str:
+    """Return the time at which a photograph was taken, from EXIF ("2026:05:17 12:30:59.25"), or ""."""
+    with open_image(path) as image:
+        tags = exif_tags(image, ExifTags.IFD.Exif)
+    parts = (tags.get(tag) for tag in (ExifTags.Base.DateTimeOriginal, ExifTags.Base.SubsecTimeOriginal))
+    return ".".join(part.strip() for part in parts if isinstance(part, str))
+
+
 def prepare_images(
     sources: Sequence[Path], folder: Path, max_side_px: int, min_share: float = 1.0
 ) -> tuple[list[WorkImage], dict[Path, str]]:
@@ -111,7 +123,7 @@ def prepare_images(
         pixels = resize_to_fit(pixels, max_side_px)
         size_hw = (pixels.shape[0], pixels.shape[1])
         write_png(folder / view, pixels, WORK_COMPRESSION)
-        images.append(WorkImage(view, source, size_hw, exif_focal_px(source, size_hw)))
+        images.append(WorkImage(view, source, size_hw, exif_focal_px(source, size_hw), exif_time(source)))
     if damaged and len(images) < min_share * len(sources):
         if len(damaged) == 1:
             raise ImageError(*damaged.values())
@@ -148,24 +160,31 @@ def lenses_of(images: Sequence[WorkImage], camera_model: str, single_camera: str
 
 
 def find_matches(
-    database: Path, folder: Path, lenses: Sequence[Lens], settings: PosesSettings, seed: int, threads: int
+    database: Path,
+    folder: Path,
+    lenses: Sequence[Lens],
+    taken: Mapping[str, str],
+    settings: PosesSettings,
+    seed: int,
+    threads: int,
 ) -> str:
     """Add images to a new database, extract features and match them; return the matcher that was used.
 
-    Features are extracted on the CPU; the result does not depend on `threads`. Call this in a separate
+    Features are extracted on the CPU; the result does not depend on `threads`. `taken` orders views in time
+    (`WorkImage.taken`); views at the same time, or without one, are in name order. Call this in a separate
     process: if the database cannot be written, COLMAP throws an exception in a C++ thread.
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
     pycolmap.Database.open(database).close()  # creates the file
     # Import first: extraction would add images as its threads finish, so results would depend on timing.
     names: list[str] = []
-    for views, camera_model, params in lenses:
+    for lens_views, camera_model, params in lenses:
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = camera_model
         if params is not None:
             reader.camera_params = ", ".join(map(repr, params))
-        pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE, views, reader)
-        names += views
+        pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE, lens_views, reader)
+        names += lens_views
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = threads
     options.use_gpu = False
@@ -173,18 +192,29 @@ def find_matches(
     options.sift.max_num_features = settings.max_features
     options.sift.peak_threshold = PEAK_THRESHOLD
     pycolmap.extract_features(database, folder, names, extraction_options=options, device=pycolmap.Device.cpu)
-    num_views, matcher = len(names), settings.matcher
-    if matcher == "auto":
-        matcher = "exhaustive" if num_views <= EXHAUSTIVE_UP_TO else "sequential"
     verification = pycolmap.TwoViewGeometryOptions()
     verification.min_num_inliers = MIN_INLIERS
     verification.ransac.random_seed = seed
     verification.ransac.num_threads = 1
     verification.ransac.max_num_trials = MAX_TRIALS
     verification.compute_relative_pose = settings.mapper == "global"
-    steps = range(1, num_views) if matcher == "exhaustive" else SEQUENTIAL_STEPS
-    partners = [[row + step for step in steps if row + step < num_views] for row in range(num_views)]
-    match_pairs(database, partners, verification, threads)
+    matcher = settings.matcher
+    if matcher == "auto":
+        matcher = "exhaustive" if len(names) <= LARGE_CAPTURE else "retrieval"
+    names.sort()  # in the order of `read_features`
+    with pycolmap.Database.open(database) as opened:
+        views = read_features(opened)
+        if matcher == "exhaustive":
+            match_pairs(opened, views, list(combinations(range(len(views)), 2)), verification, threads)
+            return matcher
+        verification.ransac.min_num_trials = MIN_TRIALS
+        vectors = appearance_vectors([view.descriptors for view in views], seed)
+        likeness = vectors @ vectors.T
+        in_time = sorted(range(len(names)), key=lambda row: taken.get(names[row], ""))
+        pairs = likely_pairs(likeness, in_time)
+        verified = match_pairs(opened, views, sorted(pairs), verification, threads)
+        more = joining_pairs(likeness, pairs, verified)
+        match_pairs(opened, views, sorted(more), verification, threads)
     return matcher
 
 
@@ -200,21 +230,29 @@ def incremental_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
 def count_matches(database: Path) -> tuple[dict[str, dict[str, int]], dict[str, dict[str, int]]]:
     """Count the verified matches of each pair of views, and each view's features and matches for the report.
 
-    Two views count as matched if they have at least `MIN_INLIERS` verified matches.
+    Two views count as matched if they have at least `MIN_INLIERS` verified matches. Groups are the connected
+    components of matched views, numbered from 1, the largest first.
     """
     with pycolmap.Database.open(database) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
         features = {name: opened.num_keypoints_for_image(number) for number, name in names.items()}
         pair_ids, inliers = opened.read_two_view_geometry_num_inliers()
-    shared: dict[str, dict[str, int]] = {name: {} for name in names.values()}
+    shared: dict[str, dict[str, int]] = {name: {} for name in sorted(names.values())}
+    row_of = {name: row for row, name in enumerate(shared)}
+    verified = []
     for pair_id, count in zip(pair_ids, inliers, strict=True):
         one, other = (names[image_id] for image_id in pycolmap.pair_id_to_image_pair(pair_id))
         shared[one][other] = shared[other][one] = int(count)
+        if count >= MIN_INLIERS:
+            verified.append((row_of[one], row_of[other]))
+    groups = groups_of(len(shared), verified)
     counts = {}
-    for name, num_features in features.items():
+    for name, group in zip(shared, groups, strict=True):
         pairs = [count for count in shared[name].values() if count >= MIN_INLIERS]
         counts[name] = {
-            "features": num_features,
+            "features": features[name],
+            "group": int(group) + 1,
+            "tried_views": len(shared[name]),
             "matched_views": len(pairs),
             "best_pair_matches": max(pairs, default=0),
         }

@@ -6,15 +6,14 @@ inner products of descriptors are computed in integers, which takes a third of t
 
 import copy
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import onnxruntime
 from jaxtyping import Float64, Int8, Int32, UInt8, UInt32
 
+from hilsplat.base.processes import in_order
 from hilsplat.models.network import one_thread_session
 from hilsplat.models.onnx_graph import Graph
 from hilsplat.scene.colmap import pycolmap
@@ -64,25 +63,30 @@ def read_features(database: pycolmap.Database) -> list[ViewFeatures]:
 
 
 def match_pairs(
-    database: Path,
-    partners: Sequence[Sequence[int]],
+    database: pycolmap.Database,
+    views: Sequence[ViewFeatures],
+    pairs: Sequence[tuple[int, int]],
     options: pycolmap.TwoViewGeometryOptions,
     threads: int,
-) -> None:
-    """Match pairs of views, verify the matches, and write matches and geometries to COLMAP's database.
+) -> list[tuple[int, int]]:
+    """Match pairs of rows of `views`, write matches and geometries to the database, return verified pairs.
 
-    `partners` lists, for each view in name order, the rows of the later views to match it with. The result
-    does not depend on `threads`.
+    A pair is verified if its matches fit a two-view geometry. The result does not depend on `threads`.
     """
-    with pycolmap.Database.open(database) as opened, ThreadPoolExecutor(threads) as pool:
-        views = read_features(opened)
-        for one, rows in zip(views, partners, strict=True):
-            others = [views[row] for row in rows]
-            found = list(pool.map(lambda other, one=one: _matched(one, other, options), others))
-            with pycolmap.DatabaseTransaction(opened):
-                for other, (matches, geometry) in zip(others, found, strict=True):
-                    opened.write_matches(one.image_id, other.image_id, matches)
-                    opened.write_two_view_geometry(one.image_id, other.image_id, geometry)
+
+    def match(pair: tuple[int, int]) -> tuple[UInt32[np.ndarray, "M 2"], pycolmap.TwoViewGeometry]:
+        return _matched(views[pair[0]], views[pair[1]], options)
+
+    verified = []
+    with pycolmap.DatabaseTransaction(database):
+        found = zip(pairs, in_order(match, pairs, threads), strict=True)
+        for (one, other), (matches, geometry) in found:
+            numbers = views[one].image_id, views[other].image_id
+            database.write_matches(*numbers, matches)
+            database.write_two_view_geometry(*numbers, geometry)
+            if len(geometry.inlier_matches) >= options.min_num_inliers:
+                verified.append((one, other))
+    return verified
 
 
 def _matched(

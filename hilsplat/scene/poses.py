@@ -2,6 +2,7 @@
 
 import logging
 import shutil
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from hilsplat.base.removal import delete
 from hilsplat.scene.assemble import Posed, PosedView, split_views, write_scene
 from hilsplat.scene.colmap import camera_of, pose_matrix, pycolmap, reprojection_errors, sparse_points
 from hilsplat.scene.features import (
+    LARGE_CAPTURE,
     MIN_INLIERS,
     WorkImage,
     count_matches,
@@ -40,11 +42,19 @@ INIT_MIN_INLIERS = 50
 POSE_MIN_INLIERS = 15
 """Minimum number of visible points needed to pose each additional view (COLMAP: 30)."""
 
+GLOBAL_RATIO = 1.4
+GLOBAL_REFINEMENTS = 2
+"""In a large capture, all poses are refined whenever the model has grown by this factor, in at most this many
+passes (COLMAP: 1.1 and 5); local refinement after each view is unchanged."""
+
 LOST_PICTURE = "not_registered.png"
 """Picture written beside the scene folder if too few photographs were registered."""
 
 WEAK_POINTS_PER_VIEW = 13
 """Fewest points per registered view in any good run on renders; unusable runs had 4 to 18."""
+
+FEW_FEATURES = 30
+"""Number of features below which a photograph can hardly have `MIN_INLIERS` verified matches."""
 
 NEIGHBOURS = 3
 """Number of registered photographs listed as neighbours of each unregistered one."""
@@ -140,7 +150,9 @@ def _reconstruct(
     )
     database, lenses = work / "features.db", lenses_of(work_images, camera_model, settings.single_camera)
     logger.info("%s: extracting and matching the features of %d images", name, len(work_images))
-    matcher = in_own_process(find_matches, database, work / "images", lenses, settings, seed, threads)
+    taken = {image.view: image.taken for image in work_images}
+    arguments = (lenses, taken, settings, seed, threads)
+    matcher = in_own_process(find_matches, database, work / "images", *arguments)
     shared, counts = count_matches(database)
     logger.info("%s: %s mapping", name, settings.mapper)
     models = map_views(database, work / "images", work / "models", settings.mapper, seed)
@@ -175,6 +187,11 @@ def map_views(
         options.min_model_size = MIN_PHOTOS
         options.mapper.init_min_num_inliers = INIT_MIN_INLIERS
         options.mapper.abs_pose_min_num_inliers = POSE_MIN_INLIERS
+        with pycolmap.Database.open(database) as opened:
+            is_large = opened.num_images() > LARGE_CAPTURE
+        if is_large:
+            options.ba_global_frames_ratio = options.ba_global_points_ratio = GLOBAL_RATIO
+            options.ba_global_max_refinements = GLOBAL_REFINEMENTS
         models = pycolmap.incremental_mapping(database, images, folder, options)
     else:
         models = pycolmap.global_mapping(database, images, folder, _global_options(seed))
@@ -204,6 +221,8 @@ def registration_report(
     """Return the registration report: totals, models, and each view's matches and outcome."""
     errors = reprojection_errors(models[0]) if models else {}
     members = [{model.images[i].name for i in model.reg_image_ids()} for model in models]
+    groups = Counter(entry["group"] for entry in matches.values())
+    main_group = max(groups, key=lambda group: sum(matches[view]["group"] == group for view in errors))
     views: dict[str, Any] = {}
     for image in images:
         is_registered = image.view in errors
@@ -214,7 +233,7 @@ def registration_report(
             entry["observations"] = len(px)
             entry["reprojection_error_px"] = round(float(px.mean()), 4) if len(px) else None
         else:
-            entry["why_not"] = _why_not(image.view, entry, members)
+            entry["why_not"] = _why_not(image.view, entry, groups, main_group, members)
         views[image.view] = entry
     every_error = np.concatenate([*errors.values(), np.zeros(0)])
     num_points = models[0].num_points3D() if models else 0
@@ -222,6 +241,10 @@ def registration_report(
     warnings = []
     if 0 < len(errors) < len(images):
         warnings.append(f"{len(images) - len(errors)} of {len(images)} views are not registered")
+    connected = [size for _, size in sorted(groups.items()) if size > 1]
+    if len(connected) > 1:
+        sizes = ", ".join(map(str, connected))
+        warnings.append(f"{len(connected)} groups of photographs share no verified matches ({sizes} views)")
     if len(members) > 1:
         sizes = ", ".join(str(len(names)) for names in members)
         warnings.append(f"the views form {len(members)} separate models ({sizes} views); the largest is used")
@@ -234,6 +257,7 @@ def registration_report(
         "images": len(images),
         "registered": len(errors),
         "models": [len(names) for names in members],
+        "groups": [size for _, size in sorted(groups.items())],
         "points": num_points,
         "points_per_view": points_per_view,
         "mean_track_length": round(models[0].compute_mean_track_length(), 3) if num_points else 0.0,
@@ -258,11 +282,21 @@ def _camera_entries(model: pycolmap.Reconstruction) -> list[dict[str, Any]]:
     ]
 
 
-def _why_not(view: str, entry: Mapping[str, Any], members: Sequence[set[str]]) -> str:
-    if entry["features"] == 0:
-        return "no features: the image is flat, dark or out of focus"
+def _why_not(
+    view: str,
+    entry: Mapping[str, Any],
+    groups: Mapping[int, int],
+    main_group: int,
+    members: Sequence[set[str]],
+) -> str:
+    num_features, num_tried = entry["features"], entry["tried_views"]
+    if num_features < FEW_FEATURES:
+        return f"few features ({num_features}): the image is flat, dark or out of focus"
     if entry["matched_views"] == 0:
-        return f"too few matches: no other view shares at least {MIN_INLIERS} verified matches with it"
+        return f"too few matches: none of {num_tried} views compared shares {MIN_INLIERS} verified matches"
+    if entry["group"] != main_group:
+        rest = f"its group of {groups[entry['group']]} photographs shares no verified matches with the others"
+        return f"another place, or too little overlap: {rest}"
     for number, names in enumerate(members[1:], start=2):
         if view in names:
             return f"in model {number} ({len(names)} views), not in the largest model"

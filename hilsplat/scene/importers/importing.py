@@ -171,7 +171,7 @@ def triangulate(
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)
     folder, database = views[0].image.parent, work / "triangulation.db"
     lenses = [([view.view], view.camera.model_name, view.camera.params.tolist()) for view in views]
-    in_own_process(find_matches, database, folder, lenses, settings, seed, threads)
+    in_own_process(find_matches, database, folder, lenses, {}, settings, seed, threads)
     model = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as opened:
         for view in views:

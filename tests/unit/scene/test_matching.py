@@ -5,7 +5,14 @@ import pytest
 
 from hilsplat.scene import matching
 from hilsplat.scene.colmap import pycolmap
-from hilsplat.scene.matching import MAX_ANGLE, MAX_RATIO, ViewFeatures, match_pairs, mutual_matches
+from hilsplat.scene.matching import (
+    MAX_ANGLE,
+    MAX_RATIO,
+    ViewFeatures,
+    match_pairs,
+    mutual_matches,
+    read_features,
+)
 
 
 def descriptors_of(directions):
@@ -80,8 +87,9 @@ def test_verified_matches_are_written(tmp_path):
             opened.write_descriptors(image, features)
     options = pycolmap.TwoViewGeometryOptions()
     options.min_num_inliers, options.ransac.random_seed = 12, 0
-    match_pairs(database, [[1, 2], [2], []], options, threads=2)
     with pycolmap.Database.open(database) as opened:
+        pairs = [(0, 1), (0, 2), (1, 2)]
+        assert match_pairs(opened, read_features(opened), pairs, options, threads=2) == [(0, 1)]
         geometries = [opened.read_two_view_geometry(*pair) for pair in ((1, 2), (1, 3))]
     # the third shares 14, one too few
     assert [each.inlier_matches.tolist() for each in geometries] == [[[row, row] for row in range(60)], []]

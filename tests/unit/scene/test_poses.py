@@ -11,7 +11,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from hilsplat.base.errors import ImageError, RegistrationError, SceneError
 from hilsplat.base.images import read_image
-from hilsplat.scene.features import WorkImage, exif_focal_px, lenses_of, prepare_images
+from hilsplat.scene.features import WorkImage, exif_focal_px, exif_time, lenses_of, prepare_images
 from hilsplat.scene.posed_images import PosedImage, write_posed_images
 from hilsplat.scene.poses import check_registration, name_neighbours, plot_lost, run_poses
 from hilsplat.scene.scene import Scene
@@ -32,10 +32,10 @@ def write_noise(folder, count, size_hw=(48, 48), suffix=".png"):
     return folder
 
 
-def plane_views(folder, views=5, size=160, step_deg=9):
+def plane_views(folder, views=5, size=160, step_deg=9, place=1):
     """Render a textured corner (the planes x = 0 and y = 0) from an arc, and return the cameras."""
     folder.mkdir()
-    noise = np.random.default_rng(1).random((2, 64, 64, 3)).repeat(4, axis=1).repeat(4, axis=2)
+    noise = np.random.default_rng(place).random((2, 64, 64, 3)).repeat(4, axis=1).repeat(4, axis=2)
     angles = np.radians(45 + step_deg * (np.arange(views) - (views - 1) / 2))
     centres = np.column_stack([4 * np.cos(angles), 4 * np.sin(angles), 1 + 0.2 * (np.arange(views) % 2)])
     cameras = numbered_cameras([(centre, np.zeros(3)) for centre in centres], size, fov_deg=45)
@@ -112,7 +112,7 @@ def test_points_are_triangulated_from_known_poses(tmp_path):
     assert report["points_from"] == "triangulated from the known poses"
 
 
-@pytest.mark.parametrize("settings", [{"mapper": "global"}, {"matcher": "sequential"}])
+@pytest.mark.parametrize("settings", [{"mapper": "global"}, {"matcher": "retrieval"}])
 def test_other_mapper_and_matcher_pose_the_renders_too(tmp_path, settings):
     plane_views(tmp_path / "renders")
     run_poses(tmp_path / "renders", tmp_path / "scene", "w/c", "metre", True, PosesSettings(**settings), 0, 1)
@@ -200,6 +200,35 @@ def test_an_unrelated_photograph_is_shown_in_the_report(tmp_path):
     assert Image.open(tmp_path / "not_registered.png").size == (1200, 330)
     pose_photos(tmp_path / "photos", tmp_path / "scene")  # the next success removes it
     assert not (tmp_path / "not_registered.png").exists()
+
+
+def test_captures_of_one_place_join_and_photographs_of_another_place_are_named(tmp_path):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for capture, views, step_deg, place in (("a", 5, 9, 1), ("b", 4, 12, 1), ("c", 3, 9, 2)):
+        for view in plane_views(tmp_path / capture, views, step_deg=step_deg, place=place).names:
+            (tmp_path / capture / view).rename(photos / f"{capture}{view}")
+    first = tmp_path / "first"
+    for out, threads in ((first, 1), (tmp_path / "second", 2)):
+        run_poses(photos, out, "w/c", "metre", True, PosesSettings(matcher="retrieval"), 0, threads)
+    report = json.loads((first / "registration.json").read_text())
+    assert report["groups"] == [9, 3] and report["registered"] == 9
+    assert "2 groups of photographs share no verified matches (9, 3 views)" in report["warnings"]
+    lost = {view: entry["why_not"] for view, entry in report["views"].items() if not entry["registered"]}
+    assert list(lost) == ["c000.png", "c001.png", "c002.png"]
+    assert all("another place" in why and "group of 3 photographs" in why for why in lost.values())
+    for file in first.rglob("*.*"):
+        assert file.read_bytes() == (tmp_path / "second" / file.relative_to(first)).read_bytes(), file
+
+
+def test_the_time_orders_photographs(tmp_path):
+    """A burst has one time per second and a fraction; without a time, a photograph comes first."""
+    moments = [("2026:05:17 12:30:59", "5"), ("2026:05:17 12:30:59", "25"), ("2026:05:17 09:00:00", None)]
+    tags = [
+        {"DateTimeOriginal": time, **({"SubsecTimeOriginal": part} if part else {})} for time, part in moments
+    ]
+    times = [exif_time(photograph(tmp_path / "a.jpg", **given)) for given in (*tags, {})]
+    assert sorted(range(4), key=times.__getitem__) == [3, 2, 1, 0]
 
 
 def photograph(path, size=(400, 300), orientation=1, **tags):
