@@ -149,14 +149,16 @@ def run(folder: Path, settings: PosesSettings, threads: int) -> dict[str, str]:
         numbers = {image.image_id: true.names.index(image.name) for image in opened.read_all_images()}
         pair_ids, inliers = opened.read_two_view_geometry_num_inliers()
     rows = np.array([[numbers[n] for n in pycolmap.pair_id_to_image_pair(pair)] for pair in pair_ids])
+    assert all(inliers)  # COLMAP doesn't list pairs without a geometry
     is_partner = partners[rows[:, 0], rows[:, 1]]
+    num_partners = (partners.sum() - len(true)) / 2
     return {
         "views": str(len(true)),
         "partners of a view": f"{(partners.sum(axis=1) - 1).mean():.1f}",
         "matcher, mapper": f"{settings.matcher}, {settings.mapper}",
-        "tested": str(len(rows)),
+        "verified pairs": str(len(rows)),
         "of them partners": f"{is_partner.mean():.1%}",
-        "verified": str(np.count_nonzero(inliers)),
+        "verified of all partners": f"{is_partner.sum() / num_partners:.1%}",
         "in the models": ", ".join(str(model.num_reg_images()) for model in models),
         "median error, m": f"{error:.4f}",
         "features, matches: s, CPU s": "; ".join(f"{value:.0f}" for value in matched - started),

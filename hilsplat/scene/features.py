@@ -252,7 +252,6 @@ def count_matches(database: Path) -> tuple[dict[str, dict[str, int]], dict[str, 
         counts[name] = {
             "features": features[name],
             "group": int(group) + 1,
-            "tried_views": len(shared[name]),
             "matched_views": len(pairs),
             "best_pair_matches": max(pairs, default=0),
         }

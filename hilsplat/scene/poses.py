@@ -289,11 +289,10 @@ def _why_not(
     main_group: int,
     members: Sequence[set[str]],
 ) -> str:
-    num_features, num_tried = entry["features"], entry["tried_views"]
-    if num_features < FEW_FEATURES:
-        return f"few features ({num_features}): the image is flat, dark or out of focus"
+    if entry["features"] < FEW_FEATURES:
+        return f"few features ({entry['features']}): the image is flat, dark or out of focus"
     if entry["matched_views"] == 0:
-        return f"too few matches: none of {num_tried} views compared shares {MIN_INLIERS} verified matches"
+        return f"too few matches: no other view shares at least {MIN_INLIERS} verified matches with it"
     if entry["group"] != main_group:
         rest = f"its group of {groups[entry['group']]} photographs shares no verified matches with the others"
         return f"another place, or too little overlap: {rest}"
