@@ -1,10 +1,11 @@
 """Measure how time and memory of the stages after the fit grow with Gaussians, views, pixels and masks.
 
-    python -m benchmarks.growth FOLDER        # thirteen scenes, 4 minutes on two idle cores
+    python -m benchmarks.growth FOLDER                    # fourteen scenes
+    python -m benchmarks.growth FOLDER --quantity views   # 250 to 2,000 views of one place
 
-Each series generates the base scene of `large_scene` with one quantity at half, once, twice and four times
-its size, and runs every stage in its own process. The script writes `growth.json` and `growth.png`, and
-prints exponents: the slopes of straight lines fitted to the logarithms. Existing results are reused.
+Each series generates scenes of `large_scene` in which one quantity grows by factors of two, and runs every
+stage in its own process. The script writes `growth.json` and `growth.png`, and prints exponents of the last
+doubling: 1 is linear growth. Existing results are reused.
 """
 
 import argparse
@@ -22,6 +23,7 @@ from benchmarks.large_scene import STAGES
 from benchmarks.table import markdown_table
 
 FACTORS = (0.5, 1.0, 2.0, 4.0)
+VIEWS = (250, 500, 1000, 2000)
 MEASURES = ("seconds", "MiB")
 LABELS = {
     "gaussians": "Gaussians",
@@ -52,7 +54,9 @@ class Size:
         return [part for name, size in sizes.items() for part in (f"--{name}", str(size))]
 
 
-QUANTITIES = tuple(Size.__annotations__)
+SERIES = {name: [Size().grown(name, factor) for factor in FACTORS] for name in LABELS}
+SERIES["views"] = [Size(views=views, pixels=200 * 150, masks=300) for views in VIEWS]
+"""Quantity -> sizes of its scenes. Large numbers of views have small pictures with many masks."""
 
 
 def measured(size: Size, folder: Path) -> dict[str, list[float]]:
@@ -66,14 +70,14 @@ def measured(size: Size, folder: Path) -> dict[str, list[float]]:
 
 
 def exponent(sizes: list[float], values: list[float]) -> float:
-    """Return the slope of a straight line fitted to the logarithms; 1 is linear growth."""
-    return float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
+    """Return the exponent of the growth from the last but one value to the last; 1 is linear growth."""
+    return float(np.log(values[-1] / values[-2]) / np.log(sizes[-1] / sizes[-2]))
 
 
 def draw(series: dict[str, dict[str, dict[str, list[float]]]]) -> Figure:
     """Draw a column per quantity, seconds above and peak memory below, with the exponent of each line."""
     figure = Figure(figsize=(3.6 * len(series), 6.4), layout="constrained")
-    panels = figure.subplots(len(MEASURES), len(series), sharey="row")
+    panels = figure.subplots(len(MEASURES), len(series), sharey="row", squeeze=False)
     for column, (quantity, found) in enumerate(series.items()):
         sizes = found["size"]["values"]
         for row, measure in enumerate(MEASURES):
@@ -107,10 +111,14 @@ def main() -> None:
     """Measure, print and draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("out", type=Path)
-    folder = parser.parse_args().out
+    parser.add_argument(
+        "--quantity", choices=SERIES, action="append", help="quantity to measure; default: all"
+    )
+    given = parser.parse_args()
+    folder = given.out
     series: dict[str, dict[str, dict[str, list[float]]]] = {}
-    for quantity in QUANTITIES:
-        sizes = [Size().grown(quantity, factor) for factor in FACTORS]
+    for quantity in given.quantity or SERIES:
+        sizes = SERIES[quantity]
         times = [measured(size, folder) for size in sizes]
         series[quantity] = {"size": {"values": [float(getattr(size, quantity)) for size in sizes]}}
         for stage in STAGES:

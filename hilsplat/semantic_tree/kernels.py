@@ -150,7 +150,8 @@ def shared_pairs(begin, end, masks, pairs, seen, least, min_iou):
         lists = np.zeros(_numbered(first, last, indices, number) + 2, np.int64)
         for k in range(first, last):
             lists[number[indices[k]] + 2] += 1
-        lists = np.cumsum(lists)  # where the list of each Gaussian's masks ends, afterwards begins
+        # lists[n + 1] is where the list of a Gaussian's masks begins, and where it ends once it is filled
+        lists = np.cumsum(lists)
         of, of_weighted = np.empty(last - first, np.int32), np.empty(last - first)
         for a in range(starts[u], starts[u + 1]):
             for k in range(indptr[a], indptr[a + 1]):
