@@ -44,7 +44,6 @@ class Facts(NamedTuple):
     imports: list[str]
 
 
-@functools.cache
 def code_digest(*roots: Code) -> str:
     """Return a digest of the modules that the roots import, directly or not; 16 hexadecimal digits.
 

@@ -248,11 +248,12 @@ class Plan:
             paths = _words(stage, self._paths(stage, wildcards, input, output))
             return f"{stage.command} {settings(wildcards)} {paths}"
 
+        code = functools.cache(stage.code_digest)
         # Snakemake compares only parameters that don't derive from input and output.
         params: dict[str, Any] = {
             "command": command,
             "settings": settings,
-            "code": lambda wildcards: stage.code_digest(plugins(wildcards)),
+            "code": lambda wildcards: code(plugins(wildcards)),
         }
         if files is not None:
             params["files"] = self.data.content(files)
