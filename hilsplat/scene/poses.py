@@ -54,7 +54,7 @@ WEAK_POINTS_PER_VIEW = 13
 """Fewest points per registered view in any good run on renders; unusable runs had 4 to 18."""
 
 FEW_FEATURES = 30
-"""Number of features below which a photograph can hardly have `MIN_INLIERS` verified matches."""
+"""With fewer features, a photograph rarely has `MIN_INLIERS` verified matches."""
 
 NEIGHBOURS = 3
 """Number of registered photographs listed as neighbours of each unregistered one."""

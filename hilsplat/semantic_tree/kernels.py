@@ -135,7 +135,7 @@ def shared_pairs(begin, end, masks, pairs, seen, least, min_iou):
 
     Returns:
         number of pairs per mask a, masks b, and two sums per pair: the intersection, and the union minus the
-        sizes of both masks (0 for a mask of which the other view sees less than `least`); and, of all masks,
+        sizes of both masks (0 if the other view shows less than `least` of the mask); and, of all masks,
         the best partner and IoU among these pairs (-1 for none; on a tie, the lowest partner).
     """
     starts, (indptr, indices, share), importance = masks
