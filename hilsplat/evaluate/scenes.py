@@ -19,7 +19,7 @@ COLUMNS = (
 
 
 PROTOCOL = "lerf/tree-nodes"
-"""Default protocol of the scores: answers of the tree in views, against regions annotated with a text."""
+"""Default protocol of the scores: the tree's answers in views, against regions annotated with a text."""
 
 
 def run_scenes(results: Path, pattern: str, out: Path | None, protocol: str = PROTOCOL) -> str:

@@ -68,7 +68,7 @@ class NodeQueries(ABC):
         threshold: float | None = None,
         visible: Bool[np.ndarray, " n"] | None = None,
     ) -> NodeHits:
-        """Return the answers of `LanguageScene.query` as rows of the tree.
+        """Return what `LanguageScene.query` finds, as rows of the tree.
 
         For arguments and errors, see there; the path may also be a sequence of texts, and level None means
         "auto". Only nodes that are `visible` compete.

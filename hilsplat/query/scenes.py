@@ -137,9 +137,9 @@ class Scenes:
         limit: int = 10,
         each: int = 1,
     ) -> list[SceneHit]:
-        """Return the best answers of the best scenes, best scene first.
+        """Return the best answers in each of the best scenes, best scene first.
 
-        Scores of different scenes are comparable if one CLIP model embedded them.
+        Scores can be compared between scenes if one CLIP model embedded them.
 
         Args:
             text, level, threshold: as in `LanguageScene.query`.

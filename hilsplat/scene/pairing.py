@@ -21,7 +21,7 @@ WORDS = 64
 """Number of visual words (docs/experiments.md: 32 to 256 words retrieve equally well)."""
 
 SAMPLE_PER_WORD = 256
-"""Number of descriptors per word in the k-means; more change nothing."""
+"""Number of descriptors per word in the k-means."""
 
 ROUNDS = 10
 """Iterations of the k-means."""

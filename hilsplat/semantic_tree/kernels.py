@@ -13,25 +13,6 @@ ROWS_OF_A_BLOCK = 256
 
 
 @compiled
-def at_entries(mass, row_view, order, matrix, out):
-    """Write to `out` the mass of each stored entry's Gaussian in the view of its row.
-
-    `order` lists the rows view by view, so that the mass of a view is unpacked once.
-    """
-    mass_indptr, mass_indices, mass_data, num_gaussians = mass
-    indptr, indices = matrix
-    unpacked = np.zeros(num_gaussians, np.float32)
-    current = -1
-    for row in order:
-        if row_view[row] != current:
-            _unpack(current, mass_indptr, mass_indices, mass_data, unpacked, False)
-            current = row_view[row]
-            _unpack(current, mass_indptr, mass_indices, mass_data, unpacked, True)
-        for k in range(indptr[row], indptr[row + 1]):
-            out[k] = unpacked[indices[k]]
-
-
-@compiled
 def _unpack(view, indptr, indices, data, out, fill):
     """Write a view's values to their columns of `out`, or zeros if `fill` is false; no view if negative."""
     if view >= 0:
@@ -41,7 +22,10 @@ def _unpack(view, indptr, indices, data, out, fill):
 
 @compiled
 def add_views(mass, pair_view, pair_row, order, matrix, out):
-    """Add to the entries of row `pair_row` their Gaussians' mass in view `pair_view`, pair by pair."""
+    """Add to the entries of row `pair_row` their Gaussians' mass in view `pair_view`, pair by pair.
+
+    `order` lists the pairs view by view, so that the mass of a view is unpacked once.
+    """
     mass_indptr, mass_indices, mass_data, num_gaussians = mass
     indptr, indices = matrix
     unpacked = np.zeros(num_gaussians, np.float32)

@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt8
 from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.contributions.compositing import column_sums
 from hilsplat.semantic_tree.evidence import Evidence, mask_evidence
-from hilsplat.semantic_tree.kernels import add_views, at_entries, divide_by_unions
+from hilsplat.semantic_tree.kernels import add_views, divide_by_unions
 from hilsplat.semantic_tree.linkage import pooled_linkage
 from hilsplat.semantic_tree.view_pairs import view_pairs
 from hilsplat.settings import SemanticTreeSettings
@@ -150,9 +150,9 @@ def mass_at_entries(
     matrix: sp.csr_matrix, mass: sp.csr_matrix, view: Int32[np.ndarray, " m"] | Int64[np.ndarray, " m"]
 ) -> Float32[np.ndarray, " E"]:
     """Return the mass of each stored entry's Gaussian in the view of its row, px."""
-    out = np.empty(matrix.nnz, np.float32)
-    order = np.argsort(view, kind="stable")
-    at_entries(_mass_arrays(mass), view, order, (matrix.indptr, matrix.indices), out)
+    out = np.zeros(matrix.nnz, np.float32)
+    rows, order = np.arange(len(view)), np.argsort(view, kind="stable")
+    add_views(_mass_arrays(mass), view, rows, order, (matrix.indptr, matrix.indices), out)
     return out
 
 

@@ -63,7 +63,7 @@ def view_pairs(visible: sp.csr_matrix) -> ViewPairs:
         indptr = np.concatenate([[0], np.cumsum(lengths)])
         columns = np.concatenate(chosen)
         own = sp.csr_matrix((np.ones(len(columns), np.int8), columns, indptr), shape=(num, num))
-        pattern = (own + own.T).tocsr()
+        pattern = (own + own.T + sp.eye(num, dtype=np.int8)).tocsr()
     pattern.sort_indices()
     row = np.repeat(np.arange(num), np.diff(pattern.indptr))
     # Sorting the entries by column, then row lists the mirror entries of the rows in order.

@@ -79,3 +79,8 @@ def test_pairs_of_masks_from_partners_have_the_same_evidence(bounded, monkeypatc
     every = stored()
     assert len(few) < len(every) / 2
     assert few == {pair: every[pair] for pair in few}
+
+
+def test_a_view_without_visible_gaussians_is_its_own_partner(bounded):
+    visible = sp.vstack([ring(), sp.csr_matrix((1, 10 * VIEWS), dtype=np.float32)], format="csr")
+    assert partners_of(visible)[-1] == [VIEWS]
