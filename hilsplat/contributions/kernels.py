@@ -333,14 +333,15 @@ def median_step(indptr, indices, data, level_index, pixels, latents, features, s
 
 
 @compiled
-def gram_product(begin, end, indptr, indices, values, features, width, out):
+def gram_product(begin, end, first, indptr, indices, values, features, width, out):
     """Multiply rows begin..end of the upper triangle and their mirror images; `out` starts at row `begin`.
 
-    Features and `out` are flat, with `width` padded channels per row. In a plain loop over channels, numba's
-    code keeps sums in memory and checks in every pass that arrays do not overlap. Here the sums stay in
-    registers: 62 instead of 168 ms at d = 16 and 6.7 million pairs.
+    Column `first` is that of row 0; columns beyond the last row are left out. Features and `out` are flat,
+    with `width` padded channels per row. In a plain loop over channels, numba's code keeps sums in memory and
+    checks in every pass that arrays do not overlap. Here the sums stay in registers: 62 instead of 168 ms at
+    d = 16 and 6.7 million pairs.
     """
-    row, origin = 3 * width, 3 * width * begin
+    row, origin, past = 3 * width, 3 * width * begin, first + len(indptr) - 1
     for i in range(begin, end):
         for c in range(0, width, WIDTH):
             here = i * row + c
@@ -348,7 +349,9 @@ def gram_product(begin, end, indptr, indices, values, features, width, out):
             own = here - origin
             whole, part, subpart = load(out, own), load(out, own + width), load(out, own + 2 * width)
             for k in range(indptr[i], indptr[i + 1]):
-                there = np.int64(indices[k]) * row + c
+                if indices[k] >= past:
+                    break
+                there = (np.int64(indices[k]) - first) * row + c
                 u, v, w = lanes(values[k, 0]), lanes(values[k, 1]), lanes(values[k, 2])
                 whole = plus(whole, u, load(features, there))
                 part = plus(part, v, load(features, there + width))
@@ -361,3 +364,23 @@ def gram_product(begin, end, indptr, indices, values, features, width, out):
             store(out, own, whole)
             store(out, own + width, part)
             store(out, own + 2 * width, subpart)
+
+
+@compiled
+def gram_across(begin, end, indptr, indices, values, features, out):
+    """Add to `out` the products of rows begin..end of G with the features (N, 3, D) of all other rows."""
+    channels = features.shape[2]
+    for i in range(end):
+        first = indptr[i] + np.searchsorted(indices[indptr[i] : indptr[i + 1]], begin if i < begin else end)
+        for k in range(first, indptr[i + 1]):
+            j = np.int64(indices[k])
+            if i < begin:
+                if j >= end:
+                    break
+                to, of = j - begin, i
+            else:
+                to, of = i - begin, j
+            for level in range(3):
+                value = values[k, level]
+                for c in range(channels):
+                    out[to, level, c] += value * features[of, level, c]

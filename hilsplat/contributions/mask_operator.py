@@ -35,6 +35,12 @@ class MaskOperator:
         """Build the operator from A (M x N) and the level of each row."""
         return MaskOperator(A, level.astype(np.int64) - 1, threads)
 
+    def block(self, begin: int, end: int) -> "MaskOperator":
+        """Return the operator of Gaussians begin..end."""
+        if end - begin == self.A.shape[1]:
+            return self
+        return MaskOperator(self.A[:, begin:end], self.level_index, self.threads)
+
     def means(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "M D"]:
         """Return A F: the mean rendered feature of each mask at its level."""
         out = np.zeros((len(self.level_index), features.shape[2]), features.dtype)
@@ -75,7 +81,9 @@ def lifted_average(
     This needs only one sparse product and is within about 10 % of the regression's optimum.
     """
     sums = masks.spread(pixels[:, None] * latents)
-    return np.where(mass[:, :, None] > 0, sums / np.maximum(mass, 1e-12)[:, :, None], np.float32(0))
+    sums /= np.maximum(mass, np.float32(1e-12))[:, :, None]
+    sums[mass <= 0] = 0
+    return sums
 
 
 def lifted_median(

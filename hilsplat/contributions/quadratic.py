@@ -6,6 +6,7 @@ and streamed instead, with the same products.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -15,21 +16,29 @@ from jaxtyping import Bool, Float, Float32
 from cpusplat.threads import over_edges
 from hilsplat.base.levels import LEVELS
 from hilsplat.contributions.compositing import padded
-from hilsplat.contributions.kernels import gram_product
+from hilsplat.contributions.kernels import gram_across, gram_product
 
 PRODUCT_PARTS = 4
 """A product with G is summed in this many parts with equal numbers of pairs. The number is fixed so that
 results don't depend on the number of threads; each part stores the sums of its rows and of all rows below."""
 
+BLOCK = 2**20
+"""The field of a scene with more Gaussians is solved in blocks of at most this many."""
+
 
 @dataclass(frozen=True)
 class Gram:
-    """Upper triangle of G for all levels in one CSR pattern (N, N); a row's columns start at the diagonal."""
+    """Upper triangle of G for all levels in one CSR pattern (N, N); a row's columns start at the diagonal.
+
+    A block is a range of rows of the same arrays. Column `first` is that of its first row, and columns beyond
+    its last row belong to other blocks.
+    """
 
     indptr: np.ndarray
     indices: np.ndarray
     values: Float32[np.ndarray, "E 3"]
     threads: int = 1
+    first: int = 0
 
     @property
     def nonzeros(self) -> int:
@@ -43,12 +52,12 @@ class Gram:
         """Return G_l F_l for every level; the order of sums is fixed."""
         wide = padded(features)
         width = wide.shape[2]
-        shares = np.linspace(0, self.nonzeros, PRODUCT_PARTS + 1)[1:-1]
+        shares = np.linspace(self.indptr[0], self.indptr[-1], PRODUCT_PARTS + 1)[1:-1]
         edges = [0, *np.searchsorted(self.indptr, shares).tolist(), self.num_gaussians]
 
         def part(begin: int, end: int) -> np.ndarray:
             out = np.zeros_like(wide[begin:])
-            rows = begin, end, self.indptr, self.indices, self.values
+            rows = begin, end, self.first, self.indptr, self.indices, self.values
             gram_product(*rows, wide.reshape(-1), width, out.reshape(-1))
             return out
 
@@ -61,6 +70,18 @@ class Gram:
     def form(self, features: Float32[np.ndarray, "N 3 D"]) -> float:
         """Return the sum over levels of tr F'GF, in float64 except for G F, whose rounding errors cancel."""
         return float(np.multiply(features, self.product(features), dtype=np.float64).sum())
+
+    def block(self, begin: int, end: int) -> "Gram":
+        """Return the rows and columns begin..end of the whole G, without copying them."""
+        return Gram(self.indptr[begin : end + 1], self.indices, self.values, self.threads, begin)
+
+    def across(
+        self, begin: int, end: int, features: Float32[np.ndarray, "N 3 D"]
+    ) -> Float32[np.ndarray, "n 3 D"]:
+        """Return the product of the rows begin..end of the whole G with the features of all other rows."""
+        out = np.zeros((end - begin, *features.shape[1:]), np.float32)
+        gram_across(begin, end, self.indptr, self.indices, self.values, features, out)
+        return out
 
     def save(self, folder: Path) -> None:
         """Write the folder `G`, whose arrays are memory-mapped when read."""
@@ -92,6 +113,20 @@ class StackedWeights:
         features = features.astype(np.float64)
         return float((features * self.product(features)).sum())
 
+    def block(self, begin: int, end: int) -> "StackedWeights":
+        """Return the weights of Gaussians begin..end."""
+        if end - begin == self.num_gaussians:
+            return self
+        return StackedWeights(self.weights[:, begin:end], self.valid)
+
+    def across(
+        self, begin: int, end: int, features: Float32[np.ndarray, "N 3 D"]
+    ) -> Float32[np.ndarray, "n 3 D"]:
+        """Return the product of the rows begin..end of G with the features of all other rows."""
+        others = features.copy()
+        others[begin:end] = 0
+        return self.product(others)[begin:end]
+
     def save(self, folder: Path) -> None:
         """Write the folder `W`, whose arrays are memory-mapped when read."""
         W = self.weights
@@ -102,10 +137,23 @@ class StackedWeights:
 Quadratic = Gram | StackedWeights
 
 
+def blocks_of(num_gaussians: int) -> list[tuple[int, int]]:
+    """Return equal ranges of at most `BLOCK` Gaussians."""
+    edges = np.linspace(0, num_gaussians, -(-num_gaussians // BLOCK) + 1).astype(np.int64)
+    return list(pairwise(edges.tolist()))
+
+
 def level_mass(quadratic: Quadratic) -> Float32[np.ndarray, "N 3"]:
     """Return each Gaussian's visible mass in the labelled pixels of each level: G_l 1 (W's rows sum to 1)."""
     ones = np.ones((quadratic.num_gaussians, len(LEVELS), 1), np.float32)
-    return quadratic.product(ones)[:, :, 0]
+    blocks = blocks_of(len(ones))
+    if len(blocks) == 1:
+        return quadratic.product(ones)[:, :, 0]
+    parts = []
+    for begin, end in blocks:
+        parts.append(quadratic.block(begin, end).product(ones[begin:end])[:, :, 0])
+        parts[-1] += quadratic.across(begin, end, ones)[:, :, 0]
+    return np.concatenate(parts)
 
 
 def _save(folder: Path, **arrays: np.ndarray) -> None:

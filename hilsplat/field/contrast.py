@@ -147,6 +147,8 @@ class Contrast:
     half_pixels: Float32[np.ndarray, " M"]  # pixels in the halves
     relations: list[ViewRelations]
     settings: FieldSettings
+    # in a block: the parts of the means over masks and halves that come from all other Gaussians
+    others: tuple[Float32[np.ndarray, "M D"], Float32[np.ndarray, "M D"]] | None = None
 
     def values(self, features: Float32[np.ndarray, "N 3 D"]) -> dict[str, float]:
         """Return the unweighted L_ins and L_part."""
@@ -178,6 +180,8 @@ class Contrast:
         """Return the mean features of each mask, its random half and its other half, in float64."""
         means = self.masks.means(features).astype(np.float64)
         halves = self.half_masks.means(features).astype(np.float64)
+        if self.others is not None:
+            means, halves = means + self.others[0], halves + self.others[1]
         n, half, rest = self._counts()
         return means, halves, (n * means - half * halves) / rest
 

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from hilsplat.contributions.mask_operator import MaskOperator, lifted_average, lifted_median
-from hilsplat.contributions.quadratic import Quadratic, level_mass
+from hilsplat.contributions.quadratic import Quadratic, blocks_of, level_mass
 from hilsplat.field.kernels import add_by_channel, add_scaled, channel_dots, pull, redirect, scaled_squares
 
 
@@ -34,6 +34,8 @@ class QuadraticProblem:
     latents: Float32[np.ndarray, "M D"]  # h
     lifted: Float32[np.ndarray, "N 3 D"]  # start of the field, towards which the ridge pulls
     weights: tuple[float, float, float]  # of the language loss, the clustering loss and the ridge
+    # in a block: G times the features of all other Gaussians, and their part of the mask means
+    others: tuple[Float32[np.ndarray, "N 3 D"], Float32[np.ndarray, "M D"]] | None = None
 
     @staticmethod
     def of(
@@ -77,10 +79,15 @@ class QuadraticProblem:
 
     def right_side(self) -> Float32[np.ndarray, "N 3 D"]:
         """Return the right side of the optimality condition hessian_product(F) = right_side()."""
-        language, _, ridge = self.weights
+        language, clustering, ridge = self.weights
         target = self.masks.spread(self.pixels[:, None] * self.latents)
         target *= np.float32(language)
         add_scaled(np.float32(ridge), self.mass, self.lifted, target)
+        if self.others is not None:
+            product, means = self.others
+            target -= np.float32(language + clustering) * product
+            if clustering:
+                target += np.float32(clustering) * self.masks.spread(self.pixels[:, None] * means)
         return target
 
     def terms(self, features: Float32[np.ndarray, "N 3 D"]) -> dict[str, float]:
@@ -88,8 +95,13 @@ class QuadraticProblem:
 
         Both losses are small differences of large sums, so all sums are computed in float64.
         """
-        form = self.quadratic.form(features)
-        means = self.masks.means(features.astype(np.float64))
+        form, means, blocks = 0.0, np.zeros(self.latents.shape), blocks_of(len(features))
+        for begin, end in blocks:
+            own = features[begin:end]
+            form += self.quadratic.block(begin, end).form(own)
+            if len(blocks) > 1:
+                form += float(channel_dots(own, self.quadratic.across(begin, end, features)).sum())
+            means += self.masks.block(begin, end).means(own.astype(np.float64))
         pixels = self.pixels[:, None].astype(np.float64)
         linear = float((pixels * means * self.latents).sum())
         constant = float((pixels * np.square(self.latents, dtype=np.float64)).sum())

@@ -3,11 +3,14 @@
 Both solvers stop early, because more steps would fit the noise of mask borders.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Float32
 
+from hilsplat.base.progress import track
+from hilsplat.contributions.quadratic import blocks_of
 from hilsplat.field.contrast import Contrast
 from hilsplat.field.kernels import add_multiple, add_slope, flat_dot
 from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
@@ -22,7 +25,45 @@ Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 def solve_field(
     problem: QuadraticProblem, contrast: Contrast
 ) -> tuple[Float32[np.ndarray, "N 3 D"], dict[str, object]]:
-    """Return the features, and a report with every loss before and after each phase."""
+    """Return the features, and a report with every loss before and after each phase.
+
+    A scene with more than `BLOCK` Gaussians is solved block by block, with the features of all other blocks
+    fixed at their latest values; the report then has the losses before and after all blocks.
+    """
+    blocks = blocks_of(len(problem.mass))
+    report: dict[str, object] = {}
+    if len(blocks) == 1:
+        for phase, features in _phases(problem, contrast):
+            report[phase] = problem.terms(features) | contrast.values(features)
+        return features, report
+    features = problem.lifted.copy()
+    report["lifted"] = problem.terms(features) | contrast.values(features)
+    operators = contrast.masks, contrast.half_masks
+    means = [operator.means(features) for operator in operators]
+    for begin, end in track(blocks, "blocks of the field"):
+        own = [operator.block(begin, end) for operator in operators]
+        rest = [total - part.means(features[begin:end]) for total, part in zip(means, own, strict=True)]
+        block = replace(
+            problem,
+            masks=own[0],
+            quadratic=problem.quadratic.block(begin, end),
+            mass=problem.mass[begin:end],
+            lifted=problem.lifted[begin:end],
+            others=(problem.quadratic.across(begin, end, features), rest[0]),
+        )
+        of_block = replace(contrast, masks=own[0], half_masks=own[1], others=(rest[0], rest[1]))
+        for phase, solved in _phases(block, of_block):
+            last = phase, solved
+        features[begin:end] = last[1]
+        means = [fixed + part.means(last[1]) for fixed, part in zip(rest, own, strict=True)]
+    report[last[0]] = problem.terms(features) | contrast.values(features)
+    return features, report | {"blocks": len(blocks)}
+
+
+def _phases(
+    problem: QuadraticProblem, contrast: Contrast
+) -> Iterator[tuple[str, Float32[np.ndarray, "N 3 D"]]]:
+    """Yield the name and the features of each phase: "lifted", "after_cg" and "after_lbfgs"."""
     settings, total = contrast.settings, problem.total_pixels
     flat = -1, problem.latents.shape[1]  # a shape with one row per Gaussian and level
     # L-BFGS needs much memory, so its variables are only the features visible in masks, scaled by the square
@@ -45,18 +86,16 @@ def solve_field(
         del curved
         return value + contrastive, gradient.reshape(flat)[shown]
 
-    lifted = problem.lifted
-    report: dict[str, object] = {"lifted": problem.terms(lifted) | contrast.values(lifted)}
+    yield "lifted", problem.lifted
     if settings.cg_steps and any(problem.weights):
         features = conjugate_gradient(problem, settings.cg_steps)
-        report["after_cg"] = problem.terms(features) | contrast.values(features)
+        yield "after_cg", features
     else:
-        features = lifted.copy()
+        features = problem.lifted.copy()
     if (settings.weight_instance or settings.weight_part) and settings.lbfgs_steps:
         first_step = total / (2 * max(sum(problem.weights), 1e-3))
         unscale(lbfgs(objective, features.reshape(flat)[shown] * root, settings.lbfgs_steps, first_step))
-        report["after_lbfgs"] = problem.terms(features) | contrast.values(features)
-    return features.astype(np.float32), report
+        yield "after_lbfgs", features
 
 
 def keep_labelled(
@@ -71,7 +110,7 @@ def keep_labelled(
     get the mask's latent and match its queries everywhere, because the regression uses only labelled pixels.
     """
     share = mass / np.maximum(total_mass, 1e-12)[:, None]
-    return np.where((share >= min_share)[:, :, None], features, np.float32(0)).astype(np.float32)
+    return np.where((share >= min_share)[:, :, None], features, np.float32(0)).astype(np.float32, copy=False)
 
 
 def lbfgs(objective: Objective, point: np.ndarray, steps: int, first_step: float) -> np.ndarray:

@@ -118,6 +118,11 @@ def test_gram_and_weights_give_the_quadratic_form_of_every_level(channels):
     for each in (gram, stack_weights(stacked)):
         assert each.product(features) == pytest.approx(expected, abs=1e-5)
         assert each.form(features) == pytest.approx((features * expected).sum(), rel=1e-6)
+        own, others = each.block(10, 30).product(features[10:30]), each.across(10, 30, features)
+        assert own == pytest.approx(
+            np.einsum("lij,jld->ild", dense[:, 10:30, 10:30], features[10:30]), abs=1e-5
+        )
+        assert own + others == pytest.approx(expected[10:30], abs=1e-5)
     # entry by entry: unit vectors pick columns
     columns = np.repeat(np.eye(40, dtype=np.float32)[:, None], 3, axis=1)
     assert gram.product(columns).transpose(1, 0, 2) == pytest.approx(dense, abs=1e-6)

@@ -1,6 +1,7 @@
 """The sparse solver against dense algebra and autograd, and the stage."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,10 @@ from scipy.optimize import minimize
 
 from hilsplat.base.artifacts import read_index, read_json, write_index
 from hilsplat.base.errors import MisalignedArtifactError, SettingsError
+from hilsplat.contributions import quadratic
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.quadratic import StackedWeights
+from hilsplat.contributions.quadratic_builder import QuadraticBuilder
 from hilsplat.contributions.view_matrices import painted_indicator
 from hilsplat.field.autoencoder import run_autoencoder
 from hilsplat.field.code import LanguageField
@@ -78,20 +81,74 @@ class Toy:
         return Contrast(self.problem.masks, half, self.pixels, self.half_pixels, [relations], settings)
 
 
+def dense_system(toy: Toy, weights: tuple[float, float, float], index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the matrix and the right side of a level's quadratic losses."""
+    language, clustering, ridge = weights
+    valid, rows = toy.labels[:, index] >= 0, toy.level == index + 1
+    W, A = toy.W[valid].astype(np.float64), toy.A[rows].astype(np.float64)
+    mass, n = np.diag(W.sum(axis=0)), np.diag(toy.pixels[rows].astype(np.float64))
+    hessian = (language + clustering) * W.T @ W - clustering * A.T @ n @ A + ridge * mass
+    return hessian, language * A.T @ n @ toy.latents[rows] + ridge * mass @ toy.problem.lifted[:, index]
+
+
 def test_conjugate_gradient_reaches_the_dense_solution():
-    language, clustering, ridge = weights = (1.0, 0.3, 0.1)
-    toy = Toy(weights)
+    toy = Toy(weights := (1.0, 0.3, 0.1))
     solved = conjugate_gradient(toy.problem, 30)
     for index in range(3):
-        valid = toy.labels[:, index] >= 0
-        rows = toy.level == index + 1
-        W = toy.W[valid].astype(np.float64)
-        G, mass = W.T @ W, np.diag(W.sum(axis=0))
-        A, n = toy.A[rows].astype(np.float64), np.diag(toy.pixels[rows].astype(np.float64))
-        hessian = (language + clustering) * G - clustering * A.T @ n @ A + ridge * mass
-        right = language * A.T @ n @ toy.latents[rows] + ridge * mass @ toy.problem.lifted[:, index]
+        hessian, right = dense_system(toy, weights, index)
         expected, *_ = np.linalg.lstsq(hessian, right, rcond=None)  # 0 for the unseen Gaussian
         assert solved[:, index] == pytest.approx(expected, abs=2e-5)
+
+
+@pytest.mark.parametrize("stored", ["weights", "gram"])
+def test_each_block_is_solved_with_the_others_fixed(stored, monkeypatch):
+    monkeypatch.setattr(quadratic, "BLOCK", 5)
+    toy = Toy(weights := (1.0, 0.3, 0.1))
+    if stored == "gram":
+        builder = QuadraticBuilder(GAUSSIANS, "gram", 1)
+        builder.add(toy.problem.quadratic)
+        toy.problem = replace(toy.problem, quadratic=builder.finish())
+    settings = FieldSettings(weight_instance=0.0, weight_part=0.0, cg_steps=30)
+    solved, report = solve_field(toy.problem, toy.contrast(settings))
+    assert (report["blocks"], report["after_cg"]["language"] < report["lifted"]["language"]) == (3, True)
+    for index in range(3):
+        hessian, right = dense_system(toy, weights, index)
+        expected = toy.problem.lifted[:, index].astype(np.float64)
+        for block in (slice(0, 4), slice(4, 8), slice(8, 12)):
+            expected[block], *_ = np.linalg.lstsq(
+                hessian[block, block],
+                right[block] - hessian[block] @ expected + hessian[block, block] @ expected[block],
+                rcond=None,
+            )
+        assert solved[:, index] == pytest.approx(expected, abs=2e-5)
+    monkeypatch.setattr(quadratic, "BLOCK", 12)
+    whole = toy.problem.terms(solved)
+    assert report["after_cg"] == pytest.approx(whole | toy.contrast(settings).values(solved), rel=1e-5)
+
+
+def test_contrastive_losses_of_a_block_count_the_other_blocks(monkeypatch):
+    toy = Toy((1.0, 0.3, 0.1))
+    settings = FieldSettings(weight_instance=0.5, weight_part=0.1, cg_steps=30, lbfgs_steps=200)
+    contrast = toy.contrast(settings)
+    whole, _ = solve_field(toy.problem, contrast)
+    # solved again with half of the Gaussians free, these must return to the solution
+    free = replace(
+        toy.problem,
+        masks=contrast.masks.block(0, 6),
+        quadratic=toy.problem.quadratic.block(0, 6),
+        mass=toy.problem.mass[:6],
+        lifted=toy.problem.lifted[:6],
+        others=(
+            toy.problem.quadratic.across(0, 6, whole),
+            contrast.masks.block(6, 12).means(whole[6:]),
+        ),
+    )
+    rest = [operator.block(6, 12).means(whole[6:]) for operator in (contrast.masks, contrast.half_masks)]
+    of_block = replace(
+        contrast, masks=free.masks, half_masks=contrast.half_masks.block(0, 6), others=(rest[0], rest[1])
+    )
+    solved, _ = solve_field(free, of_block)
+    assert solved == pytest.approx(whole[:6], abs=0.02)
 
 
 def test_a_solved_problem_stays_solved():
