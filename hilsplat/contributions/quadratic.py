@@ -5,18 +5,18 @@ levels, as an upper triangle with three values per pair of Gaussians. If W has f
 and streamed instead, with the same products.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float32
 
 from cpusplat.threads import over_edges
 from hilsplat.base.levels import LEVELS
 from hilsplat.contributions.compositing import padded
-from hilsplat.contributions.kernels import gram_across, gram_product
+from hilsplat.contributions.kernels import gram_across, gram_product, weights_product
 
 PRODUCT_PARTS = 4
 """A product with G is summed in this many parts with equal numbers of pairs. The number is fixed so that
@@ -67,10 +67,6 @@ class Gram:
             total[begin:] += sums
         return np.ascontiguousarray(total[:, :, : features.shape[2]])
 
-    def form(self, features: Float32[np.ndarray, "N 3 D"]) -> float:
-        """Return the sum over levels of tr F'GF, in float64 except for G F, whose rounding errors cancel."""
-        return float(np.multiply(features, self.product(features), dtype=np.float64).sum())
-
     def block(self, begin: int, end: int) -> "Gram":
         """Return the rows and columns begin..end of the whole G, without copying them."""
         return Gram(self.indptr[begin : end + 1], self.indices, self.values, self.threads, begin)
@@ -90,10 +86,16 @@ class Gram:
 
 @dataclass(frozen=True)
 class StackedWeights:
-    """W (P x N, rows sum to 1) of labelled pixels, and whether each pixel has a mask at each level."""
+    """W (P x N, rows sum to 1) of labelled pixels, and whether each pixel has a mask at each level.
+
+    A block is a range of columns, from Gaussian `first`.
+    """
 
     weights: sp.csr_matrix
     valid: Bool[np.ndarray, "P 3"]
+    threads: int = 1
+    first: int = 0
+    size: int | None = None  # number of Gaussians; None for all from `first`
 
     @property
     def nonzeros(self) -> int:
@@ -101,31 +103,29 @@ class StackedWeights:
 
     @property
     def num_gaussians(self) -> int:
-        return self.weights.shape[1]
+        return self.weights.shape[1] if self.size is None else self.size
 
-    def product(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "N 3 D"]:
-        """Return W' diag(valid_l) W F_l for every level, in the precision of F, on one thread."""
-        W, levels = self.weights, zip(self.valid.T, features.swapaxes(0, 1), strict=True)
-        return np.stack([W.T @ (valid[:, None] * (W @ of_level)) for valid, of_level in levels], axis=1)
-
-    def form(self, features: Float32[np.ndarray, "N 3 D"]) -> float:
-        """Return the sum over levels of tr F'GF, summed in float64."""
-        features = features.astype(np.float64)
-        return float((features * self.product(features)).sum())
+    def product(self, features: Float32[np.ndarray, "N 3 D"]) -> Float32[np.ndarray, "N 3 D"]:
+        """Return W' diag(valid_l) W F_l for every level; the order of sums is fixed."""
+        return self._product(features, False)
 
     def block(self, begin: int, end: int) -> "StackedWeights":
-        """Return the weights of Gaussians begin..end."""
-        if end - begin == self.num_gaussians:
-            return self
-        return StackedWeights(self.weights[:, begin:end], self.valid)
+        """Return the weights of Gaussians begin..end, without copying them."""
+        return replace(self, first=begin, size=end - begin)
 
     def across(
         self, begin: int, end: int, features: Float32[np.ndarray, "N 3 D"]
     ) -> Float32[np.ndarray, "n 3 D"]:
         """Return the product of the rows begin..end of G with the features of all other rows."""
-        others = features.copy()
-        others[begin:end] = 0
-        return self.product(others)[begin:end]
+        return self.block(begin, end)._product(features, True)
+
+    def _product(self, features: np.ndarray, across: bool) -> np.ndarray:
+        wide, W = padded(features), self.weights
+        out = np.zeros((self.num_gaussians, *wide.shape[1:]), np.float32)
+        rows = self.first, across, W.indptr, W.indices, W.data, self.valid
+        flat = wide.reshape(-1), wide.shape[2], out.reshape(-1)
+        over_edges(weights_product, list(range(len(LEVELS) + 1)), self.threads, *rows, *flat)
+        return np.ascontiguousarray(out[:, :, : features.shape[2]])
 
     def save(self, folder: Path) -> None:
         """Write the folder `W`, whose arrays are memory-mapped when read."""
@@ -135,6 +135,11 @@ class StackedWeights:
 
 
 Quadratic = Gram | StackedWeights
+
+
+def form(quadratic: Quadratic, features: Float32[np.ndarray, "N 3 D"]) -> float:
+    """Return the sum over levels of tr F'GF, in float64 except for G F, whose rounding errors cancel."""
+    return float(np.multiply(features, quadratic.product(features), dtype=np.float64).sum())
 
 
 def blocks_of(num_gaussians: int) -> list[tuple[int, int]]:

@@ -66,7 +66,7 @@ class Contributions:
         return read_npy(sealed(self.folder, "centres.npy"))
 
     def quadratic(self, threads: int = 1) -> Quadratic:
-        """Memory-map G or W, depending on which the stage kept; products with W use one thread.
+        """Memory-map G or W, depending on which the stage kept.
 
         Raises:
             ArtifactError: the folder contains neither G nor W.
@@ -78,7 +78,8 @@ class Contributions:
             names = ("indptr", "indices", "data", "columns", "valid")
             indptr, indices, data, columns, valid = (self._mapped(f"W/{name}") for name in names)
             shape = (len(indptr) - 1, int(columns[0]))
-            return StackedWeights(sp.csr_matrix((data, indices, indptr), shape=shape, copy=False), valid)
+            matrix = sp.csr_matrix((data, indices, indptr), shape=shape, copy=False)
+            return StackedWeights(matrix, valid, threads)
         raise ArtifactError(f"{self.folder} contains neither G nor W", fix="rerun the contributions stage")
 
     def _mapped(self, name: str) -> np.ndarray:

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from hilsplat.contributions.mask_operator import MaskOperator, lifted_average, lifted_median
-from hilsplat.contributions.quadratic import Quadratic, blocks_of, level_mass
+from hilsplat.contributions.quadratic import Quadratic, blocks_of, form, level_mass
 from hilsplat.field.kernels import add_by_channel, add_scaled, channel_dots, pull, redirect, scaled_squares
 
 
@@ -95,20 +95,20 @@ class QuadraticProblem:
 
         Both losses are small differences of large sums, so all sums are computed in float64.
         """
-        form, means, blocks = 0.0, np.zeros(self.latents.shape), blocks_of(len(features))
+        total, means, blocks = 0.0, np.zeros(self.latents.shape), blocks_of(len(features))
         for begin, end in blocks:
             own = features[begin:end]
-            form += self.quadratic.block(begin, end).form(own)
+            total += form(self.quadratic.block(begin, end), own)
             if len(blocks) > 1:
-                form += float(channel_dots(own, self.quadratic.across(begin, end, features)).sum())
+                total += float(channel_dots(own, self.quadratic.across(begin, end, features)).sum())
             means += self.masks.block(begin, end).means(own.astype(np.float64))
         pixels = self.pixels[:, None].astype(np.float64)
         linear = float((pixels * means * self.latents).sum())
         constant = float((pixels * np.square(self.latents, dtype=np.float64)).sum())
         cohesion = float((pixels * means**2).sum())
         return {
-            "language": (form - 2 * linear + constant) / self.total_pixels,
-            "clustering": (form - cohesion) / self.total_pixels,
+            "language": (total - 2 * linear + constant) / self.total_pixels,
+            "clustering": (total - cohesion) / self.total_pixels,
             "ridge": pull(self.mass, features, self.lifted) / self.total_pixels,
         }
 

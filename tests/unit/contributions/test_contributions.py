@@ -10,7 +10,7 @@ from hilsplat.base.levels import Level
 from hilsplat.base.lineage import sha256_of_path
 from hilsplat.contributions import quadratic_builder, stage
 from hilsplat.contributions.compositing import normalised_weights
-from hilsplat.contributions.quadratic import Gram, StackedWeights, level_mass
+from hilsplat.contributions.quadratic import Gram, StackedWeights, form, level_mass
 from hilsplat.contributions.quadratic_builder import GramBuilder, QuadraticBuilder, stack_weights
 from hilsplat.contributions.rows import Contributions
 from hilsplat.contributions.stage import run_contributions
@@ -117,7 +117,7 @@ def test_gram_and_weights_give_the_quadratic_form_of_every_level(channels):
     expected = np.einsum("lij,jld->ild", dense, features)
     for each in (gram, stack_weights(stacked)):
         assert each.product(features) == pytest.approx(expected, abs=1e-5)
-        assert each.form(features) == pytest.approx((features * expected).sum(), rel=1e-6)
+        assert form(each, features) == pytest.approx((features * expected).sum(), rel=1e-6)
         own, others = each.block(10, 30).product(features[10:30]), each.across(10, 30, features)
         assert own == pytest.approx(
             np.einsum("lij,jld->ild", dense[:, 10:30, 10:30], features[10:30]), abs=1e-5
