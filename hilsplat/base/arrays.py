@@ -4,6 +4,11 @@ Compiled loops do not check bounds, so an out-of-range offset would crash the pr
 """
 
 import json
+import math
+import mmap
+import os
+import tempfile
+import weakref
 import zlib
 from collections.abc import Mapping
 from dataclasses import fields
@@ -115,3 +120,34 @@ def _checksum(arrays: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> int
         total = zlib.crc32(f"{name} {array.dtype.str} {array.shape}".encode(), total)
         total = zlib.crc32(array.reshape(-1).view(np.uint8).data, total)
     return total
+
+
+class Scratch:
+    """Arrays in files without names in a folder, which the system writes out when memory is short."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._maps = weakref.WeakSet[mmap.mmap]()
+
+    def empty(self, shape: int | tuple[int, ...], dtype: type) -> np.ndarray:
+        """Return an array of zeros, whose file is deleted with it."""
+        sizes = (shape,) if isinstance(shape, int) else shape
+        count = math.prod(sizes)
+        if not count:
+            return np.empty(sizes, dtype)
+        with tempfile.TemporaryFile(dir=self._folder) as stream:
+            size = count * np.dtype(dtype).itemsize
+            stream.truncate(size)
+            if hasattr(
+                os, "posix_fallocate"
+            ):  # a full disk raises OSError here instead of killing the process later
+                os.posix_fallocate(stream.fileno(), 0, size)
+            mapped = mmap.mmap(stream.fileno(), 0)
+        self._maps.add(mapped)
+        return np.frombuffer(mapped, dtype).reshape(sizes)
+
+    def release(self) -> None:
+        """Take all pages out of this process's memory, where the system can do that; the values stay."""
+        if hasattr(mmap, "MADV_DONTNEED"):
+            for mapped in self._maps:
+                mapped.madvise(mmap.MADV_DONTNEED)

@@ -263,13 +263,12 @@ def render_rows(indptr, indices, data, pixels, share, features, wide, out):
 
 @compiled
 def weights_product(level, last, first, across, indptr, indices, data, valid, features, width, out):
-    """Add W' diag(valid) W F of one level to `out`, whose first row is Gaussian `first`.
+    """Add W' diag(valid) W F of one level to `out`, which contains Gaussian `first` and those after it.
 
-    With `across`, F has all Gaussians, and those that `out` contains are left out of W F; otherwise F has the
-    rows of `out`, and only these are used. Features and `out` are flat, with `width` channels per row.
+    With `across`, Gaussians that `out` contains are left out of W F; otherwise `out` contains all Gaussians.
+    Features and `out` are flat, with `width` channels per row.
     """
     past = first + len(out) // (3 * width)
-    skipped = 0 if across else first
     for p in range(len(indptr) - 1):
         begin, end = indptr[p], indptr[p + 1]
         own = columns_below(first, begin, end, indices)
@@ -279,9 +278,9 @@ def weights_product(level, last, first, across, indptr, indices, data, valid, fe
         for c in range(level * width, last * width, WIDTH):
             total = lanes(np.float32(0))
             for k in range(begin, own) if across else range(own, own_end):
-                total = plus(total, lanes(data[k]), load(features, (indices[k] - skipped) * 3 * width + c))
+                total = plus(total, lanes(data[k]), load(features, np.int64(indices[k]) * 3 * width + c))
             for k in range(own_end, end if across else own_end):
-                total = plus(total, lanes(data[k]), load(features, (indices[k] - skipped) * 3 * width + c))
+                total = plus(total, lanes(data[k]), load(features, np.int64(indices[k]) * 3 * width + c))
             for k in range(own, own_end):
                 to = (indices[k] - first) * 3 * width + c
                 store(out, to, plus(load(out, to), lanes(data[k]), total))

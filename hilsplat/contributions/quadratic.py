@@ -86,16 +86,11 @@ class Gram:
 
 @dataclass(frozen=True)
 class StackedWeights:
-    """W (P x N, rows sum to 1) of labelled pixels, and whether each pixel has a mask at each level.
-
-    A block is a range of columns, from Gaussian `first`.
-    """
+    """W (P x N, rows sum to 1) of labelled pixels, and whether each pixel has a mask at each level."""
 
     weights: sp.csr_matrix
     valid: Bool[np.ndarray, "P 3"]
     threads: int = 1
-    first: int = 0
-    size: int | None = None  # number of Gaussians; None for all from `first`
 
     @property
     def nonzeros(self) -> int:
@@ -103,26 +98,28 @@ class StackedWeights:
 
     @property
     def num_gaussians(self) -> int:
-        return self.weights.shape[1] if self.size is None else self.size
+        return self.weights.shape[1]
 
     def product(self, features: Float32[np.ndarray, "N 3 D"]) -> Float32[np.ndarray, "N 3 D"]:
         """Return W' diag(valid_l) W F_l for every level; the order of sums is fixed."""
-        return self._product(features, False)
+        return self._product(0, self.num_gaussians, features, False)
 
     def block(self, begin: int, end: int) -> "StackedWeights":
-        """Return the weights of Gaussians begin..end, without copying them."""
-        return replace(self, first=begin, size=end - begin)
+        """Return the weights of Gaussians begin..end."""
+        if end - begin == self.num_gaussians:
+            return self
+        return replace(self, weights=self.weights[:, begin:end])
 
     def across(
         self, begin: int, end: int, features: Float32[np.ndarray, "N 3 D"]
     ) -> Float32[np.ndarray, "n 3 D"]:
         """Return the product of the rows begin..end of G with the features of all other rows."""
-        return self.block(begin, end)._product(features, True)
+        return self._product(begin, end, features, True)
 
-    def _product(self, features: np.ndarray, across: bool) -> np.ndarray:
+    def _product(self, begin: int, end: int, features: np.ndarray, across: bool) -> np.ndarray:
         wide, W = padded(features), self.weights
-        out = np.zeros((self.num_gaussians, *wide.shape[1:]), np.float32)
-        rows = self.first, across, W.indptr, W.indices, W.data, self.valid
+        out = np.zeros((end - begin, *wide.shape[1:]), np.float32)
+        rows = begin, across, W.indptr, W.indices, W.data, self.valid
         flat = wide.reshape(-1), wide.shape[2], out.reshape(-1)
         over_edges(weights_product, list(range(len(LEVELS) + 1)), self.threads, *rows, *flat)
         return np.ascontiguousarray(out[:, :, : features.shape[2]])

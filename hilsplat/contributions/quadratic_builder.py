@@ -2,6 +2,7 @@
 
 import logging
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
@@ -10,13 +11,15 @@ from queue import SimpleQueue
 import numpy as np
 import scipy.sparse as sp
 
+from hilsplat.base.arrays import Scratch
 from hilsplat.base.artifacts import INDEX, read_index, read_npy, sealed, write_index
 from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.lineage import sha256_of_json
 from hilsplat.base.removal import DIGEST, delete
-from hilsplat.contributions.kernels import SUMS, add_to_block, enlarged, merge_rows, transpose
+from hilsplat.contributions import quadratic
+from hilsplat.contributions.kernels import SUMS, add_to_block, merge_rows, transpose
 from hilsplat.contributions.quadratic import Gram, Quadratic, StackedWeights
 
 logger = logging.getLogger(__name__)
@@ -39,12 +42,15 @@ CHECKPOINT_SECONDS = 300.0
 
 ROWS = ("indptr", "indices", "values")
 
+Empty = Callable[..., np.ndarray]
+"""`np.empty`, or the same for arrays in files."""
+
 
 class _Rows:
     """A range of rows of G; memory is reused, because first writes to new pages take time and memory."""
 
-    def __init__(self, rows: int) -> None:
-        self.indptr = np.zeros(rows + 1, np.int64)
+    def __init__(self, rows: int, empty: Empty) -> None:
+        self.indptr, self._empty = np.zeros(rows + 1, np.int64), empty
         self._indices, self._values = np.empty(0, np.int32), np.empty((0, len(LEVELS)))
 
     @property
@@ -68,25 +74,33 @@ class _Rows:
 
     def _make_room(self, needed: int, size: int) -> None:
         if needed > len(self._indices):
-            self._indices, self._values = enlarged(self._indices, self._values, size, 2 * needed)
+            indices, values = (
+                self._empty(2 * needed, np.int32),
+                self._empty((2 * needed, len(LEVELS)), np.float64),
+            )
+            indices[:size], values[:size] = self._indices[:size], self._values[:size]
+            self._indices, self._values = indices, values
 
 
 class GramBuilder:
     """Builder that sums G over parts of W, such as views; its memory grows only with the size of G.
 
+    G of more than `BLOCK` Gaussians is in files, of which memory holds the pages that one part changes.
     Entries are summed in float64 in the order of the pixels, so results depend neither on the division of
     pixels into parts nor on the number of threads. A part shows about 10 % of the Gaussians of a large scene,
     so sums of known pairs are updated in place. Only late pairs, which were added since the last merge, are
     rewritten for each part.
     """
 
-    def __init__(self, num_gaussians: int, threads: int) -> None:
+    def __init__(self, num_gaussians: int, threads: int, folder: Path) -> None:
+        self._files = Scratch(folder) if num_gaussians > quadratic.BLOCK else None
+        self._empty = np.empty if self._files is None else self._files.empty
         edges = np.linspace(0, num_gaussians, BLOCKS + 1).astype(np.int64).tolist()
         self._ranges = list(pairwise(edges))
         self._threads = max(1, threads)
         self._cells = np.zeros(0, np.uint64)
-        self._rows = [_Rows(end - begin) for begin, end in self._ranges]
-        self._late = [_Rows(end - begin) for begin, end in self._ranges]
+        self._rows = [_Rows(end - begin, self._empty) for begin, end in self._ranges]
+        self._late = [_Rows(end - begin, self._empty) for begin, end in self._ranges]
         self._idle: SimpleQueue[tuple[np.ndarray, ...]] = SimpleQueue()  # buffers of each thread
         for _ in range(self._threads):
             number, fresh = np.zeros(num_gaussians, np.int32), np.empty(num_gaussians, np.int32)
@@ -118,13 +132,15 @@ class GramBuilder:
 
         with ThreadPoolExecutor(self._threads) as pool:
             list(pool.map(grow, range(BLOCKS)))
+        if self._files is not None:
+            self._files.release()
 
     def _merged(self, number: int) -> _Rows:
         """Merge the late pairs of a block, and return all its pairs."""
         rows, late = self._rows[number], self._late[number]
         if late.nonzeros:
             rows.merge(late)
-            self._late[number] = _Rows(len(rows.indptr) - 1)
+            self._late[number] = _Rows(len(rows.indptr) - 1, self._empty)
         return rows
 
     def _columns(self, weights: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray]:
@@ -153,12 +169,12 @@ class GramBuilder:
     def finish(self) -> Gram:
         """Return G of all added parts, and empty the builder."""
         indptr = np.zeros(self._ranges[-1][1] + 1, np.int64)
-        indices = np.empty(self.nonzeros, np.int32)
-        values = np.empty((len(indices), len(LEVELS)), np.float32)
+        indices = self._empty(self.nonzeros, np.int32)
+        values = self._empty((len(indices), len(LEVELS)), np.float32)
         done = 0
         for number, (begin, end) in enumerate(self._ranges):
             some_indptr, some_indices, some_values = self._merged(number).arrays()
-            self._rows[number] = _Rows(end - begin)
+            self._rows[number] = _Rows(0, self._empty)
             indptr[begin + 1 : end + 1] = some_indptr[1:] + done
             indices[done : done + len(some_indices)] = some_indices
             values[done : done + len(some_indices)] = some_values
@@ -170,13 +186,14 @@ class QuadraticBuilder:
     """Builder of G or W, part by part; the matrix with fewer non-zeros is kept.
 
     A product reads each non-zero of G or W equally often. W is dropped and G is kept as soon as W has more
-    than `MAX_WEIGHTS` non-zeros, or more than `CLEARLY_MORE` times those of G so far. `keep` is "auto", or
-    "gram" or "weights" to force G or W.
+    than `MAX_WEIGHTS` non-zeros, or more than `CLEARLY_MORE` times those of G so far. G is dropped as soon as
+    it has more than W will have if the remaining parts have as many as the parts so far. `keep` is "auto", or
+    "gram" or "weights" to force G or W. Large sums are in files without names in `folder`.
     """
 
-    def __init__(self, num_gaussians: int, keep: str, threads: int) -> None:
-        self._num_gaussians = num_gaussians
-        self._gram = None if keep == "weights" else GramBuilder(num_gaussians, threads)
+    def __init__(self, num_gaussians: int, keep: str, parts: int, threads: int, folder: Path) -> None:
+        self._num_gaussians, self._num_parts, self._added = num_gaussians, parts, 0
+        self._gram = None if keep == "weights" else GramBuilder(num_gaussians, threads, folder)
         self._keeps_weights = keep != "gram"
         self._may_drop = keep == "auto"
         self._parts: list[StackedWeights] = []
@@ -187,28 +204,36 @@ class QuadraticBuilder:
         if self._keeps_weights:
             # copied, because a part shares the memory of all weights of its view, which may be much larger
             self._parts.append(StackedWeights(part.weights.copy(), part.valid))
-        limit = MAX_WEIGHTS
-        if self._gram is not None:
-            self._gram.add(part)
-            limit = min(limit, CLEARLY_MORE * self._gram.nonzeros)
-        if self._may_drop and self.weights_nonzeros > limit:
-            self._parts, self._keeps_weights = [], False
+        self._added += 1
+        if self._gram is None:
+            return
+        self._gram.add(part)
+        if self._may_drop and self._keeps_weights:
+            expected = self.weights_nonzeros / self._added * self._num_parts
+            if self.weights_nonzeros > min(MAX_WEIGHTS, CLEARLY_MORE * self._gram.nonzeros):
+                self._parts, self._keeps_weights = [], False
+            elif expected < min(MAX_WEIGHTS, self._gram.nonzeros):
+                self._gram = None
 
     def state(self) -> dict[str, np.ndarray]:
-        out = {"nonzeros": np.array([self.weights_nonzeros, self._keeps_weights], np.int64)}
+        counts = self.weights_nonzeros, self._keeps_weights, self._added, self._gram is not None
+        out = {"counts": np.array(counts, np.int64)}
         if self._gram is not None:
             out |= self._gram.state()
         if self._parts:
-            stacked = stack_weights(self._parts)
+            self._parts = [stacked := stack_weights(self._parts)]
             out |= {"valid": stacked.valid, "data": stacked.weights.data}
             out |= {"columns": stacked.weights.indices, "starts": stacked.weights.indptr}
         return out
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Continue from `state`; the result is byte-identical to that of an uninterrupted pass."""
-        self.weights_nonzeros, self._keeps_weights = int(state["nonzeros"][0]), bool(state["nonzeros"][1])
-        if self._gram is not None:
+        self.weights_nonzeros, keeps_weights, self._added, has_gram = state["counts"].tolist()
+        self._keeps_weights = bool(keeps_weights)
+        if self._gram is not None and has_gram:
             self._gram.restore(state)
+        else:
+            self._gram = None
         if "valid" in state:
             shape = (len(state["valid"]), self._num_gaussians)
             matrix = sp.csr_matrix((state["data"], state["columns"], state["starts"]), shape=shape)
@@ -262,7 +287,17 @@ class QuadraticCheckpoint:
 
 
 def stack_weights(parts: list[StackedWeights]) -> StackedWeights:
+    """Join parts, which are taken from the list one by one, so that memory holds W only once."""
     if len(parts) == 1:
         return parts[0]
-    matrix = sp.vstack([part.weights for part in parts], format="csr")
-    return StackedWeights(matrix, np.concatenate([part.valid for part in parts]))
+    sizes, pixels = [part.nonzeros for part in parts], [len(part.valid) for part in parts]
+    data, indices = np.empty(sum(sizes), np.float32), np.empty(sum(sizes), np.int32)
+    indptr, valid = np.zeros(sum(pixels) + 1, np.int64), np.empty((sum(pixels), len(LEVELS)), bool)
+    at, row, columns = 0, 0, parts[0].num_gaussians
+    for size, height in zip(sizes, pixels, strict=True):
+        part = parts.pop(0)
+        data[at : at + size], indices[at : at + size] = part.weights.data, part.weights.indices
+        indptr[row + 1 : row + height + 1] = part.weights.indptr[1:] + at
+        valid[row : row + height] = part.valid
+        at, row = at + size, row + height
+    return StackedWeights(sp.csr_matrix((data, indices, indptr), shape=(row, columns), copy=False), valid)

@@ -212,7 +212,7 @@ def run_contributions(
         return masks, matrices, labelled_rows(weights(), label_maps(masks))
 
     with stage_log("contributions", scene.name) as counts, atomic_folder(out) as folder:
-        builder = QuadraticBuilder(len(gaussians), settings.keep, threads)
+        builder = QuadraticBuilder(len(gaussians), settings.keep, len(cameras), threads, folder)
         summed = checkpoint.resume(builder)
         output = Output(folder)
         prepared = in_order(prepare, range(len(cameras)), together)

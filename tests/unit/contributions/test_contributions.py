@@ -1,5 +1,8 @@
 """A and G compared with their definitions, and the files of the stage."""
 
+import tempfile
+from pathlib import Path
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -8,7 +11,7 @@ from hilsplat.base.artifacts import read_index, write_index
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.base.lineage import sha256_of_path
-from hilsplat.contributions import quadratic_builder, stage
+from hilsplat.contributions import quadratic, quadratic_builder, stage
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.contributions.quadratic import Gram, StackedWeights, form, level_mass
 from hilsplat.contributions.quadratic_builder import GramBuilder, QuadraticBuilder, stack_weights
@@ -90,7 +93,8 @@ def test_mask_means_equal_their_definition(seed):
 
 def built(parts: list[StackedWeights], threads: int = 1, keep: str | None = None) -> Gram | StackedWeights:
     """Build G, or with `keep` G or W."""
-    builder = QuadraticBuilder(40, keep, threads) if keep else GramBuilder(40, threads)
+    more = threads, Path(tempfile.gettempdir())
+    builder = QuadraticBuilder(40, keep, len(parts), *more) if keep else GramBuilder(40, *more)
     for part in parts:
         builder.add(part)
     return builder.finish()
@@ -115,7 +119,7 @@ def test_gram_and_weights_give_the_quadratic_form_of_every_level(channels):
     gram = built(stacked)
     features = np.random.default_rng(5).normal(size=(40, 3, channels)).astype(np.float32)
     expected = np.einsum("lij,jld->ild", dense, features)
-    for each in (gram, stack_weights(stacked)):
+    for each in (gram, stack_weights(list(stacked))):
         assert each.product(features) == pytest.approx(expected, abs=1e-5)
         assert form(each, features) == pytest.approx((features * expected).sum(), rel=1e-6)
         own, others = each.block(10, 30).product(features[10:30]), each.across(10, 30, features)
@@ -134,7 +138,7 @@ def test_gram_and_weights_give_the_quadratic_form_of_every_level(channels):
 def test_gram_depends_neither_on_threads_nor_on_how_the_pixels_are_divided(merge_at, monkeypatch):
     monkeypatch.setattr(quadratic_builder, "MERGE_AT", merge_at)
     parts = [labelled_part(seed) for seed in range(4)]
-    one = built([stack_weights(parts)])
+    one = built([stack_weights(list(parts))])
     assert_same_gram(built(parts), one)
     assert_same_gram(built(parts, threads=2), one)
     assert_same_gram(built(parts, keep="gram"), one)
@@ -143,10 +147,21 @@ def test_gram_depends_neither_on_threads_nor_on_how_the_pixels_are_divided(merge
     assert_same_gram(built(parts, keep="auto"), one)
 
 
+def test_gram_of_many_gaussians_is_in_files_and_the_same(monkeypatch, tmp_path):
+    parts = [labelled_part(seed) for seed in range(4)]
+    one = built(parts)
+    monkeypatch.setattr(quadratic, "BLOCK", 39)
+    builder = GramBuilder(40, 2, tmp_path)
+    for part in parts:
+        builder.add(part)
+    assert_same_gram(builder.finish(), one)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("keep", ["auto", "weights", "gram"])
-def test_a_builder_resumes_from_its_state(keep):
+def test_a_builder_resumes_from_its_state(keep, tmp_path):
     parts = [labelled_part(seed) for seed in range(3)]
-    first, second = (QuadraticBuilder(40, keep, threads=1) for _ in range(2))
+    first, second = (QuadraticBuilder(40, keep, 3, 1, tmp_path) for _ in range(2))
     first.add(parts[0])
     first.add(parts[1])
     second.restore(first.state())

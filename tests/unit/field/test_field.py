@@ -15,7 +15,7 @@ from hilsplat.base.errors import MisalignedArtifactError, SettingsError
 from hilsplat.contributions import quadratic
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.quadratic import StackedWeights
-from hilsplat.contributions.quadratic_builder import QuadraticBuilder
+from hilsplat.contributions.quadratic_builder import GramBuilder
 from hilsplat.contributions.view_matrices import painted_indicator
 from hilsplat.field.autoencoder import run_autoencoder
 from hilsplat.field.code import LanguageField
@@ -101,11 +101,11 @@ def test_conjugate_gradient_reaches_the_dense_solution():
 
 
 @pytest.mark.parametrize("stored", ["weights", "gram"])
-def test_each_block_is_solved_with_the_others_fixed(stored, monkeypatch):
+def test_each_block_is_solved_with_the_others_fixed(stored, monkeypatch, tmp_path):
     monkeypatch.setattr(quadratic, "BLOCK", 5)
     toy = Toy(weights := (1.0, 0.3, 0.1))
     if stored == "gram":
-        builder = QuadraticBuilder(GAUSSIANS, "gram", 1)
+        builder = GramBuilder(GAUSSIANS, 1, tmp_path)
         builder.add(toy.problem.quadratic)
         toy.problem = replace(toy.problem, quadratic=builder.finish())
     settings = FieldSettings(weight_instance=0.0, weight_part=0.0, cg_steps=30)
