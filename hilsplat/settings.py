@@ -379,6 +379,12 @@ class FieldSettings(Section):
     )
     cg_steps: int = knob(6, "conjugate-gradient steps on the quadratic losses", ge=0)
     lbfgs_steps: int = knob(6, "L-BFGS steps, if the weight of L_ins or L_part is not 0", ge=0)
+    block_gaussians: int = knob(
+        2**20,
+        "largest number of Gaussians that are solved together; a scene with more is solved in blocks, each "
+        "with the others fixed, and a block takes about 4 kB of memory per Gaussian (16 channels)",
+        ge=1,
+    )
     min_mask_px: int = knob(50, "minimum area of masks in L_ins and L_part", unit="px", ge=1)
     prune_cosine: Share = knob(
         1.0,

@@ -56,7 +56,7 @@ Threads = Annotated[
     ),
 ]
 Memory = Annotated[
-    float | None, typer.Option(min=1, help="memory for views in parallel, in MiB; default: all free memory")
+    float | None, typer.Option(min=1, help="memory that the stage may use, in MiB; default: all free memory")
 ]
 Seed = Annotated[int, typer.Option(min=0, max=2_000_000_000, help="random seed")]
 Cache = Annotated[Path, typer.Option(callback=writable, help="cache folder of finished views, for resuming")]

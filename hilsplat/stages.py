@@ -365,12 +365,15 @@ def field(
     ] = None,
     seed: Seed = 0,
     threads: Threads = 1,
+    memory: Memory = None,
 ) -> None:
     """Solve for the language field: regression, L_h, L_ins and L_part over three levels."""
     from hilsplat.field.field import run_field
 
     rendered = (scene, gaussians, masks) if scene and gaussians and masks else None
-    run_field(contributions, coverage_tree, autoencoder, out, settings, threads, seed, rendered, start)
+    run_field(
+        contributions, coverage_tree, autoencoder, out, settings, threads, seed, rendered, start, memory
+    )
 
 
 # ---- evaluation, the only stages that read annotations -------------------------------------------

@@ -140,6 +140,10 @@ class DiskSpaceError(HilsplatError):
     """The disk is full, or has too little free space for a stage's output."""
 
 
+class MemoryLimitError(HilsplatError):
+    """A stage needs more memory than it may use."""
+
+
 class DeviceError(HilsplatError):
     """This machine does not have the device selected in the settings."""
 

@@ -5,8 +5,8 @@ levels, as an upper triangle with three values per pair of Gaussians. If W has f
 and streamed instead, with the same products.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +21,6 @@ from hilsplat.contributions.kernels import gram_across, gram_product, weights_pr
 PRODUCT_PARTS = 4
 """A product with G is summed in this many parts with equal numbers of pairs. The number is fixed so that
 results don't depend on the number of threads; each part stores the sums of its rows and of all rows below."""
-
-BLOCK = 2**20
-"""The field of a scene with more Gaussians is solved in blocks of at most this many."""
 
 
 @dataclass(frozen=True)
@@ -139,16 +136,13 @@ def form(quadratic: Quadratic, features: Float32[np.ndarray, "N 3 D"]) -> float:
     return float(np.multiply(features, quadratic.product(features), dtype=np.float64).sum())
 
 
-def blocks_of(num_gaussians: int) -> list[tuple[int, int]]:
-    """Return equal ranges of at most `BLOCK` Gaussians."""
-    edges = np.linspace(0, num_gaussians, -(-num_gaussians // BLOCK) + 1).astype(np.int64)
-    return list(pairwise(edges.tolist()))
+Blocks = Sequence[tuple[int, int]]
+"""Ranges of Gaussians that together contain each once, in order."""
 
 
-def level_mass(quadratic: Quadratic) -> Float32[np.ndarray, "N 3"]:
+def level_mass(quadratic: Quadratic, blocks: Blocks) -> Float32[np.ndarray, "N 3"]:
     """Return each Gaussian's visible mass in the labelled pixels of each level: G_l 1 (W's rows sum to 1)."""
     ones = np.ones((quadratic.num_gaussians, len(LEVELS), 1), np.float32)
-    blocks = blocks_of(len(ones))
     if len(blocks) == 1:
         return quadratic.product(ones)[:, :, 0]
     parts = []

@@ -18,7 +18,6 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.lineage import sha256_of_json
 from hilsplat.base.removal import DIGEST, delete
-from hilsplat.contributions import quadratic
 from hilsplat.contributions.kernels import SUMS, add_to_block, merge_rows, transpose
 from hilsplat.contributions.quadratic import Gram, Quadratic, StackedWeights
 
@@ -36,6 +35,9 @@ MAX_WEIGHTS = 2**28
 
 CLEARLY_MORE = 2
 """W is dropped once it has this many times as many non-zeros as G, which grows more slowly with the views."""
+
+IN_MEMORY = 2**20
+"""G of more Gaussians is summed in files."""
 
 CHECKPOINT_SECONDS = 300.0
 """Seconds between checkpoints of a long pass; short passes write none."""
@@ -85,7 +87,7 @@ class _Rows:
 class GramBuilder:
     """Builder that sums G over parts of W, such as views; its memory grows only with the size of G.
 
-    G of more than `BLOCK` Gaussians is in files, of which memory holds the pages that one part changes.
+    G of more than `IN_MEMORY` Gaussians is in files, of which memory holds the pages that one part changes.
     Entries are summed in float64 in the order of the pixels, so results depend neither on the division of
     pixels into parts nor on the number of threads. A part shows about 10 % of the Gaussians of a large scene,
     so sums of known pairs are updated in place. Only late pairs, which were added since the last merge, are
@@ -93,7 +95,7 @@ class GramBuilder:
     """
 
     def __init__(self, num_gaussians: int, threads: int, folder: Path) -> None:
-        self._files = Scratch(folder) if num_gaussians > quadratic.BLOCK else None
+        self._files = Scratch(folder) if num_gaussians > IN_MEMORY else None
         self._empty = np.empty if self._files is None else self._files.empty
         edges = np.linspace(0, num_gaussians, BLOCKS + 1).astype(np.int64).tolist()
         self._ranges = list(pairwise(edges))

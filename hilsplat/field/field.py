@@ -7,6 +7,7 @@ from jaxtyping import Float32
 
 from hilsplat.base.artifacts import read_index, read_npz, sealed, write_json
 from hilsplat.base.errors import SettingsError
+from hilsplat.base.levels import LEVELS
 from hilsplat.base.lineage import require_made_from, sha256_of_file
 from hilsplat.base.progress import stage_log
 from hilsplat.contributions.compositing import column_sums
@@ -15,9 +16,12 @@ from hilsplat.contributions.rows import Contributions
 from hilsplat.field.code import LanguageField, autoencoder_file, load_latents
 from hilsplat.field.contrast import Contrast, view_relations
 from hilsplat.field.problem import QuadraticProblem
-from hilsplat.field.solver import keep_labelled, solve_field
+from hilsplat.field.solver import LBFGS_MEMORY, keep_labelled, solve_field
 from hilsplat.segment.digests import require_same_masks
 from hilsplat.settings import FieldSettings
+
+PROCESS_MIB = 250
+"""Memory of the stage without features: libraries, masks, losses."""
 
 
 def run_field(
@@ -30,6 +34,7 @@ def run_field(
     seed: int = 0,  # for a random start, and for the order of views with `trainer: literal`
     rendered: tuple[Path, Path, Path] | None = None,  # scene, Gaussians and masks for `trainer: literal`
     start: Path | None = None,  # field from which `start: langsplat` begins
+    memory_mib: float | None = None,
 ) -> None:
     """Solve the language field of a scene; write `field.safetensors` and, beside it, `field.report.json`.
 
@@ -37,6 +42,7 @@ def run_field(
     name). The result does not depend on `threads`.
 
     Raises:
+        MemoryLimitError: the field needs more than `memory_mib`, or more than this machine has.
         MisalignedArtifactError: an input belongs to different masks, Gaussians or codes.
         SettingsError: an input that the settings require is missing, or one that they do not use is given.
     """
@@ -52,6 +58,14 @@ def run_field(
     contributions = Contributions.load(contributions_folder)
     scene = read_index(contributions_folder)["scene"]
     latents = load_latents(autoencoder_folder, contributions)
+    from hilsplat.models.memory import require_memory  # slow to import
+
+    require_memory(
+        field_mib(contributions, latents.shape[1], settings),
+        memory_mib,
+        f"the field of {contributions.num_gaussians:,} Gaussians with {latents.shape[1]} channels",
+        "lower field.block_gaussians (which changes results slightly), or leave out Gaussians",
+    )
     parents = read_parents(tree_folder, contributions)
     code_sha256 = sha256_of_file(autoencoder_file(autoencoder_folder))
     with stage_log("field", scene) as counts:
@@ -88,6 +102,18 @@ def run_field(
         counts |= {"masks": len(contributions), "Gaussians": len(features), "unseen": unseen}
 
 
+def field_mib(contributions: Contributions, channels: int, settings: FieldSettings) -> float:
+    """Return the memory of the stage in MiB, without the files of A and G, which the system can drop.
+
+    It contains the features and two copies, and for a block six more arrays and two arrays of visible
+    features per step of L-BFGS.
+    """
+    num, visible = contributions.num_gaussians, column_sums(contributions.matrix("mass")) > 0
+    block = min(num, settings.block_gaussians)
+    of_block = block * (6 + 2 * min(settings.lbfgs_steps, LBFGS_MEMORY) * visible.mean())
+    return PROCESS_MIB + (3 * num + of_block) * len(LEVELS) * channels * 4 / 2**20
+
+
 def field_losses(
     contributions: Contributions,
     parents: dict[str, np.ndarray],
@@ -105,7 +131,8 @@ def field_losses(
     half_pixels = contributions.half_pixels.astype(np.float32)
     weights = settings.weight_language, settings.weight_clustering, settings.ridge
     quadratic = contributions.quadratic(threads)
-    problem = QuadraticProblem.of(masks, quadratic, pixels, latents, weights, start, seed)
+    block = settings.block_gaussians
+    problem = QuadraticProblem.of(masks, quadratic, pixels, latents, weights, start, seed, block)
     relations = view_relations(contributions, parents, settings, masks.means(problem.lifted))
     return problem, Contrast(masks, half_masks, pixels, half_pixels, relations, settings)
 

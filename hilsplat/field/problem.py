@@ -14,12 +14,13 @@ LangSplat's regression with squared instead of absolute differences, averaged ov
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
 from hilsplat.contributions.mask_operator import MaskOperator, lifted_average, lifted_median
-from hilsplat.contributions.quadratic import Quadratic, blocks_of, form, level_mass
+from hilsplat.contributions.quadratic import Blocks, Quadratic, form, level_mass
 from hilsplat.field.kernels import add_by_channel, add_scaled, channel_dots, pull, redirect, scaled_squares
 
 
@@ -34,7 +35,8 @@ class QuadraticProblem:
     latents: Float32[np.ndarray, "M D"]  # h
     lifted: Float32[np.ndarray, "N 3 D"]  # start of the field, towards which the ridge pulls
     weights: tuple[float, float, float]  # of the language loss, the clustering loss and the ridge
-    # in a block: G times the features of all other Gaussians, and their part of the mask means
+    blocks: Blocks  # Gaussians that are solved together
+    # within a block: G times the features of all other Gaussians, and their part of the mask means
     others: tuple[Float32[np.ndarray, "N 3 D"], Float32[np.ndarray, "M D"]] | None = None
 
     @staticmethod
@@ -46,9 +48,13 @@ class QuadraticProblem:
         weights: tuple[float, float, float],
         start: str | Float32[np.ndarray, "N 3 D"] = "average",  # or "median", "random", or features
         seed: int = 0,
+        block_gaussians: int = 2**20,
     ) -> "QuadraticProblem":
         """Compute the mass and the start of the field, towards which the ridge pulls."""
-        mass = level_mass(quadratic)
+        count = quadratic.num_gaussians
+        edges = np.linspace(0, count, -(-count // block_gaussians) + 1).astype(np.int64)
+        blocks = tuple(pairwise(edges.tolist()))
+        mass = level_mass(quadratic, blocks)
         if isinstance(start, np.ndarray):
             lifted = start
         elif start == "random":
@@ -58,7 +64,7 @@ class QuadraticProblem:
             lifted = lifted_average(masks, mass, pixels, latents)
             if start == "median":
                 lifted = lifted_median(masks, pixels, latents, lifted)
-        return QuadraticProblem(masks, quadratic, mass, pixels, latents, lifted, weights)
+        return QuadraticProblem(masks, quadratic, mass, pixels, latents, lifted, weights, blocks)
 
     @property
     def total_pixels(self) -> float:
@@ -95,11 +101,11 @@ class QuadraticProblem:
 
         Both losses are small differences of large sums, so all sums are computed in float64.
         """
-        total, means, blocks = 0.0, np.zeros(self.latents.shape), blocks_of(len(features))
-        for begin, end in blocks:
+        total, means = 0.0, np.zeros(self.latents.shape)
+        for begin, end in self.blocks:
             own = features[begin:end]
             total += form(self.quadratic.block(begin, end), own)
-            if len(blocks) > 1:
+            if len(self.blocks) > 1:
                 total += float(channel_dots(own, self.quadratic.across(begin, end, features)).sum())
             means += self.masks.block(begin, end).means(own.astype(np.float64))
         pixels = self.pixels[:, None].astype(np.float64)

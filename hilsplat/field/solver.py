@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from hilsplat.base.progress import track
-from hilsplat.contributions.quadratic import blocks_of
 from hilsplat.field.contrast import Contrast
 from hilsplat.field.kernels import add_multiple, add_slope, flat_dot
 from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
@@ -27,12 +26,11 @@ def solve_field(
 ) -> tuple[Float32[np.ndarray, "N 3 D"], dict[str, object]]:
     """Return the features, and a report with every loss before and after each phase.
 
-    A scene with more than `BLOCK` Gaussians is solved block by block, with the features of all other blocks
-    fixed at their latest values; the report then has the losses before and after all blocks.
+    Several blocks are solved one after the other, with the features of all other blocks fixed at their latest
+    values; the report then has the losses before and after all blocks.
     """
-    blocks = blocks_of(len(problem.mass))
     report: dict[str, object] = {}
-    if len(blocks) == 1:
+    if len(problem.blocks) == 1:
         for phase, features in _phases(problem, contrast):
             report[phase] = problem.terms(features) | contrast.values(features)
         return features, report
@@ -40,7 +38,7 @@ def solve_field(
     report["lifted"] = problem.terms(features) | contrast.values(features)
     operators = contrast.masks, contrast.half_masks
     means = [operator.means(features) for operator in operators]
-    for begin, end in track(blocks, "blocks of the field"):
+    for begin, end in track(problem.blocks, "blocks of the field"):
         own = [operator.block(begin, end) for operator in operators]
         rest = [total - part.means(features[begin:end]) for total, part in zip(means, own, strict=True)]
         block = replace(
@@ -49,6 +47,7 @@ def solve_field(
             quadratic=problem.quadratic.block(begin, end),
             mass=problem.mass[begin:end],
             lifted=problem.lifted[begin:end],
+            blocks=((0, end - begin),),
             others=(problem.quadratic.across(begin, end, features), rest[0]),
         )
         of_block = replace(contrast, masks=own[0], half_masks=own[1], others=(rest[0], rest[1]))
@@ -57,7 +56,7 @@ def solve_field(
         features[begin:end] = last[1]
         means = [fixed + part.means(last[1]) for fixed, part in zip(rest, own, strict=True)]
     report[last[0]] = problem.terms(features) | contrast.values(features)
-    return features, report | {"blocks": len(blocks)}
+    return features, report | {"blocks": len(problem.blocks)}
 
 
 def _phases(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hilsplat.base.errors import MemoryLimitError
 from hilsplat.models.folder import ModelFolder, input_side_px
 from hilsplat.models.layouts import LAYOUTS
 
@@ -114,6 +115,22 @@ def machine_mib() -> float:
     """Return the memory in MiB available to this process, on its machine, in its container or cluster job."""
     physical = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / MIB
     return min([physical, *(limit for limit, _ in _cgroups())])
+
+
+def require_memory(needed_mib: float, memory_mib: float | None, what: str, fix: str) -> None:
+    """Refuse work that needs more than `memory_mib`, or than this machine, container or cluster job has.
+
+    Raises:
+        MemoryLimitError: it does.
+    """
+    limit_mib = min(machine_mib(), memory_mib or math.inf)
+    if needed_mib > limit_mib:
+        raise MemoryLimitError(
+            f"{what} needs more memory than it may use",
+            expected=f"at least {needed_mib / 1024:.1f} GiB",
+            found=f"{limit_mib / 1024:.1f} GiB",
+            fix=fix,
+        )
 
 
 def available_mib() -> float:

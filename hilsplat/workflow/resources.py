@@ -2,11 +2,11 @@
 
 `resources.tsv` lists each rule's core seconds per megapixel of all views, and the terms of its memory in
 megabytes: a base, and amounts per megapixel of all views (`mp`, and `capped_mp` up to `cap`), per megapixel
-of one view (`view_mp`, and `thread_mp` per thread), and per thousand Gaussians. It also lists megabytes on
-disk (with caches) per megapixel of all views and per thousand Gaussians (for fields: times latent channels).
-These estimates exceed the peaks in Snakemake's `benchmark:` records (tests/unit/workflow/peak_memory.tsv;
-`source` and `train_models` were not measured). Times were measured on benchmark scenes and can be off by a
-factor of three elsewhere. A killed job is retried with twice the memory and time limit.
+of one view (`view_mp`, and `thread_mp` per thread), and per thousand Gaussians (`thousand` up to 2**20,
+`more_thousand` for all others). It also lists megabytes on disk (with caches) per megapixel of all views and
+per thousand Gaussians (for fields: times latent channels). These estimates exceed the peaks in Snakemake's
+`benchmark:` records (tests/unit/workflow/peak_memory.tsv; `source` and `train_models` were not measured).
+Times were measured on benchmark scenes and can be off by a factor of three elsewhere. A killed job is retried with twice the memory and time limit.
 """
 
 import csv
@@ -40,6 +40,8 @@ COSTS = {row.pop("stage"): {name: float(value) for name, value in row.items()} f
 MP_PER_THREAD = 2.0  # megapixels of all views per thread
 
 RUNNER_MB = 700  # memory of the two Snakemake processes that a cluster job starts before its stage
+
+BLOCK = 2**20 / 1000  # thousands of Gaussians that the field solves together by default
 
 COMPARED_MB = (450, 4)  # memory of `comparison` per method: base, and per thousand Gaussians
 
@@ -134,7 +136,10 @@ class JobResources:
                 row = self.plan.row(wildcards)
                 (views, view_mp), thousand = self.size(row), self.gaussians(row) / 1000
                 mb += (cost["mp"] * views + cost["view_mp"] + cost["thread_mp"] * threads) * view_mp
-                mb += min(cost["cap"], cost["capped_mp"] * views * view_mp) + cost["thousand"] * thousand
+                mb += min(cost["cap"], cost["capped_mp"] * views * view_mp)
+                mb += cost["thousand"] * min(thousand, BLOCK) + cost["more_thousand"] * max(
+                    0, thousand - BLOCK
+                )
                 mb = max(mb, self._model_mb(cost_name(rule), wildcards, threads))
                 if rule == "comparison":
                     mb += len(self.plan.run.main_variants) * (COMPARED_MB[0] + COMPARED_MB[1] * thousand)

@@ -11,8 +11,7 @@ import torch
 from scipy.optimize import minimize
 
 from hilsplat.base.artifacts import read_index, read_json, write_index
-from hilsplat.base.errors import MisalignedArtifactError, SettingsError
-from hilsplat.contributions import quadratic
+from hilsplat.base.errors import MemoryLimitError, MisalignedArtifactError, SettingsError
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.quadratic import StackedWeights
 from hilsplat.contributions.quadratic_builder import GramBuilder
@@ -101,32 +100,32 @@ def test_conjugate_gradient_reaches_the_dense_solution():
 
 
 @pytest.mark.parametrize("stored", ["weights", "gram"])
-def test_each_block_is_solved_with_the_others_fixed(stored, monkeypatch, tmp_path):
-    monkeypatch.setattr(quadratic, "BLOCK", 5)
+def test_each_block_is_solved_with_the_others_fixed(stored, tmp_path):
     toy = Toy(weights := (1.0, 0.3, 0.1))
     if stored == "gram":
         builder = GramBuilder(GAUSSIANS, 1, tmp_path)
         builder.add(toy.problem.quadratic)
         toy.problem = replace(toy.problem, quadratic=builder.finish())
+    blocks = (0, 4), (4, 8), (8, 12)
+    toy.problem = replace(toy.problem, blocks=blocks)
     settings = FieldSettings(weight_instance=0.0, weight_part=0.0, cg_steps=30)
     solved, report = solve_field(toy.problem, toy.contrast(settings))
     assert (report["blocks"], report["after_cg"]["language"] < report["lifted"]["language"]) == (3, True)
     for index in range(3):
         hessian, right = dense_system(toy, weights, index)
         expected = toy.problem.lifted[:, index].astype(np.float64)
-        for block in (slice(0, 4), slice(4, 8), slice(8, 12)):
+        for block in (slice(begin, end) for begin, end in blocks):
             expected[block], *_ = np.linalg.lstsq(
                 hessian[block, block],
                 right[block] - hessian[block] @ expected + hessian[block, block] @ expected[block],
                 rcond=None,
             )
         assert solved[:, index] == pytest.approx(expected, abs=2e-5)
-    monkeypatch.setattr(quadratic, "BLOCK", 12)
-    whole = toy.problem.terms(solved)
+    whole = replace(toy.problem, blocks=((0, 12),)).terms(solved)
     assert report["after_cg"] == pytest.approx(whole | toy.contrast(settings).values(solved), rel=1e-5)
 
 
-def test_contrastive_losses_of_a_block_count_the_other_blocks(monkeypatch):
+def test_contrastive_losses_of_a_block_count_the_other_blocks():
     toy = Toy((1.0, 0.3, 0.1))
     settings = FieldSettings(weight_instance=0.5, weight_part=0.1, cg_steps=30, lbfgs_steps=200)
     contrast = toy.contrast(settings)
@@ -138,6 +137,7 @@ def test_contrastive_losses_of_a_block_count_the_other_blocks(monkeypatch):
         quadratic=toy.problem.quadratic.block(0, 6),
         mass=toy.problem.mass[:6],
         lifted=toy.problem.lifted[:6],
+        blocks=((0, 6),),
         others=(
             toy.problem.quadratic.across(0, 6, whole),
             contrast.masks.block(6, 12).means(whole[6:]),
@@ -307,6 +307,17 @@ def solved_field(boxes, name: str, settings: FieldSettings = SMALL_MASKS, thread
 
 def report_of(field: Path) -> dict:
     return read_json(field.with_suffix(".report.json"))
+
+
+def test_blocks_and_memory_of_the_stage(boxes_with_latents):
+    blocks = SMALL_MASKS.model_copy(update={"block_gaussians": 40})
+    field = solved_field(boxes_with_latents, "blocks", blocks, threads=2)
+    assert report_of(field)["blocks"] == 3
+    whole = LanguageField.load(solved_field(boxes_with_latents, "whole")).features
+    apart = np.linalg.norm(LanguageField.load(field).features - whole)
+    assert 0 < apart < 0.2 * np.linalg.norm(whole)
+    with pytest.raises(MemoryLimitError, match=r"field of 96 Gaussians(.|\n)*found +0.1 GiB"):
+        solved_field(boxes_with_latents, "refused", memory_mib=100.0)
 
 
 def test_stage_is_the_same_on_any_number_of_threads(boxes_with_latents):
