@@ -1,11 +1,12 @@
 """Measure how time and memory of the stages after the fit grow with Gaussians, views, pixels and masks.
 
-    python -m benchmarks.growth FOLDER                    # fourteen scenes
+    python -m benchmarks.growth FOLDER                    # sixteen scenes
     python -m benchmarks.growth FOLDER --quantity views   # 250 to 2,000 views of one place
 
 Each series generates scenes of `large_scene` in which one quantity grows by factors of two, and runs every
-stage in its own process. The script writes `growth.json` and `growth.png`, and prints exponents of the last
-doubling: 1 is linear growth. Existing results are reused.
+stage in its own process. Times are CPU seconds, which other work on the machine changes less. The script
+writes `growth.json` and `growth.png`, and prints exponents of the last doubling: 1 is linear growth. Existing
+results are reused.
 """
 
 import argparse
@@ -24,7 +25,8 @@ from benchmarks.table import markdown_table
 
 FACTORS = (0.5, 1.0, 2.0, 4.0)
 VIEWS = (250, 500, 1000, 2000)
-MEASURES = ("seconds", "MiB")
+GAUSSIANS = (500_000, 1_000_000, 2_000_000, 4_000_000)
+MEASURES = ("CPU seconds", "MiB")
 LABELS = {
     "gaussians": "Gaussians",
     "views": "views",
@@ -56,11 +58,12 @@ class Size:
 
 SERIES = {name: [Size().grown(name, factor) for factor in FACTORS] for name in LABELS}
 SERIES["views"] = [Size(views=views, pixels=200 * 150, masks=300) for views in VIEWS]
+SERIES["gaussians"] = [Size(gaussians=gaussians, views=48) for gaussians in GAUSSIANS]
 """Quantity -> sizes of its scenes. Large numbers of views have small pictures with many masks."""
 
 
 def measured(size: Size, folder: Path) -> dict[str, list[float]]:
-    """Return seconds and peak MiB of every stage on a generated scene; existing timings are reused."""
+    """Return seconds, CPU seconds and peak MiB of every stage; existing timings are reused."""
     name = f"{size.gaussians}-{size.views}-{size.pixels}-{size.masks}"
     kept = folder / name / "times.json"
     if not kept.exists():
@@ -101,7 +104,7 @@ def draw(series: dict[str, dict[str, dict[str, list[float]]]]) -> Figure:
             axes.yaxis.set_major_formatter("{x:g}")
             axes.grid(alpha=0.3)
             axes.set_xlabel(LABELS[quantity])
-        panels[0, 0].set_ylabel("seconds, 2 threads")
+        panels[0, 0].set_ylabel("CPU seconds")
         panels[1, 0].set_ylabel("peak memory, MiB")
     figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(STAGES))
     return figure
@@ -123,7 +126,7 @@ def main() -> None:
         series[quantity] = {"size": {"values": [float(getattr(size, quantity)) for size in sizes]}}
         for stage in STAGES:
             columns = zip(*(each[stage] for each in times), strict=True)
-            series[quantity][stage] = dict(zip(MEASURES, map(list, columns), strict=True))
+            series[quantity][stage] = dict(zip(("seconds", *MEASURES), map(list, columns), strict=True))
     (folder / "growth.json").write_text(json.dumps(series, indent=1) + "\n", encoding="utf-8")
     draw(series).savefig(folder / "growth.png", dpi=110)
     rows = [

@@ -204,15 +204,18 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument(
-        "--stage", choices=STAGES, help="run this stage in this process, and print its seconds and MiB"
+        "--stage",
+        choices=STAGES,
+        help="run this stage in this process; print its seconds, CPU seconds and MiB",
     )
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     if given.stage:
         keep_freed_memory()  # as all commands do
-        begun = time.perf_counter()
+        begun, begun_cpu = time.perf_counter(), time.process_time()
         stages(given.out, given.threads, given.device)[given.stage]()
-        print(f"{time.perf_counter() - begun:.1f} {status_mib('VmHWM'):.0f}")
+        seconds, cpu = time.perf_counter() - begun, time.process_time() - begun_cpu
+        print(f"{seconds:.1f} {cpu:.1f} {status_mib('VmHWM'):.0f}")
         return
     if not (given.out / "clip").exists():
         size_hw = (given.height, given.width)
@@ -223,14 +226,13 @@ def main() -> None:
         command += ["--threads", str(given.threads), "--device", given.device]
         environment = {**os.environ, "NUMBA_NUM_THREADS": str(given.threads)}
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, env=environment)
-        seconds, peak = done.stdout.split()[-2:]
-        rows.append((stage, seconds, peak))
+        rows.append((stage, *done.stdout.split()[-3:]))
         print(*rows[-1], flush=True)
-    total = sum(float(row[1]) for row in rows)
-    rows.append(("all", f"{total:.1f}", max((row[2] for row in rows), key=float)))
-    table = markdown_table(("stage", "s", "peak MiB"), rows, 1)
+    totals = (f"{sum(float(row[column]) for row in rows):.1f}" for column in (1, 2))
+    rows.append(("all", *totals, max((row[3] for row in rows), key=float)))
+    table = markdown_table(("stage", "s", "CPU s", "peak MiB"), rows, 1)
     (given.out / "times.md").write_text(table + "\n")
-    times = {stage: [float(seconds), float(peak)] for stage, seconds, peak in rows}
+    times = {stage: list(map(float, values)) for stage, *values in rows}
     (given.out / "times.json").write_text(json.dumps(times) + "\n")
     print(table)
 
