@@ -21,7 +21,7 @@ from hilsplat.viewer.wire import Group, Question
 from hilsplat.web.server import view_name
 
 CHUNK = 65_536
-"""Gaussians per chunk: 32 rows of the page's textures."""
+"""Gaussians per chunk: 16 rows of the page's textures."""
 
 LISTED = 24
 """Maximum number of answers in the list."""

@@ -4,7 +4,7 @@ import * as api from "./api.js";
 import { fragment, vertex } from "./shaders.js";
 import { readChunk, unzipped } from "./spz.js";
 
-const WIDTH = 2048;
+const WIDTH = 4096;
 
 export function describe() {
   const gl = document.createElement("canvas").getContext("webgl2");

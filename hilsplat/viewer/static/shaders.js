@@ -19,7 +19,7 @@ out vec2 place;
 flat out vec4 paint;
 flat out uint number;
 
-ivec2 at(uint texel) { return ivec2(int(texel & 2047u), int(texel >> 11)); }
+ivec2 at(uint texel) { return ivec2(int(texel & 4095u), int(texel >> 12)); }
 
 // Positions, rotations and harmonics are in the axes of SPZ: y up, z backwards.
 uint words[4 * TEXELS];
