@@ -1,13 +1,18 @@
 """Division of scenes into blocks: what a view sees, and which places and views belong together."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.images import write_png
+from hilsplat.scene.assemble import move_cameras
 from hilsplat.scene.blocks import BLOCKS, Blocks, block_centres, seen_points, split_scene
 from hilsplat.scene.cameras import Camera
+from hilsplat.scene.poses import run_poses
 from hilsplat.scene.scene import Scene
+from hilsplat.settings import PosesSettings
 from tests.unit.evaluate.builders import cameras_of
 
 K = np.array([[32.0, 0, 16], [0, 32, 16], [0, 0, 1]])  # 32 x 32 px: a cell is a pixel
@@ -66,6 +71,24 @@ def test_a_view_is_lent_to_a_block_in_which_it_sees_enough(tmp_path, share, borr
     ]
     assert [block.borrowed for block in blocks.blocks.values()] == borrowed
     assert Blocks.load(tmp_path / "blocks") == blocks
+
+
+def test_a_block_has_the_poses_and_the_split_of_its_scene(tmp_path):
+    scene = row_of_views(tmp_path / "scene", 20)
+    scene = replace(scene, split=scene.split | {"002.png": "test"})
+    blocks = split_scene(scene, tmp_path / "blocks", 2, 1.0).blocks
+    held_out = []
+    for name, block in blocks.items():
+        out = tmp_path / name
+        run_poses(tmp_path / "blocks" / name, out, name, "arbitrary", False, PosesSettings(), 0, 1)
+        imported = Scene.load(out)
+        assert imported.views() == list(block.owned)  # ten views, of which the settings would hold out two
+        held_out += imported.views("test")
+        whole_from_block = np.linalg.inv(imported.scene_from_source)
+        moved = move_cameras(imported.cameras.cam_from_world, whole_from_block)
+        expected = [scene.cameras[view].cam_from_world for view in imported.views()]
+        np.testing.assert_allclose(moved, expected, atol=1e-12)
+    assert held_out == ["002.png"]
 
 
 def test_too_many_blocks_are_refused(tmp_path):
