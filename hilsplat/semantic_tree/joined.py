@@ -46,9 +46,11 @@ Otherwise, a thing beyond the border that the other block segments differently w
 
 
 def inputs_of(folder: Path) -> list[Path]:
-    """Return the artifacts that are read to join a scene; raise ArtifactError if it is not finished."""
+    """Return what is read of a block, a finished scene; raise ArtifactError if it is not finished."""
     parts = FinishedScene.locate(folder).parts
-    return [*parts.as_inputs().values(), _contributions_of(parts)]
+    contributions = _contributions_of(parts)
+    artifacts = (parts.scene, parts.gaussians, parts.masks, parts.clip, parts.semantic_tree)
+    return [*artifacts, contributions / "rows.npz", contributions / "mass"]
 
 
 def _contributions_of(parts: SceneParts) -> Path:
@@ -86,6 +88,9 @@ class FinishedBlock:
         parts = FinishedScene.locate(folder).parts
         tree = SemanticTree.load(parts.semantic_tree)
         contributions = Contributions.load(_contributions_of(parts))
+        digest = sha256_of_file(parts.gaussians)
+        require_made_from(parts.semantic_tree, parts.gaussians, tree.gaussians_sha256, digest)
+        require_made_from(contributions.folder, parts.gaussians, contributions.gaussians_sha256, digest)
         require_same_masks(parts.semantic_tree, parts.masks)
         views = require_same_masks(parts.masks, contributions.folder)
         whole_from_block = np.linalg.inv(Scene.load(parts.scene).scene_from_source)

@@ -35,26 +35,31 @@ REGIONS = (
     ("rim", 3, (6, 9), (10, 20), (250, 250, 0)),
     ("book", 1, (4, 20), (42, 74), (0, 0, 250)),  # across the border
     ("label", 2, (6, 12), (52, 68), (0, 250, 0)),
+    ("pen", 2, (20, 23), (70, 80), (0, 120, 120)),
     ("mug 2", 1, (2, 22), (86, 106), (250, 20, 0)),
     ("handle 2", 2, (6, 16), (90, 100), (20, 220, 0)),
 )
 """A shelf: a pixel of its picture is a Gaussian, and each view is a window of the picture."""
 
+BORDER = 58
+OTHERWISE = {"pen": (56, 80)}
+"""Columns of masks that differ in the first block, which reach over the border."""
+
 VIEWS = tuple(f"{view:03d}.png" for view in range((LENGTH - WINDOW) // STEP + 1))
 DISTANCE = 30.0
 
 
-def region_mask(name: str) -> np.ndarray:
-    _, _, rows, columns, _ = next(region for region in REGIONS if region[0] == name)
+def region_mask(name: str, columns: tuple[int, int] | None = None) -> np.ndarray:
+    _, _, rows, own, _ = next(region for region in REGIONS if region[0] == name)
     mask = np.zeros((HEIGHT, LENGTH), bool)
-    mask[slice(*rows), slice(*columns)] = True
+    mask[slice(*rows), slice(*(columns or own))] = True
     return mask
 
 
-def visible_mask(name: str) -> np.ndarray:
+def visible_mask(name: str, columns: tuple[int, int] | None = None) -> np.ndarray:
     """Pixels of a region that no other region of its level covers, (24, 120) bool."""
     number = [region[0] for region in REGIONS].index(name)
-    mask = region_mask(name)
+    mask = region_mask(name, columns)
     for other in REGIONS[number + 1 :]:
         if other[1] == REGIONS[number][1]:
             mask &= ~region_mask(other[0])
@@ -107,7 +112,8 @@ def finish(place: Path) -> None:
     write_coordinates(ply, scene, seen, {"kind": "fitted"})
     entries = {}
     for view in scene.views("train"):
-        shown = [(window(visible_mask(region[0]), view), region[1]) for region in REGIONS]
+        drawn = OTHERWISE if place.name == "shelf-0" else {}
+        shown = [(window(visible_mask(name, drawn.get(name)), view), level) for name, level, *_ in REGIONS]
         masks = masks_of(*zip(*[(mask, level) for mask, level in shown if mask.sum() > 20], strict=True))
         masks.save(out / "masks" / f"{view}.npz")
         entries[view] = index_entry(masks)
@@ -157,6 +163,8 @@ def test_blocks_share_the_views_at_their_border_and_keep_the_split(project):
     blocks = Blocks.load(project.parent / "blocks/shelf").blocks
     assert sorted(view for block in blocks.values() for view in block.owned) == list(VIEWS)
     assert all(block.borrowed for block in blocks.values())
+    centres = [block.centre[0] for block in blocks.values()]
+    assert np.mean(centres) == pytest.approx(BORDER, abs=1)
     for name, block in blocks.items():
         scene = Scene.load(project / "photos" / name / "scene")
         assert scene.views() == sorted([*block.owned, *block.borrowed])
@@ -185,7 +193,7 @@ def test_a_joined_scene_gives_the_answers_of_the_whole_scene(project, text):
     assert len(answers[0]) == len(answers[1]) > 0
     for whole, joined in zip(*answers, strict=True):
         assert joined.level == whole.level
-        assert joined.score == pytest.approx(whole.score, abs=1e-3)
+        assert joined.score == pytest.approx(whole.score, abs=0.01)
         np.testing.assert_allclose(joined.box, whole.box, atol=1e-3)
     for view in VIEWS:
         masks = [
