@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,13 +10,13 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from hilsplat.base.artifacts import write_index, write_json
+from hilsplat.base.artifacts import read_index, write_index, write_json
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS
 from hilsplat.cli.main import app
 from hilsplat.query.language_scene import open_scene
-from hilsplat.scene.blocks import Blocks
+from hilsplat.scene.blocks import BLOCKS, Blocks
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import index_entry
 from hilsplat.semantic_tree.joined import same_nodes
@@ -204,15 +205,35 @@ def test_a_joined_scene_gives_the_answers_of_the_whole_scene(project, text):
         assert both >= 0.97 * either or either <= HEIGHT, view  # a column at the edge may be half visible
 
 
-def test_an_unfinished_block_is_named(project, tmp_path, monkeypatch):
-    monkeypatch.chdir(project.parent)
-    clip = project / "photos/shelf-1/default/clip"
-    clip.rename(tmp_path / "clip")
-    try:
-        with pytest.raises(HilsplatError, match="shelf-1"):
-            app(["blocks", "join", "blocks/shelf"], standalone_mode=False)
-    finally:
-        (tmp_path / "clip").rename(clip)
+def without_vectors(project: Path) -> None:
+    shutil.rmtree(project / "results/photos/shelf-1/default/clip")
+
+
+def with_another_segmenter(project: Path) -> None:
+    masks = project / "results/photos/shelf-1/default/masks"
+    index = read_index(masks)
+    write_index(masks, index.pop("views"), **{**index, "segmenter": "graph"})
+
+
+def with_other_poses(project: Path) -> None:
+    path = project / "blocks/shelf" / BLOCKS
+    path.write_text(path.read_text().replace('"cameras_sha256": "', '"cameras_sha256": "0'))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (without_vectors, "shelf-1 is not finished"),
+        (with_another_segmenter, "different models or settings"),
+        (with_other_poses, "was not made from"),
+    ],
+)
+def test_blocks_that_do_not_belong_together_are_refused(project, tmp_path, monkeypatch, change, message):
+    shutil.copytree(project.parent, tmp_path / "copy")
+    monkeypatch.chdir(tmp_path / "copy")
+    change(tmp_path / "copy")
+    with pytest.raises(HilsplatError, match=message):
+        app(["blocks", "join", "blocks/shelf"], standalone_mode=False)
 
 
 @pytest.mark.parametrize(
