@@ -9,7 +9,7 @@ Stages of plugins, such as those of the synthetic world, come from entry points 
 """
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -299,6 +299,31 @@ def names(
     from hilsplat.query.node_names import run_names
 
     run_names(semantic_tree, clip, out, cache, settings, evaluate)
+
+
+def _blocks(arguments: Mapping[str, Any]) -> Reads:
+    from hilsplat.scene.blocks import BLOCKS
+    from hilsplat.semantic_tree.joined import inputs_of
+
+    files = {folder.name: inputs_of(folder) for folder in arguments["finished"]}
+    return Reads({BLOCKS: arguments["blocks"] / BLOCKS, **files})
+
+
+@stage(
+    command="",
+    file="semantic_tree",
+    loop="shared views",
+    reads=_blocks,
+    beside=lambda out: (
+        *(out.parent.parent / name for name in ("scene", "gaussians.ply", "gaussians.json")),
+        *(out.with_name(name) for name in ("masks", "clip")),
+    ),
+)
+def joined(blocks: Path, scene: PathIn, finished: Sequence[Path], out: PathOut) -> None:
+    """Join the finished blocks of a scene: Gaussians, masks, vectors and nodes."""
+    from hilsplat.semantic_tree.joined import run_joined
+
+    run_joined(blocks, scene, finished, out)
 
 
 # ---- the language field --------------------------------------------------------------------------

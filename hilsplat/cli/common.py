@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hilsplat.base.errors import visible
+from hilsplat.base.errors import ArtifactError, visible
 from hilsplat.base.progress import LOG_FORMAT, LogFormatter
 
 app = typer.Typer(
@@ -19,9 +19,13 @@ app = typer.Typer(
 models_app = typer.Typer(help="Get, list, check and split models (SAM, CLIP).", no_args_is_help=True)
 datasets_app = typer.Typer(help="List, check and export published data sets.", no_args_is_help=True)
 cache_app = typer.Typer(help="Show or prune the caches of a results folder.", invoke_without_command=True)
+blocks_app = typer.Typer(
+    help="Split a large scene into blocks, and join their results.", no_args_is_help=True
+)
 app.add_typer(models_app, name="models")
 app.add_typer(datasets_app, name="datasets")
 app.add_typer(cache_app, name="cache")
+app.add_typer(blocks_app, name="blocks")
 
 Results = Annotated[Path, typer.Option(help="results folder")]
 
@@ -36,6 +40,12 @@ def start_logging(*, timestamps: bool = False) -> None:
     root.addHandler(handler)
     for noisy in ("matplotlib", "numba", "PIL", "fontTools", "urllib3"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
+
+
+def require_new_folder(out: Path) -> None:
+    """Raise ArtifactError if the folder of --out exists and is not empty."""
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ArtifactError(f"--out {out} exists", fix="choose a new folder, or remove this one first")
 
 
 def echo(text: object) -> None:

@@ -1,13 +1,22 @@
-"""Command groups: model folders, caches, and published data sets."""
+"""Command groups: model folders, caches, published data sets, and blocks of a large scene."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from hilsplat.cli.common import Results, cache_app, datasets_app, echo, models_app
+from hilsplat.cli.common import (
+    Results,
+    blocks_app,
+    cache_app,
+    datasets_app,
+    echo,
+    models_app,
+    require_new_folder,
+)
+from hilsplat.cli.user_commands import scene_folder
 from hilsplat.stage import DEFAULT_CACHE, DataRoot, Threads
-from hilsplat.stages import all_stages, family_of, label_fits
+from hilsplat.stages import all_stages, family_of, joined, label_fits, names
 
 
 @models_app.command("get")
@@ -149,4 +158,56 @@ def datasets_fits(
     masks = folder / variant / "masks"
     echo(
         label_fits(folder / "scene", folder / "gaussians.ply", masks, tree, target, name, data_root, threads)
+    )
+
+
+@blocks_app.command("split")
+def blocks_split(
+    scene: Annotated[str, typer.Argument(help="scene with finished poses, such as photos/house")],
+    blocks: Annotated[int, typer.Option(min=2, help="number of blocks")],
+    out: Annotated[Path | None, typer.Option(help="new folder; default: blocks/SCENE")] = None,
+    share: Annotated[
+        float,
+        typer.Option(min=0.01, max=1, help="lend a view to each block in which it sees at least this share"),
+    ] = 0.2,
+    results: Results = Path("results"),
+) -> None:
+    """Split a posed scene into overlapping blocks of views, to be run as separate scenes.
+
+    Writes a folder of posed images for each block, and blocks.json for `hilsplat blocks join`.
+    """
+    from hilsplat.scene.blocks import split_scene
+    from hilsplat.scene.scene import Scene
+
+    opened = Scene.load(scene_folder(scene, results) / "scene")
+    out = out or Path("blocks", opened.name.split("/")[-1])
+    require_new_folder(out)
+    for name, block in split_scene(opened, out, blocks, share).blocks.items():
+        echo(f"{name}: {len(block.owned)} views, {len(block.borrowed)} more of other blocks")
+        echo(f"  hilsplat new {name} {out / name}")
+
+
+@blocks_app.command("join")
+def blocks_join(
+    folder: Annotated[Path, typer.Argument(help="folder that `hilsplat blocks split` wrote")],
+    results: Results = Path("results"),
+    cache: Annotated[Path, typer.Option(help="cache folder of text vectors")] = DEFAULT_CACHE,
+) -> None:
+    """Join the finished blocks of a scene to a scene that accepts queries, in RESULTS/joined."""
+    from hilsplat.base.lineage import read_provenance
+    from hilsplat.scene.blocks import Blocks
+    from hilsplat.scene.finished import FinishedScene
+    from hilsplat.settings import QuerySettings
+
+    described = Blocks.load(folder)
+    scene = results / described.scene / "scene"
+    finished = [FinishedScene.locate(scene_folder(name, results)) for name in described.blocks]
+    name = scene.parent.name
+    out = results / "joined" / name / "default"
+    joined(folder, scene, [block.folder for block in finished], out / "semantic_tree")
+    record = read_provenance(finished[0].folder / "default" / "names")
+    queries = QuerySettings(**(record.settings["query"] if record else {}))
+    names(out / "semantic_tree", out / "clip", out / "names", queries, finished[0].evaluate_settings(), cache)
+    echo(
+        f"joined {len(finished)} blocks:\n  hilsplat query joined/{name} TEXT\n  hilsplat view joined/{name}"
     )

@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from hilsplat.base.errors import ArtifactError, SettingsError
-from hilsplat.cli.common import Results, app, echo
+from hilsplat.base.errors import SettingsError
+from hilsplat.cli.common import Results, app, echo, require_new_folder
 from hilsplat.stage import DataRoot, Threads
 
 SceneName = Annotated[str, typer.Argument(help="scene in results/, such as desk or photos/desk, or its path")]
@@ -195,8 +195,7 @@ def export(
 
     folder = scene_folder(scene, results)
     if out is not None:
-        if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise ArtifactError(f"--out {out} exists", fix="choose a new folder, or remove this one first")
+        require_new_folder(out)
         echo(_export(folder, form, variant, data_root, out, threads))
         return
     out = folder / "export" / (form if variant == "default" else f"{form}-{variant}")

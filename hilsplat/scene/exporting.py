@@ -17,13 +17,18 @@ from hilsplat.scene.scene import Scene
 def in_source(scene: Scene) -> tuple[list[PosedImage], Float64[np.ndarray, "P 3"]]:
     """Return undistorted images with their poses, and sparse points, in the coordinates of the source."""
     source_from_scene = np.linalg.inv(scene.scene_from_source)
-    poses = move_cameras(scene.cameras.cam_from_world, source_from_scene)
-    images = [
-        PosedImage(name, scene.image_path(name), pose, scene.cameras[name].K, scene.cameras[name].size_hw)
-        for name, pose in zip(scene.cameras.names, poses, strict=True)
-    ]
+    images = posed_images(scene, move_cameras(scene.cameras.cam_from_world, source_from_scene))
     points = scene.points_xyz.astype(np.float64) @ source_from_scene[:3, :3].T + source_from_scene[:3, 3]
     return images, points
+
+
+def posed_images(scene: Scene, cam_from_world: Float64[np.ndarray, "V 4 4"]) -> list[PosedImage]:
+    """Return the undistorted images of all views, with the given poses and the scene's split."""
+    images = []
+    for name, pose in zip(scene.cameras.names, cam_from_world, strict=True):
+        camera, split = scene.cameras[name], scene.split[name]
+        images.append(PosedImage(name, scene.image_path(name), pose, camera.K, camera.size_hw, split=split))
+    return images
 
 
 def write_colmap(scene: Scene, out: Path) -> None:

@@ -81,12 +81,12 @@ class FinishedScene:
                 logger.warning("%s", refining(folder))
         autoencoder = None
         if field.exists():
-            autoencoder = _input_of(field, "autoencoder", folder)
-            clip = _input_of(autoencoder, "clip", folder)
+            autoencoder = input_of(field, "autoencoder", folder)
+            clip = input_of(autoencoder, "clip", folder)
         elif not clip.exists():  # `default` has its own vectors; other variants may share them
             raise _unfinished(folder, clip if variant == "default" else field)
-        tree = _input_of(autoencoder or clip, "semantic_tree", folder)
-        used_field, masks = field if autoencoder else None, _input_of(clip, "masks", folder)
+        tree = input_of(autoencoder or clip, "semantic_tree", folder)
+        used_field, masks = field if autoencoder else None, input_of(clip, "masks", folder)
         gaussians = folder / "gaussians.ply"
         parts = SceneParts(folder / "scene", gaussians, tree, used_field, autoencoder, clip, masks)
         for path in parts.as_inputs().values():
@@ -156,7 +156,7 @@ def _unfinished(folder: Path, missing: Path) -> ArtifactError:
     return ArtifactError(f"{folder} is not finished: {missing} is missing", fix=run_command(missing))
 
 
-def _input_of(artifact: Path, name: str, folder: Path) -> Path:
+def input_of(artifact: Path, name: str, folder: Path) -> Path:
     """Return the path of an artifact's input from its provenance or, if not recorded, beside the artifact."""
     return _recorded_input(artifact, name, folder) or artifact.parent / name
 

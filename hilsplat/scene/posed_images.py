@@ -33,6 +33,7 @@ class PosedImage:
         cam_from_world: world-to-camera transform, OpenCV axes, in the unit of the scene.
         K: intrinsics, px; the centre of the first pixel is (0.5, 0.5).
         distortion: k1, k2, p1, p2, k3 as defined by OpenCV.
+        split: "train" or "test"; empty if `poses` decides.
     """
 
     name: str
@@ -41,6 +42,7 @@ class PosedImage:
     K: Float[np.ndarray, "3 3"]
     size_hw: tuple[int, int]
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    split: str = ""
 
     @property
     def world_from_cam(self) -> Float[np.ndarray, "4 4"]:
@@ -73,6 +75,8 @@ def write_posed_images(
 ) -> None:
     """Write `images/` and `transforms.json` (OpenGL axes, intrinsics per frame) as a source for `poses`.
 
+    The split, if given, is listed as nerfstudio expects it; its validation views are the test views.
+
     Images are copied byte for byte; distortion is kept, because `poses` undistorts them. Points, if given,
     must be in the unit of the poses; `points.ply` stores them, and they become the scene's sparse points in
     the same order. An existing folder is replaced. SceneError is raised if two images have one name.
@@ -104,6 +108,10 @@ def write_posed_images(
                 frame.update(zip(("k1", "k2", "p1", "p2", "k3"), image.distortion, strict=True))
             frames.append(frame)
         content: dict[str, object] = {"frames": frames}
+        if any(image.split for image in images):
+            for part, split in (("train", "train"), ("val", "test"), ("test", "test")):
+                files = [f"images/{image.name}" for image in images if image.split == split]
+                content[f"{part}_filenames"] = files
         if points is not None:
             content["ply_file_path"] = "points.ply"
             columns, kinds = [*points.T], [(axis, "<f4") for axis in "xyz"]

@@ -7,11 +7,12 @@ tree only scores each node's crops. The clip stage embeds the best crops, whose 
 """
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Float, Float32, Int32, Int64, UInt8
 
 from hilsplat.base.arrays import require_types
 from hilsplat.base.artifacts import read_index, write_index, write_json, write_npz
@@ -123,46 +124,96 @@ def build_tree(
         quality += nodes.quality.tolist()
 
     levels = np.array(level_of_node, np.uint8)
-    parent = node_parents(node_of_gaussian, levels, total_mass, settings.parent_coverage)
-    nested = nest_nodes(node_of_gaussian, levels, parent)
-    membership[nested != node_of_gaussian] = 0
-    renumber = renumbered_without_empty(nested, len(levels))
-    occupied = np.flatnonzero(renumber[:-1] != NONE)
-    node_of_gaussian, linked_node = renumber[nested], renumber[cluster_of_mask]
-    levels, parent, num = levels[occupied], renumber[parent[occupied]], len(occupied)
-    view_area = np.zeros((num, len(contributions.views)), np.float64)
-    linked = np.flatnonzero(linked_node != NONE)
-    np.add.at(view_area, (linked_node[linked], view[linked]), contributions.area_px[linked])
-    centroid, box, oriented = node_boxes(node_of_gaussian, levels, means, total_mass)
-    fits, iou = mask_fits(node_of_gaussian, S, mass, view, contributions.level, linked_node)
+    nodes_of, membership, levels, parent, renumber = nested_nodes(
+        node_of_gaussian, membership, levels, total_mass, settings.parent_coverage
+    )
+    linked_node = renumber[cluster_of_mask]
+    fits, iou = mask_fits(nodes_of, S, mass, view, contributions.level, linked_node)
     # Nesting may remove the Gaussians that a node's masks show; the node still needs a crop.
     fit = np.where(linked_node == NONE, 0.0, np.maximum(iou, MIN_IOU))
-    score = (np.sqrt(contributions.area_px) * fit).astype(np.float32)
     if join_wholes:  # a piece's mask has a low IoU with the joined whole, but still shows the whole
         pieces = contributions.rows_of(Level.WHOLE)
         fits[pieces] = linked_node[pieces]
-    towards = contributions.centres()[view] - centroid[linked_node] if num else np.zeros((len(view), 3))
-    towards = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
-    return SemanticTree(
+    return described_tree(
+        node_of_gaussian=nodes_of,
+        membership=membership,
         level=levels,
         parent=parent,
-        clip=np.zeros((num, 0), np.float32),
-        centroid=centroid,
-        box=box,
-        oriented_box=oriented,
-        quality=np.array(quality, np.float32)[occupied],
-        views=(view_area > 0).sum(axis=1).astype(np.int32),
-        node_of_gaussian=node_of_gaussian,
-        membership=membership,
+        quality=np.array(quality, np.float32)[renumber[:-1] != NONE],
         node_of_mask=fits,
         linked_node=linked_node,
-        crop_score=score,
-        crop_rank=crop_ranks(linked_node, score, towards),
-        view_area_px=view_area.astype(np.float32),
+        crop_score=(np.sqrt(contributions.area_px) * fit).astype(np.float32),
+        means=means,
+        mass=total_mass,
+        view=view,
+        area_px=contributions.area_px,
+        centres=contributions.centres(),
         view_names=contributions.views,
         gaussians_sha256=contributions.gaussians_sha256,
         cameras_sha256=contributions.cameras_sha256,
         min_weight=contributions.min_weight,
+    )
+
+
+def nested_nodes(
+    node_of_gaussian: Int32[np.ndarray, "N 3"],
+    membership: Float32[np.ndarray, "N 3"],
+    level: UInt8[np.ndarray, " T"],
+    mass: Float[np.ndarray, " N"],
+    min_coverage: float,
+) -> tuple[
+    Int32[np.ndarray, "N 3"],
+    Float32[np.ndarray, "N 3"],
+    UInt8[np.ndarray, " t"],
+    Int32[np.ndarray, " t"],
+    Int32[np.ndarray, " T1"],
+]:
+    """Find the parents of nodes, make each child a subset of its parent, and leave out empty nodes.
+
+    Returns:
+        node of each Gaussian, memberships, level and parent of each remaining node, and the new id of each
+        node (`nodes.renumbered_without_empty`).
+    """
+    parent = node_parents(node_of_gaussian, level, mass, min_coverage)
+    nested = nest_nodes(node_of_gaussian, level, parent)
+    membership = np.where(nested == node_of_gaussian, membership, np.float32(0))
+    renumber = renumbered_without_empty(nested, len(level))
+    occupied = np.flatnonzero(renumber[:-1] != NONE)
+    return renumber[nested], membership, level[occupied], renumber[parent[occupied]], renumber
+
+
+def described_tree(
+    *,
+    means: Float[np.ndarray, "N 3"],
+    mass: Float[np.ndarray, " N"],
+    view: Int32[np.ndarray, " M"],
+    area_px: Int64[np.ndarray, " M"],
+    centres: Float[np.ndarray, "V 3"],
+    **fields: Any,
+) -> SemanticTree:
+    """Return a tree with the boxes, crop ranks and view areas of its nodes.
+
+    Args:
+        mass: visible weight of each Gaussian over all views, px.
+        view: row of each mask's view in `centres`, the camera centres, and in `view_names`.
+        fields: the other fields of `SemanticTree`.
+    """
+    linked_node, num = fields["linked_node"], len(fields["level"])
+    view_area = np.zeros((num, len(centres)), np.float64)
+    linked = np.flatnonzero(linked_node != NONE)
+    np.add.at(view_area, (linked_node[linked], view[linked]), area_px[linked])
+    centroid, box, oriented = node_boxes(fields["node_of_gaussian"], fields["level"], means, mass)
+    towards = centres[view] - centroid[linked_node] if num else np.zeros((len(view), 3))
+    towards = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+    return SemanticTree(
+        **fields,
+        clip=np.zeros((num, 0), np.float32),
+        centroid=centroid,
+        box=box,
+        oriented_box=oriented,
+        views=(view_area > 0).sum(axis=1).astype(np.int32),
+        crop_rank=crop_ranks(linked_node, fields["crop_score"], towards),
+        view_area_px=view_area.astype(np.float32),
     )
 
 
@@ -190,10 +241,7 @@ def run_semantic_tree(
         join_wholes = read_index(masks_folder, "segmenter")["segmenter"] == "graph"
         tree = build_tree(contributions, settings, threads, join_wholes, of_levels)
         per_level = {level.label: len(tree.nodes_of(level)) for level in LEVELS}
-        orphans = {
-            level.label: int((tree.parent[tree.nodes_of(level)] == NONE).sum()) for level in LEVELS[1:]
-        }
-        counts |= {**per_level, "orphans": sum(orphans.values())}
+        counts |= {**per_level, "orphans": int(((tree.parent == NONE) & (tree.level > 1)).sum())}
         if not len(tree):
             logger.warning(
                 "the semantic tree of %s has no nodes: no group of linked masks spans %d views; "
@@ -201,20 +249,27 @@ def run_semantic_tree(
                 scene,
                 settings.min_views,
             )
-        with atomic_folder(out) as folder:
-            fields = {name: value for name, value in vars(tree).items() if isinstance(value, np.ndarray)}
-            require_types(SemanticTree, fields, out / "tree.npz", LIMITS)
-            write_npz(folder / "tree.npz", **fields)
-            write_json(folder / "tree.json", {"scene": scene, "nodes": readable_nodes(tree)})
-            write_index(
-                folder,
-                index["views"],
-                scene=scene,
-                nodes=per_level,
-                orphans=orphans,
-                masks_with_node=int((tree.linked_node >= 0).sum()),
-                masks=len(contributions),
-                gaussians_sha256=contributions.gaussians_sha256,
-                cameras_sha256=contributions.cameras_sha256,
-                min_weight=contributions.min_weight,
-            )
+        write_tree(out, tree, scene, index["views"])
+
+
+def write_tree(out: Path, tree: SemanticTree, scene: str, entries: Mapping[str, Any]) -> None:
+    """Write a tree with one entry per view in its index, atomically."""
+    per_level = {level.label: len(tree.nodes_of(level)) for level in LEVELS}
+    orphans = {level.label: int((tree.parent[tree.nodes_of(level)] == NONE).sum()) for level in LEVELS[1:]}
+    with atomic_folder(out) as folder:
+        fields = {name: value for name, value in vars(tree).items() if isinstance(value, np.ndarray)}
+        require_types(SemanticTree, fields, out / "tree.npz", LIMITS)
+        write_npz(folder / "tree.npz", **fields)
+        write_json(folder / "tree.json", {"scene": scene, "nodes": readable_nodes(tree)})
+        write_index(
+            folder,
+            entries,
+            scene=scene,
+            nodes=per_level,
+            orphans=orphans,
+            masks_with_node=int((tree.linked_node >= 0).sum()),
+            masks=len(tree.linked_node),
+            gaussians_sha256=tree.gaussians_sha256,
+            cameras_sha256=tree.cameras_sha256,
+            min_weight=tree.min_weight,
+        )

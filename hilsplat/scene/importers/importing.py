@@ -94,7 +94,7 @@ def import_poses(
     names = [view.view for view in views]
     train = {path.stem for path in (known.root / "images_train").glob("*")}  # of Gaussian Grouping's data
     held_out = [view.is_test or (bool(train) and Path(view.name).stem not in train) for view, _ in posed]
-    if any(held_out):  # the source has its own split
+    if any(held_out) or source.has_split:
         split = {view: "test" if is_test else "train" for view, is_test in zip(names, held_out, strict=True)}
     else:
         split = split_views(names, settings.test_every)

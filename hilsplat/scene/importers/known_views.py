@@ -56,12 +56,14 @@ class Source:
         points: sparse points; None if the source has none.
         left_out: why a view cannot be used, by name.
         notes: what else in the source is not used, one sentence each.
+        has_split: the source lists its training views, which may be all views.
     """
 
     views: list[KnownView] = field(default_factory=list)
     points: Points | None = None
     left_out: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    has_split: bool = False
 
     def add(self, name: str, described: Callable[..., KnownView], *args: Any) -> None:
         """Add the view `described(*args)`; leave it out if its description, lens or pose is not valid."""

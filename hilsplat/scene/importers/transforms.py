@@ -84,6 +84,7 @@ def read_transforms(known: KnownPoses) -> Source:
         source.notes += KEYS.check([content, *frames], file)
         names = [str(frame.get("file_path", f"frame {number}")) for number, frame in enumerate(frames)]
         images, held_out = find_images(known.root, names), _held_out(content, names, source.notes)
+        source.has_split |= bool(content.get(SPLITS[0]))
         is_test = file != known.files[0]
         for number, (name, frame) in enumerate(zip(names, frames, strict=True)):
             replaced = FOCAL_KEYS if FOCAL_KEYS & frame.keys() else frozenset()
