@@ -6,7 +6,8 @@ of one view (`view_mp`, and `thread_mp` per thread), and per thousand Gaussians 
 `more_thousand` for all others). It also lists megabytes on disk (with caches) per megapixel of all views and
 per thousand Gaussians (for fields: times latent channels). These estimates exceed the peaks in Snakemake's
 `benchmark:` records (tests/unit/workflow/peak_memory.tsv; `source` and `train_models` were not measured).
-Times were measured on benchmark scenes and can be off by a factor of three elsewhere. A killed job is retried with twice the memory and time limit.
+Times were measured on benchmark scenes and can be off by a factor of three elsewhere. A killed job is retried
+with twice the memory and time limit.
 """
 
 import csv
