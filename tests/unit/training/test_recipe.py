@@ -8,6 +8,7 @@ from hilsplat.base.errors import SceneError, SettingsError
 from hilsplat.datasets.hierarchy import AnnotatedNode
 from hilsplat_world.render import label_view
 from hilsplat_world.scenes.kinds import KINDS
+from models.training import render
 from models.training.cameras import training_camera
 from models.training.card import RECORD, digests
 from models.training.render import phrases_of, scene_of_seed, training_seeds
@@ -52,7 +53,8 @@ def test_an_unknown_stage_of_training_is_refused(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_recipe_writes_both_models_and_resumes_from_its_cache(tmp_path):
+def test_the_recipe_writes_both_models_and_resumes_from_its_cache(tmp_path, monkeypatch):
+    monkeypatch.setattr(render, "DRAWS", 1)  # of the vocabulary
     small = TrainingSettings(
         scenes=4, views=1, validation_scenes=2, sam_minutes=0, sam_steps=2, clip_minutes=0, clip_steps=2,
         segmented_views=1,
