@@ -10,6 +10,8 @@ import pytest
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
+from tests import lazy_checks
+
 PROJECT = Path(__file__).resolve().parents[1]
 
 UNCHECKED = (
@@ -26,7 +28,7 @@ packages = ("cpusplat", "hilsplat", "hilsplat_world", "models/training")
 sources = [path for package in packages for path in (PROJECT / package).rglob("[!_]*.py")]
 files = [path.relative_to(PROJECT).with_suffix("") for path in sources]
 checked = [name for name in map(".".join, (file.parts for file in files)) if not name.startswith(UNCHECKED)]
-install_import_hook(checked, "beartype.beartype")
+install_import_hook(checked, f"{lazy_checks.__name__}.checked")
 
 # Two test processes with two threads each on two cores are five times as slow.
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
