@@ -215,11 +215,13 @@ def _merged_run(begin, end, first, ids, values, root, place_of, self_a, self_b):
             own_extra += more
         elif place_of[c] < 0:
             place_of[c] = last
-            ids[last], values[last, 0], values[last, 1] = c, value, more
+            ids[last], values[last, 0], values[last, 1], values[last, 2] = c, value, more, values[k, 2]
             last += 1
         else:
-            values[place_of[c], 0] += value
-            values[place_of[c], 1] += more
+            at = place_of[c]
+            values[at, 0] += value
+            values[at, 1] += more
+            values[at, 2] = max(values[at, 2], values[k, 2])
     return last, own_inter, own_extra
 
 
@@ -286,13 +288,14 @@ def neighbour_runs(indptr, indices, sums):
     start = np.cumsum(start)[:num]
     stop = start.copy()
     room = 2 * len(indices) + len(indices) // 2 + 1024
-    ids, values = np.empty(room, np.int32), np.empty((room, 2))
+    ids, values = np.empty(room, np.int32), np.empty((room, 3))
     for a in range(num):  # rows in order, so that each run's neighbours are also in order
         for k in range(indptr[a], indptr[a + 1]):
             b = np.int64(indices[k])
             for own, other in ((a, b), (b, a)):
                 ids[stop[own]] = other
-                values[stop[own]] = sums[k]
+                values[stop[own], :2] = sums[k]
+                values[stop[own], 2] = np.inf
                 stop[own] += 1
     return start, stop, ids, values
 
@@ -303,31 +306,45 @@ def _best_neighbour(i, neighbours, size_of_i, sizes, members, place_of):
 
     On a tie, the lowest row is returned. The run's marks in `place_of` are cleared.
 
-    A union is at least its terms that need no size of the neighbour. This bounds the IoU of most neighbours
-    below the best, so that their sizes, which are far apart in memory, aren't read.
+    The third value of an entry bounds its IoU, because joining never creates a better pair. A union is at
+    least its terms that need no size of the neighbour, which also bounds the IoU. Most neighbours are below
+    the best by these bounds, so that their sizes, which are far apart in memory, aren't read.
     """
     start, stop, ids, values = neighbours
-    member_start, member_stop, views, counts = members
-    bound = np.empty(stop[i] - start[i])
-    for k in range(len(bound)):
-        j = ids[start[i] + k]
-        place_of[j] = -1
-        least = values[start[i] + k, 1]
-        for m in range(member_start[j], member_stop[j]):
-            least += size_of_i[views[m]] * counts[m, 0]
-        bound[k] = values[start[i] + k, 0] / least * (1 + ROUNDING) if least > 0.0 else np.inf
+    first, last = start[i], stop[i]
+    promising = first
+    for k in range(first, last):
+        place_of[ids[k]] = -1
+        if values[k, 2] == np.inf:
+            values[k, 2] = _bound(ids[k], values[k], size_of_i, members)
+        if values[k, 2] > values[promising, 2]:
+            promising = k
     best, score = -1, -1.0
-    for k in range(-1, len(bound)):
-        entry = np.argmax(bound) if k < 0 < len(bound) else k  # the most promising first
-        if entry < 0 or bound[entry] < score:
+    for k in range(first - 1, last if first < last else first - 1):
+        entry = promising if k < first else k
+        if values[entry, 2] < score:
             continue
-        j = ids[start[i] + entry]
-        union = _union(i, j, values[start[i] + entry, 1], size_of_i, sizes, members)
+        j = ids[entry]
+        values[entry, 2] = min(values[entry, 2], _bound(j, values[entry], size_of_i, members))
+        if values[entry, 2] < score:
+            continue
+        union = _union(i, j, values[entry, 1], size_of_i, sizes, members)
         if union > 0.0:
-            pooled = values[start[i] + entry, 0] / union
+            pooled = values[entry, 0] / union
+            values[entry, 2] = pooled * (1 + ROUNDING)
             if pooled > score or (pooled == score and j < best):
                 best, score = j, pooled
     return best, score
+
+
+@compiled
+def _bound(j, value, size_of_i, members):
+    """Return an upper bound of the IoU with neighbour `j`, from the terms of the union without its sizes."""
+    start, stop, views, counts = members
+    least = value[1]
+    for m in range(start[j], stop[j]):
+        least += size_of_i[views[m]] * counts[m, 0]
+    return value[0] / least * (1 + ROUNDING) if least > 0.0 else np.inf
 
 
 @compiled
@@ -385,12 +402,12 @@ def link(neighbours, best, score, sizes, members, num_views, threshold, root, wi
     """Merge clusters in place; afterwards `root` is the lowest row of each mask's cluster.
 
     Three sets of runs (start, stop, ids, values) describe the clusters. `neighbours`: the neighbour, the sum
-    of intersections, and the sum of the differences between the unions of stored pairs and `sizes` (never
-    positive, because sizes count the overlap of two masks twice). `sizes`: the view, and the cluster's size
-    there. `members`: the view, and the number of the cluster's masks there. The union of two clusters is the
-    second sum plus, over views, the size of each cluster in the view times the number of the other cluster's
-    masks there. Neighbours merged after a run was written are summed when it is next read. Runs of a merged
-    cluster are written at the end.
+    of intersections, the sum of the differences between the unions of stored pairs and `sizes` (never
+    positive, because sizes count the overlap of two masks twice), and a bound of the IoU. `sizes`: the view,
+    and the cluster's size there. `members`: the view, and the number of the cluster's masks there. The union
+    of two clusters is the second sum plus, over views, the size of each cluster in the view times the number
+    of the other cluster's masks there. Neighbours merged after a run was written are summed when it is next
+    read. Runs of a merged cluster are written at the end.
     """
     num = len(root)
     alive = np.ones(num, np.bool_)
