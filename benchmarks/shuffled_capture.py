@@ -27,7 +27,7 @@ from hilsplat.evaluate.stage import scene_from_true
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.colmap import pose_matrix, pycolmap
 from hilsplat.scene.features import find_matches, lenses_of, prepare_images
-from hilsplat.scene.poses import map_views
+from hilsplat.scene.mapping import map_views
 from hilsplat.settings import PosesSettings
 from hilsplat_world.paints import Paint
 from hilsplat_world.render import render_view

@@ -28,7 +28,7 @@ from hilsplat.settings import PosesSettings
 logger = logging.getLogger(__name__)
 
 LARGE_CAPTURE = 100
-"""Number of views above which matcher "auto" tries likely pairs only, and mapping refines all poses less."""
+"""Number of views above which matcher "auto" tries likely pairs only, and mapping refines poses less."""
 
 MIN_INLIERS = 12
 """Minimum number of verified matches per pair (COLMAP: 15)."""

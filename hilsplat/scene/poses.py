@@ -20,32 +20,20 @@ from hilsplat.base.removal import delete
 from hilsplat.scene.assemble import Posed, PosedView, split_views, write_scene
 from hilsplat.scene.colmap import camera_of, pose_matrix, pycolmap, reprojection_errors, sparse_points
 from hilsplat.scene.features import (
-    LARGE_CAPTURE,
     MIN_INLIERS,
     WorkImage,
     count_matches,
     find_matches,
-    incremental_options,
     lenses_of,
     prepare_images,
 )
 from hilsplat.scene.importers.importing import import_poses
 from hilsplat.scene.layouts import find_known_poses, photo_folder
+from hilsplat.scene.mapping import map_views
 from hilsplat.scene.sheet import MIN_PHOTOS
 from hilsplat.settings import PosesSettings
 
 logger = logging.getLogger(__name__)
-
-INIT_MIN_INLIERS = 50
-"""Minimum number of matches in a model's first pair (COLMAP: 100)."""
-
-POSE_MIN_INLIERS = 15
-"""Minimum number of visible points needed to pose each additional view (COLMAP: 30)."""
-
-GLOBAL_RATIO = 1.4
-GLOBAL_REFINEMENTS = 2
-"""In a large capture, all poses are refined whenever the model has grown by this factor, in at most this many
-passes (COLMAP: 1.1 and 5); local refinement after each view is unchanged."""
 
 LOST_PICTURE = "not_registered.png"
 """Picture written beside the scene folder if too few photographs were registered."""
@@ -172,45 +160,6 @@ def _reconstruct(
         views.append(PosedView(image.name, file, camera_of(image), pose))
     split = split_views([view.view for view in views], settings.test_every)
     return views, sparse_points(model), split, report
-
-
-def map_views(
-    database: Path, images: Path, folder: Path, mapper: str, seed: int
-) -> list[pycolmap.Reconstruction]:
-    """Run the mapper on one thread with fixed seeds, and return its models, largest first.
-
-    Despite `min_model_size`, the mapper may return a model of two views; such models are dropped.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    if mapper == "incremental":
-        options = incremental_options(seed)
-        options.min_model_size = MIN_PHOTOS
-        options.mapper.init_min_num_inliers = INIT_MIN_INLIERS
-        options.mapper.abs_pose_min_num_inliers = POSE_MIN_INLIERS
-        with pycolmap.Database.open(database) as opened:
-            is_large = opened.num_images() > LARGE_CAPTURE
-        if is_large:
-            options.ba_global_frames_ratio = options.ba_global_points_ratio = GLOBAL_RATIO
-            options.ba_global_max_refinements = GLOBAL_REFINEMENTS
-        models = pycolmap.incremental_mapping(database, images, folder, options)
-    else:
-        models = pycolmap.global_mapping(database, images, folder, _global_options(seed))
-    large_enough = [model for _, model in sorted(models.items()) if model.num_reg_images() >= MIN_PHOTOS]
-    return sorted(large_enough, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
-
-
-def _global_options(seed: int) -> pycolmap.GlobalPipelineOptions:
-    options = pycolmap.GlobalPipelineOptions()
-    mapper = options.mapper
-    options.num_threads = mapper.num_threads = 1
-    mapper.bundle_adjustment.ceres.solver_options.num_threads = 1
-    options.min_num_matches = MIN_INLIERS
-    options.min_model_size = MIN_PHOTOS
-    options.random_seed = mapper.random_seed = mapper.rotation_averaging.random_seed = seed
-    mapper.global_positioning.random_seed = mapper.retriangulation.random_seed = seed
-    mapper.global_positioning.use_gpu = False
-    mapper.bundle_adjustment.ceres.use_gpu = False
-    return options
 
 
 def registration_report(

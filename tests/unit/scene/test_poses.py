@@ -11,6 +11,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from hilsplat.base.errors import ImageError, RegistrationError, SceneError
 from hilsplat.base.images import read_image
+from hilsplat.scene import mapping
 from hilsplat.scene.features import WorkImage, exif_focal_px, exif_time, lenses_of, prepare_images
 from hilsplat.scene.posed_images import PosedImage, write_posed_images
 from hilsplat.scene.poses import check_registration, name_neighbours, plot_lost, run_poses
@@ -202,21 +203,34 @@ def test_an_unrelated_photograph_is_shown_in_the_report(tmp_path):
     assert not (tmp_path / "not_registered.png").exists()
 
 
-def test_captures_of_one_place_join_and_photographs_of_another_place_are_named(tmp_path):
+@pytest.mark.parametrize(("counts", "large"), [((5, 4, 3), 100), ((7, 6, 10), 12)])
+def test_captures_of_one_place_join_and_photographs_of_another_place_are_named(
+    tmp_path, monkeypatch, counts, large
+):
+    monkeypatch.setattr(mapping, "LARGE_CAPTURE", large)  # the second captures are large
     photos = tmp_path / "photos"
     photos.mkdir()
-    for capture, views, step_deg, place in (("a", 5, 9, 1), ("b", 4, 12, 1), ("c", 3, 9, 2)):
-        for view in plane_views(tmp_path / capture, views, step_deg=step_deg, place=place).names:
+    turns = {}
+    for capture, views, step_deg, place in zip("abc", counts, (9, 8, 9), (1, 1, 2), strict=True):
+        cameras = plane_views(tmp_path / capture, views, step_deg=step_deg, place=place)
+        for view in cameras.names:
             (tmp_path / capture / view).rename(photos / f"{capture}{view}")
-    first = tmp_path / "first"
+            turns[capture + view] = cameras[view].cam_from_world[:3, :3]
+    settings, first = PosesSettings(matcher="retrieval", min_registered_share=0.5), tmp_path / "first"
     for out, threads in ((first, 1), (tmp_path / "second", 2)):
-        run_poses(photos, out, "w/c", "metre", True, PosesSettings(matcher="retrieval"), 0, threads)
+        run_poses(photos, out, "w/c", "metre", True, settings, 0, threads)
     report = json.loads((first / "registration.json").read_text())
-    assert report["groups"] == [9, 3] and report["registered"] == 9
-    assert "2 groups of photographs share no verified matches (9, 3 views)" in report["warnings"]
+    joined, other = sum(counts[:2]), counts[2]
+    assert report["groups"] == report["models"] == [joined, other] and report["registered"] == joined
+    warning = f"2 groups of photographs share no verified matches ({joined}, {other} views)"
+    assert warning in report["warnings"]
     lost = {view: entry["why_not"] for view, entry in report["views"].items() if not entry["registered"]}
-    assert list(lost) == ["c000.png", "c001.png", "c002.png"]
-    assert all("another place" in why and "group of 3 photographs" in why for why in lost.values())
+    assert list(lost) == [f"c{row:03d}.png" for row in range(other)]
+    assert all("another place" in why and f"group of {other} photographs" in why for why in lost.values())
+    cameras = Scene.load(first).cameras
+    for view in cameras.names:  # relative turns don't depend on the scene's coordinates
+        found = cameras[view].cam_from_world[:3, :3] @ cameras["a000.png"].cam_from_world[:3, :3].T
+        np.testing.assert_allclose(found, turns[view] @ turns["a000.png"].T, atol=0.02)
     for file in first.rglob("*.*"):
         assert file.read_bytes() == (tmp_path / "second" / file.relative_to(first)).read_bytes(), file
 
