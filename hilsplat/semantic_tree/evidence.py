@@ -87,7 +87,14 @@ def mask_evidence(
     parts = over_ranges(shared_pairs, num_views, threads, masks, *rest)
     drop_small(row_start, least, sizes)
     *of_pairs, best, score = (list(part) for part in zip(*parts, strict=True))
-    counts, indices, sums = (np.concatenate(part) for part in of_pairs)
+    parts.clear()
+
+    def joined(some: list[np.ndarray]) -> np.ndarray:
+        whole = np.concatenate(some)
+        some.clear()  # pairs take much memory
+        return whole
+
+    counts, indices, sums = map(joined, of_pairs)
     indptr = np.concatenate([[0], np.cumsum(counts)])
     top = np.argmax(score, axis=0), np.arange(num)  # the first of equal parts has the lowest partners
     best_of = np.stack(best)[top], np.stack(score)[top]

@@ -4,38 +4,46 @@ Everything is sparse: only masks that share Gaussians can be joined, and the mut
 is summed over the views of their members. The run time grows with the number of pairs that share Gaussians.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Float, Int64
 
 from hilsplat.semantic_tree.evidence import Evidence
 from hilsplat.semantic_tree.kernels import link, neighbour_runs
 
+Linkage = tuple[Int64[np.ndarray, " M"], Float[np.ndarray, " K"]]
+"""Cluster of each mask, numbered by first appearance, and each cluster's pooled IoU over its own pairs (0 for
+one mask)."""
 
-def pooled_linkage(
-    evidence: Evidence, threshold: float
-) -> tuple[Int64[np.ndarray, " M"], Float[np.ndarray, " K"]]:
+
+def pooled_linkage(evidence: Evidence, threshold: float) -> Linkage:
     """Join clusters while the best pair's pooled IoU is at least the threshold.
 
     The IoU of two clusters is the sum of intersections divided by the sum of unions, over all pairs of a mask
     of one and a mask of the other. Pooling is reducible (joining never creates a better pair), so one nearest
     neighbour per cluster suffices. On a tie, the pair with the lowest rows is joined.
-
-    Returns:
-        cluster of each mask, numbered by first appearance, and each cluster's pooled IoU over its
-        own pairs (0 for a single mask).
     """
+    return prepared_linkage(evidence, threshold)()
+
+
+def prepared_linkage(evidence: Evidence, threshold: float) -> Callable[[], Linkage]:
+    """Return `pooled_linkage` as a function that can be called once and doesn't keep the evidence's pairs."""
     num = len(evidence.view)
     first, starts = np.arange(num), evidence.size_indptr
     # the bounds of both runs of a cluster, side by side because they are read together, in random order
     bounds = np.stack([starts[:-1], starts[1:], first, first + 1], axis=1)
     sizes = bounds[:, 0], bounds[:, 1], evidence.size_views, evidence.sizes[:, None]
     members = bounds[:, 2], bounds[:, 3], evidence.view, np.ones((num, 1))
-    neighbours = neighbour_runs(evidence.indptr, evidence.indices, evidence.sums)
-    within = np.zeros((2, num))
-    root = np.arange(num)
-    best = evidence.best.copy(), evidence.score.copy()
-    link(neighbours, *best, sizes, members, evidence.num_views, float(threshold), root, within)
-    # A root is the lowest row of its cluster, so sorting roots numbers clusters by first appearance.
-    tops, cluster = np.unique(root, return_inverse=True)
-    quality = within[0, tops] / np.where(within[1, tops] > 0, within[1, tops], 1.0)
-    return cluster.astype(np.int64), quality
+    best, num_views = (evidence.best.copy(), evidence.score.copy()), evidence.num_views
+    neighbours = [neighbour_runs(evidence.indptr, evidence.indices, evidence.sums)]
+
+    def linkage() -> Linkage:
+        root, within = np.arange(num), np.zeros((2, num))
+        link(neighbours.pop(), *best, sizes, members, num_views, float(threshold), root, within)
+        # A root is the lowest row of its cluster, so sorting roots numbers clusters by first appearance.
+        tops, cluster = np.unique(root, return_inverse=True)
+        quality = within[0, tops] / np.where(within[1, tops] > 0, within[1, tops], 1.0)
+        return cluster.astype(np.int64), quality
+
+    return linkage

@@ -13,12 +13,15 @@ from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.contributions.compositing import column_sums
 from hilsplat.semantic_tree.evidence import Evidence, mask_evidence
 from hilsplat.semantic_tree.kernels import add_views, divide_by_unions
-from hilsplat.semantic_tree.linkage import pooled_linkage
+from hilsplat.semantic_tree.linkage import prepared_linkage
 from hilsplat.semantic_tree.view_pairs import view_pairs
 from hilsplat.settings import SemanticTreeSettings
 
 MIN_VISIBLE_PX = 0.3
 """A Gaussian counts as visible in a view if its mass there exceeds this."""
+
+MAX_LINKED_MEANWHILE = 150_000
+"""A level is compared while the one above is linked, unless it has more masks: their pairs take gigabytes."""
 
 MIN_COVISIBLE = 0.2
 """Two masks are not used as evidence if each mask's view shows less than this share of the other mask."""
@@ -123,8 +126,12 @@ def linked_nodes(
     with ThreadPoolExecutor(1, "linkage") as linker:
         linked: list[Future[Any]] = []
         for rows in rows_of_levels:
-            linked.append(linker.submit(pooled_linkage, evidence(rows), settings.link_threshold))
-            wait(linked if threads == 1 else linked[:-1])  # one level ahead, because pairs need much memory
+            wait(linked if threads == 1 or len(rows) > MAX_LINKED_MEANWHILE else ())
+            found = evidence(rows)
+            wait(linked)
+            linked.append(linker.submit(prepared_linkage(found, settings.link_threshold)))
+            del found
+        wait(linked if threads == 1 else ())
         for rows, clusters in zip(rows_of_levels, linked, strict=True):
             yield nodes(rows, *clusters.result())
 
