@@ -54,8 +54,8 @@ def test_a_scene_of_langsplat_answers_after_two_commands(
         field = scores[(scores["protocol"] == "lerf/langsplat@2") & (scores["metric"] == "iou")]
         assert field["value"].mean() > 0.1, variant
     assert (project.root / "results/figures/photos/theirs/panel.png").is_file()
-    before = finished.hilsplat("query", "synthetic/tiny", "mug", "--out", str(theirs / "a"))
-    after = project.hilsplat("query", "photos/theirs", "mug", "--out", str(theirs / "b"))
+    before = finished.hilsplat("query", "synthetic/tiny", "mug", "--out", str(project.root / "a"))
+    after = project.hilsplat("query", "photos/theirs", "mug", "--out", str(project.root / "b"))
     level = [text.split("\n")[2].split()[1] for text in (before, after)]
     assert level[0] == level[1]
     # a rerun of an early stage keeps the imported masks
