@@ -43,6 +43,7 @@ VALUES = {
     "--source": "world:tabletop:1",
     "--data-root": ".",
     "--folder": SCENE,
+    "--blocks": 2,
     "--report": "made/report",
     "--out": "made/out",
 }
@@ -56,6 +57,8 @@ WORDS = {
     "export": ("photos/desk",),
     "world masks": ("photos/desk",),
     "datasets export": ("scannet/scene0000_00",),
+    "blocks split": ("photos/desk",),
+    "blocks join": ("mine",),
 }
 FAST = {
     "gaussians": ("--settings", '{"iterations": 10}'),
@@ -65,7 +68,7 @@ FAST = {
     "world make": ("--settings", '{"views": 3, "image_px": 32}'),
 }
 OUTPUTS = {"out", "report", "truth", "cache", "folder", "sheet"}
-NO_OUTPUTS = {"models check", "comparison", "cache"}
+NO_OUTPUTS = {"models check", "comparison", "cache", "blocks join"}
 """Commands whose `folder` is only read, and the one that runs in its own process below."""
 
 
