@@ -87,7 +87,7 @@ class _Rows:
 class GramBuilder:
     """Builder that sums G over parts of W, such as views; its memory grows only with the size of G.
 
-    G of more than `IN_MEMORY` Gaussians is in files, of which memory holds the pages that one part changes.
+    G of more than `IN_MEMORY` Gaussians is in files; memory holds only the pages that one part changes.
     Entries are summed in float64 in the order of the pixels, so results depend neither on the division of
     pixels into parts nor on the number of threads. A part shows about 10 % of the Gaussians of a large scene,
     so sums of known pairs are updated in place. Only late pairs, which were added since the last merge, are

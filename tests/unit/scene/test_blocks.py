@@ -82,7 +82,7 @@ def test_a_block_has_the_poses_and_the_split_of_its_scene(tmp_path):
         out = tmp_path / name
         run_poses(tmp_path / "blocks" / name, out, name, "arbitrary", False, PosesSettings(), 0, 1)
         imported = Scene.load(out)
-        assert imported.views() == list(block.owned)  # ten views, of which the settings would hold out two
+        assert imported.views() == list(block.owned)  # ten views; the settings would hold out two
         held_out += imported.views("test")
         whole_from_block = np.linalg.inv(imported.scene_from_source)
         moved = move_cameras(imported.cameras.cam_from_world, whole_from_block)

@@ -1,4 +1,4 @@
-"""Two blocks of a long shelf give the answers of the whole scene; every stage runs by its own command."""
+"""Queries of two joined blocks of a long shelf give the same answers as queries of the whole scene."""
 
 import json
 import os
