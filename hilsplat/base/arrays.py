@@ -138,9 +138,8 @@ class Scratch:
         with tempfile.TemporaryFile(dir=self._folder) as stream:
             size = count * np.dtype(dtype).itemsize
             stream.truncate(size)
-            if hasattr(
-                os, "posix_fallocate"
-            ):  # a full disk raises OSError here instead of killing the process later
+            if hasattr(os, "posix_fallocate"):
+                # A full disk raises OSError here; otherwise, writing to a page later would kill the process.
                 os.posix_fallocate(stream.fileno(), 0, size)
             mapped = mmap.mmap(stream.fileno(), 0)
         self._maps.add(mapped)

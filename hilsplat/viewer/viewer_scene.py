@@ -36,7 +36,7 @@ CACHED_RELEVANCIES = 8
 """Number of cached field relevancies (per variant, text and level), each with one byte per Gaussian."""
 
 MAX_GAUSSIANS = 10_000_000
-"""Maximum number of Gaussians; more do not fit in textures of 4096 x 16384 texels (degree 3: five texels per
+"""Maximum number of Gaussians; more do not fit in textures of 4096 x 16384 texels (degree 3: four texels per
 Gaussian) or a few GiB of memory."""
 
 logger = logging.getLogger(__name__)
