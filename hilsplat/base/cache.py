@@ -15,6 +15,7 @@ import platformdirs
 from hilsplat.base.artifacts import read_npz, write_arrays, write_text
 from hilsplat.base.atomic import existing_folder
 from hilsplat.base.errors import ArtifactError, HilsplatError
+from hilsplat.base.files import stats_of
 from hilsplat.base.lineage import sha256_of_json, visible_files
 from hilsplat.base.processes import remove_leftovers
 from hilsplat.base.removal import DIGEST, ENTRY, delete, is_tagged, tag
@@ -38,7 +39,7 @@ def size_table(folder: Path) -> str:
     """Return a text table of the cache sizes."""
     lines, total = [f"{folder}"], 0.0
     for name, files in caches(folder).items():
-        size_mib = sum(path.stat().st_size for path in files) / 2**20
+        size_mib = sum(stat.st_size for stat in stats_of(files).values()) / 2**20
         total += size_mib
         lines.append(f"{name:<14} {len(files):>7} files {size_mib:>9.1f} MiB")
     return "\n".join([*lines, f"{'all':<14} {'':>13} {total:>9.1f} MiB"])
@@ -68,13 +69,13 @@ def prune_cache(
     remove_leftovers(folder.parent if Path(folder).name == ".cache" else folder)
     names = set(chosen or prunable) - ({CHECKPOINTS} if days is None and not chosen else set())
     now, freed, deleted = time.time(), 0, 0
-    used = {
-        path: path.stat()
+    used = stats_of(
+        path
         for name, files in caches(folder).items()
         if name in names and is_tagged(folder / name)
         for path in files
         if ENTRY.fullmatch(path.relative_to(folder / name).as_posix())
-    }
+    )
     oldest_first = sorted(used, key=lambda path: (used[path].st_mtime, str(path)))
     total = sum(stat.st_size for stat in used.values())
     for path in oldest_first:

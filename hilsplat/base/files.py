@@ -1,7 +1,9 @@
 """Rules for names in paths, image lists of folders, and paths in the installed project."""
 
+import os
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path, PureWindowsPath
 
 from hilsplat.base.errors import HilsplatError
@@ -63,6 +65,24 @@ def list_files(folder: Path, suffixes: Collection[str]) -> list[Path]:
         and not path.name.startswith(".")
         and (path.is_file() or (path.is_symlink() and not path.exists()))  # reading a broken link fails later
     )
+
+
+def files_below(folder: Path) -> Iterator[Path]:
+    """Yield the files in a folder and its subfolders, also hidden ones.
+
+    Other commands may delete some meanwhile; `Path.rglob` would raise an error then.
+    """
+    for parent, _, names in os.walk(folder):
+        yield from (Path(parent, name) for name in names)
+
+
+def stats_of(paths: Iterable[Path]) -> dict[Path, os.stat_result]:
+    """Return the sizes and times of files, without those that another command has deleted meanwhile."""
+    stats = {}
+    for path in paths:
+        with suppress(FileNotFoundError):
+            stats[path] = path.stat()
+    return stats
 
 
 def name_problem(name: str) -> str | None:

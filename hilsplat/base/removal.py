@@ -15,6 +15,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from hilsplat.base.files import files_below
+
 UNFINISHED = re.compile(r"\.writing-(?P<host>[0-9a-f]{8})-[0-9a-f]{8}")
 """Name of a folder of unfinished files; it is hidden, so digests ignore it."""
 
@@ -50,7 +52,7 @@ def delete(path: Path, form: str = "") -> None:
 
 def tag(folder: Path) -> None:
     """Create a folder whose entries hilsplat may delete; one with other files is never tagged."""
-    files = (path for path in folder.rglob("*") if path.is_file() and not is_unfinished(path))
+    files = (path for path in files_below(folder) if not is_unfinished(path))
     if is_tagged(folder) or not all(ENTRY.fullmatch(path.relative_to(folder).as_posix()) for path in files):
         return
     folder.mkdir(parents=True, exist_ok=True)

@@ -12,6 +12,7 @@ from pathlib import Path
 from hilsplat.base.artifacts import provenance_path, run_command
 from hilsplat.base.atomic import was_interrupted
 from hilsplat.base.errors import ArtifactError, HilsplatError
+from hilsplat.base.files import files_below
 from hilsplat.base.lineage import Provenance, files_of, read_provenance, sha256_of_path, sizes_of
 from hilsplat.base.progress import track
 from hilsplat.models.store import model_digest
@@ -24,8 +25,9 @@ WHOLE, STALE, DAMAGED = "whole", "stale", "damaged"
 
 def records_in(results: Path) -> list[Path]:
     """Return the artifacts in a results folder that have provenance, sorted."""
-    paths = sorted(path for path in results.rglob("*.provenance.json") if ".cache" not in path.parts)
-    return [path.with_name(path.name.removesuffix(".provenance.json")) for path in paths]
+    suffix = ".provenance.json"
+    paths = (path for path in files_below(results) if path.name.endswith(suffix) and ".cache" not in path.parts)
+    return sorted(path.with_name(path.name.removesuffix(suffix)) for path in paths)
 
 
 def outdated(plan: Plan, *, every_byte: bool = False) -> dict[str, str]:

@@ -3,6 +3,7 @@
 import os
 import shutil
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -119,6 +120,22 @@ def test_files_in_folders_named_like_a_cache_are_kept(cache, tmp_path_factory):
     assert sorted(folder.rglob("*")) == before
     assert prune_cache(cache, CACHES, [], days=0.0, max_mib=0.0) == (5, 5.0)
     assert all((cache / "masks" / name).exists() for name in own)
+
+
+def test_commands_that_prune_at_once_do_not_disturb_each_other(tmp_path: Path) -> None:
+    tag(tmp_path / "masks")
+    for number in range(400):
+        path = tmp_path / f"masks/{number % 256:02x}/{number:064}.npz"
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+
+    def prune(_: int) -> str:
+        prune_cache(tmp_path, CACHES, [], days=0.0)
+        return size_table(tmp_path)
+
+    with ThreadPoolExecutor(8) as pool:
+        assert len(list(pool.map(prune, range(8)))) == 8
+    assert left(tmp_path) == []
 
 
 def test_a_link_in_a_cache_is_deleted_without_its_target(cache, tmp_path_factory):
