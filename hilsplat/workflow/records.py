@@ -26,7 +26,9 @@ WHOLE, STALE, DAMAGED = "whole", "stale", "damaged"
 def records_in(results: Path) -> list[Path]:
     """Return the artifacts in a results folder that have provenance, sorted."""
     suffix = ".provenance.json"
-    paths = (path for path in files_below(results) if path.name.endswith(suffix) and ".cache" not in path.parts)
+    paths = (
+        path for path in files_below(results) if path.name.endswith(suffix) and ".cache" not in path.parts
+    )
     return sorted(path.with_name(path.name.removesuffix(suffix)) for path in paths)
 
 
