@@ -21,26 +21,20 @@ class Evidence:
     Attributes:
         indptr: where the pairs of each mask a begin.
         indices: mask b > a of each pair, from a different view.
-        sums: intersection of each pair, and its union minus both visible sizes in `sizes`.
+        sums: of each pair, the intersection, the union minus both visible sizes in `sizes`, and the IoU.
         size_indptr: where the visible sizes of each mask begin.
         size_views: partners of the mask's view, in ascending order.
         sizes: visible size of the mask in that view, 0 if the view sees too little of the mask.
-        best: each mask's partner with the highest IoU, the lowest on a tie; -1 for none.
-        score: IoU of that pair, -1 for none.
         view: view of each mask.
-        num_views: number of views.
     """
 
     indptr: Int64[np.ndarray, " M1"]
     indices: Int32[np.ndarray, " E"]
-    sums: Float64[np.ndarray, "E 2"]
+    sums: Float64[np.ndarray, "E 3"]
     size_indptr: Int64[np.ndarray, " M1"]
     size_views: Int32[np.ndarray, " F"]
     sizes: Float64[np.ndarray, " F"]
-    best: Int64[np.ndarray, " M"]
-    score: Float64[np.ndarray, " M"]
     view: Int32[np.ndarray, " M"]
-    num_views: int
 
 
 def mask_evidence(
@@ -86,7 +80,7 @@ def mask_evidence(
     rest = partners, sizes, least, pairs.min_iou
     parts = over_ranges(shared_pairs, num_views, threads, masks, *rest)
     drop_small(row_start, least, sizes)
-    *of_pairs, best, score = (list(part) for part in zip(*parts, strict=True))
+    of_pairs = [list(part) for part in zip(*parts, strict=True)]
     parts.clear()
 
     def joined(some: list[np.ndarray]) -> np.ndarray:
@@ -96,6 +90,4 @@ def mask_evidence(
 
     counts, indices, sums = map(joined, of_pairs)
     indptr = np.concatenate([[0], np.cumsum(counts)])
-    top = np.argmax(score, axis=0), np.arange(num)  # the first of equal parts has the lowest partners
-    best_of = np.stack(best)[top], np.stack(score)[top]
-    return Evidence(indptr, indices, sums, row_start, size_views, sizes, *best_of, view, num_views)
+    return Evidence(indptr, indices, sums, row_start, size_views, sizes, view)

@@ -1,15 +1,11 @@
 """Compiled loops of evidence, linkage and the pixels of nodes."""
 
+import heapq
+
 import numpy as np
 
 from cpusplat.compiled import compiled
 from hilsplat.contributions.kernels import enlarged
-
-ROUNDING = 1e-9
-"""Bounds are raised by this share, which is far more than the rounding errors of sums."""
-
-ROWS_OF_A_BLOCK = 256
-"""Rows per block; the best score of each block is stored, so finding the best row requires few reads."""
 
 
 @compiled
@@ -118,16 +114,14 @@ def shared_pairs(begin, end, masks, pairs, seen, least, min_iou):
     """Return the pairs of masks a < b with an IoU of at least `min_iou`, for masks a of views begin..end.
 
     Returns:
-        number of pairs per mask a, masks b, and two sums per pair: the intersection, and the union minus the
-        sizes of both masks (0 if the other view shows less than `least` of the mask); and, of all masks,
-        the best partner and IoU among these pairs (-1 for none; on a tie, the lowest partner).
+        number of pairs per mask a, masks b, and three numbers per pair: the intersection, the union minus the
+        sizes of both masks (0 if the other view shows less than `least` of the mask), and the IoU.
     """
     starts, (indptr, indices, share), importance = masks
     (pair_indptr, partners, mirror), row_start = pairs
     number = np.full(len(importance), -1, np.int32)
     counts = np.zeros(starts[end] - starts[begin], np.int64)
-    out, out_sums = np.empty(1024, np.int32), np.empty((1024, 2))
-    best, score = np.full(starts[-1], -1, np.int64), np.full(starts[-1], -1.0)
+    out, out_sums = np.empty(1024, np.int32), np.empty((1024, 3))
     done = 0
     for u in range(begin, end):
         first, last = indptr[starts[u]], indptr[starts[u + 1]]
@@ -142,7 +136,7 @@ def shared_pairs(begin, end, masks, pairs, seen, least, min_iou):
                 at = lists[number[indices[k]] + 1]
                 of[at], of_weighted[at] = a - starts[u], importance[indices[k]] * share[k]
                 lists[number[indices[k]] + 1] += 1
-        from_a, to_b, sums = np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty((1024, 2))
+        from_a, to_b, sums = np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty((1024, 3))
         count = 0
         for p in range(pair_indptr[u], pair_indptr[u + 1]):
             v = partners[p]
@@ -175,12 +169,9 @@ def shared_pairs(begin, end, masks, pairs, seen, least, min_iou):
                     pooled = both / (extra + enough_b + enough_a)  # summed as in `_union`
                     if pooled < min_iou:
                         continue
-                    from_a[count], to_b[count], sums[count, 0], sums[count, 1] = a, b, both, extra
+                    from_a[count], to_b[count] = a, b
+                    sums[count, 0], sums[count, 1], sums[count, 2] = both, extra, pooled
                     count += 1
-                    if pooled > score[a]:
-                        best[a], score[a] = b, pooled
-                    if pooled > score[b]:
-                        best[b], score[b] = a, pooled
         for k in range(first, last):
             number[indices[k]] = -1
         if done + count > len(out):
@@ -195,285 +186,247 @@ def shared_pairs(begin, end, masks, pairs, seen, least, min_iou):
             out[at], out_sums[at] = to_b[k], sums[k]
             places[from_a[k] - starts[u]] += 1
         done += count
-    return counts, out[:done].copy(), out_sums[:done].copy(), best, score
-
-
-@compiled
-def _merged_run(begin, end, first, ids, values, root, place_of, self_a, self_b):
-    """Copy a run of neighbours to position `first`, and sum entries merged after it was written.
-
-    Entries copied there from an earlier run of the cluster are summed too. Entries that refer to the
-    cluster itself are omitted. Returns the end of the run and the two sums of the omitted entries.
-    """
-    own_inter, own_extra = 0.0, 0.0
-    last = first
-    for k in range(begin, end):
-        c = root[ids[k]]
-        value, more = values[k, 0], values[k, 1]
-        if c in (self_a, self_b):
-            own_inter += value
-            own_extra += more
-        elif place_of[c] < 0:
-            place_of[c] = last
-            ids[last], values[last, 0], values[last, 1], values[last, 2] = c, value, more, values[k, 2]
-            last += 1
-        else:
-            at = place_of[c]
-            values[at, 0] += value
-            values[at, 1] += more
-            values[at, 2] = max(values[at, 2], values[k, 2])
-    return last, own_inter, own_extra
-
-
-@compiled
-def _united_run(a, b, first, runs):
-    """Write the sum of two runs with ascending ids to `first` as the run of `a`, and return its end."""
-    start, stop, ids, values = runs
-    at_a, at_b, last = start[a], start[b], first
-    while at_a < stop[a] or at_b < stop[b]:
-        use_a = at_a < stop[a] and (at_b == stop[b] or ids[at_a] <= ids[at_b])
-        use_b = at_b < stop[b] and (at_a == stop[a] or ids[at_b] <= ids[at_a])
-        ids[last] = ids[at_a] if use_a else ids[at_b]
-        values[last, 0] = (values[at_a, 0] if use_a else 0.0) + (values[at_b, 0] if use_b else 0.0)
-        at_a += use_a
-        at_b += use_b
-        last += 1
-    start[a], stop[a] = first, last
-    return last
-
-
-@compiled
-def _unpack_sizes(i, sizes, out, fill):
-    """Write a cluster's sizes to their views in `out`, or zeros if `fill` is false."""
-    start, stop, views, values = sizes
-    for k in range(start[i], stop[i]):
-        out[views[k]] = values[k, 0] if fill else 0.0
-
-
-@compiled
-def _union(i, j, extra, size_of_i, sizes, members):
-    """Return `extra` plus, view by view, each cluster's size times the number of the other's masks there."""
-    start, stop, size_views, size_values = sizes
-    member_start, member_stop, views, counts = members
-    num_views, first, last = len(size_of_i), start[j], stop[j]
-    at_i, end_i, at_j, end_j = member_start[i], member_stop[i], member_start[j], member_stop[j]
-    union = extra
-    while at_i < end_i or at_j < end_j:
-        view_i = views[at_i] if at_i < end_i else num_views
-        view_j = views[at_j] if at_j < end_j else num_views
-        more = 0.0
-        if view_j <= view_i:
-            more = size_of_i[view_j] * counts[at_j, 0]
-            at_j += 1
-        if view_i <= view_j:
-            at = first + view_i
-            if last - first < num_views:  # some views are left out
-                at = first + np.searchsorted(size_views[first:last], view_i)
-            if at < last and size_views[at] == view_i:
-                more += size_values[at, 0] * counts[at_i, 0]
-            at_i += 1
-        union += more
-    return union
+    return counts, out[:done].copy(), out_sums[:done].copy()
 
 
 @compiled
 def neighbour_runs(indptr, indices, sums):
-    """Return runs of neighbours for `link` (start, stop, ids, values), with 25 % spare room."""
+    """Return each mask's neighbours in ascending order for `link`: start, stop, ids, values."""
     num = len(indptr) - 1
     start = np.zeros(num + 1, np.int64)
     for a in range(num):
         start[a + 1] += indptr[a + 1] - indptr[a]
         for k in range(indptr[a], indptr[a + 1]):
             start[indices[k] + 1] += 1
-    start = np.cumsum(start)[:num]
-    stop = start.copy()
-    room = 2 * len(indices) + len(indices) // 2 + 1024
-    ids, values = np.empty(room, np.int32), np.empty((room, 3))
-    for a in range(num):  # rows in order, so that each run's neighbours are also in order
+    start = np.cumsum(start)
+    stop = start[:num].copy()
+    ids, values = np.empty(start[num], np.int32), np.empty((start[num], 2))
+    for a in range(num):
         for k in range(indptr[a], indptr[a + 1]):
             b = np.int64(indices[k])
             for own, other in ((a, b), (b, a)):
                 ids[stop[own]] = other
-                values[stop[own], :2] = sums[k]
-                values[stop[own], 2] = np.inf
+                values[stop[own], 0], values[stop[own], 1] = sums[k, 0], sums[k, 1]
                 stop[own] += 1
-    return start, stop, ids, values
+    return start[:num].copy(), stop, ids, values
 
 
 @compiled
-def _best_neighbour(i, neighbours, size_of_i, sizes, members, place_of):
-    """Return the neighbour with the best pooled IoU in a run of `_merged_run` (-1: none), and that IoU.
+def _sums_with(i, j, neighbours, following, cluster):
+    """Return a cluster's two sums with cluster `j`; its runs of neighbours are a chain from `i`."""
+    start, stop, ids, values = neighbours
+    both, extra, run = 0.0, 0.0, i
+    while run >= 0:
+        for k in range(start[run], stop[run]):
+            if cluster[ids[k]] == j:
+                both += values[k, 0]
+                extra += values[k, 1]
+        run = following[run]
+    return both, extra
 
-    On a tie, the lowest row is returned. The run's marks in `place_of` are cleared.
 
-    The third value of an entry bounds its IoU, because joining never creates a better pair. A union is at
-    least its terms that need no size of the neighbour, which also bounds the IoU. Most neighbours are below
-    the best by these bounds, so that their sizes, which are far apart in memory, aren't read.
+@compiled
+def _shorten(i, j, neighbours, following, cluster, place_of):
+    """Shorten a cluster's runs before it joins `j`; return the number of neighbours left, and the last run.
+
+    Neighbours that have been joined become one, and `j`, the cluster itself and empty runs are dropped.
     """
     start, stop, ids, values = neighbours
-    first, last = start[i], stop[i]
-    promising = first
-    for k in range(first, last):
-        place_of[ids[k]] = -1
-        if values[k, 2] == np.inf:
-            values[k, 2] = _bound(ids[k], values[k], size_of_i, members)
-        if values[k, 2] > values[promising, 2]:
-            promising = k
-    best, score = -1, -1.0
-    for k in range(first - 1, last if first < last else first - 1):
-        entry = promising if k < first else k
-        if values[entry, 2] < score:
-            continue
-        j = ids[entry]
-        values[entry, 2] = min(values[entry, 2], _bound(j, values[entry], size_of_i, members))
-        if values[entry, 2] < score:
-            continue
-        union = _union(i, j, values[entry, 1], size_of_i, sizes, members)
-        if union > 0.0:
-            pooled = values[entry, 0] / union
-            values[entry, 2] = pooled * (1 + ROUNDING)
-            if pooled > score or (pooled == score and j < best):
-                best, score = j, pooled
-    return best, score
+    total, last_run, run = 0, i, i
+    while run >= 0:
+        last = start[run]
+        for k in range(start[run], stop[run]):
+            c = cluster[ids[k]]
+            if c == i or c == j:
+                continue
+            at = place_of[c]
+            if at < 0:
+                place_of[c] = last
+                ids[last], values[last, 0], values[last, 1] = c, values[k, 0], values[k, 1]
+                last += 1
+            else:
+                values[at, 0] += values[k, 0]
+                values[at, 1] += values[k, 1]
+        stop[run] = last
+        total += last - start[run]
+        if last > start[run] and run != i:
+            following[last_run] = run
+            last_run = run
+        run = following[run]
+    following[last_run] = -1
+    run = i
+    while run >= 0:
+        for k in range(start[run], stop[run]):
+            place_of[ids[k]] = -1
+        run = following[run]
+    return total, last_run
 
 
 @compiled
-def _bound(j, value, size_of_i, members):
-    """Return an upper bound of the IoU with neighbour `j`, from the terms of the union without its sizes."""
-    start, stop, views, counts = members
-    least = value[1]
-    for m in range(start[j], stop[j]):
-        least += size_of_i[views[m]] * counts[m, 0]
-    return value[0] / least * (1 + ROUNDING) if least > 0.0 else np.inf
+def _place(view, begin, end, views):
+    """Return the place of a view in an ascending run, or where it would be, and whether it is there.
 
-
-@compiled
-def _with_room(needed, used, alive, runs):
-    """Return runs with room for `needed` entries after position `used`, and that position.
-
-    If there is none, runs of existing clusters are moved to the front, or to larger arrays.
+    The search begins in steps of growing length, because the place is usually near `begin`.
     """
+    step = 1
+    while begin + step <= end and views[begin + step - 1] < view:
+        begin += step
+        step *= 2
+    place = begin + np.searchsorted(views[begin : min(begin + step, end)], view)
+    return place, place < end and views[place] == view
+
+
+@compiled
+def _union(i, j, extra, sizes, members):
+    """Return `extra` plus, view by view, each cluster's size times the number of the other's masks there.
+
+    Only views of `i` are read, because in others it has neither a size nor a mask.
+    """
+    start, stop, size_views, size_values = sizes
+    member_start, member_stop, views, counts = members
+    at, end, member, member_end = start[i], stop[i], member_start[i], member_stop[i]
+    other, other_member = start[j], member_start[j]
+    union = extra
+    while at < end or member < member_end:
+        has_size = at < end and (member == member_end or size_views[at] <= views[member])
+        has_masks = member < member_end and (at == end or views[member] <= size_views[at])
+        more = 0.0
+        if has_size:
+            other_member, is_there = _place(size_views[at], other_member, member_stop[j], views)
+            if is_there:
+                more += size_values[at] * counts[other_member]
+            at += 1
+        if has_masks:
+            other, is_there = _place(views[member], other, stop[j], size_views)
+            if is_there:
+                more += size_values[other] * counts[member]
+            member += 1
+        union += more
+    return union
+
+
+@compiled
+def _with_room(needed, used, runs):
+    """Return runs with room for `needed` entries after position `used`, and that position."""
     start, stop, ids, values = runs
     if used + needed <= len(ids):
         return runs, used
-    living = 0
-    for i in range(len(alive)):
-        if alive[i]:
-            living += stop[i] - start[i]
-    to_ids, to_values = ids, values
-    if living + needed > len(ids):
-        room = (living + needed) * 5 // 4
-        to_ids, to_values = np.empty(room, np.int32), np.empty((room, values.shape[1]))
+    room = (np.sum(stop - start) + needed) * 5 // 4
+    to_ids, to_values = np.empty(room, np.int32), np.empty(room)
     used = 0
-    for i in np.argsort(start):  # in the order of the runs, so that none overwrites one that isn't moved yet
-        if alive[i]:
-            begin, start[i] = start[i], used
-            for k in range(begin, stop[i]):
-                to_ids[used] = ids[k]
-                to_values[used] = values[k]
-                used += 1
-            stop[i] = used
+    for i in range(len(start)):
+        begin, start[i] = start[i], used
+        for k in range(begin, stop[i]):
+            to_ids[used], to_values[used] = ids[k], values[k]
+            used += 1
+        stop[i] = used
     return (start, stop, to_ids, to_values), used
 
 
 @compiled
-def _set_score(i, value, score, block_best):
-    """Set a row's score and update the best score of its block."""
-    score[i] = value
-    block = i // ROWS_OF_A_BLOCK
-    best = -np.inf
-    for row in range(block * ROWS_OF_A_BLOCK, min((block + 1) * ROWS_OF_A_BLOCK, len(score))):
-        best = max(best, score[row])
-    block_best[block] = best
+def _unite(i, j, used, runs):
+    """Add the run of `i` to that of `j`, in place or after position `used`; return the runs and `used`."""
+    start, stop, ids, values = runs
+    more, most = (j, i) if stop[i] - start[i] > stop[j] - start[j] else (i, j)
+    place, is_inside = start[most], True
+    for k in range(start[more], stop[more]):
+        place, is_there = _place(ids[k], place, stop[most], ids)
+        is_inside = is_inside and is_there
+    if is_inside:
+        place = start[most]
+        for k in range(start[more], stop[more]):
+            place, _ = _place(ids[k], place, stop[most], ids)
+            values[place] += values[k]
+        start[j], stop[j] = start[most], stop[most]
+        start[i], stop[i] = 0, 0
+        return runs, used
+    runs, used = _with_room(stop[i] - start[i] + stop[j] - start[j], used, runs)
+    start, stop, ids, values = runs
+    at_i, at_j, last = start[i], start[j], used
+    while at_i < stop[i] or at_j < stop[j]:
+        use_i = at_i < stop[i] and (at_j == stop[j] or ids[at_i] <= ids[at_j])
+        use_j = at_j < stop[j] and (at_i == stop[i] or ids[at_j] <= ids[at_i])
+        ids[last] = ids[at_i] if use_i else ids[at_j]
+        values[last] = (values[at_i] if use_i else 0.0) + (values[at_j] if use_j else 0.0)
+        at_i += use_i
+        at_j += use_j
+        last += 1
+    start[j], stop[j] = used, last
+    start[i], stop[i] = 0, 0
+    return runs, last
 
 
 @compiled
-def _best_row(score, block_best):
-    """Return the lowest row with the best score, or -1 if there are no rows."""
-    block = np.argmax(block_best)
-    for row in range(block * ROWS_OF_A_BLOCK, min((block + 1) * ROWS_OF_A_BLOCK, len(score))):
-        if score[row] == block_best[block]:
-            return row
-    return -1
-
-
-@compiled
-def link(neighbours, best, score, sizes, members, num_views, threshold, root, within):
+def link(pairs, neighbours, sizes, members, threshold, root, within):
     """Merge clusters in place; afterwards `root` is the lowest row of each mask's cluster.
 
+    `pairs`: first mask, second mask and IoU of the pairs of masks at or above the threshold, best first.
     Three sets of runs (start, stop, ids, values) describe the clusters. `neighbours`: the neighbour, the sum
-    of intersections, the sum of the differences between the unions of stored pairs and `sizes` (never
-    positive, because sizes count the overlap of two masks twice), and a bound of the IoU. `sizes`: the view,
-    and the cluster's size there. `members`: the view, and the number of the cluster's masks there. The union
-    of two clusters is the second sum plus, over views, the size of each cluster in the view times the number
-    of the other cluster's masks there. Neighbours merged after a run was written are summed when it is next
-    read. Runs of a merged cluster are written at the end.
-    """
-    num = len(root)
-    alive = np.ones(num, np.bool_)
-    used = used_sizes = used_members = 0
-    if num:
-        used, used_sizes, used_members = neighbours[1][-1], sizes[1][-1], members[1][-1]
-    # Number of merges of each cluster, and of its best neighbour when the neighbour was found. If the
-    # neighbour has merged since, the score is only an upper bound, because joining never creates a better
-    # pair. A bound is recomputed only when it is the best score.
-    merges, best_merges = np.zeros(num, np.int64), np.zeros(num, np.int64)
-    # the masks of each cluster, as a chain from its root
-    following, final = np.full(num, -1, np.int64), np.arange(num)
-    block_best = np.full(num // ROWS_OF_A_BLOCK + 1, -np.inf)
-    for row in range(num):
-        block_best[row // ROWS_OF_A_BLOCK] = max(block_best[row // ROWS_OF_A_BLOCK], score[row])
-    place_of = np.full(num, -1, np.int64)
-    size_of = np.zeros(num_views)
-    while True:
-        top = _best_row(score, block_best)
-        if top < 0 or score[top] < threshold:
-            break
-        start, stop, ids, values = neighbours
-        if best[top] < 0 or not alive[best[top]] or merges[best[top]] != best_merges[top]:
-            stop[top], _, _ = _merged_run(
-                start[top], stop[top], start[top], ids, values, root, place_of, top, top
-            )
-            _unpack_sizes(top, sizes, size_of, True)
-            best[top], value = _best_neighbour(top, neighbours, size_of, sizes, members, place_of)
-            _unpack_sizes(top, sizes, size_of, False)
-            _set_score(top, value, score, block_best)
-            if best[top] >= 0:
-                best_merges[top] = merges[best[top]]
-            continue
-        a, b = min(top, best[top]), max(top, best[top])
+    of intersections, and the sum of the differences between the unions of stored pairs and `sizes` (never
+    positive, because sizes count the overlap of two masks twice). `sizes`: the view, and the cluster's size
+    there. `members`: the view, and the number of the cluster's masks there. The union of two clusters is the
+    second sum plus, over views, the size of each cluster in the view times the number of the other cluster's
+    masks there.
 
-        needed = stop[a] - start[a] + stop[b] - start[b]
-        neighbours, used = _with_room(needed, used, alive, neighbours)
-        start, stop, ids, values = neighbours
-        first = used
-        used, joined_inter, joined_extra = _merged_run(
-            start[a], stop[a], used, ids, values, root, place_of, a, b
-        )
-        used, _, _ = _merged_run(start[b], stop[b], used, ids, values, root, place_of, a, b)
-        for k in range(first, used):
-            place_of[ids[k]] = -1
-        start[a], stop[a] = first, used
-        within[0, a] += within[0, b] + joined_inter
-        _unpack_sizes(a, sizes, size_of, True)
-        within[1, a] += within[1, b] + _union(a, b, joined_extra, size_of, sizes, members)
-        _unpack_sizes(a, sizes, size_of, False)
-        needed = sizes[1][a] - sizes[0][a] + sizes[1][b] - sizes[0][b]
-        sizes, used_sizes = _with_room(needed, used_sizes, alive, sizes)
-        used_sizes = _united_run(a, b, used_sizes, sizes)
-        needed = members[1][a] - members[0][a] + members[1][b] - members[0][b]
-        members, used_members = _with_room(needed, used_members, alive, members)
-        used_members = _united_run(a, b, used_members, members)
-        alive[b] = False
-        following[final[a]], final[a] = b, final[b]
-        mask = b
+    Joining never creates a better pair. So two clusters need to be compared only when the best IoU of two of
+    their parts becomes the best of all, and the smaller cluster's neighbours and views suffice for that.
+    """
+    firsts, seconds, ious = pairs
+    num = len(root)
+    # a cluster has the number of one of its masks; its masks and its runs of neighbours are chains from there
+    cluster, lowest, num_masks = np.arange(num).astype(np.int32), np.arange(num), np.ones(num, np.int64)
+    following, last_mask = np.full(num, -1, np.int64), np.arange(num)
+    following_run, last_run = np.full(num, -1, np.int64), np.arange(num)  # a shortened chain keeps its first
+    num_neighbours = neighbours[1] - neighbours[0]
+    place_of = np.full(num, -1, np.int64)
+    used_sizes, used_members = len(sizes[2]), len(members[2])
+    # A comparison is outdated when one of the clusters has grown, which its number of masks shows.
+    queue = [(0.0, 0, 0, 0)]  # compared clusters: negative IoU, lowest masks, number of masks
+    queue.pop()
+    compared = {(0, 0): 0}  # two clusters -> number of masks when they were compared
+    at = 0
+    while at < len(ious) or len(queue):
+        if not len(queue) or (at < len(ious) and (-ious[at], firsts[at], seconds[at], 2) < queue[0]):
+            a, b, num_compared = np.int64(firsts[at]), np.int64(seconds[at]), 2
+            at += 1
+        else:
+            _, a, b, num_compared = heapq.heappop(queue)
+        i, j = np.int64(cluster[a]), np.int64(cluster[b])
+        if i == j:
+            continue
+        together = num_masks[i] + num_masks[j]
+        if num_neighbours[i] > num_neighbours[j]:
+            i, j = j, i
+        if num_compared != together:
+            key = min(i, j), max(i, j)
+            if key in compared and compared[key] == together:
+                continue
+            compared[key] = together
+        both, extra = _sums_with(i, j, neighbours, following_run, cluster)
+        few, many = (j, i) if sizes[1][i] - sizes[0][i] > sizes[1][j] - sizes[0][j] else (i, j)
+        union = _union(few, many, extra, sizes, members)
+        if num_compared != together:
+            if union > 0.0 and both / union >= threshold:
+                a, b = min(lowest[i], lowest[j]), max(lowest[i], lowest[j])
+                heapq.heappush(queue, (-both / union, a, b, together))
+            continue
+        within[0, j] += within[0, i] + both
+        within[1, j] += within[1, i] + union
+        sizes, used_sizes = _unite(i, j, used_sizes, sizes)
+        members, used_members = _unite(i, j, used_members, members)
+        num_masks[j] = together
+        lowest[j] = min(lowest[i], lowest[j])
+        more, last = _shorten(i, j, neighbours, following_run, cluster, place_of)
+        num_neighbours[j] += more
+        following_run[last_run[j]], last_run[j] = i, last
+        following[last_mask[j]], last_mask[j] = i, last_mask[i]
+        mask = i
         while mask >= 0:
-            root[mask] = a
+            cluster[mask] = j
             mask = following[mask]
-        merges[a] += 1
-        best[a] = -1
-        _set_score(a, max(score[a], score[b]), score, block_best)
-        _set_score(b, -np.inf, score, block_best)
+    for mask in range(num):
+        root[mask] = lowest[cluster[mask]]
+    within[:] = within[:, cluster]
 
 
 @compiled

@@ -21,26 +21,27 @@ def pooled_linkage(evidence: Evidence, threshold: float) -> Linkage:
     """Join clusters while the best pair's pooled IoU is at least the threshold.
 
     The IoU of two clusters is the sum of intersections divided by the sum of unions, over all pairs of a mask
-    of one and a mask of the other. Pooling is reducible (joining never creates a better pair), so one nearest
-    neighbour per cluster suffices. On a tie, the pair with the lowest rows is joined.
+    of one and a mask of the other. Pooling is reducible (joining never creates a better pair). On a tie, the
+    pair with the lowest rows is joined.
     """
     return prepared_linkage(evidence, threshold)()
 
 
 def prepared_linkage(evidence: Evidence, threshold: float) -> Callable[[], Linkage]:
     """Return `pooled_linkage` as a function that can be called once and doesn't keep the evidence's pairs."""
-    num = len(evidence.view)
-    first, starts = np.arange(num), evidence.size_indptr
-    # the bounds of both runs of a cluster, side by side because they are read together, in random order
-    bounds = np.stack([starts[:-1], starts[1:], first, first + 1], axis=1)
-    sizes = bounds[:, 0], bounds[:, 1], evidence.size_views, evidence.sizes[:, None]
-    members = bounds[:, 2], bounds[:, 3], evidence.view, np.ones((num, 1))
-    best, num_views = (evidence.best.copy(), evidence.score.copy()), evidence.num_views
+    num, starts, first = len(evidence.view), evidence.size_indptr, np.arange(len(evidence.view))
+    iou = evidence.sums[:, 2]
+    chosen = np.flatnonzero(iou >= threshold)
+    chosen = chosen[np.argsort(-iou[chosen], kind="stable")]
+    masks = np.searchsorted(evidence.indptr, chosen, side="right") - 1
+    pairs = masks, evidence.indices[chosen], iou[chosen]
+    sizes = starts[:-1].copy(), starts[1:].copy(), evidence.size_views.copy(), evidence.sizes.copy()
+    members = first.copy(), first + 1, evidence.view.copy(), np.ones(num)
     neighbours = [neighbour_runs(evidence.indptr, evidence.indices, evidence.sums)]
 
     def linkage() -> Linkage:
         root, within = np.arange(num), np.zeros((2, num))
-        link(neighbours.pop(), *best, sizes, members, num_views, float(threshold), root, within)
+        link(pairs, neighbours.pop(), sizes, members, float(threshold), root, within)
         # A root is the lowest row of its cluster, so sorting roots numbers clusters by first appearance.
         tops, cluster = np.unique(root, return_inverse=True)
         quality = within[0, tops] / np.where(within[1, tops] > 0, within[1, tops], 1.0)
