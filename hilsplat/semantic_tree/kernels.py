@@ -237,7 +237,7 @@ def _shorten(i, j, neighbours, following, cluster, place_of):
         last = start[run]
         for k in range(start[run], stop[run]):
             c = cluster[ids[k]]
-            if c == i or c == j:
+            if c in (i, j):
                 continue
             at = place_of[c]
             if at < 0:
