@@ -15,19 +15,15 @@ from hilsplat.scene.sheet import PHOTOS, SceneRow
 from hilsplat.stages import stage_of
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.progress import duration
-from hilsplat.workflow.resources import GUIDED, NODES, PICTURE_S, START_S, JobResources, cost_name
+from hilsplat.workflow.resources import GPU, GUIDED, NODES, PICTURE_S, START_S, JobResources
 from hilsplat.workflow.scene_data import of_variant
-
-GPU_GAIN = {"gaussians": 4, "masks": 27, "clip": 60}
-"""Rule -> speed with a GPU relative to one core. The value for `gaussians` was measured on a fit of 100,000
-Gaussians (docs/benchmarks.md), with loss and Adam on the CPU. The others are based on published times on an
-RTX 3090: SAM ViT-H's generator takes 4 s per picture, CLIP B/16 5 ms per crop."""
 
 OTHERS = "tables"  # row for jobs without a scene
 
 NOTES = (
     "Hours are scaled by how long Python takes to start here. Memory is that of the largest job.",
-    "GPU: published times of a 24 GB card for fits, SAM and CLIP; other jobs run on the CPU.",
+    f"GPU: {'measured' if GPU['measured'] else 'estimated, not measured,'} for fits, SAM and CLIP on "
+    f"{GPU['card']}; other jobs run on the CPU.",
 )
 
 KEPT_PROMPTS = 0.3  # share of the previewed prompts whose masks are decoded
@@ -40,7 +36,7 @@ class JobEstimate(NamedTuple):
     disk_mb: float
     memory_mb: int
     core_s: float
-    gpu_gain: int
+    card_s: float | None  # on a card, or None for jobs of the CPU
 
 
 class RunEstimate:
@@ -49,16 +45,24 @@ class RunEstimate:
     def __init__(self, resources: JobResources) -> None:
         self.resources = resources
         self._jobs = defaultdict[str, list[JobEstimate]](list)
+        self._candidates = set[tuple[object, ...]]()
 
     def add(self, rule: str, wildcards: Mapping[str, str], memory_mb: int) -> None:
-        gain = GPU_GAIN.get(cost_name(rule), 0)
         if "scene" not in wildcards:
-            self._jobs[OTHERS].append(JobEstimate("", 0.0, memory_mb, START_S, gain))
+            self._jobs[OTHERS].append(JobEstimate("", 0.0, memory_mb, START_S, None))
             return
         job = SimpleNamespace(**wildcards)
         scene = f"{job.dataset}/{job.scene}"
         disk_mb, core_s = self.resources.disk_mb(rule, job), self.resources.core_seconds(rule, job)
-        self._jobs[job.dataset].append(JobEstimate(scene, disk_mb, memory_mb, core_s, gain))
+        card_s, candidates = self.resources.card_seconds(rule, job), self.resources.candidates(rule, job)
+        if candidates in self._candidates:  # another variant's job leaves them in the cache
+            core_s, card_s = (
+                START_S + PICTURE_S * self.resources.size(self.resources.plan.row(job)).views,
+                None,
+            )
+        elif candidates is not None:
+            self._candidates.add(candidates)
+        self._jobs[job.dataset].append(JobEstimate(scene, disk_mb, memory_mb, core_s, card_s))
 
     def lines(self) -> list[str]:
         """Return the table; empty if nothing would run."""
@@ -84,9 +88,7 @@ def machine_scale() -> float:
 def _row(name: str, jobs: Sequence[JobEstimate], cores: int, scale: float) -> tuple[str, ...]:
     scenes = {job.scene for job in jobs if job.scene}
     core_s = scale * sum(job.core_s for job in jobs)
-    with_gpu_s = sum(
-        job.core_s / job.gpu_gain if job.gpu_gain else scale * job.core_s / cores for job in jobs
-    )
+    with_gpu_s = sum(scale * job.core_s / cores if job.card_s is None else job.card_s for job in jobs)
     return (
         name,
         str(len(scenes)) if scenes else "",

@@ -12,6 +12,7 @@ with twice the memory and time limit.
 
 import csv
 import functools
+import json
 import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -24,11 +25,12 @@ from hilsplat.base.images import opened_image
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.lineage import version_of
 from hilsplat.baselines import TrainedSettings
+from hilsplat.configuration import StageSettings
 from hilsplat.datasets.generators import GENERATORS
 from hilsplat.models.store import model_path, read_model
 from hilsplat.scene.layouts import vertex_count
 from hilsplat.scene.sheet import SceneRow
-from hilsplat.settings import MasksSettings
+from hilsplat.settings import GaussiansSettings, MasksSettings
 from hilsplat.stages import all_stages, family_of, stage_of
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.scene_data import Job
@@ -37,6 +39,13 @@ with Path(__file__).with_suffix(".tsv").open(encoding="utf-8") as _stream:
     _rows = list(csv.DictReader(_stream, delimiter="\t"))
 COSTS = {row.pop("stage"): {name: float(value) for name, value in row.items()} for row in _rows}
 """Stage -> its terms (`cost_name`)."""
+
+GPU: dict[str, Any] = json.loads(Path(__file__).with_name("gpu.json").read_text(encoding="utf-8"))
+"""Seconds on a card, as `python -m benchmarks.gpu` writes them: of a step of the fit, per step, megapixel and
+Gaussian; of a picture in SAM, by part of the model's name; of a crop in CLIP."""
+
+MEAN_SHARE = 0.75
+"""Mean number of Gaussians over a fit, as a share of the maximum, to which they grow in about half of the steps."""
 
 MP_PER_THREAD = 2.0  # megapixels of all views per thread
 
@@ -69,6 +78,12 @@ PROMPT_S, PICTURE_S, CROP_S = 0.02, 1.0, 0.3
 
 PREVIEWED, GUIDED = 0.65, 0.25
 """Relative cost of a prompt with preview, and share of the grid's prompts that guided views use."""
+
+CANDIDATES = (
+    *("model", "variant", "precision", "generator", "points_per_side", "crop_layers", "stability_offset"),
+    *("prompts", "key_views"),
+)
+"""Settings of masks that the candidates of SAM depend on."""
 
 MASKS, NODES = 230, 400
 """Typical numbers of masks per photograph and nodes per room, from `plush_bedroom` (docs/benchmarks.md)."""
@@ -183,25 +198,47 @@ class JobResources:
         """Return the estimated core seconds of a scene's job."""
         return START_S + self._seconds(cost_name(rule), *self.plan.which(job), self.size(self.plan.row(job)))
 
+    def card_seconds(self, rule: str, job: Job) -> float | None:
+        """Return the estimated seconds of a job on a card (`GPU`), or None if it has no work for one."""
+        rule, stages, (views, view_mp) = cost_name(rule), self.plan.stages(job), self.size(self.plan.row(job))
+        if rule == "gaussians":
+            steps, seen_mp = _steps_and_mp(stages.gaussians, views, view_mp)
+            per_gaussian = GPU["fit_step_s_per_gaussian"] * MEAN_SHARE * stages.gaussians.max_gaussians
+            return START_S + steps * (GPU["fit_step_s"] + GPU["fit_step_s_per_mp"] * seen_mp + per_gaussian)
+        if not self._uses_network(rule, stages):
+            return None
+        if rule == "clip":
+            return START_S + GPU["clip_crop_s"] * _crops(stages, views)
+        named = GPU["sam_picture_s"]
+        picture_s = next(cost for word, cost in named.items() if word in stages.masks.model)
+        return START_S + picture_s * views * stages.masks.key_views * _pictures(stages.masks)
+
+    def candidates(self, rule: str, job: Job) -> tuple[Any, ...] | None:
+        """Return what the candidates of a job's SAM depend on, or None; jobs of a scene share cached ones."""
+        if cost_name(rule) != "masks" or not self._uses_network("masks", stages := self.plan.stages(job)):
+            return None
+        return self.plan.row(job).name, *(getattr(stages.masks, name) for name in CANDIDATES)
+
+    def _uses_network(self, rule: str, stages: StageSettings) -> bool:
+        """Return whether a job runs a released SAM or CLIP."""
+        if rule not in EMBEDDED_S or (rule == "masks" and stages.masks.segmenter != "sam"):
+            return False
+        model = read_model(Path(getattr(stages, rule).model))
+        return model is not None and not model.embedded
+
     def _estimate(self, rule: str, variant: str, scopes: tuple[str, ...], size: Size) -> float:
         stages = self.plan.stages_of(variant, scopes)
         views, view_mp = size
         if rule == "gaussians":
             fit = stages.gaussians
-            small, half = fit.quarter_until, max(fit.half_until - fit.quarter_until, 0.0)
-            seen_mp = view_mp * fit.image_scale**2 * (small / 16 + half / 4 + max(1 - small - half, 0.0))
-            steps = min(fit.iterations, fit.steps_per_view * views)
+            steps, seen_mp = _steps_and_mp(fit, views, view_mp)
             return steps * (FIT_S_PER_MP * seen_mp + FIT_S_PER_GAUSSIAN * fit.max_gaussians)
         if rule == "masks" and stages.masks.segmenter == "graph":
             return GRAPH_S_PER_MP * views * view_mp
         if rule in EMBEDDED_S:
-            model = read_model(Path(getattr(stages, rule).model))
-            if model is None or model.embedded:
+            if not self._uses_network(rule, stages):
                 return views * EMBEDDED_S[rule]
-            if rule == "masks":
-                return views * _sam_s(stages.masks)
-            crops = NODES * stages.clip.crops_per_node
-            return CROP_S * (views * MASKS if stages.clip.crops == "masks" else crops)
+            return views * _sam_s(stages.masks) if rule == "masks" else CROP_S * _crops(stages, views)
         if rule == "method" and isinstance(stages.method, TrainedSettings):
             pixels_mp = view_mp / stages.method.pixel_step**2
             return TRAINED_S_PER_MP * len(LEVELS) * stages.method.steps * pixels_mp
@@ -241,13 +278,28 @@ class JobResources:
         return _model_memory_mb(model_path(settings.model), settings.variant, batch, threads)
 
 
+def _steps_and_mp(fit: GaussiansSettings, views: int, view_mp: float) -> tuple[int, float]:
+    """Return the steps of a fit, and the mean megapixels of a step."""
+    small, half = fit.quarter_until, max(fit.half_until - fit.quarter_until, 0.0)
+    seen_mp = view_mp * fit.image_scale**2 * (small / 16 + half / 4 + max(1 - small - half, 0.0))
+    return min(fit.iterations, fit.steps_per_view * views), seen_mp
+
+
+def _crops(stages: StageSettings, views: int) -> int:
+    return views * MASKS if stages.clip.crops == "masks" else NODES * stages.clip.crops_per_node
+
+
+def _pictures(masks: MasksSettings) -> int:
+    """Return the number of pictures per view that SAM encodes: the view and its crops."""
+    return sum(4**layer for layer in range(masks.crop_layers + 1))
+
+
 def _sam_s(masks: MasksSettings) -> float:
     """Return a full-size SAM model's core seconds for a view and its crops, times the share of key views."""
     picture_s = next((cost for word, cost in SAM_S.items() if word in masks.model), OTHER_SAM_S)
-    pictures = sum(4**layer for layer in range(masks.crop_layers + 1))
     share = 1.0 if masks.generator == "official" else PREVIEWED
     prompts = masks.points_per_side**2 * share * (GUIDED if masks.prompts == "guided" else 1.0)
-    return masks.key_views * pictures * (picture_s + PICTURE_S + prompts * PROMPT_S)
+    return masks.key_views * _pictures(masks) * (picture_s + PICTURE_S + prompts * PROMPT_S)
 
 
 def _first_mp(images: Iterable[str], max_side_px: int) -> float:

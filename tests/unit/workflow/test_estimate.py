@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 
 from hilsplat.workflow import estimate
-from hilsplat.workflow.estimate import GPU_GAIN, RunEstimate
-from hilsplat.workflow.resources import START_S, JobResources
+from hilsplat.workflow.estimate import RunEstimate
+from hilsplat.workflow.resources import NODES, PICTURE_S, START_S, JobResources, Size
 from tests.unit.workflow.plans import BENCHMARK, plan_of
 from tests.unit.workflow.test_resources import plan
 
@@ -19,6 +19,7 @@ def resources(tmp_path, monkeypatch):
     found = JobResources(plan(tmp_path, scenes=2), cores=2)
     seconds = {"gaussians": 7200.0, "poses": 720.0}
     monkeypatch.setattr(found, "core_seconds", lambda rule, job: seconds.get(rule, START_S))
+    monkeypatch.setattr(found, "card_seconds", lambda rule, job: 900.0 if rule == "gaussians" else None)
     monkeypatch.setattr(found, "disk_mb", lambda rule, job: 500.0 if rule == "gaussians" else 0.0)
     return found
 
@@ -34,8 +35,8 @@ def test_jobs_are_summed_by_data_set(resources, monkeypatch):
     run.add("table", {"table": "lerf"}, 500)
     rows = [re.split(r"\s{2,}", line) for line in run.lines()[1:5]]
     assert rows[0] == ["", "scenes", "jobs", "disk", "memory", "hours, 2 cores", "hours, GPU"]
-    # two scenes of 7920 core seconds on two cores, at twice the speed; 7200 of them by the GPU
-    gpu = (2 * 7200 / GPU_GAIN["gaussians"] + 0.5 * 720) / 3600
+    # two scenes of 7920 core seconds on two cores, at twice the speed; 7200 of them are 900 s of the card
+    gpu = (2 * 900 + 0.5 * 720) / 3600
     assert rows[1] == ["synthetic", "2", "4", "1.0 GB", "4.0 GB", "1.10", f"{gpu:.2f}"]
     assert [row[0] for row in rows[2:]] == ["tables", "all"]
     assert rows[3][1:5] == ["2", "5", "1.0 GB", "4.0 GB"]
@@ -59,6 +60,32 @@ def photographs(tmp_path, monkeypatch):
     monkeypatch.setattr("hilsplat.embed.model_check.seconds_of", lambda *inputs: seconds)
     monkeypatch.setattr(estimate.JobResources, "core_seconds", lambda self, rule, job: 75.0)
     return tmp_path
+
+
+def test_time_on_a_card_grows_with_the_work(photographs, monkeypatch):
+    """20 views of 0.5 megapixels, fit in 1,200 steps to 80,000 Gaussians."""
+    constants = {"fit_step_s": 0.001, "fit_step_s_per_mp": 0.01, "fit_step_s_per_gaussian": 1e-7}
+    constants |= {"sam_picture_s": {"huge": 0.5, "": 0.1}, "clip_crop_s": 0.002}
+    monkeypatch.setattr("hilsplat.workflow.resources.GPU", constants)
+    fit = {"iterations": 1200, "max_gaussians": 80_000, "quarter_until": 0.0, "half_until": 0.0}
+    masks = {"model": "models/sam-vit-huge", "crop_layers": 1}
+    found = plan_of(photographs, (DESK,), groups=["photos"], gaussians=fit, masks=masks)
+    resources = JobResources(found, cores=2)
+    monkeypatch.setattr(resources, "size", lambda row: Size(20, 0.5))
+    (row,) = found.scenes
+    assert resources.card_seconds("gaussians", row) == pytest.approx(START_S + 1200 * (0.001 + 0.005 + 0.006))
+    assert resources.card_seconds("masks", row) == pytest.approx(START_S + 20 * 5 * 0.5)
+    nodes = found.stages(row).clip.crops_per_node * NODES
+    assert resources.card_seconds("clip", row) == pytest.approx(START_S + 0.002 * nodes)
+    assert resources.card_seconds("field", row) is None
+    # variants that only filter the same candidates use cached ones
+    run = RunEstimate(resources)
+    job = {"dataset": "photos", "scene": "desk"}
+    for variant in ("default", "default"):
+        run.add("masks", {**job, "variant": variant}, 1000)
+    first, second = run._jobs["photos"]
+    assert (first.card_s, second.card_s) == (pytest.approx(52.0), None)
+    assert second.core_s == START_S + 20 * PICTURE_S
 
 
 def test_first_answer_and_all_photographs_are_predicted(photographs):

@@ -1,0 +1,63 @@
+"""NVIDIA cards of this machine, and a lock on each, so that jobs of several processes don't share one."""
+
+import ctypes
+import logging
+import os
+import tempfile
+import time
+from functools import cache
+from pathlib import Path
+from typing import IO
+
+from hilsplat.base.processes import lock
+
+logger = logging.getLogger(__name__)
+
+LIBRARY = "libnvidia-ml.so.1"  # of the driver; it doesn't start CUDA, which would choose a card
+
+_held: list[IO[bytes]] = []  # the lock of this process's card, until the process ends
+
+
+def cards() -> list[str]:
+    """Return the cards that this process may use, named as in `CUDA_VISIBLE_DEVICES`."""
+    named = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if named is not None:
+        return [name.strip() for name in named.split(",") if name.strip() not in ("", "-1")]
+    count = ctypes.c_uint(0)
+    try:
+        library = ctypes.CDLL(LIBRARY)
+        if library.nvmlInit_v2() == 0:
+            library.nvmlDeviceGetCount_v2(ctypes.byref(count))
+            library.nvmlShutdown()
+    except (OSError, AttributeError):  # no driver, or one from before 2011
+        return []
+    return [str(number) for number in range(count.value)]
+
+
+@cache
+def take_card(folder: Path | None = None, poll_s: float = 1.0) -> str | None:
+    """Wait for a card that no other job of this user has, and let CUDA see only that card; None without one.
+
+    It must be called before CUDA starts, and the card is kept until the process ends, even if it is killed.
+    Under Slurm, the scheduler has assigned cards, so none is taken.
+    """
+    choice = cards()
+    if not choice or "SLURM_JOB_ID" in os.environ:
+        return None
+    folder, is_waiting = folder or Path(tempfile.gettempdir()), False
+    while True:
+        for name in choice:
+            stream = (folder / f"hilsplat-{os.getuid()}-card-{name.replace('/', '_')}.lock").open("ab")
+            try:
+                lock(stream, wait=False)
+            except BlockingIOError:
+                stream.close()
+                continue
+            _held.append(stream)
+            # in the order of the driver's library; CUDA's own default is the fastest first
+            os.environ |= {"CUDA_VISIBLE_DEVICES": name, "CUDA_DEVICE_ORDER": "PCI_BUS_ID"}
+            return name
+        if not is_waiting:
+            logger.info("waiting for one of %d cards, which other jobs use", len(choice))
+            is_waiting = True
+        time.sleep(poll_s)

@@ -1,0 +1,84 @@
+"""Cards: how many a process may use, and the lock on each."""
+
+import ctypes
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from hilsplat.base import cards as module
+from hilsplat.base.cards import cards, take_card
+from tests.conftest import PROJECT
+
+HOLD = """
+import sys
+from pathlib import Path
+from hilsplat.base.cards import take_card
+print(take_card(Path(sys.argv[1]), 0.01), flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.fixture(autouse=True)
+def no_scheduler(monkeypatch):
+    monkeypatch.delenv("SLURM_JOB_ID", raising=False)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    monkeypatch.setenv("CUDA_DEVICE_ORDER", "PCI_BUS_ID")  # so that it is restored
+    take_card.cache_clear()
+    yield
+    take_card.cache_clear()
+
+
+def driver(number: int) -> SimpleNamespace:
+    """The driver's library on a machine with a number of cards."""
+
+    def count(pointer) -> int:
+        pointer._obj.value = number
+        return 0
+
+    return SimpleNamespace(nvmlInit_v2=lambda: 0, nvmlDeviceGetCount_v2=count, nvmlShutdown=lambda: 0)
+
+
+def test_the_driver_counts_the_cards_unless_the_variable_names_them(monkeypatch):
+    monkeypatch.setattr(ctypes, "CDLL", lambda name: driver(3))
+    assert cards() == ["0", "1", "2"]
+    for named, expected in (("2,0", ["2", "0"]), ("", []), ("-1", []), ("GPU-8f2a, 1", ["GPU-8f2a", "1"])):
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", named)
+        assert cards() == expected
+
+
+def test_without_a_driver_there_is_no_card(monkeypatch, tmp_path):
+    def absent(name):
+        raise OSError(f"{name}: cannot open shared object file")
+
+    monkeypatch.setattr(ctypes, "CDLL", absent)
+    assert cards() == [] and take_card(tmp_path) is None and not list(tmp_path.iterdir())
+
+
+def test_under_slurm_the_scheduler_has_chosen(monkeypatch, tmp_path):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
+    monkeypatch.setenv("SLURM_JOB_ID", "7")
+    assert take_card(tmp_path) is None and os.environ["CUDA_VISIBLE_DEVICES"] == "0"
+
+
+def holder(folder: Path, visible: str) -> subprocess.Popen:
+    environment = {**os.environ, "CUDA_VISIBLE_DEVICES": visible, "PYTHONPATH": str(PROJECT)}
+    command = [sys.executable, "-P", "-c", HOLD, str(folder)]
+    return subprocess.Popen(
+        command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+
+
+def test_jobs_get_cards_of_their_own_and_wait_for_one(tmp_path, monkeypatch, caplog):
+    caplog.set_level("INFO")
+    with holder(tmp_path, "0,1") as first, holder(tmp_path, "0,1") as second:
+        assert {first.stdout.readline(), second.stdout.readline()} == {"0\n", "1\n"}
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
+        monkeypatch.setattr(module.time, "sleep", lambda seconds: second.kill())
+        freed = take_card(tmp_path)
+        assert "waiting for one of 2 cards" in caplog.text
+        assert os.environ["CUDA_VISIBLE_DEVICES"] == freed and take_card(tmp_path) == freed
+        first.kill()
