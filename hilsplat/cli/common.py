@@ -3,12 +3,22 @@
 import logging
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from hilsplat.base.errors import ArtifactError, visible
 from hilsplat.base.progress import LOG_FORMAT, LogFormatter
+
+PANELS = {
+    "Start": ("init", "new", "run", "scenes", "settings", "doctor"),
+    "Use a scene": ("query", "view", "annotate", "export", "show-masks"),
+    "Data and models": ("models", "datasets", "blocks", "cache", "verify", "world"),
+    "Scores and tables": ("evaluate-files", "table", "figures", "comparison", "sweep-plot", "efficiency"),
+}
+"""Panels of `hilsplat --help` and their commands; all others are stages."""
+
+STAGES = "Stages, which hilsplat run starts"
 
 app = typer.Typer(
     help="Turn photographs into a 3D Gaussian scene that answers text queries at three semantic levels.",
@@ -26,6 +36,21 @@ app.add_typer(models_app, name="models")
 app.add_typer(datasets_app, name="datasets")
 app.add_typer(cache_app, name="cache")
 app.add_typer(blocks_app, name="blocks")
+
+
+def sort_into_panels() -> None:
+    """Sort the commands and groups of `app` into the panels of its help."""
+    listed = {name: panel for panel, names in PANELS.items() for name in names}
+    order = [*listed]
+
+    def name_of(info: Any) -> str:
+        return info.name or info.callback.__name__
+
+    for infos in (app.registered_commands, app.registered_groups):
+        for info in infos:
+            info.rich_help_panel = listed.get(name_of(info), STAGES)
+        infos.sort(key=lambda info: order.index(name) if (name := name_of(info)) in listed else len(order))
+
 
 Results = Annotated[Path, typer.Option(help="results folder")]
 

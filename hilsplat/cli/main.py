@@ -36,12 +36,10 @@ import typer  # noqa: E402
 from hilsplat.base.cache import use_writable_cache  # noqa: E402
 from hilsplat.base.errors import HilsplatError, require_working_directory, system_error  # noqa: E402
 from hilsplat.base.processes import end_with_workflow, keep_freed_memory  # noqa: E402
-from hilsplat.cli.common import app, echo, start_logging  # noqa: E402
+from hilsplat.cli import group_commands, scene_commands, stage_commands, user_commands  # noqa: E402, F401
+from hilsplat.cli.common import app, echo, sort_into_panels, start_logging  # noqa: E402
 
-# `hilsplat --help` lists the commands in this order.
-# isort: off
-from hilsplat.cli import scene_commands, stage_commands, user_commands, group_commands  # noqa: E402, F401
-# isort: on
+sort_into_panels()
 
 
 def main() -> None:

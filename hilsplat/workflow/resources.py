@@ -45,7 +45,7 @@ GPU: dict[str, Any] = json.loads(Path(__file__).with_name("gpu.json").read_text(
 Gaussian; of a picture in SAM, by part of the model's name; of a crop in CLIP."""
 
 MEAN_SHARE = 0.75
-"""Mean number of Gaussians over a fit, as a share of the maximum, to which they grow in about half of the steps."""
+"""Mean number of Gaussians over a fit, as a share of the maximum, reached after about half of the steps."""
 
 MP_PER_THREAD = 2.0  # megapixels of all views per thread
 

@@ -1,6 +1,7 @@
 """Links, commands, options, settings, configurations, files and functions in the documentation exist."""
 
 import ast
+import itertools
 import re
 import shlex
 from pathlib import Path
@@ -9,9 +10,11 @@ from typing import Any, get_type_hints
 import pytest
 import typer
 from jaxtyping import AbstractArray
+from typer.testing import CliRunner
 
 from hilsplat.base.arrays import described
 from hilsplat.baselines import own_settings
+from hilsplat.cli.common import PANELS, STAGES
 from hilsplat.cli.main import app
 from hilsplat.configuration import SECTIONS
 from hilsplat.contributions.rows import Contributions
@@ -180,3 +183,14 @@ def test_every_package_is_in_the_architecture_and_has_at_most_twenty_files() -> 
     assert {f"hilsplat/{room.name}/" for room in rooms} <= named
     folders = {path.parent for path in (PROJECT / "hilsplat").rglob("*.py")}
     assert {folder: count for folder in folders if (count := len(list(folder.glob("*.py")))) > 20} == {}
+
+
+def test_help_lists_commands_for_people_before_stages():
+    shown = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "200", "TERM": "dumb"}).output
+    panels = [*PANELS, STAGES]
+    assert [shown.count(f" {panel} ") for panel in panels] == [1] * len(panels)
+    assert sorted(panels, key=lambda panel: shown.index(f" {panel} ")) == panels
+    for panel, after in itertools.zip_longest(panels, panels[1:]):
+        part = shown[shown.index(f" {panel} ") : shown.index(f" {after} ") if after else None]
+        for name in PANELS.get(panel, ("poses", "masks", "field", "evaluate")):
+            assert re.search(rf"^\W*{name} ", part, re.MULTILINE), name
