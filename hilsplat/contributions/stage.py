@@ -13,7 +13,10 @@ The language field's losses and the semantic tree need no other data from the im
 """
 
 import math
+from collections.abc import Callable
+from contextlib import nullcontext
 from functools import cache as cache_calls
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +44,7 @@ from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ContributionsSettings
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
-from hilsplat.splat.rasterise.device import choose_device
+from hilsplat.splat.rasterise.device import choose_device, explained_memory
 
 MATRICES = ("A", "A_half", "S", "mass")
 PARTS = {"data": np.float32, "indices": np.int32, "indptr": np.int64}
@@ -50,6 +53,10 @@ WEIGHTS_PER_PIXEL = 40  # weights per pixel in a typical scene
 
 MAX_WEIGHTS_TOGETHER = 2**25
 """Views with more weights (256 MiB) are prepared one at a time; up to four finished views may be waiting."""
+
+
+MEMORY_USER = "a view's contributions"
+MEMORY_FIX = "lower poses.max_side_px, end other programs that use the card, or set contributions.device: cpu"
 
 
 class ArrayStream:
@@ -179,7 +186,7 @@ def run_contributions(
     gaussians_sha256, digests = sha256_of_file(gaussians_ply), digests_in(masks_folder)
     names = digests if read_index(masks_folder).get("partial") else scene.views("train")
     cameras = [scene.cameras[name] for name in names]
-    device, code = choose_device(settings.device), code_digest(run_contributions)
+    device, code = choose_device(settings.rasteriser), code_digest(run_contributions)
     inputs = {
         "code": code,
         "device": device,
@@ -192,26 +199,38 @@ def run_contributions(
     store = ViewCache(Path(cache) / "contributions", compressed=False)
     checkpoint = QuadraticCheckpoint(store.folder / "partial", keys, settings.keep)
 
+    draw: Callable[[Camera], Any]  # normalised weights of a view, on the device
+    if device == "cuda":
+        from hilsplat.contributions import device as card
+
+        draw = partial(card.drawn_weights, card.on_device(gaussians), min_weight=settings.min_weight)
+        contributions = partial(card.view_contributions, num_gaussians=len(gaussians))
+        matrix = partial(card.Entries.on_host, num_gaussians=len(gaussians))
+    else:
+
+        def draw(camera: Camera) -> sp.csr_matrix:
+            least = settings.min_weight
+            raw = pixel_weights(gaussians, camera, min_weight=least, threads=threads_each)
+            return normalised_weights(raw)
+
+        contributions, matrix = partial(view_contributions, threads=threads_each), lambda weights: weights
+
     def prepare(number: int) -> tuple[HierarchicalMasks, dict[str, np.ndarray], StackedWeights | None]:
         """Return the masks and matrices of a view, and its rows of W if they are not yet in G."""
         camera = cameras[number]
         masks = view_masks(masks_folder, camera, digests)
 
         @cache_calls
-        def weights() -> sp.csr_matrix:
-            least = settings.min_weight
-            return normalised_weights(
-                pixel_weights(gaussians, camera, min_weight=least, threads=threads_each, device=device)
-            )
+        def weights() -> Any:
+            return draw(camera)
 
-        matrices = store.get(
-            keys[number], lambda: view_contributions(camera.name, weights(), masks, threads_each)
-        )
+        matrices = store.get(keys[number], lambda: contributions(camera.name, weights(), masks))
         if settings.keep == "none" or number < summed:
             return masks, matrices, None
-        return masks, matrices, labelled_rows(weights(), label_maps(masks))
+        return masks, matrices, labelled_rows(matrix(weights()), label_maps(masks))
 
-    with stage_log("contributions", scene.name) as counts, atomic_folder(out) as folder:
+    guard = explained_memory(MEMORY_USER, MEMORY_FIX) if device == "cuda" else nullcontext()
+    with guard, stage_log("contributions", scene.name) as counts, atomic_folder(out) as folder:
         builder = QuadraticBuilder(len(gaussians), settings.keep, len(cameras), threads, folder)
         summed = checkpoint.resume(builder)
         output = Output(folder)
