@@ -62,7 +62,7 @@ def times_of(gaussians: Gaussians, camera: Camera, device: Device, threads: int)
         if device == "cpu":
             return pixel_weights(gaussians, camera, min_weight=1 / 255, threads=threads)
         g = cuda.on_device(gaussians)
-        return cuda.pixel_weights(g, cuda.CardCamera.of(camera), 1 / 255).on_host(len(gaussians))
+        return cuda.pixel_weights(g, cuda.CardCamera.of(camera), 1 / 255).on_host()
 
     return [median_ms(weights), median_ms(step)]
 

@@ -35,14 +35,12 @@ def normalised_entries(weights: Entries) -> Entries:
     covered = alpha >= MIN_ALPHA
     kept = covered[pixel]
     weight = (weights.weight / alpha[pixel]).float()
-    return Entries(starts_of(count * covered), weights.gaussian[kept], weight[kept])
+    return Entries(starts_of(count * covered), weights.gaussian[kept], weight[kept], weights.num_gaussians)
 
 
-def view_contributions(
-    view: str, weights: Entries, masks: HierarchicalMasks, num_gaussians: int
-) -> dict[str, np.ndarray]:
+def view_contributions(view: str, weights: Entries, masks: HierarchicalMasks) -> dict[str, np.ndarray]:
     """Return what `view_matrices.view_contributions` returns for the same normalised weights."""
-    device, maps = weights.weight.device, label_maps(masks)
+    device, maps, num_gaussians = weights.weight.device, label_maps(masks), weights.num_gaussians
     labels, half, level, *runs = (
         torch.from_numpy(array).to(device)
         for array in (maps, random_half(view, len(maps)), masks.level.astype(np.int64) - 1, *_runs(masks))
@@ -61,7 +59,7 @@ def view_contributions(
         parts = torch.stack([torch.ones_like(painted), painted, painted & half[at]], dim=1)
         pair, length = pair.unique_consecutive(return_counts=True)
         terms = parts * weights.weight[entry[order]].double()[:, None]
-        sums.append(torch.segment_reduce(terms, "sum", lengths=length, axis=0))
+        sums.append(torch.segment_reduce(terms, "sum", lengths=length, axis=0, unsafe=True))
         pairs.append(pair)
     pair = torch.cat(pairs)
     covered = weights.start.diff() > 0
@@ -86,7 +84,7 @@ def _runs(masks: HierarchicalMasks) -> tuple[Int64[np.ndarray, " R"], ...]:
     return owner[inside], (ends - lengths)[inside], ends[inside]
 
 
-def _batches(first_run: Int64[Tensor, " M+1"], of_masks: list[int]) -> Iterator[slice]:
+def _batches(first_run: Int64[Tensor, " M_and_1"], of_masks: list[int]) -> Iterator[slice]:
     """Group consecutive masks with at most MAX_LISTED entries together, and return the runs of each group."""
     edges, total = [0], 0
     for mask, entries in enumerate(of_masks):

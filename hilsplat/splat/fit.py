@@ -3,7 +3,6 @@
 import json
 import logging
 import math
-from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,7 @@ from hilsplat.splat.densify import control_density, prune
 from hilsplat.splat.flyaround import contact_sheet, write_flyaround
 from hilsplat.splat.gaussians import Gaussians, morton_order
 from hilsplat.splat.initial import TrainingView, camera_extent, first_gaussians, load_views
-from hilsplat.splat.model import Model, means_rate, model_on
+from hilsplat.splat.model import Model, StepOptions, means_rate, model_on
 from hilsplat.splat.ply import save_ply
 from hilsplat.splat.rasterise.api import render
 from hilsplat.splat.rasterise.device import choose_device, explained_memory, require_card_memory
@@ -99,8 +98,7 @@ def fit_step(state: FitState, views: list[TrainingView], settings: GaussiansSett
     rate = 0.0 if is_frozen else means_rate(settings, progress)
     is_early = model.steps < int(settings.densify_until * settings.iterations)
     is_watched = is_early and not is_frozen and settings.strategy == "default"
-    options = {"degree": degree, "background": background, "rate": rate, "is_watched": is_watched}
-    scores = model.step(view, settings, extent, **options)
+    scores = model.step(view, settings, extent, StepOptions(degree, background, rate, is_watched))
     if model.steps % CURVE_EVERY == 0:
         loss, error = scores()
         state.curve.append([model.steps, loss, -10 * np.log10(max(error, 1e-12)), len(model)])
@@ -125,6 +123,7 @@ def scale_at(settings: GaussiansSettings, progress: float, side_px: int) -> floa
     return scale
 
 
+@explained_memory(MEMORY_USER, MEMORY_FIX)
 def fit_gaussians(
     scene: Scene,
     settings: GaussiansSettings,
@@ -154,38 +153,8 @@ def fit_gaussians(
     views = load_views(scene, "train", settings.image_scale)
     if not views:
         raise SceneError(f"{scene.name} has no training views", fix="hold out fewer views (poses.test_every)")
-    device = fit_device(scene, settings)
+    model_class = model_on(fit_device(scene, settings))
     settings = settings.model_copy(update={"iterations": steps_of(settings, len(views))})
-    with explained_memory(MEMORY_USER, MEMORY_FIX) if device == "cuda" else nullcontext():
-        return _fit(scene, views, settings, seed, model_on(device), threads, checkpoint)
-
-
-def fit_device(scene: Scene, settings: GaussiansSettings) -> Device:
-    """Return the device that `settings.device` selects, if its memory suffices (see `require_card_memory`).
-
-    Raises:
-        DeviceError: if `settings.device` is `cuda` and cannot be used.
-    """
-    if choose_device(settings.device) == "cpu":
-        return "cpu"
-    from hilsplat.splat.torch_model import bytes_needed
-
-    cameras = [scene.cameras[name] for name in scene.views("train")]
-    pixels = [int(settings.image_scale**2 * math.prod(camera.size_hw)) for camera in cameras]
-    number = settings.max_gaussians if settings.initial != "frozen" else len(scene.points_xyz)
-    needed = bytes_needed(number, (settings.sh_degree + 1) ** 2, pixels)
-    return require_card_memory(settings.device, needed, MEMORY_USER, MEMORY_FIX)
-
-
-def _fit(
-    scene: Scene,
-    views: list[TrainingView],
-    settings: GaussiansSettings,
-    seed: int,
-    model_class: type[Model],
-    threads: int,
-    checkpoint: Path | None,
-) -> tuple[Gaussians, Float64[np.ndarray, "S 4"]]:
     cameras = [view.camera for view in views]
     extent = camera_extent(cameras)
     state = FitState.load(checkpoint, model_class, threads) if checkpoint else None
@@ -214,6 +183,23 @@ def _fit(
     if checkpoint:
         delete(checkpoint, r"[0-9a-f]{16}\.npz")
     return model.as_gaussians(), np.array(state.curve).reshape(-1, 4)
+
+
+def fit_device(scene: Scene, settings: GaussiansSettings) -> Device:
+    """Return the device that `settings.device` selects, if its memory suffices (see `require_card_memory`).
+
+    Raises:
+        DeviceError: if `settings.device` is `cuda` and cannot be used.
+    """
+    if choose_device(settings.device) == "cpu":
+        return "cpu"
+    from hilsplat.splat.torch_model import bytes_needed
+
+    cameras = [scene.cameras[name] for name in scene.views("train")]
+    pixels = [int(settings.image_scale**2 * math.prod(camera.size_hw)) for camera in cameras]
+    number = settings.max_gaussians if settings.initial != "frozen" else len(scene.points_xyz)
+    needed = bytes_needed(number, (settings.sh_degree + 1) ** 2, pixels)
+    return require_card_memory(settings.device, needed, MEMORY_USER, MEMORY_FIX)
 
 
 def write_report(

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
@@ -49,6 +49,15 @@ def is_regularised(settings: GaussiansSettings) -> bool:
     return settings.strategy == "mcmc" and settings.initial != "frozen"
 
 
+class StepOptions(NamedTuple):
+    """What varies between the steps of a fit."""
+
+    degree: int  # of the spherical harmonics
+    background: Float32[np.ndarray, " 3"]
+    rate: float  # step size of the means, in units of the extent
+    is_watched: bool  # whether to sum screen-space gradients
+
+
 class Model(ABC):
     """Gaussians under optimisation: their parameters, Adam's moments, and sums of screen-space gradients.
 
@@ -77,17 +86,9 @@ class Model(ABC):
 
     @abstractmethod
     def step(
-        self,
-        view: TrainingView,
-        settings: GaussiansSettings,
-        extent: float,  # radius of the cameras, scene units
-        *,
-        degree: int,  # of the spherical harmonics
-        background: Float32[np.ndarray, " 3"],
-        rate: float,  # step size of the means, in units of the extent
-        is_watched: bool,  # whether to sum screen-space gradients
+        self, view: TrainingView, settings: GaussiansSettings, extent: float, options: StepOptions
     ) -> Scores:
-        """Take one step of Adam on one view.
+        """Take one step of Adam on one view; `extent` is the radius of the cameras, in scene units.
 
         Raises:
             HilsplatError: if some Gaussians cannot be drawn; a card may report them when scores are read.
@@ -179,16 +180,9 @@ class CpuModel(Model):
         return array
 
     def step(
-        self,
-        view: TrainingView,
-        settings: GaussiansSettings,
-        extent: float,
-        *,
-        degree: int,
-        background: Float32[np.ndarray, " 3"],
-        rate: float,
-        is_watched: bool,
+        self, view: TrainingView, settings: GaussiansSettings, extent: float, options: StepOptions
     ) -> Scores:
+        degree, background, rate, is_watched = options
         drawing = draw(self.as_gaussians(), view.camera, degree, threads=self.threads)
         image, grad_alpha = drawing.image, np.zeros_like(drawing.alpha)
         if background.any():

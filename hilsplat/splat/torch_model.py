@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import conv2d
 from torch.optim.adam import adam
@@ -20,7 +20,7 @@ from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.gaussians import FIELDS
 from hilsplat.splat.initial import TrainingView
 from hilsplat.splat.kernels import MIN_GATE, NOISE_SHARPNESS
-from hilsplat.splat.model import SH_REST_SHARE, Model, Scores, is_regularised, step_sizes
+from hilsplat.splat.model import SH_REST_SHARE, Model, Scores, StepOptions, is_regularised, step_sizes
 from hilsplat.splat.rasterise import cuda
 from hilsplat.splat.rasterise.drawn import refuse_broken
 
@@ -48,7 +48,7 @@ def bytes_needed(number: int, num_harmonics: int, pixels: list[int]) -> int:
         pixels: number of pixels of each training view, which is stored in uint8.
     """
     of_gaussian = 4 * 4 * (11 + 3 * num_harmonics) + PASSING_BYTES
-    return int(SPARE * (number * of_gaussian + 3 * sum(pixels) + PIXEL_BYTES * max(pixels)))
+    return int(SPARE * (number * of_gaussian + 3 * sum(pixels) + PIXEL_BYTES * max(pixels, default=0)))
 
 
 class TorchModel(Model):
@@ -65,18 +65,11 @@ class TorchModel(Model):
         return array.cpu().numpy()
 
     def step(
-        self,
-        view: TrainingView,
-        settings: GaussiansSettings,
-        extent: float,
-        *,
-        degree: int,
-        background: Float32[np.ndarray, " 3"],
-        rate: float,
-        is_watched: bool,
+        self, view: TrainingView, settings: GaussiansSettings, extent: float, options: StepOptions
     ) -> Scores:
         import gsplat
 
+        degree, background, rate, is_watched = options
         camera, pixels = self._uploaded(view)
         target = pixels / 255
         g = {name: values.detach().requires_grad_() for name, values in self.parameters.items()}

@@ -51,9 +51,10 @@ class CardCamera(NamedTuple):
 class Entries(NamedTuple):
     """Blending weights of one view on the device, in CSR form: a row per pixel, columns are Gaussians."""
 
-    start: Int64[Tensor, " P+1"]
+    start: Int64[Tensor, " P_and_1"]
     gaussian: Int64[Tensor, " E"]  # sorted within a pixel
     weight: Float[Tensor, " E"]  # positive
+    num_gaussians: int
 
     @property
     def pixel(self) -> Int64[Tensor, " E"]:
@@ -62,13 +63,13 @@ class Entries(NamedTuple):
             self.start.diff(), output_size=len(self.weight)
         )
 
-    def on_host(self, num_gaussians: int) -> csr_matrix:
+    def on_host(self) -> csr_matrix:
         """Return the weights as a matrix (pixels x Gaussians)."""
         arrays = (each.cpu().numpy() for each in (self.weight, self.gaussian.int(), self.start))
-        return weight_matrix(*arrays, num_gaussians)
+        return weight_matrix(*arrays, self.num_gaussians)
 
 
-def starts_of(count: Int64[Tensor, " n"]) -> Int64[Tensor, " n+1"]:
+def starts_of(count: Int64[Tensor, " n"]) -> Int64[Tensor, " n_and_1"]:
     """Return the start of each row, and the end of the last, given the number of entries per row."""
     return torch.cat([count.new_zeros(1), count.cumsum(0)])
 
@@ -154,7 +155,7 @@ def pixel_weights(g: dict[str, Tensor], camera: CardCamera, min_weight: float) -
     pixel, who, weight = pixel[kept], who[kept], weight[kept]
     order = torch.argsort(pixel * len(g["means"]) + who)
     count = torch.bincount(pixel, minlength=height * width)
-    return Entries(starts_of(count), who[order], weight[order].float())
+    return Entries(starts_of(count), who[order], weight[order].float(), len(g["means"]))
 
 
 def _light_before(alpha: Float[Tensor, " E"], count: Tensor) -> Float[Tensor, " E"]:

@@ -6,6 +6,7 @@ import io
 import logging
 import os
 import socket
+import sys
 from collections.abc import Iterator
 from functools import cache
 from importlib.util import find_spec
@@ -21,6 +22,8 @@ logger = logging.getLogger(__name__)
 UNBUILT = "the CUDA kernels of gsplat cannot be compiled"
 ABSENT = ("gsplat is not installed", "no NVIDIA driver is installed", "torch ")
 """Beginnings of the problems of machines on which CUDA is not expected to work."""
+
+TOO_MUCH = "needs more memory than the card has free"
 
 CHOSEN: dict[str, Device] = {}
 """Device of each setting in this process."""
@@ -131,7 +134,7 @@ def require_card_memory(
     problem = f"{user} needs about {_gib(needed)} of the card's memory; {_gib(free)} are free"
     if requested == "cuda":
         raise DeviceError(
-            f"{user} needs more memory than the card has free",
+            f"{user} {TOO_MUCH}",
             expected=f"about {_gib(needed)}",
             found=_gib(free),
             fix=fix,
@@ -155,11 +158,10 @@ def _gib(size: int) -> str:
 @contextlib.contextmanager
 def explained_memory(user: str, fix: str) -> Iterator[None]:
     """Turn torch's out-of-memory error into a DeviceError; arguments are those of `require_card_memory`."""
-    import torch
-
     try:
         yield
-    except torch.OutOfMemoryError as error:
-        raise DeviceError(
-            f"{user} needs more memory than the card has free", found=first_line(error), fix=fix
-        ) from error
+    except Exception as error:
+        torch = sys.modules.get("torch")  # importing it is slow, and not needed on the CPU
+        if torch is None or not isinstance(error, torch.OutOfMemoryError):
+            raise
+        raise DeviceError(f"{user} {TOO_MUCH}", found=first_line(error), fix=fix) from error

@@ -11,7 +11,7 @@ from hilsplat.scene.cameras import Camera
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.initial import TrainingView
-from hilsplat.splat.model import Model, model_on
+from hilsplat.splat.model import Model, StepOptions, model_on
 from hilsplat.splat.rasterise import api
 from hilsplat.splat.rasterise.drawn import Device
 
@@ -73,13 +73,12 @@ def _differences(one: Device, other: Device, number: int) -> dict[str, float]:
     K = np.array([[70.0, 0, 41], [0, 75, 29], [0, 0, 1]])
     camera = Camera("test", np.eye(4), K, (60, 80))
     view = TrainingView(camera, rng.integers(0, 256, (60, 80, 3), np.uint8))
-    background = rng.uniform(size=3).astype(np.float32)
+    options = StepOptions(3, rng.uniform(size=3).astype(np.float32), 1e-3, True)
     settings = GaussiansSettings(strategy="mcmc")
 
     def stepped(device: Device) -> tuple[Model, float]:
         model = model_on(device)({name: getattr(gaussians, name).copy() for name in FIELDS})
-        options = {"degree": 3, "background": background, "rate": 1e-3, "is_watched": True}
-        loss, _ = model.step(view, settings, 1.0, **options)()
+        loss, _ = model.step(view, settings, 1.0, options)()
         return model, loss
 
     (first, loss), (second, other_loss) = (stepped(device) for device in (one, other))
@@ -106,4 +105,4 @@ def _pixel_weights(gaussians: Gaussians, camera: Camera, device: Device) -> csr_
     from hilsplat.splat.rasterise import cuda
 
     entries = cuda.pixel_weights(cuda.on_device(gaussians), cuda.CardCamera.of(camera), 1 / 255)
-    return entries.on_host(len(gaussians))
+    return entries.on_host()

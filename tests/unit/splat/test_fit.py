@@ -88,6 +88,7 @@ def test_threads_and_interruptions_do_not_change_the_bytes(stage, tmp_path, monk
     assert len(list((tmp_path / "cache").rglob("*.npz"))) == 1
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(fit, "fit_device", lambda *arguments: "cuda")
+        patch.setattr(fit, "model_on", lambda device: CpuModel)
         run("another device", settings, stop=0)  # a fit doesn't resume on it
     assert run("resumed", settings) == undisturbed
     assert steps[0] == 25

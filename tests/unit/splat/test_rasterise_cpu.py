@@ -6,17 +6,15 @@ import sys
 from collections.abc import Callable
 from types import SimpleNamespace
 
-import gsplat
 import numpy as np
 import pytest
 
 from cpusplat import binning
 from hilsplat.base.errors import DeviceError
 from hilsplat.splat.gaussians import Gaussians
-from hilsplat.splat.rasterise import cuda, device, parity
+from hilsplat.splat.rasterise import cuda, device
 from hilsplat.splat.rasterise.api import draw, pixel_weights
 from hilsplat.splat.rasterise.device import choose_device
-from tests.cpusplat import gsplat_on_cpu
 from tests.unit.splat.rasterise_scenes import camera, random_gaussians
 
 
