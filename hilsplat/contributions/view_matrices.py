@@ -48,7 +48,8 @@ def view_contributions(
     W = weights.indptr, weights.indices, weights.data, weights.shape[1]
     parts = over_edges(summed_masks, edges, threads, *runs, *pixels, *W)
     counts, sizes, columns, sums = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return scaled_matrices(*counts.T, sizes, columns, sums, visible_mass(weights))
+    painted, in_half = counts.T
+    return scaled_matrices(painted, in_half, sizes, columns, sums, visible_mass(weights))
 
 
 def scaled_matrices(

@@ -135,15 +135,16 @@ class TorchModel(Model):
     def add_noise(
         self, settings: GaussiansSettings, rate: float, extent: float, generator: np.random.Generator
     ) -> None:
-        p, weight = self.parameters, settings.mcmc_noise * rate
+        import gsplat
+
+        p = self.parameters
         gate = (NOISE_SHARPNESS * (settings.min_opacity - p["opacity_logits"].sigmoid())).sigmoid()
-        gate *= gate >= MIN_GATE
+        weight = settings.mcmc_noise * rate * gate * (gate >= MIN_GATE)
         # wider Gaussians would overflow; their steps are limited to the extent anyway
-        scales = (p["log_scales"] - float(np.log(extent))).clamp_max(20)
-        turn = _rotations(p["quats"])
+        scales = (p["log_scales"] - float(np.log(extent))).clamp_max(20).exp()
+        covariance, _ = gsplat.quat_scale_to_covar_preci(p["quats"], scales, compute_preci=False)
         normal = normal_numbers(p["means"], generator)
-        local = torch.einsum("nki,nk->ni", turn, normal) * (2 * scales).exp()
-        step = torch.einsum("nik,nk->ni", turn, local) * weight * gate[:, None]
+        step = weight[:, None] * (covariance * normal[:, None]).sum(dim=2)
         p["means"] += extent * step / step.norm(dim=1, keepdim=True).clamp_min(1)
 
 
@@ -151,16 +152,6 @@ def normal_numbers(like: Tensor, generator: np.random.Generator) -> Tensor:
     """Return normal numbers, generated on the device from a seed that the generator determines."""
     seeded = torch.Generator(like.device).manual_seed(int(generator.integers(2**63)))
     return torch.randn(like.shape, generator=seeded, device=like.device)
-
-
-def _rotations(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    entries = (
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return torch.stack(entries, dim=1).reshape(-1, 3, 3)
 
 
 def photometric_loss(
@@ -179,8 +170,8 @@ def ssim(image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float
     x, t = image.permute(2, 0, 1), target.permute(2, 0, 1)
     maps = torch.cat([x, t, x * x, t * t, x * t])[None]
     windows = _taps(image.device).expand(maps.shape[1], 1, -1)
-    options = {"padding": "same", "groups": maps.shape[1]}
-    blurred = conv2d(conv2d(maps, windows[..., None], **options), windows[:, :, None], **options)
+    blurred = conv2d(maps, windows[..., None], padding="same", groups=len(windows))
+    blurred = conv2d(blurred, windows[:, :, None], padding="same", groups=len(windows))
     x_mean, t_mean, xx, tt, xt = blurred[0].chunk(5)
     product, squares = x_mean * t_mean, x_mean * x_mean + t_mean * t_mean
     upper = (2 * product + float(C1)) * (2 * (xt - product) + float(C2))

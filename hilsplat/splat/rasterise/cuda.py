@@ -65,8 +65,10 @@ class Entries(NamedTuple):
 
     def on_host(self) -> csr_matrix:
         """Return the weights as a matrix (pixels x Gaussians)."""
-        arrays = (each.cpu().numpy() for each in (self.weight, self.gaussian.int(), self.start))
-        return weight_matrix(*arrays, self.num_gaussians)
+        weights, columns, start = (
+            each.cpu().numpy() for each in (self.weight, self.gaussian.int(), self.start)
+        )
+        return weight_matrix(weights, columns, start, self.num_gaussians)
 
 
 def starts_of(count: Int64[Tensor, " n"]) -> Int64[Tensor, " n_and_1"]:

@@ -132,7 +132,7 @@ def recorder(monkeypatch) -> Recorder:
 
         return run
 
-    for name in ("rasterization", "spherical_harmonics"):
+    for name in ("rasterization", "spherical_harmonics", "quat_scale_to_covar_preci"):
         monkeypatch.setattr(gsplat, name, unrecorded(getattr(gsplat, name)))
     return recorder
 
@@ -194,7 +194,7 @@ def test_noise_equals_that_of_the_cpu(width):
         model.add_noise(SETTINGS, 1e-4, 2.0, np.random.default_rng(0))
         moved.append(model.read("means") - start["means"])
     assert np.abs(moved[0]).max() > 1e-3
-    np.testing.assert_allclose(moved[1], moved[0], atol=2e-6)
+    np.testing.assert_allclose(moved[1], moved[0], rtol=1e-5, atol=2e-6)
 
 
 def test_noise_depends_on_the_generator_alone():
