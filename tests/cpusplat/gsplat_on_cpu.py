@@ -3,13 +3,9 @@
 They replace gsplat's kernels on machines without a device, and in float64 they are the backends' reference.
 """
 
-import gsplat
-import pytest
 import torch
 from gsplat.cuda import _torch_impl as reference
 from torch import Tensor
-
-from hilsplat.splat.rasterise import cuda, device
 
 LEAST_ALPHA, MOST_ALPHA, LEAST_LIGHT = 1 / 255, 0.999, 1e-4
 """Constants of gsplat's CUDA kernels."""
@@ -74,13 +70,3 @@ def _light_before(alpha: Tensor) -> Tensor:
     """Transmittance in front of each Gaussian at each pixel."""
     left = torch.cumprod(1 - alpha, dim=0)
     return torch.cat([torch.ones_like(left[:1]), left[:-1]])
-
-
-def replace_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the code for cards run on the CPU, on a card of 1 TiB that passed its self-test."""
-    monkeypatch.setattr(cuda, "DEVICE", "cpu")
-    monkeypatch.setattr(device, "CHOSEN", {"auto": "cuda", "cuda": "cuda", "cpu": "cpu"})
-    monkeypatch.setattr(device, "free_card_bytes", lambda: 2**40)
-    kernels = rasterization, spherical_harmonics, rasterize_to_indices_in_range, quat_scale_to_covar_preci
-    for function in kernels:
-        monkeypatch.setattr(gsplat, function.__name__, function)

@@ -8,10 +8,7 @@ from scipy.sparse import csr_matrix
 from hilsplat.base.cache import remembered
 from hilsplat.base.code import code_digest
 from hilsplat.scene.cameras import Camera
-from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.gaussians import FIELDS, Gaussians
-from hilsplat.splat.initial import TrainingView
-from hilsplat.splat.model import Model, StepOptions, model_on
 from hilsplat.splat.rasterise import api
 from hilsplat.splat.rasterise.drawn import Device
 
@@ -60,6 +57,11 @@ def disagreement(one: Device, other: Device) -> str | None:
 
 
 def _differences(one: Device, other: Device, number: int) -> dict[str, float]:
+    # slow imports, which most processes don't need
+    from hilsplat.settings import GaussiansSettings
+    from hilsplat.splat.initial import TrainingView
+    from hilsplat.splat.model import Model, StepOptions, model_on
+
     rng = np.random.default_rng(0)
     near = -0.5 if number > 1 else 2.0
     arrays = (

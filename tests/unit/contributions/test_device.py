@@ -19,7 +19,7 @@ from hilsplat.settings import ContributionsSettings
 from hilsplat.splat.rasterise import cuda
 from hilsplat.splat.rasterise import device as choice
 from hilsplat.splat.rasterise.api import pixel_weights
-from tests.cpusplat.gsplat_on_cpu import replace_kernels
+from tests.unit.card_on_cpu import replace_kernels
 from tests.unit.contributions.test_contributions import random_view
 from tests.unit.splat.rasterise_scenes import camera, random_gaussians
 from tests.unit.two_boxes_world import two_boxes_weights

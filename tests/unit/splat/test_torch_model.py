@@ -21,7 +21,7 @@ from hilsplat.splat.model import TABLES, CpuModel, StepOptions, step_sizes
 from hilsplat.splat.rasterise import cuda, device, parity
 from hilsplat.splat.rasterise.drawn import Gradients
 from hilsplat.splat.torch_model import TorchModel, bytes_needed
-from tests.cpusplat.gsplat_on_cpu import replace_kernels
+from tests.unit.card_on_cpu import replace_kernels
 from tests.unit.splat.rasterise_scenes import random_gaussians
 from tests.unit.splat.three_gaussians_world import three_gaussians_scene
 
