@@ -145,10 +145,11 @@ def require_card_memory(
 
 
 def free_card_bytes() -> int:
-    """Return the free memory of the current CUDA device, which other processes may also use."""
+    """Return the memory of the current CUDA device that this process can use: free, or kept by torch."""
     import torch
 
-    return int(torch.cuda.mem_get_info()[0])
+    kept = torch.cuda.memory_reserved() - torch.cuda.memory_allocated()
+    return int(torch.cuda.mem_get_info()[0]) + kept
 
 
 def _gib(size: int) -> str:
