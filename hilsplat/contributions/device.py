@@ -15,16 +15,14 @@ from hilsplat.contributions.compositing import MIN_ALPHA
 from hilsplat.contributions.view_matrices import label_maps, random_half, scaled_matrices
 from hilsplat.scene.cameras import Camera
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.splat.rasterise.cuda import CardCamera, Entries, on_device, pixel_weights, starts_of
-
-__all__ = ["Entries", "drawn_weights", "normalised_entries", "on_device", "view_contributions"]
+from hilsplat.splat.rasterise.cuda import CardCamera, Entries, pixel_weights, starts_of
 
 MAX_LISTED = 2**24
 """Maximum number of entries sorted at once, unless one mask has more; they take about 100 bytes each."""
 
 
 def drawn_weights(g: dict[str, Tensor], camera: Camera, *, min_weight: float) -> Entries:
-    """Return the normalised weights of Gaussians (see `on_device`) in a view."""
+    """Return the normalised weights of Gaussians (see `cuda.on_device`) in a view."""
     return normalised_entries(pixel_weights(g, CardCamera.of(camera), min_weight))
 
 
@@ -50,6 +48,7 @@ def view_contributions(view: str, weights: Entries, masks: HierarchicalMasks) ->
     of_masks = torch.zeros(len(masks), dtype=torch.int64, device=device).index_add_(0, mask_of_run, count)
     pairs, sums = [], []
     for chosen in _batches(starts_of(mask_of_run.bincount(minlength=len(masks))), of_masks.tolist()):
+        # list the entries of all runs: the run of each, and its number within the run
         run = torch.arange(len(first), device=device)[chosen].repeat_interleave(count[chosen])
         within = torch.arange(len(run), device=device) - starts_of(count[chosen])[run - chosen.start]
         entry = first[run] + within

@@ -55,10 +55,6 @@ MAX_WEIGHTS_TOGETHER = 2**25
 """Views with more weights (256 MiB) are prepared one at a time; up to four finished views may be waiting."""
 
 
-MEMORY_USER = "a view's contributions"
-MEMORY_FIX = "lower poses.max_side_px, end other programs that use the card, or set contributions.device: cpu"
-
-
 class ArrayStream:
     """An .npy file of numbers that grows, so that the stage never keeps all of its output in memory."""
 
@@ -166,7 +162,10 @@ def drawn_weights(gaussians: Gaussians, camera: Camera, *, min_weight: float, th
     return normalised_weights(pixel_weights(gaussians, camera, min_weight=min_weight, threads=threads))
 
 
-@explained_memory(MEMORY_USER, MEMORY_FIX)
+@explained_memory(
+    "a view's contributions",
+    "lower poses.max_side_px, end other programs that use the card, or set contributions.device: cpu",
+)
 def run_contributions(
     scene_folder: Path,
     gaussians_ply: Path,
@@ -208,10 +207,10 @@ def run_contributions(
 
     if device == "cuda":
         from hilsplat.contributions import device as card
+        from hilsplat.splat.rasterise.cuda import on_device
 
-        draw: Callable[[Camera], Any] = partial(
-            card.drawn_weights, card.on_device(gaussians), min_weight=settings.min_weight
-        )
+        g = on_device(gaussians)
+        draw: Callable[[Camera], Any] = partial(card.drawn_weights, g, min_weight=settings.min_weight)
         contributions: Callable[..., dict[str, np.ndarray]] = card.view_contributions
     else:
         draw = partial(drawn_weights, gaussians, min_weight=settings.min_weight, threads=threads_each)

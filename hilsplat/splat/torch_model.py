@@ -77,8 +77,8 @@ class TorchModel(Model):
         image, alpha, notes = cuda.blend(g, camera, colours)
         if background.any():
             # numbers as arguments of kernels: copying an array would wait for the card
-            behind = [torch.full_like(image[..., 0], float(value)) for value in background]
-            image = image + (1 - alpha)[..., None] * torch.stack(behind, dim=-1)
+            behind = torch.stack([image.new_full((), float(value)) for value in background])
+            image = image + (1 - alpha)[..., None] * behind
         # cuDNN might compute the windows of SSIM in TF32, too coarse for differences of squares
         with torch.backends.cudnn.flags(enabled=False):
             loss = photometric_loss(image, target, settings.ssim_weight)

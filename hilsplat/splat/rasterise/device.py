@@ -25,7 +25,9 @@ ABSENT = ("gsplat is not installed", "no NVIDIA driver is installed", "torch ")
 
 TOO_MUCH = "needs more memory than the card has free"
 
-CHOSEN: dict[str, Device] = {}
+Requested = Literal["auto", "cpu", "cuda"]
+
+CHOSEN: dict[Requested, Device] = {}
 """Device of each setting in this process."""
 
 
@@ -78,7 +80,7 @@ def forget_cuda() -> None:
     CHOSEN.clear()
 
 
-def choose_device(requested: Literal["auto", "cpu", "cuda"]) -> Device:
+def choose_device(requested: Requested) -> Device:
     """Return the device that a setting selects in this process, and log it the first time.
 
     `auto` uses CUDA if torch finds a device, gsplat works, and a self-test agrees with the CPU. If gsplat is
@@ -93,7 +95,7 @@ def choose_device(requested: Literal["auto", "cpu", "cuda"]) -> Device:
     return CHOSEN[requested]
 
 
-def _examined(requested: Literal["auto", "cpu", "cuda"]) -> Device:
+def _examined(requested: Requested) -> Device:
     problem = None if requested == "cpu" else cuda_problem()
     if requested == "cuda" and problem:
         raise DeviceError(
@@ -117,9 +119,7 @@ def _examined(requested: Literal["auto", "cpu", "cuda"]) -> Device:
     return device
 
 
-def require_card_memory(
-    requested: Literal["auto", "cpu", "cuda"], needed: int, user: str, fix: str
-) -> Device:
+def require_card_memory(requested: Requested, needed: int, user: str, fix: str) -> Device:
     """Return the chosen device; if its free memory is less than `needed` bytes, `auto` selects the CPU.
 
     Args:
@@ -134,10 +134,7 @@ def require_card_memory(
     problem = f"{user} needs about {_gib(needed)} of the card's memory; {_gib(free)} are free"
     if requested == "cuda":
         raise DeviceError(
-            f"{user} {TOO_MUCH}",
-            expected=f"about {_gib(needed)}",
-            found=_gib(free),
-            fix=fix,
+            f"{user} {TOO_MUCH}", expected=f"about {_gib(needed)} free", found=f"{_gib(free)} free", fix=fix
         )
     logger.warning("rasterising on cpu (device: auto; %s); to use the card, %s", problem, fix)
     CHOSEN[requested] = "cpu"  # also for the provenance record

@@ -63,9 +63,9 @@ def _differences(one: Device, other: Device, number: int) -> dict[str, float]:
     from hilsplat.splat.model import Model, StepOptions, model_on
 
     rng = np.random.default_rng(0)
-    near = -0.5 if number > 1 else 2.0
+    low, high = ((-2, -1.5, -0.5), (2, 1.5, 4)) if number > 1 else ((-0.1, -0.1, 2), (0.1, 0.1, 4))
     arrays = (
-        rng.uniform((-2, -1.5, near), (2, 1.5, 4), (number, 3)) * (number > 1 or (0.1, 0.1, 1)),
+        rng.uniform(low, high, (number, 3)),
         np.log(rng.uniform(0.02, 0.3, (number, 3))),
         rng.normal(size=(number, 4)),
         rng.normal(size=number),

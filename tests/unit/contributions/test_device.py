@@ -82,7 +82,7 @@ def random_masks(size_hw: tuple[int, int]) -> HierarchicalMasks:
 def test_drawn_contributions_equal_those_of_the_cpu(where):
     gaussians, view = random_gaussians(300), camera()
     masks, tolerance = random_masks(view.size_hw), {"rtol": 1e-4, "atol": 1e-6}
-    on_card = card.drawn_weights(card.on_device(gaussians), view, min_weight=1 / 255)
+    on_card = card.drawn_weights(cuda.on_device(gaussians), view, min_weight=1 / 255)
     weights = normalised_weights(pixel_weights(gaussians, view, min_weight=1 / 255))
     # a pixel whose alpha is 0.5, or a weight of 1/255, up to rounding may be on either side
     assert abs(on_card.on_host() - weights).max(axis=0).toarray().max() < 1e-4
