@@ -3,7 +3,7 @@
     python -m benchmarks.devices                 # both devices; CUDA needs hilsplat[gpu]
     python -m benchmarks.devices --devices cpu
 
-Times are medians. They include all copies between host and device, because callers pass and get NumPy arrays.
+Times are medians. Those of pixel weights include copies between host and device.
 """
 
 import argparse
@@ -13,16 +13,17 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+import torch
 
 from benchmarks.scenes import SIZES, random_scene
 from benchmarks.test_splat import HALF_WAY, SETTINGS
 from hilsplat.base.tables import markdown_table
 from hilsplat.scene.cameras import Camera
-from hilsplat.splat.densify import ScreenGradients
 from hilsplat.splat.fit import FitState, fit_step
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.initial import TrainingView
-from hilsplat.splat.optimise import Adam
+from hilsplat.splat.model import model_on
+from hilsplat.splat.rasterise import cuda
 from hilsplat.splat.rasterise.api import draw, pixel_weights
 from hilsplat.splat.rasterise.drawn import Device
 from hilsplat.splat.rasterise.parity import disagreement
@@ -46,27 +47,24 @@ def median_ms(work: Callable[[], object]) -> float:
 
 
 def times_of(gaussians: Gaussians, camera: Camera, device: Device, threads: int) -> list[float]:
-    """Return the times of an image, its gradients, pixel weights and a step of a fit, ms."""
-    seen = draw(gaussians, camera, 3, threads=threads, device=device)
-    slope, flat = np.ones_like(seen.image), np.zeros_like(seen.alpha)
+    """Return the times of a view's pixel weights and of a step of a fit, ms."""
+    view = TrainingView(camera, (255 * draw(gaussians, camera, 3).image.clip(0, 1)).astype(np.uint8))
+    model = model_on(device)({field: getattr(gaussians, field).copy() for field in FIELDS}, threads)
+    state = FitState(model, np.random.default_rng(0))
+    model.steps = HALF_WAY
 
-    def both_ways() -> None:
-        draw(gaussians, camera, 3, threads=threads, device=device).gradients(slope, flat)
+    def step() -> None:
+        fit_step(state, [view], SETTINGS, 1.0)
+        if device == "cuda":
+            torch.cuda.synchronize()
 
-    settings = SETTINGS.model_copy(update={"device": device})
-    view = TrainingView(camera, (255 * np.clip(seen.image, 0, 1)).astype(np.uint8))
-    start = {field: getattr(gaussians, field).copy() for field in FIELDS}
-    generator = np.random.default_rng(0)
-    state = FitState(Adam.start(start), ScreenGradients.start(len(gaussians)), generator)
-    state.adam.steps = HALF_WAY
-    return [
-        median_ms(lambda: draw(gaussians, camera, 3, threads=threads, device=device)),
-        median_ms(both_ways),
-        median_ms(
-            lambda: pixel_weights(gaussians, camera, min_weight=1 / 255, threads=threads, device=device)
-        ),
-        median_ms(lambda: fit_step(state, [view], settings, 1.0, threads)),
-    ]
+    def weights() -> object:
+        if device == "cpu":
+            return pixel_weights(gaussians, camera, min_weight=1 / 255, threads=threads)
+        g = cuda.on_device(gaussians)
+        return cuda.pixel_weights(g, cuda.CardCamera.of(camera), 1 / 255).on_host()
+
+    return [median_ms(weights), median_ms(step)]
 
 
 def main() -> None:
@@ -84,7 +82,7 @@ def main() -> None:
             times = times_of(gaussians, camera, device, given.threads)
             rows.append((name, device, *(f"{value:.1f}" for value in times)))
             print(*rows[-1], flush=True)
-    head = ("scene", "device", "image", "image and gradients", "pixel weights", "step of a fit")
+    head = ("scene", "device", "pixel weights", "step of a fit")
     print(markdown_table(head, rows, 2))
 
 

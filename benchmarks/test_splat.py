@@ -17,11 +17,10 @@ from benchmarks.scenes import SIZES, random_scene
 from cpusplat.photometric import photometric_loss
 from cpusplat.views import blend_forward, blend_gradients, project_gradients
 from hilsplat.settings import GaussiansSettings
-from hilsplat.splat.densify import ScreenGradients
 from hilsplat.splat.fit import FitState, fit_step
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.initial import TrainingView
-from hilsplat.splat.optimise import Adam
+from hilsplat.splat.model import CpuModel
 from hilsplat.splat.rasterise.api import pixel_weights, project_gaussians
 
 LARGE = "100k 800x600"
@@ -115,16 +114,16 @@ def test_fit_iteration(benchmark, scene, threads):
     rng = np.random.default_rng(3)
     start = {field: getattr(gaussians, field).copy() for field in FIELDS}
     start["sh"] += 0.1 * rng.normal(size=start["sh"].shape).astype(np.float32)
-    state = FitState(Adam.start(start), ScreenGradients.start(len(start["means"])), rng)
+    state = FitState(CpuModel(start, threads), rng)
 
     def reset():
         # Every round starts from the same Gaussians, so that the number of hits stays valid.
         for field in FIELDS:
-            state.adam.parameters[field][...] = start[field] if field == "sh" else getattr(gaussians, field)
-        state.adam.steps, state.order = HALF_WAY, []
+            state.model.parameters[field][...] = start[field] if field == "sh" else getattr(gaussians, field)
+        state.model.steps, state.order = HALF_WAY, []
 
     benchmark.extra_info |= {"case": name("fit iteration", scene, threads), "count": 1, "of": "iterations"}
-    benchmark.pedantic(lambda: fit_step(state, views, SETTINGS, 1.0, threads), setup=reset, rounds=25)
+    benchmark.pedantic(lambda: fit_step(state, views, SETTINGS, 1.0), setup=reset, rounds=25)
 
 
 @threads

@@ -12,9 +12,9 @@ from cpusplat.threads import over_ranges
 
 RADIUS = 5
 SIGMA_PX = 1.5
-_C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)
-_TAPS = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA_PX) ** 2)
-_TAPS = (_TAPS / _TAPS.sum()).astype(np.float32)
+C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
+TAPS = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA_PX) ** 2)
+TAPS = (TAPS / TAPS.sum()).astype(np.float32)
 _LANES = 16
 _SIDE = 16  # zero columns left and right of a padded row; at least 3 channels x RADIUS
 _ZERO, _TWO = np.float32(0.0), np.float32(2.0)
@@ -25,7 +25,7 @@ def _blurred(source, at, step):
     """Return the window's weighted sum along an axis, centred at an index of a flat array."""
     total = lanes(_ZERO)
     for k in range(2 * RADIUS + 1):
-        total = total + lanes(_TAPS[k]) * load(source, at + (k - RADIUS) * step)
+        total = total + lanes(TAPS[k]) * load(source, at + (k - RADIUS) * step)
     return total
 
 
@@ -41,14 +41,14 @@ def _ssim_rows(begin, end, num, stride, image, target, slopes, ssim_sums, l1_sum
     moments = np.zeros(5 * row_length, np.float32)
     out = np.empty(4 * _LANES, np.float32)
     zero, two = lanes(_ZERO), lanes(_TWO)
-    c1, c2 = lanes(_C1), lanes(_C2)
+    c1, c2 = lanes(C1), lanes(C2)
     map_size = len(slopes) // 3
     for y in range(begin, end):
         for group in range(groups):
             at = _SIDE + group * _LANES
             x_sum, t_sum, xx_sum, tt_sum, xt_sum = zero, zero, zero, zero, zero
             for k in range(2 * RADIUS + 1):
-                tap = lanes(_TAPS[k])
+                tap = lanes(TAPS[k])
                 x, t = load(image, (y + k) * stride + at), load(target, (y + k) * stride + at)
                 tap_x, tap_t = tap * x, tap * t
                 x_sum = x_sum + tap_x

@@ -58,8 +58,6 @@ Suffix = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]*$")]
 Auto = Literal["auto"]
 Device = Literal["auto", "cpu", "cuda"]
 
-DEVICE = "rasteriser; auto: cuda if torch finds a device and gsplat is installed, else cpu"
-
 
 class PosesSettings(Section):
     """Camera poses, from structure from motion or imported."""
@@ -139,7 +137,15 @@ class GaussiansSettings(Section):
         origin="OpenGaussian on ScanNet: frozen",
     )
     checkpoint_every: int = knob(1000, "steps between checkpoints", ge=1)
-    device: Device = knob("auto", DEVICE)
+    device: Device = knob(
+        "auto",
+        "cuda: gsplat and torch; auto: cuda if it works and the card has enough free memory, else cpu",
+    )
+
+    @property
+    def rasteriser(self) -> Device:
+        """Value of `device`."""
+        return self.device
 
 
 class MasksSettings(Section):
@@ -281,7 +287,15 @@ class ContributionsSettings(Section):
         "gram: store pairs of Gaussians; weights: store pixel weights of all views; auto: the one with fewer "
         "non-zeros; none: neither, which suffices for a semantic tree without a field",
     )
-    device: Device = knob("auto", DEVICE)
+    device: Device = knob(
+        "auto",
+        "cuda: gsplat and torch compute the weights; auto: cpu, which was as fast (docs/benchmarks.md)",
+    )
+
+    @property
+    def rasteriser(self) -> Device:
+        """Value of `device`; on the CPU for `auto`."""
+        return "cpu" if self.device == "auto" else self.device
 
 
 class SemanticTreeSettings(Section):

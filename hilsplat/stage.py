@@ -251,7 +251,9 @@ def _recorded(stage: Stage[..., Any], arguments: Mapping[str, Any]) -> Iterator[
     paths = [path for value in inputs.values() for path in ([value] if isinstance(value, Path) else value)]
     require_replaceable((out, *beside, *new), stage.name, paths)
     require_free_space(out.parent, MIN_FREE_MIB)
-    device = next((section.device for section in sections.values() if hasattr(section, "device")), None)
+    device = next(
+        (section.rasteriser for section in sections.values() if hasattr(section, "rasteriser")), None
+    )
     with output_lock(out):
         before, code = Inputs(stage.name, inputs), stage.code_digest(extra.plugins)
         yield

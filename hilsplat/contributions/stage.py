@@ -13,7 +13,9 @@ The language field's losses and the semantic tree need no other data from the im
 """
 
 import math
+from collections.abc import Callable
 from functools import cache as cache_calls
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,9 +41,10 @@ from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ContributionsSettings
+from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
-from hilsplat.splat.rasterise.device import choose_device
+from hilsplat.splat.rasterise.device import choose_device, explained_memory
 
 MATRICES = ("A", "A_half", "S", "mass")
 PARTS = {"data": np.float32, "indices": np.int32, "indptr": np.int64}
@@ -154,6 +157,15 @@ def views_at_once(cameras: list[Camera], threads: int) -> int:
     return min(2, max(1, threads)) if most_px * WEIGHTS_PER_PIXEL <= MAX_WEIGHTS_TOGETHER else 1
 
 
+def drawn_weights(gaussians: Gaussians, camera: Camera, *, min_weight: float, threads: int) -> sp.csr_matrix:
+    """Return the normalised weights of Gaussians in a view."""
+    return normalised_weights(pixel_weights(gaussians, camera, min_weight=min_weight, threads=threads))
+
+
+@explained_memory(
+    "a view's contributions",
+    "lower poses.max_side_px, end other programs that use the card, or set contributions.device: cpu",
+)
 def run_contributions(
     scene_folder: Path,
     gaussians_ply: Path,
@@ -174,12 +186,13 @@ def run_contributions(
         MisalignedArtifactError: masks and images differ in size, or the masks of a view differ from those
             recorded in their index.
         ArtifactError: no training view has masks.
+        DeviceError: `settings.device` is `cuda` and cannot be used, or the card's memory runs out.
     """
     scene, gaussians = Scene.load(scene_folder), load_ply(gaussians_ply)
     gaussians_sha256, digests = sha256_of_file(gaussians_ply), digests_in(masks_folder)
     names = digests if read_index(masks_folder).get("partial") else scene.views("train")
     cameras = [scene.cameras[name] for name in names]
-    device, code = choose_device(settings.device), code_digest(run_contributions)
+    device, code = choose_device(settings.rasteriser), code_digest(run_contributions)
     inputs = {
         "code": code,
         "device": device,
@@ -192,24 +205,31 @@ def run_contributions(
     store = ViewCache(Path(cache) / "contributions", compressed=False)
     checkpoint = QuadraticCheckpoint(store.folder / "partial", keys, settings.keep)
 
+    if device == "cuda":
+        from hilsplat.contributions import device as card
+        from hilsplat.splat.rasterise.cuda import on_device
+
+        g = on_device(gaussians)
+        draw: Callable[[Camera], Any] = partial(card.drawn_weights, g, min_weight=settings.min_weight)
+        contributions: Callable[..., dict[str, np.ndarray]] = card.view_contributions
+    else:
+        draw = partial(drawn_weights, gaussians, min_weight=settings.min_weight, threads=threads_each)
+        contributions = partial(view_contributions, threads=threads_each)
+
     def prepare(number: int) -> tuple[HierarchicalMasks, dict[str, np.ndarray], StackedWeights | None]:
         """Return the masks and matrices of a view, and its rows of W if they are not yet in G."""
         camera = cameras[number]
         masks = view_masks(masks_folder, camera, digests)
 
         @cache_calls
-        def weights() -> sp.csr_matrix:
-            least = settings.min_weight
-            return normalised_weights(
-                pixel_weights(gaussians, camera, min_weight=least, threads=threads_each, device=device)
-            )
+        def weights() -> Any:  # on the device
+            return draw(camera)
 
-        matrices = store.get(
-            keys[number], lambda: view_contributions(camera.name, weights(), masks, threads_each)
-        )
+        matrices = store.get(keys[number], lambda: contributions(camera.name, weights(), masks))
         if settings.keep == "none" or number < summed:
             return masks, matrices, None
-        return masks, matrices, labelled_rows(weights(), label_maps(masks))
+        W = weights() if device == "cpu" else weights().on_host()
+        return masks, matrices, labelled_rows(W, label_maps(masks))
 
     with stage_log("contributions", scene.name) as counts, atomic_folder(out) as folder:
         builder = QuadraticBuilder(len(gaussians), settings.keep, len(cameras), threads, folder)

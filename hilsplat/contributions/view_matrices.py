@@ -4,7 +4,7 @@ import hashlib
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Int32
+from jaxtyping import Float32, Float64, Int32, Int64
 
 from cpusplat.threads import over_edges
 from hilsplat.base.levels import LEVELS
@@ -48,13 +48,31 @@ def view_contributions(
     W = weights.indptr, weights.indices, weights.data, weights.shape[1]
     parts = over_edges(summed_masks, edges, threads, *runs, *pixels, *W)
     counts, sizes, columns, sums = (np.concatenate(part) for part in zip(*parts, strict=True))
-    starts = np.concatenate([[0], np.cumsum(sizes)])
     painted, in_half = counts.T
+    return scaled_matrices(painted, in_half, sizes, columns, sums, visible_mass(weights))
+
+
+def scaled_matrices(
+    painted: Int64[np.ndarray, " M"],
+    in_half: Int64[np.ndarray, " M"],
+    sizes: Int64[np.ndarray, " M"],
+    columns: Int32[np.ndarray, " E"],
+    sums: Float64[np.ndarray, "E 3"],
+    mass: Float32[np.ndarray, " N"],
+) -> dict[str, np.ndarray]:
+    """Return the matrices of `view_contributions`, given the sums of weights of each mask.
+
+    Args:
+        painted, in_half: covered pixels of each painted mask, and those in the random half.
+        sizes: number of Gaussians that each mask shows; `columns` and `sums` list them mask by mask.
+        sums: weight of a Gaussian in the raw mask, in the painted pixels, and in those in the half.
+        mass: visible mass of each Gaussian.
+    """
+    starts = np.concatenate([[0], np.cumsum(sizes)])
     arrays = {"pixels": painted.copy(), "half_pixels": in_half.copy()}
-    mass = visible_mass(weights)
     seen = np.flatnonzero(mass)
     arrays |= {"mass_data": mass[seen], "mass_indices": seen, "mass_indptr": np.array([0, len(seen)])}
-    areas = {"S": np.ones(len(masks)), "A": np.maximum(painted, 1), "A_half": np.maximum(in_half, 1)}
+    areas = {"S": np.ones(len(sizes)), "A": np.maximum(painted, 1), "A_half": np.maximum(in_half, 1)}
     for index, (name, area) in enumerate(areas.items()):
         present = sums[:, index] > 0
         scaled = np.repeat(1.0 / area, sizes) * sums[:, index]

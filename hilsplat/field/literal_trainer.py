@@ -31,7 +31,6 @@ from hilsplat.segment.digests import digests_in, load_masks
 from hilsplat.settings import FieldSettings
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import draw
-from hilsplat.splat.rasterise.device import choose_device
 
 logger = logging.getLogger(__name__)
 
@@ -133,7 +132,7 @@ def train_by_rendering(
     scene = Scene.load(scene_folder)
     recorded, digest = contributions.gaussians_sha256, sha256_of_file(gaussians_ply)
     require_made_from(contributions.folder, gaussians_ply, recorded, digest)
-    gaussians, device = load_ply(gaussians_ply), choose_device("auto")
+    gaussians = load_ply(gaussians_ply)
     features = problem.lifted.reshape(len(gaussians), -1).astype(np.float32)
     channels = features.shape[1] // len(LEVELS)
     shares = len(contributions.views), problem.total_pixels, *num_compared(contrast.relations)
@@ -158,7 +157,7 @@ def train_by_rendering(
     order = in_random_order(views, np.random.default_rng(seed), settings.iterations)
     for step, number in enumerate(order, start=1):
         camera = scene.cameras[contributions.views[number]]
-        render = draw(gaussians, camera, 0, features=features, threads=threads, device=device)
+        render = draw(gaussians, camera, 0, features=features, threads=threads)
         if number not in targets:
             targets[number] = targets_of(number, render.alpha.reshape(-1) >= MIN_ALPHA)
         alpha = np.maximum(render.alpha.reshape(-1, 1), 1e-6)

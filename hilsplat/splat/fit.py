@@ -2,6 +2,7 @@
 
 import json
 import logging
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from cpusplat.photometric import photometric_loss, psnr, ssim
+from cpusplat.photometric import psnr, ssim
 from hilsplat.base.artifacts import read_npz, write_arrays, write_index, write_json
 from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.code import code_digest
@@ -22,14 +23,15 @@ from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.coordinates import import_gaussians, write_coordinates
-from hilsplat.splat.densify import ScreenGradients, add_regularisers, control_density, prune
+from hilsplat.splat.densify import control_density, prune
 from hilsplat.splat.flyaround import contact_sheet, write_flyaround
-from hilsplat.splat.gaussians import FIELDS, Gaussians, morton_order
+from hilsplat.splat.gaussians import Gaussians, morton_order
 from hilsplat.splat.initial import TrainingView, camera_extent, first_gaussians, load_views
-from hilsplat.splat.optimise import Adam, means_rate
+from hilsplat.splat.model import Model, StepOptions, means_rate, model_on
 from hilsplat.splat.ply import save_ply
-from hilsplat.splat.rasterise.api import draw, render
-from hilsplat.splat.rasterise.device import choose_device
+from hilsplat.splat.rasterise.api import render
+from hilsplat.splat.rasterise.device import choose_device, explained_memory, require_card_memory
+from hilsplat.splat.rasterise.drawn import Device
 
 logger = logging.getLogger(__name__)
 
@@ -37,16 +39,20 @@ CURVE_EVERY = 20  # number of steps between two points on the training curve
 MIN_SIDE_PX = 64  # minimum length of a downscaled image's shorter side
 MAX_SHOWN = 8  # maximum number of views on the contact sheet of test views
 ERROR_GAIN = 4  # factor by which displayed errors are multiplied
-TABLES = ("parameters", "first", "second")  # tables of `Adam` that a checkpoint contains
+
+MEMORY_USER = "the fit of the Gaussians"
+MEMORY_FIX = (
+    "lower gaussians.max_gaussians or gaussians.image_scale, end other programs that use the card, "
+    "or set gaussians.device: cpu"
+)
 
 
 @dataclass
 class FitState:
     """State from which a fit resumes exactly."""
 
-    adam: Adam  # its `steps` are the completed steps of the fit
-    gradients: ScreenGradients  # since the last densification
-    generator: np.random.Generator  # for view order, splits and backgrounds
+    model: Model  # its `steps` are the completed steps of the fit
+    generator: np.random.Generator  # for view order, splits, backgrounds and noise
     order: list[int] = field(default_factory=list)  # indices of the remaining views in this epoch
     curve: list[list[float]] = field(default_factory=list)  # step, loss, training PSNR (dB), Gaussians
 
@@ -54,75 +60,50 @@ class FitState:
         """Write a checkpoint."""
         tag(path.parent)
         arrays = {
-            "steps": np.array(self.adam.steps),
             "order": np.array(self.order, dtype=np.int64),
             "generator": np.array(json.dumps(self.generator.bit_generator.state)),
-            "gradient_total": self.gradients.total,
-            "gradient_seen": self.gradients.seen,
             "curve": np.array(self.curve).reshape(-1, 4),
+            **self.model.state(),
         }
-        for table in TABLES:
-            arrays |= {f"{table}_{name}": getattr(self.adam, table)[name] for name in FIELDS}
         write_arrays(path, arrays, compressed=False)  # compression would take longer than a hundred steps
 
     @staticmethod
-    def load(path: Path) -> "FitState | None":
+    def load(path: Path, model: type[Model], threads: int) -> "FitState | None":
         """Read a checkpoint; return None if it is missing or damaged."""
         if not path.is_file():
             return None
         try:
             arrays = read_npz(path)
-            values, first, second = ({name: arrays[f"{table}_{name}"] for name in FIELDS} for table in TABLES)
             generator = np.random.default_rng()
             generator.bit_generator.state = json.loads(arrays["generator"].item())
-            return FitState(
-                Adam(values, first, second, arrays["steps"].item()),
-                ScreenGradients(arrays["gradient_total"], arrays["gradient_seen"]),
-                generator,
-                arrays["order"].tolist(),
-                arrays["curve"].tolist(),
-            )
+            restored = model.restore(arrays, threads)
+            return FitState(restored, generator, arrays["order"].tolist(), arrays["curve"].tolist())
         except (ArtifactError, KeyError, TypeError, ValueError) as error:
             logger.warning("ignoring the checkpoint and restarting the fit: %s", error)
             return None
 
 
-def fit_step(
-    state: FitState, views: list[TrainingView], settings: GaussiansSettings, extent: float, threads: int
-) -> None:
+def fit_step(state: FitState, views: list[TrainingView], settings: GaussiansSettings, extent: float) -> None:
     """Take one optimiser step on one view, then control density if due."""
     if not state.order:
         state.order = state.generator.permutation(len(views)).tolist()
     view = views[state.order.pop()]
-    progress = state.adam.steps / settings.iterations
+    model, progress = state.model, state.model.steps / settings.iterations
     # 3DGS adds a degree every 1000 of 30 000 steps; here, every fit reaches degree 3 after 30 % of its steps
     degree = min(settings.sh_degree, int(progress * 10))
-    behind = np.full(3, settings.background == "white", np.float32)
+    background = np.full(3, settings.background == "white", np.float32)
     if settings.background == "random":
-        behind = state.generator.uniform(size=3).astype(np.float32)
-
-    device = choose_device(settings.device)
-    drawing = draw(state.adam.as_gaussians(), view.camera, degree, threads=threads, device=device)
-    image, grad_alpha = drawing.image, np.zeros_like(drawing.alpha)
-    if behind.any():
-        image = drawing.image + (1 - drawing.alpha)[..., None] * behind
-    target = to_float(view.image)
-    loss, grad = photometric_loss(image, target, ssim_weight=settings.ssim_weight, threads=threads)
-    if behind.any():
-        grad_alpha = -(grad @ behind)
-    gradients = drawing.gradients(grad, grad_alpha)
+        background = state.generator.uniform(size=3).astype(np.float32)
     is_frozen = settings.initial == "frozen"
     rate = 0.0 if is_frozen else means_rate(settings, progress)
-    if settings.strategy == "mcmc" and not is_frozen:
-        add_regularisers(state.adam, gradients, settings, extent)
-    elif not is_frozen and state.adam.steps < int(settings.densify_until * settings.iterations):
-        state.gradients.add(gradients.means_px, drawing.drawn, view.camera.size_hw)
-    state.adam.step(gradients, settings, extent * rate, threads)
-    if state.adam.steps % CURVE_EVERY == 0:
-        error = float(np.square(image - target).mean(dtype=np.float64))
-        state.curve.append([state.adam.steps, loss, -10 * np.log10(max(error, 1e-12)), len(state.adam)])
+    is_early = model.steps < int(settings.densify_until * settings.iterations)
+    is_watched = is_early and not is_frozen and settings.strategy == "default"
+    scores = model.step(view, settings, extent, StepOptions(degree, background, rate, is_watched))
+    if model.steps % CURVE_EVERY == 0:
+        loss, error = scores()
+        state.curve.append([model.steps, loss, -10 * np.log10(max(error, 1e-12)), len(model)])
     if not is_frozen:
-        control_density(state.adam, state.gradients, settings, rate, extent, state.generator, threads)
+        control_density(model, settings, rate, extent, state.generator)
 
 
 def steps_of(settings: GaussiansSettings, num_views: int) -> int:
@@ -142,6 +123,7 @@ def scale_at(settings: GaussiansSettings, progress: float, side_px: int) -> floa
     return scale
 
 
+@explained_memory(MEMORY_USER, MEMORY_FIX)
 def fit_gaussians(
     scene: Scene,
     settings: GaussiansSettings,
@@ -152,7 +134,8 @@ def fit_gaussians(
 ) -> tuple[Gaussians, Float64[np.ndarray, "S 4"]]:
     """Fit Gaussians to the training views of a scene.
 
-    The result is byte-identical for any number of threads, even if the fit was interrupted and resumed.
+    On the CPU, the result is byte-identical for any number of threads, even if the fit was interrupted and
+    resumed. A card adds gradients in varying order, so its results vary within rounding.
 
     Args:
         seed: determines the view order, splits, relocations, noise and random points.
@@ -165,27 +148,29 @@ def fit_gaussians(
 
     Raises:
         SceneError: if there are no training views, or no Gaussians are left.
+        DeviceError: if `settings.device` is `cuda` and cannot be used, or the card's memory runs out.
     """
     views = load_views(scene, "train", settings.image_scale)
     if not views:
         raise SceneError(f"{scene.name} has no training views", fix="hold out fewer views (poses.test_every)")
+    model_class = model_on(fit_device(scene, settings))
     settings = settings.model_copy(update={"iterations": steps_of(settings, len(views))})
     cameras = [view.camera for view in views]
     extent = camera_extent(cameras)
-    state = FitState.load(checkpoint) if checkpoint else None
+    state = FitState.load(checkpoint, model_class, threads) if checkpoint else None
     if state is None:
         generator = np.random.default_rng(seed)
-        adam = Adam.start(first_gaussians(scene, cameras, settings, generator))
-        state = FitState(adam, ScreenGradients.start(len(adam)), generator)
+        start = first_gaussians(scene, cameras, settings, generator)
+        state = FitState(model_class(start, threads), generator)
     else:
-        logger.info("resuming from the checkpoint at step %d", state.adam.steps)
-    sizes = {1.0: views}
-    for step in track(range(state.adam.steps, settings.iterations), "fit steps"):
+        logger.info("resuming from the checkpoint at step %d", state.model.steps)
+    model, sizes = state.model, {1.0: views}
+    for step in track(range(model.steps, settings.iterations), "fit steps"):
         scale = scale_at(settings, step / settings.iterations, min(cameras[0].size_hw))
         if scale not in sizes:
             sizes[scale] = load_views(scene, "train", scale * settings.image_scale)
-        fit_step(state, sizes[scale], settings, extent, threads)
-        if len(state.adam) == 0:
+        fit_step(state, sizes[scale], settings, extent)
+        if len(model) == 0:
             raise SceneError(
                 f"all Gaussians of {scene.name} became transparent",
                 fix="check the poses (registration.png), or lower gaussians.min_opacity",
@@ -193,11 +178,28 @@ def fit_gaussians(
         if checkpoint and (step + 1) % settings.checkpoint_every == 0 and step + 1 < settings.iterations:
             state.save(checkpoint)
     if settings.initial != "frozen":
-        prune(state.adam, settings, extent)
-        state.adam.keep(morton_order(state.adam.parameters["means"]))
+        prune(model, settings, extent)
+        model.select(morton_order(model.read("means")))
     if checkpoint:
         delete(checkpoint, r"[0-9a-f]{16}\.npz")
-    return state.adam.as_gaussians(), np.array(state.curve).reshape(-1, 4)
+    return model.as_gaussians(), np.array(state.curve).reshape(-1, 4)
+
+
+def fit_device(scene: Scene, settings: GaussiansSettings) -> Device:
+    """Return the device that `settings.device` selects, if its memory suffices (see `require_card_memory`).
+
+    Raises:
+        DeviceError: if `settings.device` is `cuda` and cannot be used.
+    """
+    if choose_device(settings.device) == "cpu":
+        return "cpu"
+    from hilsplat.splat.torch_model import bytes_needed
+
+    cameras = [scene.cameras[name] for name in scene.views("train")]
+    pixels = [int(settings.image_scale**2 * math.prod(camera.size_hw)) for camera in cameras]
+    number = settings.max_gaussians if settings.initial != "frozen" else len(scene.points_xyz)
+    needed = bytes_needed(number, (settings.sh_degree + 1) ** 2, pixels)
+    return require_card_memory(settings.device, needed, MEMORY_USER, MEMORY_FIX)
 
 
 def write_report(
@@ -305,7 +307,7 @@ def run_gaussians(
             gaussians, origin = import_gaussians(existing, scene, dataparser, transforms)
         else:
             # a fit must resume on the same device, because sums differ between CPU and CUDA
-            settings = settings.model_copy(update={"device": choose_device(settings.device)})
+            settings = settings.model_copy(update={"device": fit_device(scene, settings)})
             inputs = [settings.model_dump(mode="json"), seed, sha256_of_path(scene_folder)]
             key = sha256_of_json([*inputs, code_digest(fit_gaussians)])
             checkpoint = Path(cache) / "gaussians" / f"{key[:16]}.npz"

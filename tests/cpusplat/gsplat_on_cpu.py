@@ -16,13 +16,19 @@ def spherical_harmonics(degree: int, directions: Tensor, coefficients: Tensor) -
     return reference._spherical_harmonics(degree, directions, coefficients)
 
 
+def quat_scale_to_covar_preci(quats: Tensor, scales: Tensor, *, compute_preci: bool) -> tuple[Tensor, None]:
+    """As `gsplat.quat_scale_to_covar_preci`, without precision matrices."""
+    assert not compute_preci
+    return reference._quat_scale_to_covar_preci(quats, scales, True, False, triu=False)
+
+
 def rasterization(
     means, quats, scales, opacities, colors, viewmats, Ks, width, height, *, near_plane, eps2d, **options
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """As `gsplat.rasterization` for one view, without tiles."""
     assert options["radius_clip"] == 0 and options["rasterize_mode"] == "classic"
     assert not options["packed"] and options["sh_degree"] is None
-    covariances, _ = reference._quat_scale_to_covar_preci(quats, scales, True, False, triu=False)
+    covariances, _ = quat_scale_to_covar_preci(quats, scales, compute_preci=False)
     radii, means2d, depths, conics, _ = reference._fully_fused_projection(
         means, covariances, viewmats, Ks, width, height, eps2d=eps2d, near_plane=near_plane
     )

@@ -125,7 +125,7 @@ def build_two_boxes(
     monkeypatch.setattr(
         stage,
         "pixel_weights",
-        lambda gaussians, camera, *, min_weight, threads, device: two_boxes_weights(names.index(camera.name)),
+        lambda gaussians, camera, *, min_weight, threads: two_boxes_weights(names.index(camera.name)),
     )
     return world
 

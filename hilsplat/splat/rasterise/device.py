@@ -6,6 +6,8 @@ import io
 import logging
 import os
 import socket
+import sys
+from collections.abc import Iterator
 from functools import cache
 from importlib.util import find_spec
 from typing import Literal
@@ -20,6 +22,13 @@ logger = logging.getLogger(__name__)
 UNBUILT = "the CUDA kernels of gsplat cannot be compiled"
 ABSENT = ("gsplat is not installed", "no NVIDIA driver is installed", "torch ")
 """Beginnings of the problems of machines on which CUDA is not expected to work."""
+
+TOO_MUCH = "needs more memory than the card has free"
+
+Requested = Literal["auto", "cpu", "cuda"]
+
+CHOSEN: dict[Requested, Device] = {}
+"""Device of each setting in this process."""
 
 
 @cache
@@ -68,12 +77,11 @@ def forget_cuda() -> None:
     """Forget earlier results, so that `cuda_problem` and the self-test examine this machine again."""
     forget(KIND)
     cuda_problem.cache_clear()
-    choose_device.cache_clear()
+    CHOSEN.clear()
 
 
-@cache
-def choose_device(requested: Literal["auto", "cpu", "cuda"]) -> Device:
-    """Return the device that a setting selects on this machine, and log it the first time.
+def choose_device(requested: Requested) -> Device:
+    """Return the device that a setting selects in this process, and log it the first time.
 
     `auto` uses CUDA if torch finds a device, gsplat works, and a self-test agrees with the CPU. If gsplat is
     installed but does not work on a machine with a device, a warning names the reason.
@@ -82,6 +90,12 @@ def choose_device(requested: Literal["auto", "cpu", "cuda"]) -> Device:
     Raises:
         DeviceError: if `cuda` was requested and cannot be used. There is no fallback.
     """
+    if requested not in CHOSEN:
+        CHOSEN[requested] = _examined(requested)
+    return CHOSEN[requested]
+
+
+def _examined(requested: Requested) -> Device:
     problem = None if requested == "cpu" else cuda_problem()
     if requested == "cuda" and problem:
         raise DeviceError(
@@ -103,3 +117,49 @@ def choose_device(requested: Literal["auto", "cpu", "cuda"]) -> Device:
     suffix = f"; {problem}{advice}" if problem else ""
     logger.log(level, "rasterising on %s (device: %s%s)", device, requested, suffix)
     return device
+
+
+def require_card_memory(requested: Requested, needed: int, user: str, fix: str) -> Device:
+    """Return the chosen device; if its free memory is less than `needed` bytes, `auto` selects the CPU.
+
+    Args:
+        user: noun phrase that names what needs the memory.
+        fix: settings that reduce it.
+
+    Raises:
+        DeviceError: if `cuda` was requested, and its free memory is less.
+    """
+    if choose_device(requested) == "cpu" or needed <= (free := free_card_bytes()):
+        return choose_device(requested)
+    problem = f"{user} needs about {_gib(needed)} of the card's memory; {_gib(free)} are free"
+    if requested == "cuda":
+        raise DeviceError(
+            f"{user} {TOO_MUCH}", expected=f"about {_gib(needed)} free", found=f"{_gib(free)} free", fix=fix
+        )
+    logger.warning("rasterising on cpu (device: auto; %s); to use the card, %s", problem, fix)
+    CHOSEN[requested] = "cpu"  # also for the provenance record
+    return "cpu"
+
+
+def free_card_bytes() -> int:
+    """Return the memory of the current CUDA device that this process can use: free, or kept by torch."""
+    import torch
+
+    kept = torch.cuda.memory_reserved() - torch.cuda.memory_allocated()
+    return int(torch.cuda.mem_get_info()[0]) + kept
+
+
+def _gib(size: int) -> str:
+    return f"{size / 2**30:.1f} GiB"
+
+
+@contextlib.contextmanager
+def explained_memory(user: str, fix: str) -> Iterator[None]:
+    """Turn torch's out-of-memory error into a DeviceError; arguments are those of `require_card_memory`."""
+    try:
+        yield
+    except Exception as error:
+        torch = sys.modules.get("torch")  # importing it is slow, and not needed on the CPU
+        if torch is None or not isinstance(error, torch.OutOfMemoryError):
+            raise
+        raise DeviceError(f"{user} {TOO_MUCH}", found=first_line(error), fix=fix) from error

@@ -1,4 +1,4 @@
-"""Views of Gaussians as both backends draw them, and the errors of Gaussians that cannot be drawn."""
+"""Drawn views of Gaussians, and the errors of Gaussians that cannot be drawn."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ class Gradients:
 
 @dataclass(frozen=True)
 class Drawn:
-    """One view as drawn by either backend."""
+    """One drawn view."""
 
     image: Float32[np.ndarray, "H W C"]  # premultiplied RGB, then features, without background
     alpha: Float32[np.ndarray, "H W"]  # coverage in [0, 1], the sum of the blending weights

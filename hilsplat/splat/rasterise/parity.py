@@ -1,6 +1,9 @@
-"""Self-test that compares the CUDA backend with the CPU backend; its result is cached per machine."""
+"""Self-test that compares a card with the CPU: one step of a fit, and pixel weights; cached per machine."""
+
+import ctypes
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from hilsplat.base.cache import remembered
 from hilsplat.base.code import code_digest
@@ -12,52 +15,96 @@ from hilsplat.splat.rasterise.drawn import Device
 KIND = "cuda"
 """Kind of `remembered` results about CUDA."""
 
-MAX_DIFFERENCES = {"image": 1e-3, "alpha": 1e-3, "weights": 1e-3, "gradients": 1e-2}
-"""Maximum differences caused by rounding. The limit for gradients is relative and covers all Gaussians."""
+MAX_DIFFERENCES = {"loss": 1e-4, "gradients": 1e-2, "step": 2e-2, "weights": 1e-3}
+"""Maximum differences caused by rounding; those of gradients and step are relative to their length."""
 
 
 def cuda_disagreement() -> str | None:
-    """Return how CUDA differs from the CPU here, or None; cached per device, library and code version."""
+    """Return how CUDA differs from the CPU here, or None; cached per device, versions, driver and code."""
     import gsplat
     import torch
 
-    machine = [torch.__version__, gsplat.__version__, torch.cuda.get_device_name(), str(torch.version.cuda)]
-    key = [*machine, code_digest("hilsplat.splat.rasterise.cuda", api.draw)]
-    return remembered(KIND, ["self-test", *key], lambda: disagreement("cpu", "cuda") or "") or None
+    versions = [torch.__version__, gsplat.__version__, str(torch.version.cuda), driver_version()]
+    code = code_digest("hilsplat.splat.torch_model", disagreement)
+    key = ["self-test", *versions, torch.cuda.get_device_name(), code]
+    return remembered(KIND, key, lambda: disagreement("cpu", "cuda") or "") or None
+
+
+def driver_version() -> str:
+    """Return the version of the NVIDIA driver, or an empty text if there is none."""
+    version = ctypes.create_string_buffer(80)
+    try:
+        library = ctypes.CDLL("libnvidia-ml.so.1")
+        library.nvmlInit_v2()
+        library.nvmlSystemGetDriverVersion(version, len(version))
+    except (OSError, AttributeError):
+        return ""
+    return version.value.decode()
 
 
 def disagreement(one: Device, other: Device) -> str | None:
-    """Return how two devices differ in a small scene's image, gradients and pixel weights, or None."""
+    """Return how two devices differ in a step of a fit and in pixel weights, or None.
+
+    Both are compared for many Gaussians in several tiles, some behind the camera, and for a single one.
+    """
+    wrong = [
+        f"{what} of {number} Gaussians by {apart:.2g}"
+        for number in (300, 1)
+        for what, apart in _differences(one, other, number).items()
+        if not apart <= MAX_DIFFERENCES[what]  # also if it is NaN
+    ]
+    return f"{other} differs from {one}: {', '.join(wrong)}" if wrong else None
+
+
+def _differences(one: Device, other: Device, number: int) -> dict[str, float]:
+    # slow imports, which most processes don't need
+    from hilsplat.settings import GaussiansSettings
+    from hilsplat.splat.initial import TrainingView
+    from hilsplat.splat.model import Model, StepOptions, model_on
+
     rng = np.random.default_rng(0)
-    number = 300  # some of them are behind the camera
+    low, high = ((-2, -1.5, -0.5), (2, 1.5, 4)) if number > 1 else ((-0.1, -0.1, 2), (0.1, 0.1, 4))
     arrays = (
-        rng.uniform((-2, -1.5, -0.5), (2, 1.5, 4), (number, 3)),
+        rng.uniform(low, high, (number, 3)),
         np.log(rng.uniform(0.02, 0.3, (number, 3))),
         rng.normal(size=(number, 4)),
         rng.normal(size=number),
-        rng.normal(size=(number, 4, 3)) * 0.4,
+        rng.normal(size=(number, 16, 3)) * 0.4,
     )
     gaussians = Gaussians(*(values.astype(np.float32) for values in arrays))
     K = np.array([[70.0, 0, 41], [0, 75, 29], [0, 0, 1]])
     camera = Camera("test", np.eye(4), K, (60, 80))
-    slope = rng.normal(size=(60, 80, 3)).astype(np.float32)
-    flat = rng.normal(size=(60, 80)).astype(np.float32)
-    seen = [api.draw(gaussians, camera, 1, device=device) for device in (one, other)]
-    grads = [each.gradients(slope, flat) for each in seen]
-    weights = [
-        api.pixel_weights(gaussians, camera, min_weight=1 / 255, device=device) for device in (one, other)
-    ]
-    apart = {
-        "image": float(np.abs(seen[0].image - seen[1].image).max()),
-        "alpha": float(np.abs(seen[0].alpha - seen[1].alpha).max()),
+    view = TrainingView(camera, rng.integers(0, 256, (60, 80, 3), np.uint8))
+    options = StepOptions(3, rng.uniform(size=3).astype(np.float32), 1e-3, True)
+    settings = GaussiansSettings(strategy="mcmc")
+
+    def stepped(device: Device) -> tuple[Model, float]:
+        model = model_on(device)({name: getattr(gaussians, name).copy() for name in FIELDS})
+        loss, _ = model.step(view, settings, 1.0, options)()
+        return model, loss
+
+    (first, loss), (second, other_loss) = (stepped(device) for device in (one, other))
+    a, b = first.state(), second.state()
+    start = {f"parameters_{name}": getattr(gaussians, name) for name in FIELDS}
+
+    def apart(names: list[str]) -> float:
+        errors = [np.linalg.norm(a[n] - b[n]) / np.linalg.norm(a[n] - start.get(n, 0)) for n in names]
+        return float(np.max(errors))
+
+    weights = [_pixel_weights(gaussians, camera, device) for device in (one, other)]
+    return {
+        "loss": abs(loss - other_loss),
+        # the moments after one step are the gradients and their squares, up to a factor
+        "gradients": apart([f"first_{name}" for name in FIELDS] + ["gradient_total"]),
+        "step": apart([*start]),
         "weights": float(abs(weights[0] - weights[1]).max()),
     }
-    errors = []
-    for name in FIELDS:
-        first, second = (getattr(each, name) for each in grads)
-        errors.append(np.linalg.norm(first - second) / np.linalg.norm(first))
-    apart["gradients"] = float(np.max(errors))  # NaN if any error is NaN
-    wrong = [
-        f"{what} by {apart[what]:.2g}" for what, most in MAX_DIFFERENCES.items() if not apart[what] <= most
-    ]
-    return f"{other} differs from {one}: {', '.join(wrong)}" if wrong else None
+
+
+def _pixel_weights(gaussians: Gaussians, camera: Camera, device: Device) -> csr_matrix:
+    if device == "cpu":
+        return api.pixel_weights(gaussians, camera, min_weight=1 / 255)
+    from hilsplat.splat.rasterise import cuda
+
+    entries = cuda.pixel_weights(cuda.on_device(gaussians), cuda.CardCamera.of(camera), 1 / 255)
+    return entries.on_host()

@@ -14,9 +14,6 @@ from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat import fit
 from hilsplat.splat.densify import (
-    ScreenGradients,
-    add_noise,
-    add_regularisers,
     densify,
     opacities,
     prune,
@@ -27,7 +24,7 @@ from hilsplat.splat.densify import (
 )
 from hilsplat.splat.gaussians import morton_order
 from hilsplat.splat.initial import RANDOM_POINTS, first_gaussians
-from hilsplat.splat.optimise import Adam, means_rate
+from hilsplat.splat.model import CpuModel, means_rate, step_sizes
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.drawn import Gradients
 from tests.unit.round_gaussians import round_gaussians
@@ -61,9 +58,9 @@ def stage(scene, tmp_path, monkeypatch):
 
     def run(name: str, settings: GaussiansSettings, threads: int = 1, stop: int = 60) -> dict[str, bytes]:
         def counted(state, *rest):
-            if state.adam.steps == stop:
+            if state.model.steps == stop:
                 raise KeyboardInterrupt
-            steps.append(state.adam.steps)
+            steps.append(state.model.steps)
             step(state, *rest)
 
         steps.clear()
@@ -90,7 +87,8 @@ def test_threads_and_interruptions_do_not_change_the_bytes(stage, tmp_path, monk
         run("stopped", settings, stop=40)
     assert len(list((tmp_path / "cache").rglob("*.npz"))) == 1
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(fit, "choose_device", lambda requested: "cuda")
+        patch.setattr(fit, "fit_device", lambda *arguments: "cuda")
+        patch.setattr(fit, "model_on", lambda device: CpuModel)
         run("another device", settings, stop=0)  # a fit doesn't resume on it
     assert run("resumed", settings) == undisturbed
     assert steps[0] == 25
@@ -117,14 +115,14 @@ def test_threads_and_interruptions_do_not_change_the_bytes(stage, tmp_path, monk
 )
 def test_a_checkpoint_with_other_content_is_ignored(scene, tmp_path, change):
     generator, cameras = np.random.default_rng(0), [scene.cameras[view] for view in scene.views("train")]
-    adam = Adam.start(first_gaussians(scene, cameras, SETTINGS, generator))
+    model = CpuModel(first_gaussians(scene, cameras, SETTINGS, generator))
     path = tmp_path / f"{'0' * 16}.npz"
-    fit.FitState(adam, ScreenGradients.start(len(adam)), generator).save(path)
-    assert fit.FitState.load(path) is not None
+    fit.FitState(model, generator).save(path)
+    assert fit.FitState.load(path, CpuModel, 1) is not None
     arrays = read_npz(path)
     change(arrays)
     write_arrays(path, arrays, compressed=False)
-    assert fit.FitState.load(path) is None
+    assert fit.FitState.load(path, CpuModel, 1) is None
 
 
 def test_random_points_are_in_view_of_cameras(scene):
@@ -192,10 +190,10 @@ def two_gaussians() -> dict[str, np.ndarray]:
     return two | {"log_scales": np.log(np.float32([[0.001] * 3, [0.1, 0.05, 0.05]]))}
 
 
-def gradients_of(adam: Adam, value: float) -> Gradients:
+def gradients_of(model: CpuModel, value: float) -> Gradients:
     """Gradients that have one value everywhere."""
-    by_name = {name: np.full_like(values, value) for name, values in adam.parameters.items()}
-    features, means_px = (np.zeros((len(adam), width), np.float32) for width in (0, 2))
+    by_name = {name: np.full_like(values, value) for name, values in model.parameters.items()}
+    features, means_px = (np.zeros((len(model), width), np.float32) for width in (0, 2))
     return Gradients(**by_name, features=features, means_px=means_px)
 
 
@@ -203,43 +201,44 @@ def gradients_of(adam: Adam, value: float) -> Gradients:
     ("most", "widths"), [(1000, [0.001, 0.001, 0.0625, 0.0625]), (3, [0.001, 0.0625, 0.0625])]
 )
 def test_small_gaussians_are_cloned_and_large_ones_split_by_gradient_up_to_the_cap(most, widths):
-    adam = Adam.start(two_gaussians())
+    model = CpuModel(two_gaussians())
     settings = GaussiansSettings(densify_gradient=0.5).model_copy(update={"max_gaussians": most})
-    gradients = ScreenGradients(np.array([1.0, 2.0]), np.ones(2, np.int32))
-    densify(adam, gradients, settings, 1.0, np.random.default_rng(0))
+    model.total, model.seen = np.array([1.0, 2.0]), np.ones(2, np.int32)
+    densify(model, settings, 1.0, np.random.default_rng(0))
     # the small one, its clone if there is room, and the two halves of the large one: 0.1 / 1.6
-    np.testing.assert_allclose(np.exp(adam.parameters["log_scales"][:, 0]), widths, rtol=1e-5)
-    np.testing.assert_array_equal(adam.parameters["means"][:-2], 0)
-    assert not np.array_equal(adam.parameters["means"][-2], adam.parameters["means"][-1])
+    np.testing.assert_allclose(np.exp(model.parameters["log_scales"][:, 0]), widths, rtol=1e-5)
+    np.testing.assert_array_equal(model.parameters["means"][:-2], 0)
+    assert not np.array_equal(model.parameters["means"][-2], model.parameters["means"][-1])
 
 
 def test_transparent_and_huge_gaussians_are_pruned_and_opacity_is_reset():
-    adam = Adam.start(two_gaussians())
-    adam.parameters["opacity_logits"][0] = -6  # opacity 0.0025 < 0.005
-    prune(adam, GaussiansSettings(), extent=1.0)
-    assert len(adam) == 1
-    reset_opacities(adam)
-    assert 1 / (1 + np.exp(-adam.parameters["opacity_logits"][0])) == pytest.approx(0.01, rel=1e-5)
-    prune(adam, GaussiansSettings(), extent=0.1)  # largest axis 0.1 >= 0.5 x 0.1
-    assert len(adam) == 0
+    model = CpuModel(two_gaussians())
+    model.parameters["opacity_logits"][0] = -6  # opacity 0.0025 < 0.005
+    prune(model, GaussiansSettings(), extent=1.0)
+    assert len(model) == 1
+    reset_opacities(model)
+    assert 1 / (1 + np.exp(-model.parameters["opacity_logits"][0])) == pytest.approx(0.01, rel=1e-5)
+    prune(model, GaussiansSettings(), extent=0.1)  # largest axis 0.1 >= 0.5 x 0.1
+    assert len(model) == 0
 
 
 def test_screen_gradient_is_in_units_of_half_the_image():
-    gradients = ScreenGradients.start(1)
-    for _ in range(2):
-        gradients.add(np.float32([[3e-3, 2e-3]]), np.array([True]), (40, 20))
+    model = CpuModel(two_gaussians())
+    for drawn in ([True, True], [True, False]):
+        model.add_screen_gradients(np.float32([[3e-3, 2e-3], [0, 0]]), np.array(drawn), (40, 20))
     # x times 10, y times 20: (0.03, 0.04) has length 0.05 in both steps
-    assert (gradients.total[0], gradients.seen[0]) == (pytest.approx(0.1, rel=1e-6), 2)
+    assert model.screen_gradients() == pytest.approx([0.05, 0], rel=1e-6)
+    assert model.seen.tolist() == [2, 1]
 
 
 def test_first_adam_step_moves_by_the_rate_against_the_sign():
-    adam = Adam.start(two_gaussians())
-    before = {name: values.copy() for name, values in adam.parameters.items()}
+    model = CpuModel(two_gaussians())
+    before = {name: values.copy() for name, values in model.parameters.items()}
     settings = GaussiansSettings(scales_rate=0.01, sh_rate=2.5e-3)
-    adam.step(gradients_of(adam, 1.0), settings, rate_of_means=3.2e-4, threads=1)
-    np.testing.assert_allclose(before["means"] - adam.parameters["means"], 3.2e-4, rtol=1e-3)
-    np.testing.assert_allclose(before["log_scales"] - adam.parameters["log_scales"], 0.01, rtol=1e-3)
-    np.testing.assert_allclose(before["sh"] - adam.parameters["sh"], 2.5e-3, rtol=1e-3)
+    model.descend(gradients_of(model, 1.0), step_sizes(settings, 3.2e-4))
+    np.testing.assert_allclose(before["means"] - model.parameters["means"], 3.2e-4, rtol=1e-3)
+    np.testing.assert_allclose(before["log_scales"] - model.parameters["log_scales"], 0.01, rtol=1e-3)
+    np.testing.assert_allclose(before["sh"] - model.parameters["sh"], 2.5e-3, rtol=1e-3)
 
 
 MCMC = GaussiansSettings(strategy="mcmc")
@@ -266,57 +265,57 @@ def test_coincident_gaussians_cover_what_one_covered(opacity, number):
 
 
 def test_dead_gaussians_move_onto_live_ones_and_moments_are_reset():
-    adam = Adam.start(row_of_gaussians([0.9, 0.004, 0.5, 0.001]))
-    for table in (adam.first, adam.second):
+    model = CpuModel(row_of_gaussians([0.9, 0.004, 0.5, 0.001]))
+    for table in (model.first, model.second):
         for values in table.values():
             values[:] = 1
-    relocate_and_grow(adam, NO_GROWTH, np.random.default_rng(1))
-    assert len(adam) == 4
-    assert set(adam.parameters["means"][:, 0]) <= {0.0, 2.0}
-    moved = adam.parameters["means"][[1, 3], 0]
+    relocate_and_grow(model, NO_GROWTH, np.random.default_rng(1))
+    assert len(model) == 4
+    assert set(model.parameters["means"][:, 0]) <= {0.0, 2.0}
+    moved = model.parameters["means"][[1, 3], 0]
     for source in (0, 2):
-        members = np.flatnonzero(adam.parameters["means"][:, 0] == source)
+        members = np.flatnonzero(model.parameters["means"][:, 0] == source)
         opacity, number = [0.9, None, 0.5][source], len(members)
-        assert 1 - np.prod(1 - opacities(adam)[members]) == pytest.approx(opacity, rel=1e-4)
+        assert 1 - np.prod(1 - opacities(model)[members]) == pytest.approx(opacity, rel=1e-4)
         shared = shared_opacity(np.array([opacity]), np.array([number]))
         scale = 0.2 * scale_factor(np.array([opacity]), shared, np.array([number])).item()
-        np.testing.assert_allclose(np.exp(adam.parameters["log_scales"][members]), scale, rtol=1e-4)
+        np.testing.assert_allclose(np.exp(model.parameters["log_scales"][members]), scale, rtol=1e-4)
         touched = source in moved
-        assert (adam.first["means"][members] == (0 if touched else 1)).all()
+        assert (model.first["means"][members] == (0 if touched else 1)).all()
 
 
 @pytest.mark.parametrize(("min_opacity", "opacity"), [(0.005, 0.1), (0.003, 0.1), (0.1, 0.6), (0.5, 0.9)])
 def test_gaussians_that_share_a_place_stay_alive(min_opacity, opacity):
     # an equal share for 51 would be 0.002, 0.002, 0.018 or 0.044: below each threshold
-    adam = Adam.start(row_of_gaussians([opacity] + [min_opacity / 2] * 200))
+    model = CpuModel(row_of_gaussians([opacity] + [min_opacity / 2] * 200))
     settings = NO_GROWTH.model_copy(update={"min_opacity": min_opacity})
-    relocate_and_grow(adam, settings, np.random.default_rng(0))
-    assert (opacities(adam) > min_opacity).all()
-    np.testing.assert_allclose(opacities(adam), min_opacity, rtol=1e-5)
-    before = {name: values.copy() for name, values in adam.parameters.items()}
-    relocate_and_grow(adam, settings, np.random.default_rng(1))
+    relocate_and_grow(model, settings, np.random.default_rng(0))
+    assert (opacities(model) > min_opacity).all()
+    np.testing.assert_allclose(opacities(model), min_opacity, rtol=1e-5)
+    before = {name: values.copy() for name, values in model.parameters.items()}
+    relocate_and_grow(model, settings, np.random.default_rng(1))
     for name, values in before.items():
-        np.testing.assert_array_equal(adam.parameters[name], values)
+        np.testing.assert_array_equal(model.parameters[name], values)
 
 
 def test_growth_is_a_share_and_stops_at_the_cap():
-    adam = Adam.start(row_of_gaussians([0.5] * 40))
+    model = CpuModel(row_of_gaussians([0.5] * 40))
     settings = MCMC.model_copy(update={"mcmc_growth": 0.05, "max_gaussians": 43})
-    relocate_and_grow(adam, settings, np.random.default_rng(0))
-    assert len(adam) == 42  # 5 % of 40
+    relocate_and_grow(model, settings, np.random.default_rng(0))
+    assert len(model) == 42  # 5 % of 40
     for _ in range(2):
-        relocate_and_grow(adam, settings, np.random.default_rng(0))
-        assert len(adam) == 43
+        relocate_and_grow(model, settings, np.random.default_rng(0))
+        assert len(model) == 43
     # each place keeps its opacity, however many Gaussians share it
     for place in range(40):
-        members = adam.parameters["means"][:, 0] == place
-        assert 1 - np.prod(1 - opacities(adam)[members]) == pytest.approx(0.5, rel=1e-4)
+        members = model.parameters["means"][:, 0] == place
+        assert 1 - np.prod(1 - opacities(model)[members]) == pytest.approx(0.5, rel=1e-4)
 
 
 def test_places_are_drawn_by_their_opacity():
-    adam = Adam.start(row_of_gaussians([0.8, 0.2] + [0.0001] * 4000))
-    relocate_and_grow(adam, NO_GROWTH, np.random.default_rng(0))
-    share = (adam.parameters["means"][2:, 0] == 0).mean()
+    model = CpuModel(row_of_gaussians([0.8, 0.2] + [0.0001] * 4000))
+    relocate_and_grow(model, NO_GROWTH, np.random.default_rng(0))
+    share = (model.parameters["means"][2:, 0] == 0).mean()
     assert share == pytest.approx(0.8, abs=0.02)  # standard error 0.006
 
 
@@ -326,8 +325,8 @@ def test_noise_is_normal_numbers_times_the_covariance_and_spares_opaque_gaussian
     generator = np.random.default_rng(2)
     parameters["log_scales"] = np.log(generator.uniform(0.001, 0.02, (32, 3))).astype(np.float32)
     parameters["quats"] = (3 * generator.normal(size=(32, 4))).astype(np.float32)
-    adam = Adam.start(parameters | {"means": parameters["means"].copy()})
-    add_noise(adam, MCMC, 1e-4, 2.0, np.random.default_rng(0))
+    model = CpuModel(parameters | {"means": parameters["means"].copy()})
+    model.add_noise(MCMC, 1e-4, 2.0, np.random.default_rng(0))
     normal = np.random.default_rng(0).standard_normal((32, 3), dtype=np.float32)
     turns = Rotation.from_quat(np.roll(parameters["quats"], -1, axis=1)).as_matrix()
     root = turns * np.exp(parameters["log_scales"].astype(float))[:, None]
@@ -335,15 +334,15 @@ def test_noise_is_normal_numbers_times_the_covariance_and_spares_opaque_gaussian
     # lengths in units of the extent 2, and back
     expected = 5e5 * 1e-4 * gate * np.einsum("nij,nkj,nk->ni", root, root, normal) / 2
     # means lie up to 30 from 0, where float32 steps by 2e-6
-    np.testing.assert_allclose(adam.parameters["means"] - parameters["means"], expected, atol=2e-6)
-    np.testing.assert_array_equal(adam.parameters["means"][30:], parameters["means"][30:])
+    np.testing.assert_allclose(model.parameters["means"] - parameters["means"], expected, atol=2e-6)
+    np.testing.assert_array_equal(model.parameters["means"][30:], parameters["means"][30:])
 
 
 def test_regularisers_add_the_gradient_of_mean_opacity_and_mean_scale():
-    adam = Adam.start(row_of_gaussians([0.5, 0.2], scale=0.3))
-    gradients = gradients_of(adam, 0.0)
+    model = CpuModel(row_of_gaussians([0.5, 0.2], scale=0.3))
+    gradients = gradients_of(model, 0.0)
     settings = MCMC.model_copy(update={"mcmc_opacity_weight": 0.1, "mcmc_scale_weight": 0.6})
-    add_regularisers(adam, gradients, settings, extent=2.0)
+    model.add_regularisers(gradients, settings, extent=2.0)
     # 0.1 / 2 x o (1 - o); 0.6 / (3 x 2) x 0.3 / 2
     np.testing.assert_allclose(gradients.opacity_logits, [0.05 * 0.25, 0.05 * 0.16], rtol=1e-5)
     np.testing.assert_allclose(gradients.log_scales, 0.015, rtol=1e-5)

@@ -1,4 +1,4 @@
-"""Threads, bands of tiles, notice and choice of the device; the CUDA backend without a device."""
+"""Threads, bands of tiles, and choice of the device."""
 
 import logging
 import subprocess
@@ -6,17 +6,15 @@ import sys
 from collections.abc import Callable
 from types import SimpleNamespace
 
-import gsplat
 import numpy as np
 import pytest
 
 from cpusplat import binning
 from hilsplat.base.errors import DeviceError
 from hilsplat.splat.gaussians import Gaussians
-from hilsplat.splat.rasterise import cuda, device, parity
+from hilsplat.splat.rasterise import cuda, device
 from hilsplat.splat.rasterise.api import draw, pixel_weights
 from hilsplat.splat.rasterise.device import choose_device
-from tests.cpusplat import gsplat_on_cpu
 from tests.unit.splat.rasterise_scenes import camera, random_gaussians
 
 
@@ -25,7 +23,7 @@ def everything(threads: int, order: str) -> list[np.ndarray]:
     gaussians, view = random_gaussians(300, seed=5), camera(70, 90)
     gaussians = Gaussians(*(np.asarray(values, order=order) for values in vars(gaussians).values()))
     features = np.linspace(-1, 1, 1800, dtype=np.float32).reshape(300, 6)
-    seen = draw(gaussians, view, 3, features=features, threads=threads, device="cpu")
+    seen = draw(gaussians, view, 3, features=features, threads=threads)
     gradients = seen.gradients(2 * seen.image, np.ones_like(seen.alpha))
     matrix = pixel_weights(gaussians, view, min_weight=1e-3, threads=threads)
     sparse = [matrix.data, matrix.indices, matrix.indptr]
@@ -52,10 +50,10 @@ def no_cuda(monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     monkeypatch.setattr("ctypes.CDLL", lambda name: None)
     device.cuda_problem.cache_clear()
-    choose_device.cache_clear()
+    device.CHOSEN.clear()
     yield
     device.cuda_problem.cache_clear()
-    choose_device.cache_clear()
+    device.CHOSEN.clear()
 
 
 @pytest.mark.usefixtures("no_cuda")
@@ -118,7 +116,7 @@ def test_a_failing_build_of_gsplat_is_tried_once_and_selects_the_cpu(card, caplo
     assert choose_device("auto") == "cpu"
     assert "the CUDA kernels of gsplat cannot be compiled: " in caplog.text
     device.cuda_problem.cache_clear()  # as in the next stage's process
-    choose_device.cache_clear()
+    device.CHOSEN.clear()
     assert choose_device("auto") == "cpu" and len(tries) == 1
     device.forget_cuda()  # as `hilsplat doctor` does
     assert choose_device("auto") == "cpu" and len(tries) == 2
@@ -142,30 +140,5 @@ def test_a_broken_driver_selects_the_cpu(card, monkeypatch, caplog):
 
 def test_the_cpu_is_selected_without_a_check_for_cuda(monkeypatch):
     monkeypatch.setattr(device, "cuda_problem", lambda: pytest.fail("it ran"))
-    assert choose_device.__wrapped__("cpu") == "cpu"
-
-
-# ---- CUDA backend with gsplat's reference implementation in torch ----------------------------------
-
-
-@pytest.fixture
-def without_device(monkeypatch):
-    """gsplat's reference functions in place of its kernels."""
-    monkeypatch.setattr(cuda, "DEVICE", "cpu")
-    for name in ("rasterization", "spherical_harmonics", "rasterize_to_indices_in_range"):
-        monkeypatch.setattr(gsplat, name, getattr(gsplat_on_cpu, name))
-
-
-@pytest.mark.usefixtures("without_device")
-def test_gsplats_reference_draws_what_our_kernels_draw():
-    assert parity.disagreement("cpu", "cuda") is None
-
-
-@pytest.mark.usefixtures("without_device")
-@pytest.mark.parametrize(
-    ("name", "value", "what"),
-    [("LOW_PASS_PX2", 0.6, "image"), ("NEAR", 1.0, "image"), ("MAX_ALPHA", 0.5, "weights")],
-)
-def test_the_self_test_detects_other_conventions(monkeypatch, name, value, what):
-    monkeypatch.setattr(cuda, name, value)
-    assert what in parity.disagreement("cpu", "cuda")
+    monkeypatch.setattr(device, "CHOSEN", {})
+    assert choose_device("cpu") == "cpu"
