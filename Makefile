@@ -5,19 +5,21 @@
 # make docs    set up, then build the site of the documentation in site/; a broken link fails
 # make bench   set up, then time the fast paths and a run on photographs; tables go to results/benchmarks (docs/benchmarks.md)
 #              with BASE=<commit>: what got slower since then, by runs of both versions in turn
+# make gpu     set up, then test and measure what needs an NVIDIA card; with DEVICE=cpu, at tiny sizes (docs/gpu.md)
 # make published  set up, then run config/paper.yaml over tiny data in the published layouts (docs/workflow.md)
 # make chaos   set up, then kill, freeze and starve runs of the ci configuration, and compare tables (docs/workflow.md)
 # make report  set up, run, and write results/report.html
 # make setup   create .venv with everything that the targets above need
 PYTHON ?= python3
 CORES ?= 2
+DEVICE ?= cuda
 KILLS ?= 30
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: run demo test lint docs bench chaos published report setup
+.PHONY: run demo test lint docs bench gpu chaos published report setup
 
 run: $(STAMP)
 	hilsplat run -- --cores $(CORES)
@@ -47,6 +49,9 @@ test: lint
 # The variable turns off mkdocs-material's notice about MkDocs 2, which pyproject.toml excludes.
 docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 mkdocs build --strict
+
+gpu: $(STAMP)
+	python -m benchmarks.gpu --device $(DEVICE)
 
 bench: $(STAMP)
 ifdef BASE

@@ -1,8 +1,11 @@
 """Benchmarks run, untimed; a case counts as slower only if it clearly is in every pair of runs."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 from benchmarks.compare import paired
 
@@ -17,6 +20,18 @@ def test_every_benchmark_runs():
         [sys.executable, *command, "-k", heavy], cwd=ROOT, stdout=subprocess.PIPE, text=True
     )
     assert done.returncode == 0, done.stdout
+
+
+def test_what_needs_a_card_runs_on_the_cpu(tmp_path: Path):
+    command = [sys.executable, "-m", "benchmarks.gpu", "--device", "cpu", "--out", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    assert done.returncode == 0, done.stdout
+    found = json.loads((tmp_path / "gpu.json").read_text())
+    assert found["parity"]["differs"] == "" and found["slots"]["seconds"] >= 4
+    assert all(row["step_ms"] > 0 and row["longest_ms"] for row in found["steps"]["steps"])
+    assert found["fit"]["cuda"]["psnr_db"] == pytest.approx(found["fit"]["cpu"]["psnr_db"], abs=0.5)
+    assert {"sam-tiny", "clip-tiny"} <= found["networks"].keys()
+    assert (tmp_path / "gpu.md").read_text().count("\n| ") >= 9
 
 
 def test_a_difference_must_be_in_every_pair_of_one_moment():

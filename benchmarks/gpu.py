@@ -1,0 +1,402 @@
+"""Everything that can be tested and measured only on an NVIDIA card, in one command (docs/gpu.md).
+
+    make gpu                                  # on a card; about 450 s are planned on an H100 with 16 cores
+    make gpu DEVICE=cpu                       # the same code on the CPU at tiny sizes, with gsplat in torch
+    python -m benchmarks.gpu --part steps     # one part
+    python -m benchmarks.gpu --models FOLDER  # with full-size networks (benchmarks.real_size exports them)
+
+Each part runs in its own process and fails alone. `gpu.json` and `gpu.md` are written to results/benchmarks.
+Nothing is downloaded. On a card, the seconds that a dry run's estimate uses are written to
+hilsplat/workflow/gpu.json.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.large_scene import made_gaussians, ring_of_cameras
+from benchmarks.scenes import random_scene
+from benchmarks.table import markdown_table
+from benchmarks.test_splat import HALF_WAY, SETTINGS
+from hilsplat.base.artifacts import write_json, write_text
+from hilsplat.base.errors import first_line
+from hilsplat.base.images import write_png
+from hilsplat.models.folder import ModelFolder, input_side_px
+from hilsplat.scene.scene import Scene
+from hilsplat.settings import MasksSettings
+from hilsplat.splat.fit import FitState, fit_gaussians, fit_step
+from hilsplat.splat.gaussians import FIELDS
+from hilsplat.splat.initial import TrainingView
+from hilsplat.splat.model import model_on
+from hilsplat.splat.rasterise.api import render
+from hilsplat.splat.rasterise.parity import disagreement, driver_version
+
+ROOT = Path(__file__).resolve().parents[1]
+OUT = ROOT / "results/benchmarks"
+ESTIMATE = ROOT / "hilsplat/workflow/gpu.json"
+LIMIT_S = 200  # of a part
+CORES = os.cpu_count() or 1
+TESTS = ("splat", "contributions", "models", "segment", "embed")  # folders of tests/unit with tests of a card
+MAX_PSNR_LOSS_DB = 0.5
+"""Maximum by which the PSNR of a fit on a card may be below that of the same fit on the CPU."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much to measure."""
+
+    copied: int  # bytes
+    product: int  # side of the matrices that are multiplied
+    steps: tuple[tuple[int, tuple[int, int]], ...]  # Gaussians, image size of fit steps
+    fit: tuple[int, int, int, int]  # Gaussians of the scene, views, image side, steps
+    long_fit: tuple[int, int, int, int] | None
+    contributions: tuple[int, int, int, int]  # Gaussians, views, width, masks
+    crops: tuple[int, ...]
+    points_per_side: int
+
+
+CARD = Sizes(
+    2**31,
+    8192,
+    ((100_000, (600, 800)), (100_000, (1200, 1600)), (1_000_000, (728, 986)), (3_000_000, (728, 986))),
+    (50_000, 24, 256, 1500),
+    (1_000_000, 24, 800, 7000),
+    (1_000_000, 24, 986, 300),
+    (1, 64, 256),
+    32,
+)
+TINY = Sizes(
+    2**24,
+    256,
+    ((300, (48, 64)), (300, (96, 128)), (600, (48, 64))),
+    (400, 6, 48, 60),
+    None,
+    (2000, 2, 160, 30),
+    (1, 8),
+    8,
+)
+
+
+def synchronise(device: str) -> None:
+    if device == "cuda":
+        torch.cuda.synchronize()
+
+
+def median_ms(work: Callable[[], object], device: str, rounds: int) -> float:
+    """Return the median duration of a call after a warm-up, ms."""
+    times = []
+    for _ in range(rounds + 2):
+        synchronise(device)
+        begun = time.perf_counter()
+        work()
+        synchronise(device)
+        times.append(time.perf_counter() - begun)
+    return 1e3 * statistics.median(times[2:])
+
+
+# ---- parts ---------------------------------------------------------------------------------------
+
+
+def machine(device: str, sizes: Sizes, models: Path | None) -> dict[str, Any]:
+    """Versions, and how fast the device copies and multiplies."""
+    import gsplat
+
+    source = torch.ones(sizes.copied // 4, device=device)
+    target = torch.empty_like(source)
+    dtype = torch.bfloat16 if device == "cuda" else torch.float32
+    matrix = torch.ones(sizes.product, sizes.product, device=device, dtype=dtype)
+    copy_ms = median_ms(lambda: target.copy_(source), device, 5)
+    product_ms = median_ms(lambda: matrix @ matrix, device, 5)
+    return {
+        "card": torch.cuda.get_device_name() if device == "cuda" else "none",
+        "driver": driver_version(),
+        "torch": torch.__version__,
+        "gsplat": gsplat.__version__,
+        "cores": CORES,
+        "copy_tb_per_s": 2 * sizes.copied / copy_ms / 1e9,
+        "product_tflop_per_s": 2 * sizes.product**3 / product_ms / 1e9,
+    }
+
+
+def parity(device: str, sizes: Sizes, models: Path | None) -> dict[str, Any]:
+    """A step of the fit and pixel weights against the CPU."""
+    if wrong := disagreement("cpu", "cuda"):
+        raise RuntimeError(wrong)
+    return {"differs": ""}
+
+
+def tests(device: str, sizes: Sizes, models: Path | None) -> dict[str, Any]:
+    """The tests that need a card."""
+    if device == "cpu":
+        return {"left out": "they need a card"}
+    folders = [f"tests/unit/{name}" for name in TESTS]
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "gpu", *folders]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    (last,) = done.stdout.strip().splitlines()[-1:]
+    if done.returncode or "skipped" in last:
+        raise RuntimeError(f"{last}\n{done.stdout[-4000:]}")
+    return {"pytest": last}
+
+
+def steps(device: str, sizes: Sizes, models: Path | None) -> dict[str, Any]:
+    """Time of a fit's step, its longest operations, and its peak memory."""
+    return {"steps": [step_of(number, size_hw, device) for number, size_hw in sizes.steps]}
+
+
+def step_of(number: int, size_hw: tuple[int, int], device: str) -> dict[str, Any]:
+    gaussians, camera = random_scene(number, size_hw)
+    picture = render(gaussians, camera, threads=CORES).clip(0, 1)
+    view = TrainingView(camera, (255 * picture).astype(np.uint8))
+    model = model_on("cuda")({name: getattr(gaussians, name).copy() for name in FIELDS}, 1)
+    state = FitState(model, np.random.default_rng(0))
+    model.steps = HALF_WAY
+    if device == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+    step_ms = median_ms(lambda: fit_step(state, [view], SETTINGS, 1.0), device, 20 if device == "cuda" else 2)
+    peak = torch.cuda.max_memory_allocated() if device == "cuda" else 0
+    kinds = [torch.profiler.ProfilerActivity.CPU]
+    kinds += [torch.profiler.ProfilerActivity.CUDA] if device == "cuda" else []
+    with torch.profiler.profile(activities=kinds) as profile:
+        fit_step(state, [view], SETTINGS, 1.0)
+        synchronise(device)
+    spent = "self_device_time_total" if device == "cuda" else "self_cpu_time_total"
+    longest = sorted(profile.key_averages(), key=lambda event: -getattr(event, spent))[:8]
+    return {
+        "gaussians": number,
+        "megapixels": size_hw[0] * size_hw[1] / 1e6,
+        "step_ms": step_ms,
+        "peak_mib": peak / 2**20,
+        "longest_ms": {event.key[:60]: getattr(event, spent) / 1e3 for event in longest},
+    }
+
+
+def fit(device: str, sizes: Sizes, models: Path | None) -> dict[str, Any]:
+    """A fit on the CPU and on the card, from the same scene: seconds and training PSNR."""
+    found = {name: fitted(name, *sizes.fit) for name in ("cpu", "cuda")}
+    if not found["cuda"]["psnr_db"] > found["cpu"]["psnr_db"] - MAX_PSNR_LOSS_DB:
+        raise RuntimeError(f"the fit on the card is worse than on the CPU: {found}")
+    if sizes.long_fit is not None:
+        found["cuda, long"] = fitted("cuda", *sizes.long_fit)
+    return found
+
+
+def fitted(device: str, number: int, views: int, side_px: int, iterations: int) -> dict[str, float]:
+    """Fit pictures of made Gaussians, starting from a tenth of them; return seconds and the final PSNR."""
+    gaussians, _ = made_gaussians(number)
+    cameras = ring_of_cameras(views, (side_px * 3 // 4, side_px))
+    start = np.random.default_rng(0).choice(number, number // 10, replace=False)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        for name in cameras.names:
+            picture = render(gaussians, cameras[name], threads=CORES)
+            write_png(folder / "images" / name, (255 * picture.clip(0, 1)).astype(np.uint8))
+        colours = np.full((len(start), 3), 128, np.uint8)
+        split = dict.fromkeys(cameras.names, "train")
+        points = gaussians.means[start]
+        Scene(folder, "made/large", "metre", cameras, split, points, colours, np.eye(4)).save()
+        settings = SETTINGS.model_copy(
+            update={
+                "device": device,
+                "iterations": iterations,
+                "steps_per_view": iterations,
+                "max_gaussians": number,
+            }
+        )
+        begun = time.perf_counter()
+        result, curve = fit_gaussians(Scene.load(folder), settings, seed=0, threads=CORES)
+        seconds = time.perf_counter() - begun
+    last = curve[-max(1, len(curve) // 10) :, 2]
+    return {"seconds": seconds, "psnr_db": float(last.mean()), "gaussians": float(len(result))}
+
+
+def networks(device: str, sizes: Sizes, models: Path | None) -> dict[str, Any]:
+    """SAM and CLIP on the device: milliseconds per picture and per crop."""
+    from hilsplat.models.folder import open_model_folder
+    from hilsplat.models.store import EMBEDDED
+
+    folders = [*models.iterdir()] if models else [ROOT / folder for folder in EMBEDDED.values()]
+    opened = [open_model_folder(folder) for folder in folders]
+    times = {"sam": times_of_sam, "clip": times_of_clip}
+    return {model.folder.name: times[model.kind](model, device, sizes) for model in opened}
+
+
+def times_of_sam(model: ModelFolder, device: str, sizes: Sizes) -> dict[str, Any]:
+    from hilsplat.segment.generate import decode_candidates
+    from hilsplat.segment.sam import SamModel
+
+    sam = SamModel(model, device)
+    picture = np.random.default_rng(0).integers(0, 256, (600, 800, 3)).astype(np.uint8)
+    settings = MasksSettings(device=device, points_per_side=sizes.points_per_side)
+    return {
+        "encode_ms": median_ms(lambda: sam.encode(picture), device, 3),
+        "picture_ms": median_ms(lambda: decode_candidates(picture, sam, settings, None), device, 2),
+        "decoder": "factored" if sam.factored else "as exported",
+    }
+
+
+def times_of_clip(model: ModelFolder, device: str, sizes: Sizes) -> dict[str, Any]:
+    from hilsplat.embed.clip import ClipModel
+
+    clip, rng = ClipModel(model, device=device), np.random.default_rng(0)
+
+    def crop_ms(number: int) -> float:
+        crops = rng.integers(0, 256, (number, *[input_side_px(model)] * 2, 3)).astype(np.uint8)
+        return median_ms(lambda: clip.embed_crops(crops), device, 3) / number
+
+    return {"crop_ms": {number: crop_ms(number) for number in sizes.crops}}
+
+
+def contributions(device: str, sizes: Sizes, models: Path | None) -> dict[str, Any]:
+    """Contributions of a generated scene on the CPU and on the card."""
+    from benchmarks.large_scene import make, stages
+
+    number, views, width, masks = sizes.contributions
+    found = {}
+    with tempfile.TemporaryDirectory() as temporary:
+        out, threads = Path(temporary), CORES
+        make(out, number, views, (width * 3 // 4, width), masks, threads)
+        for name in ("cpu", "cuda"):
+            begun = time.perf_counter()
+            stages(out, threads, name)["contributions"]()
+            found[f"{name}_s"] = time.perf_counter() - begun
+    return found
+
+
+def slots(device: str, sizes: Sizes, models: Path | None) -> dict[str, Any]:
+    """Two jobs and one card: the second waits until the first has ended."""
+    hold = "import time; from hilsplat.base.cards import take_card; print(take_card()); time.sleep(2)"
+    environment = {
+        **os.environ,
+        "CUDA_VISIBLE_DEVICES": os.environ.get("CUDA_VISIBLE_DEVICES", "0")[:1] or "0",
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        environment["TMPDIR"] = folder
+        begun = time.perf_counter()
+        jobs = [subprocess.Popen([sys.executable, "-c", hold], env=environment, cwd=ROOT) for _ in range(2)]
+        failed = [job.wait() for job in jobs]
+    seconds = time.perf_counter() - begun
+    if any(failed) or seconds < 4:
+        raise RuntimeError(f"two jobs of 2 s on one card took {seconds:.1f} s")
+    return {"seconds": seconds}
+
+
+def answer(device: str, sizes: Sizes, models: Path | None) -> dict[str, Any]:
+    """A run from posed photographs to scores."""
+    if device == "cpu":
+        return {"left out": "make test runs the workflow on the CPU"}
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "hilsplat", "run", "--config", str(ROOT / "config/ci.yaml")]
+        begun = time.perf_counter()
+        subprocess.run(command, check=True, cwd=folder, env={**os.environ, "PYTHONPATH": str(ROOT)})
+        return {"seconds": time.perf_counter() - begun}
+
+
+PARTS = (machine, parity, tests, steps, fit, networks, contributions, slots, answer)
+
+
+# ---- results -------------------------------------------------------------------------------------
+
+
+def run_part(name: str, device: str, models: Path | None) -> dict[str, Any]:
+    """Run a part in its own process; the result has its seconds, and "failed" if it did."""
+    command = [sys.executable, "-m", "benchmarks.gpu", "--part", name, "--device", device]
+    command += ["--models", str(models)] if models else []
+    begun, result = time.perf_counter(), dict[str, Any]()
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, cwd=ROOT)
+        if done.returncode:
+            result["failed"] = done.stderr[-4000:]
+        else:
+            result = json.loads(done.stdout.splitlines()[-1])
+    except subprocess.TimeoutExpired:
+        result["failed"] = f"it took more than {LIMIT_S} s"
+    return {**result, "part_s": time.perf_counter() - begun}
+
+
+def estimate_of(results: dict[str, Any]) -> dict[str, Any]:
+    """Return the seconds for `hilsplat/workflow/gpu.json`; those of a step by least squares."""
+    rows = results["steps"]["steps"]
+    terms = np.array([[1.0, row["megapixels"], row["gaussians"]] for row in rows])
+    scale = terms.max(axis=0)
+    from scipy.optimize import nnls
+
+    weights, _ = nnls(terms / scale, np.array([row["step_ms"] / 1e3 for row in rows]))
+    base, per_mp, per_gaussian = (weights / scale).tolist()
+    known = json.loads(ESTIMATE.read_text(encoding="utf-8"))
+    sam_s = dict(known["sam_picture_s"])
+    crop_s = known["clip_crop_s"]
+    for name, found in results["networks"].items():
+        if isinstance(found, dict) and "picture_ms" in found:
+            sam_s[next(word for word in sam_s if word in name)] = found["picture_ms"] / 1e3
+        elif isinstance(found, dict) and "crop_ms" in found:
+            crop_s = min(found["crop_ms"].values()) / 1e3
+    return {
+        "card": results["machine"]["card"],
+        "measured": True,
+        "fit_step_s": base,
+        "fit_step_s_per_mp": per_mp,
+        "fit_step_s_per_gaussian": per_gaussian,
+        "sam_picture_s": sam_s,
+        "clip_crop_s": crop_s,
+    }
+
+
+def main() -> int:
+    """Run all parts or one, write the results, and return 1 if a part failed."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
+    parser.add_argument("--part", choices=[part.__name__ for part in PARTS])
+    parser.add_argument("--models", type=Path, help="folder of model folders; default: the embedded models")
+    parser.add_argument("--out", type=Path, default=OUT)
+    given = parser.parse_args()
+    if given.part:
+        if given.device == "cpu":
+            import pytest
+
+            from tests.unit.card_on_cpu import replace_kernels
+
+            replace_kernels(pytest.MonkeyPatch())
+        (part,) = (part for part in PARTS if part.__name__ == given.part)
+        print(json.dumps(part(given.device, CARD if given.device == "cuda" else TINY, given.models)))
+        return 0
+    results = {}
+    for part in PARTS:
+        name = part.__name__
+        results[name] = run_part(name, given.device, given.models)
+        state = "FAILED" if "failed" in results[name] else "passed"
+        print(f"{name:<14} {state} {results[name]['part_s']:6.1f} s", flush=True)
+    write_json(given.out / "gpu.json", results)
+    failed = {name: found["failed"] for name, found in results.items() if "failed" in found}
+    rows = [
+        (
+            name,
+            "failed" if name in failed else "",
+            f"{found['part_s']:.0f}",
+            json.dumps({key: value for key, value in found.items() if key not in ("failed", "part_s")}),
+        )
+        for name, found in results.items()
+    ]
+    write_text(given.out / "gpu.md", markdown_table(("part", "", "s", "results"), rows) + "\n")
+    print(f"wrote {given.out / 'gpu.json'} and {given.out / 'gpu.md'}")
+    if given.device == "cuda" and not {"machine", "steps"} & failed.keys() and given.models:
+        write_json(ESTIMATE, estimate_of(results))
+        print(f"wrote {ESTIMATE}: the dry run's estimate uses this card")
+    for name, problem in failed.items():
+        print(f"\n{name} failed: {first_line(problem.strip().splitlines()[-1])}\n{problem}")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
