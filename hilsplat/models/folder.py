@@ -98,9 +98,19 @@ class ModelFolder:
         files = [(path.relative_to(self.folder).as_posix(), sha256_of_file(path)) for path in self.files]
         return sha256_of_json(files)
 
-    def network(self, name: str, changed: Graph | Path | None = None, provider: str | None = None) -> Network:
-        """Open one of the model's networks and check its inputs and outputs (see `Network`)."""
-        return Network(self.networks[name], LAYOUTS[self.layout].usable[name], changed, provider)
+    def network(
+        self, name: str, changed: Graph | Path | None = None, device: str = "cpu", half: bool = False
+    ) -> Network:
+        """Open one of the model's networks and check its inputs and outputs.
+
+        It is a `Network` on the CPU, otherwise a `TorchNetwork`.
+        """
+        network = self.networks[name], LAYOUTS[self.layout].usable[name], changed
+        if device == "cpu":
+            return Network(*network)
+        from hilsplat.models.torch_network import TorchNetwork  # torch takes seconds to import
+
+        return TorchNetwork(*network, device=device, half=half)
 
 
 def open_model_folder(
