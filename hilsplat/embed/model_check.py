@@ -14,7 +14,7 @@ from hilsplat.base.errors import HilsplatError
 from hilsplat.embed.clip import ClipModel
 from hilsplat.models.folder import input_side_px, open_model_folder
 from hilsplat.models.int8 import considers_int8, int8_network
-from hilsplat.models.network import execution_providers, require_one_space
+from hilsplat.models.network import require_one_space
 from hilsplat.models.store import broken_models, present_models
 from hilsplat.segment.sam import SamModel
 
@@ -55,12 +55,12 @@ def check_model(folder: Path, variant: str = "") -> str:
             f"masks      3 heads (subpart, part, whole) of {masks.shape[-2]} x {masks.shape[-1]} px",
             f"decoder    {'factored' if opened.factored else 'onnxruntime'}",
         ]
-        providers = opened.encoder.providers
+        providers = opened.encoder.runs_on
     else:
         vectors = opened.embed_crops(np.full((1, side, side, 3), 128, np.uint8))
         require_one_space(model.folder, vectors.shape[1], opened.embed_texts(["object"]).shape[1])
         lines += [f"vectors    {vectors.shape[1]} dimensions"]
-        providers = opened.vision.providers
+        providers = opened.vision.runs_on
     _remember(folder, variant, seconds, writable(CACHE))
     lines += [f"time       {listed}", f"runs on    {', '.join(providers)}", f"digest     {model.digest}"]
     return "\n".join(lines)

@@ -88,7 +88,7 @@ def run_clip(
                 "masks": [pixels[row] for row in order],
                 "model": model.digest,
                 "precision": model.precision,
-                "providers": model.vision.providers,
+                "providers": model.vision.runs_on,
                 "settings": settings.model_dump(include={"crop", "background", "batch"}),
                 "code": code_digest(ClipModel),
             }

@@ -14,7 +14,7 @@ from hilsplat.base.cache import ViewCache
 from hilsplat.base.lineage import sha256_of_json
 from hilsplat.base.removal import is_unfinished
 from hilsplat.models.folder import ModelFolder, external_weights, input_side_px
-from hilsplat.models.network import CPU, Network, execution_providers, or_as_exported
+from hilsplat.models.network import Network, or_as_exported
 from hilsplat.models.onnx_graph import Graph, needed_names
 from hilsplat.models.repeatable import random_pixels, require_repeatable_once
 
@@ -47,7 +47,7 @@ def considers_int8(precision: str, model: ModelFolder, name: str) -> bool:
     `auto` ignores large networks, such as those of ViT-L and ViT-H. A warning is logged if int8 is required
     but cannot save time: on a GPU, or for a model of the synthetic world.
     """
-    possible = execution_providers()[0] == CPU and not model.config.get("world_only")
+    possible = not model.config.get("world_only")
     if precision == "int8" and not possible:
         logger.warning("%s runs in float32: int8 requires a pretrained model on a CPU", model.folder)
     path = model.networks[name]

@@ -50,5 +50,5 @@ def require_repeatable_once(
         require_repeatable(network, feeds, {name: np.flip(value, axis=-1) for name, value in feeds.items()})
         return "repeatable"
 
-    key = [model.digest, network.path.name, form, onnxruntime.__version__, network.providers]
+    key = [model.digest, network.path.name, form, onnxruntime.__version__, network.runs_on]
     remembered("networks", key, check)

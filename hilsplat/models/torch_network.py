@@ -5,7 +5,9 @@ on the host, such as the arithmetic with which exporters compute the arguments o
 list of torch calls, which later calls repeat without waiting for the card.
 """
 
+import copy
 from collections import Counter, deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -64,12 +66,14 @@ class TorchNetwork(Network):
     """A `Network` in torch; several threads must not call it at once.
 
     Args:
+        network: arguments of `Network`.
         device: torch device, such as "cuda".
-        half: compute products in float16, as torch's autocast does.
     """
 
-    def __init__(self, *network: Any, device: str, half: bool = False) -> None:
-        self.device, self.half = torch.device(device), half
+    half = False  # see `in_half`
+
+    def __init__(self, *network: Any, device: str) -> None:
+        self.device = torch.device(device)
         self._plans: dict[tuple[Any, ...], list[Step]] = {}
         self._uploaded: dict[str, Tensor] = {}
         super().__init__(*network)
@@ -87,6 +91,10 @@ class TorchNetwork(Network):
 
     def run(self, **feeds: np.ndarray | Tensor) -> list[Tensor]:
         """Run the network as `__call__` does, but leave the outputs on the device."""
+        return self._with_right_axes(self.values(feeds, list(self.spec.outputs)))
+
+    def values(self, feeds: Mapping[str, np.ndarray | Tensor], names: Sequence[str]) -> list[Tensor]:
+        """Return outputs of the network, float32 on the device."""
         given = {
             name: torch.as_tensor(value).to(self.device, _dtype(self.inputs[name].type))
             for name, value in feeds.items()
@@ -98,16 +106,20 @@ class TorchNetwork(Network):
                 if shapes in self._plans:
                     values = _repeat(self._plans[shapes], dict(given))
                 else:
-                    steps, values = self._first_call(dict(given))
-                    self._plans[shapes] = steps
+                    self._plans[shapes], values = self._first_call(dict(given))
                     if len(self._plans) > PLANS:
                         del self._plans[next(iter(self._plans))]
-                outputs = [values[name].float() for name in self.spec.outputs]
+                return [values[name].float() for name in names]
         except (HilsplatError, torch.OutOfMemoryError):
             raise
         except Exception as error:  # torch raises many types
             raise self._failed(error, given) from error
-        return self._with_right_axes(outputs)
+
+    def in_half(self) -> "TorchNetwork":
+        """Return a network that shares the weights, and computes products in float16 as torch's autocast does."""
+        other = copy.copy(self)
+        other.half, other._plans, other.runs_on = True, {}, [*self.runs_on, "half"]
+        return other
 
     def __call__(self, **feeds: np.ndarray | Tensor) -> list[np.ndarray]:
         return [output.cpu().numpy() for output in self.run(**feeds)]

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from hilsplat.base.errors import ModelError
+from hilsplat.models.card import CPU
 from hilsplat.models.folder import ModelFolder
-from hilsplat.models.network import CPU
 from hilsplat.models.onnx_graph import Graph, computed_from, reads_through, without_joined
 from hilsplat.models.repeatable import require_repeatable
 
@@ -26,11 +26,11 @@ class DecoderNetwork:
         prompts_per_call: required number of prompts per call; None for any number.
     """
 
-    def __init__(self, model: ModelFolder, name: str) -> None:
+    def __init__(self, model: ModelFolder, name: str, device: str = CPU) -> None:
         self.graph = Graph.read(model.networks[name])
         without_boxes = without_joined(self.graph, BOXES, POINTS)
         self.graph = without_boxes or self.graph
-        self.network = model.network(name, without_boxes)
+        self.network = model.network(name, without_boxes, device)
         self.pads = without_boxes is not None and not reads_through(self.graph, LABELS, ("Concat", "Pad"))
         problem = "requires a box with each prompt" if self._needs_boxes() else ""
         if self.pads and LABELS not in self.network.inputs:
@@ -44,7 +44,7 @@ class DecoderNetwork:
         along_first = self.network.fixed_axis(POINTS, 1) == 1 and self.network.fixed_axis(POINTS, 0) != 1
         self.axis = 0 if along_first else 1
         self.prompts_per_call = self.network.fixed_axis(POINTS, self.axis)
-        if self.prompts_per_call is None and self.axis == 0 and self.network.providers[0] == CPU:
+        if self.prompts_per_call is None and self.axis == 0 and device == CPU:
             # each of 8 prompts in a call, with its own copy of the image, takes 1.6 times as long
             self.prompts_per_call = 1
 
@@ -75,7 +75,10 @@ class DecoderNetwork:
         }
         for name, value in features.items():
             is_single = len(value) == images or self.network.fixed_axis(name, 0) == 1
-            feeds[name] = value if is_single else np.repeat(value, images, axis=0)
+            if not is_single:
+                is_array = isinstance(value, np.ndarray)
+                value = np.repeat(value, images, axis=0) if is_array else value.expand(images, -1, -1, -1)
+            feeds[name] = value
         return feeds
 
     def __call__(
@@ -91,7 +94,7 @@ class DecoderNetwork:
                 expected=f"an input {LABELS}",
                 fix="use only points inside the object, or another model",
             )
-        outputs = self.network(**self.feeds(features, points_xy, inside))
+        outputs = self.network.run(**self.feeds(features, points_xy, inside))
         scores, logits = (output.swapaxes(0, 1 - self.axis)[0] for output in outputs)
         return scores, logits
 

@@ -110,7 +110,7 @@ def candidates_key(
             "image": image_sha256,
             "model": model.digest,
             "precision": model.precision,
-            "providers": model.encoder.providers,
+            "providers": model.encoder.runs_on,
             "points_per_side": settings.points_per_side,
             "points": None if points is None else sha256_of_bytes(points.tobytes()),
             "points_per_batch": batch,

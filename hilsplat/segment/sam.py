@@ -24,7 +24,7 @@ from hilsplat.base.processes import in_order
 from hilsplat.models.folder import SAM_SIDE_PX, ModelFolder, input_side_px, open_model_folder
 from hilsplat.models.int8 import CHECKED_GRID, agreement_of_masks, considers_int8, int8_network, use_int8
 from hilsplat.models.layouts import DECODER, PREVIEW
-from hilsplat.models.network import CPU, Network, execution_providers, or_as_exported
+from hilsplat.models.network import Network, or_as_exported
 from hilsplat.models.onnx_graph import Graph, with_rowwise_attention
 from hilsplat.models.repeatable import random_pixels, require_repeatable_once
 from hilsplat.segment.decoder_network import DecoderNetwork
@@ -120,7 +120,7 @@ class SamModel:
         features = self._random_features()
         for decoder in filter(None, (self.decoder, self.previewer)):
             decoder.require_repeatable(features, self.padded_hw[0])
-        if self.previewer is None and self.decoder.network.providers[0] == CPU:
+        if self.previewer is None:
             cost = "each prompt takes about 6 times as long"
             self.factored = or_as_exported(model.networks[DECODER], cost, lambda: self._factor(features))
         self.as_exported = self.factored is None or (self._graph is None and not self.stretches)
@@ -169,7 +169,7 @@ class SamModel:
             require_repeatable_once(self.model, network, form, random_pixels(network, self.padded_hw[0]))
             return graph, network
 
-        if self.stretches or not isinstance(vision, dict) or execution_providers()[0] != CPU:
+        if self.stretches or not isinstance(vision, dict) :
             return open_as(None)
         layers = vision.get("global_attn_indexes", (2, 5, 8, 11))
         heads = vision.get("num_attention_heads", 12)
