@@ -82,12 +82,14 @@ class Network:
 
     Attributes:
         runs_on: library and device, part of cache keys.
+        version: version of the library.
 
     Raises:
         ModelError: the network cannot be read, or its inputs or outputs have unexpected names or axes.
     """
 
     runs_on: Sequence[str] = (CPU,)
+    version = onnxruntime.__version__
     inputs: Mapping[str, Any]  # with the attributes of `Declared`
     outputs: Mapping[str, Any]
 
@@ -178,6 +180,11 @@ class Network:
                 problem = f"network {self.path} returned {name} of shape {tuple(output.shape)}"
                 raise ModelError(problem, expected=_described(name, axes), fix=EXPORT_AGAIN)
         return outputs
+
+
+def on_host(values: Any) -> np.ndarray:
+    """Return an array, or a tensor's values as an array."""
+    return values if isinstance(values, np.ndarray) else np.asarray(values.cpu())
 
 
 def _fits(shape: Sequence[Any], axes: Axes) -> bool:

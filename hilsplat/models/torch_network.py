@@ -77,6 +77,7 @@ class TorchNetwork(Network):
         self._plans: dict[tuple[Any, ...], list[Step]] = {}
         self._uploaded: dict[str, Tensor] = {}
         super().__init__(*network)
+        self.version = torch.__version__
         self.runs_on = ["torch", self.device.type]
 
     def _open(self, source: Graph | Path) -> None:
@@ -96,7 +97,7 @@ class TorchNetwork(Network):
     def values(self, feeds: Mapping[str, np.ndarray | Tensor], names: Sequence[str]) -> list[Tensor]:
         """Return outputs of the network, float32 on the device."""
         given = {
-            name: torch.as_tensor(value).to(self.device, _dtype(self.inputs[name].type))
+            name: tensor_of(value, DTYPES[self.inputs[name].type]).to(self.device)
             for name, value in feeds.items()
             if name in self.inputs
         }
@@ -243,8 +244,15 @@ def _value(attribute: Any) -> Any:
     return value.decode() if isinstance(value, bytes) else value
 
 
-def _dtype(name: str) -> torch.dtype:
-    return torch.from_numpy(np.empty(0, DTYPES[name])).dtype
+def tensor_of(value: np.ndarray | Tensor, dtype: type) -> Tensor:
+    """Return a tensor, or a copy of an array as a tensor, with a type of numpy."""
+    if isinstance(value, Tensor):
+        return value.to(host_type(dtype))
+    return torch.from_numpy(np.array(value, dtype))
+
+
+def host_type(dtype: type) -> torch.dtype:
+    return torch.from_numpy(np.empty(0, dtype)).dtype
 
 
 def _declared(values: Any) -> dict[str, Declared]:

@@ -16,7 +16,7 @@ from jaxtyping import Float, Float32, Int8, Int32, Int64, Real
 from torch import Tensor
 
 from hilsplat.models.layouts import NetworkSpec
-from hilsplat.models.torch_network import TorchNetwork
+from hilsplat.models.torch_network import TorchNetwork, tensor_of
 from hilsplat.segment.decoder_kernels import FirstPrompts, MaskImage, SecondPrompts, Upscaling
 from hilsplat.segment.decoder_network import DecoderNetwork
 from hilsplat.segment.decoder_weights import Attention, Linear, Norm
@@ -69,7 +69,7 @@ class TorchDecoder(FactoredDecoder):
     @torch.inference_mode()
     def image(self, features: Mapping[str, Any]) -> ImageTerms:
         return super().image(
-            {name: torch.as_tensor(value).to(self.device) for name, value in features.items()}
+            {name: tensor_of(value, np.float32).to(self.device) for name, value in features.items()}
         )
 
     @torch.inference_mode()
