@@ -58,6 +58,7 @@ Suffix = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]*$")]
 Auto = Literal["auto"]
 Device = Literal["auto", "cpu", "cuda"]
 
+NETWORKS = "device of the networks; auto: cuda if torch finds one with enough free memory, else cpu"
 DEVICE = "rasteriser; auto: cuda if torch finds a device and gsplat is installed, else cpu"
 
 
@@ -156,8 +157,10 @@ class MasksSettings(Section):
     )
     variant: Suffix = knob("", "suffix of the network files, such as fp16 for vision_encoder_fp16.onnx")
     precision: Literal["auto", "fp32", "int8"] = knob(
-        "auto", "auto: int8 on a CPU if it agrees with fp32 on the scene; embedded models: fp32"
+        "auto",
+        "auto: int8 on a CPU, fp16 on CUDA, if it agrees with fp32 on the scene; embedded models: fp32",
     )
+    device: Device = knob("auto", NETWORKS)
     key_views: float = knob(
         1.0, "share of training views to segment; below 1: together they show the most Gaussians", gt=0, le=1
     )
@@ -177,7 +180,7 @@ class MasksSettings(Section):
     points_per_side: int = knob(32, "point prompts per image side", ge=1, le=128, origin="LangSplat: 32")
     points_per_batch: Annotated[int, Field(ge=1, le=4096)] | Auto = knob(
         "auto",
-        "prompts per decoder call; auto: the model folder's value, else 8 (full-size SAM: 60 MB each)",
+        "prompts per call on a CPU; auto: the model folder's value, else 8 (full-size SAM: 60 MB each)",
         origin="LangSplat: 64",
     )
     crop_layers: int = knob(0, "layers of crops to segment", ge=0, le=2, origin="LangSplat: 1")
@@ -244,8 +247,9 @@ class ClipSettings(Section):
     """CLIP vectors of masks and nodes."""
 
     precision: Literal["auto", "fp32", "int8"] = knob(
-        "auto", "auto: int8 on a CPU if it agrees with fp32 on crops; embedded models: fp32"
+        "auto", "auto: int8 on a CPU, fp16 on CUDA, if it agrees with fp32 on crops; embedded models: fp32"
     )
+    device: Device = knob("auto", NETWORKS)
     crops: Literal["auto", "nodes", "masks"] = knob(
         "auto",
         "masks to embed; nodes: those showing each node best; masks: all; auto: set by autoencoder.targets",
@@ -265,7 +269,7 @@ class ClipSettings(Section):
     background: Literal["black", "keep"] = knob(
         "black", "pixels of a crop outside its mask: painted black, or kept", origin="LangSplat: black"
     )
-    batch: int = knob(1, "crops per network call; above 1 is faster only on a GPU", ge=1, le=4096)
+    batch: int = knob(1, "crops per network call on a CPU, where more are no faster", ge=1, le=4096)
 
     @property
     def uses_model(self) -> bool:

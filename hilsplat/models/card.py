@@ -77,26 +77,36 @@ def network_device(requested: Literal["auto", "cpu", "cuda"], section: str, need
         problem = f"the GPU has {free / 1024:.1f} GiB free, and about {needed_mib / 1024:.1f} are needed"
         logger.warning("%s runs on the CPU: %s", section, problem)
         return CPU
-    device = CPU if problem or requested == CPU else "cuda"
-    logger.info("%s runs on %s (device: %s%s)", section, device, requested, f"; {problem}" if problem else "")
-    return device
+    if problem or requested == CPU:
+        logger.debug("%s runs on the CPU: %s", section, problem or "device: cpu")
+        return CPU
+    logger.info("%s runs on the GPU", section)
+    return "cuda"
+
+
+def recorded(device: str) -> dict[str, str]:
+    """Return the entry of an artifact's index that names a card; none for the CPU."""
+    return {} if device == CPU else {"device": device}
 
 
 def _fix(section: str) -> str:
-    return f"end other programs on the GPU, use a smaller model ({section}.model), or set {section}.device: cpu"
+    return (
+        f"end other programs on the GPU, use a smaller model ({section}.model), or set {section}.device: cpu"
+    )
 
 
 class Batches:
     """Calls of a network for many items.
 
-    On the CPU, every call has `size` items. On a card, the memory of the first call determines the size of later
-    calls, and calls that run out of memory are repeated with half as many items.
+    On the CPU, every call has `size` items. On a card, the memory of the first call determines the size of
+    later calls, and calls that run out of memory are repeated with half as many items.
 
     Args:
         size: items per call; on a card, of the first call.
         most: maximum number of items per call on a card; `size` if the network fixes the number.
-        is_padded: repeat the last item to fill the last call, for networks that are slow to run, or cannot run,
-            with another number of items; results then don't depend on how the items are split into calls.
+        is_padded: repeat the last item to fill the last call, for networks with a fixed number of items, and
+            for those whose first call with another number is slow. Results then don't depend on how items are
+            split into calls.
         section: section of the settings, for messages.
     """
 
@@ -107,8 +117,10 @@ class Batches:
         self.is_padded, self.section = is_padded, section
         self._is_measured = self._is_fixed = most <= size
 
-    def __call__(self, total: int, work: Callable[[Int64[np.ndarray, " b"], int], Result]) -> Iterator[Result]:
-        """Yield `work(rows, number)` for the rows of each call; all rows after the first `number` are padding.
+    def __call__(
+        self, total: int, work: Callable[[Int64[np.ndarray, " b"], int], Result]
+    ) -> Iterator[Result]:
+        """Yield `work(rows, number)` for the rows of each call; those after the first `number` are padding.
 
         Raises:
             MemoryLimitError: a call with a single item, or a network's fixed number, runs out of memory.
@@ -161,7 +173,7 @@ class Batches:
     def _shrink(self, number: int, problem: str) -> None:
         if number == 1 or self._is_fixed:
             raise MemoryLimitError(
-                f"the GPU has too little memory for {number} item{'s' * (number > 1)} of {self.section} at once",
+                f"the GPU has too little memory for a {self.section} call of size {number}",
                 found=problem,
                 fix=_fix(self.section),
             )

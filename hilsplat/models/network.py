@@ -7,16 +7,26 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import onnxruntime
 
 from hilsplat.base.errors import ModelError, first_line
 from hilsplat.models.layouts import Axes, NetworkSpec
 from hilsplat.models.onnx_graph import Graph, has_external_weights, refuse_pointer
 
+try:
+    import onnxruntime
+    from onnxruntime import InferenceSession, SessionOptions
+except ImportError as error:
+    raise ModelError(
+        f"onnxruntime cannot be imported, or is incomplete: {first_line(error)}",
+        fix="pip uninstall onnxruntime-gpu, then pip install --force-reinstall onnxruntime",
+    ) from error
+
 logger = logging.getLogger(__name__)
 
 Fast = TypeVar("Fast")
 
+Array = Any
+"""An array of numpy, or on a card a tensor of torch, which only code for cards imports."""
 EXPORT_AGAIN = "export the model in the layout of the Hugging Face ONNX exports"
 DTYPES = {
     "tensor(float)": np.float32,
@@ -27,26 +37,20 @@ DTYPES = {
 }
 CPU = "CPUExecutionProvider"
 
-if not hasattr(onnxruntime, "InferenceSession"):
-    raise ModelError(
-        "onnxruntime is incomplete; uninstalling onnxruntime-gpu removes its files",
-        fix="pip uninstall onnxruntime-gpu, then pip install --force-reinstall onnxruntime",
-    )
 
-
-def one_thread_session(network: Graph | Path) -> onnxruntime.InferenceSession:
-    """Open a network that runs on the CPU in one thread per call; a `Graph`'s weights must outlive the session.
+def one_thread_session(network: Graph | Path) -> InferenceSession:
+    """Open a network that runs on the CPU, in one thread; a `Graph`'s weights must outlive the session.
 
     Stages are faster if they process several views at once; results don't depend on the number of threads.
     """
-    options = onnxruntime.SessionOptions()
+    options = SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 3
     if isinstance(network, Path):
-        return onnxruntime.InferenceSession(str(network), options, providers=[CPU])
+        return InferenceSession(str(network), options, providers=[CPU])
     values = [onnxruntime.OrtValue.ortvalue_from_numpy(value) for value in network.weights.values()]
     options.add_external_initializers(list(network.weights), values)
-    return onnxruntime.InferenceSession(network.serialized(), options, providers=[CPU])
+    return InferenceSession(network.serialized(), options, providers=[CPU])
 
 
 def or_as_exported(network: Path, cost: str, prepare: Callable[[], Fast]) -> Fast | None:
@@ -74,8 +78,8 @@ class Declared:
 class Network:
     """An ONNX network with checked names; inputs are cast to its types, and outputs are float32.
 
-    It runs on the CPU, in onnxruntime. Each call runs in one thread (`one_thread_session`), and several threads
-    may call a network.
+    It runs in onnxruntime on the CPU. Each call runs in one thread (`one_thread_session`), and several
+    threads may call a network.
 
     Args:
         changed: a changed network, or its file, to use instead of `path`.
@@ -166,6 +170,10 @@ class Network:
         """Run the network as `__call__` does, but leave the outputs where the network runs."""
         return self(**feeds)
 
+    def in_half(self) -> "Network":
+        """Return this network with products in float16; only for networks on a card (`TorchNetwork`)."""
+        raise NotImplementedError
+
     def _failed(self, error: Exception, feeds: Mapping[str, Any]) -> ModelError:
         return ModelError(
             f"network {self.path} failed: {error}",
@@ -182,8 +190,8 @@ class Network:
         return outputs
 
 
-def on_host(values: Any) -> np.ndarray:
-    """Return an array, or a tensor's values as an array."""
+def on_host(values: Array) -> np.ndarray:
+    """Return the values as an array of numpy."""
     return values if isinstance(values, np.ndarray) else np.asarray(values.cpu())
 
 

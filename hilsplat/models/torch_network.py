@@ -87,7 +87,9 @@ class TorchNetwork(Network):
         if opset < MIN_OPSET:
             raise self._refused(f"its opset {opset} is older than {MIN_OPSET}")
         constants = {tensor.name for tensor in graph.initializer}
-        inputs, outputs = map(_declared, ([each for each in graph.input if each.name not in constants], graph.output))
+        inputs, outputs = map(
+            _declared, ([each for each in graph.input if each.name not in constants], graph.output)
+        )
         self.inputs, self.outputs = inputs, outputs
 
     def run(self, **feeds: np.ndarray | Tensor) -> list[Tensor]:
@@ -117,7 +119,7 @@ class TorchNetwork(Network):
             raise self._failed(error, given) from error
 
     def in_half(self) -> "TorchNetwork":
-        """Return a network that shares the weights, and computes products in float16 as torch's autocast does."""
+        """Return a network with the same weights whose products are float16, as in torch's autocast."""
         other = copy.copy(self)
         other.half, other._plans, other.runs_on = True, {}, [*self.runs_on, "half"]
         return other
@@ -141,7 +143,10 @@ class TorchNetwork(Network):
         while nodes:
             node = nodes.popleft()
             if node.op_type == "If":
-                nodes.extendleft(reversed(self._branch(node, known)))
+                chosen = self._branch(node, known)
+                uses.subtract(inputs_of(node))
+                uses.update(name for each in chosen for name in inputs_of(each))
+                nodes.extendleft(reversed(chosen))
                 continue
             # the result is known if the inputs are, or if it depends only on their shapes
             is_known = node.op_type in ("Shape", "Size") or not any(name in values for name in node.input)
@@ -263,7 +268,8 @@ def _declared(values: Any) -> dict[str, Declared]:
     for value in values:
         kind = value.type.tensor_type
         axes = [
-            each.dim_value if each.HasField("dim_value") else each.dim_param or None for each in kind.shape.dim
+            each.dim_value if each.HasField("dim_value") else each.dim_param or None
+            for each in kind.shape.dim
         ]
         found[value.name] = Declared(f"tensor({TensorProto.DataType.Name(kind.elem_type).lower()})", axes)
     return found

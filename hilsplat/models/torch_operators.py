@@ -78,8 +78,8 @@ def _gemm(
     c: Tensor | None = None,
     alpha: float = 1,
     beta: float = 1,
-    transA: int = 0,  # noqa: N803 (ONNX's name)
-    transB: int = 0,  # noqa: N803
+    transA: int = 0,
+    transB: int = 0,
 ) -> Tensor:
     product = alpha * ((a.T if transA else a) @ (b.T if transB else b))
     return product if c is None else product + beta * c
@@ -128,37 +128,26 @@ def _conv_transpose(
     return function(x, weight, bias, strides, 0, output_padding, group, dilations)
 
 
-def _max_pool(
-    x: Tensor,
-    kernel_shape: Sequence[int],
-    pads: Sequence[int] = (),
-    strides: Sequence[int] | int = 1,
-    dilations: Sequence[int] | int = 1,
-    ceil_mode: int = 0,
-    storage_order: int = 0,
-    auto_pad: str = "NOTSET",
-) -> Tensor:
-    begin = _same_pads(x, pads, auto_pad)
-    return F.max_pool2d(x, tuple(kernel_shape), strides, begin, dilations, bool(ceil_mode))
+def _pool(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    def pooled(
+        x: Tensor,
+        kernel_shape: Sequence[int],
+        pads: Sequence[int] = (0, 0, 0, 0),
+        strides: Sequence[int] = (1, 1),
+        dilations: Sequence[int] = (1, 1),
+        ceil_mode: int = 0,
+        count_include_pad: int = 0,
+        storage_order: int = 0,
+        auto_pad: str = "NOTSET",
+    ) -> Tensor:
+        require(x.ndim == 4 and tuple(dilations) == (1, 1), "another form")
+        require(auto_pad in ("NOTSET", "VALID") and list(pads[:2]) == list(pads[2:]), "pads")
+        more = {"count_include_pad": bool(count_include_pad)} if function is F.avg_pool2d else {}
+        return function(
+            x, tuple(kernel_shape), tuple(strides), tuple(pads[:2]), ceil_mode=bool(ceil_mode), **more
+        )
 
-
-def _average_pool(
-    x: Tensor,
-    kernel_shape: Sequence[int],
-    pads: Sequence[int] = (),
-    strides: Sequence[int] | int = 1,
-    ceil_mode: int = 0,
-    count_include_pad: int = 0,
-    auto_pad: str = "NOTSET",
-) -> Tensor:
-    begin = _same_pads(x, pads, auto_pad)
-    return F.avg_pool2d(x, tuple(kernel_shape), strides, begin, bool(ceil_mode), bool(count_include_pad))
-
-
-def _same_pads(x: Tensor, pads: Sequence[int], auto_pad: str) -> list[int]:
-    require(x.ndim == 4, f"{x.ndim} axes")
-    require(auto_pad in ("NOTSET", "VALID") and list(pads[:2]) == list(pads[2:]), "pads")
-    return list(pads[:2]) or [0, 0]
+    return pooled
 
 
 def _pad(
@@ -170,7 +159,8 @@ def _pad(
 ) -> Tensor:
     require(mode in ("constant", "edge", "reflect"), f"mode {mode}")
     axes = range(x.ndim) if axes is None else axes
-    by_axis = dict(zip((axis % x.ndim for axis in axes), zip(pads[: len(axes)], pads[len(axes) :], strict=True)))
+    begin_and_end = zip(pads[: len(axes)], pads[len(axes) :], strict=True)
+    by_axis = dict(zip([axis % x.ndim for axis in axes], begin_and_end, strict=True))
     ends = [end for axis in reversed(range(x.ndim)) for end in by_axis.get(axis, (0, 0))]
     if mode == "constant":
         return F.pad(x, ends, value=value or 0)
@@ -321,8 +311,8 @@ def _resize(
     extrapolation_value: float = 0,
     keep_aspect_ratio_policy: str = "stretch",
 ) -> Tensor:
-    form = RESIZERS.get((mode, coordinate_transformation_mode), {}).get(x.ndim)
-    require(form is not None, f"{mode} with coordinates {coordinate_transformation_mode}")
+    form = RESIZERS.get((mode, coordinate_transformation_mode), {}).get(x.ndim, "")
+    require(bool(form), f"{mode} with coordinates {coordinate_transformation_mode}")
     require(mode != "nearest" or nearest_mode == "floor", f"nearest_mode {nearest_mode}")
     require(cubic_coeff_a == -0.75 and not exclude_outside and not antialias, "the given filter")
     require(keep_aspect_ratio_policy == "stretch", keep_aspect_ratio_policy)
@@ -350,7 +340,7 @@ OPERATORS: dict[str, Callable[..., Any]] = {
     "Add": lambda a, b: a + b,
     "And": torch.logical_and,
     "ArgMax": _argmax,
-    "AveragePool": _average_pool,
+    "AveragePool": _pool(F.avg_pool2d),
     "Cast": _cast,
     "Clip": lambda x, low=None, high=None: x.clamp(low, high) if (low, high) != (None, None) else x,
     "Concat": lambda *parts, axis: torch.cat(parts, axis),
@@ -379,7 +369,7 @@ OPERATORS: dict[str, Callable[..., Any]] = {
     "Less": torch.lt,
     "LessOrEqual": torch.le,
     "MatMul": torch.matmul,
-    "MaxPool": _max_pool,
+    "MaxPool": _pool(F.max_pool2d),
     "Mod": _modulo,
     "Mul": lambda a, b: a * b,
     "Neg": torch.neg,

@@ -17,7 +17,7 @@ rounding; `SamModel` checks this on a few prompts before it uses this class.
 The two attentions of a layer, its layer norm and the next attention process one block of pixels at a time
 for several prompts (`decoder_kernels`). Operations on tokens alone use plain numpy in this module.
 
-`TorchDecoder` (`torch_decoder`) overrides what processes pixels, and passes tensors on a card through the rest.
+`TorchDecoder` (`torch_decoder`) overrides the methods that process pixels, and uses the others for tensors.
 """
 
 from collections.abc import Mapping
@@ -30,7 +30,7 @@ from jaxtyping import Float, Float32, Float64
 
 from cpusplat.lanes import WIDTH
 from hilsplat.base.errors import ModelError
-from hilsplat.models.network import one_thread_session
+from hilsplat.models.network import Array, one_thread_session
 from hilsplat.models.onnx_graph import Graph
 from hilsplat.segment import decoder_kernels as kernels
 from hilsplat.segment.decoder_kernels import (
@@ -58,14 +58,14 @@ class ImageTerms:
     """Arrays that the decoder computes once per image."""
 
     grid_hw: tuple[int, int]  # size of the image embedding
-    keys: np.ndarray  # keys and values of the first token-to-pixel attention (`kernels.read_image`)
-    values: np.ndarray
+    keys: Array  # keys and values of the first token-to-pixel attention (`kernels.read_image`)
+    values: Array
     first: FirstLayer
     second: SecondLayer
     masks: MaskImage
 
 
-Kept = Mapping[str, np.ndarray]
+Kept = Mapping[str, Array]
 """Arrays from which all logits of previewed prompts are computed, one row per prompt."""
 
 
@@ -99,9 +99,7 @@ class FactoredDecoder:
             graph.until(*(f"{layers[0]}/{module}" for module in modules)) for modules in (tokens, image_side)
         ]
         _relax_shapes(self._graphs[0])
-        self._tokens, self._image_side = (
-            one_thread_session(subgraph) for subgraph in self._graphs
-        )
+        self._tokens, self._image_side = (one_thread_session(subgraph) for subgraph in self._graphs)
         self.inner = len(self._reads[0].q.bias)
         tokens0, tokens9 = (self._token_rows(np.full((1, 2), place)) for place in (0.0, 9.0))
         is_constant = (tokens0 == tokens9).all(axis=-1).reshape(-1)
@@ -146,7 +144,7 @@ class FactoredDecoder:
             bias=second_bias,
         )
 
-    def image(self, features: Mapping[str, np.ndarray]) -> ImageTerms:
+    def image(self, features: Mapping[str, Array]) -> ImageTerms:
         """Compute the terms shared by all prompts from an encoder's outputs (float32, by name).
 
         A ModelError is raised if the image embedding cannot be divided into blocks.
@@ -215,7 +213,7 @@ class FactoredDecoder:
 
     def decode(
         self, image: ImageTerms, points_xy: Float[np.ndarray, "P 2"], *, fine: bool
-    ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 h w"], Kept]:
+    ) -> tuple[Float32[Array, "P 3"], Float32[Array, "P 3 h w"], Kept]:
         """Return predicted IoUs, logits and the arrays that `logits` needs, for one point per prompt.
 
         Points are inside the object, in px of the network's input. With `fine`, all 4 x 4 logits of each
@@ -246,8 +244,10 @@ class FactoredDecoder:
             low=_low(rows, self._low_read1, change0),
             offset=self._offsets(rows, read1.k, [d0]),
         )
-        parts = _through(change0, self._values1, self.heads), self._split(d0 @ read1.v.weight.T)
-        s1, e, values = self._update_and_read_first(image, first, *parts)
+        of_factors = _through(change0, self._values1, self.heads)
+        s1, e, values = self._update_and_read_first(
+            image, first, of_factors, self._split(d0 @ read1.v.weight.T)
+        )
         q = self._perceptron(1, q + read1.out(joined(values + self._split(read1.v(self._b1)))))
 
         keys1, (change1, last1) = self._scores(update1.k(q + pe)), self._token_values(update1.v(q))
@@ -269,11 +269,9 @@ class FactoredDecoder:
             low=_low(rows, self._low_read2, changes),
             offset=self._offsets(rows, read2.k, [d0g, kg]),
         )
-        parts = (
-            _through(changes, self._values2, self.heads),
-            *(self._split(x @ read2.v.weight.T) for x in (d0g, kg)),
-        )
-        s2, e, values = self._update_and_read_second(image, second, s1, e, *parts)
+        of_factors = _through(changes, self._values2, self.heads)
+        of_scales = [self._split(x @ read2.v.weight.T) for x in (d0g, kg)]
+        s2, e, values = self._update_and_read_second(image, second, s1, e, of_factors, *of_scales)
         q = self._last_norm(q + read2.out(joined(values + self._split(read2.v(self._b2)))))
 
         iou = _perceptron(self._iou_head, q[:, self._iou_token])[:, 1:]
@@ -295,26 +293,26 @@ class FactoredDecoder:
         }
         return single(iou), self._logits(image, kept, e, fine=fine), kept
 
-    def logits(self, image: ImageTerms, kept: Kept) -> Float32[np.ndarray, "P 3 h w"]:
+    def logits(self, image: ImageTerms, kept: Kept) -> Float32[Array, "P 3 h w"]:
         """Compute all logits of previewed prompts."""
         return self._logits(image, kept, self._factors(image, kept), fine=True)
 
-    def _image_sides(self, features: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+    def _image_sides(self, features: Mapping[str, Array]) -> list[Array]:
         """Return the image features without and with positions, (1, ..., pixels, channels)."""
         return self._run(self._image_side, features, np.zeros((1, 2)))
 
-    def _blocks(self, rows: Float64[np.ndarray, "r P"]) -> Float32[np.ndarray, " rP"]:
+    def _blocks(self, rows: Float[Array, "r P"]) -> Float32[Array, "*n"]:
         """Return an image array in the order of the kernels."""
         shape = (len(rows), -1, min(BLOCK, rows.shape[1]))
         return np.ascontiguousarray(single(rows).reshape(shape).transpose(1, 0, 2)).reshape(-1)
 
-    def _by_pixel(self, rows: Float64[np.ndarray, "HD P"]) -> Float32[np.ndarray, " n"]:
+    def _by_pixel(self, rows: Float64[Array, "HD P"]) -> Float32[Array, "*n"]:
         """Return the image array of an attention's values in the order of the kernels."""
         shape = (self.heads, self.dim, -1, min(BLOCK, rows.shape[1]))
         values = single(rows).reshape(shape).transpose(2, 0, 3, 1)
         return np.pad(values, [(0, 0)] * 3 + [(0, up(self.dim) - self.dim)]).reshape(-1)
 
-    def _read_image(self, image: ImageTerms, rows: np.ndarray) -> Float32[np.ndarray, "n H T D"]:
+    def _read_image(self, image: ImageTerms, rows: Array) -> Float32[Array, "n H T D"]:
         """Compute the first token-to-pixel attention."""
         sizes = self._sizes(image, *rows.shape[::2])
         sums = PixelSums(sizes, 0)
@@ -322,12 +320,12 @@ class FactoredDecoder:
         return sums.values()
 
     def _update_and_read_first(
-        self, image: ImageTerms, prompts: FirstPrompts, *parts: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Compute the first pixel-to-token attention, its layer norm, and the second token-to-pixel attention.
+        self, image: ImageTerms, prompts: FirstPrompts, *parts: Array
+    ) -> tuple[Array, Array, Array]:
+        """Compute the first pixel-to-token attention, its layer norm, and the attention that follows.
 
-        `parts` are the values of the factors and of each pixel's scales (`PixelSums.values`). Returns scales of
-        the pixels (n, P), scaled factors, and values of the tokens (n, H, T, D).
+        `parts` are the values of the factors and of the pixels' scales (`PixelSums.values`). Returns the
+        scales (n, P), scaled factors, and values of the tokens (n, H, T, D).
         """
         number, _, tokens, _ = prompts.update_keys.shape
         sizes, factors = self._sizes(image, number, tokens), self.heads * (tokens - 1)
@@ -342,8 +340,8 @@ class FactoredDecoder:
         return s1, e, sums.values(*parts)
 
     def _update_and_read_second(
-        self, image: ImageTerms, prompts: SecondPrompts, s1: np.ndarray, e: np.ndarray, *parts: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        self, image: ImageTerms, prompts: SecondPrompts, s1: Array, e: Array, *parts: Array
+    ) -> tuple[Array, Array, Array]:
         """Compute the second layer and the last attention; arguments as in `_update_and_read_first`."""
         number, _, tokens, _ = prompts.update_keys.shape
         sizes, factors = self._sizes(image, number, tokens), 2 * self.heads * (tokens - 1)
@@ -356,10 +354,10 @@ class FactoredDecoder:
         )  # fmt: skip
         return s2, e2, sums.values(*parts)
 
-    def _scales(self, image: ImageTerms, number: int) -> np.ndarray:
+    def _scales(self, image: ImageTerms, number: int) -> Array:
         return np.empty((number, image.grid_hw[0] * image.grid_hw[1]), np.float32)
 
-    def _factors(self, image: ImageTerms, kept: Kept) -> np.ndarray:
+    def _factors(self, image: ImageTerms, kept: Kept) -> Array:
         """Recompute the scaled factors of both layers."""
         number, _, tokens, _ = kept["keys0"].shape
         e = np.empty(kept["s1"].size * up(2 * self.heads * (tokens - 1)), np.float32)
@@ -370,7 +368,7 @@ class FactoredDecoder:
         )  # fmt: skip
         return e
 
-    def _logits(self, image: ImageTerms, kept: Kept, e: np.ndarray, *, fine: bool) -> np.ndarray:
+    def _logits(self, image: ImageTerms, kept: Kept, e: Array, *, fine: bool) -> Array:
         """Compute logits from the scaled factors of the image embedding."""
         changes = kept["changes"]
         number, _, others, _ = changes.shape
@@ -386,7 +384,7 @@ class FactoredDecoder:
         )  # fmt: skip
         return out
 
-    def _token_rows(self, points_xy: Float[np.ndarray, "P 2"]) -> Float32[np.ndarray, "P T C"]:
+    def _token_rows(self, points_xy: Float[np.ndarray, "P 2"]) -> Float32[Array, "P T C"]:
         """Return the tokens of each prompt before the first layer."""
         names = [node.name for node in self._tokens.get_inputs() if node.name.startswith("image_")]
         blank = dict.fromkeys(names, np.zeros((1, 1, 1, 1), np.float32))
@@ -396,7 +394,7 @@ class FactoredDecoder:
     def _run(
         self,
         session: onnxruntime.InferenceSession,
-        features: Mapping[str, np.ndarray],
+        features: Mapping[str, Array],
         points_xy: Float[np.ndarray, "P 2"],
     ) -> list[np.ndarray]:
         """Run a subgraph of the decoder for prompts of one point."""
@@ -409,7 +407,7 @@ class FactoredDecoder:
         block = min(BLOCK, pixels)
         return number, pixels // block, self.heads, tokens, self.dim, block, up(self.dim)
 
-    def _attend_tokens(self, layer: int, q: np.ndarray, pe: np.ndarray) -> np.ndarray:
+    def _attend_tokens(self, layer: int, q: Array, pe: Array) -> Array:
         """Apply a layer's self-attention; the first layer uses neither positions nor a residual."""
         attention, norm = self._self[layer], self._norms[layer][0]
         x = q + pe if layer else q
@@ -418,33 +416,32 @@ class FactoredDecoder:
         update = attention.out(joined(self._softmax(scores) @ values))
         return norm(q + update if layer else update)
 
-    def _softmax(self, scores: np.ndarray) -> np.ndarray:
+    def _softmax(self, scores: Array) -> Array:
         weights = np.exp(scores - scores.max(axis=3, keepdims=True))
         return weights / weights.sum(axis=3, keepdims=True)
 
-    def _perceptron(self, layer: int, q: np.ndarray) -> np.ndarray:
+    def _perceptron(self, layer: int, q: Array) -> Array:
         """Apply the two norms after a layer's attention to the image, and the perceptron between them."""
         _, norm, last_norm = self._norms[layer]
         q = norm(q)
         return last_norm(q + _perceptron(self._mlps[layer], q))
 
-    def _split(self, x: Float32[np.ndarray, "*n i"]) -> Float32[np.ndarray, "n H T D"]:
+    def _split(self, x: Float32[Array, "*n i"]) -> Float32[Array, "n H T D"]:
         """Split heads: (n, T, H D) -> (n, H, T, D); one vector per prompt (n, H D) counts as one token."""
         if x.ndim < 3:
             x = x.reshape(-1, 1, x.shape[-1])
         return x.reshape(*x.shape[:2], self.heads, -1).swapaxes(1, 2)
 
-    def _scores(self, x: Float32[np.ndarray, "n T i"]) -> Float32[np.ndarray, "n H T D"]:
+    def _scores(self, x: Float32[Array, "n T i"]) -> Float32[Array, "n H T D"]:
         """Scale queries or keys of tokens so that their products with pixels are scores."""
         return self._split(x) * (self.score_scale / np.float32(self.dim**0.5))
 
-    def _token_values(self, x: Float32[np.ndarray, "n T i"]) -> tuple[np.ndarray, np.ndarray]:
+    def _token_values(self, x: Float32[Array, "n T i"]) -> tuple[Array, Array]:
         """Return tokens' values minus the last token's (n, H, T - 1, D), and the last token's (n, H D)."""
         values = self._split(x)
         return values[:, :, :-1] - values[:, :, -1:], contiguous(x[:, -1])
 
-
-    def _offsets(self, rows: np.ndarray, layer: Linear, vectors: list[np.ndarray]) -> np.ndarray:
+    def _offsets(self, rows: Array, layer: Linear, vectors: list[np.ndarray]) -> Array:
         """Return products of rows with projected vectors (n, C): (n, H, T, D) -> (n, H, T, vectors)."""
         number, heads, _, dim = rows.shape
         projected = [(vector @ layer.weight.T).reshape(number, heads, dim, 1) for vector in vectors]
@@ -460,9 +457,7 @@ class PixelSums:
         self.sizes, self.factors = sizes, factors
         self.top, self.sums = np.empty(rows, np.float32), np.empty(rows * width, np.float32)
 
-    def values(
-        self, factor_values: np.ndarray | None = None, *scale_values: np.ndarray
-    ) -> Float32[np.ndarray, "n H T D"]:
+    def values(self, factor_values: Array | None = None, *scale_values: Array) -> Float32[Array, "n H T D"]:
         """Return the weighted means of the pixels' values.
 
         Factors have values (n, H, F, D); the pixels' scales multiply `scale_values` (n, H, 1, D).
@@ -486,20 +481,20 @@ def _relax_shapes(graph: Graph) -> None:
                 side.Clear()
 
 
-def _perceptron(layers: list[Linear], x: np.ndarray) -> np.ndarray:
+def _perceptron(layers: list[Linear], x: Array) -> Array:
     """Apply linear layers with ReLUs between them."""
     for layer in layers[:-1]:
         x = layer(x).clip(0, None)
     return layers[-1](x)
 
 
-def _along(changes: Float32[np.ndarray, "n K J D"], vectors: Float32[np.ndarray, "n KD"]) -> np.ndarray:
+def _along(changes: Float32[Array, "n K J D"], vectors: Float32[Array, "n KD"]) -> Array:
     """Return the product of each change with its head's part of a vector, (n, K, J)."""
     number, heads, _, dim = changes.shape
     return (changes @ vectors.reshape(number, heads, dim, 1))[..., 0]
 
 
-def _low(rows: np.ndarray, base: Float32[np.ndarray, "HD KD"], changes: np.ndarray) -> np.ndarray:
+def _low(rows: Array, base: Float32[Array, "HD KD"], changes: Array) -> Array:
     """Return rows^T base changes for all pairs: (n, H, T, D), (n, K, J, D) -> (n, H, T, K, J)."""
     number, heads, tokens, dim = rows.shape
     kinds = changes.shape[1]
@@ -508,13 +503,13 @@ def _low(rows: np.ndarray, base: Float32[np.ndarray, "HD KD"], changes: np.ndarr
     return (left.swapaxes(2, 3) @ right).swapaxes(2, 3)
 
 
-def _between(changes: Float32[np.ndarray, "n K J D"], base: Float32[np.ndarray, "KD KD"]) -> np.ndarray:
+def _between(changes: Float32[Array, "n K J D"], base: Float32[Array, "KD KD"]) -> Array:
     """Return changes^T base changes for all pairs, (n, K J, K J)."""
     number, heads, others, _ = changes.shape
     return _low(changes, base, changes).reshape(number, heads * others, -1)
 
 
-def _through(changes: np.ndarray, base: Float32[np.ndarray, "KD HD"], heads: int) -> np.ndarray:
+def _through(changes: Array, base: Float32[Array, "KD HD"], heads: int) -> Array:
     """Multiply changes by a matrix and split heads: (n, K, J, D) -> (n, H, K J, D)."""
     number, kinds, others, dim = changes.shape
     products = changes @ base.reshape(kinds, dim, -1)
@@ -526,31 +521,31 @@ def doubled_below(gram: Float32[np.ndarray, "n F F"]) -> Float32[np.ndarray, "n 
     return 2 * np.tril(gram, -1) + gram * np.eye(gram.shape[-1], dtype=np.float32)
 
 
-def joined(x: Float32[np.ndarray, "n H T D"]) -> Float32[np.ndarray, "n T HD"]:
+def joined(x: Float32[Array, "n H T D"]) -> Float32[Array, "n T HD"]:
     return x.swapaxes(1, 2).reshape(x.shape[0], x.shape[2], -1)
 
 
-def wide(x: Any) -> Any:
+def wide(x: Array) -> Array:
     return x.astype(np.float64) if isinstance(x, np.ndarray) else x.double()
 
 
-def single(x: Any) -> Any:
+def single(x: Array) -> Array:
     return x.astype(np.float32) if isinstance(x, np.ndarray) else x.float()
 
 
-def contiguous(x: Any) -> Any:
+def contiguous(x: Array) -> Array:
     return np.ascontiguousarray(x) if isinstance(x, np.ndarray) else x.contiguous()
 
 
-def ordered(x: Any, *axes: int) -> Any:
+def ordered(x: Array, *axes: int) -> Array:
     return x.transpose(axes) if isinstance(x, np.ndarray) else x.permute(axes)
 
 
-def centred(x: np.ndarray, axis: int = -1) -> np.ndarray:
+def centred(x: Array, axis: int = -1) -> Array:
     return x - x.mean(axis=axis, keepdims=True)
 
 
-def flat(x: np.ndarray) -> Float32[np.ndarray, " n"]:
+def flat(x: Array) -> Float32[np.ndarray, " n"]:
     """Return a contiguous, flat float32 array, as the kernels expect."""
     return np.ascontiguousarray(x, np.float32).reshape(-1)
 

@@ -8,7 +8,6 @@ LangSplat's suppression. `generator: official` runs each step as published (diff
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -17,7 +16,7 @@ from jaxtyping import Bool, Float, Float32, Float64, Int8, Int32, Int64, Real, U
 from hilsplat.base.code import code_digest
 from hilsplat.base.levels import Level
 from hilsplat.base.lineage import sha256_of_bytes, sha256_of_json
-from hilsplat.models.network import on_host
+from hilsplat.models.network import Array, on_host
 from hilsplat.segment.kernels import cleaned_runs, upscaled_runs
 from hilsplat.segment.masks import HierarchicalMasks, join_rows, take_runs
 from hilsplat.segment.sam import (
@@ -152,7 +151,7 @@ def decode_candidates(
     grid = point_grid(settings.points_per_side)
     thresholds = model.thresholds(settings)
     batch = model.prompts_per_call(thresholds.points_per_batch, len(grid))
-    parts = []
+    parts = list[Candidates]()
     for crop, (left, top, right, bottom) in enumerate(boxes):
         encoded = model.encode(np.ascontiguousarray(image[top:bottom, left:right]))
         on_grid = grid * (right - left, bottom - top)
@@ -218,7 +217,7 @@ def distinct_prompts(
 
 def keep_candidates(
     scores: Float32[np.ndarray, "P 3"],
-    logits: Float32[np.ndarray, "P 3 h w"],
+    logits: Float32[Array, "P 3 h w"],
     frame: Frame,
     crop: int,
     settings: MasksSettings,
@@ -228,7 +227,6 @@ def keep_candidates(
     iou_floor, stability_floor = floors(thresholds)
     predicted_iou = scores.reshape(-1)
     flat = logits.reshape(-1, *logits.shape[2:])
-    steps: np.ndarray
     steps, stability, boxes = read_logits(flat, settings.stability_offset, frame)
     if settings.generator == "official":
         steps, boxes = flat, positive_boxes(flat)
@@ -249,8 +247,8 @@ def keep_candidates(
     )
 
 
-def joined(parts: list[Any]) -> Any:
-    """Concatenate arrays, or tensors of a card, along the first axis."""
+def joined(parts: list[Array]) -> Array:
+    """Concatenate arrays along the first axis."""
     if isinstance(parts[0], np.ndarray):
         return np.concatenate(parts)
     import torch
@@ -259,7 +257,7 @@ def joined(parts: list[Any]) -> Any:
 
 
 def edge_windows(
-    logits: Real[np.ndarray, "K h w"], rows: Int64[np.ndarray, " m"], boxes: Int32[np.ndarray, "K 4"]
+    logits: Real[Array, "K h w"], rows: Int64[np.ndarray, " m"], boxes: Int32[np.ndarray, "K 4"]
 ) -> tuple[Real[np.ndarray, " R"], Int64[np.ndarray, " m_and_1"], Int32[np.ndarray, "m 4"]]:
     """Return the windows of `Candidates` for the given rows: concatenated logits, offsets and boxes (xyxy).
 

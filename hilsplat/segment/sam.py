@@ -23,10 +23,16 @@ from hilsplat.base.lineage import sha256_of_bytes
 from hilsplat.base.processes import in_order
 from hilsplat.models.card import CPU, Batches, network_device
 from hilsplat.models.folder import SAM_SIDE_PX, ModelFolder, input_side_px, open_model_folder
-from hilsplat.models.int8 import CHECKED_GRID, agreement_of_masks, considers_int8, int8_network, use_int8
+from hilsplat.models.int8 import (
+    CHECKED_GRID,
+    agreement_of_masks,
+    int8_network,
+    reduced_precision,
+    use_reduced,
+)
 from hilsplat.models.layouts import DECODER, PREVIEW
 from hilsplat.models.memory import needs_of
-from hilsplat.models.network import Network, on_host, or_as_exported
+from hilsplat.models.network import Array, Network, on_host, or_as_exported
 from hilsplat.models.onnx_graph import Graph, with_rowwise_attention
 from hilsplat.models.repeatable import random_pixels, require_repeatable_once
 from hilsplat.segment.decoder_network import DecoderNetwork
@@ -58,12 +64,12 @@ class Frame:
 class Encoded:
     """Output of the vision encoder for one image."""
 
-    features: Mapping[str, np.ndarray]  # inputs of the decoder by name, float32 (1, C, h, w)
+    features: Mapping[str, Array]  # inputs of the decoder by name, float32 (1, C, h, w)
     frame: Frame
     terms: ImageTerms | None = None  # arrays of the factored decoder, if the model has one
 
 
-Prompts = Mapping[str, np.ndarray]
+Prompts = Mapping[str, Array]
 """Prompts of an image, as arrays with one row per prompt: `points` (x, y, px of the image) or, for previewed
 prompts, the arrays that the factored decoder keeps."""
 
@@ -97,7 +103,7 @@ def point_grid(points_per_side: int) -> Float[np.ndarray, "P 2"]:
 class SamModel:
     """A SAM model folder, opened for inference."""
 
-    precision: str = "fp32"  # precision of the encoder: "fp32" or "int8"
+    precision: str = "fp32"  # precision of the encoder: "fp32", "int8" or "fp16"
     own: Thresholds = REAL_SAM
     stretches: bool = False  # images are stretched to a square (SAM 2), not padded (SAM)
     previewer: DecoderNetwork | None = None  # the decoder at half the resolution (`layouts.PREVIEW`)
@@ -130,16 +136,19 @@ class SamModel:
             self.decoder = DecoderNetwork(model, DECODER, device)
         for decoder in filter(None, (self.decoder, self.previewer)):
             decoder.require_repeatable(features, self.padded_hw[0])
-        self.as_exported = self.factored is None or (self._graph is None and not self.stretches)
+        self.as_exported = device == CPU and (
+            self.factored is None or (self._graph is None and not self.stretches)
+        )
 
     def choose_precision(
         self, precision: str, images: Sequence[UInt8[np.ndarray, "H W 3"]], cache: Path, threads: int = 1
     ) -> None:
-        """Use int8 if `masks.precision` requires it, or if int8 and float32 masks of these images agree."""
-        if not considers_int8(precision, self.model, "vision_encoder"):
+        """Use a lower precision if `masks.precision` requires it, or if masks of these images agree."""
+        form = reduced_precision(precision, self.model, "vision_encoder", self.device)
+        if not form:
             return
-        quantised = self.int8_encoder(cache)
-        if quantised is None:
+        reduced = self.int8_encoder(cache) if form == "int8" else self.encoder.in_half()
+        if reduced is None:
             return
         grid = point_grid(CHECKED_GRID)
         batch = self.prompts_per_call(self.own.points_per_batch, len(grid))
@@ -147,19 +156,22 @@ class SamModel:
         def masks(work: tuple[np.ndarray, Network]) -> np.ndarray:
             image, encoder = work
             encoded, points = self.encode(image, encoder), grid * (image.shape[1], image.shape[0])
-            pieces = np.split(points, range(batch, len(points), batch))
-            logits = np.concatenate([self.decode(encoded, piece)[1] for piece in pieces])
+
+            def decode(rows: np.ndarray, number: int) -> np.ndarray:
+                return on_host(self.decode(encoded, points[rows])[1])[:number]
+
+            logits = np.concatenate(list(self.batches("masks", batch)(len(points), decode)))
             return logits.reshape(-1, *logits.shape[2:]) > 0
 
         def measure() -> dict[str, float]:
-            work = [(image, encoder) for encoder in (self.encoder, quantised) for image in images]
-            full, int8 = np.split(np.stack(list(in_order(masks, work, threads))), 2)
-            return agreement_of_masks(np.concatenate(full), np.concatenate(int8))
+            work = [(image, encoder) for encoder in (self.encoder, reduced) for image in images]
+            full, lower = np.split(np.stack(list(in_order(masks, work, threads))), 2)
+            return agreement_of_masks(np.concatenate(full), np.concatenate(lower))
 
         digests = [sha256_of_bytes(image.tobytes()) for image in images]
         inputs = {"model": self.digest, "images": digests, "grid": CHECKED_GRID}
-        if use_int8(precision, "SAM's encoder", cache, inputs, measure):
-            self.encoder, self.precision = quantised, "int8"
+        if use_reduced(form, precision, "SAM's encoder", cache, inputs, measure):
+            self.encoder, self.precision = reduced, form
 
     def int8_encoder(self, cache: Path) -> Network | None:
         """Open the int8 version of the encoder (`models.int8.int8_network`)."""
@@ -280,7 +292,7 @@ class SamModel:
 
     def decode(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "P 2"]
-    ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 h w"]]:
+    ) -> tuple[Float32[np.ndarray, "P 3"], Float32[Array, "P 3 h w"]]:
         """Return predicted IoUs and low-resolution logits (ordered as `HEADS`) for each image point, px."""
         points = in_input(points_xy, encoded.frame)
         if self.factored and encoded.terms:
@@ -289,7 +301,7 @@ class SamModel:
         iou, logits = self.decoder(encoded.features, points[:, None])
         return self._finite(iou), logits
 
-    def _finite(self, iou: Float32[np.ndarray, "*n"]) -> Float32[np.ndarray, "*n"]:
+    def _finite(self, iou: Float32[Array, "*n"]) -> Float32[np.ndarray, "*n"]:
         """Return predicted IoUs; raise ModelError if they are not numbers, as otherwise no mask is kept."""
         iou = on_host(iou)
         if not np.isfinite(iou).all():
@@ -302,7 +314,7 @@ class SamModel:
 
     def decode_clicks(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "K 2"], inside: Bool[np.ndarray, " K"]
-    ) -> tuple[Float32[np.ndarray, " 3"], Float32[np.ndarray, "3 h w"]]:
+    ) -> tuple[Float32[np.ndarray, " 3"], Float32[Array, "3 h w"]]:
         """Decode three masks of one object for several points (px) inside or outside it."""
         points = in_input(points_xy, encoded.frame)[None]
         iou, logits = self.decoder(encoded.features, points, inside[None])
@@ -315,7 +327,7 @@ class SamModel:
 
     def preview(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "P 2"]
-    ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 low_h low_w"], Prompts]:
+    ) -> tuple[Float32[np.ndarray, "P 3"], Float32[Array, "P 3 low_h low_w"], Prompts]:
         """Decode prompts at a lower resolution (requires `previews`); pass the third result to `finish`."""
         points = in_input(points_xy, encoded.frame)
         if self.factored and encoded.terms:
@@ -328,7 +340,7 @@ class SamModel:
 
     def finish(
         self, encoded: Encoded, prompts: Prompts
-    ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 h w"]]:
+    ) -> tuple[Float32[np.ndarray, "P 3"], Float32[Array, "P 3 h w"]]:
         """Decode prompts that may have been previewed, at full resolution."""
         if "points" in prompts:
             return self.decode(encoded, prompts["points"])
@@ -389,8 +401,8 @@ def own_thresholds(model: ModelFolder) -> Thresholds:
 
 
 def read_logits(
-    logits: Float32[np.ndarray, "K h w"], offset: float, frame: Frame
-) -> tuple[Int8[np.ndarray, "K h w"], Float32[np.ndarray, " K"], Int32[np.ndarray, "K 4"]]:
+    logits: Float32[Array, "K h w"], offset: float, frame: Frame
+) -> tuple[Int8[Array, "K h w"], Float32[np.ndarray, " K"], Int32[np.ndarray, "K 4"]]:
     """Round logits, and compute the stability and the box of each mask.
 
     Stability is the IoU of the masks at logit thresholds +offset and -offset, or 0 if the larger one
@@ -421,7 +433,7 @@ def read_logits(
     return steps, stability, positive_boxes(steps)
 
 
-def positive_boxes(logits: Real[np.ndarray, "K h w"]) -> Int32[np.ndarray, "K 4"]:
+def positive_boxes(logits: Real[Array, "K h w"]) -> Int32[np.ndarray, "K 4"]:
     """Return the box (xyxy, end exclusive) of the positive logits of each mask, all 0 if there are none."""
     if not isinstance(logits, np.ndarray):
         from hilsplat.segment import torch_masks

@@ -4,7 +4,6 @@ Arrays have one row per prompt, and pixels last. H: heads; T: tokens; D: channel
 image embedding; F: factors of a layer, H (T - 1).
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
@@ -12,29 +11,29 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Float32, Int8, Int32, Int64, Real
+from jaxtyping import Float
 from torch import Tensor
 
 from hilsplat.models.layouts import NetworkSpec
 from hilsplat.models.torch_network import TorchNetwork, tensor_of
-from hilsplat.segment.decoder_kernels import FirstPrompts, MaskImage, SecondPrompts, Upscaling
+from hilsplat.segment.decoder_kernels import Upscaling
 from hilsplat.segment.decoder_network import DecoderNetwork
 from hilsplat.segment.decoder_weights import Attention, Linear, Norm
-from hilsplat.segment.factored_decoder import HEADS_PER_ATTENTION, FactoredDecoder, ImageTerms, Kept, single
+from hilsplat.segment.factored_decoder import HEADS_PER_ATTENTION, FactoredDecoder, ImageTerms, single
 
 
 class TorchLinear(Linear):
     """A `Linear` of tensors."""
 
     def __call__(self, x: Any) -> Any:
-        return F.linear(x, self.weight, self.bias)  # type: ignore[arg-type]
+        return F.linear(x, self.weight, self.bias)
 
 
 class TorchNorm(Norm):
     """A `Norm` of tensors."""
 
     def __call__(self, x: Any) -> Any:
-        return F.layer_norm(x, self.scale.shape, self.scale, self.shift, self.eps)  # type: ignore[arg-type]
+        return F.layer_norm(x, self.scale.shape, self.scale, self.shift, self.eps)
 
 
 def on_device(value: Any, device: torch.device) -> Any:
@@ -57,7 +56,9 @@ class TorchDecoder(FactoredDecoder):
     score_scale = 1.0  # type: ignore[assignment]
     device: torch.device | None = None  # while the weights are read
 
-    def __init__(self, network: DecoderNetwork, heads: int = HEADS_PER_ATTENTION, device: str = "cuda") -> None:
+    def __init__(
+        self, network: DecoderNetwork, heads: int = HEADS_PER_ATTENTION, device: str = "cuda"
+    ) -> None:
         super().__init__(network, heads)
         self.device = torch.device(device)
         for name, value in vars(self).items():
@@ -68,16 +69,17 @@ class TorchDecoder(FactoredDecoder):
 
     @torch.inference_mode()
     def image(self, features: Mapping[str, Any]) -> ImageTerms:
-        return super().image(
-            {name: tensor_of(value, np.float32).to(self.device) for name, value in features.items()}
-        )
+        on_card: dict[str, Any] = {
+            name: tensor_of(value, np.float32).to(self.device) for name, value in features.items()
+        }
+        return super().image(on_card)
 
     @torch.inference_mode()
-    def decode(self, image: ImageTerms, points_xy: Float[np.ndarray, "P 2"], *, fine: bool) -> Any:
+    def decode(self, image: Any, points_xy: Float[np.ndarray, "P 2"], *, fine: bool) -> Any:
         return super().decode(image, points_xy, fine=fine)
 
     @torch.inference_mode()
-    def logits(self, image: ImageTerms, kept: Kept) -> Any:
+    def logits(self, image: Any, kept: Any) -> Any:
         return super().logits(image, kept)
 
     def _image_sides(self, features: Mapping[str, Any]) -> list[Any]:
@@ -97,7 +99,7 @@ class TorchDecoder(FactoredDecoder):
         return scores.softmax(dim=-1)
 
     def _by_head(self, rows: Tensor, image: Tensor) -> Tensor:
-        """Multiply rows (n, H, R, X) with each head's image rows (H X, P) or their transposes -> (n, H, R, P)."""
+        """Multiply rows (n, H, R, D) with each head's rows of an image array (H D, P) -> (n, H, R, P)."""
         number, heads, length, inner = rows.shape
         flat = rows.swapaxes(0, 1).reshape(heads, number * length, inner)
         return (flat @ image.reshape(heads, inner, -1)).view(heads, number, length, -1).swapaxes(0, 1)
@@ -109,7 +111,7 @@ class TorchDecoder(FactoredDecoder):
         sums = flat @ values.view(heads, -1, pixels).swapaxes(1, 2)
         return sums.view(heads, number, tokens, -1).swapaxes(0, 1)
 
-    def _read_image(self, image: ImageTerms, rows: Any) -> Any:
+    def _read_image(self, image: Any, rows: Any) -> Any:
         return self._means(self._softmax(self._by_head(rows, image.keys)), image.values)
 
     def _shares(self, scores: Tensor) -> Tensor:
@@ -121,11 +123,11 @@ class TorchDecoder(FactoredDecoder):
         number, heads, tokens = low.shape[:3]
         return (low.reshape(number, heads * tokens, -1) @ e).view(number, heads, tokens, -1)
 
-    def _first_factors(self, image: ImageTerms, keys: Tensor) -> Tensor:
+    def _first_factors(self, image: Any, keys: Tensor) -> Tensor:
         return self._shares(self._by_head(keys, image.first.queries))
 
     def _second_factors(
-        self, image: ImageTerms, keys: Tensor, low: Tensor, offset: Tensor, s1: Tensor, e: Tensor
+        self, image: Any, keys: Tensor, low: Tensor, offset: Tensor, s1: Tensor, e: Tensor
     ) -> Tensor:
         scale, terms = s1[:, None, None], image.second
         scores = scale * (self._by_head(keys, terms.scaled_queries) + offset)
@@ -143,7 +145,9 @@ class TorchDecoder(FactoredDecoder):
         of_factors, *of_scales = parts
         by_pixel = [scale[:, None, None] for scale in scales]
         scores = by_pixel[0] * self._by_head(prompts.queries, terms.scaled_keys)
-        scores = scores + self._by_head(prompts.queries, terms.fixed_keys) + self._times_factors(prompts.low, e)
+        scores = (
+            scores + self._by_head(prompts.queries, terms.fixed_keys) + self._times_factors(prompts.low, e)
+        )
         for column, scale in enumerate(by_pixel):
             scores = scores + prompts.offset[..., column, None] * scale
         weights = self._softmax(scores)
@@ -154,9 +158,7 @@ class TorchDecoder(FactoredDecoder):
             values = values + (weights * scale).sum(dim=-1, keepdim=True) * value
         return values
 
-    def _update_and_read_first(
-        self, image: ImageTerms, prompts: FirstPrompts, *parts: Any
-    ) -> tuple[Any, Any, Any]:
+    def _update_and_read_first(self, image: Any, prompts: Any, *parts: Any) -> tuple[Any, Any, Any]:
         terms = image.first
         e = self._first_factors(image, prompts.update_keys)
         y = self._by_head(prompts.twice_changes, terms.before).flatten(1, 2)
@@ -167,7 +169,7 @@ class TorchDecoder(FactoredDecoder):
         return s1, e, self._read(terms, prompts, e, [s1], parts)
 
     def _update_and_read_second(
-        self, image: ImageTerms, prompts: SecondPrompts, s1: Any, e: Any, *parts: Any
+        self, image: Any, prompts: Any, s1: Any, e: Any, *parts: Any
     ) -> tuple[Any, Any, Any]:
         terms, heads = image.second, self.heads
         more = self._second_factors(
@@ -196,7 +198,7 @@ class TorchDecoder(FactoredDecoder):
         """Return the scale of a layer norm from the sum of squares over channels."""
         return (squares / len(self._bias0) + self._eps).rsqrt()
 
-    def _factors(self, image: ImageTerms, kept: Kept) -> Any:
+    def _factors(self, image: Any, kept: Any) -> Any:
         keys0, keys1, low, offset, s1, s2 = (
             kept[name] for name in ("keys0", "keys1", "low", "offset", "s1", "s2")
         )
@@ -204,7 +206,7 @@ class TorchDecoder(FactoredDecoder):
         more = self._second_factors(image, keys1, low, offset, s1, e)
         return torch.cat([e, more], dim=1) * s2[:, None]
 
-    def _logits(self, image: ImageTerms, kept: Kept, e: Any, *, fine: bool) -> Any:
+    def _logits(self, image: Any, kept: Any, e: Any, *, fine: bool) -> Any:
         weights, terms, parts = self._upscaling, image.masks, 4 if fine else 1
         wide, narrow = len(weights.norm_scale), len(weights.bias)
         s2 = kept["s2"][:, None]

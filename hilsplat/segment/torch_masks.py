@@ -1,4 +1,4 @@
-"""Reading masks from logits on a card; results as of the functions of the same names in `sam` and `generate`."""
+"""Reading masks from logits on a card; `sam` and `generate` have the same functions for arrays."""
 
 import numpy as np
 import torch
@@ -14,7 +14,9 @@ def stepped(logits: Tensor, step: float) -> Tensor:
 
 
 @torch.inference_mode()
-def areas_above(steps: Tensor, thresholds: tuple[int, int], size_hw: tuple[int, int]) -> Int64[np.ndarray, "2 K"]:
+def areas_above(
+    steps: Tensor, thresholds: tuple[int, int], size_hw: tuple[int, int]
+) -> Int64[np.ndarray, "2 K"]:
     """Count the logits (K, h, w) above each threshold in the top left `size_hw`."""
     visible = steps[:, : size_hw[0], : size_hw[1]]
     areas = torch.stack([(visible > threshold).sum(dim=(1, 2)) for threshold in thresholds])
