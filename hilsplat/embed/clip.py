@@ -12,7 +12,7 @@ from tokenizers import Tokenizer
 from hilsplat.base.artifacts import read_index, read_json
 from hilsplat.base.errors import MisalignedArtifactError, ModelError
 from hilsplat.base.files import INSTALLED
-from hilsplat.models.card import CPU, Batches, network_device
+from hilsplat.models.card import CPU, Batches, in_turn, network_device
 from hilsplat.models.folder import WHOLE_COPY, ModelFolder, input_side_px, open_model_folder
 from hilsplat.models.memory import needs_of
 from hilsplat.models.network import Array, Network, require_one_space
@@ -78,7 +78,10 @@ class ClipModel:
         (vector,) = network.spec.outputs
         widths = network.fixed_axis(vector, 1), self.text.fixed_axis(self.words, 1)
         require_one_space(self.model.folder, *widths)
-        require_repeatable_once(self.model, network, "as exported", random_pixels(network, self.side_px))
+        pixels = random_pixels(network, self.side_px)
+        in_turn(
+            self.device, "clip", lambda: require_repeatable_once(self.model, network, "as exported", pixels)
+        )
         return network
 
     @property

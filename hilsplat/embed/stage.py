@@ -16,7 +16,7 @@ from hilsplat.base.lineage import sha256_of_bytes, sha256_of_file, sha256_of_jso
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel, unit
-from hilsplat.models.card import Batches, recorded
+from hilsplat.models.card import in_turn, recorded
 from hilsplat.models.int8 import (
     CHECKED_CROPS,
     WORDS,
@@ -169,7 +169,7 @@ def _choose_precision(
             (vectors,) = reduced(**{model.pixels: model.prepare(crop[None])})
             return model.embed_crops(crop[None]), unit(vectors)
 
-        return Batches(1, model.device, section="clip").once(run)
+        return in_turn(model.device, "clip", run)
 
     def measure() -> dict[str, float]:
         full, lower = map(np.concatenate, zip(*in_order(embed_twice, list(crops), threads), strict=True))

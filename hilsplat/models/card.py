@@ -5,7 +5,7 @@ import logging
 import sys
 from collections.abc import Callable, Iterator
 from functools import cache
-from threading import Lock
+from threading import RLock
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -22,7 +22,7 @@ CPU = "cpu"
 USED_SHARE = 0.8
 """Share of the free memory of a card that a call may take, because memory is fragmented."""
 MIB = 2**20
-TURN = Lock()
+TURN = RLock()
 """Held during a call on a card, so that threads share its memory one after the other."""
 
 
@@ -144,11 +144,6 @@ class Batches:
             yield result
             start += number
 
-    def once(self, work: Callable[[], Result]) -> Result:
-        """Return the result of a call for a single item."""
-        (result,) = self(1, lambda rows, number: work())
-        return result
-
     def _call(self, work: Callable[[Int64[np.ndarray, " b"], int], Result], rows: Any, number: int) -> Result:
         if self.device == CPU:
             return work(rows, number)
@@ -182,3 +177,9 @@ class Batches:
         torch.cuda.empty_cache()
         self.size, self._is_measured = number // 2, True
         logger.info("%s: %d items per call, because the GPU ran out of memory", self.section, self.size)
+
+
+def in_turn(device: str, section: str, work: Callable[[], Result]) -> Result:
+    """Return the result of a call for a single item; errors as in `Batches`."""
+    (result,) = Batches(1, device, section=section)(1, lambda rows, number: work())
+    return result

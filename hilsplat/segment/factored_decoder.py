@@ -167,10 +167,10 @@ class FactoredDecoder:
 
         blocks, by_pixel = self._blocks, self._by_pixel
 
-        def projected(layer: Linear, rows: np.ndarray) -> np.ndarray:
+        def projected(layer: Linear, rows: Array) -> Array:
             return wide(layer.weight) @ rows
 
-        def offset(layer: Linear, rows: np.ndarray) -> np.ndarray:
+        def offset(layer: Linear, rows: Array) -> Array:
             return projected(layer, rows) + wide(layer.bias)[:, None]
 
         first = FirstLayer(

@@ -21,7 +21,7 @@ from hilsplat.base.errors import ModelError
 from hilsplat.base.levels import Level
 from hilsplat.base.lineage import sha256_of_bytes
 from hilsplat.base.processes import in_order
-from hilsplat.models.card import CPU, Batches, network_device
+from hilsplat.models.card import CPU, Batches, in_turn, network_device
 from hilsplat.models.folder import SAM_SIDE_PX, ModelFolder, input_side_px, open_model_folder
 from hilsplat.models.int8 import (
     CHECKED_GRID,
@@ -135,7 +135,11 @@ class SamModel:
         if self.factored is None and device != CPU:
             self.decoder = DecoderNetwork(model, DECODER, device)
         for decoder in filter(None, (self.decoder, self.previewer)):
-            decoder.require_repeatable(features, self.padded_hw[0])
+            in_turn(
+                device,
+                "masks",
+                lambda of=decoder: of.require_repeatable(features, self.padded_hw[0]),  # type: ignore[misc]
+            )
         self.as_exported = device == CPU and (
             self.factored is None or (self._graph is None and not self.stretches)
         )
@@ -185,7 +189,8 @@ class SamModel:
         def open_as(graph: Graph | None) -> tuple[Graph | None, Network]:
             network = self.model.network("vision_encoder", graph, self.device)
             form = "as exported" if graph is None else "row-wise"
-            require_repeatable_once(self.model, network, form, random_pixels(network, self.padded_hw[0]))
+            pixels = random_pixels(network, self.padded_hw[0])
+            in_turn(self.device, "masks", lambda: require_repeatable_once(self.model, network, form, pixels))
             return graph, network
 
         if self.stretches or not isinstance(vision, dict) or self.device != CPU:
@@ -273,7 +278,7 @@ class SamModel:
             features = dict(zip(names, network.run(pixel_values=pixels), strict=True))
             return Encoded(features, frame, self.factored.image(features) if self.factored else None)
 
-        return Batches(1, self.device).once(run)
+        return in_turn(self.device, "masks", run)
 
     def prompts_per_call(self, limit: int, prompts: int) -> int:
         """Return the number of prompts per call: the decoder's fixed number, else min(limit, prompts)."""

@@ -126,7 +126,8 @@ def test_operators(tmp_path, text):
         ("n = NonZero (x) y = Cast <to = 1> (n)", "NonZero depends on values of its inputs"),
         (
             "r = ReduceMax <keepdims = 0> (x) c = Greater (r, three) "
-            "y = If <then_branch = g () => (float[] t) { t = Neg (x) }, else_branch = h () => (float[] e) { e = Exp (x) }> (c)",
+            "y = If <then_branch = g () => (float[] t) { t = Neg (x) }, "
+            "else_branch = h () => (float[] e) { e = Exp (x) }> (c)",
             "If depends on values of its inputs",
         ),
     ],
