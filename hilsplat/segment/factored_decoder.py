@@ -441,7 +441,7 @@ class FactoredDecoder:
         values = self._split(x)
         return values[:, :, :-1] - values[:, :, -1:], contiguous(x[:, -1])
 
-    def _offsets(self, rows: Array, layer: Linear, vectors: list[np.ndarray]) -> Array:
+    def _offsets(self, rows: Array, layer: Linear, vectors: list[Array]) -> Array:
         """Return products of rows with projected vectors (n, C): (n, H, T, D) -> (n, H, T, vectors)."""
         number, heads, _, dim = rows.shape
         projected = [(vector @ layer.weight.T).reshape(number, heads, dim, 1) for vector in vectors]

@@ -68,7 +68,8 @@ def test_candidates_agree(folder, photograph, device, official):
     model, on_cpu = SamModel(folder, device), SamModel(folder)
     assert isinstance(model.encoder, TorchNetwork) and (model.factored is None) == (on_cpu.factored is None)
     more = {"generator": "official", "stability": "full", "crop_layers": 1} if official else {}
-    settings = MasksSettings(points_per_side=6, **LOOSE, **more)
+    per_side = 3 if on_cpu.factored is None else 6
+    settings = MasksSettings(points_per_side=per_side, **LOOSE, **more)
     expected, found = (decode_candidates(photograph, each, settings) for each in (on_cpu, model))
     assert len(expected.head) > 1
     for name, values in vars(expected).items():
@@ -79,7 +80,7 @@ def test_candidates_agree(folder, photograph, device, official):
     np.testing.assert_allclose(found.predicted_iou, expected.predicted_iou, atol=1e-4)
     np.testing.assert_allclose(found.stability, expected.stability, atol=3e-3)  # a few pixels on the border
     # int8 logits differ by one step at most, float logits by rounding; borders of bands may move
-    far = np.abs(found.logits.astype(float) - expected.logits) > (1e-3 if official else 1)
+    far = np.abs(found.logits.astype(float) - expected.logits) > (5e-3 if official else 1)
     assert far.mean() < 1e-3
 
 
@@ -208,8 +209,7 @@ def test_half_precision_is_used_if_the_masks_agree(
 def test_the_cpu_does_not_import_torch(sam_parts):
     program = f"""
 import sys, numpy as np
-import subprocess
-import sys
+from pathlib import Path
 from hilsplat.embed.clip import ClipModel
 from hilsplat.segment.generate import decode_candidates
 from hilsplat.segment.sam import SamModel
