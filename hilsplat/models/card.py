@@ -95,6 +95,16 @@ def _fix(section: str) -> str:
     )
 
 
+def is_out_of_memory(error: Exception) -> bool:
+    """Return whether an exception of torch, or of a library that it calls, means that a card is full."""
+    torch = sys.modules.get("torch")
+    texts = "out of memory", "ALLOC_FAILED"
+    return torch is not None and (
+        isinstance(error, torch.OutOfMemoryError)
+        or (isinstance(error, RuntimeError) and any(text in str(error) for text in texts))
+    )
+
+
 class Batches:
     """Calls of a network for many items.
 
@@ -134,8 +144,7 @@ class Batches:
             try:
                 result = self._call(work, rows, number)
             except RuntimeError as error:
-                torch = sys.modules.get("torch")
-                if torch is None or not isinstance(error, torch.OutOfMemoryError):
+                if not is_out_of_memory(error):
                     raise
                 problem = first_line(error)
             if problem:  # outside the handler, whose traceback keeps the call's arrays

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from hilsplat.base.errors import HilsplatError, ModelError, first_line
+from hilsplat.models.card import is_out_of_memory
 from hilsplat.models.network import DTYPES, Declared, Network
 from hilsplat.models.onnx_graph import Graph, inputs_of
 from hilsplat.models.torch_operators import ON_HOST, OPERATORS
@@ -113,9 +114,9 @@ class TorchNetwork(Network):
                     if len(self._plans) > PLANS:
                         del self._plans[next(iter(self._plans))]
                 return [values[name].float() for name in names]
-        except (HilsplatError, torch.OutOfMemoryError):
-            raise
         except Exception as error:  # torch raises many types
+            if isinstance(error, HilsplatError) or is_out_of_memory(error):
+                raise
             raise self._failed(error, given) from error
 
     def in_half(self) -> "TorchNetwork":
@@ -152,7 +153,7 @@ class TorchNetwork(Network):
             is_known = node.op_type in ("Shape", "Size") or not any(name in values for name in node.input)
             step = self._step(node, known, values, is_known)
             try:
-                with torch.autocast(self.device.type, enabled=self.half and not is_known):
+                with torch.autocast(self.device.type, torch.float16, self.half and not is_known):
                     found = step.run(values)
             except (TypeError, NotImplementedError) as error:
                 raise self._refused(f"{node.op_type} in an unknown form ({first_line(error)})") from error

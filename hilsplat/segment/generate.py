@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Float32, Float64, Int8, Int32, Int64, Real, U
 from hilsplat.base.code import code_digest
 from hilsplat.base.levels import Level
 from hilsplat.base.lineage import sha256_of_bytes, sha256_of_json
+from hilsplat.models.card import in_turn
 from hilsplat.models.network import Array, on_host
 from hilsplat.segment.kernels import cleaned_runs, upscaled_runs
 from hilsplat.segment.masks import HierarchicalMasks, join_rows, take_runs
@@ -212,7 +213,11 @@ def distinct_prompts(
         chosen[rows[distinct]] = True
     chosen[0] |= not chosen.any()
     names = list(previewed[0])
-    return {name: joined([arrays.pop(name) for arrays in previewed])[chosen] for name in names}
+
+    def join() -> Prompts:
+        return {name: joined([arrays.pop(name) for arrays in previewed])[chosen] for name in names}
+
+    return in_turn(model.device, "masks", join)
 
 
 def keep_candidates(

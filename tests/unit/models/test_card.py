@@ -9,7 +9,7 @@ import torch
 
 from hilsplat.base.errors import DeviceError, MemoryLimitError
 from hilsplat.models import card
-from hilsplat.models.card import CPU, Batches, network_device
+from hilsplat.models.card import CPU, Batches, is_out_of_memory, network_device
 
 
 @pytest.fixture
@@ -82,6 +82,11 @@ def test_a_single_item_or_a_fixed_number_that_does_not_fit_ends_with_the_setting
     words = rf"call of size {number}(.|\n)*Tried to allocate 20 MiB(.|\n)*masks.device: cpu"
     with pytest.raises(MemoryLimitError, match=words):
         calls_of(batches, 9, fitting=0)
+
+
+@pytest.mark.parametrize("text", ["CUDA error: out of memory", "CUDA error: CUBLAS_STATUS_ALLOC_FAILED"])
+def test_libraries_that_find_no_memory_count(text):
+    assert is_out_of_memory(RuntimeError(text)) and not is_out_of_memory(ValueError(text))
 
 
 def test_other_errors_are_not_retried():

@@ -171,7 +171,9 @@ def test_networks_in_half_precision_are_close():
     network = open_model_folder(PROJECT / "models/clip-tiny").network("vision_model", device=HERE)
     pixels = random_pixels(network, 64)
     (full,) = network(**pixels)
-    (half,) = network.in_half()(**pixels)
+    halved = network.in_half()
+    (half,) = halved(**pixels)
+    np.testing.assert_array_equal(halved(**pixels)[0], half)
     assert 0 < np.abs(half - full).max() < 0.01 * np.abs(full).max()
     np.testing.assert_array_equal(network(**pixels)[0], full)
 
