@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import torch
 from torch import Tensor
 
@@ -84,7 +85,7 @@ class TorchNetwork(Network):
     def _open(self, source: Graph | Path) -> None:
         self._graph = source if isinstance(source, Graph) else Graph.read(source)
         graph = self._graph.model.graph
-        opset = max(each.version for each in self._graph.model.opset_import if not each.domain)
+        self._opset = opset = max(each.version for each in self._graph.model.opset_import if not each.domain)
         if opset < MIN_OPSET:
             raise self._refused(f"its opset {opset} is older than {MIN_OPSET}")
         constants = {tensor.name for tensor in graph.initializer}
@@ -178,8 +179,6 @@ class TorchNetwork(Network):
 
     def _branch(self, node: Any, known: Constants) -> list[Any]:
         """Return the nodes of an If's branch, and nodes that pass its results on."""
-        from onnx import helper
-
         (condition,) = node.input
         if condition not in known:
             raise self._refused("the operator If depends on values of its inputs")
@@ -187,7 +186,10 @@ class TorchNetwork(Network):
         (graph,) = (attribute.g for attribute in node.attribute if attribute.name == chosen)
         known.initializers |= {tensor.name: tensor for tensor in graph.initializer}
         results = zip(graph.output, node.output, strict=True)
-        return [*graph.node, *(helper.make_node("Identity", [each.name], [name]) for each, name in results)]
+        return [
+            *graph.node,
+            *(onnx.helper.make_node("Identity", [each.name], [name]) for each, name in results),
+        ]
 
     def _step(self, node: Any, known: Constants, values: dict[str, Tensor], is_known: bool) -> Step:
         """Return the call of a node: with names of values, constants on the device, numbers and lists."""
@@ -206,7 +208,12 @@ class TorchNetwork(Network):
                 arguments.append(known[name].tolist())
             else:
                 arguments.append(known[name] if is_known else self._upload(name, known))
+        schema = onnx.defs.get_schema(node.op_type, self._opset, node.domain)
         attributes = {each.name: _value(each) for each in node.attribute}
+        for key, known_attribute in schema.attributes.items():
+            default = known_attribute.default_value
+            if default.type and attributes.get(key) == _value(default):
+                del attributes[key]
         if node.op_type == "Split":
             attributes["outputs"] = len(node.output)
         outputs = [name for name in node.output if name]
@@ -235,17 +242,13 @@ def _repeat(steps: list[Step], values: dict[str, Tensor]) -> dict[str, Tensor]:
 
 def host_tensor(tensor: Any) -> Tensor:
     """Return a tensor of a graph on the host."""
-    from onnx import numpy_helper
-
-    return torch.from_numpy(np.array(numpy_helper.to_array(tensor)))
+    return torch.from_numpy(np.array(onnx.numpy_helper.to_array(tensor)))
 
 
 def _value(attribute: Any) -> Any:
     """Return the value of a node's attribute; texts as str, tensors on the host."""
-    from onnx import TensorProto, helper
-
-    value = helper.get_attribute_value(attribute)
-    if isinstance(value, TensorProto):
+    value = onnx.helper.get_attribute_value(attribute)
+    if isinstance(value, onnx.TensorProto):
         return host_tensor(value)
     return value.decode() if isinstance(value, bytes) else value
 
@@ -263,8 +266,6 @@ def host_type(dtype: type) -> torch.dtype:
 
 def _declared(values: Any) -> dict[str, Declared]:
     """Return the inputs or outputs that a graph declares, as onnxruntime describes them."""
-    from onnx import TensorProto
-
     found = {}
     for value in values:
         kind = value.type.tensor_type
@@ -272,5 +273,7 @@ def _declared(values: Any) -> dict[str, Declared]:
             each.dim_value if each.HasField("dim_value") else each.dim_param or None
             for each in kind.shape.dim
         ]
-        found[value.name] = Declared(f"tensor({TensorProto.DataType.Name(kind.elem_type).lower()})", axes)
+        found[value.name] = Declared(
+            f"tensor({onnx.TensorProto.DataType.Name(kind.elem_type).lower()})", axes
+        )
     return found

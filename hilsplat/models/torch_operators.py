@@ -1,7 +1,7 @@
 """The ONNX operators of published and embedded exports, as functions of torch.
 
-A function takes an operator's inputs and attributes (opset 13 or later) by ONNX's names and in its order. It
-raises TypeError for an unknown attribute, and NotImplementedError for an unsupported value of one.
+A function takes an operator's inputs in ONNX's order (opset 13 or later), and by name the attributes that
+differ from ONNX's default. It raises TypeError for unknown attributes, and NotImplementedError for values.
 """
 
 import math
@@ -48,6 +48,10 @@ ON_HOST: dict[str, tuple[int, ...]] = {
 depend on the network's inputs."""
 
 
+Ints = Sequence[int]
+Function = Callable[..., Any]
+
+
 def require(condition: bool, what: str) -> None:
     if not condition:
         raise NotImplementedError(what)
@@ -63,99 +67,51 @@ def _divide(a: Tensor, b: Tensor) -> Tensor:
     return a / b if a.is_floating_point() else torch.div(a, b, rounding_mode="trunc")
 
 
-def _modulo(a: Tensor, b: Tensor, fmod: int = 0) -> Tensor:
-    return torch.fmod(a, b) if fmod else torch.remainder(a, b)
-
-
-def _cast(x: Tensor, to: int, saturate: int = 1) -> Tensor:
+def _cast(x: Tensor, to: int) -> Tensor:
     require(to in DTYPES, f"type {to}")
     return x.to(DTYPES[to])
 
 
 def _gemm(
-    a: Tensor,
-    b: Tensor,
-    c: Tensor | None = None,
-    alpha: float = 1,
-    beta: float = 1,
-    transA: int = 0,
-    transB: int = 0,
+    a: Tensor, b: Tensor, c: Tensor | float = 0, *, alpha: float = 1, beta: float = 1, **turned: int
 ) -> Tensor:
-    product = alpha * ((a.T if transA else a) @ (b.T if transB else b))
-    return product if c is None else product + beta * c
+    require(turned.keys() <= {"transA", "transB"}, f"{turned}")
+    a, b = (x.T if turned.get(name) else x for x, name in ((a, "transA"), (b, "transB")))
+    return alpha * (a @ b) + beta * c
 
 
-def _padded(x: Tensor, weight: Tensor, pads: Sequence[int], auto_pad: str) -> tuple[Tensor, list[int]]:
-    """Return a convolution's input and the padding that the convolution itself adds at both ends."""
-    axes = weight.ndim - 2
-    require(auto_pad in ("NOTSET", "VALID"), f"auto_pad {auto_pad}")
-    begin, end = (list(pads[:axes]), list(pads[axes:])) if pads else ([0] * axes, [0] * axes)
-    if begin == end:
-        return x, begin
-    return _pad(x, [0, 0, *begin, 0, 0, *end]), [0] * axes
+def _convolution(by_axes: dict[int, Function], transposed: bool = False) -> Function:
+    def run(
+        x: Tensor, weight: Tensor, bias: Tensor | None = None, *, kernel_shape: Ints = (), pads: Ints = (),
+        strides: Ints | int = 1, dilations: Ints | int = 1, group: int = 1, auto_pad: str = "VALID",
+        output_padding: Ints = (),
+    ) -> Tensor:  # fmt: skip
+        require(auto_pad == "VALID" and not (transposed and any(pads)), "pads")
+        require(not any(output_padding), "output_padding")
+        if any(pads):
+            half = len(pads) // 2
+            x = _pad(x, [0, 0, *pads[:half], 0, 0, *pads[half:]])
+        if transposed:
+            return by_axes[weight.ndim](x, weight, bias, strides, 0, 0, group, dilations)
+        return by_axes[weight.ndim](x, weight, bias, strides, 0, dilations, group)
+
+    return run
 
 
-def _conv(
-    x: Tensor,
-    weight: Tensor,
-    bias: Tensor | None = None,
-    kernel_shape: Sequence[int] = (),
-    pads: Sequence[int] = (),
-    strides: Sequence[int] | int = 1,
-    dilations: Sequence[int] | int = 1,
-    group: int = 1,
-    auto_pad: str = "NOTSET",
-) -> Tensor:
-    function = (F.conv1d, F.conv2d, F.conv3d)[weight.ndim - 3]
-    x, padding = _padded(x, weight, pads, auto_pad)
-    return function(x, weight, bias, strides, padding, dilations, group)
-
-
-def _conv_transpose(
-    x: Tensor,
-    weight: Tensor,
-    bias: Tensor | None = None,
-    kernel_shape: Sequence[int] = (),
-    pads: Sequence[int] = (),
-    strides: Sequence[int] | int = 1,
-    dilations: Sequence[int] | int = 1,
-    output_padding: Sequence[int] | int = 0,
-    group: int = 1,
-    auto_pad: str = "NOTSET",
-) -> Tensor:
-    require(auto_pad == "NOTSET" and not any(pads), "pads")
-    function = (F.conv_transpose1d, F.conv_transpose2d, F.conv_transpose3d)[weight.ndim - 3]
-    return function(x, weight, bias, strides, 0, output_padding, group, dilations)
-
-
-def _pool(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    def pooled(
-        x: Tensor,
-        kernel_shape: Sequence[int],
-        pads: Sequence[int] = (0, 0, 0, 0),
-        strides: Sequence[int] = (1, 1),
-        dilations: Sequence[int] = (1, 1),
-        ceil_mode: int = 0,
-        count_include_pad: int = 0,
-        storage_order: int = 0,
-        auto_pad: str = "NOTSET",
+def _pool(function: Function) -> Function:
+    def run(
+        x: Tensor, kernel_shape: Ints, *, pads: Ints = (0,) * 4, strides: Ints = (1, 1), dilations: Ints = ()
     ) -> Tensor:
-        require(x.ndim == 4 and tuple(dilations) == (1, 1), "another form")
-        require(auto_pad in ("NOTSET", "VALID") and list(pads[:2]) == list(pads[2:]), "pads")
-        more = {"count_include_pad": bool(count_include_pad)} if function is F.avg_pool2d else {}
-        return function(
-            x, tuple(kernel_shape), tuple(strides), tuple(pads[:2]), ceil_mode=bool(ceil_mode), **more
-        )
+        require(x.ndim == 4 and list(pads[:2]) == list(pads[2:]), "pads")
+        require({*dilations} <= {1}, "dilations")
+        require(function is F.max_pool2d or not any(pads), "pads")
+        return function(x, tuple(kernel_shape), tuple(strides), tuple(pads[:2]))
 
-    return pooled
+    return run
 
 
 def _pad(
-    x: Tensor,
-    pads: Sequence[int],
-    value: float | None = None,
-    axes: Sequence[int] | None = None,
-    mode: str = "constant",
+    x: Tensor, pads: Ints, value: float | None = None, axes: Ints | None = None, *, mode: str = "constant"
 ) -> Tensor:
     require(mode in ("constant", "edge", "reflect"), f"mode {mode}")
     axes = range(x.ndim) if axes is None else axes
@@ -170,152 +126,82 @@ def _pad(
 
 
 def _layer_norm(
-    x: Tensor,
-    scale: Tensor,
-    shift: Tensor | None = None,
-    axis: int = -1,
-    epsilon: float = 1e-5,
-    stash_type: int = 1,
+    x: Tensor, scale: Tensor, shift: Tensor | None = None, *, axis: int = -1, epsilon: float = 1e-5
 ) -> Tensor:
     return F.layer_norm(x, x.shape[axis:], scale, shift, epsilon)
 
 
-def _reduction(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    def reduced(
-        x: Tensor,
-        of: Sequence[int] | None = None,
-        axes: Sequence[int] | None = None,  # an attribute before opset 18
-        keepdims: int = 1,
-        noop_with_empty_axes: int = 0,
-    ) -> Tensor:
-        axes = of or axes
-        if not axes and noop_with_empty_axes:
-            return x
-        return function(x, dim=list(axes or range(x.ndim)), keepdim=bool(keepdims))
+def _reduction(function: Function) -> Function:
+    # before opset 18, the axes are an attribute
+    def run(x: Tensor, of: Ints | None = None, *, axes: Ints | None = None, keepdims: int = 1) -> Tensor:
+        return function(x, dim=list(of or axes or range(x.ndim)), keepdim=bool(keepdims))
 
-    return reduced
+    return run
 
 
-def _reshape(x: Tensor, shape: Sequence[int], allowzero: int = 0) -> Tensor:
-    if allowzero:
-        return x.reshape(list(shape))
-    return x.reshape([length or x.shape[axis] for axis, length in enumerate(shape)])
+def _reshape(x: Tensor, shape: Ints, *, allowzero: int = 0) -> Tensor:
+    return x.reshape([n if n or allowzero else x.shape[axis] for axis, n in enumerate(shape)])
 
 
-def _transpose(x: Tensor, perm: Sequence[int] | None = None) -> Tensor:
-    return x.permute(list(perm or reversed(range(x.ndim))))
-
-
-def _squeeze(x: Tensor, axes: Sequence[int] | None = None) -> Tensor:
-    return x.squeeze() if axes is None else x.squeeze(tuple(axes))
-
-
-def _unsqueeze(x: Tensor, axes: Sequence[int]) -> Tensor:
+def _unsqueeze(x: Tensor, axes: Ints) -> Tensor:
     rank = x.ndim + len(axes)
     for axis in sorted(axis % rank for axis in axes):
         x = x.unsqueeze(axis)
     return x
 
 
-def _flatten(x: Tensor, axis: int = 1) -> Tensor:
-    return x.reshape(math.prod(x.shape[:axis]), -1)
-
-
 def _split(
-    x: Tensor, sizes: Sequence[int] | None = None, axis: int = 0, num_outputs: int = 0, outputs: int = 0
+    x: Tensor, sizes: Ints | None = None, *, axis: int = 0, num_outputs: int = 0, outputs: int = 1
 ) -> tuple[Tensor, ...]:
     return x.split(list(sizes) if sizes else -(-x.shape[axis] // outputs), axis)
 
 
 def _slice(
-    x: Tensor,
-    starts: Sequence[int],
-    ends: Sequence[int],
-    axes: Sequence[int] | None = None,
-    steps: Sequence[int] | None = None,
+    x: Tensor, starts: Ints, ends: Ints, axes: Ints | None = None, steps: Ints | None = None
 ) -> Tensor:
     axes, steps = axes or range(len(starts)), steps or [1] * len(starts)
     for start, end, axis, step in zip(starts, ends, axes, steps, strict=True):
         rows = range(*slice(start, end, step).indices(x.shape[axis]))
         if step > 0:
-            index = [slice(None)] * (axis % x.ndim) + [slice(rows.start, rows.stop, step)]
-            x = x[tuple(index)]
+            x = x[(slice(None),) * (axis % x.ndim) + (slice(rows.start, rows.stop, step),)]
         else:
             x = x.index_select(axis, torch.tensor(list(rows), device=x.device))
     return x
 
 
-def _gather(x: Tensor, indices: Tensor, axis: int = 0) -> Tensor:
+def _gather(x: Tensor, indices: Tensor, *, axis: int = 0) -> Tensor:
     axis %= x.ndim
     rows = torch.where(indices < 0, indices + x.shape[axis], indices).reshape(-1)
-    shape = (*x.shape[:axis], *indices.shape, *x.shape[axis + 1 :])
-    return x.index_select(axis, rows).reshape(shape)
+    return x.index_select(axis, rows).reshape(x.shape[:axis] + indices.shape + x.shape[axis + 1 :])
 
 
-def _gather_nd(x: Tensor, indices: Tensor, batch_dims: int = 0) -> Tensor:
-    require(not batch_dims, "batch_dims")
-    return x[indices.unbind(-1)]
-
-
-def _scatter_nd(x: Tensor, indices: Tensor, updates: Tensor, reduction: str = "none") -> Tensor:
-    require(reduction == "none", f"reduction {reduction}")
-    return x.index_put(indices.unbind(-1), updates)
-
-
-def _scatter(x: Tensor, indices: Tensor, updates: Tensor, axis: int = 0, reduction: str = "none") -> Tensor:
-    require(reduction == "none", f"reduction {reduction}")
-    return x.scatter(axis, indices, updates)
-
-
-def _one_hot(indices: Tensor, depth: int | list[int], values: Tensor, axis: int = -1) -> Tensor:
+def _one_hot(indices: Tensor, depth: int | list[int], values: Tensor, *, axis: int = -1) -> Tensor:
     number = depth[0] if isinstance(depth, list) else depth
     rows = torch.arange(number, device=indices.device)
-    hot = torch.where(indices.unsqueeze(-1) % number == rows, values[1], values[0])
-    return hot.movedim(-1, axis)
+    return torch.where(indices.unsqueeze(-1) % number == rows, values[1], values[0]).movedim(-1, axis)
 
 
-def _constant_of_shape(shape: Sequence[int], value: Tensor | None = None) -> Tensor:
+def _constant_of_shape(shape: Ints, *, value: Tensor | None = None) -> Tensor:
     return torch.zeros(list(shape)) if value is None else value.expand(list(shape))
 
 
-def _expand(x: Tensor, shape: Sequence[int]) -> Tensor:
-    return x.expand(torch.broadcast_shapes(x.shape, tuple(shape)))
-
-
-def _argmax(x: Tensor, axis: int = 0, keepdims: int = 1, select_last_index: int = 0) -> Tensor:
-    require(not select_last_index, "select_last_index")
-    return x.argmax(axis, keepdim=bool(keepdims))
-
-
 RESIZERS = {
-    ("nearest", "asymmetric"): {3: "nearest", 4: "nearest"},
-    ("linear", "half_pixel"): {3: "linear", 4: "bilinear"},
-    ("linear", "pytorch_half_pixel"): {3: "linear", 4: "bilinear"},
-    ("cubic", "half_pixel"): {4: "bicubic"},
-    ("cubic", "pytorch_half_pixel"): {4: "bicubic"},
+    ("nearest", "asymmetric", "floor"): {3: "nearest", 4: "nearest"},
+    ("linear", "half_pixel", ""): {3: "linear", 4: "bilinear"},
+    ("linear", "pytorch_half_pixel", ""): {3: "linear", 4: "bilinear"},
+    ("cubic", "half_pixel", ""): {4: "bicubic"},
+    ("cubic", "pytorch_half_pixel", ""): {4: "bicubic"},
 }
-"""Mode and coordinates of Resize -> number of axes -> torch's mode."""
+"""Mode, coordinates and rounding of Resize -> number of axes -> torch's mode."""
 
 
 def _resize(
-    x: Tensor,
-    roi: Sequence[float] | None = None,
-    scales: Sequence[float] | None = None,
-    sizes: Sequence[int] | None = None,
-    mode: str = "nearest",
-    coordinate_transformation_mode: str = "half_pixel",
-    nearest_mode: str = "round_prefer_floor",
-    cubic_coeff_a: float = -0.75,
-    exclude_outside: int = 0,
-    antialias: int = 0,
-    extrapolation_value: float = 0,
-    keep_aspect_ratio_policy: str = "stretch",
-) -> Tensor:
-    form = RESIZERS.get((mode, coordinate_transformation_mode), {}).get(x.ndim, "")
-    require(bool(form), f"{mode} with coordinates {coordinate_transformation_mode}")
-    require(mode != "nearest" or nearest_mode == "floor", f"nearest_mode {nearest_mode}")
-    require(cubic_coeff_a == -0.75 and not exclude_outside and not antialias, "the given filter")
-    require(keep_aspect_ratio_policy == "stretch", keep_aspect_ratio_policy)
+    x: Tensor, roi: Any = None, scales: Sequence[float] | None = None, sizes: Ints | None = None, *,
+    mode: str = "nearest", coordinate_transformation_mode: str = "half_pixel", nearest_mode: str = "",
+) -> Tensor:  # fmt: skip
+    key = mode, coordinate_transformation_mode, nearest_mode if mode == "nearest" else ""
+    form = RESIZERS.get(key, {}).get(x.ndim, "")
+    require(bool(form), f"{' '.join(key)} of {x.ndim} axes")
     if sizes:
         require(list(sizes[:2]) == list(x.shape[:2]), f"sizes {sizes}")
         return F.interpolate(x, size=list(sizes[2:]), mode=form)
@@ -325,7 +211,7 @@ def _resize(
 
 
 def _grid_sample(
-    x: Tensor, grid: Tensor, mode: str = "linear", padding_mode: str = "zeros", align_corners: int = 0
+    x: Tensor, grid: Tensor, *, mode: str = "bilinear", padding_mode: str = "zeros", align_corners: int = 0
 ) -> Tensor:
     mode = {"linear": "bilinear", "cubic": "bicubic"}.get(mode, mode)
     return F.grid_sample(x, grid, mode, padding_mode, bool(align_corners))
@@ -336,18 +222,18 @@ def _depth_to_space(x: Tensor, blocksize: int, mode: str = "DCR") -> Tensor:
     return F.pixel_shuffle(x, blocksize)
 
 
-OPERATORS: dict[str, Callable[..., Any]] = {
+OPERATORS: dict[str, Function] = {
     "Add": lambda a, b: a + b,
     "And": torch.logical_and,
-    "ArgMax": _argmax,
+    "ArgMax": lambda x, *, axis=0, keepdims=1: x.argmax(axis, keepdim=bool(keepdims)),
     "AveragePool": _pool(F.avg_pool2d),
     "Cast": _cast,
     "Clip": lambda x, low=None, high=None: x.clamp(low, high) if (low, high) != (None, None) else x,
     "Concat": lambda *parts, axis: torch.cat(parts, axis),
     "Constant": _constant,
     "ConstantOfShape": _constant_of_shape,
-    "Conv": _conv,
-    "ConvTranspose": _conv_transpose,
+    "Conv": _convolution({3: F.conv1d, 4: F.conv2d, 5: F.conv3d}),
+    "ConvTranspose": _convolution({4: F.conv_transpose2d}, transposed=True),
     "Cos": torch.cos,
     "DepthToSpace": _depth_to_space,
     "Div": _divide,
@@ -355,10 +241,10 @@ OPERATORS: dict[str, Callable[..., Any]] = {
     "Equal": torch.eq,
     "Erf": torch.erf,
     "Exp": torch.exp,
-    "Expand": _expand,
-    "Flatten": _flatten,
+    "Expand": lambda x, shape: x.expand(torch.broadcast_shapes(x.shape, tuple(shape))),
+    "Flatten": lambda x, *, axis=1: x.reshape(math.prod(x.shape[:axis]), -1),
     "Gather": _gather,
-    "GatherND": _gather_nd,
+    "GatherND": lambda x, indices: x[indices.unbind(-1)],
     "Gelu": lambda x, approximate="none": F.gelu(x, approximate=approximate),
     "Gemm": _gemm,
     "Greater": torch.gt,
@@ -370,7 +256,7 @@ OPERATORS: dict[str, Callable[..., Any]] = {
     "LessOrEqual": torch.le,
     "MatMul": torch.matmul,
     "MaxPool": _pool(F.max_pool2d),
-    "Mod": _modulo,
+    "Mod": torch.remainder,
     "Mul": lambda a, b: a * b,
     "Neg": torch.neg,
     "NonZero": lambda x: torch.tensor(x).nonzero().T,
@@ -388,21 +274,21 @@ OPERATORS: dict[str, Callable[..., Any]] = {
     "Relu": torch.relu,
     "Reshape": _reshape,
     "Resize": _resize,
-    "ScatterElements": _scatter,
-    "ScatterND": _scatter_nd,
+    "ScatterElements": lambda x, indices, updates, *, axis=0: x.scatter(axis, indices, updates),
+    "ScatterND": lambda x, indices, updates: x.index_put(indices.unbind(-1), updates),
     "Shape": lambda x, start=0, end=None: torch.tensor(x.shape[start:end]),
     "Sigmoid": torch.sigmoid,
     "Sin": torch.sin,
     "Size": lambda x: torch.tensor(x.numel()),
     "Slice": _slice,
-    "Softmax": lambda x, axis=-1: torch.softmax(x, axis),
+    "Softmax": lambda x, *, axis=-1: torch.softmax(x, axis),
     "Split": _split,
     "Sqrt": torch.sqrt,
-    "Squeeze": _squeeze,
+    "Squeeze": lambda x, axes=None: x.squeeze() if axes is None else x.squeeze(tuple(axes)),
     "Sub": lambda a, b: a - b,
     "Tanh": torch.tanh,
     "Tile": lambda x, repeats: x.repeat(repeats),
-    "Transpose": _transpose,
+    "Transpose": lambda x, *, perm=None: x.permute(list(perm or reversed(range(x.ndim)))),
     "Unsqueeze": _unsqueeze,
     "Where": torch.where,
 }

@@ -21,8 +21,8 @@ TOLERANCE = 1e-5
 
 GRAPHS = [
     "w = ConstantOfShape <value = float[1] {3}> (s) y = Conv <pads = [1, 0, 2, 1], strides = [2, 1]> (x, w)",
-    "w = ConstantOfShape <value = float[1] {0.3}> (s) y = ConvTranspose <strides = [2, 2]> (x, w)",
-    "y = MaxPool <kernel_shape = [2, 2], strides = [2, 2]> (x)",
+    "w = ConstantOfShape <value = float[1] {3}> (s) y = ConvTranspose <strides = [2, 2], output_padding = [0, 0]> (x, w)",
+    "y = MaxPool <kernel_shape = [2, 2], strides = [2, 2], dilations = [1, 1]> (x)",
     "y = AveragePool <kernel_shape = [2, 3]> (x)",
     "y = LayerNormalization <axis = 2, epsilon = 1e-3> (x, half)",
     "y = Resize <mode = 'linear'> (x, , , sizes)",
@@ -121,8 +121,8 @@ def test_operators(tmp_path, text):
             "y = AveragePool <kernel_shape = [2, 2], pads = [0, 0, 1, 1]> (x)",
             "AveragePool in an unknown form",
         ),
-        ("y = Resize <mode = 'nearest'> (x, , scales)", "nearest with coordinates half_pixel"),
-        ("y = Softmax <unknown = 1> (x)", "Softmax in an unknown form"),
+        ("y = Resize <mode = 'nearest'> (x, , scales)", "nearest half_pixel"),
+        ("y = ArgMax <axis = 1, select_last_index = 1> (x)", "ArgMax in an unknown form"),
         ("n = NonZero (x) y = Cast <to = 1> (n)", "NonZero depends on values of its inputs"),
         (
             "r = ReduceMax <keepdims = 0> (x) c = Greater (r, three) "
