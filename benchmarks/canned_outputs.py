@@ -75,18 +75,18 @@ def replace_outputs(model: type[SamModel]) -> None:
 
     def canned_decode(self: Any, encoded: Encoded, points_xy: np.ndarray) -> Any:
         decode(self, encoded, points_xy)
-        return encoded.features["canned"].logits(in_input(points_xy, encoded.frame), 1)  # type: ignore[attr-defined]
+        return encoded.features["canned"].logits(in_input(points_xy, encoded.frame), 1)
 
     def canned_preview(self: Any, encoded: Encoded, points_xy: np.ndarray) -> Any:
         _, _, kept = preview(self, encoded, points_xy)
         points = in_input(points_xy, encoded.frame)
-        return *encoded.features["canned"].logits(points, 4), {**kept, "canned": points}  # type: ignore[attr-defined]
+        return *encoded.features["canned"].logits(points, 4), {**kept, "canned": points}
 
     def canned_finish(self: Any, encoded: Encoded, prompts: Any) -> Any:
         if "canned" not in prompts:
             return canned_decode(self, encoded, prompts["points"])
         finish(self, encoded, prompts)
-        return encoded.features["canned"].logits(prompts["canned"], 1)  # type: ignore[attr-defined]
+        return encoded.features["canned"].logits(prompts["canned"], 1)
 
     changed = {"encode": canned_encode, "decode": canned_decode}
     for name, function in (changed | {"preview": canned_preview, "finish": canned_finish}).items():

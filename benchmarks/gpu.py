@@ -238,7 +238,7 @@ def times_of_sam(model: ModelFolder, device: str, sizes: Sizes) -> dict[str, Any
 
     sam = SamModel(model, device)
     picture = np.random.default_rng(0).integers(0, 256, (600, 800, 3)).astype(np.uint8)
-    settings = MasksSettings(device=device, points_per_side=sizes.points_per_side)
+    settings = MasksSettings(points_per_side=sizes.points_per_side)
     return {
         "encode_ms": median_ms(lambda: sam.encode(picture), device, 3),
         "picture_ms": median_ms(lambda: decode_candidates(picture, sam, settings, None), device, 2),
@@ -379,7 +379,7 @@ def main() -> int:
         print(f"{name:<14} {state} {results[name]['part_s']:6.1f} s", flush=True)
     write_json(given.out / "gpu.json", results)
     failed = {name: found["failed"] for name, found in results.items() if "failed" in found}
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (
             name,
             "failed" if name in failed else "",

@@ -46,6 +46,11 @@ class Section(BaseModel):
         """Whether the stage runs the model in the setting `model`."""
         return False
 
+    @property
+    def uses_card(self) -> bool:
+        """Whether the stage uses an NVIDIA card if there is one that works."""
+        return False
+
 
 def _takes(annotation: Any, kind: type) -> bool:
     """Return whether a type or a part of it is `kind` or `Any`."""
@@ -57,6 +62,8 @@ Size = Annotated[int, Field(ge=1, le=1000)]
 Suffix = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]*$")]
 Auto = Literal["auto"]
 Device = Literal["auto", "cpu", "cuda"]
+
+NETWORKS = "device of the networks; auto: cuda if torch finds one with enough free memory, else cpu"
 
 
 class PosesSettings(Section):
@@ -147,6 +154,10 @@ class GaussiansSettings(Section):
         """Value of `device`."""
         return self.device
 
+    @property
+    def uses_card(self) -> bool:
+        return self.device != "cpu"
+
 
 class MasksSettings(Section):
     """Masks of each view, at three levels."""
@@ -162,8 +173,10 @@ class MasksSettings(Section):
     )
     variant: Suffix = knob("", "suffix of the network files, such as fp16 for vision_encoder_fp16.onnx")
     precision: Literal["auto", "fp32", "int8"] = knob(
-        "auto", "auto: int8 on a CPU if it agrees with fp32 on the scene; embedded models: fp32"
+        "auto",
+        "auto: int8 on a CPU, fp16 on CUDA, if it agrees with fp32 on the scene; embedded models: fp32",
     )
+    device: Device = knob("auto", NETWORKS)
     key_views: float = knob(
         1.0, "share of training views to segment; below 1: together they show the most Gaussians", gt=0, le=1
     )
@@ -183,7 +196,7 @@ class MasksSettings(Section):
     points_per_side: int = knob(32, "point prompts per image side", ge=1, le=128, origin="LangSplat: 32")
     points_per_batch: Annotated[int, Field(ge=1, le=4096)] | Auto = knob(
         "auto",
-        "prompts per decoder call; auto: the model folder's value, else 8 (full-size SAM: 60 MB each)",
+        "prompts per call on a CPU; auto: the model folder's value, else 8 (full-size SAM: 60 MB each)",
         origin="LangSplat: 64",
     )
     crop_layers: int = knob(0, "layers of crops to segment", ge=0, le=2, origin="LangSplat: 1")
@@ -232,6 +245,10 @@ class MasksSettings(Section):
     def uses_model(self) -> bool:
         return self.segmenter == "sam"
 
+    @property
+    def uses_card(self) -> bool:
+        return self.uses_model and self.device != "cpu"
+
 
 class CoverageTreeSettings(Section):
     """Coverage tree of each view."""
@@ -250,8 +267,9 @@ class ClipSettings(Section):
     """CLIP vectors of masks and nodes."""
 
     precision: Literal["auto", "fp32", "int8"] = knob(
-        "auto", "auto: int8 on a CPU if it agrees with fp32 on crops; embedded models: fp32"
+        "auto", "auto: int8 on a CPU, fp16 on CUDA, if it agrees with fp32 on crops; embedded models: fp32"
     )
+    device: Device = knob("auto", NETWORKS)
     crops: Literal["auto", "nodes", "masks"] = knob(
         "auto",
         "masks to embed; nodes: those showing each node best; masks: all; auto: set by autoencoder.targets",
@@ -271,11 +289,15 @@ class ClipSettings(Section):
     background: Literal["black", "keep"] = knob(
         "black", "pixels of a crop outside its mask: painted black, or kept", origin="LangSplat: black"
     )
-    batch: int = knob(1, "crops per network call; above 1 is faster only on a GPU", ge=1, le=4096)
+    batch: int = knob(1, "crops per network call on a CPU, where more are no faster", ge=1, le=4096)
 
     @property
     def uses_model(self) -> bool:
         return True
+
+    @property
+    def uses_card(self) -> bool:
+        return self.device != "cpu"
 
 
 class ContributionsSettings(Section):
@@ -296,6 +318,10 @@ class ContributionsSettings(Section):
     def rasteriser(self) -> Device:
         """Value of `device`; on the CPU for `auto`."""
         return "cpu" if self.device == "auto" else self.device
+
+    @property
+    def uses_card(self) -> bool:
+        return self.rasteriser != "cpu"
 
 
 class SemanticTreeSettings(Section):

@@ -22,6 +22,7 @@ import typer
 from hilsplat.base.artifacts import provenance_path
 from hilsplat.base.atomic import output_lock, require_free_space, was_interrupted
 from hilsplat.base.cache import writable
+from hilsplat.base.cards import take_card
 from hilsplat.base.code import code_digest, modules_of
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.lineage import Inputs, write_provenance
@@ -255,6 +256,8 @@ def _recorded(stage: Stage[..., Any], arguments: Mapping[str, Any]) -> Iterator[
         (section.rasteriser for section in sections.values() if hasattr(section, "rasteriser")), None
     )
     with output_lock(out):
+        if any(section.uses_card for section in sections.values()):
+            take_card()
         before, code = Inputs(stage.name, inputs), stage.code_digest(extra.plugins)
         yield
         try:

@@ -1,9 +1,9 @@
-"""CLIP in onnxruntime: unit vectors of mask crops and texts in a shared space."""
+"""CLIP: unit vectors of mask crops and texts in a shared space."""
 
 import logging
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float16, Float32, Int64, UInt8
@@ -12,8 +12,10 @@ from tokenizers import Tokenizer
 from hilsplat.base.artifacts import read_index, read_json
 from hilsplat.base.errors import MisalignedArtifactError, ModelError
 from hilsplat.base.files import INSTALLED
+from hilsplat.models.card import CPU, Batches, in_turn, network_device
 from hilsplat.models.folder import WHOLE_COPY, ModelFolder, input_side_px, open_model_folder
-from hilsplat.models.network import Network, require_one_space
+from hilsplat.models.memory import needs_of
+from hilsplat.models.network import Array, Network, require_one_space
 from hilsplat.models.repeatable import random_pixels, require_repeatable_once
 from hilsplat.models.store import MODELS, user_models
 from hilsplat.segment.crops import crop_to_square
@@ -24,16 +26,19 @@ logger = logging.getLogger(__name__)
 
 SIGLIP_TOKENS = 64
 """Text length (tokens) of a SigLIP model whose configuration does not specify it."""
+CARD_CROPS, MOST_CROPS = 64, 256
+"""Crops of a card's first call, and maximum of later calls."""
 MODEL_PATTERNS = ("*/config.json", "*/*/config.json")  # configurations of the models in `models/`
 
 
 class ClipModel:
     """A loaded CLIP model; texts are inserted into the prompt template at `{}`."""
 
-    precision: str = "fp32"  # precision of the vision network: "fp32" or "int8"
+    precision: str = "fp32"  # precision of the vision network: "fp32", "int8" or "fp16"
+    device: str = CPU  # of the vision network (`models.card`)
 
-    def __init__(self, model: ModelFolder, template: str = "{}") -> None:
-        self.model = model
+    def __init__(self, model: ModelFolder, template: str = "{}", device: str = CPU) -> None:
+        self.model, self.device = model, device
         self.template = template
         self._text_vectors: dict[str, np.ndarray] = {}
         self.digest = model.digest
@@ -69,11 +74,14 @@ class ClipModel:
     @cached_property
     def vision(self) -> Network:
         """Vision network, opened on first use because it is large and not needed for texts."""
-        network = self.model.network("vision_model")
+        network = self.model.network("vision_model", device=self.device)
         (vector,) = network.spec.outputs
         widths = network.fixed_axis(vector, 1), self.text.fixed_axis(self.words, 1)
         require_one_space(self.model.folder, *widths)
-        require_repeatable_once(self.model, network, "as exported", random_pixels(network, self.side_px))
+        pixels = random_pixels(network, self.side_px)
+        in_turn(
+            self.device, "clip", lambda: require_repeatable_once(self.model, network, "as exported", pixels)
+        )
         return network
 
     @property
@@ -85,6 +93,10 @@ class ClipModel:
     def crops_per_call(self) -> int | None:
         """Fixed number of crops per call of the vision network, if any; it is 1 in open_clip's exports."""
         return self.vision.fixed_axis(self.pixels, 0)
+
+    @cached_property
+    def _on_card(self) -> Batches:
+        return Batches(CARD_CROPS, self.device, MOST_CROPS, section="clip")
 
     def _pad_id(self, text_config: dict[str, Any]) -> int:
         """Return the padding token's id from the tokenizer, else its configuration, else the model's."""
@@ -99,9 +111,14 @@ class ClipModel:
         return int(pad_id or 0)
 
     @staticmethod
-    def load(folder: Path, variant: str = "") -> "ClipModel":
-        """Open a model folder and its vision network; errors as in `open_model_folder`."""
-        model = ClipModel(open_model_folder(folder, "clip", variant=variant))
+    def load(folder: Path, variant: str = "", device: Literal["auto", "cpu", "cuda"] = "cpu") -> "ClipModel":
+        """Open a model folder, and its vision network on the device that a setting selects.
+
+        Errors as in `open_model_folder` and `network_device`.
+        """
+        opened = open_model_folder(folder, "clip", variant=variant)
+        place = network_device(device, "clip", needs_of(opened, CARD_CROPS).card_mib)
+        model = ClipModel(opened, device=place)
         _ = model.vision  # open and check it now
         return model
 
@@ -129,15 +146,21 @@ class ClipModel:
                 fix="set clip.model to the model that computed it, or rerun the clip stage and later stages",
             )
 
-    def prepare(self, crops: UInt8[np.ndarray, "B side side 3"]) -> Float32[np.ndarray, "B 3 side side"]:
-        """Normalise crops and move the channels to the first axis."""
+    def prepare(self, crops: UInt8[np.ndarray, "B side side 3"]) -> Float32[Array, "B 3 side side"]:
+        """Normalise crops and move the channels to the first axis; on a card, return a tensor."""
+        if self.device != CPU:
+            import torch
+
+            mean, std = (torch.from_numpy(values).to(self.device) for values in (self.mean, self.std))
+            on_card = torch.from_numpy(crops).to(self.device).float()
+            return ((on_card * float(self.rescale) - mean) / std).permute(0, 3, 1, 2)
         values = (crops.astype(np.float32) * self.rescale - self.mean) / self.std
         return np.ascontiguousarray(values.transpose(0, 3, 1, 2))
 
     def embed_crops(self, crops: UInt8[np.ndarray, "B side side 3"]) -> Float32[np.ndarray, "B C"]:
         """Return the unit vectors of square crops with side `side_px`."""
         step = self.crops_per_call or len(crops)
-        pieces = np.split(self.prepare(crops), range(step, len(crops), step))
+        pieces = [self.prepare(crops[start : start + step]) for start in range(0, len(crops), step)]
         return self._unit(np.concatenate([self.vision(**{self.pixels: piece})[0] for piece in pieces]))
 
     def embed_picture(self, picture: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, " C"]:
@@ -157,11 +180,20 @@ class ClipModel:
         chosen = range(len(masks)) if rows is None else rows.tolist()
         if not chosen:
             return np.zeros((0, self.width), dtype=np.float16)
-        parts = []
-        for start in range(0, len(chosen), settings.batch):
-            crops = [self.crop(image, masks, row, settings) for row in chosen[start : start + settings.batch]]
-            parts.append(self.embed_crops(np.stack(crops)))
-        return np.concatenate(parts).astype(np.float16)
+
+        def crop(row: int) -> np.ndarray:
+            return self.crop(image, masks, row, settings)
+
+        known = (
+            {} if self.device == CPU else {row: crop(row) for row in chosen}
+        )  # before it is this view's turn
+
+        def embed(rows: Int64[np.ndarray, " b"], number: int) -> np.ndarray:
+            named = [chosen[row] for row in rows]
+            return self.embed_crops(np.stack([known[row] if known else crop(row) for row in named]))
+
+        batches = Batches(settings.batch) if self.device == CPU else self._on_card
+        return np.concatenate(list(batches(len(chosen), embed))).astype(np.float16)
 
     def crop(
         self, image: UInt8[np.ndarray, "H W 3"], masks: HierarchicalMasks, row: int, settings: ClipSettings

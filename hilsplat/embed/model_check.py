@@ -13,16 +13,17 @@ from hilsplat.base.cache import writable
 from hilsplat.base.errors import HilsplatError
 from hilsplat.embed.clip import ClipModel
 from hilsplat.models.folder import input_side_px, open_model_folder
-from hilsplat.models.int8 import considers_int8, int8_network
-from hilsplat.models.network import execution_providers, require_one_space
+from hilsplat.models.int8 import int8_network, reduced_precision
+from hilsplat.models.network import require_one_space
+from hilsplat.models.repeatable import random_pixels
 from hilsplat.models.store import broken_models, present_models
 from hilsplat.segment.sam import SamModel
 
 CACHE = Path("results/.cache")
 """Folder for measured timings, and for int8 networks if the models folder is read-only."""
 IMAGE_NETWORKS = {"sam": "vision_encoder", "clip": "vision_model"}
-MAX_PROVIDER_DIFFERENCE = 0.02
-"""Maximum relative difference attributed to rounding, such as that of TF32 products on CUDA."""
+MAX_CARD_DIFFERENCE = 0.02
+"""Maximum relative difference attributed to rounding, such as that of TF32 convolutions."""
 Measured = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Result = TypeVar("Result")
 Seconds = dict[str, float]
@@ -38,7 +39,7 @@ def check_model(folder: Path, variant: str = "") -> str:
     side = input_side_px(model)
     lines = [f"folder     {model.folder}", f"kind       {model.layout}", f"image      {side} x {side} px"]
     opened = SamModel(model) if model.kind == "sam" else ClipModel(model)
-    precisions = ["fp32", "int8"] if considers_int8("auto", model, IMAGE_NETWORKS[model.kind]) else ["fp32"]
+    precisions = ["fp32", *filter(None, [reduced_precision("auto", model, IMAGE_NETWORKS[model.kind])])]
     seconds = {name: times for name in precisions if (times := _measure(opened, name))}
     listed = "; ".join(
         f"{precision}: " + ", ".join(f"{value:.4f} s per {what}" for what, value in times.items())
@@ -55,14 +56,12 @@ def check_model(folder: Path, variant: str = "") -> str:
             f"masks      3 heads (subpart, part, whole) of {masks.shape[-2]} x {masks.shape[-1]} px",
             f"decoder    {'factored' if opened.factored else 'onnxruntime'}",
         ]
-        providers = opened.encoder.providers
     else:
         vectors = opened.embed_crops(np.full((1, side, side, 3), 128, np.uint8))
         require_one_space(model.folder, vectors.shape[1], opened.embed_texts(["object"]).shape[1])
         lines += [f"vectors    {vectors.shape[1]} dimensions"]
-        providers = opened.vision.providers
     _remember(folder, variant, seconds, writable(CACHE))
-    lines += [f"time       {listed}", f"runs on    {', '.join(providers)}", f"digest     {model.digest}"]
+    lines += [f"time       {listed}", f"digest     {model.digest}"]
     return "\n".join(lines)
 
 
@@ -78,27 +77,21 @@ def check_models() -> tuple[str, int]:
     return "\n\n".join(texts) or "no model is installed", num_failed
 
 
-def provider_disagreement(folder: Path) -> str | None:
-    """Return how the image network's output for a random image differs between providers, or None."""
+def card_disagreement(folder: Path, device: str = "cuda") -> str | None:
+    """Return how a model's image network differs between a card and the CPU, or None.
+
+    A ModelError is raised if a network cannot run on the card.
+    """
     model = open_model_folder(folder)
-    providers = execution_providers()
-    if len(providers) < 2:
+    on_card = (
+        SamModel(model, device).encoder if model.kind == "sam" else ClipModel(model, device=device).vision
+    )
+    pixels = random_pixels(on_card, input_side_px(model))
+    pairs = zip(model.network(IMAGE_NETWORKS[model.kind])(**pixels), on_card(**pixels), strict=True)
+    difference = max(float(np.linalg.norm(a - b)) / max(float(np.linalg.norm(a)), 1e-12) for a, b in pairs)
+    if difference <= MAX_CARD_DIFFERENCE:
         return None
-    name = IMAGE_NETWORKS[model.kind]
-    side = input_side_px(model)
-    pixels = np.random.default_rng(0).normal(size=(1, 3, side, side)).astype(np.float32)
-    outputs = {
-        provider: model.network(name, provider=provider)(pixel_values=pixels) for provider in providers
-    }
-    reference = outputs.pop("CPUExecutionProvider")
-    for provider, values in outputs.items():
-        pairs = zip(reference, values, strict=True)
-        difference = max(
-            float(np.linalg.norm(a - b)) / max(float(np.linalg.norm(a)), 1e-12) for a, b in pairs
-        )
-        if not difference <= MAX_PROVIDER_DIFFERENCE:
-            return f"{provider} differs from the CPU by {difference:.2g} times the output's norm"
-    return None
+    return f"{device} differs from the CPU by {difference:.2g} times the output's norm"
 
 
 def seconds_of(folder: Path, variant: str, precision: str, cache: Path) -> Seconds:
@@ -107,7 +100,7 @@ def seconds_of(folder: Path, variant: str, precision: str, cache: Path) -> Secon
     `precision` is "fp32", or "auto" or "int8", which both mean int8 where possible.
     """
     model = open_model_folder(folder, variant=variant)
-    requested = "int8" if considers_int8(precision, model, IMAGE_NETWORKS[model.kind]) else "fp32"
+    requested = reduced_precision(precision, model, IMAGE_NETWORKS[model.kind]) or "fp32"
     seconds = _known(cache).get(_key(folder, variant, requested), {})
     if not seconds.keys() >= ({"crop"} if model.kind == "clip" else {"image", "masks"}):
         opened = SamModel(model) if model.kind == "sam" else ClipModel(model)

@@ -16,13 +16,14 @@ from hilsplat.base.lineage import sha256_of_bytes, sha256_of_file, sha256_of_jso
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel, unit
+from hilsplat.models.card import in_turn, recorded
 from hilsplat.models.int8 import (
     CHECKED_CROPS,
     WORDS,
     agreement_of_vectors,
-    considers_int8,
     int8_network,
-    use_int8,
+    reduced_precision,
+    use_reduced,
 )
 from hilsplat.models.memory import needs_of
 from hilsplat.scene.scene import Scene
@@ -73,7 +74,7 @@ def run_clip(
     if semantic_tree_folder is not None:
         require_same_masks(semantic_tree_folder, masks_folder)
         chosen = chosen_masks(semantic_tree_folder, settings.crops_per_node)
-    model = ClipModel.load(Path(settings.model), settings.variant)
+    model = ClipModel.load(Path(settings.model), settings.variant, settings.device)
     _choose_precision(model, scene, masks_folder, digests, chosen, cache, settings, threads)
     threads = needs_of(model.model, settings.batch).views_at_once(threads, memory_mib)
     view_cache = ViewCache(cache / "clip")
@@ -88,7 +89,7 @@ def run_clip(
                 "masks": [pixels[row] for row in order],
                 "model": model.digest,
                 "precision": model.precision,
-                "providers": model.vision.providers,
+                "providers": model.vision.runs_on,
                 "settings": settings.model_dump(include={"crop", "background", "batch"}),
                 "code": code_digest(ClipModel),
             }
@@ -124,7 +125,7 @@ def run_clip(
             crops = vectors[vectors.any(axis=1)]
             distinct.update(vector.tobytes() for vector in crops[:FEW_CROPS])
             index[view] = {MASKS_SHA256: digests[view], "masks": len(vectors), "crops": len(crops)}
-        more = {"precision": model.precision, "background": settings.background}
+        more = {"precision": model.precision, "background": settings.background, **recorded(model.device)}
         if len(distinct) == 1 and sum(entry["crops"] for entry in index.values()) >= FEW_CROPS:
             raise ModelError(
                 f"the CLIP model {settings.model} gives the same vector for all crops of {scene.name}",
@@ -145,15 +146,18 @@ def _choose_precision(
     settings: ClipSettings,
     threads: int,
 ) -> None:
-    """Switch the model to int8 if the settings require it, or if int8 and float32 agree on scene crops."""
-    if not considers_int8(settings.precision, model.model, "vision_model"):
+    """Switch the model to a lower precision if the settings require it, or if scene crops agree."""
+    form = reduced_precision(settings.precision, model.model, "vision_model", model.device)
+    if not form:
         return
     entries = read_index(masks_folder)["views"]
     rows = chosen or {view: np.arange(entries[view]["whole"]) for view in digests}
     pairs = [(view, row) for view in digests for row in rows[view].tolist()]
     pairs = pairs[:: max(1, len(pairs) // CHECKED_CROPS)][:CHECKED_CROPS]
-    quantised = int8_network(model.model, "vision_model", cache) if pairs else None
-    if quantised is None:
+    if not pairs:
+        return
+    reduced = int8_network(model.model, "vision_model", cache) if form == "int8" else model.vision.in_half()
+    if reduced is None:
         return
 
     def crop(pair: tuple[str, int]) -> np.ndarray:
@@ -161,18 +165,21 @@ def _choose_precision(
         return model.crop(scene.image(view), load_masks(masks_folder, view, digests), row, settings)
 
     def embed_twice(crop: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        (vectors,) = quantised(**{model.pixels: model.prepare(crop[None])})
-        return model.embed_crops(crop[None]), unit(vectors)
+        def run() -> tuple[np.ndarray, np.ndarray]:
+            (vectors,) = reduced(**{model.pixels: model.prepare(crop[None])})
+            return model.embed_crops(crop[None]), unit(vectors)
+
+        return in_turn(model.device, "clip", run)
 
     def measure() -> dict[str, float]:
-        full, int8 = map(np.concatenate, zip(*in_order(embed_twice, list(crops), threads), strict=True))
-        return agreement_of_vectors(full, int8, model.embed_texts(list(WORDS)))
+        full, lower = map(np.concatenate, zip(*in_order(embed_twice, list(crops), threads), strict=True))
+        return agreement_of_vectors(full, lower, model.embed_texts(list(WORDS)))
 
     crops = np.stack(list(map(crop, pairs)))
 
     inputs = {"model": model.digest, "crops": sha256_of_bytes(crops.tobytes()), "words": WORDS}
-    if use_int8(settings.precision, "CLIP", cache, inputs, measure):
-        model.vision, model.precision = quantised, "int8"
+    if use_reduced(form, settings.precision, "CLIP", cache, inputs, measure):
+        model.vision, model.precision = reduced, form
 
 
 def chosen_masks(semantic_tree_folder: Path, per_node: int) -> dict[str, Int64[np.ndarray, " m"]]:

@@ -15,6 +15,7 @@ from pydantic import AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field
 from hilsplat.base.artifacts import read_json
 from hilsplat.base.errors import ArtifactError, ModelError
 from hilsplat.base.lineage import sha256_of_file, sha256_of_json
+from hilsplat.models.card import CPU
 from hilsplat.models.layouts import (
     LAYOUTS,
     OTHER_TYPES,
@@ -98,9 +99,14 @@ class ModelFolder:
         files = [(path.relative_to(self.folder).as_posix(), sha256_of_file(path)) for path in self.files]
         return sha256_of_json(files)
 
-    def network(self, name: str, changed: Graph | Path | None = None, provider: str | None = None) -> Network:
-        """Open one of the model's networks and check its inputs and outputs (see `Network`)."""
-        return Network(self.networks[name], LAYOUTS[self.layout].usable[name], changed, provider)
+    def network(self, name: str, changed: Graph | Path | None = None, device: str = CPU) -> Network:
+        """Open one of the model's networks, in torch unless on the CPU, and check its inputs and outputs."""
+        network = self.networks[name], LAYOUTS[self.layout].usable[name], changed
+        if device == CPU:
+            return Network(*network)
+        from hilsplat.models.torch_network import TorchNetwork  # torch takes seconds to import
+
+        return TorchNetwork(*network, device=device)
 
 
 def open_model_folder(

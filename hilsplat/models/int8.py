@@ -1,8 +1,11 @@
-"""Dynamically quantised int8 networks. Stages check them on the scene's own photographs."""
+"""Faster networks of lower precision: int8 on a CPU, dynamically quantised, and float16 on a card.
+
+Stages check them on the scene's own photographs.
+"""
 
 import logging
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +14,11 @@ from jaxtyping import Bool, Float
 
 from hilsplat.base.atomic import atomic_path
 from hilsplat.base.cache import ViewCache
-from hilsplat.base.lineage import sha256_of_json
+from hilsplat.base.lineage import sha256_of_json, version_of
 from hilsplat.base.removal import is_unfinished
+from hilsplat.models.card import CPU
 from hilsplat.models.folder import ModelFolder, external_weights, input_side_px
-from hilsplat.models.network import CPU, Network, execution_providers, or_as_exported
+from hilsplat.models.network import Network, or_as_exported
 from hilsplat.models.onnx_graph import Graph, needed_names
 from hilsplat.models.repeatable import random_pixels, require_repeatable_once
 
@@ -31,7 +35,7 @@ WORDS = (
 """Texts ranked for each crop: the canonical phrases of LERF and everyday words."""
 
 MIN_AGREEMENT = {"mask IoU": 0.98, "cosine": 0.99, "rank correlation": 0.95}
-"""Minimum agreement of int8 with float32: mean IoU of masks from the same prompts, mean cosine of vectors,
+"""Minimum agreement with float32: mean IoU of masks from the same prompts, mean cosine of vectors,
 and rank correlation of `WORDS` by cosine with a crop. Two crops of one object from neighbouring views agree
 less."""
 LARGE_BYTES = 1_000_000_000
@@ -41,18 +45,22 @@ CHECKED_CROPS, CHECKED_VIEWS, CHECKED_GRID = 16, 2, 5
 """Number of crops used to check a CLIP model; numbers of views and of prompts per side for a SAM model."""
 
 
-def considers_int8(precision: str, model: ModelFolder, name: str) -> bool:
-    """Return whether to compare a network's int8 version with float32.
+def reduced_precision(precision: str, model: ModelFolder, name: str, device: str = CPU) -> str:
+    """Return the precision to compare a network with in float32: "int8", "fp16", or "" for none.
 
-    `auto` ignores large networks, such as those of ViT-L and ViT-H. A warning is logged if int8 is required
-    but cannot save time: on a GPU, or for a model of the synthetic world.
+    `auto` ignores large networks on a CPU, such as those of ViT-L and ViT-H. A warning is logged if int8 is
+    required but cannot save time: on a card, or for a model of the synthetic world.
     """
-    possible = execution_providers()[0] == CPU and not model.config.get("world_only")
-    if precision == "int8" and not possible:
+    is_world = bool(model.config.get("world_only"))
+    if precision == "int8" and (is_world or device != CPU):
         logger.warning("%s runs in float32: int8 requires a pretrained model on a CPU", model.folder)
+    if is_world or precision == "fp32":
+        return ""
+    if device != CPU:
+        return "fp16" if precision == "auto" else ""
     path = model.networks[name]
     num_bytes = sum(file.stat().st_size for file in (path, *external_weights(path)))
-    return possible and (precision == "int8" or (precision == "auto" and num_bytes <= LARGE_BYTES))
+    return "int8" if precision == "int8" or num_bytes <= LARGE_BYTES else ""
 
 
 def int8_network(
@@ -117,24 +125,32 @@ def _nodes_only_for(graph: Any, outputs: Sequence[str]) -> list[str]:
     )
 
 
-def use_int8(
-    precision: str, what: str, cache: Path, inputs: object, measure: Callable[[], dict[str, float]]
+def use_reduced(
+    reduced: str,
+    precision: str,
+    what: str,
+    cache: Path,
+    inputs: Mapping[str, object],
+    measure: Callable[[], dict[str, float]],
 ) -> bool:
-    """Return whether to use int8 (`precision` is "auto" or "int8"), and log the measured agreement.
+    """Return whether to use a network of lower precision, and log the measured agreement.
 
     Args:
+        reduced: "int8" or "fp16".
+        precision: setting; if it equals `reduced`, the network is used whatever is measured.
         what: name of the network in the log.
         inputs: digests of the model and of the data that `measure` reads; they are the cache key.
-        measure: function that returns the agreement of int8 with float32, by keys of `MIN_AGREEMENT`.
+        measure: function that returns the agreement with float32, by keys of `MIN_AGREEMENT`.
     """
+    key = [RECIPE, inputs] if reduced == "int8" else [reduced, version_of("torch"), inputs]
     agreement = ViewCache(cache / "int8").get(
-        sha256_of_json([RECIPE, inputs]),
-        lambda: {name: np.array([value]) for name, value in measure().items()},
+        sha256_of_json(key), lambda: {name: np.array([value]) for name, value in measure().items()}
     )
     minima = [(name, float(value[0]), MIN_AGREEMENT[name]) for name, value in agreement.items()]
-    is_used = precision == "int8" or all(value >= minimum for _, value, minimum in minima)
+    is_used = precision == reduced or all(value >= minimum for _, value, minimum in minima)
     measured = ", ".join(f"{name} {value:.4f} (minimum: {minimum})" for name, value, minimum in minima)
-    logger.info("%s runs in %s. int8 vs. float32: %s", what, "int8" if is_used else "float32", measured)
+    used = reduced if is_used else "float32"
+    logger.info("%s runs in %s. %s vs. float32: %s", what, used, reduced, measured)
     return is_used
 
 

@@ -40,6 +40,11 @@ class Needs:
     weights_mib: float
     view_mib: float
 
+    @property
+    def card_mib(self) -> float:
+        """Memory on a card, where one view or batch is processed at a time, MiB."""
+        return self.weights_mib + self.view_mib
+
     def total_mib(self, views: int) -> int:
         """Return the memory of a stage that processes this many views at once, MiB."""
         return round(PROCESS_MIB + self.weights_mib + views * self.view_mib)

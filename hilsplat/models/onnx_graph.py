@@ -207,15 +207,15 @@ def needed_names(graph: Any, outputs: Sequence[str]) -> set[str]:
     while waiting:
         name = waiting.pop()
         if name in makers and name not in needed:
-            waiting += _inputs(makers[name])
+            waiting += inputs_of(makers[name])
         needed.add(name)
     return needed
 
 
-def _inputs(node: Any) -> list[str]:
+def inputs_of(node: Any) -> list[str]:
     """Return the names that a node and its subgraphs read."""
     subgraphs = [graph for attribute in node.attribute for graph in (attribute.g, *attribute.graphs)]
-    return [*node.input, *(name for graph in subgraphs for inner in graph.node for name in _inputs(inner))]
+    return [*node.input, *(name for graph in subgraphs for inner in graph.node for name in inputs_of(inner))]
 
 
 def without_joined(graph: Graph, name: str, other: str) -> Graph | None:
@@ -245,7 +245,7 @@ def computed_from(graph: Graph, name: str) -> set[str]:
     while len(names) > before:  # converters to float16 append nodes in any order
         before = len(names)
         for node in graph.model.graph.node:
-            if node.op_type != "Shape" and names.intersection(_inputs(node)):
+            if node.op_type != "Shape" and names.intersection(inputs_of(node)):
                 names.update(node.output)
     return names
 

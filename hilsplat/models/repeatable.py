@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 
 import numpy as np
-import onnxruntime
 
 from hilsplat.base.cache import remembered
 from hilsplat.base.errors import ModelError
@@ -44,11 +43,11 @@ def random_pixels(network: Network, side_px: int) -> dict[str, np.ndarray]:
 def require_repeatable_once(
     model: ModelFolder, network: Network, form: str, feeds: Mapping[str, np.ndarray]
 ) -> None:
-    """Apply `require_repeatable` to a form of a slow network, once for each version of onnxruntime."""
+    """Apply `require_repeatable` to a form of a slow network, once for each version of its library."""
 
     def check() -> str:
         require_repeatable(network, feeds, {name: np.flip(value, axis=-1) for name, value in feeds.items()})
         return "repeatable"
 
-    key = [model.digest, network.path.name, form, onnxruntime.__version__, network.providers]
+    key = [model.digest, network.path.name, form, network.version, network.runs_on]
     remembered("networks", key, check)

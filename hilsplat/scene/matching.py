@@ -157,7 +157,7 @@ def _integer_products() -> onnxruntime.InferenceSession | None:
         [helper.make_tensor("zero", TensorProto.INT8, [], [-128])],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
-    session = one_thread_session(Graph(model, {}), ["CPUExecutionProvider"])
+    session = one_thread_session(Graph(model, {}))
     rows = np.full((_BLOCK, _CHANNELS), 255, np.uint8)
     columns = np.repeat(np.array([[-128, 127]], np.int8), _CHANNELS, axis=0)
     found = session.run(None, {"rows": rows, "columns": columns})[0]

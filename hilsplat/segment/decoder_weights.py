@@ -9,6 +9,7 @@ from jaxtyping import Float32
 
 from cpusplat.lanes import WIDTH
 from hilsplat.base.errors import ModelError
+from hilsplat.models.network import Array
 from hilsplat.models.onnx_graph import Graph
 from hilsplat.segment import decoder_kernels as kernels
 
@@ -19,8 +20,8 @@ DEFAULT_EPS = 1e-5  # of ONNX's LayerNormalization
 class Linear:
     """A linear layer: weights (out, in) and bias (out)."""
 
-    weight: Float32[np.ndarray, "o i"]
-    bias: Float32[np.ndarray, " o"]
+    weight: Float32[Array, "o i"]
+    bias: Float32[Array, " o"]
 
     @cached_property
     def _packed(self) -> tuple[np.ndarray, np.ndarray]:
@@ -30,7 +31,7 @@ class Linear:
         panels = weight.reshape(-1, WIDTH, weight.shape[1]).transpose(0, 2, 1)
         return np.ascontiguousarray(panels).reshape(-1), np.pad(self.bias, (0, more))
 
-    def __call__(self, x: Float32[np.ndarray, "*n i"]) -> Float32[np.ndarray, "*n o"]:
+    def __call__(self, x: Float32[Array, "*n i"]) -> Float32[Array, "*n o"]:
         panels, bias = self._packed
         rows = np.ascontiguousarray(x, np.float32).reshape(-1, x.shape[-1])
         products = np.empty((len(rows), len(bias)), np.float32)
@@ -42,11 +43,11 @@ class Linear:
 class Norm:
     """A layer norm over the last axis."""
 
-    scale: Float32[np.ndarray, " c"]
-    shift: Float32[np.ndarray, " c"]
+    scale: Float32[Array, " c"]
+    shift: Float32[Array, " c"]
     eps: float
 
-    def __call__(self, x: Float32[np.ndarray, "*n c"]) -> Float32[np.ndarray, "*n c"]:
+    def __call__(self, x: Float32[Array, "*n c"]) -> Float32[Array, "*n c"]:
         x = x - x.mean(axis=-1, keepdims=True)
         variance = np.square(x).mean(axis=-1, keepdims=True)
         return x / np.sqrt(variance + np.float32(self.eps)) * self.scale + self.shift

@@ -7,7 +7,6 @@ LangSplat's suppression. `generator: official` runs each step as published (diff
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -17,6 +16,8 @@ from jaxtyping import Bool, Float, Float32, Float64, Int8, Int32, Int64, Real, U
 from hilsplat.base.code import code_digest
 from hilsplat.base.levels import Level
 from hilsplat.base.lineage import sha256_of_bytes, sha256_of_json
+from hilsplat.models.card import in_turn
+from hilsplat.models.network import Array, on_host
 from hilsplat.segment.kernels import cleaned_runs, upscaled_runs
 from hilsplat.segment.masks import HierarchicalMasks, join_rows, take_runs
 from hilsplat.segment.sam import (
@@ -110,7 +111,7 @@ def candidates_key(
             "image": image_sha256,
             "model": model.digest,
             "precision": model.precision,
-            "providers": model.encoder.providers,
+            "providers": model.encoder.runs_on,
             "points_per_side": settings.points_per_side,
             "points": None if points is None else sha256_of_bytes(points.tobytes()),
             "points_per_batch": batch,
@@ -151,29 +152,27 @@ def decode_candidates(
     grid = point_grid(settings.points_per_side)
     thresholds = model.thresholds(settings)
     batch = model.prompts_per_call(thresholds.points_per_batch, len(grid))
-    parts = []
+    parts = list[Candidates]()
     for crop, (left, top, right, bottom) in enumerate(boxes):
         encoded = model.encode(np.ascontiguousarray(image[top:bottom, left:right]))
         on_grid = grid * (right - left, bottom - top)
         prompts: Prompts = {"points": on_grid if points is None or crop else points}
         if uses_preview(model, settings):
             prompts = distinct_prompts(encoded, prompts, model, settings, batch)
-        for called, number in calls(prompts, batch):
+
+        def decoded(
+            rows: Int64[np.ndarray, " b"],
+            number: int,
+            encoded: Encoded = encoded,
+            prompts: Prompts = prompts,
+            crop: int = crop,
+        ) -> Candidates:
+            called = {name: rows_of[rows] for name, rows_of in prompts.items()}
             scores, logits = (values[:number] for values in model.finish(encoded, called))
-            parts.append(keep_candidates(scores, logits, encoded.frame, crop, settings, thresholds))
+            return keep_candidates(scores, logits, encoded.frame, crop, settings, thresholds)
+
+        parts += model.batches("masks", batch)(len(next(iter(prompts.values()))), decoded)
     return Candidates.concatenate(parts)
-
-
-def calls(prompts: Prompts, batch: int) -> Iterator[tuple[Prompts, int]]:
-    """Yield the prompts of each decoder call, and how many of them are not padding.
-
-    The last prompt is repeated to fill the last call: some networks have a fixed batch size, and a
-    constant size makes the results independent of how the prompts are split into calls.
-    """
-    total = len(next(iter(prompts.values())))
-    for start in range(0, total, batch):
-        rows = np.minimum(np.arange(start, start + batch), total - 1)
-        yield {name: rows_of[rows] for name, rows_of in prompts.items()}, min(batch, total - start)
 
 
 def uses_preview(model: SamModel, settings: MasksSettings) -> bool:
@@ -193,12 +192,17 @@ def distinct_prompts(
     """
     iou_floor, stability_floor = floors(model.thresholds(settings))
     measured, previewed = [], []
-    for called, number in calls(prompts, batch):
-        scores, logits, arrays = model.preview(encoded, called["points"])
+
+    def preview(rows: Int64[np.ndarray, " b"], number: int) -> tuple[tuple[np.ndarray, ...], Prompts]:
+        scores, logits, arrays = model.preview(encoded, prompts["points"][rows])
         flat = logits[:number].reshape(-1, *logits.shape[2:])
         _, stability, boxes = read_logits(flat, settings.stability_offset, encoded.frame)
-        measured.append((scores[:number], stability.reshape(number, -1), boxes.reshape(number, -1, 4)))
-        previewed.append({name: rows[:number] for name, rows in arrays.items()})
+        found = scores[:number], stability.reshape(number, -1), boxes.reshape(number, -1, 4)
+        return found, {name: rows_of[:number] for name, rows_of in arrays.items()}
+
+    for found, arrays in model.batches("previews", batch)(len(prompts["points"]), preview):
+        measured.append(found)
+        previewed.append(dict(arrays))
     predicted_iou, stability, boxes = map(np.concatenate, zip(*measured, strict=True))
     likely = (predicted_iou >= iou_floor) & (stability >= stability_floor) & boxes.any(axis=2)
     chosen = np.zeros(len(likely), bool)
@@ -209,12 +213,16 @@ def distinct_prompts(
         chosen[rows[distinct]] = True
     chosen[0] |= not chosen.any()
     names = list(previewed[0])
-    return {name: np.concatenate([arrays.pop(name) for arrays in previewed])[chosen] for name in names}
+
+    def join() -> Prompts:
+        return {name: joined([arrays.pop(name) for arrays in previewed])[chosen] for name in names}
+
+    return in_turn(model.device, "masks", join)
 
 
 def keep_candidates(
     scores: Float32[np.ndarray, "P 3"],
-    logits: Float32[np.ndarray, "P 3 h w"],
+    logits: Float32[Array, "P 3 h w"],
     frame: Frame,
     crop: int,
     settings: MasksSettings,
@@ -224,13 +232,12 @@ def keep_candidates(
     iou_floor, stability_floor = floors(thresholds)
     predicted_iou = scores.reshape(-1)
     flat = logits.reshape(-1, *logits.shape[2:])
-    steps: np.ndarray
     steps, stability, boxes = read_logits(flat, settings.stability_offset, frame)
     if settings.generator == "official":
-        steps, boxes = np.ascontiguousarray(flat), positive_boxes(flat)
+        steps, boxes = flat, positive_boxes(flat)
     likely = (predicted_iou >= iou_floor) & boxes.any(axis=1)
     if needs_full_size(settings):
-        stability[likely] = full_stability(flat[likely], settings.stability_offset, frame)
+        stability[likely] = full_stability(on_host(flat[likely]), settings.stability_offset, frame)
     rows = np.flatnonzero(likely & (stability >= stability_floor))
     values, offsets, windows = edge_windows(steps, rows, boxes)
     return Candidates(
@@ -245,8 +252,17 @@ def keep_candidates(
     )
 
 
+def joined(parts: list[Array]) -> Array:
+    """Concatenate arrays along the first axis."""
+    if isinstance(parts[0], np.ndarray):
+        return np.concatenate(parts)
+    import torch
+
+    return torch.cat(parts)
+
+
 def edge_windows(
-    logits: Real[np.ndarray, "K h w"], rows: Int64[np.ndarray, " m"], boxes: Int32[np.ndarray, "K 4"]
+    logits: Real[Array, "K h w"], rows: Int64[np.ndarray, " m"], boxes: Int32[np.ndarray, "K 4"]
 ) -> tuple[Real[np.ndarray, " R"], Int64[np.ndarray, " m_and_1"], Int32[np.ndarray, "m 4"]]:
     """Return the windows of `Candidates` for the given rows: concatenated logits, offsets and boxes (xyxy).
 
@@ -255,6 +271,12 @@ def edge_windows(
     height, width = logits.shape[1:]
     reach = np.array([-BAND_PX, -BAND_PX, BAND_PX, BAND_PX], np.int32)
     windows = np.clip(boxes[rows] + reach, 0, np.array([width, height, width, height], np.int32))
+    if not isinstance(logits, np.ndarray):
+        from hilsplat.segment import torch_masks
+
+        values = torch_masks.windows(logits, rows, windows, BAND_PX)
+        sizes = (windows[:, 2:] - windows[:, :2]).prod(axis=1, dtype=np.int64)
+        return values, np.concatenate([[0], np.cumsum(sizes)]), windows
     square = np.ones((2 * BAND_PX + 1, 2 * BAND_PX + 1), np.uint8)
     parts = [np.zeros(0, logits.dtype)]
     for row, (x0, y0, x1, y1) in zip(rows.tolist(), windows.tolist(), strict=True):

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -21,10 +21,18 @@ from hilsplat.base.errors import ModelError
 from hilsplat.base.levels import Level
 from hilsplat.base.lineage import sha256_of_bytes
 from hilsplat.base.processes import in_order
+from hilsplat.models.card import CPU, Batches, in_turn, network_device
 from hilsplat.models.folder import SAM_SIDE_PX, ModelFolder, input_side_px, open_model_folder
-from hilsplat.models.int8 import CHECKED_GRID, agreement_of_masks, considers_int8, int8_network, use_int8
+from hilsplat.models.int8 import (
+    CHECKED_GRID,
+    agreement_of_masks,
+    int8_network,
+    reduced_precision,
+    use_reduced,
+)
 from hilsplat.models.layouts import DECODER, PREVIEW
-from hilsplat.models.network import CPU, Network, execution_providers, or_as_exported
+from hilsplat.models.memory import needs_of
+from hilsplat.models.network import Array, Network, on_host, or_as_exported
 from hilsplat.models.onnx_graph import Graph, with_rowwise_attention
 from hilsplat.models.repeatable import random_pixels, require_repeatable_once
 from hilsplat.segment.decoder_network import DecoderNetwork
@@ -56,12 +64,12 @@ class Frame:
 class Encoded:
     """Output of the vision encoder for one image."""
 
-    features: Mapping[str, np.ndarray]  # inputs of the decoder by name, float32 (1, C, h, w)
+    features: Mapping[str, Array]  # inputs of the decoder by name, float32 (1, C, h, w)
     frame: Frame
     terms: ImageTerms | None = None  # arrays of the factored decoder, if the model has one
 
 
-Prompts = Mapping[str, np.ndarray]
+Prompts = Mapping[str, Array]
 """Prompts of an image, as arrays with one row per prompt: `points` (x, y, px of the image) or, for previewed
 prompts, the arrays that the factored decoder keeps."""
 
@@ -79,6 +87,7 @@ class Thresholds:
 REAL_SAM = Thresholds(predicted_iou_min=0.7, stability_min=0.85, nms_score=0.7, points_per_batch=8)
 """LangSplat's thresholds for the released SAM models. A ViT-B call takes 60 MB per prompt, and calls of
 more than 8 prompts are no faster per prompt."""
+MOST_PROMPTS = 256  # per call on a card
 CHECKED_PROMPTS, AGREEMENT = 2, 1e-4
 """Number of prompts for checking the factored decoder against the network, and the maximum difference."""
 OWN = "mask_generation"  # key of `config.json` under which a model specifies its own `Thresholds`
@@ -94,20 +103,19 @@ def point_grid(points_per_side: int) -> Float[np.ndarray, "P 2"]:
 class SamModel:
     """A SAM model folder, opened for inference."""
 
-    precision: str = "fp32"  # precision of the encoder: "fp32" or "int8"
+    precision: str = "fp32"  # precision of the encoder: "fp32", "int8" or "fp16"
     own: Thresholds = REAL_SAM
     stretches: bool = False  # images are stretched to a square (SAM 2), not padded (SAM)
     previewer: DecoderNetwork | None = None  # the decoder at half the resolution (`layouts.PREVIEW`)
     factored: FactoredDecoder | None = None  # the much faster decoder, if the graph can be factored
     as_exported: bool = True  # the encoder or decoder runs as exported, which takes more memory
+    device: str = CPU  # of the networks; on any other, features and logits are tensors (`models.card`)
 
-    def __init__(self, model: ModelFolder) -> None:
-        self.model, self.digest = model, model.digest
+    def __init__(self, model: ModelFolder, device: str = CPU) -> None:
+        self.model, self.digest, self.device = model, model.digest, device
+        self._batches: dict[str, Batches] = {}
         self.own = own_thresholds(model)
         self.stretches = model.layout == "sam2"
-        self.decoder = DecoderNetwork(model, DECODER)
-        if PREVIEW in model.networks:
-            self.previewer = DecoderNetwork(model, PREVIEW)
         preprocessing = model.preprocessing
         self.longest_edge = preprocessing.get("size", SAM_SIDE_PX)
         self.padded_hw = (input_side_px(model),) * 2
@@ -117,22 +125,34 @@ class SamModel:
         self.std = np.array(preprocessing.get("image_std", (0.229, 0.224, 0.225)), dtype=np.float32)
         self.rescale = np.float32(preprocessing.get("rescale_factor", 1 / 255))
         self._graph, self.encoder = self._open_encoder()
+        self.decoder = DecoderNetwork(model, DECODER)
         features = self._random_features()
-        for decoder in filter(None, (self.decoder, self.previewer)):
-            decoder.require_repeatable(features, self.padded_hw[0])
-        if self.previewer is None and self.decoder.network.providers[0] == CPU:
+        if PREVIEW in model.networks:
+            self.previewer = DecoderNetwork(model, PREVIEW, device)
+        else:
             cost = "each prompt takes about 6 times as long"
             self.factored = or_as_exported(model.networks[DECODER], cost, lambda: self._factor(features))
-        self.as_exported = self.factored is None or (self._graph is None and not self.stretches)
+        if self.factored is None and device != CPU:
+            self.decoder = DecoderNetwork(model, DECODER, device)
+        for decoder in filter(None, (self.decoder, self.previewer)):
+            in_turn(
+                device,
+                "masks",
+                lambda of=decoder: of.require_repeatable(features, self.padded_hw[0]),  # type: ignore[misc]
+            )
+        self.as_exported = device == CPU and (
+            self.factored is None or (self._graph is None and not self.stretches)
+        )
 
     def choose_precision(
         self, precision: str, images: Sequence[UInt8[np.ndarray, "H W 3"]], cache: Path, threads: int = 1
     ) -> None:
-        """Use int8 if `masks.precision` requires it, or if int8 and float32 masks of these images agree."""
-        if not considers_int8(precision, self.model, "vision_encoder"):
+        """Use a lower precision if `masks.precision` requires it, or if masks of these images agree."""
+        form = reduced_precision(precision, self.model, "vision_encoder", self.device)
+        if not form:
             return
-        quantised = self.int8_encoder(cache)
-        if quantised is None:
+        reduced = self.int8_encoder(cache) if form == "int8" else self.encoder.in_half()
+        if reduced is None:
             return
         grid = point_grid(CHECKED_GRID)
         batch = self.prompts_per_call(self.own.points_per_batch, len(grid))
@@ -140,19 +160,22 @@ class SamModel:
         def masks(work: tuple[np.ndarray, Network]) -> np.ndarray:
             image, encoder = work
             encoded, points = self.encode(image, encoder), grid * (image.shape[1], image.shape[0])
-            pieces = np.split(points, range(batch, len(points), batch))
-            logits = np.concatenate([self.decode(encoded, piece)[1] for piece in pieces])
+
+            def decode(rows: np.ndarray, number: int) -> np.ndarray:
+                return on_host(self.decode(encoded, points[rows])[1])[:number]
+
+            logits = np.concatenate(list(self.batches("masks", batch)(len(points), decode)))
             return logits.reshape(-1, *logits.shape[2:]) > 0
 
         def measure() -> dict[str, float]:
-            work = [(image, encoder) for encoder in (self.encoder, quantised) for image in images]
-            full, int8 = np.split(np.stack(list(in_order(masks, work, threads))), 2)
-            return agreement_of_masks(np.concatenate(full), np.concatenate(int8))
+            work = [(image, encoder) for encoder in (self.encoder, reduced) for image in images]
+            full, lower = np.split(np.stack(list(in_order(masks, work, threads))), 2)
+            return agreement_of_masks(np.concatenate(full), np.concatenate(lower))
 
         digests = [sha256_of_bytes(image.tobytes()) for image in images]
         inputs = {"model": self.digest, "images": digests, "grid": CHECKED_GRID}
-        if use_int8(precision, "SAM's encoder", cache, inputs, measure):
-            self.encoder, self.precision = quantised, "int8"
+        if use_reduced(form, precision, "SAM's encoder", cache, inputs, measure):
+            self.encoder, self.precision = reduced, form
 
     def int8_encoder(self, cache: Path) -> Network | None:
         """Open the int8 version of the encoder (`models.int8.int8_network`)."""
@@ -164,12 +187,13 @@ class SamModel:
         vision, path = self.model.config.get("vision_config"), self.model.networks["vision_encoder"]
 
         def open_as(graph: Graph | None) -> tuple[Graph | None, Network]:
-            network = self.model.network("vision_encoder", graph)
+            network = self.model.network("vision_encoder", graph, self.device)
             form = "as exported" if graph is None else "row-wise"
-            require_repeatable_once(self.model, network, form, random_pixels(network, self.padded_hw[0]))
+            pixels = random_pixels(network, self.padded_hw[0])
+            in_turn(self.device, "masks", lambda: require_repeatable_once(self.model, network, form, pixels))
             return graph, network
 
-        if self.stretches or not isinstance(vision, dict) or execution_providers()[0] != CPU:
+        if self.stretches or not isinstance(vision, dict) or self.device != CPU:
             return open_as(None)
         layers = vision.get("global_attn_indexes", (2, 5, 8, 11))
         heads = vision.get("num_attention_heads", 12)
@@ -196,17 +220,27 @@ class SamModel:
     def _factor(self, features: Mapping[str, np.ndarray]) -> FactoredDecoder:
         """Return the factored decoder; raise an exception if factoring or the comparison fails."""
         config = self.model.config.get("mask_decoder_config", {})
-        factored = FactoredDecoder(self.decoder, config.get("num_attention_heads", HEADS_PER_ATTENTION))
+        heads = config.get("num_attention_heads", HEADS_PER_ATTENTION)
+        if self.device == CPU:
+            factored = FactoredDecoder(self.decoder, heads)
+        else:
+            from hilsplat.segment.torch_decoder import TorchDecoder  # torch takes seconds to import
+
+            factored = TorchDecoder(self.decoder, heads, self.device)
         difference = largest_difference(factored, self.decoder, features, self.padded_hw[0])
         if not difference <= AGREEMENT:
             raise ModelError(f"the factored decoder differs by {difference:.2g}")
         return factored
 
     @staticmethod
-    def load(folder: Path, variant: str = "") -> "SamModel":
-        """Open a model folder; errors as in `open_model_folder`."""
+    def load(folder: Path, variant: str = "", device: Literal["auto", "cpu", "cuda"] = "cpu") -> "SamModel":
+        """Open a model folder on the device that a setting selects.
+
+        Errors as in `open_model_folder` and `network_device`.
+        """
         fix = "set masks.segmenter: graph, which needs no model"
-        return SamModel(open_model_folder(folder, "sam", variant=variant, fix=fix))
+        model = open_model_folder(folder, "sam", variant=variant, fix=fix)
+        return SamModel(model, network_device(device, "masks", needs_of(model, 1, as_exported=True).card_mib))
 
     def thresholds(self, settings: MasksSettings) -> Thresholds:
         """Return the settings' thresholds, with the model's own in place of `auto`."""
@@ -238,9 +272,13 @@ class SamModel:
     def encode(self, image: UInt8[np.ndarray, "H W 3"], encoder: Network | None = None) -> Encoded:
         """Run the vision encoder, or the version of it given as `encoder`."""
         pixels, frame = self.prepare(image)
-        names = self.encoder.spec.outputs
-        features = dict(zip(names, (encoder or self.encoder)(pixel_values=pixels), strict=True))
-        return Encoded(features, frame, self.factored.image(features) if self.factored else None)
+        names, network = self.encoder.spec.outputs, encoder or self.encoder
+
+        def run() -> Encoded:
+            features = dict(zip(names, network.run(pixel_values=pixels), strict=True))
+            return Encoded(features, frame, self.factored.image(features) if self.factored else None)
+
+        return in_turn(self.device, "masks", run)
 
     def prompts_per_call(self, limit: int, prompts: int) -> int:
         """Return the number of prompts per call: the decoder's fixed number, else min(limit, prompts)."""
@@ -248,9 +286,18 @@ class SamModel:
             return PROMPTS
         return self.decoder.prompts_per_call or min(limit, prompts)
 
+    def batches(self, what: str, size: int) -> Batches:
+        """Return the calls for many prompts; on a card, their size is kept for each kind of call."""
+        if self.device == CPU:
+            return Batches(size, is_padded=True)
+        if what not in self._batches:
+            most = size if self.decoder.prompts_per_call and not self.factored else MOST_PROMPTS
+            self._batches[what] = Batches(size, self.device, most, is_padded=self.factored is None)
+        return self._batches[what]
+
     def decode(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "P 2"]
-    ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 h w"]]:
+    ) -> tuple[Float32[np.ndarray, "P 3"], Float32[Array, "P 3 h w"]]:
         """Return predicted IoUs and low-resolution logits (ordered as `HEADS`) for each image point, px."""
         points = in_input(points_xy, encoded.frame)
         if self.factored and encoded.terms:
@@ -259,8 +306,9 @@ class SamModel:
         iou, logits = self.decoder(encoded.features, points[:, None])
         return self._finite(iou), logits
 
-    def _finite(self, iou: Float32[np.ndarray, "*n"]) -> Float32[np.ndarray, "*n"]:
+    def _finite(self, iou: Float32[Array, "*n"]) -> Float32[np.ndarray, "*n"]:
         """Return predicted IoUs; raise ModelError if they are not numbers, as otherwise no mask is kept."""
+        iou = on_host(iou)
         if not np.isfinite(iou).all():
             raise ModelError(
                 f"the SAM model {self.model.folder} predicts {np.count_nonzero(~np.isfinite(iou))} IoUs of "
@@ -271,7 +319,7 @@ class SamModel:
 
     def decode_clicks(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "K 2"], inside: Bool[np.ndarray, " K"]
-    ) -> tuple[Float32[np.ndarray, " 3"], Float32[np.ndarray, "3 h w"]]:
+    ) -> tuple[Float32[np.ndarray, " 3"], Float32[Array, "3 h w"]]:
         """Decode three masks of one object for several points (px) inside or outside it."""
         points = in_input(points_xy, encoded.frame)[None]
         iou, logits = self.decoder(encoded.features, points, inside[None])
@@ -284,19 +332,20 @@ class SamModel:
 
     def preview(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "P 2"]
-    ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 low_h low_w"], Prompts]:
+    ) -> tuple[Float32[np.ndarray, "P 3"], Float32[Array, "P 3 low_h low_w"], Prompts]:
         """Decode prompts at a lower resolution (requires `previews`); pass the third result to `finish`."""
         points = in_input(points_xy, encoded.frame)
         if self.factored and encoded.terms:
             iou, logits, prompts = self.factored.decode(encoded.terms, points, fine=False)
-            return self._finite(iou), logits, {"iou": iou, **prompts}
+            iou = self._finite(iou)
+            return iou, logits, {"iou": iou, **prompts}
         assert self.previewer is not None
         iou, logits = self.previewer(encoded.features, points[:, None])
         return self._finite(iou), logits, {"points": points_xy}
 
     def finish(
         self, encoded: Encoded, prompts: Prompts
-    ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 h w"]]:
+    ) -> tuple[Float32[np.ndarray, "P 3"], Float32[Array, "P 3 h w"]]:
         """Decode prompts that may have been previewed, at full resolution."""
         if "points" in prompts:
             return self.decode(encoded, prompts["points"])
@@ -332,7 +381,8 @@ def largest_difference(
     step = decoder.prompts_per_call or CHECKED_PROMPTS
     calls = [decoder(features, points[start : start + step]) for start in range(0, CHECKED_PROMPTS, step)]
     iou, logits = map(np.concatenate, zip(*calls, strict=True))
-    fast_iou, fast_logits, _ = factored.decode(factored.image(features), points[:, 0], fine=True)
+    decoded = factored.decode(factored.image(features), points[:, 0], fine=True)
+    fast_iou, fast_logits = map(on_host, decoded[:2])
     difference = np.abs(fast_logits - logits).max() / max(1, np.abs(logits).max())
     return float(max(difference, np.abs(fast_iou - iou).max()))
 
@@ -356,8 +406,8 @@ def own_thresholds(model: ModelFolder) -> Thresholds:
 
 
 def read_logits(
-    logits: Float32[np.ndarray, "K h w"], offset: float, frame: Frame
-) -> tuple[Int8[np.ndarray, "K h w"], Float32[np.ndarray, " K"], Int32[np.ndarray, "K 4"]]:
+    logits: Float32[Array, "K h w"], offset: float, frame: Frame
+) -> tuple[Int8[Array, "K h w"], Float32[np.ndarray, " K"], Int32[np.ndarray, "K 4"]]:
     """Round logits, and compute the stability and the box of each mask.
 
     Stability is the IoU of the masks at logit thresholds +offset and -offset, or 0 if the larger one
@@ -365,8 +415,8 @@ def read_logits(
     ones, so that dropped masks need no upscaling.
 
     Returns:
-        logits in steps of `LOGIT_STEP`, clipped to +-127 steps; stability; box (xyxy, low-resolution
-        px, end exclusive) of the positive logits, all 0 if there are none.
+        logits in steps of `LOGIT_STEP`, clipped to +-127 steps, where the given logits are; stability; box
+        (xyxy, low-resolution px, end exclusive) of the positive logits, all 0 if there are none.
     """
     # low-resolution rows and columns that overlap the image; the rest is padding
     height, width = (
@@ -374,6 +424,12 @@ def read_logits(
     )
     # an integer exceeds x if and only if it exceeds floor(x)
     upper, lower = math.floor(offset / LOGIT_STEP), math.floor(-offset / LOGIT_STEP)
+    if not isinstance(logits, np.ndarray):
+        from hilsplat.segment import torch_masks
+
+        on_card = torch_masks.stepped(logits, LOGIT_STEP)
+        areas = torch_masks.areas_above(on_card, (upper, lower), (height, width))
+        return on_card, (areas[0] / np.maximum(areas[1], 1)).astype(np.float32), positive_boxes(on_card)
     steps, stability = np.empty(logits.shape, np.int8), np.empty(len(logits), np.float32)
     for row, values in enumerate(logits):  # one by one, in the processor's cache
         steps[row] = np.rint(values / np.float32(LOGIT_STEP)).clip(-127, 127)
@@ -382,8 +438,12 @@ def read_logits(
     return steps, stability, positive_boxes(steps)
 
 
-def positive_boxes(logits: Real[np.ndarray, "K h w"]) -> Int32[np.ndarray, "K 4"]:
+def positive_boxes(logits: Real[Array, "K h w"]) -> Int32[np.ndarray, "K 4"]:
     """Return the box (xyxy, end exclusive) of the positive logits of each mask, all 0 if there are none."""
+    if not isinstance(logits, np.ndarray):
+        from hilsplat.segment import torch_masks
+
+        return torch_masks.positive_boxes(logits)
     boxes = np.empty((len(logits), 4), np.int32)
     for row, values in enumerate(logits):
         x, y, width, height = cv2.boundingRect((values > 0).view(np.uint8))

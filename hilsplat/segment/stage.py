@@ -17,6 +17,7 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.base.lineage import sha256_of_file, sha256_of_json
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
+from hilsplat.models.card import recorded
 from hilsplat.models.int8 import CHECKED_VIEWS
 from hilsplat.models.memory import needs_of
 from hilsplat.scene.scene import Scene
@@ -86,7 +87,7 @@ def run_sam_masks(
     scene, view_cache = Scene.load(scene_folder), ViewCache(cache / "masks")
     finished_digests = digests_in(finished) if finished else {}
     with stage_log("masks", scene.name) as counts:
-        model = SamModel.load(Path(settings.model), settings.variant)
+        model = SamModel.load(Path(settings.model), settings.variant, settings.device)
         training = train_views(scene)
         checked = training[:: max(1, len(training) // CHECKED_VIEWS)][:CHECKED_VIEWS]
         model.choose_precision(settings.precision, [scene.image(view) for view in checked], cache, threads)
@@ -105,6 +106,7 @@ def run_sam_masks(
         chosen = training if views is None else views
         masks = zip(chosen, in_order(segment, chosen, threads), strict=True)
         origin = {"model": settings.model, "model_sha256": model.digest, "precision": model.precision}
+        origin |= recorded(model.device)
         counts.update(write_masks(out, scene, masks, len(chosen), "sam", **origin))
         counts.update(from_cache=view_cache.hits)
 
@@ -197,7 +199,7 @@ def sam_masks(
         {
             "candidates": key,
             "size": size_hw,
-            "settings": settings.model_dump(exclude={"levels", "theta", "key_views", "prompts"}),
+            "settings": settings.model_dump(exclude={"levels", "theta", "key_views", "prompts", "device"}),
             "code": code_digest(masks_from_candidates, HierarchicalMasks),
         }
     )

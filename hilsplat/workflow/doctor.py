@@ -62,8 +62,6 @@ def libraries() -> Iterator[Finding]:
         if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
             continue
         number += 1
-        if requirement.name == "onnxruntime" and version_of("onnxruntime-gpu"):
-            continue  # onnxruntime-gpu replaces onnxruntime
         found = version_of(requirement.name)
         if found is None:
             wrong.append(f"{requirement.name} is missing")
@@ -71,24 +69,6 @@ def libraries() -> Iterator[Finding]:
             wrong.append(f"{requirement.name} {found} does not satisfy {requirement.specifier}")
     fix = "pip install --upgrade hilsplat, with the repository's constraints.txt"
     yield verdict("libraries", "; ".join(wrong), f"{number} libraries in the required versions", fix)
-
-
-def onnx() -> Iterator[Finding]:
-    """Check on which provider a session runs, and whether two builds of onnxruntime overwrite each other."""
-    import onnxruntime
-
-    from hilsplat.models.network import cuda_provider_problem, execution_providers
-
-    problem, found = "", cuda_provider_problem()
-    fix = "pip uninstall onnxruntime onnxruntime-gpu, then pip install onnxruntime-gpu"
-    if version_of("onnxruntime") and version_of("onnxruntime-gpu"):
-        problem = "onnxruntime and onnxruntime-gpu are both installed; their files overwrite each other"
-    elif version_of("onnxruntime-gpu") and found:
-        fix = "install the CUDA and cuDNN versions that onnxruntime-gpu requires, or pip install onnxruntime"
-        yield Finding("onnxruntime", "note", f"onnxruntime-gpu runs on the CPU: {found}", fix)
-        return
-    sound = f"{onnxruntime.__version__}: sessions run on {execution_providers()[0]}"
-    yield verdict("onnxruntime", problem, sound, fix)
 
 
 def cuda() -> Iterator[Finding]:
@@ -127,22 +107,24 @@ def video() -> Iterator[Finding]:
 
 
 def models() -> Iterator[Finding]:
-    """Run each model for photographs on each of onnxruntime's providers."""
-    from hilsplat.embed.model_check import check_model, provider_disagreement
-    from hilsplat.models.network import execution_providers
+    """Run each model for photographs on the CPU, and on a card if there is one."""
+    from hilsplat.embed.model_check import card_disagreement, check_model
+    from hilsplat.models.card import card_problem
 
     real = [model for model in present_models() if not model.embedded]
     missing = {"sam", "clip"} - {model.family for model in real}
     for folder in [*(model.folder for model in real or present_models()), *broken_models()]:
         try:
             check_model(folder)
-            apart = provider_disagreement(folder)
+            apart = None if card_problem() else card_disagreement(folder)
         except HilsplatError as error:
             yield Finding("models", "fault", str(error), f"hilsplat models get {folder.name}")
             continue
-        sound = f"{folder} works on {' and '.join(execution_providers())}"
+        sound = f"{folder} works on the CPU{'' if card_problem() else ' and the GPU'}"
         problem = f"{folder}: {apart}" if apart else ""
-        yield verdict("models", problem, sound, "pip install onnxruntime instead")
+        yield verdict(
+            "models", problem, sound, "set masks.device and clip.device: cpu, and report this output"
+        )
     if missing:
         names = " and no ".join(family.upper() for family in sorted(missing))
         problem = f"no {names} for photographs: answers about them are meaningless"
@@ -188,7 +170,7 @@ def writing() -> Iterator[Finding]:
             yield Finding("writing", state, f"{what}: {existing} is read-only", fix)
 
 
-CHECKS = (python, libraries, onnx, cuda, kernels, video, models, space, writing)
+CHECKS = (python, libraries, cuda, kernels, video, models, space, writing)
 
 
 def _codec(name: str, mode: Literal["r", "w"]) -> bool:

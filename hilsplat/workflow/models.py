@@ -6,6 +6,7 @@ from pathlib import Path
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.files import INSTALLED
 from hilsplat.configuration import CONFIG, StageSettings, parse_run, read_config
+from hilsplat.models.card import network_device
 from hilsplat.models.store import RELEASES, meaningless, read_model
 from hilsplat.scene.sheet import PHOTOS
 
@@ -29,7 +30,10 @@ def check_device(stages: StageSettings, where: str) -> None:
     for section, values in stages:
         if getattr(values, "device", "") == "cuda":
             try:
-                choose_device("cuda")
+                if section in ("masks", "clip"):
+                    network_device("cuda", section, 0.0)
+                else:
+                    choose_device("cuda")
             except HilsplatError as error:
                 raise HilsplatError(f"{section}.device of {where}: {error}") from error
 

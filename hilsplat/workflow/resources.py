@@ -20,10 +20,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hilsplat.base.cards import cards
 from hilsplat.base.errors import ImageError, ModelError
 from hilsplat.base.images import opened_image
 from hilsplat.base.levels import LEVELS
-from hilsplat.base.lineage import version_of
 from hilsplat.baselines import TrainedSettings
 from hilsplat.configuration import StageSettings
 from hilsplat.datasets.generators import GENERATORS
@@ -138,7 +138,7 @@ class JobResources:
         stage = stage_of(name)
         resources = {"mem_mb": self.memory_mb(name), "runtime": self.minutes(name)}
         sections = [type(self.plan.defaults[section]) for section in stage.sections.values()]
-        if any("device" in section.model_fields or "model" in section.model_fields for section in sections):
+        if any("device" in section.model_fields for section in sections):
             resources["gpu"] = self.gpus(family_of(stage))
         return resources
 
@@ -174,14 +174,18 @@ class JobResources:
         return needed
 
     def gpus(self, section: str) -> Callable[[Job], int]:
-        """Return the function for the resource `gpu`: 1 for `device: cuda` or onnxruntime-gpu, else 0."""
+        """Return the function for the resource `gpu`: 1 for jobs that use a card.
+
+        For `device: auto`, these are jobs on this machine if it has a card; nodes of a cluster are unknown.
+        """
+        has_card = self.cores is not None and bool(cards())
 
         def needed(wildcards: Any) -> int:
-            settings = getattr(self.plan.stages(wildcards), section)
-            if section not in ("masks", "clip"):
-                return int(settings.device == "cuda")
-            runs = not self.plan.row(wildcards).features and getattr(settings, "segmenter", "sam") == "sam"
-            return int(runs and version_of("onnxruntime-gpu") is not None)
+            row, settings = self.plan.row(wildcards), getattr(self.plan.stages(wildcards), section)
+            is_imported = row.gaussians is not None if section == "gaussians" else bool(row.features)
+            if is_imported and section != "contributions":
+                return 0
+            return int(settings.uses_card and (settings.device == "cuda" or has_card))
 
         return needed
 

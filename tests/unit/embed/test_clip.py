@@ -14,7 +14,7 @@ from hilsplat.configuration import parse_section
 from hilsplat.embed.clip import ClipModel, open_clip_of, unit
 from hilsplat.embed.stage import chosen_masks, run_clip
 from hilsplat.models.folder import open_model_folder
-from hilsplat.models.int8 import considers_int8
+from hilsplat.models.int8 import reduced_precision
 from hilsplat.models.network import Network
 from hilsplat.segment.digests import digests_in, index_entry
 from hilsplat.settings import ClipSettings
@@ -167,8 +167,8 @@ def test_int8_is_used_only_if_it_agrees_on_crops_of_the_scene(
 
 def test_an_embedded_model_runs_in_float32_with_a_warning_if_int8_is_required(project, caplog):
     embedded = open_model_folder(project / "models/clip-tiny")
-    assert not considers_int8("auto", embedded, "vision_model") and not caplog.text
-    assert not considers_int8("int8", embedded, "vision_model")
+    assert not reduced_precision("auto", embedded, "vision_model") and not caplog.text
+    assert not reduced_precision("int8", embedded, "vision_model")
     assert "clip-tiny runs in float32: int8 requires a pretrained model" in caplog.text
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from hilsplat.models.folder import ModelFolder
-from hilsplat.models.int8 import considers_int8
+from hilsplat.models.int8 import reduced_precision
 from hilsplat.models.memory import PROCESS_MIB, Needs, available_mib, machine_mib, needs_of
 
 
@@ -47,9 +47,11 @@ def test_the_estimates_for_vit_b_agree_with_the_measurements(tmp_path):
 @pytest.mark.parametrize(("megabytes", "auto"), [(400, True), (1300, False)])
 def test_int8_of_a_large_network_is_used_only_if_it_is_required(tmp_path, megabytes, auto):
     model = folder(tmp_path, "sam", {}, 1024, megabytes)
-    assert considers_int8("auto", model, "vision_encoder") == auto
-    assert considers_int8("int8", model, "vision_encoder")
-    assert not considers_int8("fp32", model, "vision_encoder")
+    assert reduced_precision("auto", model, "vision_encoder") == ("int8" if auto else "")
+    assert reduced_precision("int8", model, "vision_encoder") == "int8"
+    assert reduced_precision("fp32", model, "vision_encoder") == ""
+    on_card = [reduced_precision(each, model, "vision_encoder", "cuda") for each in ("auto", "int8", "fp32")]
+    assert on_card == ["fp16", "", ""]
 
 
 GIB, UNLIMITED = 2**30, 9223372036854771712

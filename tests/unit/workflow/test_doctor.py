@@ -12,12 +12,11 @@ from typer.testing import CliRunner
 from hilsplat.base.errors import ModelError
 from hilsplat.base.lineage import version_of
 from hilsplat.cli.main import app
-from hilsplat.models.folder import ModelFolder
+from hilsplat.embed import model_check
+from hilsplat.models.torch_network import TorchNetwork
 from hilsplat.splat.rasterise import parity
 from hilsplat.workflow import doctor
 from tests.unit.models.test_store import write_model
-
-CPU = "CPUExecutionProvider"
 
 
 @pytest.fixture(autouse=True)
@@ -39,13 +38,10 @@ def test_a_sound_machine_has_no_fault(project, monkeypatch):
     ("check", "name", "replacement", "words"),
     [
         (doctor.python, "platform.python_version", lambda: "3.9.1", "3.9.1"),
-        (doctor.onnx, "importlib.metadata.version", lambda name: "1.0", "overwrite"),
         (doctor.video, "hilsplat.workflow.doctor._codec", lambda name, mode: name != "libx264", "libx264"),
     ],
 )
-def test_an_old_python_two_onnxruntimes_and_a_missing_codec_are_faults(
-    monkeypatch, check, name, replacement, words
-):
+def test_an_old_python_and_a_missing_codec_are_faults(monkeypatch, check, name, replacement, words):
     monkeypatch.setattr(name, replacement)
     [found] = check()
     assert found.state == "fault" and words in found.found
@@ -70,11 +66,6 @@ def test_a_library_that_is_missing_or_old_is_named(monkeypatch):
     assert "scipy is missing" in found.found and "numpy 1.20.0 does not satisfy >=2.1" in found.found
 
 
-def test_onnxruntime_gpu_replaces_onnxruntime(monkeypatch):
-    install(monkeypatch, "onnxruntime", **{"onnxruntime-gpu": "1.20"})
-    assert [found.state for found in doctor.libraries()] == ["ok"]
-
-
 @pytest.mark.parametrize(
     ("problem", "apart", "state"),
     [("no gsplat", None, "note"), (None, "cuda differs from cpu: image by 0.3", "fault"), (None, None, "ok")],
@@ -94,19 +85,15 @@ def test_a_broken_model_is_a_fault_and_missing_real_ones_are_noted(tmp_path, mon
 
 
 @pytest.mark.parametrize(("shift", "state"), [(0.0, "ok"), (0.1, "fault")])
-def test_a_model_must_give_the_same_on_every_provider(project, monkeypatch, shift, state):
+def test_a_model_must_give_the_same_on_a_card(project, monkeypatch, shift, state):
     monkeypatch.chdir(project)
-    cuda = "CUDAExecutionProvider"
     monkeypatch.setattr("hilsplat.embed.model_check.check_model", lambda folder: "")
-    monkeypatch.setattr("hilsplat.models.network.execution_providers", lambda: [cuda])
-    monkeypatch.setattr("hilsplat.embed.model_check.execution_providers", lambda: [cuda, CPU])
-    opened = ModelFolder.network
-
-    def network(model: ModelFolder, name: str, provider: str):
-        run = opened(model, name, provider=CPU)
-        return lambda **feeds: [out * (1 + shift * (provider == cuda)) for out in run(**feeds)]
-
-    monkeypatch.setattr(ModelFolder, "network", network)
+    monkeypatch.setattr("hilsplat.models.card.card_problem", lambda: None)
+    compare, run = model_check.card_disagreement, TorchNetwork.run
+    monkeypatch.setattr(model_check, "card_disagreement", lambda folder: compare(folder, "cpu:0"))
+    monkeypatch.setattr(
+        TorchNetwork, "run", lambda self, **feeds: [out * (1 + shift) for out in run(self, **feeds)]
+    )
     findings = [finding for finding in doctor.models() if finding.state != "note"]
     assert {finding.state for finding in findings} == {state} and len(findings) == 2
 

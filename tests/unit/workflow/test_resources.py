@@ -76,16 +76,26 @@ def test_threads_grow_with_the_pixels_of_a_scene(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("segmenter", "build", "expected"),
-    [("sam", True, [1, 1]), ("graph", True, [0, 1]), ("sam", False, [0, 0])],
+    ("cores", "on_machine", "device", "segmenter", "expected"),
+    [
+        (2, ["0"], "auto", "sam", [1, 1, 1, 0]),
+        (2, ["0"], "auto", "graph", [1, 0, 1, 0]),
+        (2, ["0"], "cpu", "sam", [0, 0, 0, 0]),
+        (2, [], "auto", "sam", [0, 0, 0, 0]),
+        (2, [], "cuda", "sam", [1, 1, 1, 1]),  # an error later says that there is none
+        (None, ["0"], "auto", "sam", [0, 0, 0, 0]),  # the nodes of a cluster are unknown
+        (None, [], "cuda", "sam", [1, 1, 1, 1]),
+    ],
 )
-def test_device_cuda_and_networks_with_onnxruntimes_gpu_build_request_a_gpu(
-    tmp_path, monkeypatch, segmenter, build, expected
+def test_jobs_that_use_a_card_request_one(
+    tmp_path, monkeypatch, cores, on_machine, device, segmenter, expected
 ):
-    monkeypatch.setattr("hilsplat.workflow.resources.version_of", lambda name: "1.20" if build else None)
-    found = JobResources(plan(tmp_path, masks={"segmenter": segmenter}, gaussians={"device": "cuda"}))
-    assert [found.gpus(section)(JOB) for section in ("masks", "clip")] == expected
-    assert [found.gpus(section)(JOB) for section in ("gaussians", "contributions")] == [1, 0]
+    monkeypatch.setattr("hilsplat.workflow.resources.cards", lambda: on_machine)
+    sections = ("gaussians", "masks", "clip", "contributions")
+    config = {section: {"device": device} for section in sections}
+    config["masks"]["segmenter"] = segmenter
+    found = JobResources(plan(tmp_path, **config), cores)
+    assert [found.gpus(section)(JOB) for section in sections] == expected
 
 
 def test_the_number_of_gaussians_is_read_from_the_header_of_a_ply(tmp_path):

@@ -1,0 +1,194 @@
+"""An NVIDIA card for the networks: whether to use it, and how many items fit into a call."""
+
+import ctypes
+import logging
+import sys
+from collections.abc import Callable, Iterator
+from functools import cache
+from threading import RLock
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from jaxtyping import Int64
+
+from hilsplat.base.errors import DeviceError, MemoryLimitError, first_line
+
+logger = logging.getLogger(__name__)
+
+Result = TypeVar("Result")
+
+CPU = "cpu"
+"""Device on which onnxruntime runs a network; on any other, such as `cuda`, torch does."""
+USED_SHARE = 0.8
+"""Share of the free memory of a card that a call may take, because memory is fragmented."""
+MIB = 2**20
+TURN = RLock()
+"""Held during a call on a card, so that threads share its memory one after the other."""
+
+
+@cache
+def card_problem() -> str | None:
+    """Return why torch cannot use an NVIDIA card here, or None; without a driver, torch isn't imported."""
+    try:
+        ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return "no NVIDIA driver is installed"
+    try:
+        import torch
+
+        return None if torch.cuda.is_available() else f"torch {torch.__version__} finds no CUDA device"
+    except Exception as error:  # a broken installation can raise anything
+        return f"torch cannot be imported: {first_line(error)}"
+
+
+def free_mib(device: str = "cuda") -> float:
+    """Return the memory of a card that is free, or that torch has reserved but doesn't use, MiB."""
+    import torch
+
+    reserved = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return (torch.cuda.mem_get_info(device)[0] + reserved) / MIB
+
+
+def network_device(requested: Literal["auto", "cpu", "cuda"], section: str, needed_mib: float) -> str:
+    """Return the device for the networks of a section of the settings, and log it.
+
+    `auto` uses a card if torch finds one with enough free memory.
+
+    Raises:
+        DeviceError: `cuda` was requested, but there is no usable card.
+        MemoryLimitError: `cuda` was requested, but the card has less than `needed_mib` of free memory.
+    """
+    problem = None if requested == CPU else card_problem()
+    if requested == "cuda" and problem:
+        raise DeviceError(
+            f"{section}.device: cuda was requested but cannot be used",
+            expected="an NVIDIA card, its driver, and a CUDA build of torch",
+            found=problem,
+            fix=f"set {section}.device: auto or cpu",
+        )
+    if requested != CPU and problem is None and (free := free_mib()) < needed_mib:
+        if requested == "cuda":
+            raise MemoryLimitError(
+                f"the model in {section}.model needs more memory than the GPU has free",
+                expected=f"about {needed_mib / 1024:.1f} GiB",
+                found=f"{free / 1024:.1f} GiB",
+                fix=_fix(section),
+            )
+        problem = f"the GPU has {free / 1024:.1f} GiB free, and about {needed_mib / 1024:.1f} are needed"
+        logger.warning("%s runs on the CPU: %s", section, problem)
+        return CPU
+    if problem or requested == CPU:
+        logger.debug("%s runs on the CPU: %s", section, problem or "device: cpu")
+        return CPU
+    logger.info("%s runs on the GPU", section)
+    return "cuda"
+
+
+def recorded(device: str) -> dict[str, str]:
+    """Return the entry of an artifact's index that names a card; none for the CPU."""
+    return {} if device == CPU else {"device": device}
+
+
+def _fix(section: str) -> str:
+    return (
+        f"end other programs on the GPU, use a smaller model ({section}.model), or set {section}.device: cpu"
+    )
+
+
+def is_out_of_memory(error: Exception) -> bool:
+    """Return whether an exception of torch, or of a library that it calls, means that a card is full."""
+    torch = sys.modules.get("torch")
+    texts = "out of memory", "ALLOC_FAILED"
+    return torch is not None and (
+        isinstance(error, torch.OutOfMemoryError)
+        or (isinstance(error, RuntimeError) and any(text in str(error) for text in texts))
+    )
+
+
+class Batches:
+    """Calls of a network for many items.
+
+    On the CPU, every call has `size` items. On a card, the memory of the first call determines the size of
+    later calls, and calls that run out of memory are repeated with half as many items.
+
+    Args:
+        size: items per call; on a card, of the first call.
+        most: maximum number of items per call on a card; `size` if the network fixes the number.
+        is_padded: repeat the last item to fill the last call, for networks with a fixed number of items, and
+            for those whose first call with another number is slow. Results then don't depend on how items are
+            split into calls.
+        section: section of the settings, for messages.
+    """
+
+    def __init__(
+        self, size: int, device: str = CPU, most: int = 0, *, is_padded: bool = False, section: str = "masks"
+    ) -> None:
+        self.size, self.device, self.most = size, device, most
+        self.is_padded, self.section = is_padded, section
+        self._is_measured = self._is_fixed = most <= size
+
+    def __call__(
+        self, total: int, work: Callable[[Int64[np.ndarray, " b"], int], Result]
+    ) -> Iterator[Result]:
+        """Yield `work(rows, number)` for the rows of each call; those after the first `number` are padding.
+
+        Raises:
+            MemoryLimitError: a call with a single item, or a network's fixed number, runs out of memory.
+        """
+        start = 0
+        while start < total:
+            number = min(self.size, total - start)
+            rows = np.arange(start, start + (self.size if self.is_padded else number))
+            rows = np.minimum(rows, total - 1)
+            problem = ""
+            try:
+                result = self._call(work, rows, number)
+            except RuntimeError as error:
+                if not is_out_of_memory(error):
+                    raise
+                problem = first_line(error)
+            if problem:  # outside the handler, whose traceback keeps the call's arrays
+                self._shrink(len(rows), problem)
+                continue
+            yield result
+            start += number
+
+    def _call(self, work: Callable[[Int64[np.ndarray, " b"], int], Result], rows: Any, number: int) -> Result:
+        if self.device == CPU:
+            return work(rows, number)
+        with TURN:
+            if self._is_measured or not self.device.startswith("cuda"):
+                return work(rows, number)
+            import torch
+
+            torch.cuda.reset_peak_memory_stats(self.device)
+            before = torch.cuda.memory_allocated(self.device)
+            result = work(rows, number)
+            each = (torch.cuda.max_memory_allocated(self.device) - before) / MIB / len(rows)
+            self.size = self.fitting(free_mib(self.device), each)
+            self._is_measured = True
+            logger.debug("%s: %.0f MiB per item, %d items per call", self.section, each, self.size)
+            return result
+
+    def fitting(self, free: float, each: float) -> int:
+        """Return the number of items that fit into a card's free memory, if each takes `each`; MiB."""
+        return max(1, min(self.most, int(USED_SHARE * free / max(each, 1e-3))))
+
+    def _shrink(self, number: int, problem: str) -> None:
+        if number == 1 or self._is_fixed:
+            raise MemoryLimitError(
+                f"the GPU has too little memory for a {self.section} call of size {number}",
+                found=problem,
+                fix=_fix(self.section),
+            )
+        import torch
+
+        torch.cuda.empty_cache()
+        self.size, self._is_measured = number // 2, True
+        logger.info("%s: %d items per call, because the GPU ran out of memory", self.section, self.size)
+
+
+def in_turn(device: str, section: str, work: Callable[[], Result]) -> Result:
+    """Return the result of a call for a single item; errors as in `Batches`."""
+    (result,) = Batches(1, device, section=section)(1, lambda rows, number: work())
+    return result

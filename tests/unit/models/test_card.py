@@ -1,0 +1,118 @@
+"""Choice of the device for networks, and sizes of batches when a card's memory is short."""
+
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from hilsplat.base.errors import DeviceError, MemoryLimitError
+from hilsplat.models import card
+from hilsplat.models.card import CPU, Batches, is_out_of_memory, network_device
+
+
+@pytest.fixture
+def with_card(monkeypatch):
+    """A card with 4 GiB of free memory."""
+    monkeypatch.setattr(card, "card_problem", lambda: None)
+    monkeypatch.setattr(card, "free_mib", lambda device="cuda": 4096.0)
+
+
+def test_a_card_is_used_if_it_has_enough_memory(with_card, caplog):
+    assert network_device("auto", "masks", 4000.0) == network_device("cuda", "clip", 4000.0) == "cuda"
+    assert network_device("cpu", "masks", 4000.0) == network_device("auto", "masks", 5000.0) == CPU
+    assert "masks runs on the CPU: the GPU has 4.0 GiB free, and about 4.9 are needed" in caplog.text
+    with pytest.raises(
+        MemoryLimitError, match=r"masks.model(.|\n)*4.9 GiB(.|\n)*4.0 GiB(.|\n)*masks.device: cpu"
+    ):
+        network_device("cuda", "masks", 5000.0)
+
+
+def test_without_a_card_auto_means_the_cpu_and_cuda_is_an_error(monkeypatch):
+    monkeypatch.setattr(card, "card_problem", lambda: "no NVIDIA driver is installed")
+    assert network_device("auto", "clip", 1.0) == CPU
+    with pytest.raises(
+        DeviceError, match=r"clip.device: cuda(.|\n)*no NVIDIA driver(.|\n)*clip.device: auto or cpu"
+    ):
+        network_device("cuda", "clip", 1.0)
+
+
+def test_a_missing_driver_is_found_without_importing_torch(monkeypatch):
+    def absent(name: str) -> None:
+        raise OSError(name)
+
+    monkeypatch.setattr(card.ctypes, "CDLL", absent)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    card.card_problem.cache_clear()
+    assert card.card_problem() == "no NVIDIA driver is installed"
+    monkeypatch.setattr(card.ctypes, "CDLL", lambda name: None)
+    card.card_problem.cache_clear()
+    assert "torch cannot be imported" in card.card_problem()
+    card.card_problem.cache_clear()
+
+
+def calls_of(batches: Batches, total: int, fitting: int = 1000) -> list[tuple[list[int], int]]:
+    """Return the rows of each successful call; calls of more than `fitting` rows run out of memory."""
+
+    def work(rows: np.ndarray, number: int) -> tuple[list[int], int]:
+        if len(rows) > fitting:
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20 MiB.\nmore")
+        return rows.tolist(), number
+
+    return list(batches(total, work))
+
+
+def test_calls_on_a_cpu_have_one_size():
+    assert calls_of(Batches(3), 7) == [([0, 1, 2], 3), ([3, 4, 5], 3), ([6], 1)]
+    assert calls_of(Batches(3, is_padded=True), 4) == [([0, 1, 2], 3), ([3, 3, 3], 1)]
+    assert calls_of(Batches(3), 0) == []
+
+
+def test_calls_that_run_out_of_memory_are_halved_and_stay_small():
+    batches = Batches(16, "cpu:0", 256)
+    found = calls_of(batches, 40, fitting=5)
+    assert [row for rows, _ in found for row in rows] == list(range(40))
+    assert [number for _, number in found] == [4] * 10
+    assert calls_of(batches, 6) == [([0, 1, 2, 3], 4), ([4, 5], 2)]
+
+
+@pytest.mark.parametrize(("batches", "number"), [(Batches(4, "cpu:0", 8), 1), (Batches(4, "cpu:0"), 4)])
+def test_a_single_item_or_a_fixed_number_that_does_not_fit_ends_with_the_setting(batches, number):
+    words = rf"call of size {number}(.|\n)*Tried to allocate 20 MiB(.|\n)*masks.device: cpu"
+    with pytest.raises(MemoryLimitError, match=words):
+        calls_of(batches, 9, fitting=0)
+
+
+@pytest.mark.parametrize("text", ["CUDA error: out of memory", "CUDA error: CUBLAS_STATUS_ALLOC_FAILED"])
+def test_libraries_that_find_no_memory_count(text):
+    assert is_out_of_memory(RuntimeError(text)) and not is_out_of_memory(ValueError(text))
+
+
+def test_other_errors_are_not_retried():
+    def work(rows: np.ndarray, number: int) -> None:
+        raise RuntimeError("no kernel image is available")
+
+    with pytest.raises(RuntimeError, match="no kernel image"):
+        list(Batches(4, "cpu:0", 8)(9, work))
+
+
+def test_the_memory_of_the_first_call_determines_the_size_of_later_calls(monkeypatch, with_card):
+    fake = SimpleNamespace(
+        reset_peak_memory_stats=lambda device: None,
+        memory_allocated=lambda device: 100 * 2**20,
+        max_memory_allocated=lambda device: 740 * 2**20,
+    )
+    monkeypatch.setattr(torch, "cuda", fake)
+    # 640 MiB for 16 items; 80 % of 4096 MiB hold 81
+    assert [number for _, number in calls_of(Batches(16, "cuda", 256), 200)] == [16, 81, 81, 22]
+    assert [number for _, number in calls_of(Batches(16, "cuda", 50), 120)] == [16, 50, 50, 4]
+
+
+@pytest.mark.gpu
+def test_a_real_card_reports_its_memory():
+    if (problem := card.card_problem()) is not None:
+        pytest.skip(problem)
+    assert card.free_mib() > 100
+    batches = Batches(2, "cuda", 64)
+    assert len(list(batches(200, lambda rows, number: torch.zeros(number, 2**20, device="cuda").sum()))) < 10
