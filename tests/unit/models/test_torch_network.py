@@ -21,7 +21,8 @@ TOLERANCE = 1e-5
 
 GRAPHS = [
     "w = ConstantOfShape <value = float[1] {3}> (s) y = Conv <pads = [1, 0, 2, 1], strides = [2, 1]> (x, w)",
-    "w = ConstantOfShape <value = float[1] {3}> (s) y = ConvTranspose <strides = [2, 2], output_padding = [0, 0]> (x, w)",
+    "w = ConstantOfShape <value = float[1] {3}> (s) y = ConvTranspose <strides = [2, 2], "
+    "output_padding = [0, 0]> (x, w)",
     "y = MaxPool <kernel_shape = [2, 2], strides = [2, 2], dilations = [1, 1]> (x)",
     "y = AveragePool <kernel_shape = [2, 3]> (x)",
     "y = LayerNormalization <axis = 2, epsilon = 1e-3> (x, half)",
