@@ -48,7 +48,7 @@ OUT = ROOT / "results/benchmarks"
 ESTIMATE = ROOT / "hilsplat/workflow/gpu.json"
 LIMIT_S = 200  # of a part
 CORES = os.cpu_count() or 1
-TESTS = ("splat", "contributions", "models", "segment", "embed")  # folders of tests/unit with tests of a card
+TESTS = ("splat", "contributions", "models", "export")  # folders of tests/unit with tests of a card
 MAX_PSNR_LOSS_DB = 0.5
 """Maximum by which the PSNR of a fit on a card may be below that of the same fit on the CPU."""
 
@@ -229,7 +229,8 @@ def networks(device: str, sizes: Sizes, models: Path | None) -> dict[str, Any]:
     folders = [*models.iterdir()] if models else [ROOT / folder for folder in EMBEDDED.values()]
     opened = [open_model_folder(folder) for folder in folders]
     times = {"sam": times_of_sam, "clip": times_of_clip}
-    return {model.folder.name: times[model.kind](model, device, sizes) for model in opened}
+    torch_device = "cuda" if device == "cuda" else "cpu:0"  # `cpu` means onnxruntime
+    return {model.folder.name: times[model.kind](model, torch_device, sizes) for model in opened}
 
 
 def times_of_sam(model: ModelFolder, device: str, sizes: Sizes) -> dict[str, Any]:
