@@ -70,14 +70,14 @@ def list_files(folder: Path, suffixes: Collection[str]) -> list[Path]:
 def files_below(folder: Path) -> Iterator[Path]:
     """Yield the files in a folder and its subfolders, also hidden ones.
 
-    Other commands may delete some meanwhile; `Path.rglob` would raise an error then.
+    If another command deletes some at the same time, `Path.rglob` would raise an error.
     """
     for parent, _, names in os.walk(folder):
         yield from (Path(parent, name) for name in names)
 
 
 def stats_of(paths: Iterable[Path]) -> dict[Path, os.stat_result]:
-    """Return the sizes and times of files, without those that another command has deleted meanwhile."""
+    """Return the sizes and times of files, without those that another command has just deleted."""
     stats = {}
     for path in paths:
         with suppress(FileNotFoundError):

@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 Fast = TypeVar("Fast")
 
 Array = Any
-"""An array of numpy, or on a card a tensor of torch, which only code for cards imports."""
+"""A NumPy array, or on a card a torch tensor, which only code for cards imports."""
 EXPORT_AGAIN = "export the model in the layout of the Hugging Face ONNX exports"
 DTYPES = {
     "tensor(float)": np.float32,
@@ -191,7 +191,7 @@ class Network:
 
 
 def on_host(values: Array) -> np.ndarray:
-    """Return the values as an array of numpy."""
+    """Return the values as a NumPy array."""
     return values if isinstance(values, np.ndarray) else np.asarray(values.cpu())
 
 

@@ -203,7 +203,7 @@ class JobResources:
         return START_S + self._seconds(cost_name(rule), *self.plan.which(job), self.size(self.plan.row(job)))
 
     def card_seconds(self, rule: str, job: Job) -> float | None:
-        """Return the estimated seconds of a job on a card (`GPU`), or None if it has no work for one."""
+        """Return how many seconds a job would take on a card (`GPU`), or None if it has no work for one."""
         rule, stages, (views, view_mp) = cost_name(rule), self.plan.stages(job), self.size(self.plan.row(job))
         if rule == "gaussians":
             steps, seen_mp = _steps_and_mp(stages.gaussians, views, view_mp)
