@@ -66,7 +66,8 @@ def network_device(requested: Literal["auto", "cpu", "cuda"], section: str, need
             found=problem,
             fix=f"set {section}.device: auto or cpu",
         )
-    if requested != CPU and problem is None and (free := free_mib()) < needed_mib:
+    # asking for the free memory starts CUDA, which takes memory itself
+    if requested != CPU and problem is None and needed_mib and (free := free_mib()) < needed_mib:
         if requested == "cuda":
             raise MemoryLimitError(
                 f"the model in {section}.model needs more memory than the GPU has free",

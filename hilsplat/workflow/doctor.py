@@ -81,7 +81,7 @@ def cuda() -> Iterator[Finding]:
         fix = "on a machine with an NVIDIA GPU: pip install 'hilsplat[gpu]', and a CUDA toolkit (nvcc)"
         yield Finding("cuda", "note", f"{problem}: everything runs on the CPU", fix)
         return
-    sound = "gsplat and the CPU agree on image, gradients and pixel weights"
+    sound = "gsplat and the CPU agree on a step of a fit and pixel weights"
     yield verdict("cuda", cuda_disagreement(), sound, "set device: cpu, and report this output")
 
 
