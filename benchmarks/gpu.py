@@ -31,6 +31,7 @@ from benchmarks.scenes import random_scene
 from benchmarks.table import markdown_table
 from benchmarks.test_splat import HALF_WAY, SETTINGS
 from hilsplat.base.artifacts import write_json, write_text
+from hilsplat.base.cards import driver_version
 from hilsplat.base.errors import first_line
 from hilsplat.base.images import write_png
 from hilsplat.models.folder import ModelFolder, input_side_px
@@ -41,7 +42,7 @@ from hilsplat.splat.gaussians import FIELDS
 from hilsplat.splat.initial import TrainingView
 from hilsplat.splat.model import model_on
 from hilsplat.splat.rasterise.api import render
-from hilsplat.splat.rasterise.parity import disagreement, driver_version
+from hilsplat.splat.rasterise.parity import disagreement
 
 ROOT = Path(__file__).resolve().parents[1]
 OUT = ROOT / "results/benchmarks"

@@ -1,4 +1,7 @@
-"""NVIDIA cards of this machine, and a lock on each, so that jobs of several processes don't share one."""
+"""NVIDIA cards of this machine as the driver reports them, and a lock on each, so that jobs don't share one.
+
+Nothing here imports torch or starts CUDA.
+"""
 
 import ctypes
 import logging
@@ -13,9 +16,30 @@ from hilsplat.base.processes import lock
 
 logger = logging.getLogger(__name__)
 
-LIBRARY = "libnvidia-ml.so.1"  # of the driver; it doesn't start CUDA, which would choose a card
+MANAGEMENT, CUDA = "libnvidia-ml.so.1", "libcuda.so.1"  # libraries of the driver
 
 _held: list[IO[bytes]] = []  # the lock of this process's card, until the process ends
+
+
+def has_driver() -> bool:
+    """Return whether an NVIDIA driver is installed."""
+    try:
+        ctypes.CDLL(CUDA)
+    except OSError:
+        return False
+    return True
+
+
+def driver_version() -> str:
+    """Return the version of the NVIDIA driver, or an empty text if there is none."""
+    version = ctypes.create_string_buffer(80)
+    try:
+        library = ctypes.CDLL(MANAGEMENT)
+        library.nvmlInit_v2()
+        library.nvmlSystemGetDriverVersion(version, len(version))
+    except (OSError, AttributeError):
+        return ""
+    return version.value.decode()
 
 
 def cards() -> list[str]:
@@ -25,7 +49,7 @@ def cards() -> list[str]:
         return [name.strip() for name in named.split(",") if name.strip() not in ("", "-1")]
     count = ctypes.c_uint(0)
     try:
-        library = ctypes.CDLL(LIBRARY)
+        library = ctypes.CDLL(MANAGEMENT)
         if library.nvmlInit_v2() == 0:
             library.nvmlDeviceGetCount_v2(ctypes.byref(count))
             library.nvmlShutdown()

@@ -1,6 +1,5 @@
 """An NVIDIA card for the networks: whether to use it, and how many items fit into a call."""
 
-import ctypes
 import logging
 import sys
 from collections.abc import Callable, Iterator
@@ -11,6 +10,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from jaxtyping import Int64
 
+from hilsplat.base.cards import has_driver
 from hilsplat.base.errors import DeviceError, MemoryLimitError, first_line
 
 logger = logging.getLogger(__name__)
@@ -29,9 +29,7 @@ TURN = RLock()
 @cache
 def card_problem() -> str | None:
     """Return why torch cannot use an NVIDIA card here, or None; without a driver, torch isn't imported."""
-    try:
-        ctypes.CDLL("libcuda.so.1")
-    except OSError:
+    if not has_driver():
         return "no NVIDIA driver is installed"
     try:
         import torch

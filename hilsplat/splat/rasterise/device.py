@@ -1,7 +1,6 @@
 """Choice of the rendering backend: our own on the CPU, or gsplat on CUDA."""
 
 import contextlib
-import ctypes
 import io
 import logging
 import os
@@ -13,6 +12,7 @@ from importlib.util import find_spec
 from typing import Literal
 
 from hilsplat.base.cache import forget, remembered
+from hilsplat.base.cards import has_driver
 from hilsplat.base.errors import DeviceError, first_line
 from hilsplat.splat.rasterise.drawn import Device
 from hilsplat.splat.rasterise.parity import KIND, cuda_disagreement
@@ -37,9 +37,7 @@ def cuda_problem() -> str | None:
     # checked before importing torch, which takes 1.3 to 3 s
     if find_spec("gsplat") is None:
         return "gsplat is not installed"
-    try:
-        ctypes.CDLL("libcuda.so.1")
-    except OSError:
+    if not has_driver():
         return "no NVIDIA driver is installed"
     try:
         import gsplat

@@ -1,11 +1,10 @@
 """Self-test that compares a card with the CPU: one step of a fit, and pixel weights; cached per machine."""
 
-import ctypes
-
 import numpy as np
 from scipy.sparse import csr_matrix
 
 from hilsplat.base.cache import remembered
+from hilsplat.base.cards import driver_version
 from hilsplat.base.code import code_digest
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
@@ -28,18 +27,6 @@ def cuda_disagreement() -> str | None:
     code = code_digest("hilsplat.splat.torch_model", disagreement)
     key = ["self-test", *versions, torch.cuda.get_device_name(), code]
     return remembered(KIND, key, lambda: disagreement("cpu", "cuda") or "") or None
-
-
-def driver_version() -> str:
-    """Return the version of the NVIDIA driver, or an empty text if there is none."""
-    version = ctypes.create_string_buffer(80)
-    try:
-        library = ctypes.CDLL("libnvidia-ml.so.1")
-        library.nvmlInit_v2()
-        library.nvmlSystemGetDriverVersion(version, len(version))
-    except (OSError, AttributeError):
-        return ""
-    return version.value.decode()
 
 
 def disagreement(one: Device, other: Device) -> str | None:

@@ -1,5 +1,6 @@
 """Choice of the device for networks, and sizes of batches when a card's memory is short."""
 
+import ctypes
 import sys
 from types import SimpleNamespace
 
@@ -42,11 +43,11 @@ def test_a_missing_driver_is_found_without_importing_torch(monkeypatch):
     def absent(name: str) -> None:
         raise OSError(name)
 
-    monkeypatch.setattr(card.ctypes, "CDLL", absent)
+    monkeypatch.setattr(ctypes, "CDLL", absent)
     monkeypatch.setitem(sys.modules, "torch", None)
     card.card_problem.cache_clear()
     assert card.card_problem() == "no NVIDIA driver is installed"
-    monkeypatch.setattr(card.ctypes, "CDLL", lambda name: None)
+    monkeypatch.setattr(ctypes, "CDLL", lambda name: None)
     card.card_problem.cache_clear()
     assert "torch cannot be imported" in card.card_problem()
     card.card_problem.cache_clear()
