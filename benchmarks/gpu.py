@@ -278,7 +278,7 @@ def contributions(device: str, sizes: Sizes, models: Path | None) -> dict[str, A
 
 def slots(device: str, sizes: Sizes, models: Path | None) -> dict[str, Any]:
     """Two jobs and one card: the second waits until the first has ended."""
-    hold = "import time; from hilsplat.base.cards import take_card; print(take_card()); time.sleep(2)"
+    hold = "import time; from hilsplat.base.cards import take_card; take_card(); time.sleep(2)"
     environment = {
         **os.environ,
         "CUDA_VISIBLE_DEVICES": os.environ.get("CUDA_VISIBLE_DEVICES", "0")[:1] or "0",

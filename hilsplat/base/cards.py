@@ -8,7 +8,6 @@ import logging
 import os
 import tempfile
 import time
-from functools import cache
 from pathlib import Path
 from typing import IO
 
@@ -18,7 +17,7 @@ logger = logging.getLogger(__name__)
 
 MANAGEMENT, CUDA = "libnvidia-ml.so.1", "libcuda.so.1"  # libraries of the driver
 
-_held: list[IO[bytes]] = []  # the lock of this process's card, until the process ends
+_held: list[IO[bytes]] = []  # the lock of this process's card
 
 
 def has_driver() -> bool:
@@ -58,16 +57,15 @@ def cards() -> list[str]:
     return [str(number) for number in range(count.value)]
 
 
-@cache
-def take_card(folder: Path | None = None, poll_s: float = 1.0) -> str | None:
-    """Wait for a card that no other job of this user has, and let CUDA see only that card; None without one.
+def take_card(folder: Path | None = None, poll_s: float = 1.0) -> None:
+    """Wait for a card that no other job of this user has, and let CUDA see only that card.
 
-    It must be called before CUDA starts, and the card is kept until the process ends, even if it is killed.
-    Under Slurm, the scheduler has assigned cards, so none is taken.
+    It must be called before CUDA starts. The card is kept until `release_card` or the end of the process,
+    even if it is killed. Under Slurm, the scheduler has assigned cards, so none is taken.
     """
     choice = cards()
-    if not choice or "SLURM_JOB_ID" in os.environ:
-        return None
+    if not choice or _held or "SLURM_JOB_ID" in os.environ:
+        return
     folder, is_waiting = folder or Path(tempfile.gettempdir()), False
     while True:
         for name in choice:
@@ -80,8 +78,14 @@ def take_card(folder: Path | None = None, poll_s: float = 1.0) -> str | None:
             _held.append(stream)
             # in the order of the driver's library; CUDA's own default is the fastest first
             os.environ |= {"CUDA_VISIBLE_DEVICES": name, "CUDA_DEVICE_ORDER": "PCI_BUS_ID"}
-            return name
+            return
         if not is_waiting:
             logger.info("waiting for one of %d cards, which other jobs use", len(choice))
             is_waiting = True
         time.sleep(poll_s)
+
+
+def release_card() -> None:
+    """Let other jobs take this process's card, because it turned out that the CPU is used."""
+    while _held:
+        _held.pop().close()

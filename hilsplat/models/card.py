@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from jaxtyping import Int64
 
-from hilsplat.base.cards import has_driver
+from hilsplat.base.cards import has_driver, release_card
 from hilsplat.base.errors import DeviceError, MemoryLimitError, first_line
 
 logger = logging.getLogger(__name__)
@@ -75,9 +75,11 @@ def network_device(requested: Literal["auto", "cpu", "cuda"], section: str, need
             )
         problem = f"the GPU has {free / 1024:.1f} GiB free, and about {needed_mib / 1024:.1f} are needed"
         logger.warning("%s runs on the CPU: %s", section, problem)
+        release_card()
         return CPU
     if problem or requested == CPU:
         logger.debug("%s runs on the CPU: %s", section, problem or "device: cpu")
+        release_card()
         return CPU
     logger.info("%s runs on the GPU", section)
     return "cuda"

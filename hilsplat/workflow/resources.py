@@ -27,6 +27,7 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.baselines import TrainedSettings
 from hilsplat.configuration import StageSettings
 from hilsplat.datasets.generators import GENERATORS
+from hilsplat.models.card import card_problem
 from hilsplat.models.store import model_path, read_model
 from hilsplat.scene.layouts import vertex_count
 from hilsplat.scene.sheet import SceneRow
@@ -178,14 +179,15 @@ class JobResources:
 
         For `device: auto`, these are jobs on this machine if it has a card; nodes of a cluster are unknown.
         """
-        has_card = self.cores is not None and bool(cards())
+        uses = _fit_can_use_card if section in ("gaussians", "contributions") else _networks_can_use_card
+        is_here = self.cores is not None
 
         def needed(wildcards: Any) -> int:
             row, settings = self.plan.row(wildcards), getattr(self.plan.stages(wildcards), section)
             is_imported = row.gaussians is not None if section == "gaussians" else bool(row.features)
             if is_imported and section != "contributions":
                 return 0
-            return int(settings.uses_card and (settings.device == "cuda" or has_card))
+            return int(settings.uses_card and (settings.device == "cuda" or (is_here and uses())))
 
         return needed
 
@@ -280,6 +282,16 @@ class JobResources:
             return 0
         batch = settings.batch if rule == "clip" else settings.points_per_batch
         return _model_memory_mb(model_path(settings.model), settings.variant, batch, threads)
+
+
+def _fit_can_use_card() -> bool:
+    from hilsplat.splat.rasterise.device import cuda_problem
+
+    return bool(cards()) and cuda_problem() is None
+
+
+def _networks_can_use_card() -> bool:
+    return bool(cards()) and card_problem() is None
 
 
 def _steps_and_mp(fit: GaussiansSettings, views: int, view_mp: float) -> tuple[int, float]:

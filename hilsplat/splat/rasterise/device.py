@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from typing import Literal
 
 from hilsplat.base.cache import forget, remembered
-from hilsplat.base.cards import has_driver
+from hilsplat.base.cards import has_driver, release_card
 from hilsplat.base.errors import DeviceError, first_line
 from hilsplat.splat.rasterise.drawn import Device
 from hilsplat.splat.rasterise.parity import KIND, cuda_disagreement
@@ -114,6 +114,8 @@ def _examined(requested: Requested) -> Device:
     advice = "; after a fix, run `hilsplat doctor`" if is_broken else ""
     suffix = f"; {problem}{advice}" if problem else ""
     logger.log(level, "rasterising on %s (device: %s%s)", device, requested, suffix)
+    if device == "cpu":
+        release_card()
     return device
 
 
@@ -136,6 +138,7 @@ def require_card_memory(requested: Requested, needed: int, user: str, fix: str) 
         )
     logger.warning("rasterising on cpu (device: auto; %s); to use the card, %s", problem, fix)
     CHOSEN[requested] = "cpu"  # also for the provenance record
+    release_card()
     return "cpu"
 
 

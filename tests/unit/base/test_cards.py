@@ -10,14 +10,15 @@ from types import SimpleNamespace
 import pytest
 
 from hilsplat.base import cards as module
-from hilsplat.base.cards import cards, take_card
+from hilsplat.base.cards import cards, release_card, take_card
 from tests.conftest import PROJECT
 
 HOLD = """
-import sys
+import os, sys
 from pathlib import Path
 from hilsplat.base.cards import take_card
-print(take_card(Path(sys.argv[1]), 0.01), flush=True)
+take_card(Path(sys.argv[1]), 0.01)
+print(os.environ["CUDA_VISIBLE_DEVICES"], flush=True)
 sys.stdin.read()
 """
 
@@ -27,9 +28,8 @@ def no_scheduler(monkeypatch):
     monkeypatch.delenv("SLURM_JOB_ID", raising=False)
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     monkeypatch.setenv("CUDA_DEVICE_ORDER", "PCI_BUS_ID")  # so that it is restored
-    take_card.cache_clear()
     yield
-    take_card.cache_clear()
+    release_card()
 
 
 def driver(number: int) -> SimpleNamespace:
@@ -55,13 +55,15 @@ def test_without_a_driver_there_is_no_card(monkeypatch, tmp_path):
         raise OSError(f"{name}: cannot open shared object file")
 
     monkeypatch.setattr(ctypes, "CDLL", absent)
-    assert cards() == [] and take_card(tmp_path) is None and not list(tmp_path.iterdir())
+    take_card(tmp_path)
+    assert cards() == [] and not list(tmp_path.iterdir())
 
 
 def test_under_slurm_the_scheduler_has_chosen(monkeypatch, tmp_path):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
     monkeypatch.setenv("SLURM_JOB_ID", "7")
-    assert take_card(tmp_path) is None and os.environ["CUDA_VISIBLE_DEVICES"] == "0"
+    take_card(tmp_path)
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == "0" and not list(tmp_path.iterdir())
 
 
 def holder(folder: Path, visible: str) -> subprocess.Popen:
@@ -78,7 +80,12 @@ def test_jobs_get_cards_of_their_own_and_wait_for_one(tmp_path, monkeypatch, cap
         assert {first.stdout.readline(), second.stdout.readline()} == {"0\n", "1\n"}
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
         monkeypatch.setattr(module.time, "sleep", lambda seconds: second.kill())
-        freed = take_card(tmp_path)
+        take_card(tmp_path)
         assert "waiting for one of 2 cards" in caplog.text
-        assert os.environ["CUDA_VISIBLE_DEVICES"] == freed and take_card(tmp_path) == freed
+        freed = os.environ["CUDA_VISIBLE_DEVICES"]
+        assert freed in ("0", "1")
+        with holder(tmp_path, freed) as third:
+            release_card()  # as a job does that uses the CPU after all
+            assert third.stdout.readline() == f"{freed}\n"
+            third.kill()
         first.kill()

@@ -76,21 +76,24 @@ def test_threads_grow_with_the_pixels_of_a_scene(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("cores", "on_machine", "device", "segmenter", "expected"),
+    ("cores", "on_machine", "gsplat_problem", "device", "segmenter", "expected"),
     [
-        (2, ["0"], "auto", "sam", [1, 1, 1, 0]),
-        (2, ["0"], "auto", "graph", [1, 0, 1, 0]),
-        (2, ["0"], "cpu", "sam", [0, 0, 0, 0]),
-        (2, [], "auto", "sam", [0, 0, 0, 0]),
-        (2, [], "cuda", "sam", [1, 1, 1, 1]),  # an error later says that there is none
-        (None, ["0"], "auto", "sam", [0, 0, 0, 0]),  # the nodes of a cluster are unknown
-        (None, [], "cuda", "sam", [1, 1, 1, 1]),
+        (2, ["0"], None, "auto", "sam", [1, 1, 1, 0]),
+        (2, ["0"], "no nvcc", "auto", "sam", [0, 1, 1, 0]),
+        (2, ["0"], None, "auto", "graph", [1, 0, 1, 0]),
+        (2, ["0"], None, "cpu", "sam", [0, 0, 0, 0]),
+        (2, [], None, "auto", "sam", [0, 0, 0, 0]),
+        (2, [], None, "cuda", "sam", [1, 1, 1, 1]),  # an error later says that there is none
+        (None, ["0"], None, "auto", "sam", [0, 0, 0, 0]),  # the nodes of a cluster are unknown
+        (None, [], None, "cuda", "sam", [1, 1, 1, 1]),
     ],
 )
 def test_jobs_that_use_a_card_request_one(
-    tmp_path, monkeypatch, cores, on_machine, device, segmenter, expected
+    tmp_path, monkeypatch, cores, on_machine, gsplat_problem, device, segmenter, expected
 ):
     monkeypatch.setattr("hilsplat.workflow.resources.cards", lambda: on_machine)
+    monkeypatch.setattr("hilsplat.workflow.resources.card_problem", lambda: None)
+    monkeypatch.setattr("hilsplat.splat.rasterise.device.cuda_problem", lambda: gsplat_problem)
     sections = ("gaussians", "masks", "clip", "contributions")
     config = {section: {"device": device} for section in sections}
     config["masks"]["segmenter"] = segmenter
