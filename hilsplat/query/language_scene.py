@@ -102,7 +102,7 @@ class LanguageScene(NodeQueries):
         require(parts.semantic_tree, parts.gaussians, tree.gaussians_sha256)
         decoded_field = None
         if parts.field is not None and parts.autoencoder is not None:
-            language = files.get(LanguageField.load, parts.field)
+            language = LanguageField.load(parts.field)  # not kept: variants have fields of their own
             require(parts.field, parts.gaussians, language.gaussians_sha256)
             require(parts.field, autoencoder_file(parts.autoencoder), language.autoencoder_sha256)
             code = files.get(load_code, parts.autoencoder)

@@ -54,8 +54,6 @@ RUNNER_MB = 700  # memory of the two Snakemake processes that a cluster job star
 
 BLOCK = 2**20 / 1000  # thousands of Gaussians that the field solves together by default
 
-COMPARED_MB = (450, 4)  # memory of `comparison` per method: base, and per thousand Gaussians
-
 TIME_FACTOR, LEAST_MINUTES = 6, 10  # ratio of a job's time limit to its estimate, and minimum limit
 
 START_S = 2.0  # seconds to start Python, load libraries and read the inputs of a job
@@ -158,8 +156,6 @@ class JobResources:
                     0, thousand - BLOCK
                 )
                 mb = max(mb, self._model_mb(cost_name(rule), wildcards, threads))
-                if rule == "comparison":
-                    mb += len(self.plan.run.main_variants) * (COMPARED_MB[0] + COMPARED_MB[1] * thousand)
             return math.ceil((mb + RUNNER_MB) / 100) * 100 * 2 ** (attempt - 1)
 
         return needed

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, UInt8
 from matplotlib.figure import Figure
 
 from hilsplat.base.errors import SettingsError
@@ -55,6 +55,22 @@ class Answerer:
             for row in rows
         ]
 
+    def features(self, view: str) -> list[UInt8[np.ndarray, "H W 3"]]:
+        """Return the features at each level as colours; those of a tree are of its nodes."""
+        if self.method == "tree":
+            return [node_image(self.scene, view, level) for level in LEVELS]
+        return [self.scene.field.image(view, level) for level in LEVELS]
+
+
+@dataclass(frozen=True)
+class Column:
+    """What the figures show of a method: answers to all queries, to one in several views, and features."""
+
+    title: str
+    answers: list[Bool[np.ndarray, "H W"]]
+    in_views: list[Bool[np.ndarray, "H W"]]
+    features: list[UInt8[np.ndarray, "H W 3"]]
+
 
 def run_comparison(
     folder: Path,
@@ -88,32 +104,32 @@ def run_comparison(
         raise SettingsError(
             "there are no variants to compare", expected="at least one", fix="list them in main_variants"
         )
-    scenes = open_variants(folder, variants, threads)
-    scene = scenes[variants[0]].scene
+    opened = Opened()  # shared by all variants
+    first = open_variant(folder, variants[0], opened, threads)
+    scene, image = first.scene, first.views.image
     with stage_log("comparison", scene.name) as counts:
-        methods = [
-            Answerer(row_name(variant, method, names), method, scenes[variant])
-            for variant in variants
-            for method in (("tree", "field") if variant == "default" else ("field",))
-        ]
         truths = shown_truths(scene, truth, labels, data_root, evaluate)
-        rows = annotated_rows(truths, settings) if truths else free_rows(methods[0].scene, queries, settings)
-        save_png_and_pdf(draw_methods(methods, rows, evaluate), out)
+        rows = annotated_rows(truths, settings) if truths else free_rows(first, queries, settings)
+        del first
         several = over_views(scene, rows, truths)
-        save_png_and_pdf(draw_views(methods, several, evaluate), Path(out).with_name("views.png"))
         view = several[0].view if several else (scene.views("test") or scene.views("train"))[0]
-        save_png_and_pdf(draw_features(methods, view), Path(out).with_name("features.png"))
-        counts |= {"methods": len(methods), "queries": len(rows), "views": len(several)}
+        columns = []
+        for variant in track(list(variants), "variants compared"):  # one in memory at a time
+            answers = open_variant(folder, variant, opened, threads)
+            for method in ("tree", "field") if variant == "default" else ("field",):
+                one = Answerer(row_name(variant, method, names), method, answers)
+                shown = one.masks(rows, evaluate), one.masks(several, evaluate), one.features(view)
+                columns.append(Column(one.title, *shown))
+        save_png_and_pdf(draw_methods(scene, image, columns, rows), out)
+        save_png_and_pdf(draw_views(scene, image, columns, several), Path(out).with_name("views.png"))
+        save_png_and_pdf(draw_features(scene, image, columns, view), Path(out).with_name("features.png"))
+        counts |= {"methods": len(columns), "queries": len(rows), "views": len(several)}
 
 
-def open_variants(folder: Path, variants: Sequence[str], threads: int) -> dict[str, LanguageScene]:
-    """Open variants of a scene with their own evaluation settings; shared files are opened once."""
-    opened, scenes = Opened(), {}
-    for variant in variants:
-        found = FinishedScene.locate(folder, variant)
-        settings = found.evaluate_settings()
-        scenes[variant] = LanguageScene.from_parts(found.parts, settings, threads=threads, opened=opened)
-    return scenes
+def open_variant(folder: Path, variant: str, opened: Opened, threads: int) -> LanguageScene:
+    """Open a variant of a scene with its own evaluation settings; files in `opened` are not read again."""
+    found = FinishedScene.locate(folder, variant)
+    return LanguageScene.from_parts(found.parts, found.evaluate_settings(), threads=threads, opened=opened)
 
 
 def over_views(
@@ -142,64 +158,60 @@ def over_views(
     return found
 
 
-def draw_methods(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: EvaluateSettings) -> Figure:
+def draw_methods(
+    scene: Scene, image: Callable[[str], np.ndarray], columns: Sequence[Column], rows: Sequence[Shown]
+) -> Figure:
     """Draw one row per query and one column per method, transposed if there are many methods."""
-    first = methods[0].scene
-    scene = first.scene
-    many = len(methods) > MAX_COLUMNS
-    shape = max(len(rows), 1), len(methods) + 1
+    many = len(columns) > MAX_COLUMNS
+    shape = max(len(rows), 1), len(columns) + 1
     width_in = WIDTH_IN * min(shape[0] / MAX_COLUMNS, 1) if many else WIDTH_IN
     title = f"{scene.name}: queries by method"
     figure, grid = _grid(scene, *(shape[::-1] if many else shape), title, width_in)
     by_query = grid.T if many else grid
-    answers = [method.masks(rows, evaluate) for method in track(list(methods), "methods compared")]
     for number, (axes, row) in enumerate(zip(by_query, rows, strict=False)):
-        image = first.views.image(row.view)
+        photograph = image(row.view)
         query = f"“{row.text}” ({row.level.label})\n" if many and row.level else ""
-        show(axes[0], paint_answer(image, None, row.truth), query + row.title)
+        show(axes[0], paint_answer(photograph, None, row.truth), query + row.title)
         if not many:
             label_left(axes[0], row.text, row.level)
-        for place, method, masks in zip(axes[1:], methods, answers, strict=True):
-            score = row.score(masks[number])
-            named = score if many else f"{method.title}\n{score}".rstrip()
-            show(place, paint_answer(image, masks[number], row.truth), named)
+        for place, column in zip(axes[1:], columns, strict=True):
+            mask = column.answers[number]
+            score = row.score(mask)
+            named = score if many else f"{column.title}\n{score}".rstrip()
+            show(place, paint_answer(photograph, mask, row.truth), named)
     if many:
-        for axes, method in zip(grid[1:, 0], methods, strict=True):
-            label_left(axes, method.title)
+        for axes, column in zip(grid[1:, 0], columns, strict=True):
+            label_left(axes, column.title)
     return figure
 
 
-def draw_views(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: EvaluateSettings) -> Figure:
+def draw_views(
+    scene: Scene, image: Callable[[str], np.ndarray], columns: Sequence[Column], rows: Sequence[Shown]
+) -> Figure:
     """Draw one row per method, one column per view, to compare a method's answers across views."""
-    first = methods[0].scene
-    scene = first.scene
     query = f"“{rows[0].text}” in {len(rows)} views" if rows else "no query"
-    figure, grid = _grid(scene, len(methods) + 1, max(len(rows), 1), f"{scene.name}: {query}")
-    answers = [method.masks(rows, evaluate) for method in methods]
-    for column, row in enumerate(rows):
-        image = first.views.image(row.view)
-        show(grid[0][column], paint_answer(image, None, row.truth), row.view)
-        for place, masks in enumerate(answers, start=1):
-            picture = paint_answer(image, masks[column], row.truth)
-            show(grid[place][column], picture, row.score(masks[column]))
+    figure, grid = _grid(scene, len(columns) + 1, max(len(rows), 1), f"{scene.name}: {query}")
+    for number, row in enumerate(rows):
+        photograph = image(row.view)
+        show(grid[0][number], paint_answer(photograph, None, row.truth), row.view)
+        for place, column in enumerate(columns, start=1):
+            mask = column.in_views[number]
+            show(grid[place][number], paint_answer(photograph, mask, row.truth), row.score(mask))
     label_left(grid[0][0], "photograph")
-    for place, method in enumerate(methods, start=1):
-        label_left(grid[place][0], method.title)
+    for place, column in enumerate(columns, start=1):
+        label_left(grid[place][0], column.title)
     return figure
 
 
-def draw_features(methods: Sequence[Answerer], view: str) -> Figure:
-    """Draw one row per method, one column per level; trees are drawn as coloured nodes."""
-    scene = methods[0].scene.scene
-    figure, grid = _grid(scene, len(methods), len(LEVELS) + 1, f"{scene.name}: features at three levels")
-    for axes, method in zip(grid, methods, strict=True):
-        show(axes[0], methods[0].scene.views.image(view), view)
-        label_left(axes[0], method.title)
-        for level in LEVELS:
-            if method.method == "tree":
-                picture = node_image(method.scene, view, level)
-            else:
-                picture = method.scene.field.image(view, level)
+def draw_features(
+    scene: Scene, image: Callable[[str], np.ndarray], columns: Sequence[Column], view: str
+) -> Figure:
+    """Draw one row per method, one column per level."""
+    figure, grid = _grid(scene, len(columns), len(LEVELS) + 1, f"{scene.name}: features at three levels")
+    for axes, column in zip(grid, columns, strict=True):
+        show(axes[0], image(view), view)
+        label_left(axes[0], column.title)
+        for level, picture in zip(LEVELS, column.features, strict=True):
             show(axes[level.index + 1], picture, level.label)
     return figure
 

@@ -19,10 +19,11 @@ from hilsplat.base.errors import ArtifactError, ModelError, SettingsError
 from hilsplat.cli.main import app
 from hilsplat.cli.user_commands import scene_folder
 from hilsplat.datasets.registry import open_labelled
-from hilsplat.evaluate.figures.comparison import open_variants
+from hilsplat.evaluate.figures.comparison import open_variant
 from hilsplat.models.folder import open_model_folder
 from hilsplat.query.answer import answer
 from hilsplat.query.names import NO_FILE, NodeNames
+from hilsplat.query.scene_views import Opened
 from hilsplat.scene.finished import FinishedScene
 from tests.unit.artifact_changes import change_index, write_record
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH
@@ -203,8 +204,8 @@ def test_variants_open_shared_artifacts_once(copied):
     (copied / "omega-2").mkdir()
     for part in copied.glob("default/field.safetensors*"):
         shutil.copy(part, copied / "omega-2")
-    scenes = open_variants(copied, ["default", "omega-2"], 1)
-    first, second = scenes["default"], scenes["omega-2"]
+    opened = Opened()
+    first, second = (open_variant(copied, variant, opened, 1) for variant in ("default", "omega-2"))
     assert first.gaussians is second.gaussians
     assert first.tree is second.tree
     assert first.scene is second.scene

@@ -11,6 +11,7 @@ from hilsplat.base.levels import Level
 from hilsplat.evaluate.figures import comparison
 from hilsplat.evaluate.figures.comparison import (
     Answerer,
+    Column,
     draw_methods,
     node_image,
     over_views,
@@ -37,12 +38,11 @@ def test_tree_and_field_of_an_exact_world_answer_with_the_truth(block_world, row
 
 
 def test_many_methods_are_rows_and_queries_columns(block_world, rows):
-    methods = [
-        Answerer(f"method {n}", "tree", block_world.answers) for n in range(comparison.MAX_COLUMNS + 1)
-    ]
-    figure = draw_methods(methods, rows[1], EVALUATE)
-    grid = np.array(figure.get_axes()).reshape(len(methods) + 1, len(rows[1]))
-    assert [axes.get_ylabel() for axes in grid[:, 0]] == ["", *(method.title for method in methods)]
+    masks = Answerer("tree", "tree", block_world.answers).masks(rows[1], EVALUATE)
+    columns = [Column(f"method {n}", masks, [], []) for n in range(comparison.MAX_COLUMNS + 1)]
+    figure = draw_methods(block_world.scene, block_world.answers.views.image, columns, rows[1])
+    grid = np.array(figure.get_axes()).reshape(len(columns) + 1, len(rows[1]))
+    assert [axes.get_ylabel() for axes in grid[:, 0]] == ["", *(column.title for column in columns)]
     assert all("IoU" in axes.get_title() for axes in grid[1:].ravel())
     for axes, row in zip(grid[0], rows[1], strict=True):
         assert axes.get_title().startswith(f"“{row.text}” ({row.level.label})\ntruth")
@@ -66,9 +66,7 @@ def test_equal_nodes_have_equal_colours_and_other_pixels_are_black(block_world):
 @pytest.fixture
 def compare(block_world, tmp_path, monkeypatch):
     """Function that draws the figures of the block world into a folder."""
-    monkeypatch.setattr(
-        comparison, "open_variants", lambda _, variants, __: dict.fromkeys(variants, block_world.answers)
-    )
+    monkeypatch.setattr(comparison, "open_variant", lambda *how: block_world.answers)
 
     def run(name, variants, names, **more):
         out, settings = tmp_path / name / "comparison.png", FiguresSettings(queries_per_level=1)
@@ -90,7 +88,7 @@ def test_all_figures_are_written_as_png_and_pdf_twice_the_same(block_world, tmp_
 
 def test_scenes_without_labels_show_the_queries_of_the_configuration(compare, monkeypatch):
     drawn = []
-    monkeypatch.setattr(comparison, "draw_methods", lambda methods, rows, _: drawn.append(rows) or None)
+    monkeypatch.setattr(comparison, "draw_methods", lambda *of: drawn.append(of[-1]) or None)
     monkeypatch.setattr(comparison, "save_png_and_pdf", lambda figure, out: None)
     compare("free", ["default"], {}, queries=["bear"])
     assert [(row.text, row.truth) for row in drawn[0]] == [("bear", None)]
