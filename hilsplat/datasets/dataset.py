@@ -67,10 +67,14 @@ class Dataset:
         """Read a whole scene and report what was found."""
         return self.open(root, scene).report()
 
+    def needs(self, root: Path, scene: str) -> tuple[str, ...]:
+        """Return the paths that a scene needs, relative to the data set's folder `root`."""
+        return self.required(scene)
+
     def missing(self, root: Path, scene: str) -> tuple[str, ...]:
         """Return the required paths of a scene that are missing below the data set's folder `root`."""
         # `normpath` resolves `..` even if the folder before it does not exist.
-        paths = {place: Path(os.path.normpath(root / place)) for place in self.required(scene)}
+        paths = {place: Path(os.path.normpath(root / place)) for place in self.needs(root, scene)}
         return tuple(place for place, path in paths.items() if not path.exists())
 
     def found(self, root: Path) -> tuple[str, ...]:
@@ -100,7 +104,7 @@ class Dataset:
         """Raise SceneError if a scene lacks a required path, for instance if it was only partly unpacked."""
         missing = self.missing(root, scene)
         if missing:
-            here = [place for place in self.required(scene) if place not in missing]
+            here = [place for place in self.needs(root, scene) if place not in missing]
             raise SceneError(
                 f"scene {scene} of {self.title} is incomplete in {root}",
                 expected=f"also {', '.join(missing)}",
@@ -110,7 +114,7 @@ class Dataset:
 
     def has_part(self, root: Path, scene: str) -> bool:
         """Return whether a required path of a scene exists; paths outside `root` are ignored."""
-        inside = [place for place in self.required(scene) if not place.startswith("..")]
+        inside = [place for place in self.needs(root, scene) if not place.startswith("..")]
         return any((root / place).exists() for place in inside)
 
     def _has_begun(self, root: Path) -> bool:

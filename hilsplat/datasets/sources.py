@@ -86,9 +86,9 @@ def image_files(source: str, data_root: str) -> tuple[Path, ...]:
     """Return the data set's files from which a scene's images and poses are exported."""
     name, _, scene = source.removeprefix(DATA_PREFIX).partition("/")
     dataset = dataset_of(name)
-    files: set[Path] = set()
-    for required in dataset.required(scene):
-        files.update(files_of(dataset.root(data_root) / required))
+    files, root = set[Path](), dataset.root(data_root)
+    for place in dataset.needs(root, scene):
+        files.update(files_of(root / place))
     labels = label_files(f"{name}/{scene}", data_root)
     return tuple(sorted(files.difference(labels)))
 

@@ -87,13 +87,13 @@ class Segments(Dataset):
         files = [path for split in SPLITS for path in (root / split).glob(f"{LABELS}/*.parquet")]
         return tuple(sorted({*(path.stem for path in files), *record_files(root)}))
 
-    def missing(self, root: Path, scene: str) -> tuple[str, ...]:
-        """Return the missing paths of a segment; empty if it has a file from release 1."""
-        if scene in record_files(root):
-            return ()
-        split = find_parquet(root, scene) or root / SPLITS[0]
-        paths = [parquet.component_path(split, tag, scene) for tag in parquet.COMPONENTS]
-        return tuple(str(path.relative_to(root)) for path in paths if not path.is_file())
+    def needs(self, root: Path, scene: str) -> tuple[str, ...]:
+        """Return the paths of a segment in release 2, or its file in release 1."""
+        split, record = find_parquet(root, scene), record_files(root).get(scene)
+        if split is None and record is not None:
+            return (str(record.relative_to(root)),)
+        paths = [parquet.component_path(split or root / SPLITS[0], tag, scene) for tag in parquet.COMPONENTS]
+        return tuple(str(path.relative_to(root)) for path in paths)
 
 
 DATASET = Segments(

@@ -10,6 +10,7 @@ import pytest
 
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.registry import DATASETS
+from hilsplat.datasets.sources import image_files
 from hilsplat.datasets.waymo.frames import (
     CameraShot,
     LidarFrame,
@@ -150,6 +151,21 @@ def test_a_written_segment_reads_back_in_the_frame_of_its_first_vehicle(root):
     assert scene.warnings[0].startswith("lenses have k3 distortion")
     (root / "validation" / "vehicle_pose" / f"{SEGMENT}.parquet").unlink()
     assert dataset.missing(root, SEGMENT) == (f"validation/vehicle_pose/{SEGMENT}.parquet",)
+
+
+@pytest.mark.parametrize("split", ["validation", "training"])
+def test_a_segments_files_are_inputs_wherever_they_are(root, split):
+    (root / "validation").rename(root / "files")
+    (root / "files").rename(root / split)
+    files = image_files(f"data:waymo/{SEGMENT}", str(root.parent))
+    assert files and {path.parents[1] for path in files} == {root / split}
+    assert not [path for path in files if path.parent.name == "lidar_segmentation"]  # evaluation reads it
+    (root / split).rename(root / "elsewhere")
+    record = root / split / RECORD
+    record.parent.mkdir()
+    record.touch()
+    assert image_files(f"data:waymo/{SEGMENT}", str(root.parent)) == (record,)
+    assert DATASETS["waymo"].missing(root, SEGMENT) == ()
 
 
 def test_damaged_components_are_refused_with_a_fix(root):
