@@ -1,7 +1,7 @@
 """ONNX networks in torch, for NVIDIA cards: the same files as in onnxruntime, equal results up to rounding.
 
 A network's first call with inputs of given shapes computes everything that depends only on weights and shapes
-on the host, such as the arithmetic with which exporters compute the arguments of `Reshape`. What remains is a
+on the host, such as the arithmetic with which exporters compute the arguments of `Reshape`. The result is a
 list of torch calls, which later calls repeat without waiting for the card.
 """
 
@@ -254,7 +254,7 @@ def _value(attribute: Any) -> Any:
 
 
 def tensor_of(value: np.ndarray | Tensor, dtype: type) -> Tensor:
-    """Return a tensor, or a copy of an array as a tensor, with a type of numpy."""
+    """Return a tensor, or a copy of an array as a tensor, with a NumPy type."""
     if isinstance(value, Tensor):
         return value.to(host_type(dtype))
     return torch.from_numpy(np.array(value, dtype))

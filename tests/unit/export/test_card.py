@@ -81,7 +81,7 @@ def test_candidates_agree(folder, photograph, device, official):
     np.testing.assert_allclose(found.stability, expected.stability, atol=3e-3)  # a few pixels on the border
     one, other = expected.logits.astype(float), found.logits.astype(float)
     in_band = (np.abs(one) < 127) & (np.abs(other) < 127)
-    # logits of 0, of which these random networks return many, decide how far bands reach
+    # these random networks return many logits of 0, which decide how far bands reach
     assert in_band.mean() > 0.1 and (in_band != (np.abs(one) < 127)).mean() < 0.02
     # steps of int8, or rounding of unrounded logits up to 40
     np.testing.assert_allclose(other[in_band], one[in_band], atol=5e-3 if official else 1)
