@@ -155,6 +155,8 @@ class JobResources:
                 mb += cost["thousand"] * min(thousand, BLOCK) + cost["more_thousand"] * max(
                     0, thousand - BLOCK
                 )
+                if cost_name(rule) == "semantic_tree":
+                    mb = max(mb, cost["base"] + cost["thousand"] * thousand + _pairs_mb(views))
                 mb = max(mb, self._model_mb(cost_name(rule), wildcards, threads))
             return math.ceil((mb + RUNNER_MB) / 100) * 100 * 2 ** (attempt - 1)
 
@@ -278,6 +280,13 @@ class JobResources:
             return 0
         batch = settings.batch if rule == "clip" else settings.points_per_batch
         return _model_memory_mb(model_path(settings.model), settings.variant, batch, threads)
+
+
+def _pairs_mb(views: int) -> float:
+    """Return the memory for the pairs of masks that are compared, with 300 masks per view, MB."""
+    from hilsplat.semantic_tree.view_pairs import MAX_ALL
+
+    return 0.078 * views**2 if views <= MAX_ALL else 2.7 * views
 
 
 def _fit_can_use_card() -> bool:
