@@ -582,7 +582,7 @@ def figures(
 
 @stage(
     scope="scene",
-    loop="methods compared",
+    loop="variants compared",
     reads=_labels,
     beside=lambda out: (out.with_name("views.png"), out.with_name("features.png")),
 )
