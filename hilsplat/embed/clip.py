@@ -184,9 +184,8 @@ class ClipModel:
         def crop(row: int) -> np.ndarray:
             return self.crop(image, masks, row, settings)
 
-        known = (
-            {} if self.device == CPU else {row: crop(row) for row in chosen}
-        )  # before it is this view's turn
+        # on a card, all crops are made before it is this view's turn
+        known = {} if self.device == CPU else {row: crop(row) for row in chosen}
 
         def embed(rows: Int64[np.ndarray, " b"], number: int) -> np.ndarray:
             named = [chosen[row] for row in rows]
