@@ -14,7 +14,7 @@ from typing import Any
 import platformdirs
 
 from hilsplat.base.artifacts import parse_json
-from hilsplat.base.files import project_path
+from hilsplat.base.files import files_below, project_path, stats_of
 from hilsplat.base.lineage import digests_of, sha256_of_json, visible_files
 from hilsplat.models.layouts import LAYOUTS, layout_of
 
@@ -83,7 +83,7 @@ def read_model(folder: Path) -> PresentModel | None:
     except (OSError, ValueError):
         return None
     layout = layout_of(config)
-    if layout is None or not any(path.rglob("*.onnx")):
+    if layout is None or not _has_network(path):
         return None
     return PresentModel(folder, LAYOUTS[layout].kind, is_embedded(config))
 
@@ -126,7 +126,11 @@ def present_models() -> list[PresentModel]:
 def broken_models() -> list[Path]:
     """Return the folders that contain networks but no configuration of a supported model."""
     folders = {folder.resolve(): folder for folder in _folders()}.values()
-    return [folder for folder in folders if any(folder.rglob("*.onnx")) and read_model(folder) is None]
+    return [folder for folder in folders if _has_network(folder) and read_model(folder) is None]
+
+
+def _has_network(folder: Path) -> bool:
+    return any(path.suffix == ".onnx" for path in files_below(folder))
 
 
 def _folders() -> list[Path]:
@@ -171,7 +175,7 @@ def models_table() -> str:
     for name, model in present.items():
         if name in released:
             continue
-        num_bytes = sum(path.stat().st_size for path in model.folder.rglob("*") if path.is_file())
+        num_bytes = sum(stat.st_size for stat in stats_of(files_below(model.folder)).values())
         use = "the synthetic world only" if model.embedded else ""
         rows.append((name, model.family.upper(), f"{num_bytes / 1e6:.0f}", "", state(name), use))
     lines = ["{:<24} {:<5} {:>8}  {:<11} {:<11} {}".format(*row).rstrip() for row in rows]
