@@ -101,7 +101,7 @@ for path in entry_points("hilsplat.rules").values():
 
 if (INSTALLED / "models/training").is_dir():  # only in a checkout
 
-    include: "models/training/train.smk"
+    include: str(INSTALLED / "models/training/train.smk")
 
 
 rule all:
