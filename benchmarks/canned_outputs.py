@@ -1,10 +1,13 @@
 """Graph segmenter masks that replace the outputs of a SAM with random weights after its networks have run."""
 
+import hashlib
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+from hilsplat.base.artifacts import read_npy, write_npy
 from hilsplat.base.levels import Level
 from hilsplat.segment.graph import segment_graph
 from hilsplat.segment.sam import HEADS, Encoded, Frame, SamModel, in_input
@@ -61,16 +64,19 @@ class Regions:
         return self._known[head, label]
 
 
-def replace_outputs(model: type[SamModel]) -> None:
-    """Patch a `SamModel` so that it runs its networks but returns canned masks."""
+def replace_outputs(model: type[SamModel], kept: Path) -> None:
+    """Patch a `SamModel` so that it runs its networks but returns canned masks.
+
+    The folder `kept` keeps the regions of images, which take longer to compute than to read.
+    """
     encode, decode, preview, finish = model.encode, model.decode, model.preview, model.finish
-    known: dict[int, list[np.ndarray]] = {}  # because the int8 check encodes an image twice
 
     def canned_encode(self: Any, image: np.ndarray, *encoder: Any) -> Encoded:
-        encoded, digest = encode(self, image, *encoder), hash(image.tobytes())
-        if digest not in known:
-            known[digest] = labels_of(image, encoded.frame)
-        encoded.features["canned"] = Regions(known[digest], encoded.frame)  # type: ignore[index]
+        encoded = encode(self, image, *encoder)
+        path = kept / f"{hashlib.sha256(image.tobytes()).hexdigest()}.npy"
+        if not path.is_file():
+            write_npy(path, np.stack(labels_of(image, encoded.frame)))
+        encoded.features["canned"] = Regions(list(read_npy(path)), encoded.frame)  # type: ignore[index]
         return encoded
 
     def canned_decode(self: Any, encoded: Encoded, points_xy: np.ndarray) -> Any:

@@ -5,7 +5,8 @@
 
 Full-size networks with random weights (`real_size`) take as long as trained ones, but a random SAM predicts
 no confident mask. Its networks therefore run in full, and their masks are replaced by the graph segmenter's
-regions at each prompt (`canned_outputs`), so that later stages process realistic masks. FOLDER becomes a
+regions at each prompt (`canned_outputs`), so that later stages process realistic masks. The regions are kept
+beside the exported models, so the second run of a set of photographs doesn't compute them. FOLDER becomes a
 project with one scene. An existing FOLDER is refused, because its caches would be used.
 """
 
@@ -36,8 +37,9 @@ class Finder(importlib.abc.MetaPathFinder):
         load = spec.loader.exec_module
         def exec_module(module):
             load(module)
+            from pathlib import Path
             from benchmarks.canned_outputs import replace_outputs
-            replace_outputs(module.SamModel)
+            replace_outputs(module.SamModel, Path({regions!r}))
         spec.loader.exec_module = exec_module
         return spec
 
@@ -46,7 +48,7 @@ sys.meta_path.insert(0, Finder())
 """`sitecustomize.py` of all processes of the run, which patches SAM with canned outputs on import."""
 
 
-def make_project(folder: Path, models: dict[str, Path], precision: str) -> list[str]:
+def make_project(folder: Path, models: dict[str, Path], regions: Path, precision: str) -> list[str]:
     """Make a project with links to the code and the models, and return the options of its run."""
     for name in ("Snakefile", "workflow", "rules", "profiles"):
         (folder / name).symlink_to(PROJECT / name)
@@ -57,7 +59,7 @@ def make_project(folder: Path, models: dict[str, Path], precision: str) -> list[
     for kind, place in models.items():
         (folder / "models" / f"rehearsal-{kind}").symlink_to(place.resolve())
     (folder / "patch").mkdir()
-    (folder / "patch/sitecustomize.py").write_text(PATCH)
+    (folder / "patch/sitecustomize.py").write_text(PATCH.format(regions=str(regions)))
     if precision == "auto":
         return []
     fixed = {"overrides": {"photos": {kind: {"precision": precision} for kind in ("masks", "clip")}}}
@@ -120,10 +122,11 @@ def main() -> None:
         return
     if given.folder.exists():
         sys.exit(f"{given.folder} exists, and its caches would shorten the run; pass a new folder")
-    models = export_missing(given.models.resolve(), given.sam)
+    models_folder = given.models.resolve()
+    models = export_missing(models_folder, given.sam)
     given.folder.mkdir(parents=True)
     folder = given.folder.resolve()
-    options = make_project(folder, models, given.precision)
+    options = make_project(folder, models, models_folder / "regions", given.precision)
     found = rehearse(folder, given.photographs.resolve(), options, given.cores)
     print(stage_table(folder))
     print(", ".join(f"{what} after {seconds:.0f} s" for what, seconds in found.items()))
