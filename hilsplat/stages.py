@@ -212,11 +212,12 @@ def contributions(
     settings: of.ContributionsSettings,
     cache: Cache = DEFAULT_CACHE,
     threads: Threads = 1,
+    memory: Memory = None,
 ) -> None:
     """Compute the weight of each Gaussian in each mask, in one pass over the views."""
     from hilsplat.contributions.stage import run_contributions
 
-    run_contributions(scene, gaussians, masks, out, cache, settings, threads)
+    run_contributions(scene, gaussians, masks, out, cache, settings, threads, memory)
 
 
 @stage(artifact="semantic_tree", when=lambda scene: scene.settings.semantic_tree.evidence == "features")
@@ -243,11 +244,12 @@ def semantic_tree(
     out: PathOut,
     settings: of.SemanticTreeSettings,
     threads: Threads = 1,
+    memory: Memory = None,
 ) -> None:
     """Compute nodes at three levels, by linking masks across views."""
     from hilsplat.semantic_tree.build import run_semantic_tree
 
-    run_semantic_tree(contributions, masks, out, settings, threads)
+    run_semantic_tree(contributions, masks, out, settings, threads, memory_mib=memory)
 
 
 @stage(artifact="clip", when=lambda scene: scene.is_imported)

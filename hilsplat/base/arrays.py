@@ -8,6 +8,7 @@ import math
 import mmap
 import os
 import tempfile
+import threading
 import weakref
 import zlib
 from collections.abc import Mapping
@@ -123,20 +124,31 @@ def _checksum(arrays: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> int
 
 
 class Scratch:
-    """Arrays in files without names in a folder, which the system writes out when memory is short."""
+    """Arrays in memory, and beyond a limit in files without names in a folder.
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    The system writes the pages of such files out when memory is short.
+    """
+
+    def __init__(self, folder: Path, memory_bytes: float = 0.0) -> None:
+        self._folder, self._free = folder, memory_bytes
+        self._lock = threading.RLock()  # an array can be deleted while its own thread holds the lock
         self._maps = weakref.WeakSet[mmap.mmap]()
 
+    def _take(self, size: int) -> bool:
+        with self._lock:
+            if is_free := size <= self._free:
+                self._free -= size
+            return is_free
+
     def empty(self, shape: int | tuple[int, ...], dtype: type) -> np.ndarray:
-        """Return an array of zeros, whose file is deleted with it."""
+        """Return an array with any values; its file is deleted with it."""
         sizes = (shape,) if isinstance(shape, int) else shape
-        count = math.prod(sizes)
-        if not count:
-            return np.empty(sizes, dtype)
+        size = math.prod(sizes) * np.dtype(dtype).itemsize
+        if self._take(size):
+            array = np.empty(sizes, dtype)
+            weakref.finalize(array, self._take, -size)
+            return array
         with tempfile.TemporaryFile(dir=self._folder) as stream:
-            size = count * np.dtype(dtype).itemsize
             stream.truncate(size)
             if hasattr(os, "posix_fallocate"):
                 # A full disk raises OSError here; otherwise, writing to a page later would kill the process.

@@ -2,7 +2,6 @@
 
 import logging
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
@@ -36,23 +35,17 @@ MAX_WEIGHTS = 2**28
 CLEARLY_MORE = 2
 """W is dropped once it has this many times as many non-zeros as G, which grows more slowly with the views."""
 
-IN_MEMORY = 2**20
-"""G of more Gaussians is summed in files."""
-
 CHECKPOINT_SECONDS = 300.0
 """Seconds between checkpoints of a long pass; short passes write none."""
 
 ROWS = ("indptr", "indices", "values")
 
-Empty = Callable[..., np.ndarray]
-"""`np.empty`, or the same for arrays in files."""
-
 
 class _Rows:
     """A range of rows of G; memory is reused, because first writes to new pages take time and memory."""
 
-    def __init__(self, rows: int, empty: Empty) -> None:
-        self.indptr, self._empty = np.zeros(rows + 1, np.int64), empty
+    def __init__(self, rows: int, arrays: Scratch) -> None:
+        self.indptr, self._empty = np.zeros(rows + 1, np.int64), arrays.empty
         self._indices, self._values = np.empty(0, np.int32), np.empty((0, len(LEVELS)))
 
     @property
@@ -87,22 +80,20 @@ class _Rows:
 class GramBuilder:
     """Builder that sums G over parts of W, such as views; its memory grows only with the size of G.
 
-    G of more than `IN_MEMORY` Gaussians is in files; memory holds only the pages that one part changes.
-    Entries are summed in float64 in the order of the pixels, so results depend neither on the division of
-    pixels into parts nor on the number of threads. A part shows about 10 % of the Gaussians of a large scene,
-    so sums of known pairs are updated in place. Only late pairs, which were added since the last merge, are
-    rewritten for each part.
+    If G is in files, memory holds only the pages that one part changes. Entries are summed in float64 in the
+    order of the pixels, so results depend neither on the division of pixels into parts nor on the number of
+    threads. A part shows about 10 % of the Gaussians of a large scene, so sums of known pairs are updated in
+    place. Only late pairs, which were added since the last merge, are rewritten for each part.
     """
 
-    def __init__(self, num_gaussians: int, threads: int, folder: Path) -> None:
-        self._files = Scratch(folder) if num_gaussians > IN_MEMORY else None
-        self._empty = np.empty if self._files is None else self._files.empty
+    def __init__(self, num_gaussians: int, threads: int, arrays: Scratch) -> None:
+        self._arrays = arrays
         edges = np.linspace(0, num_gaussians, BLOCKS + 1).astype(np.int64).tolist()
         self._ranges = list(pairwise(edges))
         self._threads = max(1, threads)
         self._cells = np.zeros(0, np.uint64)
-        self._rows = [_Rows(end - begin, self._empty) for begin, end in self._ranges]
-        self._late = [_Rows(end - begin, self._empty) for begin, end in self._ranges]
+        self._rows = [_Rows(end - begin, arrays) for begin, end in self._ranges]
+        self._late = [_Rows(end - begin, arrays) for begin, end in self._ranges]
         self._idle: SimpleQueue[tuple[np.ndarray, ...]] = SimpleQueue()  # buffers of each thread
         for _ in range(self._threads):
             number, fresh = np.zeros(num_gaussians, np.int32), np.empty(num_gaussians, np.int32)
@@ -126,23 +117,24 @@ class GramBuilder:
             rows, late, indptr = self._rows[block], self._late[block], np.zeros(end - begin + 1, np.int64)
             number, sums, fresh, *buffers = self._idle.get()
             pairs = rows.arrays(), late.arrays(), number
-            buffers = add_to_block(begin, end, arrays, columns, *pairs, sums, fresh, indptr, *buffers)
-            late.replace(indptr, *buffers)
-            self._idle.put((number, sums, fresh, *buffers))
+            try:
+                buffers = add_to_block(begin, end, arrays, columns, *pairs, sums, fresh, indptr, *buffers)
+                late.replace(indptr, *buffers)
+            finally:  # after an error, such as a full disk, other blocks must not wait for these buffers
+                self._idle.put((number, sums, fresh, *buffers))
             if MERGE_AT * late.nonzeros > rows.nonzeros:
                 self._merged(block)
 
         with ThreadPoolExecutor(self._threads) as pool:
             list(pool.map(grow, range(BLOCKS)))
-        if self._files is not None:
-            self._files.release()
+        self._arrays.release()
 
     def _merged(self, number: int) -> _Rows:
         """Merge the late pairs of a block, and return all its pairs."""
         rows, late = self._rows[number], self._late[number]
         if late.nonzeros:
             rows.merge(late)
-            self._late[number] = _Rows(len(rows.indptr) - 1, self._empty)
+            self._late[number] = _Rows(len(rows.indptr) - 1, self._arrays)
         return rows
 
     def _columns(self, weights: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray]:
@@ -171,12 +163,12 @@ class GramBuilder:
     def finish(self) -> Gram:
         """Return G of all added parts, and empty the builder."""
         indptr = np.zeros(self._ranges[-1][1] + 1, np.int64)
-        indices = self._empty(self.nonzeros, np.int32)
-        values = self._empty((len(indices), len(LEVELS)), np.float32)
+        indices = self._arrays.empty(self.nonzeros, np.int32)
+        values = self._arrays.empty((len(indices), len(LEVELS)), np.float32)
         done = 0
         for number, (begin, end) in enumerate(self._ranges):
             some_indptr, some_indices, some_values = self._merged(number).arrays()
-            self._rows[number] = _Rows(0, self._empty)
+            self._rows[number] = _Rows(0, self._arrays)
             indptr[begin + 1 : end + 1] = some_indptr[1:] + done
             indices[done : done + len(some_indices)] = some_indices
             values[done : done + len(some_indices)] = some_values
@@ -190,12 +182,13 @@ class QuadraticBuilder:
     A product reads each non-zero of G or W equally often. W is dropped and G is kept as soon as W has more
     than `MAX_WEIGHTS` non-zeros, or more than `CLEARLY_MORE` times those of G so far. G is dropped as soon as
     it has more than W will have if the remaining parts have as many as the parts so far. `keep` is "auto", or
-    "gram" or "weights" to force G or W. Large sums are in files without names in `folder`.
+    "gram" or "weights" to force G or W. Both are in `arrays`.
     """
 
-    def __init__(self, num_gaussians: int, keep: str, parts: int, threads: int, folder: Path) -> None:
+    def __init__(self, num_gaussians: int, keep: str, parts: int, threads: int, arrays: Scratch) -> None:
+        self._arrays = arrays
         self._num_gaussians, self._num_parts, self._added = num_gaussians, parts, 0
-        self._gram = None if keep == "weights" else GramBuilder(num_gaussians, threads, folder)
+        self._gram = None if keep == "weights" else GramBuilder(num_gaussians, threads, arrays)
         self._keeps_weights = keep != "gram"
         self._may_drop = keep == "auto"
         self._parts: list[StackedWeights] = []
@@ -205,7 +198,7 @@ class QuadraticBuilder:
         self.weights_nonzeros += part.nonzeros
         if self._keeps_weights:
             # copied, because a part shares the memory of all weights of its view, which may be much larger
-            self._parts.append(StackedWeights(part.weights.copy(), part.valid))
+            self._parts.append(stack_weights([part], self._arrays))
         self._added += 1
         if self._gram is None:
             return
@@ -223,7 +216,7 @@ class QuadraticBuilder:
         if self._gram is not None:
             out |= self._gram.state()
         if self._parts:
-            self._parts = [stacked := stack_weights(self._parts)]
+            self._parts = [stacked := stack_weights(self._parts, self._arrays)]
             out |= {"valid": stacked.valid, "data": stacked.weights.data}
             out |= {"columns": stacked.weights.indices, "starts": stacked.weights.indptr}
         return out
@@ -243,7 +236,7 @@ class QuadraticBuilder:
 
     def finish(self) -> Quadratic:
         if self._gram is None or (self._keeps_weights and self.weights_nonzeros < self._gram.nonzeros):
-            return stack_weights(self._parts)
+            return stack_weights(self._parts, self._arrays)
         return self._gram.finish()
 
 
@@ -288,12 +281,10 @@ class QuadraticCheckpoint:
         delete(self._folder, DIGEST)
 
 
-def stack_weights(parts: list[StackedWeights]) -> StackedWeights:
-    """Join parts, which are taken from the list one by one, so that memory holds W only once."""
-    if len(parts) == 1:
-        return parts[0]
+def stack_weights(parts: list[StackedWeights], arrays: Scratch) -> StackedWeights:
+    """Join copies of parts, which are taken from the list one by one, so that memory holds W only once."""
     sizes, pixels = [part.nonzeros for part in parts], [len(part.valid) for part in parts]
-    data, indices = np.empty(sum(sizes), np.float32), np.empty(sum(sizes), np.int32)
+    data, indices = (arrays.empty(sum(sizes), dtype) for dtype in (np.float32, np.int32))
     indptr, valid = np.zeros(sum(pixels) + 1, np.int64), np.empty((sum(pixels), len(LEVELS)), bool)
     at, row, columns = 0, 0, parts[0].num_gaussians
     for size, height in zip(sizes, pixels, strict=True):

@@ -22,13 +22,14 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from hilsplat.base.arrays import require_types
+from hilsplat.base.arrays import Scratch, require_types
 from hilsplat.base.artifacts import read_index, write_index, write_npz
 from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.cache import ViewCache
 from hilsplat.base.code import code_digest
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.lineage import sha256_of_bytes, sha256_of_file, sha256_of_json
+from hilsplat.base.memory import MIB, limit_mib, require_memory
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.contributions.compositing import normalised_weights
@@ -50,6 +51,12 @@ MATRICES = ("A", "A_half", "S", "mass")
 PARTS = {"data": np.float32, "indices": np.int32, "indptr": np.int64}
 
 WEIGHTS_PER_PIXEL = 40  # weights per pixel in a typical scene
+
+BASE_MIB, WEIGHT_BYTES, GAUSSIAN_BYTES = 350, 24, 200
+"""Memory of the stage without G and W of all views: of libraries, per weight of a view, and per Gaussian."""
+
+IN_MEMORY = 2**20
+"""G and W of more Gaussians are summed in files."""
 
 MAX_WEIGHTS_TOGETHER = 2**25
 """Views with more weights (256 MiB) are prepared one at a time; up to four finished views may be waiting."""
@@ -153,8 +160,12 @@ def view_masks(masks_folder: Path, camera: Camera, digests: dict[str, str]) -> H
 
 def views_at_once(cameras: list[Camera], threads: int) -> int:
     """Return 2 if W of two views fits in memory, because half the work on a view uses one thread, else 1."""
-    most_px = max((math.prod(camera.size_hw) for camera in cameras), default=0)
-    return min(2, max(1, threads)) if most_px * WEIGHTS_PER_PIXEL <= MAX_WEIGHTS_TOGETHER else 1
+    return min(2, max(1, threads)) if weights_of_view(cameras) <= MAX_WEIGHTS_TOGETHER else 1
+
+
+def weights_of_view(cameras: list[Camera]) -> int:
+    """Return the typical number of weights of the largest view."""
+    return WEIGHTS_PER_PIXEL * max((math.prod(camera.size_hw) for camera in cameras), default=0)
 
 
 def drawn_weights(gaussians: Gaussians, camera: Camera, *, min_weight: float, threads: int) -> sp.csr_matrix:
@@ -174,18 +185,20 @@ def run_contributions(
     cache: Path,
     settings: ContributionsSettings,
     threads: int,
+    memory_mib: float | None = None,
 ) -> None:
     """Write A, A_half, S, mass, and G or W, in one pass over the training views.
 
     One or two views are prepared while rows of previous views are written and added to G. Memory contains
-    these views and the sum of G so far. After an interruption, a rerun reads the matrices of finished views
-    from the cache, and G from a checkpoint at most `CHECKPOINT_SECONDS` (and one view) old; it rasterises W
-    again for views not yet in that G.
+    these views and the sums so far; sums that don't fit into `memory_mib` are in files. After an
+    interruption, a rerun reads the matrices of finished views from the cache, and G from a checkpoint at most
+    `CHECKPOINT_SECONDS` (and one view) old; it rasterises W again for views not yet in that G.
 
     Raises:
         MisalignedArtifactError: masks and images differ in size, or the masks of a view differ from those
             recorded in their index.
         ArtifactError: no training view has masks.
+        MemoryLimitError: one view needs more than `memory_mib`, or more than this machine has.
         DeviceError: `settings.device` is `cuda` and cannot be used, or the card's memory runs out.
     """
     scene, gaussians = Scene.load(scene_folder), load_ply(gaussians_ply)
@@ -200,7 +213,18 @@ def run_contributions(
         "min_weight": settings.min_weight,
     }
     keys = [view_key(camera, digests.get(camera.name), inputs) for camera in cameras]
+    fixed_mib = BASE_MIB + GAUSSIAN_BYTES * len(gaussians) / MIB
+    view_mib = WEIGHT_BYTES * weights_of_view(cameras) / MIB
+    require_memory(
+        fixed_mib + view_mib,
+        memory_mib,
+        f"contributions of {len(gaussians):,} Gaussians in a view of {scene.name}",
+        "lower poses.max_side_px or gaussians.max_gaussians",
+    )
     together = views_at_once(cameras, threads)
+    if fixed_mib + together * view_mib > limit_mib(memory_mib):
+        together = 1
+    sums_mib = limit_mib(memory_mib) - fixed_mib - together * view_mib
     threads_each = max(1, threads // together)
     store = ViewCache(Path(cache) / "contributions", compressed=False)
     checkpoint = QuadraticCheckpoint(store.folder / "partial", keys, settings.keep)
@@ -232,7 +256,8 @@ def run_contributions(
         return masks, matrices, labelled_rows(W, label_maps(masks))
 
     with stage_log("contributions", scene.name) as counts, atomic_folder(out) as folder:
-        builder = QuadraticBuilder(len(gaussians), settings.keep, len(cameras), threads, folder)
+        sums = Scratch(folder, sums_mib * MIB if len(gaussians) <= IN_MEMORY else 0.0)
+        builder = QuadraticBuilder(len(gaussians), settings.keep, len(cameras), threads, sums)
         summed = checkpoint.resume(builder)
         output = Output(folder)
         prepared = in_order(prepare, range(len(cameras)), together)

@@ -9,6 +9,7 @@ from hilsplat.base.artifacts import read_index, read_npz, sealed, write_json
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.lineage import require_made_from, sha256_of_file
+from hilsplat.base.memory import require_memory
 from hilsplat.base.progress import stage_log
 from hilsplat.contributions.compositing import column_sums
 from hilsplat.contributions.mask_operator import MaskOperator
@@ -58,8 +59,6 @@ def run_field(
     contributions = Contributions.load(contributions_folder)
     scene = read_index(contributions_folder)["scene"]
     latents = load_latents(autoencoder_folder, contributions)
-    from hilsplat.models.memory import require_memory  # slow to import
-
     require_memory(
         field_mib(contributions, latents.shape[1], settings),
         memory_mib,

@@ -89,6 +89,7 @@ def build_tree(
     threads: int,
     join_wholes: bool,
     of_levels: Iterable[LevelNodes] | None,
+    memory_mib: float | None,
 ) -> SemanticTree:
     """Link masks into nodes, compute the nodes' Gaussians, parents and boxes, and score their crops.
 
@@ -108,7 +109,7 @@ def build_tree(
     membership = np.zeros((S.shape[1], len(LEVELS)), np.float32)
     nearest = None if of_levels else nearest_gaussians(means, threads)
     rows_of_levels = [contributions.rows_of(level) for level in LEVELS]
-    of_levels = of_levels or linked_nodes(S, mass, view, rows_of_levels, settings, threads)
+    of_levels = of_levels or linked_nodes(S, mass, view, rows_of_levels, settings, threads, memory_mib)
     for level, rows, nodes in zip(LEVELS, rows_of_levels, of_levels, strict=True):
         if join_wholes and level is Level.WHOLE:
             whole = joined_regions(nodes.of_gaussian, len(nodes.quality), means, mass, settings.whole_side)
@@ -224,6 +225,7 @@ def run_semantic_tree(
     settings: SemanticTreeSettings,
     threads: int = 1,
     of_levels: Iterable[LevelNodes] | None = None,
+    memory_mib: float | None = None,
 ) -> None:
     """Write the 3D semantic tree of a scene: `tree.npz`, the human-readable `tree.json`, and `index.json`.
 
@@ -232,6 +234,7 @@ def run_semantic_tree(
     Raises:
         MisalignedArtifactError: the contributions were computed from different masks.
         ArtifactError: the masks do not record their segmenter.
+        MemoryLimitError: linking needs more than `memory_mib`, or more than this machine has.
     """
     contributions = Contributions.load(contributions_folder)
     index = read_index(contributions_folder)
@@ -239,7 +242,7 @@ def run_semantic_tree(
     require_same_masks(contributions_folder, masks_folder)
     with stage_log("semantic tree", scene) as counts:
         join_wholes = read_index(masks_folder, "segmenter")["segmenter"] == "graph"
-        tree = build_tree(contributions, settings, threads, join_wholes, of_levels)
+        tree = build_tree(contributions, settings, threads, join_wholes, of_levels, memory_mib)
         per_level = {level.label: len(tree.nodes_of(level)) for level in LEVELS}
         counts |= {**per_level, "orphans": int(((tree.parent == NONE) & (tree.level > 1)).sum())}
         if not len(tree):

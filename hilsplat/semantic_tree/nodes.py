@@ -10,11 +10,12 @@ import scipy.sparse as sp
 from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt8
 
 from hilsplat.base.levels import LEVELS, NONE
+from hilsplat.base.memory import MIB, limit_mib, require_memory
 from hilsplat.contributions.compositing import column_sums
 from hilsplat.semantic_tree.evidence import Evidence, mask_evidence
 from hilsplat.semantic_tree.kernels import add_views, divide_by_unions
 from hilsplat.semantic_tree.linkage import prepared_linkage
-from hilsplat.semantic_tree.view_pairs import view_pairs
+from hilsplat.semantic_tree.view_pairs import ViewPairs, view_pairs
 from hilsplat.settings import SemanticTreeSettings
 
 MIN_VISIBLE_PX = 0.3
@@ -22,6 +23,15 @@ MIN_VISIBLE_PX = 0.3
 
 MAX_LINKED_MEANWHILE = 150_000
 """A level is compared while the one above is linked, unless it has more masks: their pairs take gigabytes."""
+
+SAMPLED_VIEWS = 8
+"""Number of views whose pairs of masks are counted to estimate the memory of all pairs."""
+
+PAIR_BYTES, LINKED_PAIR_BYTES = 80, 40
+"""Memory per pair of masks while a level is compared, and while it is linked."""
+
+BASE_MIB, ENTRY_BYTES, GAUSSIAN_BYTES = 300, 40, 300
+"""Other memory of the stage: of libraries, per entry of a level's rows of S, and per Gaussian."""
 
 MIN_COVISIBLE = 0.2
 """Two masks are not used as evidence if each mask's view shows less than this share of the other mask."""
@@ -78,6 +88,7 @@ def linked_nodes(
     rows_of_levels: Sequence[Int64[np.ndarray, " _"]],
     settings: SemanticTreeSettings,
     threads: int,
+    memory_mib: float | None = None,
 ) -> Iterator[LevelNodes]:
     """Link the masks of each level (rows of `S`) into nodes, and assign Gaussians to them.
 
@@ -86,13 +97,16 @@ def linked_nodes(
 
     Linking takes one thread; with several, the next level is prepared at the same time. `S` and `mass`,
     the visible mass of each Gaussian in each view, are in px; masks are sorted by view.
+
+    Raises:
+        MemoryLimitError: the pairs of masks need more than `memory_mib`, or more than this machine has.
     """
     visible = visible_in(mass)
     total_mass = column_sums(mass)
     importance = column_sums(visible) / np.maximum(num_views_of(visible), 1)
     pairs = view_pairs(visible)
 
-    def evidence(rows: Int64[np.ndarray, " m"]) -> Evidence:
+    def evidence(rows: Int64[np.ndarray, " m"], pairs: ViewPairs = pairs) -> Evidence:
         view, shares = view_of_mask[rows], S[rows].astype(np.float64)
         there = mass_at_entries(shares, mass, view)
         shares.data /= np.where(there > MIN_VISIBLE_PX, there, np.inf)
@@ -123,10 +137,34 @@ def linked_nodes(
         of_mask = renumber[of_cluster[cluster]].astype(np.int64)
         return LevelNodes(of_mask, renumber[node], share, quality[with_views[renumber[:-1] != NONE]])
 
+    def most_at_once() -> int:
+        """Return 2 if memory suffices to compare a level while another is linked, else 1.
+
+        If the pairs of all masks of partner views don't fit, those of a few views are counted.
+        """
+        num_views, most_mib = mass.shape[0], limit_mib(memory_mib)
+        entries = max(int(np.diff(S.indptr)[rows].sum()) for rows in rows_of_levels)
+        other_mib = BASE_MIB + (ENTRY_BYTES * entries + GAUSSIAN_BYTES * S.shape[1]) / MIB
+        first = np.repeat(np.arange(num_views), np.diff(pairs.indptr))
+        masks = [np.bincount(view_of_mask[rows], minlength=num_views) for rows in rows_of_levels]
+        counts = [float(number[first] @ number[pairs.partners]) / 2 for number in masks]
+        if other_mib + _pairs_mib(counts, 2) > most_mib:
+            sampled = pairs.of_views(np.linspace(0, num_views - 1, SAMPLED_VIEWS).astype(np.int64))
+            scale = (len(pairs.partners) - num_views) / max(1, len(sampled.partners) - num_views)
+            counts = [scale * len(evidence(rows, sampled).indices) for rows in rows_of_levels]
+        require_memory(
+            other_mib + _pairs_mib(counts, 1),
+            memory_mib,
+            f"the semantic tree of {len(view_of_mask):,} masks in {num_views:,} views",
+            "use fewer photographs, or divide the scene into blocks (docs/large_captures.md)",
+        )
+        return 2 if other_mib + _pairs_mib(counts, 2) <= most_mib else 1
+
+    meanwhile = most_at_once() > 1 and threads > 1
     with ThreadPoolExecutor(1, "linkage") as linker:
         linked: list[Future[Any]] = []
         for rows in rows_of_levels:
-            wait(linked if threads == 1 or len(rows) > MAX_LINKED_MEANWHILE else ())
+            wait(() if meanwhile and len(rows) <= MAX_LINKED_MEANWHILE else linked)
             found = evidence(rows)
             wait(linked)
             linked.append(linker.submit(prepared_linkage(found, settings.link_threshold)))
@@ -134,6 +172,13 @@ def linked_nodes(
         wait(linked if threads == 1 else ())
         for rows, clusters in zip(rows_of_levels, linked, strict=True):
             yield nodes(rows, *clusters.result())
+
+
+def _pairs_mib(counts: Sequence[float], at_once: int) -> float:
+    """Return the memory for the pairs of masks of each level, of one or two levels at once, MiB."""
+    linked = counts[:-1] if at_once > 1 else [0.0] * (len(counts) - 1)
+    pairs = zip(counts, [0.0, *linked], strict=True)
+    return max(PAIR_BYTES * compared + LINKED_PAIR_BYTES * before for compared, before in pairs) / MIB
 
 
 def _row_of(matrix: sp.csr_matrix) -> Int64[np.ndarray, " E"]:

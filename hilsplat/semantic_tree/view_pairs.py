@@ -42,6 +42,14 @@ class ViewPairs:
     mirror: Int64[np.ndarray, " E"]
     min_iou: float
 
+    def of_views(self, views: Int64[np.ndarray, " S"]) -> "ViewPairs":
+        """Return the pairs that contain one of these views; other views keep only themselves."""
+        num = len(self.indptr) - 1
+        row, chosen = np.repeat(np.arange(num), np.diff(self.indptr)), np.isin(np.arange(num), views)
+        kept = chosen[row] | chosen[self.partners] | (row == self.partners)
+        entries = np.ones(kept.sum(), np.int8), (row[kept], self.partners[kept])
+        return _symmetric(sp.csr_matrix(entries, shape=(num, num)), self.min_iou)
+
 
 def view_pairs(visible: sp.csr_matrix) -> ViewPairs:
     """Choose the partners of each view.
@@ -64,14 +72,18 @@ def view_pairs(visible: sp.csr_matrix) -> ViewPairs:
         columns = np.concatenate(chosen)
         own = sp.csr_matrix((np.ones(len(columns), np.int8), columns, indptr), shape=(num, num))
         pattern = (own + own.T + sp.eye(num, dtype=np.int8)).tocsr()
+    return _symmetric(pattern, 0.0 if num <= MAX_ALL else MIN_IOU)
+
+
+def _symmetric(pattern: sp.csr_matrix, min_iou: float) -> ViewPairs:
+    """Return the pairs that are stored entries of a symmetric matrix."""
     pattern.sort_indices()
-    row = np.repeat(np.arange(num), np.diff(pattern.indptr))
+    row = np.repeat(np.arange(pattern.shape[0]), np.diff(pattern.indptr))
     # Sorting the entries by column, then row lists the mirror entries of the rows in order.
     place = np.empty(len(row), np.int64)
     place[np.lexsort((row, pattern.indices))] = np.arange(len(row))
     mirror = place - pattern.indptr[pattern.indices]
-    partners, min_iou = pattern.indices.astype(np.int32), 0.0 if num <= MAX_ALL else MIN_IOU
-    return ViewPairs(pattern.indptr.astype(np.int64), partners, mirror, min_iou)
+    return ViewPairs(pattern.indptr.astype(np.int64), pattern.indices.astype(np.int32), mirror, min_iou)
 
 
 def _shared(visible: sp.csr_matrix) -> Iterator[Int32[np.ndarray, " V"]]:

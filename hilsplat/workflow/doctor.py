@@ -16,8 +16,8 @@ from packaging.specifiers import SpecifierSet
 from hilsplat.base.atomic import existing_folder
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.lineage import version_of
+from hilsplat.base.memory import machine_mib
 from hilsplat.configuration import merged_config
-from hilsplat.models.memory import machine_mib
 from hilsplat.models.store import RECOMMENDED, broken_models, present_models, user_models
 from hilsplat.stages import all_stages
 from hilsplat.workflow.plan import Plan

@@ -24,6 +24,7 @@ from hilsplat.base.cards import cards
 from hilsplat.base.errors import ImageError, ModelError
 from hilsplat.base.images import opened_image
 from hilsplat.base.levels import LEVELS
+from hilsplat.base.memory import MIB
 from hilsplat.baselines import TrainedSettings
 from hilsplat.configuration import StageSettings
 from hilsplat.datasets.generators import GENERATORS
@@ -339,7 +340,7 @@ def _first_mp(images: Iterable[str], max_side_px: int) -> float:
 def _model_memory_mb(folder: Path, variant: str, batch: int | str, threads: int) -> int:
     """Return the memory of a stage's model, MB; 0 if the folder is unreadable (the stage reports it)."""
     from hilsplat.models.folder import open_model_folder
-    from hilsplat.models.memory import MIB, needs_of  # onnxruntime is slow to import
+    from hilsplat.models.memory import needs_of  # onnxruntime is slow to import
     from hilsplat.segment.sam import own_thresholds
 
     try:

@@ -1,5 +1,7 @@
 """A and G compared with their definitions, and the files of the stage."""
 
+import errno
+import math
 import tempfile
 from pathlib import Path
 
@@ -7,8 +9,9 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
+from hilsplat.base.arrays import Scratch
 from hilsplat.base.artifacts import read_index, write_index
-from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.errors import MemoryLimitError, MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.base.lineage import sha256_of_path
 from hilsplat.contributions import quadratic_builder, stage
@@ -33,6 +36,7 @@ from tests.unit.two_boxes_world import (
 
 SIZE = (9, 7)
 PIXELS = 63
+IN_MEMORY = Scratch(Path(tempfile.gettempdir()), math.inf)
 
 
 def random_view(seed: int, num_gaussians: int = 40) -> tuple[sp.csr_matrix, HierarchicalMasks]:
@@ -93,7 +97,7 @@ def test_mask_means_equal_their_definition(seed):
 
 def built(parts: list[StackedWeights], threads: int = 1, keep: str | None = None) -> Gram | StackedWeights:
     """Build G, or with `keep` G or W."""
-    more = threads, Path(tempfile.gettempdir())
+    more = threads, IN_MEMORY
     builder = QuadraticBuilder(40, keep, len(parts), *more) if keep else GramBuilder(40, *more)
     for part in parts:
         builder.add(part)
@@ -119,7 +123,7 @@ def test_gram_and_weights_give_the_quadratic_form_of_every_level(channels):
     gram = built(stacked)
     features = np.random.default_rng(5).normal(size=(40, 3, channels)).astype(np.float32)
     expected = np.einsum("lij,jld->ild", dense, features)
-    for each in (gram, stack_weights(list(stacked))):
+    for each in (gram, stack_weights(list(stacked), IN_MEMORY)):
         assert each.product(features) == pytest.approx(expected, abs=1e-5)
         assert form(each, features) == pytest.approx((features * expected).sum(), rel=1e-6)
         own, others = each.block(10, 30).product(features[10:30]), each.across(10, 30, features)
@@ -139,7 +143,7 @@ def test_gram_and_weights_give_the_quadratic_form_of_every_level(channels):
 def test_gram_depends_neither_on_threads_nor_on_how_the_pixels_are_divided(merge_at, monkeypatch):
     monkeypatch.setattr(quadratic_builder, "MERGE_AT", merge_at)
     parts = [labelled_part(seed) for seed in range(4)]
-    one = built([stack_weights(list(parts))])
+    one = built([stack_weights(list(parts), IN_MEMORY)])
     assert_same_gram(built(parts), one)
     assert_same_gram(built(parts, threads=2), one)
     assert_same_gram(built(parts, keep="gram"), one)
@@ -148,21 +152,45 @@ def test_gram_depends_neither_on_threads_nor_on_how_the_pixels_are_divided(merge
     assert_same_gram(built(parts, keep="auto"), one)
 
 
-def test_gram_of_many_gaussians_is_in_files_and_the_same(monkeypatch, tmp_path):
+@pytest.mark.parametrize("memory_bytes", [0.0, 10_000.0])
+def test_sums_in_files_are_the_same(memory_bytes, tmp_path):
     parts = [labelled_part(seed) for seed in range(4)]
-    one = built(parts)
-    monkeypatch.setattr(quadratic_builder, "IN_MEMORY", 39)
-    builder = GramBuilder(40, 2, tmp_path)
-    for part in parts:
-        builder.add(part)
-    assert_same_gram(builder.finish(), one)
+    arrays = Scratch(tmp_path, memory_bytes)
+    for keep in ("gram", "weights"):
+        builder, one = QuadraticBuilder(40, keep, len(parts), 2, arrays), built(parts, keep=keep)
+        for part in parts:
+            builder.add(part)
+        found = builder.finish()
+        matrices = (found, one) if keep == "gram" else (found.weights, one.weights)
+        for name in ("indptr", "indices", "values" if keep == "gram" else "data"):
+            assert getattr(matrices[0], name).tobytes() == getattr(matrices[1], name).tobytes()
     assert not list(tmp_path.iterdir())
 
 
+def test_a_full_disk_ends_the_sums_with_its_error(tmp_path, monkeypatch):
+    builder = GramBuilder(40, 1, Scratch(tmp_path))
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("os.posix_fallocate", full)
+    with pytest.raises(OSError, match="No space left"):
+        builder.add(labelled_part(0))
+
+
+def test_scratch_keeps_arrays_in_memory_up_to_its_limit(tmp_path):
+    arrays = Scratch(tmp_path, 100.0)
+    first, second = arrays.empty(10, np.float64), arrays.empty((2, 2), np.float64)
+    assert first.base is None
+    assert second.base is not None  # in a file
+    del first
+    assert arrays.empty(10, np.float64).base is None
+
+
 @pytest.mark.parametrize("keep", ["auto", "weights", "gram"])
-def test_a_builder_resumes_from_its_state(keep, tmp_path):
+def test_a_builder_resumes_from_its_state(keep):
     parts = [labelled_part(seed) for seed in range(3)]
-    first, second = (QuadraticBuilder(40, keep, 3, 1, tmp_path) for _ in range(2))
+    first, second = (QuadraticBuilder(40, keep, 3, 1, IN_MEMORY) for _ in range(2))
     first.add(parts[0])
     first.add(parts[1])
     second.restore(first.state())
@@ -171,6 +199,12 @@ def test_a_builder_resumes_from_its_state(keep, tmp_path):
     assert type(whole) is type(resumed)
     columns = np.repeat(np.eye(40, dtype=np.float32)[:, None], 3, axis=1)
     assert whole.product(columns).tobytes() == resumed.product(columns).tobytes()
+
+
+def test_a_view_that_needs_more_memory_is_refused(two_boxes):
+    inputs = two_boxes.scene, two_boxes.ply, two_boxes.masks, two_boxes.folder / "out", two_boxes.folder / "c"
+    with pytest.raises(MemoryLimitError, match=r"96 Gaussians in a view of(.|\n)*poses.max_side_px"):
+        run_contributions(*inputs, ContributionsSettings(), 1, memory_mib=100.0)
 
 
 def test_the_smaller_quadratic_is_kept_and_read_back_equal(two_boxes):

@@ -10,6 +10,7 @@ import scipy.sparse as sp
 import torch
 from scipy.optimize import minimize
 
+from hilsplat.base.arrays import Scratch
 from hilsplat.base.artifacts import read_index, read_json, write_index
 from hilsplat.base.errors import MemoryLimitError, MisalignedArtifactError, SettingsError
 from hilsplat.contributions.mask_operator import MaskOperator
@@ -103,7 +104,7 @@ def test_conjugate_gradient_reaches_the_dense_solution():
 def test_each_block_is_solved_with_the_others_fixed(stored, tmp_path):
     toy = Toy(weights := (1.0, 0.3, 0.1))
     if stored == "gram":
-        builder = GramBuilder(GAUSSIANS, 1, tmp_path)
+        builder = GramBuilder(GAUSSIANS, 1, Scratch(tmp_path))
         builder.add(toy.problem.quadratic)
         toy.problem = replace(toy.problem, quadratic=builder.finish())
     blocks = (0, 4), (4, 8), (8, 12)

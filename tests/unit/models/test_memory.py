@@ -4,9 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from hilsplat.base.memory import available_mib, machine_mib
 from hilsplat.models.folder import ModelFolder
 from hilsplat.models.int8 import reduced_precision
-from hilsplat.models.memory import PROCESS_MIB, Needs, available_mib, machine_mib, needs_of
+from hilsplat.models.memory import PROCESS_MIB, Needs, needs_of
 
 
 def folder(tmp_path, layout: str, config: dict, size: int, megabytes: int = 0) -> ModelFolder:
@@ -97,7 +98,7 @@ def write_system(folder: Path, membership: str, groups: dict) -> None:
 )
 def test_memory_limits_of_control_groups(tmp_path, monkeypatch, membership, groups, limit_gib, free_gib):
     monkeypatch.setattr("os.sysconf", {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 64 * GIB // 4096}.__getitem__)
-    monkeypatch.setattr("hilsplat.models.memory.SYSTEM", tmp_path)
+    monkeypatch.setattr("hilsplat.base.memory.SYSTEM", tmp_path)
     write_system(tmp_path, membership, groups)
     assert machine_mib() == 1024 * limit_gib
     assert available_mib() == 1024 * free_gib

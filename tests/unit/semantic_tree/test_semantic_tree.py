@@ -7,10 +7,11 @@ import pytest
 import scipy.sparse as sp
 
 from hilsplat.base.artifacts import read_index, read_json, read_npy, write_index, write_npy
-from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.errors import MemoryLimitError, MisalignedArtifactError
 from hilsplat.base.lineage import sha256_of_path
 from hilsplat.semantic_tree import nodes
 from hilsplat.semantic_tree.build import run_semantic_tree
+from hilsplat.semantic_tree.evidence import mask_evidence
 from hilsplat.semantic_tree.nodes import (
     gaussian_nodes,
     linked_nodes,
@@ -19,6 +20,7 @@ from hilsplat.semantic_tree.nodes import (
     without_strays,
 )
 from hilsplat.semantic_tree.tree import SemanticTree
+from hilsplat.semantic_tree.view_pairs import ViewPairs, view_pairs
 from hilsplat.settings import SemanticTreeSettings
 from tests.unit.artifact_changes import change_index
 from tests.unit.two_boxes_world import HEIGHT, NUM_GAUSSIANS, REGIONS, WIDTH, region_mask, reverse_masks
@@ -145,6 +147,39 @@ def test_a_rerun_writes_the_same_bytes_and_too_few_views_give_an_empty_tree(tree
     run_semantic_tree(world.folder / "contributions", world.masks, out, SemanticTreeSettings(min_views=5))
     assert len(SemanticTree.load(out)) == 0
     assert "has no nodes" in caplog.text
+
+
+def test_levels_are_compared_one_by_one_if_memory_is_short(tree_of_boxes, monkeypatch):
+    world, out = tree_of_boxes
+    inputs = world.folder / "contributions", world.masks, world.folder / "short", SemanticTreeSettings(), 2
+    at_once: list[int] = []
+
+    def pairs_mib(counts: list[float], levels: int) -> float:
+        at_once.append(levels)
+        return 1000.0 * levels if len(at_once) > 1 else 5000.0  # the bound doesn't fit, the counted pairs do
+
+    monkeypatch.setattr(nodes, "_pairs_mib", pairs_mib)
+    run_semantic_tree(*inputs, memory_mib=1500.0)
+    assert at_once == [2, 1, 2]
+    assert sha256_of_path(world.folder / "short" / "tree.npz") == sha256_of_path(out / "tree.npz")
+    with pytest.raises(MemoryLimitError, match=r"tree of 24 masks in 4 views(.|\n)*found +1.0 GiB"):
+        run_semantic_tree(*inputs, memory_mib=1024.0)
+
+
+def test_a_few_views_tell_the_number_of_pairs():
+    """The sample's pairs, scaled by pairs of views, are those of all views if every view is alike."""
+    num, masks = 40, 3
+    visible = sp.csr_matrix(np.ones((num, 30), np.float32))
+    shares = sp.csr_matrix(np.tile(np.kron(np.eye(masks), np.ones(10)), (num, 1)))
+    view, pairs = np.repeat(np.arange(num, dtype=np.int32), masks), view_pairs(visible)
+
+    def count(of: ViewPairs) -> int:
+        return len(mask_evidence(shares, np.ones(30), visible, view, of, 0.2).indices)
+
+    sampled = pairs.of_views(np.array([0, 13, 39]))
+    assert len(sampled.partners) - num == 2 * (39 + 38 + 37)
+    assert count(sampled) == masks * (39 + 38 + 37)
+    assert count(pairs) == masks * num * (num - 1) // 2
 
 
 def test_masks_in_another_order_are_refused(tree_of_boxes):
