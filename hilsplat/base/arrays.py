@@ -145,7 +145,7 @@ class Scratch:
         sizes = (shape,) if isinstance(shape, int) else shape
         size = math.prod(sizes) * np.dtype(dtype).itemsize
         if self._take(size):
-            array = np.empty(sizes, dtype)
+            array: np.ndarray = np.empty(sizes, dtype)
             weakref.finalize(array, self._take, -size)
             return array
         with tempfile.TemporaryFile(dir=self._folder) as stream:

@@ -284,10 +284,13 @@ class JobResources:
 
 
 def _pairs_mb(views: int) -> float:
-    """Return the memory for the pairs of masks that are compared, with 300 masks per view, MB."""
+    """Return the memory for the pairs of masks that are compared, with about 400 masks per view, MB.
+
+    The stage counts them, and refuses to start if they need more.
+    """
     from hilsplat.semantic_tree.view_pairs import MAX_ALL
 
-    return 0.078 * views**2 if views <= MAX_ALL else 2.7 * views
+    return 0.12 * views**2 if views <= MAX_ALL else 4.0 * views
 
 
 def _fit_can_use_card() -> bool:
