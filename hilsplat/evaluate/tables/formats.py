@@ -23,11 +23,14 @@ LATEX_SPECIAL = str.maketrans({letter: "\\" + letter for letter in "&%$#_{}"} | 
 HTML_STYLE = """<style>
 .hilsplat-table { font: 14px/1.4 system-ui, sans-serif; color: #1b1b1b; background: #fff; padding: 1em; }
 .hilsplat-table table { border-collapse: collapse; margin: 0 0 1.2em; }
-.hilsplat-table caption { text-align: left; font-weight: 600; padding: .4em 0; }
+.hilsplat-table h3 { font-size: 1em; margin: .4em 0; }
 .hilsplat-table th, .hilsplat-table td { padding: .2em .6em; text-align: right; white-space: nowrap; }
-.hilsplat-table th { border-bottom: 1px solid #444; font-weight: 600; }
+.hilsplat-table th { border-bottom: 1px solid #444; font-weight: 600; white-space: normal; }
+.hilsplat-table th { vertical-align: bottom; }
 .hilsplat-table .name { text-align: left; }
+.hilsplat-table tr { background: #fff; }
 .hilsplat-table tbody tr:nth-child(even) { background: #f6f6f6; }
+.hilsplat-table tr > :first-child { position: sticky; left: 0; background: inherit; }
 .hilsplat-table .rank1 { background: rgb(255,179,179); font-weight: 700; }
 .hilsplat-table .rank2 { background: rgb(255,217,179); }
 .hilsplat-table .rank3 { background: rgb(255,255,179); }
@@ -128,8 +131,7 @@ def as_html(table: Table) -> str:
     notes = table.numbered_notes()
     lines = [HTML_STYLE, '<div class="hilsplat-table">', f"<h2>{html.escape(table.title)}</h2>"]
     for block in table.blocks:
-        lines.append('<div class="scroll"><table>')
-        lines += [f"<caption>{html.escape(block.title)}</caption>", "<thead><tr>"]
+        lines += [f"<h3>{html.escape(block.title)}</h3>", '<div class="scroll"><table><thead><tr>']
         lines += [f'<th class="name">{html.escape(name)}</th>' for name in block.names()]
         lines += [f"<th>{html.escape(column)}</th>" for column in block.filled_columns()]
         lines += ["</tr></thead>", "<tbody>"]
