@@ -3,6 +3,7 @@
 All geometry is computed here, with the polygon filling used in evaluation; the page only displays it.
 """
 
+import shlex
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -122,7 +123,9 @@ class OpenedScene(ShownScene):
                 fix=f"hilsplat run {scene}",
             )
         proposing = (folder / variant / "masks", folder / variant / "semantic_tree")
-        self.note((scene, folder / "gaussians.ply", *proposing))
+        parts = (scene, folder / "gaussians.ply", *proposing)
+        self.identify(parts)
+        self.note(parts)
         self.scene, self.photographs = Scene.load(scene), (scene,)
         self.proposals = Proposals(self.scene, folder, variant, threads)
         self.clicks = Clicks(self.scene, folder / variant / "masks")
@@ -132,11 +135,12 @@ class OpenedScene(ShownScene):
 
     def described(self) -> dict[str, Any]:
         """Describe the photographs and available proposals."""
-        cameras = self.scene.cameras
+        cameras, words = self.scene.cameras, ["hilsplat", "annotate", str(self.folder)]
         return {
             "name": self.scene.name,
             "of": self.state,
             "folder": str(self.labels),
+            "restart": shlex.join([*words, "--data-root", str(self.labels.parents[2])]),
             "proposes": self.proposals.of,
             "segments": self.clicks.name,
             "carries": self.proposals.gaussians is not None,

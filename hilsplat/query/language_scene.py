@@ -68,6 +68,8 @@ class LanguageScene(NodeQueries):
         scene = LanguageScene.from_parts(parts, finished.evaluate_settings(), threads=threads, opened=opened)
         names = read_names(finished.folder, parts.semantic_tree)
         naming = NodeNaming.load(parts.clip.parent / "names", parts.semantic_tree, parts.clip)
+        if naming is not None and scene.caution:
+            naming = naming.hidden()
         return replace(scene, names=names, naming=naming)
 
     @staticmethod

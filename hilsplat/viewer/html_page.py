@@ -37,7 +37,12 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
     with shown.unchanged():
         images = [resize_to_fit(scene.views.image(view), PHOTO_PX) for view in scene.views.names]
     described: dict[str, Any] = {
-        "scene": {**shown.described(), "variants": [asked.variant], "chunk": len(shown.gaussians)},
+        "scene": {
+            **shown.described(),
+            "variants": [asked.variant],
+            "chunk": len(shown.gaussians),
+            "restart": "",
+        },
         "variant": shown.described_variant(asked.variant),
         "asked": [question.model_dump(exclude_none=True) for question in questions],
         "answers": [payload.answer(scene, question) for question in questions],

@@ -96,6 +96,7 @@ def crossing(cameras: Cameras) -> Float64[np.ndarray, " 3"]:
 def described_nodes(scene: LanguageScene) -> dict[str, Any]:
     """Describe the nodes for the page's outline: one entry per node, in row order."""
     tree, names, naming = scene.tree, scene.names, scene.naming
+    has_names = naming is not None and any(naming.of_node)
     members = np.bincount(tree.node_of_gaussian.ravel() + 1, minlength=len(tree) + 1)[1:]
     corners = box_corners(tree.oriented_box)
     return {
@@ -106,7 +107,7 @@ def described_nodes(scene: LanguageScene) -> dict[str, Any]:
                 "level": int(tree.level[node]) - 1,
                 "parent": int(tree.parent[node]),
                 "name": names.of_node.get(node, ""),
-                "called": "" if naming is None else naming.of_node[node] or "?",
+                "called": naming.of_node[node] or "?" if naming is not None and has_names else "",
                 "surface": naming is not None and naming.surfaces[node],
                 "gaussians": int(members[node]),
                 "views": int(tree.views[node]),

@@ -1,6 +1,7 @@
 """A scene as the viewer page shows it: its Gaussians, and each variant once it accepts queries."""
 
 import logging
+import shlex
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -35,6 +36,9 @@ VIEWS_MIB = 256.0
 CACHED_RELEVANCIES = 8
 """Number of cached field relevancies (per variant, text and level), each with one byte per Gaussian."""
 
+ANSWERING = ("semantic_tree", "clip", "masks", "autoencoder", "field.safetensors")
+"""Parts of a variant on which its answers depend."""
+
 MAX_GAUSSIANS = 10_000_000
 """Maximum number of Gaussians; more do not fit in textures of 4096 x 16384 texels (degree 3: four texels per
 Gaussian) or a few GiB of memory."""
@@ -63,6 +67,9 @@ class ViewerScene(ShownScene):
             raise ArtifactError(
                 f"{folder} has no Gaussians to show yet: {ply} is missing", fix=run_command(ply)
             )
+        variants = [self.folder / name for name in self.variants]
+        answering = [variant / part for variant in variants for part in ANSWERING]
+        self.identify((self.folder / "scene", ply, *answering))
         self.note((self.folder / "scene", ply))
         self.scene = self.opened.get(Scene.load, self.folder / "scene")
         self.gaussians: Gaussians = self.opened.get(load_ply, ply)
@@ -132,6 +139,7 @@ class ViewerScene(ShownScene):
 
     def described(self) -> dict[str, Any]:
         state = {"variants": self.variants, "of": self.state, "folder": self.folder.name}
+        state["restart"] = shlex.join(["hilsplat", "view", str(self.folder)])
         return payload.described_scene(self.scene, self.gaussians) | state
 
     def described_variant(self, variant: str) -> dict[str, Any]:

@@ -5,7 +5,6 @@ release the GIL, so the server stays responsive. The annotator's proposals have 
 """
 
 import asyncio
-import secrets
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
@@ -20,6 +19,7 @@ from starlette.routing import Route
 
 from hilsplat.base.artifacts import INDEX
 from hilsplat.base.images import resize_to_fit
+from hilsplat.base.lineage import sha256_of_json
 from hilsplat.scene.scene import Scene
 from hilsplat.web.file_changes import StaleSceneError
 from hilsplat.web.server import answer, encoded, plain, read, view_name
@@ -28,7 +28,9 @@ THUMB_PX = 160
 
 
 class ShownScene:
-    """A scene as it was when a page opened it, identified by `state`. Subclasses set `scene`.
+    """A scene as it was when a page opened it, identified by `state`. Subclasses set `scene` and `state`.
+
+    A server that is started again has the same state if no file changed, so it accepts pages opened before.
 
     Writers always replace the whole file, so `stat` detects a rewritten file without reading it. A folder's
     state is that of its index, which is written last.
@@ -39,8 +41,12 @@ class ShownScene:
     """Parts that must not change while photographs are read; empty means all parts."""
 
     def __init__(self) -> None:
-        self.state = secrets.token_hex(4)
+        self.state = ""
         self._seen: dict[Path, tuple[int, int, int] | None] = {}
+
+    def identify(self, parts: Iterable[Path]) -> None:
+        """Derive `state` from the current state of all parts that exist."""
+        self.state = sha256_of_json({str(part.resolve()): _state_of(part) for part in parts})[:16]
 
     def note(self, parts: Iterable[Path]) -> None:
         """Record the current state of parts that are about to be opened, unless already recorded."""

@@ -1,6 +1,7 @@
 """The annotation page in a real browser; elements are found by role and label."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from hilsplat.annotate.labels import Label, label_path, read_labels, write_labels
 from hilsplat.datasets.registry import open_labelled
 from hilsplat.web.file_changes import version_of
-from tests.browser.conftest import phone_fits
+from tests.browser.conftest import phone_fits, serving
 from tests.conftest import PROJECT
 from tests.unit.artifact_changes import change_index, write_again
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, WIDTH
@@ -306,3 +307,54 @@ def test_a_rewritten_scene_is_reported(opened, annotating, own_desk, tmp_path):
     page.get_by_role("button", name="Reload").click()
     page.get_by_role("alert").wait_for(state="hidden")
     page.get_by_role("treeitem", name="rim, whole").wait_for()
+
+
+def test_nothing_is_lost_while_the_server_is_stopped(opened, desk, tmp_path):
+    """A drawing waits for a server at the same port, whose address is opened in the same browser."""
+    words = ("annotate", "--data-root", str(tmp_path))
+    opened.expected += ["ERR_CONNECTION_REFUSED", "403"]
+    with serving(desk, *words) as address:
+        page = opened(address)
+        port = re.search(r":(\d+)/", address).group(1)
+        draw_mug(page)
+    name_of = page.get_by_role("tree", name="In this photograph")
+    page.locator("#view").press("n")
+    name(page, "book")
+    page.locator("#view").press("p")
+    for corner in ((22, 2), (36, 2), (36, 20)):
+        page.mouse.click(*place(page, *corner))
+    page.keyboard.press("Enter")
+    notice = page.get_by_role("alert").filter(has_text="The server has stopped")
+    notice.filter(has_text="not saved yet").wait_for()
+    assert f"hilsplat annotate {desk} --data-root {tmp_path} --port {port}" in notice.text_content()
+    with serving(desk, *words, "--port", port) as address:
+        page.context.new_page().goto(address)
+        notice.wait_for(state="hidden")
+        name_of.get_by_text("book").wait_for()
+        saved(page)
+        assert [label.text for label in kept(tmp_path)] == ["mug", "book"]
+        page.context.close()
+
+
+def test_undo_works_in_the_text_box_once_its_text_is_saved(page, tmp_path):
+    draw_mug(page)
+    text = page.locator("#text")
+    text.fill("cup")
+    text.press("Control+z")  # the browser undoes typing
+    assert things(page) == ["mug, whole"]
+    text.fill("cup")
+    text.press("Enter")
+    saved(page)
+    text.focus()
+    text.press("Control+z")
+    saved(page)
+    assert [label.text for label in kept(tmp_path)] == ["mug"]
+
+
+def test_the_page_explains_the_first_steps_and_a_missing_sam(page):
+    assert "First annotation: 1. type what you see" in page.get_by_role("status").text_content()
+    page.locator("#view").press("s")
+    page.get_by_text("made by a SAM that is installed here").wait_for()
+    page.locator("#view").press("?")
+    focused = page.evaluate("document.activeElement.id")
+    assert focused == "help-title"

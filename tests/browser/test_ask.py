@@ -1,5 +1,6 @@
 """Queries, choices, names and saved files in both painters; elements are found by role and label."""
 
+import re
 import shutil
 
 import numpy as np
@@ -21,6 +22,7 @@ from tests.browser.conftest import (
     on_page,
     pixels,
     save,
+    serving,
     wire_camera,
 )
 from tests.unit.artifact_changes import change_index
@@ -51,6 +53,38 @@ def test_a_query_typed_after_the_slash_key_paints_its_answer(opened, desk_addres
     ask(page, "unicorn")
     doubt = "'unicorn' may not be in the scene: the model's vocabulary lacks 'unicorn'."
     page.get_by_role("status").get_by_text(doubt).wait_for()
+
+
+def test_an_answer_outside_the_view_is_one_click_away(opened, desk_address):
+    page = opened(desk_address)
+    page.locator("#colour").select_option("relevancy")
+    page.get_by_text("Run a query first").wait_for()
+    page.locator("#colour").select_option("answers")
+    look = page.get_by_role("button", name="No answer is in view: fly to the best one")
+    ask_and_wait(page, "mug > handle")
+    assert look.is_hidden()
+    page.evaluate("hilsplat.camera.orbit(3, 0); hilsplat.redraw()")
+    look.click()
+    look.wait_for(state="hidden")
+    ask(page, "unicorn")
+    status = page.get_by_role("status").filter(has_text="'unicorn' may not be in the scene").inner_text()
+    assert status.index("may not be in the scene") < status.index("answer")  # a doubt comes first
+
+
+def test_a_stopped_server_is_reported_until_it_is_started_again(opened, desk):
+    opened.expected += ["ERR_CONNECTION_REFUSED", "403"]
+    with serving(desk) as address:
+        page = opened(address)
+        port = re.search(r":(\d+)/", address).group(1)
+    ask(page, "mug > handle")
+    notice = page.get_by_role("alert").filter(has_text="The server has stopped")
+    notice.wait_for()
+    assert f"hilsplat view {desk} --port {port}" in notice.text_content()
+    with serving(desk, "view", "--port", port) as address:
+        page.context.new_page().goto(address)
+        notice.wait_for(state="hidden")
+        ask_and_wait(page, "mug > handle")
+        page.context.close()
 
 
 def test_a_query_typed_before_the_tree_is_loaded_runs_later(opened, desk_address):

@@ -1,6 +1,6 @@
 // The annotation page; the server computes all regions.
 
-import { ask, exportUrl, scene as described, watch } from "./api.js";
+import { ask, exportUrl, scene as described, tellUnsaved, watch } from "./api.js";
 import { $, counted, LEVELS, make } from "./elements.js";
 import { attachHands } from "./hands.js";
 import { Sheet } from "./sheet.js";
@@ -28,6 +28,7 @@ const soon = (work) => {
   return working;
 };
 function markSaved() { document.body.dataset.saved = String(!store.unsaved && !waiting); }
+tellUnsaved(() => store.unsaved || waiting ? "Your last changes are not saved yet. " : "");
 
 // -- showing ---------------------------------------------------------------------------------------
 
@@ -329,14 +330,15 @@ document.addEventListener("keydown", (event) => {
   if (document.querySelector("dialog[open]")) return;
   if (event.key === "Escape") { escape(); $("view").focus(); return; }
   const typing = event.target.closest("input:not([type=radio]):not([type=range]), select");
-  if (typing) { if (event.key === "Enter" && event.target.id === "text") { event.target.blur(); $("view").focus(); event.preventDefault(); } return; }
   const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
-  if ((event.ctrlKey || event.metaKey) && (key === "z" || key === "y")) { step(key === "y" || event.shiftKey ? "redo" : "undo"); event.preventDefault(); return; }
+  const isTyped = typing?.id === "text" && typing.value !== (own() ?? next).text;   // the browser undoes typing
+  if ((event.ctrlKey || event.metaKey) && (key === "z" || key === "y") && !isTyped) { step(key === "y" || event.shiftKey ? "redo" : "undo"); event.preventDefault(); return; }
+  if (typing) { if (event.key === "Enter" && event.target.id === "text") { event.target.blur(); $("view").focus(); event.preventDefault(); } return; }
   if (event.ctrlKey || event.metaKey || event.altKey) return;
   const arrow = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[key], onView = event.target === $("view") || event.target === document.body;
   const by = event.shiftKey ? 10 : 1;
   const keys = {
-    v: () => setTool("choose"), p: () => setTool("polygon"), b: () => setTool("brush"), e: () => setTool("erase"), x: () => scene.proposes && setTool("propose"), s: () => scene.segments && setTool("segment"),
+    v: () => setTool("choose"), p: () => setTool("polygon"), b: () => setTool("brush"), e: () => setTool("erase"), x: () => scene.proposes && setTool("propose"), s: () => scene.segments ? setTool("segment") : tell("Outlining clicked things needs masks of this scene made by a SAM that is installed here."),
     i: () => tool() === "segment" && cross && clicked(cross, true), o: () => tool() === "segment" && cross && clicked(cross, false),
     n: () => fresh(), j: () => fresh(true), t: () => { $("text").focus(); $("text").select(); }, a: () => own()?.origin === "proposed" && accept(), c: () => scene.carries && soon(carry),
     Delete: () => own() && remove(), Backspace: () => { draft = draft.slice(0, -1); draw(); }, "[": () => stand(number - 1), "]": () => stand(number + 1),
@@ -366,7 +368,7 @@ for (const [id, work] of Object.entries({ new: () => fresh(), child: () => fresh
 $("file").addEventListener("change", () => { const files = [...$("file").files]; $("file").value = ""; $("save").open = false; soon(() => take_in(files)); });
 $("radius").addEventListener("input", draw);
 window.addEventListener("pagehide", () => { if (store.views) store.remember(scene.folder); });
-window.addEventListener("beforeunload", (event) => { if (store.unsaved) event.preventDefault(); });
+window.addEventListener("beforeunload", (event) => { if (store.unsaved || waiting) event.preventDefault(); });
 
 async function begin() {
   scene = await described();
@@ -382,6 +384,7 @@ async function begin() {
   const first = store.views.findIndex((view) => view.labels.length);
   stand(Number(start.get("view") ?? Math.max(0, first)) || 0);
   setTool("choose");
+  if (first < 0) tell("First annotation: 1. type what you see, 2. choose polygon (P) or brush (B) and draw around it, 3. press Enter. It is saved at once.");
   document.body.dataset.ready = "yes";
   watch();
 }

@@ -2,20 +2,23 @@
 
 import { $ } from "./elements.js";
 import { get, send } from "./http.js";
+import { insist, isStopped, restartWith, showStopped } from "./stopped.js";
 
 const POLL_MS = 4000;
-let state = "";
+let state = "", unsaved = () => "";
+export const tellUnsaved = (sentence) => { unsaved = sentence; };
 const at = (path) => `${path}?of=${state}`;
 
 export async function scene() {
   const described = await (await get("/api/scene")).json();
   state = described.of;
+  restartWith(described.restart);
   return described;
 }
 export const labels = async () => (await get(at("/api/labels"))).json();
 export const save = async (number, labels, version) =>
-  (await send(at(`/api/labels/${number}`), { labels }, { method: "PUT", headers: { "if-match": `"${version}"` } })).json();
-export const ask = async (path, value) => (await send(at(path), value)).json();
+  (await insist(() => send(at(`/api/labels/${number}`), { labels }, { method: "PUT", headers: { "if-match": `"${version}"` } }), unsaved)).json();
+export const ask = async (path, value) => (await insist(() => send(at(path), value), unsaved)).json();
 export const photoUrl = (number) => at(`/api/photo/${number}`);
 export const thumbUrl = (number) => at(`/api/thumb/${number}`);
 export const exportUrl = (kind) => at(`/api/export/${kind}`);
@@ -27,9 +30,10 @@ export async function watch() {
     if (document.hidden) continue;
     try {
       const now = await (await get("/api/changes")).json();
+      showStopped(false);
       if (now.of === state && !now.changed.length) continue;
       $("changed-what").textContent = `The scene has changed${now.changed.length ? ` (${now.changed.join(", ")})` : ""}. Reload to use the new files.`;
       $("changed").hidden = false;
-    } catch { /* the server has stopped; the next change reports it */ }
+    } catch (error) { if (isStopped(error)) showStopped(true, unsaved()); }
   }
 }

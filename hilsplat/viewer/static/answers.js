@@ -3,7 +3,7 @@
 import * as api from "./api.js";
 import { $, counted, make, nameOf } from "./elements.js";
 import { picture } from "./pictures.js";
-import { shownHits } from "./styles.js";
+import { isDoubtful, shownHits } from "./styles.js";
 
 // beside: {outline, answer, by} of the right pane, or undefined.
 export function showAnswers(outline, answer, acts, beside) {
@@ -44,8 +44,8 @@ export function summary(answer) {
     : `${counted(answer.total, "answer")}, best ${best.score.toFixed(2)}, ${answer.level}`];
   if (answer.route === "fallback") lines.push("No answer is part of a match for the first text: the whole scene was searched.");
   const doubts = answer.doubts.map((doubt) => `${doubt}.`);
-  if (!alike && best.score < 0.5 && !doubts.length) doubts.push("The object may be absent: the best score is below 0.5.");
-  return [...lines, ...doubts].map((line) => line[0].toUpperCase() + line.slice(1)).join("\n");
+  if (isDoubtful(answer) && !doubts.length) doubts.push("The object may be absent: the best score is below 0.5.");
+  return [...doubts, ...lines].map((line) => line[0].toUpperCase() + line.slice(1)).join("\n");
 }
 
 export function markChosen(node) {

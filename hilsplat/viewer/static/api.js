@@ -1,6 +1,7 @@
 // Requests to the server. An exported page has offline.js instead, with the same exports.
 
 import { get, send, streamed } from "./http.js";
+import { restartWith } from "./stopped.js";
 
 export const offline = false;
 export const texts = [], kept = [], first = "", opening = "";   // answered queries and initial camera of an exported page
@@ -15,6 +16,7 @@ const at = (path, of = `of=${state}`) => `${path}?${of}${token ? `&token=${token
 export async function scene() {
   const described = await (await get(at("api/scene", ""))).json();
   state = described.of;
+  restartWith(token ? "" : described.restart);
   return described;
 }
 export const changes = async () => (await get(at("api/changes", ""))).json();

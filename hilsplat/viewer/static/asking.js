@@ -42,6 +42,7 @@ function answered(what, answer) {
   tell(summary(answer));
   listAnswers();
   page.outline.answered(answer.hits.map((hit) => hit.node));
+  page.photos.reveal(page.asked.shows);
   markChosen(page.chosen);
   showKept();
 }

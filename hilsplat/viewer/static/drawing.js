@@ -2,7 +2,7 @@
 
 import * as api from "./api.js";
 import { $, nameOf } from "./elements.js";
-import { drawOverlay } from "./overlay.js";
+import { drawOverlay, inPicture } from "./overlay.js";
 import { showScale } from "./scale.js";
 import { host, keptIn, level, levelIndex, main, options, outlines, page, panes, threshold, variantOf } from "./state.js";
 import { shownHits, styleOf } from "./styles.js";
@@ -42,6 +42,8 @@ export function overlay() {
   const width = host.clientWidth, height = host.clientHeight;
   drawOverlay($("overlay"), page.camera, panes.map((pane, k) => ({ boxes: boxes(pane, k), label: panes.length > 1 ? pane.by.replace("|", ", ") : "" })), width, height, $("tools").offsetTop + $("tools").offsetHeight);
   showScale(currentStyles()[0]);
+  const hits = shownHits(panes[0].answer), own = main(), each = width / panes.length;
+  $("look").hidden = !hits.length || hits.some((hit) => inPicture(page.camera, own.nodes[hit.node].corners, each, height));
   page.photos.place(page.camera, width, height, panes.length);
   page.photos.mark(page.camera.view, page.asked?.shows ?? []);
 }

@@ -69,8 +69,12 @@ export function attachHands() {
   $("threshold-at").addEventListener("input", thresholdChanged);
   $("threshold-at").addEventListener("change", askAgain);
   if (start.get("least")) { $("threshold-on").checked = true; $("threshold-at").value = start.get("least"); thresholdChanged(); }
-  $("colour").addEventListener("change", () => fillField());
+  $("colour").addEventListener("change", () => {
+    if (["relevancy", "field"].includes($("colour").value) && !page.asked) tell("Run a query first: these colours show how well nodes or Gaussians match it.");
+    fillField();
+  });
   $("blend").addEventListener("click", () => { if (page.camera.view < 0) stand(nearestView()); page.photos.cycle(); redraw(); });
+  $("look").addEventListener("click", () => { flyTo(panes[0].answer.hits[0].node); $("view").focus(); });
   $("reload").addEventListener("click", () => location.reload());
   $("help-button").addEventListener("click", () => $("help").showModal());
   $("picture-button").addEventListener("click", () => $("picture").click());

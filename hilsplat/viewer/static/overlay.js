@@ -10,6 +10,14 @@ function element(name, attributes, text) {
   return made;
 }
 
+const isOutside = (at, width, height) => [width, height].some((side, axis) => at.every((point) => point[axis] < 0) || at.every((point) => point[axis] > side));
+
+// Whether a box is in the picture, or around the camera.
+export function inPicture(camera, corners, width, height) {
+  const k = camera.intrinsics(width, height), at = corners.map((corner) => camera.project(corner, k)), before = at.filter(Boolean);
+  return before.length > 0 && (before.length < at.length || !isOutside(at, width, height));
+}
+
 // panes: [{boxes: [{corners, kind, label, node, stroke}]}], side by side in width x height CSS px; tools cover the top `covered` px.
 export function drawOverlay(svg, camera, panes, width, height, covered = 0) {
   svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
@@ -20,7 +28,7 @@ export function drawOverlay(svg, camera, panes, width, height, covered = 0) {
     for (const { corners, kind, label, node, stroke = null } of pane.boxes) {
       const at = corners.map((corner) => camera.project(corner, k));
       if (at.some((point) => !point)) continue;   // a corner is behind the camera
-      if ([each, height].some((side, axis) => at.every((point) => point[axis] < 0) || at.every((point) => point[axis] > side))) continue;   // outside the picture
+      if (isOutside(at, each, height)) continue;
       const d = EDGES.map(([a, b]) => `M${at[a][0].toFixed(1)} ${at[a][1].toFixed(1)}L${at[b][0].toFixed(1)} ${at[b][1].toFixed(1)}`).join("");
       group.append(element("path", { d, class: "shadow" }), element("path", { d, class: kind, "data-node": node, ...(stroke ? { stroke } : {}) }));
       const top = at.reduce((best, point) => point[1] < best[1] ? point : best);

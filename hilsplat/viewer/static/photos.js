@@ -35,6 +35,13 @@ export class Photos {
     Object.assign(photo.style, { left: `${x}px`, top: `${y}px`, width: `${s * camera.lens.w}px`, height: `${s * camera.lens.h}px` });
   }
 
+  // Scroll to the first photograph of these, if none of them is visible.
+  reveal(numbers) {
+    const strip = $("views").getBoundingClientRect(), buttons = numbers.map((number) => $("views").children[number]);
+    const isVisible = (button) => { const { left, right } = button.getBoundingClientRect(); return left >= strip.left && right <= strip.right; };
+    if (!buttons.some(isVisible)) buttons[0]?.scrollIntoView({ block: "nearest", inline: "center" });
+  }
+
   mark(number, shows = []) {
     [...$("views").children].forEach((button, k) => {
       const chosen = k === number;

@@ -2,6 +2,7 @@
 
 import * as api from "./api.js";
 import { $, LEVELS } from "./elements.js";
+import { isStopped, showStopped } from "./stopped.js";
 import { KEPT } from "./styles.js";
 
 export const host = $("view"), options = new URLSearchParams(location.search);
@@ -24,6 +25,7 @@ export const main = () => outlines.get(variantOf(panes[0]));
 export function tell(text, error = false) { $("status").textContent = text; $("status").classList.toggle("error", error); }
 export const failed = (error) => {
   if (error.status === 409) sceneChanged();
+  if (isStopped(error)) showStopped(true);
   if (error.name !== "AbortError") tell(error.message, true);
 };
 

@@ -6,6 +6,7 @@ import { choose } from "./choosing.js";
 import { restyle } from "./drawing.js";
 import { $, counted, make } from "./elements.js";
 import { askKeptAgain, keepFromStart } from "./kept.js";
+import { isStopped, showStopped } from "./stopped.js";
 import { failed, loadVariant, main, page, panes, sceneChanged, start, tell, variantOf } from "./state.js";
 
 const POLL_MS = 4000;
@@ -39,6 +40,8 @@ export async function useVariants() {
 
 function showOutline() {
   page.outline.show(main());
+  const names = [...new Set(main().nodes.map((node) => node.name || node.called).filter((name) => name && name !== "?"))];
+  if (names.length && !api.offline) $("text").placeholder = names.slice(0, 2).join(", or ");
   listAnswers();
   $("about").textContent = `${page.scene.name}: ${counted(page.scene.gaussians, "Gaussian")}. Masks: ${main().masks}. Text and image vectors: ${main().clip}.`;
   restyle();
@@ -65,9 +68,10 @@ export async function watch() {
     if (document.hidden) continue;
     try {
       const now = await api.changes();
+      showStopped(false);
       if (now.of !== page.scene.of || now.changed.length) sceneChanged(now.changed);
       else if (now.variants.join() !== page.scene.variants.join()) await moreAnswer(now.variants);
-    } catch (error) { if (error.status) failed(error); }   // without a status, the server has stopped
+    } catch (error) { if (isStopped(error)) showStopped(true); else failed(error); }
   }
 }
 

@@ -4,17 +4,20 @@ export class Refused extends Error {
   constructor(message, status) { super(message); this.status = status; }
 }
 
-async function checked(response) {
+// A server that doesn't answer refuses with status 0.
+async function checked(path, options) {
+  let response;
+  try { response = await fetch(path, options); } catch (error) { throw error.name === "AbortError" ? error : new Refused("The server has stopped.", 0); }
   if (response.ok) return response;
   let message = `${response.status} ${response.statusText}`;
   try { message = (await response.clone().json()).error; } catch { message = await response.text() || message; }
   throw new Refused(message, response.status);
 }
 
-export const get = async (path) => checked(await fetch(path));
-export const send = async (path, value, { method = "POST", headers = {}, signal } = {}) => checked(await fetch(path, {
+export const get = (path) => checked(path);
+export const send = (path, value, { method = "POST", headers = {}, signal } = {}) => checked(path, {
   method, signal, headers: { "content-type": "application/json", ...headers }, body: JSON.stringify(value),
-}));
+});
 
 // Read progress lines {"made", "of"}, then {"bytes"} and the file of that many bytes; or {"error"}.
 export async function streamed(response, told) {
