@@ -66,6 +66,10 @@ Device = Literal["auto", "cpu", "cuda"]
 NETWORKS = "device of the networks; auto: cuda if torch finds one with enough free memory, else cpu"
 
 
+LEAST_FIT_STEPS = 1500
+"""Steps below which fits to 12 photographs are clearly worse (docs/experiments.md, "Small sets")."""
+
+
 class PosesSettings(Section):
     """Camera poses, from structure from motion or imported."""
 
@@ -95,7 +99,9 @@ class GaussiansSettings(Section):
     """Fit of the 3D Gaussians."""
 
     iterations: int = knob(3000, "maximum number of steps, each on one view", ge=1, origin="3DGS: 30000")
-    steps_per_view: int = knob(60, "steps per training view, up to `iterations` in total", ge=1)
+    steps_per_view: int = knob(
+        60, "steps per training view: at least 1500 in total, and at most `iterations`", ge=1
+    )
     max_gaussians: int = knob(50_000, "maximum number of Gaussians at any step", ge=100)
     image_scale: float = knob(1.0, "scale of the images in the fit; 0.5 halves their sides", gt=0, le=1)
     quarter_until: Share = knob(0.15, "share of iterations that use quarter-size images", origin="3DGS: 0")
@@ -148,6 +154,10 @@ class GaussiansSettings(Section):
         "auto",
         "cuda: gsplat and torch; auto: cuda if it works and the card has enough free memory, else cpu",
     )
+
+    def steps(self, num_views: int) -> int:
+        """Return the number of steps of a fit; fits to few views overfit sooner, so they take fewer steps."""
+        return min(self.iterations, max(LEAST_FIT_STEPS, self.steps_per_view * num_views))
 
     @property
     def rasteriser(self) -> Device:

@@ -106,11 +106,6 @@ def fit_step(state: FitState, views: list[TrainingView], settings: GaussiansSett
         control_density(model, settings, rate, extent, state.generator)
 
 
-def steps_of(settings: GaussiansSettings, num_views: int) -> int:
-    """Return the number of steps of a fit; fits to few views overfit sooner, so they take fewer steps."""
-    return min(settings.iterations, settings.steps_per_view * num_views)
-
-
 def scale_at(settings: GaussiansSettings, progress: float, side_px: int) -> float:
     """Return the scale of the training images, which grows with `progress` (the share of completed steps).
 
@@ -154,7 +149,7 @@ def fit_gaussians(
     if not views:
         raise SceneError(f"{scene.name} has no training views", fix="hold out fewer views (poses.test_every)")
     model_class = model_on(fit_device(scene, settings))
-    settings = settings.model_copy(update={"iterations": steps_of(settings, len(views))})
+    settings = settings.model_copy(update={"iterations": settings.steps(len(views))})
     cameras = [view.camera for view in views]
     extent = camera_extent(cameras)
     state = FitState.load(checkpoint, model_class, threads) if checkpoint else None
@@ -317,7 +312,7 @@ def run_gaussians(
             origin = {
                 "kind": "fitted",
                 "strategy": "frozen" if settings.initial == "frozen" else settings.strategy,
-                "iterations": steps_of(settings, len(scene.views("train"))),
+                "iterations": settings.steps(len(scene.views("train"))),
                 "seed": seed,
             }
         report = write_report(out_report, gaussians, scene, curve, origin, settings, threads)

@@ -307,7 +307,7 @@ def _steps_and_mp(fit: GaussiansSettings, views: int, view_mp: float) -> tuple[i
     """Return the steps of a fit, and the mean megapixels of a step."""
     small, half = fit.quarter_until, max(fit.half_until - fit.quarter_until, 0.0)
     seen_mp = view_mp * fit.image_scale**2 * (small / 16 + half / 4 + max(1 - small - half, 0.0))
-    return min(fit.iterations, fit.steps_per_view * views), seen_mp
+    return fit.steps(views), seen_mp
 
 
 def _crops(stages: StageSettings, views: int) -> int:

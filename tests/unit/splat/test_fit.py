@@ -40,6 +40,12 @@ def scene(tmp_path_factory) -> Scene:
     return three_gaussians_scene(tmp_path_factory.mktemp("three") / "scene")
 
 
+@pytest.mark.parametrize(("views", "steps"), [(3, 1500), (25, 1500), (26, 1560), (60, 3000)])
+def test_the_steps_of_a_fit_grow_with_the_views_between_two_bounds(views, steps):
+    assert GaussiansSettings().steps(views) == steps
+    assert GaussiansSettings(iterations=600).steps(views) == 600
+
+
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
 def test_fit_improves_held_out_views(scene, strategy):
     settings = SETTINGS.model_copy(update={"strategy": strategy})
