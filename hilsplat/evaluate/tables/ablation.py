@@ -73,7 +73,8 @@ def mean_difference(differences: list[float]) -> Cell:
     if not differences:
         return Cell()
     mean = statistics.fmean(differences)
+    shown = f"{round(mean, 1) + 0.0:+.1f}"  # never "-0.0"
     if len(differences) == 1:
-        return Cell(f"{mean:+.1f}", mean)
+        return Cell(shown, mean)
     error = statistics.stdev(differences) / math.sqrt(len(differences))
-    return Cell(f"{mean:+.1f} ± {error:.1f}", mean, spread=error)
+    return Cell(f"{shown} ± {error:.1f}", mean, spread=error)

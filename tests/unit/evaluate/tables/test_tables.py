@@ -15,6 +15,7 @@ from hilsplat.datasets.classes import SCANNET200_INSTANCES
 from hilsplat.evaluate.metrics.instances import match_instances
 from hilsplat.evaluate.protocols.cards import INSTANCES, LERF_MASK, OVS_ARGMAX
 from hilsplat.evaluate.scores import write_instances, write_scores
+from hilsplat.evaluate.tables.ablation import mean_difference
 from hilsplat.evaluate.tables.build import TABLES, published_values, run_table
 from hilsplat.evaluate.tables.formats import latex_text
 from hilsplat.evaluate.tables.measured import table_value
@@ -173,6 +174,7 @@ def test_rows_of_the_ladder_are_compared_with_the_row_that_they_extend_by_scene_
     steps, _ = ablation_of(tmp_path, values)
     # differences of 0.1, 0, 0.1 and 0: mean 0.05, deviation 0.0577, error 0.0289
     assert steps == {"3D-HC": ("", ""), "paper-part": ("3D-HC", "5.00 ± 2.89")}
+    assert mean_difference([-0.03, 0.02]).text == "+0.0 ± 0.0"
 
 
 def test_steps_of_the_ladder_are_variants_of_the_configuration():
