@@ -27,7 +27,7 @@ def rendered_gradient(
         indptr, indices, data: weights (pixels x Gaussians), CSR.
         labels: row of the code and the offset of each pixel, -1 for none.
         codes, offsets, features, gradient: float32, flat, `wide` numbers per row or Gaussian, with zeros
-            after each code; `gradient` is written.
+            after each code; without offsets, the last two terms are 0; `gradient` is written.
         share, attraction: float32.
         wide: multiple of `WIDTH`.
     """
@@ -42,8 +42,9 @@ def rendered_gradient(
                 total = plus(total, quad(data[k]), load_quad(features, np.int64(indices[k]) * wide + c))
             row = np.int64(labels[p]) * wide + c
             pull = signs_of_difference(total, load_quad(codes, row), share)
-            pull = plus(pull, total, quad(attraction))
-            pull = plus(pull, load_quad(offsets, row), quad(np.float32(1)))
+            if len(offsets):
+                pull = plus(pull, total, quad(attraction))
+                pull = plus(pull, load_quad(offsets, row), quad(np.float32(1)))
             for k in range(begin, end):
                 there = np.int64(indices[k]) * wide + c
                 store(gradient, there, plus(load_quad(gradient, there), quad(data[k]), pull))

@@ -150,9 +150,10 @@ def train(
     seed: int,
     terms: HierarchyTerms | None = None,  # of the same views
 ) -> Float32[np.ndarray, "N 3 D"]:
-    """Train with Adam from zeros, each level in turn on its own random view, all used once before a repeat.
+    """Train with Adam from zeros, on a random view per step; each view is used once before a repeat.
 
-    Level l draws its views with the seed `seed` + l. Levels without a labelled pixel stay 0.
+    With `terms`, the levels take steps in turn. Level l draws its views with the seed `seed` + l. Levels
+    without a labelled pixel stay 0.
     """
     channels = latents.shape[1]
     wide = channels + -channels % WIDTH
@@ -169,23 +170,25 @@ def train(
     repeats = 1 if terms is None else 2
     codes = [padded(np.repeat(latents[view.rows], repeats, axis=0)) for view in views]
     by_l1 = terms is None or terms.settings.language == "l1"
-    for _ in track(range(settings.steps), "steps"):
-        for level, adam, order, num_views in levels:
-            number = next(order)
-            weights, labels = views[number].weights, views[number].labels
-            attraction, offsets = 0.0, np.zeros_like(codes[number])
-            if terms is not None:
-                labels = terms.views[number].labels
-                attraction, of_rows = terms.gradient(number, level, features, num_views)
-                offsets = padded(of_rows)
-            labels = labels[:, level.index]
-            share = by_l1 / (np.count_nonzero(labels >= 0) * channels)
-            rendered_gradient(
-                *(weights.indptr, weights.indices, weights.data),
-                *(labels, codes[number], np.float32(share), np.float32(attraction), offsets),
-                *(wide, features[level.index].reshape(-1), gradient),
-            )
-            adam.step(gradient)
+    # Levels that don't interact are trained one after the other, because their arrays then stay in the cache.
+    groups = [[own] for own in levels] if terms is None else [levels]
+    turns = (own for group in groups for _ in range(settings.steps) for own in group)
+    for level, adam, order, num_views in track(turns, "steps", total=settings.steps * len(levels)):
+        number = next(order)
+        weights, labels = views[number].weights, views[number].labels
+        attraction, offsets = 0.0, np.zeros(0, np.float32)
+        if terms is not None:
+            labels = terms.views[number].labels
+            attraction, of_rows = terms.gradient(number, level, features, num_views)
+            offsets = padded(of_rows)
+        labels = labels[:, level.index]
+        share = by_l1 / (np.count_nonzero(labels >= 0) * channels)
+        rendered_gradient(
+            *(weights.indptr, weights.indices, weights.data),
+            *(labels, codes[number], np.float32(share), np.float32(attraction), offsets),
+            *(wide, features[level.index].reshape(-1), gradient),
+        )
+        adam.step(gradient)
     return np.ascontiguousarray(features[:, :, :channels].transpose(1, 0, 2))
 
 
