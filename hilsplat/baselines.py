@@ -8,12 +8,12 @@ import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
 from hilsplat.base.errors import SettingsError
-from hilsplat.settings import Section, Size, knob
+from hilsplat.settings import HierarchyLosses, Section, Size, knob
 
 OURS = "hilsplat"
 """The method of this repository; the `field` stage computes its field."""
@@ -52,13 +52,23 @@ class TrainedSettings(MethodSettings):
 
     steps: int = knob(
         1800,
-        "steps, each on one view; per level for langsplat, langsplat_v2 and gaussian_grouping, otherwise for "
-        "all levels together",
+        "steps, each on one view; per level for langsplat, hi_lsplat, langsplat_v2 and gaussian_grouping, "
+        "otherwise for all levels together",
         ge=1,
         origin="LangSplat, LangSplatV2: 30000",
     )
     rate: float = knob(0.0025, "Adam step size", gt=0, origin="LangSplat")
     pixel_step: int = knob(2, "pixel stride in x and y", ge=1, origin="LangSplat: 1")
+
+
+class HiLSplatSettings(TrainedSettings, HierarchyLosses):
+    """LangSplat's training with the paper's losses."""
+
+    language: Literal["l1", "squared"] = knob(
+        "l1",
+        "loss between rendered and painted codes; squared: that of the solver in section field",
+        origin="LangSplat: l1",
+    )
 
 
 class OpenGaussianSettings(TrainedSettings):
@@ -78,13 +88,6 @@ class OmniSeg3DSettings(TrainedSettings):
 class VchSettings(TrainedSettings):
     thresholds: Annotated[Granularities, AfterValidator(_falling)] = knob(
         (0.6, 0.5, 0.45), "maximum edge of a component: whole, part, subpart; falling"
-    )
-    theta: float | None = knob(
-        None,
-        "share of a mask that its parent contains; default: coverage_tree.theta",
-        gt=0.5,
-        lt=1,
-        origin="VCH: 0.95",
     )
 
 
@@ -106,6 +109,7 @@ class Method:
 BASELINES = {
     "dr_splat": Method("hilsplat.methods.dr_splat:fit"),
     "gaussian_grouping": Method("hilsplat.methods.gaussian_grouping:fit", TrainedSettings),
+    "hi_lsplat": Method("hilsplat.methods.langsplat:fit", HiLSplatSettings),
     "laga": Method("hilsplat.methods.laga:fit", TrainedSettings),
     "langsplat": Method("hilsplat.methods.langsplat:fit", TrainedSettings),
     "langsplat_v2": Method("hilsplat.methods.langsplat_v2:fit", TrainedSettings),

@@ -18,7 +18,7 @@ from hilsplat.base.errors import SettingsError
 from hilsplat.base.files import NAME_RULE, name_problem, project_path, regular
 from hilsplat.base.levels import path_of
 from hilsplat.base.plugins import entry_points
-from hilsplat.baselines import MethodSettings, VchSettings, own_settings, settings_class
+from hilsplat.baselines import MethodSettings, own_settings, settings_class
 from hilsplat.models.store import AUTO, EMBEDDED, read_model, real_model
 from hilsplat.settings import LARGEST, Section, knob
 
@@ -52,16 +52,13 @@ class CoreSettings(Section):
 
     def resolve_auto(self) -> "CoreSettings":
         """Return all sections after resolving values that depend on others: models, crops, theta."""
-        clip, masks, method = resolve_auto(self.clip), resolve_auto(self.masks), self.method
-        theta = {"theta": self.coverage_tree.theta}
+        clip, masks = resolve_auto(self.clip), resolve_auto(self.masks)
         if masks.levels == "tree" and masks.theta is None:
-            masks = masks.model_copy(update=theta)
-        if isinstance(method, VchSettings) and method.theta is None:
-            method = method.model_copy(update=theta)
+            masks = masks.model_copy(update={"theta": self.coverage_tree.theta})
         if clip.crops == AUTO:
             crops = "masks" if self.autoencoder.targets == "mask" else "nodes"
             clip = clip.model_copy(update={"crops": crops})
-        return self.model_copy(update={"masks": masks, "clip": clip, "method": method})
+        return self.model_copy(update={"masks": masks, "clip": clip})
 
 
 _PLUGIN_SECTIONS: dict[str, type[Section]] = dict(entry_points("hilsplat.settings"))
@@ -170,6 +167,7 @@ class RunSettings(StageSettings):
         (), "scenes in ablation, sweep and pruning tables; empty: all tabletop and photographed scenes"
     )
     seeds: int = knob(1, "number of training seeds; if above 1, tables report mean and spread", ge=1, le=10)
+    ablation_seeds: int = knob(1, "the same for the paper's ablation table, if above `seeds`", ge=1, le=10)
     variants: dict[str, dict[str, dict[str, Any]]] = knob(
         {}, "named overrides: variant -> section -> setting -> value; 'default' always exists"
     )
@@ -201,9 +199,15 @@ class RunSettings(StageSettings):
         ]
         return [name for first in dict.fromkeys(names) for name in self.all_seeds(first)]
 
-    def all_seeds(self, variant: str) -> list[str]:
-        """Return a variant's name, and its names with the other seeds: `<name>.seed1`, ..."""
-        return [variant, *(f"{variant}.seed{number}" for number in range(1, self.seeds))]
+    def all_seeds(self, variant: str, table: str = "") -> list[str]:
+        """Return a variant's name, and its names with the other seeds: `<name>.seed1`, ...
+
+        Args:
+            table: key that lists the variants of a table, to return only the seeds in that table.
+        """
+        is_ablation = table == "ablation_variants" or (not table and variant in self.ablation_variants)
+        seeds = max(self.seeds, self.ablation_seeds) if is_ablation else self.seeds
+        return [variant, *(f"{variant}.seed{number}" for number in range(1, seeds))]
 
     def seed_of(self, variant: str) -> int:
         return self.seed + _parts_of(variant)[1]

@@ -8,7 +8,7 @@ one stage or of related stages, so a changed setting reruns exactly the stages t
 
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 LARGEST = 2_000_000_000
 """Maximum of an integer setting: libraries use 32-bit integers, and a run adds up to 10 to its seed."""
@@ -383,10 +383,9 @@ class AutoencoderSettings(Section):
         return self.code == "network"
 
 
-class FieldSettings(Section):
-    """Language field: one latent per Gaussian and level."""
+class HierarchyLosses(Section):
+    """Weights and readings of the paper's losses L_h, L_ins and L_part (Eq. 2 to 6)."""
 
-    weight_language: float = knob(1.0, "weight of the latent regression", ge=0, origin="paper: not stated")
     weight_clustering: float = knob(0.0, "weight of L_h (Eq. 2)", ge=0, origin="paper: 1")
     weight_instance: float = knob(0.0, "weight of L_ins (Eq. 3), lambda_1", ge=0, origin="paper: e-6")
     weight_part: float = knob(0.01, "weight of L_part (Eq. 5), lambda_2", ge=0, origin="paper: e-5")
@@ -402,6 +401,19 @@ class FieldSettings(Section):
     )
     omega: float = knob(10.0, "similarity degree Omega: base of distances in L_ins", gt=1, origin="paper: 10")
     tau: float = knob(0.1, "temperature of L_part", gt=0, origin="paper: not given; VCH: 0.1")
+    min_mask_px: int = knob(50, "minimum area of masks in L_ins and L_part", unit="px", ge=1)
+    prune_cosine: Share = knob(
+        1.0,
+        "L_ins and L_part omit a mask if the cosine between its mean initial feature (hi_lsplat: its code) "
+        "and that of a larger, unrelated mask of the same view and level exceeds this; 1: keep all",
+        origin="paper: pruning, no value given",
+    )
+
+
+class FieldSettings(HierarchyLosses):
+    """Language field: one latent per Gaussian and level."""
+
+    weight_language: float = knob(1.0, "weight of the latent regression", ge=0, origin="paper: not stated")
     start: Literal["average", "median", "random", "langsplat"] = knob(
         "average",
         "initial features; average, median: of the latents of masks that contain a Gaussian (the "
@@ -409,17 +421,6 @@ class FieldSettings(Section):
         "method.name langsplat and the same autoencoder",
     )
     ridge: float = knob(0.1, "weight of the pull towards the initial features, per visible mass", ge=0)
-    trainer: Literal["fast", "literal"] = knob(
-        "fast",
-        "fast: sparse products of frozen geometry (cg_steps, lbfgs_steps); literal: the same objective, with "
-        "a rendered view for each Adam step (iterations, rate), which takes hours",
-        origin="paper: literal",
-    )
-    iterations: int = knob(30_000, "steps of the literal trainer, each on one view", ge=1, origin="paper")
-    rate: float = knob(0.0025, "Adam step size of the literal trainer", gt=0, origin="LangSplat")
-    language: Literal["squared", "l1"] = knob(
-        "squared", "loss of the latent regression; l1 needs trainer: literal", origin="LangSplat: l1"
-    )
     min_labelled_share: float = knob(
         0.3,
         "a Gaussian gets a latent at a level if masks of that level contain this share of its weight; 0: all",
@@ -435,24 +436,11 @@ class FieldSettings(Section):
         "with the others fixed, and a block takes about 4 kB of memory per Gaussian (16 channels)",
         ge=1,
     )
-    min_mask_px: int = knob(50, "minimum area of masks in L_ins and L_part", unit="px", ge=1)
-    prune_cosine: Share = knob(
-        1.0,
-        "L_ins and L_part omit a mask if the cosine between its mean feature and that of a larger, "
-        "unrelated mask of the same view and level exceeds this; 1: keep all",
-        origin="paper: pruning, no value given",
-    )
 
     @property
     def is_random(self) -> bool:
-        """Whether the field depends on the seed: the literal trainer and some starts are random."""
-        return self.trainer == "literal" or self.start in ("random", "langsplat")
-
-    @model_validator(mode="after")
-    def _l1_is_literal(self) -> "FieldSettings":
-        if self.language == "l1" and self.trainer != "literal":
-            raise ValueError("language: l1 needs trainer: literal; the fast trainer needs a squared loss")
-        return self
+        """Whether the field depends on the seed: some starts are random."""
+        return self.start in ("random", "langsplat")
 
 
 class EvaluateSettings(Section):

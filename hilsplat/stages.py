@@ -338,12 +338,15 @@ def autoencoder(
     contributions: PathIn,
     out: PathOut,
     settings: of.AutoencoderSettings,
+    code: Annotated[
+        Path | None, typer.Option(help="output of this stage whose code encodes the masks"), Role.INPUT
+    ] = None,
     seed: Seed = 0,
 ) -> None:
     """Fit the compression of a scene's CLIP vectors (PCA or autoencoder), and encode the masks."""
     from hilsplat.field.autoencoder import run_autoencoder
 
-    run_autoencoder(clip, semantic_tree, contributions, out, settings, seed)
+    run_autoencoder(clip, semantic_tree, contributions, out, settings, seed, code)
 
 
 def _baseline(arguments: Mapping[str, Any]) -> Reads:
@@ -362,6 +365,7 @@ def method(
     masks: PathIn,
     contributions: PathIn,
     autoencoder: PathIn,
+    coverage_tree: PathIn,
     out: PathOut,
     settings: MethodSettings,
     seed: Seed = 0,
@@ -370,9 +374,8 @@ def method(
     """Compute the language field with the baseline selected in the settings."""
     from hilsplat.methods.method import MethodInputs, run_method
 
-    run_method(
-        MethodInputs(scene, gaussians, masks, contributions, autoencoder, threads), out, settings, seed
-    )
+    inputs = MethodInputs(scene, gaussians, masks, contributions, autoencoder, coverage_tree, threads)
+    run_method(inputs, out, settings, seed)
 
 
 @stage(file="field.safetensors")
@@ -382,11 +385,6 @@ def field(
     autoencoder: PathIn,
     out: PathOut,
     settings: of.FieldSettings,
-    scene: Annotated[Path | None, typer.Option(help="posed scene, for trainer: literal"), Role.INPUT] = None,
-    gaussians: Annotated[Path | None, typer.Option(help="3DGS PLY, for trainer: literal"), Role.INPUT] = None,
-    masks: Annotated[
-        Path | None, typer.Option(help="masks of the views, for trainer: literal"), Role.INPUT
-    ] = None,
     start: Annotated[
         Path | None, typer.Option(help="initial field, for start: langsplat"), Role.INPUT
     ] = None,
@@ -397,10 +395,7 @@ def field(
     """Solve for the language field: regression, L_h, L_ins and L_part over three levels."""
     from hilsplat.field.field import run_field
 
-    rendered = (scene, gaussians, masks) if scene and gaussians and masks else None
-    run_field(
-        contributions, coverage_tree, autoencoder, out, settings, threads, seed, rendered, start, memory
-    )
+    run_field(contributions, coverage_tree, autoencoder, out, settings, threads, seed, start, memory)
 
 
 # ---- evaluation, the only stages that read annotations -------------------------------------------

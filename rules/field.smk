@@ -2,6 +2,7 @@
 use rule stage as autoencoder with:
     input:
         **PLAN.inputs("autoencoder"),
+        code=PLAN.first_code,  # empty, except for levels by the coverage tree
     output:
         out=directory("<results>/{dataset}/{scene}/{variant}/autoencoder"),
     log:
@@ -19,9 +20,6 @@ use rule stage as autoencoder with:
 use rule stage as field with:
     input:
         **PLAN.inputs("field"),
-        scene=PLAN.rendered("scene"),  # empty, except for trainer: literal
-        gaussians=PLAN.rendered("gaussians"),
-        masks=PLAN.rendered("masks"),
         start=PLAN.first_field,  # empty, except for start: langsplat
     output:
         out="<results>/{dataset}/{scene}/{variant}/field.safetensors",

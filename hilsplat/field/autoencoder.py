@@ -13,6 +13,7 @@ from jaxtyping import Float32, Int64
 
 from hilsplat.base.artifacts import read_index, write_index, write_npz
 from hilsplat.base.atomic import atomic_folder
+from hilsplat.base.errors import ArtifactError
 from hilsplat.base.lineage import sha256_of_file
 from hilsplat.base.progress import stage_log
 from hilsplat.embed.vectors import mask_embeddings, require_every_vector
@@ -25,6 +26,7 @@ from hilsplat.field.code import (
     LinearCode,
     autoencoder_file,
     layers_of,
+    load_code,
     unit_rows,
 )
 from hilsplat.field.kernels import swap
@@ -46,8 +48,9 @@ def run_autoencoder(
     out: Path,
     settings: AutoencoderSettings,
     seed: int,
+    code_folder: Path | None = None,
 ) -> None:
-    """Fit the scene's code and encode the target vector of every mask.
+    """Fit the scene's code, or read that of `code_folder`, and encode the target vector of every mask.
 
     The target is the vector of the node that the mask fits best, or the mean over all nodes for a mask that
     shares no Gaussian with any node. With `targets: mask`, as in the paper, or without nodes, it is the
@@ -56,7 +59,7 @@ def run_autoencoder(
 
     Raises:
         MisalignedArtifactError: the semantic tree or the CLIP vectors belong to different masks.
-        ArtifactError: a mask needs its own vector and has none.
+        ArtifactError: a mask needs its own vector and has none, or the code is for other vectors or sizes.
     """
     require_same_masks(semantic_tree_folder, contributions_folder)
     tree = SemanticTree.load(semantic_tree_folder, clip_folder)
@@ -69,7 +72,17 @@ def run_autoencoder(
         target = train = clip
     with stage_log("autoencoder", read_index(contributions_folder)["scene"]) as counts:
         model: Code
-        if settings.code == "pca":
+        if code_folder is not None:
+            model = load_code(code_folder)
+            expected, found = (train.shape[1], settings.latent), (model.channels, model.latent)
+            if found != expected:
+                raise ArtifactError(
+                    f"the code in {code_folder} does not fit the vectors in {clip_folder}",
+                    expected="vectors of {} numbers and codes of {}".format(*expected),
+                    found="{} and {}".format(*found),
+                    fix="pass the folder of a code for this scene with the same settings",
+                )
+        elif settings.code == "pca":
             model = LinearCode.fit(train, settings.latent)
         else:
             model = train_autoencoder(train, settings, seed)

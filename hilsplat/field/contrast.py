@@ -4,10 +4,12 @@ Both depend only on the mask means, so a step needs a sparse product but no rend
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 
+from hilsplat.base.artifacts import read_npz, sealed
 from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.rows import Contributions
@@ -19,7 +21,8 @@ from hilsplat.field.losses import (
     part_loss_disentangle,
     part_loss_literal,
 )
-from hilsplat.settings import FieldSettings
+from hilsplat.segment.digests import require_same_masks
+from hilsplat.settings import FieldSettings, HierarchyLosses
 
 MAX_MASKS_PER_LEVEL = 96  # maximum masks per view and level in the losses, because all pairs are compared
 
@@ -36,37 +39,45 @@ class ViewRelations:
 
 
 def view_relations(
-    contributions: Contributions,
-    parents: dict[str, np.ndarray],  # by view, the row of each mask's parent among the view's masks
-    settings: FieldSettings,
-    means: Float32[np.ndarray, "M D"],  # mean lifted features of each mask, to prune similar masks
-) -> list[ViewRelations]:
-    """Select the masks of each view for the contrastive losses, largest first."""
-    relations = []
-    for view, rows in zip(contributions.views, contributions.rows_of_views(), strict=True):
-        pixels, half, parent = contributions.pixels[rows], contributions.half_pixels[rows], parents[view]
-        depth = common_ancestor_depth(parent)
-        usable = (pixels >= settings.min_mask_px) & (half > 0) & (half < pixels)
-        chosen = []
-        for level in LEVELS:
-            local = np.flatnonzero(usable & (contributions.level[rows] == int(level)))
-            order = local[np.lexsort((local, -pixels[local]))][:MAX_MASKS_PER_LEVEL]
-            if settings.prune_cosine < 1:
-                related = depth[np.ix_(order, order)]
-                order = order[distinct(means[rows[order]], related, settings.prune_cosine)]
-            chosen.append(np.sort(order))
-        every = np.sort(np.concatenate(chosen))
-        visible_parent = np.where((parent != NONE) & (pixels[parent] > 0), rows[parent], NONE)
-        parts = ((rows[masks], visible_parent[masks]) for masks in chosen[1:])
-        relations.append(
-            ViewRelations(
-                rows=rows[every],
-                depth=depth[np.ix_(every, every)],
-                level=contributions.level[rows[every]].astype(np.int64),
-                parts=tuple(part for part in parts if len(part[0]) > 1 and (part[1] != NONE).any()),
-            )
-        )
-    return relations
+    rows: Int64[np.ndarray, " m"],  # rows of the view's masks in the arrays that contain their means
+    level: UInt8[np.ndarray, " m"],
+    parent: Int32[np.ndarray, " m"],  # row of each mask's parent among the view's masks, -1 for none
+    pixels: Int64[np.ndarray, " m"],  # pixels that show each mask
+    half_pixels: Int64[np.ndarray, " m"],  # those in the random half
+    settings: HierarchyLosses,
+    means: Float32[np.ndarray, "m D"],  # features that represent the masks, to prune similar ones
+) -> ViewRelations:
+    """Select the masks of a view for the contrastive losses, largest first."""
+    depth = common_ancestor_depth(parent)
+    usable = (pixels >= settings.min_mask_px) & (half_pixels > 0) & (half_pixels < pixels)
+    chosen = []
+    for of_level in LEVELS:
+        local = np.flatnonzero(usable & (level == int(of_level)))
+        order = local[np.lexsort((local, -pixels[local]))][:MAX_MASKS_PER_LEVEL]
+        if settings.prune_cosine < 1:
+            order = order[distinct(means[order], depth[np.ix_(order, order)], settings.prune_cosine)]
+        chosen.append(np.sort(order))
+    every = np.sort(np.concatenate(chosen))
+    visible_parent = np.where((parent != NONE) & (pixels[parent] > 0), rows[parent], NONE)
+    parts = ((rows[masks], visible_parent[masks]) for masks in chosen[1:])
+    return ViewRelations(
+        rows=rows[every],
+        depth=depth[np.ix_(every, every)],
+        level=level[every].astype(np.int64),
+        parts=tuple(part for part in parts if len(part[0]) > 1 and (part[1] != NONE).any()),
+    )
+
+
+def read_parents(tree_folder: Path, contributions: Contributions) -> dict[str, np.ndarray]:
+    """Return, by view, the row of each mask's parent in the view's coverage tree, -1 for none.
+
+    Raises:
+        MisalignedArtifactError: the trees were computed from different masks.
+    """
+    require_same_masks(tree_folder, contributions.folder)
+    return {
+        view: read_npz(sealed(tree_folder, f"{view}.npz"), "parent")["parent"] for view in contributions.views
+    }
 
 
 def distinct(
@@ -86,13 +97,8 @@ def distinct(
     return np.flatnonzero(kept)
 
 
-def num_compared(relations: list[ViewRelations]) -> tuple[int, int]:
-    """Return the number of views averaged in L_ins, and of (view, level) pairs averaged in L_part."""
-    return sum(len(view.rows) > 1 for view in relations), sum(len(view.parts) for view in relations)
-
-
 def instance_term(
-    means: Float64[np.ndarray, "M D"], relations: list[ViewRelations], settings: FieldSettings
+    means: Float64[np.ndarray, "M D"], relations: list[ViewRelations], settings: HierarchyLosses
 ) -> tuple[float, Float64[np.ndarray, "M D"]]:
     """Compute L_ins of the mask means, averaged over views with at least two masks, and its gradient."""
     losses, gradient = [], np.zeros(means.shape)
@@ -115,7 +121,7 @@ def part_term(
     halves: Float64[np.ndarray, "M D"],  # means over a random half of each mask's pixels
     other_halves: Float64[np.ndarray, "M D"],  # means over the other pixels
     relations: list[ViewRelations],
-    settings: FieldSettings,
+    settings: HierarchyLosses,
 ) -> tuple[float, tuple[Float64[np.ndarray, "M D"], ...]]:
     """Compute L_part, averaged over views and levels that have masks to compare, and its three gradients."""
     losses = []

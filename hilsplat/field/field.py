@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from hilsplat.base.artifacts import read_index, read_npz, sealed, write_json
+from hilsplat.base.artifacts import read_index, write_json
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.lineage import require_made_from, sha256_of_file
@@ -15,10 +15,9 @@ from hilsplat.contributions.compositing import column_sums
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.code import LanguageField, autoencoder_file, load_latents
-from hilsplat.field.contrast import Contrast, view_relations
+from hilsplat.field.contrast import Contrast, read_parents, view_relations
 from hilsplat.field.problem import QuadraticProblem
 from hilsplat.field.solver import LBFGS_MEMORY, keep_labelled, solve_field
-from hilsplat.segment.digests import require_same_masks
 from hilsplat.settings import FieldSettings
 
 PROCESS_MIB = 250
@@ -32,30 +31,25 @@ def run_field(
     out: Path,
     settings: FieldSettings,
     threads: int,
-    seed: int = 0,  # for a random start, and for the order of views with `trainer: literal`
-    rendered: tuple[Path, Path, Path] | None = None,  # scene, Gaussians and masks for `trainer: literal`
+    seed: int = 0,  # for a random start
     start: Path | None = None,  # field from which `start: langsplat` begins
     memory_mib: float | None = None,
 ) -> None:
     """Solve the language field of a scene; write `field.safetensors` and, beside it, `field.report.json`.
 
-    With `trainer: fast`, only a random start depends on the seed (mask halves are seeded by the view's
-    name). The result does not depend on `threads`.
+    Only a random start depends on the seed (mask halves are seeded by the view's name). The result does not
+    depend on `threads`.
 
     Raises:
         MemoryLimitError: the field needs more than `memory_mib`, or more than this machine has.
         MisalignedArtifactError: an input belongs to different masks, Gaussians or codes.
-        SettingsError: an input that the settings require is missing, or one that they do not use is given.
+        SettingsError: an initial field is missing, or one is given that the settings do not use.
     """
-    for name, value, option, options in (
-        ("trainer", "literal", rendered, "--scene, --gaussians and --masks"),
-        ("start", "langsplat", start, "--start <field.safetensors>"),
-    ):
-        if (getattr(settings, name) == value) != (option is not None):
-            raise SettingsError(
-                f"field.{name} and the options do not match",
-                expected=f"{options} if and only if {name}: {value}",
-            )
+    if (settings.start == "langsplat") != (start is not None):
+        raise SettingsError(
+            "field.start and the options do not match",
+            expected="--start <field.safetensors> if and only if start: langsplat",
+        )
     contributions = Contributions.load(contributions_folder)
     scene = read_index(contributions_folder)["scene"]
     latents = load_latents(autoencoder_folder, contributions)
@@ -76,12 +70,7 @@ def run_field(
             require_made_from(start, autoencoder_folder, initial.autoencoder_sha256, code_sha256)
             first = initial.features
         problem, contrast = field_losses(contributions, parents, latents, settings, first, seed, threads)
-        if rendered is None:
-            features, report = solve_field(problem, contrast)
-        else:
-            from hilsplat.field.literal_trainer import train_by_rendering
-
-            features, report = train_by_rendering(problem, contrast, contributions, rendered, seed, threads)
+        features, report = solve_field(problem, contrast)
         total_mass = column_sums(contributions.matrix("mass"))
         features = keep_labelled(features, problem.mass, total_mass, settings.min_labelled_share)
         LanguageField(features, contributions.gaussians_sha256, code_sha256).save(out)
@@ -132,17 +121,17 @@ def field_losses(
     quadratic = contributions.quadratic(threads)
     block = settings.block_gaussians
     problem = QuadraticProblem.of(masks, quadratic, pixels, latents, weights, start, seed, block)
-    relations = view_relations(contributions, parents, settings, masks.means(problem.lifted))
+    means = masks.means(problem.lifted)
+    relations = [
+        view_relations(
+            rows,
+            contributions.level[rows],
+            parents[view],
+            contributions.pixels[rows],
+            contributions.half_pixels[rows],
+            settings,
+            means[rows],
+        )
+        for view, rows in zip(contributions.views, contributions.rows_of_views(), strict=True)
+    ]
     return problem, Contrast(masks, half_masks, pixels, half_pixels, relations, settings)
-
-
-def read_parents(tree_folder: Path, contributions: Contributions) -> dict[str, np.ndarray]:
-    """Return the parent of each mask in the coverage trees, by view.
-
-    Raises:
-        MisalignedArtifactError: the trees were computed from different masks.
-    """
-    require_same_masks(tree_folder, contributions.folder)
-    return {
-        view: read_npz(sealed(tree_folder, f"{view}.npz"), "parent")["parent"] for view in contributions.views
-    }

@@ -18,7 +18,8 @@ from jaxtyping import Float32, Int64
 
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.contributions.rows import Contributions
-from hilsplat.field.field import field_losses, read_parents
+from hilsplat.field.contrast import read_parents
+from hilsplat.field.field import field_losses
 from hilsplat.field.solver import solve_field
 from hilsplat.methods.common.groups import CENTRES, clusters, group_means
 from hilsplat.semantic_tree.build import run_semantic_tree

@@ -12,24 +12,26 @@ WIDTH = 4
 
 
 @compiled
-def l1_gradient(indptr, indices, data, labels, codes, channels, wide, features, gradient):
-    """Write the features' gradient of the mean absolute difference between rendered and painted codes.
+def rendered_gradient(
+    indptr, indices, data, labels, codes, share, attraction, offsets, wide, features, gradient
+):
+    """Write the features' gradient of a loss on rendered codes.
+
+    At a labelled pixel with rendered code x and painted code c, the loss has the gradient
+    `share` sign(x - c) + `attraction` x + offset.
 
     A row of weights is read once for its sum and, while still in the fastest cache, once for its gradient.
     Sums have the same order as products with the matrix and its transpose; one thread is used.
 
     Args:
         indptr, indices, data: weights (pixels x Gaussians), CSR.
-        labels: row of the code painted at each pixel, -1 for none.
-        codes, features, gradient: float32, flat, `wide` numbers per row or Gaussian; `gradient` is written.
-        channels: size of a code; the padding after each code is 0.
+        labels: row of the code and the offset of each pixel, -1 for none.
+        codes, offsets, features, gradient: float32, flat, `wide` numbers per row or Gaussian, with zeros
+            after each code; without offsets, the last two terms are 0; `gradient` is written.
+        share, attraction: float32.
         wide: multiple of `WIDTH`.
     """
     gradient[:] = 0
-    labelled = 0
-    for p in range(len(labels)):
-        labelled += labels[p] >= 0
-    share = np.float32(1 / max(labelled * channels, 1))
     for p in range(len(labels)):
         if labels[p] < 0:
             continue
@@ -38,7 +40,11 @@ def l1_gradient(indptr, indices, data, labels, codes, channels, wide, features, 
             total = quad(np.float32(0))
             for k in range(begin, end):
                 total = plus(total, quad(data[k]), load_quad(features, np.int64(indices[k]) * wide + c))
-            pull = signs_of_difference(total, load_quad(codes, np.int64(labels[p]) * wide + c), share)
+            row = np.int64(labels[p]) * wide + c
+            pull = signs_of_difference(total, load_quad(codes, row), share)
+            if len(offsets):
+                pull = plus(pull, total, quad(attraction))
+                pull = plus(pull, load_quad(offsets, row), quad(np.float32(1)))
             for k in range(begin, end):
                 there = np.int64(indices[k]) * wide + c
                 store(gradient, there, plus(load_quad(gradient, there), quad(data[k]), pull))

@@ -43,6 +43,7 @@ class MethodInputs:
     masks_folder: Path
     contributions_folder: Path
     autoencoder_folder: Path
+    coverage_tree_folder: Path
     threads: int = 1  # rasteriser threads; results must not depend on this number
 
     @cached_property

@@ -13,7 +13,7 @@ hardyho/ultrametric_feature_fields. The constants below are the authors'; they u
 Departs:
     - vectors of 16 numbers on frozen Gaussians, not an instant-NGP field of 128 with its own density;
     - unit length by division, without a penalty on the norm; depth is not smoothed;
-    - a parent contains `theta` (0.9) of a mask, as in our coverage tree, not 0.95 with an IoU below 0.9;
+    - parents are those of our coverage tree; the authors require 0.95 of a mask and an IoU below 0.9;
     - components consist of Gaussians, not of 0.002 voxels; all but the 200 largest join the nearest of these;
     - the authors don't support text.
 """
@@ -29,12 +29,11 @@ from torch.nn.functional import softplus
 
 from hilsplat.base.levels import NONE
 from hilsplat.baselines import VchSettings
+from hilsplat.field.contrast import read_parents
 from hilsplat.methods.common.groups import cluster_field, nearest
 from hilsplat.methods.common.training import initial_features, product, train, unit
 from hilsplat.methods.kernels import joining_edges
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
-from hilsplat.segment.coverage import coverage_tree
-from hilsplat.settings import CoverageTreeSettings
 
 CHANNELS = 16
 TEMPERATURE = 0.1
@@ -130,17 +129,14 @@ def components(
 
 def fit(inputs: MethodInputs, settings: VchSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train vectors, connect Gaussians at decreasing distances, and assign components the codes of masks."""
-    theta = settings.theta or CoverageTreeSettings().theta
     contributions = inputs.contributions
     views = labelled_views(inputs, settings.pixel_step)
-    trees = {}  # level and parent of the masks, by view number
-    for view in views:
-        masks = inputs.view_masks(contributions.views[view.number])
-        trees[view.number] = (masks.level, coverage_tree(masks, theta)[0])
+    parents = read_parents(inputs.coverage_tree_folder, contributions)
     features = initial_features(contributions.num_gaussians, CHANNELS, seed)
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
-        a, b, c = chosen = triplets(view.labels, *trees[view.number], random)
+        parent = parents[contributions.views[view.number]]
+        a, b, c = chosen = triplets(view.labels, contributions.level[view.rows], parent, random)
         if not chosen.shape[1]:
             return features.sum() * 0
         vectors = unit(product(view.weights, unit(features)))

@@ -195,10 +195,10 @@ class Plan:
         """Return a section's settings for a job, as JSON."""
         return escape_json_for_report(self._json(section, *self.which(job)))
 
-    def seeded(self, variant: str, row: SceneRow) -> list[str]:
-        """Return a variant and, if it is random, its repetitions with other seeds."""
+    def seeded(self, variant: str, row: SceneRow, table: str) -> list[str]:
+        """Return a variant and, if it is random, its repetitions with a table's other seeds."""
         is_random = self.identity(SCORED, variant, *self.situation(row)).seed is not None
-        return self.run.all_seeds(variant) if is_random else [variant]
+        return self.run.all_seeds(variant, table) if is_random else [variant]
 
     def seed(self, stage: Stage[..., Any], job: Job) -> int:
         """Return a job's seed, 0 for a variant's stage that is deterministic."""
@@ -472,14 +472,21 @@ class Plan:
         by_node = self.stages(job).clip.crops == "nodes"
         return [self.shared_path("semantic_tree", job)] if by_node else []
 
-    def rendered(self, artifact: str) -> Callable[[VariantJob], list[str]]:
-        """Return the input function of `field` for an artifact that only the literal trainer reads."""
+    def first_code(self, job: VariantJob) -> list[str]:
+        """Return the input of `autoencoder`: the code of the same masks with levels by head, if there is one.
 
-        def paths(job: VariantJob) -> list[str]:
-            is_literal = self.stages(job).field.trainer == "literal"
-            return [self.shared_path(artifact, job)] if is_literal else []
-
-        return paths
+        Levels don't change masks and their vectors, so that variants which differ in levels share a code.
+        """
+        stages, situation = self.stages(job), self.situation(self.row(job))
+        if stages.masks.levels == "head" or stages.autoencoder.targets != "mask":
+            return []
+        own = self.identity("autoencoder", job.variant, *situation)
+        masks = stages.masks.model_copy(update={"levels": "head", "theta": None})
+        by_head = own._replace(settings=tuple((dict(own.settings) | {"masks": masks}).items()))
+        for name in self.run.every_variant():
+            if self.identity("autoencoder", name, *situation) == by_head:
+                return [self.path(job, name, "autoencoder")]
+        return []
 
     def first_field(self, job: VariantJob) -> list[str]:
         """Return the input of `field`: LangSplat's initial field; SettingsError if no variant computes it."""

@@ -63,8 +63,7 @@ FIT_S_PER_MP, FIT_S_PER_GAUSSIAN, GRAPH_S_PER_MP = 0.14, 0.9e-6, 4.0
 """Core seconds of a fit step per megapixel of the view, and per Gaussian that the fit may have; core seconds
 of the graph segmenter per megapixel."""
 
-TRAINED_S_PER_MP, LITERAL_S_PER_MP = 0.08, 0.15
-"""Core seconds per step, level and megapixel of a trained baseline, and of the literal trainer."""
+TRAINED_S_PER_MP = 0.08  # core seconds per step, level and megapixel of a trained baseline
 
 NETWORK_S = 10.0  # core seconds to train an autoencoder
 
@@ -249,8 +248,6 @@ class JobResources:
             return TRAINED_S_PER_MP * len(LEVELS) * stages.method.steps * pixels_mp
         if rule == "method":
             return COSTS["field"]["core_s_per_mp"] * views * view_mp
-        if rule == "field" and stages.field.trainer == "literal":
-            return LITERAL_S_PER_MP * len(LEVELS) * stages.field.iterations * view_mp
         if rule == "autoencoder" and stages.autoencoder.code == "network":
             return NETWORK_S
         return COSTS.get(rule, OTHER)["core_s_per_mp"] * views * view_mp

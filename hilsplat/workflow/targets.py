@@ -53,7 +53,7 @@ def scores(plan: Plan, table: str, name: str = "scores.csv") -> list[str]:
         plan.path(row, variant, name)
         for row in rows
         for first in getattr(plan.run, kind.variants)
-        for variant in plan.seeded(first, row)
+        for variant in plan.seeded(first, row, kind.variants)
     ]
 
 

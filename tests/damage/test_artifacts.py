@@ -16,7 +16,7 @@ from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.contributions.rows import Contributions
 from hilsplat.embed.vectors import mask_embeddings
 from hilsplat.field.code import LanguageField, load_code, load_latents
-from hilsplat.field.field import read_parents
+from hilsplat.field.contrast import read_parents
 from hilsplat.query.node_names import NodeNaming
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene

@@ -45,6 +45,8 @@ WORLD = WorldSettings(views=12, image_px=128, arc_deg=100, objects=3, samples=1)
 LABELLED = ("002.png", "006.png", "010.png")
 SEED = 210
 
+VARIANTS = yaml.safe_load((PROJECT / "config/paper.yaml").read_text(encoding="utf-8"))["variants"]
+
 REDUCED = {
     "gaussians": {"iterations": 300, "max_gaussians": 8000, "densify_every": 50, "sh_degree": 1},
     "masks": {"model": "models/sam-tiny", "points_per_side": 16, "crop_layers": 0, "min_area_px": 8},
@@ -52,7 +54,11 @@ REDUCED = {
     "semantic_tree": {"min_views": 2},
     "autoencoder": {"epochs": 30, "min_steps": 500},
     "evaluate": {"min_region_px": 30},
-    "variants": {"langsplat": {"method": {"steps": 200, "pixel_step": 2}}},
+    "variants": {
+        name: {"method": {"steps": 200, "pixel_step": 2}}
+        for name, sections in VARIANTS.items()
+        if "steps" in sections["method"]
+    },
     "overrides": {group: {"poses": {"max_side_px": 128}} for group in ("scannet", "replica", "waymo")},
 }
 """Fewer steps, fewer prompts and the embedded models."""

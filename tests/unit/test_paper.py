@@ -6,7 +6,7 @@ import re
 import pytest
 import yaml
 
-from hilsplat.configuration import SECTIONS
+from hilsplat.configuration import validated
 from hilsplat.evaluate.protocols.cards import CARDS
 from hilsplat.evaluate.tables.build import TABLES
 from tests.conftest import PROJECT
@@ -27,7 +27,8 @@ def test_functions_exist(place):
 def test_settings_take_the_value_of_the_literal_reading(setting):
     place, _, value = setting.partition(": ")
     section, _, key = place.partition(".")
-    SECTIONS[section].model_validate({key: yaml.safe_load(value)})
+    name = {"name": "hi_lsplat"} if section == "method" else {}
+    validated(section, {**name, key: yaml.safe_load(value)}, section)
 
 
 def test_every_equation_and_table_has_a_row():

@@ -136,8 +136,8 @@ def test_the_paper_configuration_holds_the_papers_numbers(project: Path) -> None
     stages = parse_run(merged_config([project / "config/paper.yaml"])).stages("paper")
     assert stages.gaussians.iterations == 30_000
     assert stages.masks.points_per_side == 32
-    assert (stages.coverage_tree.theta, stages.field.omega) == (0.9, 10)
-    assert (stages.field.weight_instance, stages.field.weight_part) == (1e-6, 1e-5)
+    assert (stages.coverage_tree.theta, stages.method.omega) == (0.9, 10)
+    assert (stages.method.weight_instance, stages.method.weight_part) == (1e-6, 1e-5)
     assert stages.autoencoder.latent == 3
 
 
@@ -157,11 +157,4 @@ def test_a_method_has_its_own_settings() -> None:
     run = parse_run({"overrides": {"g": trained}, "variants": {"v": {"method": {"name": "vch"}}}})
     assert run.stages(scopes=("g",)).method == TrainedSettings(name="langsplat", steps=5)
     vch = run.stages("v", scopes=("g",)).method
-    assert (vch.name, vch.steps, vch.theta) == ("vch", 1800, None)  # not those of a different method
-
-
-def test_theta_of_the_coverage_tree_reaches_the_methods_that_build_one() -> None:
-    variants = {"vch": {"coverage_tree": {"theta": 0.8}, "method": {"name": "vch"}}}
-    assert parse_run({"variants": variants}).stages("vch").resolve_auto().method.theta == 0.8
-    variants["vch"]["method"]["theta"] = 0.95
-    assert parse_run({"variants": variants}).stages("vch").resolve_auto().method.theta == 0.95
+    assert (vch.name, vch.steps, vch.rate) == ("vch", 1800, 0.0025)  # not those of a different method

@@ -2,7 +2,9 @@
 
 import math
 import statistics
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 from hilsplat.datasets.sources import LEVELLED
@@ -16,7 +18,8 @@ if TYPE_CHECKING:
 
 def ablation_blocks(kind: TableKind, sources: Sources) -> list[Block]:
     """Return a row per variant and method, the ablation's protocols side by side."""
-    blocks = measured.measured_blocks(kind, sources, component_cells, over_seeds=against_default)
+    over_seeds = partial(step_cells, kind.steps, sources.labels)
+    blocks = measured.measured_blocks(kind, sources, component_cells, over_seeds)
     return [replace(block, columns=tuple(block.filled_columns())) for block in blocks]
 
 
@@ -42,20 +45,27 @@ def component_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, C
     }
 
 
-def against_default(scores: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
-    """Return a row's mIoU over all seeds minus the default field's mIoU, paired by scene.
+def step_cells(
+    steps: Mapping[str, str], labels: Mapping[str, str], scores: "pd.DataFrame", part: "pd.DataFrame"
+) -> dict[str, Cell]:
+    """Return the row that a row extends, and its mean differences from it in mIoU and HC.
 
-    Scenes differ more than rows do, so the spread of paired differences shows whether one row is better.
+    Scenes and codes differ more than rows do, so differences are paired by scene and seed or, if the rows
+    have different seeds, by scene, with means over seeds. Errors count the pairs as independent.
     """
     first = part.iloc[0]
-    default = (scores["variant"] == "default") & (scores["method"] == "field")
+    before = steps.get(first["variant"], "default")
+    others = scores[(scores["variant"] == before) & (scores["method"] == "field")]
     for key in ("dataset", "masks", "protocol"):
-        default &= scores[key] == first[key]
-    cell = Cell()
-    if (first["variant"], first["method"]) != ("default", "field"):
-        ours, others = (measured.level_averages_of_scenes(rows, "iou") for rows in (part, scores[default]))
-        cell = mean_difference(list(100 * (ours - others).dropna()))
-    return {"against default field": cell}
+        others = others[others[key] == first[key]]
+    if others.empty or (first["variant"], first["method"]) == (before, "field"):
+        return {}
+    pairs = ["scene", "seed"] if set(part["seed"]) == set(others["seed"]) else ["scene"]
+    cells = {"step from": Cell(measured.row_name(before, "field", labels))}
+    for name, metric in (("mIoU step", "iou"), ("HC step", "hc_containment")):
+        own, other = (measured.level_averages(rows, metric, pairs) for rows in (part, others))
+        cells[name] = mean_difference(list(100 * (own - other).dropna()))
+    return cells
 
 
 def mean_difference(differences: list[float]) -> Cell:
@@ -63,7 +73,8 @@ def mean_difference(differences: list[float]) -> Cell:
     if not differences:
         return Cell()
     mean = statistics.fmean(differences)
+    shown = f"{round(mean, 1) + 0.0:+.1f}"  # never "-0.0"
     if len(differences) == 1:
-        return Cell(f"{mean:+.1f}", mean)
+        return Cell(shown, mean)
     error = statistics.stdev(differences) / math.sqrt(len(differences))
-    return Cell(f"{mean:+.1f} ± {error:.1f}", mean, spread=error)
+    return Cell(f"{shown} ± {error:.1f}", mean, spread=error)

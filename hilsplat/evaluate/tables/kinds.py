@@ -1,8 +1,8 @@
 """The tables, described in `kinds.json`: titles, columns, protocols, the paper's rows and footnotes."""
 
 import json
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ class TableKind:
         protocols: prefixes of the protocols that have rows, for each set of measured blocks.
         methods: methods that have rows; empty for all.
         columns: value columns. A group whose columns name `{scene}` is repeated for each scene.
+        steps: variant -> the variant that its row extends, in ablations; others extend `default`.
         ranked_by_protocol: whether only rows of the same protocol are ranked together.
     """
 
@@ -40,6 +41,7 @@ class TableKind:
     methods: tuple[str, ...] = ()
     columns: tuple[tuple[str, ...], ...] = ()
     unranked: tuple[str, ...] = ()
+    steps: Mapping[str, str] = field(default_factory=dict)
     ranked_by_protocol: bool = True
     footnotes: tuple[str, ...]
 

@@ -217,9 +217,9 @@ def percent(rows: "pd.DataFrame", metric: str) -> Cell:
     return Cell.percent(table_value(rows, metric))
 
 
-def level_averages_of_scenes(rows: "pd.DataFrame", metric: str) -> "pd.Series":
-    """Return one number per scene, for paired comparisons: mean over a level's rows, levels, then seeds."""
+def level_averages(rows: "pd.DataFrame", metric: str, pairs: list[str]) -> "pd.Series":
+    """Return one number per scene, or per scene and seed, as `pairs` says: mean over levels, then seeds."""
     values = rows[rows["metric"] == metric]
     of_level = values.groupby(["scene", "seed", "level"], sort=True)["value"].mean()
     of_seed = of_level.groupby(level=["scene", "seed"], sort=True).mean()
-    return of_seed.groupby(level="scene", sort=True).mean()
+    return of_seed.groupby(level=pairs, sort=True).mean()

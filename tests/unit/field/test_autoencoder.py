@@ -239,3 +239,17 @@ def test_stage_encodes_every_mask(boxes_with_tree):
     model = load_code(out)
     decoded = model.decode_array(latents)
     assert (decoded * SemanticTree.load(tree, world.clip).clip[node]).sum(axis=1).mean() > 0.8
+
+
+def test_a_code_of_other_masks_of_the_scene_is_reused(boxes_with_tree):
+    world, contributions, tree = boxes_with_tree
+    first, second = world.folder / "first", world.folder / "second"
+    inputs = world.clip, tree, contributions
+    settings = QUICK.model_copy(update={"targets": "mask"})
+    run_autoencoder(*inputs, first, settings, 0)
+    run_autoencoder(*inputs, second, settings, 1, first)
+    assert autoencoder_file(first).read_bytes() == autoencoder_file(second).read_bytes()
+    masks = Contributions.load(contributions)
+    assert np.array_equal(load_latents(first, masks), load_latents(second, masks))
+    with pytest.raises(ArtifactError, match=r"does not fit the vectors(.|\n)*codes of 4(.|\n)*16 and 3"):
+        run_autoencoder(*inputs, second, settings.model_copy(update={"latent": 4}), 0, first)

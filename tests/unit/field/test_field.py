@@ -13,25 +13,31 @@ from scipy.optimize import minimize
 from hilsplat.base.arrays import Scratch
 from hilsplat.base.artifacts import read_index, read_json, write_index
 from hilsplat.base.errors import MemoryLimitError, MisalignedArtifactError, SettingsError
+from hilsplat.base.levels import LEVELS
+from hilsplat.baselines import HiLSplatSettings
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.quadratic import StackedWeights
 from hilsplat.contributions.quadratic_builder import GramBuilder
+from hilsplat.contributions.rows import Contributions
 from hilsplat.contributions.view_matrices import painted_indicator
 from hilsplat.field.autoencoder import run_autoencoder
-from hilsplat.field.code import LanguageField
-from hilsplat.field.contrast import Contrast, ViewRelations, distinct, num_compared
-from hilsplat.field.field import run_field
-from hilsplat.field.literal_trainer import ViewTargets, view_losses
+from hilsplat.field.code import LanguageField, load_latents
+from hilsplat.field.contrast import Contrast, ViewRelations, distinct, read_parents, view_relations
+from hilsplat.field.field import field_losses, run_field
 from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
 from hilsplat.field.solver import dot, keep_labelled, solve_field
-from hilsplat.methods.method import MethodInputs
+from hilsplat.methods import method
+from hilsplat.methods.langsplat import HierarchyTerms, MaskHalves
+from hilsplat.methods.method import LabelledView, MethodInputs, run_method
 from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.settings import AutoencoderSettings, FieldSettings, SemanticTreeSettings
 from tests.unit.field.torch_losses import instance_term, part_term
 from tests.unit.round_gaussians import round_gaussians
-from tests.unit.two_boxes_world import reverse_masks
+from tests.unit.two_boxes_world import reverse_masks, two_boxes_weights
 
 PIXELS, GAUSSIANS, CHANNELS = 60, 12, 2
+PARENT = np.array([-1] * 3 + [0, 0, 1] + [3, 4, 4], np.int32)
+NO_PLACES = np.zeros((PIXELS, 2), np.int64)
 
 
 class Toy:
@@ -49,7 +55,8 @@ class Toy:
         self.level = np.repeat(np.array([1, 2, 3], np.uint8), 3)
         labels = self.labels.astype(np.int32)
         self.painted = painted_indicator(labels, 9, np.ones(PIXELS, bool))
-        self.half = painted_indicator(labels, 9, rng.random(PIXELS) < 0.5)
+        self.in_half = rng.random(PIXELS) < 0.5
+        self.half = painted_indicator(labels, 9, self.in_half)
         self.pixels = np.asarray(self.painted.sum(axis=1)).ravel().astype(np.float32)
         self.half_pixels = np.asarray(self.half.sum(axis=1)).ravel().astype(np.float32)
         self.A = (sp.diags(1 / self.pixels) @ self.painted @ self.W).astype(np.float32)
@@ -64,21 +71,21 @@ class Toy:
         )
         self.features = rng.normal(size=(GAUSSIANS, 3, CHANNELS)).astype(np.float32)
 
-    def view(self, settings: FieldSettings) -> ViewTargets:
-        """The view as the literal trainer's input."""
-        relations = self.contrast(settings).relations[0]
-        return ViewTargets(np.arange(9), self.level.astype(np.int64) - 1, self.painted, self.half, relations)
-
     def contrast(self, settings: FieldSettings) -> Contrast:
-        parent = np.array([-1] * 3 + [0, 0, 1] + [3, 4, 4])
         relations = ViewRelations(
             np.arange(9),
             np.zeros((9, 9), np.int64),
             self.level.astype(np.int64),
-            ((np.array([3, 4, 5]), parent[3:6]), (np.array([6, 7, 8]), parent[6:9])),
+            tuple((np.arange(begin, begin + 3), PARENT[begin:][:3].astype(np.int64)) for begin in (3, 6)),
         )
         half = MaskOperator.of(sp.csr_matrix(self.A_half), self.level)
         return Contrast(self.problem.masks, half, self.pixels, self.half_pixels, [relations], settings)
+
+    def terms(self, settings: HiLSplatSettings) -> HierarchyTerms:
+        """The losses of the trainer."""
+        view = LabelledView(0, np.arange(9), sp.csr_matrix(self.W), self.labels.astype(np.int32), NO_PLACES)
+        halves = MaskHalves.of(view, self.in_half, self.level, PARENT, self.latents, settings)
+        return HierarchyTerms([halves], settings, int(self.pixels.sum()), 1, 2)
 
 
 def dense_system(toy: Toy, weights: tuple[float, float, float], index: int) -> tuple[np.ndarray, np.ndarray]:
@@ -255,31 +262,24 @@ def test_pruning_drops_similar_unrelated_masks():
 
 
 @READINGS
-def test_the_literal_trainer_has_the_objective_of_the_solver(readings):
-    weights = {"weight_language": 0.7, "weight_clustering": 0.4, "weight_instance": 0.5, "weight_part": 0.25}
-    settings = FieldSettings(**readings, **weights)
-    toy = Toy((0.7, 0.4, 0.0))
-    contrast = toy.contrast(settings)
-    shares = 1, toy.problem.total_pixels, *num_compared(contrast.relations)
-    W = toy.W.astype(np.float64)
-    maps = np.einsum("pg,gld->pld", W, toy.features)
-    losses, by_maps = view_losses(maps, toy.view(settings), toy.latents, settings, shares)
-    expected = toy.problem.terms(toy.features) | contrast.values(toy.features)
-    assert losses == pytest.approx({name: expected[name] for name in losses}, rel=1e-4)
-    _, by_features = contrast.weighted(toy.features)
+def test_the_trainer_has_the_gradient_of_the_solver(readings):
+    weights = {"weight_clustering": 0.4, "weight_instance": 0.5, "weight_part": 0.25, **readings}
+    toy = Toy((1.0, 0.4, 0.0))
+    own = HiLSplatSettings(language="squared", pixel_step=1, min_mask_px=1, **weights)
+    padded = np.pad(toy.features.transpose(1, 0, 2), ((0, 0), (0, 0), (0, 2)))
+    terms, found = toy.terms(own), np.zeros(toy.features.shape)
+    for level in LEVELS:
+        attraction, offsets = terms.gradient(0, level, padded, num_views=1)
+        rows = terms.views[0].labels[:, level.index]
+        W = toy.W[rows >= 0].astype(np.float64)
+        by_pixel = attraction * W @ toy.features[:, level.index] + offsets[rows[rows >= 0]]
+        found[:, level.index] = W.T @ by_pixel
+    counts = toy.pixels.astype(np.int64), toy.half_pixels.astype(np.int64)
+    relations = view_relations(np.arange(9), toy.level, PARENT, *counts, own, toy.latents)
+    contrast = replace(toy.contrast(FieldSettings(**weights)), relations=[relations])
+    _, expected = contrast.weighted(toy.features)
     half = toy.problem.hessian_product(toy.features) - toy.problem.right_side()
-    by_features = by_features + 2 / toy.problem.total_pixels * half
-    assert np.einsum("pg,pld->gld", W, by_maps) == pytest.approx(by_features, abs=1e-5)
-
-
-def test_langsplats_l1_is_a_mean_over_all_pixels():
-    toy = Toy((1.0, 0.0, 0.0))
-    settings = FieldSettings(language="l1", trainer="literal", weight_part=0.0)
-    maps = np.einsum("pg,gld->pld", toy.W.astype(np.float64), toy.features)
-    losses, gradient = view_losses(maps, toy.view(settings), toy.latents, settings, (1, 1.0, 1, 1))
-    apart = np.abs(maps - toy.latents[toy.labels])[toy.labels >= 0]
-    assert losses["language"] == pytest.approx(apart.sum() / (PIXELS * CHANNELS))
-    assert not gradient[toy.labels < 0].any()
+    assert found == pytest.approx(expected + 2 / toy.problem.total_pixels * half, abs=1e-5)
 
 
 @pytest.fixture
@@ -293,15 +293,12 @@ def boxes_with_latents(two_boxes_contributions):
 
 
 SMALL_MASKS = FieldSettings(min_mask_px=4, weight_part=0.003)
-LITERAL = SMALL_MASKS.model_copy(update={"trainer": "literal", "iterations": 60, "rate": 0.05})
 
 
 def solved_field(boxes, name: str, settings: FieldSettings = SMALL_MASKS, threads: int = 1, **more) -> Path:
     """The field of a run of the stage."""
     world, contributions, autoencoder = boxes
     out = world.folder / name / "field.safetensors"
-    if settings.trainer == "literal":
-        more.setdefault("rendered", (world.scene, world.ply, world.masks))
     run_field(contributions, world.coverage_tree, autoencoder, out, settings, threads, **more)
     return out
 
@@ -338,44 +335,53 @@ def test_the_median_start_and_pruning_are_options_of_the_stage(boxes_with_latent
     assert pruned["contrasted_masks"] < plain["contrasted_masks"]
 
 
-@pytest.fixture
-def flat_boxes(boxes_with_latents, monkeypatch):
-    """The two boxes, with Gaussians that render them."""
-    row, column = np.divmod(np.arange(96), 12)
-    means = np.stack([column - 5.5, row - 3.5, np.full(96, 10.0)], axis=1)
-    flat = round_gaussians(means, log_scale=-1.5, opacity_logit=5.0)
-    monkeypatch.setattr("hilsplat.field.literal_trainer.load_ply", lambda path: flat)
-    return boxes_with_latents
+@READINGS
+def test_the_trainer_reaches_the_objective_of_the_solver(boxes_with_latents, monkeypatch, readings):
+    world, contributions, autoencoder = boxes_with_latents
+    weights = {"weight_clustering": 0.3, "weight_instance": 0.002, "weight_part": 0.002, **readings}
+    solved = FieldSettings(min_mask_px=4, ridge=0.0, cg_steps=30, lbfgs_steps=40, **weights)
+    trained = HiLSplatSettings(
+        name="hi_lsplat", language="squared", pixel_step=1, min_mask_px=4, steps=500, rate=0.005, **weights
+    )
+    monkeypatch.setattr(method, "load_ply", lambda path: round_gaussians(np.zeros((96, 3))))
+    monkeypatch.setattr(
+        method, "pixel_weights", lambda _, camera, **__: two_boxes_weights(world.views.index(camera.name))
+    )
+    out = world.folder / "trained.safetensors"
+    folders = world.scene, world.ply, world.masks, contributions, autoencoder, world.coverage_tree
+    run_method(MethodInputs(*folders), out, trained, 0)
+    masks = Contributions.load(contributions)
+    latents, parents = load_latents(autoencoder, masks), read_parents(world.coverage_tree, masks)
+    problem, contrast = field_losses(masks, parents, latents, solved, "average", 0, 1)
+
+    def objective(features):
+        terms = problem.terms(features) | contrast.values(features)
+        names = "clustering", "instance", "part"
+        return terms["language"] + sum(weights[f"weight_{name}"] * terms[name] for name in names)
+
+    features, _ = solve_field(problem, contrast)
+    assert objective(LanguageField.load(out).features) == pytest.approx(objective(features), rel=0.01)
+    assert objective(problem.lifted) > 1.1 * objective(features)
 
 
-def test_the_literal_trainer_lowers_its_loss_and_is_the_same_on_any_number_of_threads(flat_boxes):
-    settings = LITERAL.model_copy(update={"start": "random"})
-    one, two = (solved_field(flat_boxes, str(threads), settings, threads) for threads in (1, 2))
-    report = report_of(one)
-    assert [point["step"] for point in report["curve"]] == list(range(2, 61, 2))
-    assert report["curve"][-1]["loss"] < 0.7 * report["curve"][0]["loss"]
-    assert report["trained"]["language"] < 0.5 * report["start"]["language"]
-    assert one.read_bytes() == two.read_bytes()
-    assert LanguageField.load(one).features.shape == (96, 3, 3)
-
-
-def test_a_field_resumes_from_another_one(flat_boxes):
-    first = solved_field(flat_boxes, "first", LITERAL.model_copy(update={"min_labelled_share": 0.0}))
+def test_a_field_resumes_from_another_one(boxes_with_latents):
+    every = SMALL_MASKS.model_copy(update={"min_labelled_share": 0.0})
+    first = solved_field(boxes_with_latents, "first", every)
     onward = SMALL_MASKS.model_copy(update={"start": "langsplat"})
-    begun = report_of(solved_field(flat_boxes, "second", onward, start=first))["lifted"]
-    trained = report_of(first)["trained"]
+    begun = report_of(solved_field(boxes_with_latents, "second", onward, start=first))["lifted"]
+    solved = report_of(first)["after_lbfgs"]
     assert begun.pop("ridge") == 0  # which pulls towards the start
-    assert begun == pytest.approx({name: trained[name] for name in begun}, rel=1e-4)
+    assert begun == pytest.approx({name: solved[name] for name in begun}, rel=1e-4)
     LanguageField(LanguageField.load(first).features, "other", "code").save(first)
     with pytest.raises(MisalignedArtifactError, match=r"not made from the Gaussians of .*contributions"):
-        solved_field(flat_boxes, "second", onward, start=first)
+        solved_field(boxes_with_latents, "second", onward, start=first)
 
 
-@pytest.mark.parametrize("update", [{"trainer": "literal"}, {"start": "langsplat"}])
-def test_settings_without_their_input_are_refused(boxes_with_latents, update):
-    settings = SMALL_MASKS.model_copy(update=update)
-    with pytest.raises(SettingsError, match="options do not match"):
-        solved_field(boxes_with_latents, "field", settings, rendered=None)
+def test_a_start_and_its_field_are_given_together(boxes_with_latents):
+    onward = SMALL_MASKS.model_copy(update={"start": "langsplat"})
+    for settings, start in ((onward, None), (SMALL_MASKS, Path("field.safetensors"))):
+        with pytest.raises(SettingsError, match="options do not match"):
+            solved_field(boxes_with_latents, "field", settings, start=start)
 
 
 @pytest.mark.parametrize("stale", ["coverage_tree", "autoencoder", "contributions"])
@@ -391,17 +397,13 @@ def test_parts_of_masks_in_another_order_are_refused(boxes_with_latents, stale):
         solved_field(boxes_with_latents, "field")
 
 
-def test_the_literal_trainer_and_baselines_refuse_other_gaussians_and_masks_in_another_order(flat_boxes):
-    world, *own = flat_boxes
+def test_baselines_refuse_other_gaussians_and_masks_in_another_order(boxes_with_latents):
+    world, *own = boxes_with_latents
     other = world.folder / "other.ply"
     other.write_bytes(b"other")
-    rendered = world.scene, other, world.masks
     with pytest.raises(MisalignedArtifactError, match=r"contributions was not made from .*other\.ply"):
-        solved_field(flat_boxes, "literal", LITERAL, rendered=rendered)
-    with pytest.raises(MisalignedArtifactError, match=r"contributions was not made from .*other\.ply"):
-        MethodInputs(*rendered, *own).view_weights(world.views[0])
+        MethodInputs(world.scene, other, world.masks, *own, world.coverage_tree).view_weights(world.views[0])
     reverse_masks(world, "001.png")
+    inputs = MethodInputs(world.scene, world.ply, world.masks, *own, world.coverage_tree)
     with pytest.raises(MisalignedArtifactError, match=r"view 001\.png was not made from .*001\.png\.npz"):
-        solved_field(flat_boxes, "literal", LITERAL)
-    with pytest.raises(MisalignedArtifactError, match=r"view 001\.png was not made from .*001\.png\.npz"):
-        MethodInputs(world.scene, world.ply, world.masks, *own).view_labels("001.png")
+        inputs.view_labels("001.png")

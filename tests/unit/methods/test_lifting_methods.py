@@ -13,7 +13,7 @@ from hilsplat.baselines import MethodSettings, TrainedSettings
 from hilsplat.field.adam import Adam, in_random_order
 from hilsplat.field.code import Autoencoder, LinearCode
 from hilsplat.methods import dr_splat, langsplat_v2, lifted, occam
-from hilsplat.methods.langsplat import train_level
+from hilsplat.methods.langsplat import train
 from hilsplat.methods.langsplat_v2 import as_vectors, cosine_loss, largest_shares
 from hilsplat.methods.method import LabelledView, MethodInputs
 from hilsplat.scene.cameras import Camera
@@ -60,7 +60,7 @@ def test_training_has_the_bytes_of_products_in_scipy(channels):
         weights = view.weights[pixels]
         apart = weights @ features - latents[view.labels[pixels, Level.PART.index]]
         adam.step(weights.T @ (np.sign(apart) * np.float32(1 / apart.size)))
-    assert np.array_equal(train_level(views, latents, Level.PART, 9, settings, seed=4), features)
+    assert np.array_equal(train(views, latents, 9, settings, seed=3)[:, Level.PART.index], features)
 
 
 def test_views_are_drawn_in_random_order_each_once_before_any_is_repeated():
@@ -197,6 +197,6 @@ def test_occam_uses_the_mask_at_the_centre_of_a_gaussian_and_ignores_hidden_ones
 def test_methods_that_average_vectors_refuse_a_network_code(tmp_path, monkeypatch):
     network = Autoencoder.__new__(Autoencoder)
     monkeypatch.setattr("hilsplat.methods.method.load_code", lambda folder: network)
-    inputs = MethodInputs(*[tmp_path] * 5)
+    inputs = MethodInputs(*[tmp_path] * 6)
     with pytest.raises(SettingsError, match="method dr_splat needs a linear code"):
         inputs.linear_code("dr_splat")

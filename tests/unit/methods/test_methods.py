@@ -1,6 +1,7 @@
 """Every baseline on small scenes: what it finds, and repeated fits; registry and stage."""
 
 import csv
+import functools
 import inspect
 import json
 import re
@@ -47,6 +48,11 @@ FITS = {
     # method: settings, regions that it finds, least share of a region's Gaussians with its code
     "dr_splat": ({}, EVERY, 0.8),
     "gaussian_grouping": ({"steps": 100}, EVERY, 0.8),
+    "hi_lsplat": (
+        {"weight_clustering": 0.1, "weight_instance": 1e-4, "weight_part": 1e-4, "min_mask_px": 4},
+        EVERY,
+        0.8,
+    ),
     "laga": ({}, EVERY, 0.8),
     "langsplat": ({}, EVERY, 0.8),
     "langsplat_v2": ({}, EVERY, 0.8),
@@ -91,7 +97,7 @@ def inputs_of(tmp_path_factory):
         with pytest.MonkeyPatch.context() as monkeypatch:
             world = build_two_boxes(tmp_path_factory.mktemp("boxes"), monkeypatch, regions)
             folders = world.scene, world.ply, world.masks, build_contributions(world), world.folder
-            return BoxesInputs(*folders, world=world)
+            return BoxesInputs(*folders, world.coverage_tree, world=world)
 
     return inputs_of
 
@@ -127,6 +133,14 @@ def test_fits_are_identical_on_any_number_of_threads(inputs_of, name):
     finally:
         torch.set_num_threads(before)
     assert made[0].tobytes() == made[1].tobytes()
+
+
+def test_without_its_losses_the_paper_s_method_is_langsplat(inputs_of):
+    none = {"weight_clustering": 0.0, "weight_instance": 0.0, "weight_part": 0.0}
+    plain, own = fit_of("langsplat", inputs_of()), functools.partial(fit_of, "hi_lsplat", inputs_of())
+    assert own(**none).tobytes() == plain.tobytes()
+    for weight in none:
+        assert own(**none | {weight: 0.1}).tobytes() != plain.tobytes(), weight
 
 
 THIN = {

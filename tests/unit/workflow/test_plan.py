@@ -89,10 +89,39 @@ def test_only_random_variants_are_repeated_per_seed(tmp_path):
     variants = {**VARIANTS, "langsplat": {"method": {"name": "langsplat"}}}
     found = plan(tmp_path, variants=variants, seeds=3, overrides={"synthetic/two": {"autoencoder": NETWORK}})
     one, two = found.rows[:2]
-    assert found.seeded("default", one) == ["default"]
-    assert found.seeded("langsplat", one) == ["langsplat", "langsplat.seed1", "langsplat.seed2"]
-    assert len(found.seeded("default", two)) == 3
-    assert [found.run.seed_of(name) for name in found.seeded("network", one)] == [0, 1, 2]
+    seeded = functools.partial(found.seeded, table="main_variants")
+    assert seeded("default", one) == ["default"]
+    assert seeded("langsplat", one) == ["langsplat", "langsplat.seed1", "langsplat.seed2"]
+    assert len(seeded("default", two)) == 3
+    assert [found.run.seed_of(name) for name in seeded("network", one)] == [0, 1, 2]
+
+
+def test_the_ablation_has_its_own_number_of_seeds(tmp_path):
+    own = {"ablation_variants": ["network"], "ablation_seeds": 3}
+    found = plan(tmp_path, main_variants=["network"], **own)
+    of_scene = [path for path in targets.scores(found, "ablation") if "/one/" in path]
+    assert variants_in(of_scene) == ["network", "network.seed1", "network.seed2"]
+    assert set(variants_in(targets.scores(found, "hierarchy"))) == {"network"}
+    assert found.run.all_seeds("omega") == ["omega"]
+
+
+def test_levels_by_the_tree_share_the_code_of_levels_by_head_with_the_same_seed(tmp_path):
+    own = {**NETWORK, "targets": "mask"}
+    by_tree = {"masks": {"levels": "tree"}}
+    variants = {
+        "head": {"autoencoder": own, "method": {"name": "langsplat"}},
+        "tree": {"autoencoder": own, **by_tree},
+        "theta": {"autoencoder": own, **by_tree, "coverage_tree": {"theta": 0.7}},
+        "alone": {"autoencoder": {**own, "latent": 4}, **by_tree},
+        "nodes": {"autoencoder": NETWORK, **by_tree},
+    }
+    found = plan(tmp_path, variants=variants, main_variants=["default"], seeds=2)
+    codes = {name: found.first_code(Job(variant=name)) for name in (*variants, "tree.seed1")}
+    assert {name: variants_in(paths) for name, paths in codes.items()} == {
+        **{name: [] for name in ("head", "alone", "nodes")},
+        **{name: ["head"] for name in ("tree", "theta")},
+        "tree.seed1": ["head.seed1"],
+    }
 
 
 def test_photographs_that_you_annotated_are_scored_without_replacing_the_tables(tmp_path):
@@ -157,23 +186,18 @@ def test_levels_by_the_tree_take_the_theta_of_the_tree(tmp_path):
     assert found.masks_priority(Job(variant="levels")) < found.masks_priority(Job())  # cached by then
 
 
-def test_inputs_of_the_literal_trainer_and_of_a_field_that_continues_langsplats(tmp_path):
+def test_inputs_of_a_field_that_continues_langsplats(tmp_path):
     shared = {"autoencoder": NETWORK}
     variants = {
+        "paper": {**shared, "method": {"name": "hi_lsplat"}},
         "langsplat": {**shared, "method": {"name": "langsplat"}},
         "on": {**shared, "field": {"start": "langsplat"}},
-        "literal": {**shared, "field": {"trainer": "literal"}},
         "alone": {"field": {"start": "langsplat"}},
     }
     found = plan(tmp_path, variants=variants, main_variants=["default"], seeds=2)
-    on, literal = (Job(variant=name) for name in ("on.seed1", "literal"))
-    first = found.first_field(on)
-    assert first == ["results/synthetic/one/langsplat.seed1/field.safetensors"]
-    assert found.rendered("masks")(on) == found.first_field(literal) == []
-    rendered = [path for name in ("scene", "gaussians", "masks") for path in found.rendered(name)(literal)]
-    assert [path.removeprefix("results/synthetic/one/") for path in rendered] == [
-        *("scene", "gaussians.ply", "default/masks")
-    ]
+    on = Job(variant="on.seed1")
+    assert found.first_field(on) == ["results/synthetic/one/langsplat.seed1/field.safetensors"]
+    assert found.first_field(Job()) == []
     field = stage_of("field")
     assert (found.seed(field, on), found.seed(field, Job())) == (1, 0)
     with pytest.raises(SettingsError, match=r"no variant has method\.name langsplat with the same"):

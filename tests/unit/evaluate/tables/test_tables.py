@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 
 from hilsplat.base.errors import ArtifactError
 from hilsplat.configuration import RunSettings
@@ -14,6 +15,7 @@ from hilsplat.datasets.classes import SCANNET200_INSTANCES
 from hilsplat.evaluate.metrics.instances import match_instances
 from hilsplat.evaluate.protocols.cards import INSTANCES, LERF_MASK, OVS_ARGMAX
 from hilsplat.evaluate.scores import write_instances, write_scores
+from hilsplat.evaluate.tables.ablation import mean_difference
 from hilsplat.evaluate.tables.build import TABLES, published_values, run_table
 from hilsplat.evaluate.tables.formats import latex_text
 from hilsplat.evaluate.tables.measured import table_value
@@ -129,22 +131,56 @@ def test_ablation_rows_take_localization_from_the_flat_protocol(tmp_path):
     assert names == ["hilsplat (field)", "hilsplat (tree)", "Omega 2"]
 
 
-def test_ablation_rows_are_compared_with_the_default_field_scene_by_scene(tmp_path):
-    values = {
-        ("one", "whole"): {"default": 0.4, "d-8": 0.5, "d-8.seed1": 0.7, "paper": 0.2},
-        ("one", "part"): {"default": 0.2, "d-8": 0.3},
-        ("two", "whole"): {"default": 0.8, "d-8": 0.7, "d-8.seed1": 0.9},
-    }
+def ablation_of(tmp_path, values):
+    """The measured rows of an ablation by name, and its Markdown; values by scene, level and variant."""
     scores = [
         score("iou", value, variant=variant, method="field", scene=scene, level=level)
         for (scene, level), of_variants in values.items()
         for variant, value in of_variants.items()
     ]
-    rows, forms = built(tmp_path, "ablation", scores)
-    differences = {row["method"]: row["against default field"] for row in rows if row["kind"] != "reported"}
+    rows, forms = built(tmp_path, "ablation", scores, {"paper-hc": "3D-HC"})
+    steps = {row["method"]: (row["step from"], row["mIoU step"]) for row in rows if row["kind"] != "reported"}
+    return steps, forms[".md"]
+
+
+def test_ablation_rows_are_compared_with_the_default_field_scene_by_scene(tmp_path):
+    values = {
+        ("one", "whole"): {"default": 0.4, "d-8": 0.5, "d-8.seed1": 0.7, "other": 0.2},
+        ("one", "part"): {"default": 0.2, "d-8": 0.3},
+        ("two", "whole"): {"default": 0.8, "d-8": 0.7, "d-8.seed1": 0.9},
+    }
+    steps, text = ablation_of(tmp_path, values)
     # levels, then seeds. Scene one: (0.4 + 0.7) / 2 - 0.3 = 0.25; scene two: (0.7 + 0.9) / 2 - 0.8 = 0
-    assert differences == {"hilsplat (field)": "", "d-8": "12.50 ± 12.50", "paper": "-10.00"}
-    assert "+12.5 ± 12.5" in forms[".md"]
+    ours = "hilsplat (field)"
+    assert steps == {ours: ("", ""), "d-8": (ours, "12.50 ± 12.50"), "other": (ours, "-10.00")}
+    assert "+12.5 ± 12.5" in text
+
+
+def test_rows_of_the_ladder_are_compared_with_the_row_that_they_extend_by_scene_and_seed(tmp_path):
+    values = {
+        ("one", "whole"): {
+            "paper-hc": 0.4,
+            "paper-hc.seed1": 0.6,
+            "paper-part": 0.5,
+            "paper-part.seed1": 0.6,
+        },
+        ("two", "whole"): {
+            "paper-hc": 0.2,
+            "paper-hc.seed1": 0.8,
+            "paper-part": 0.3,
+            "paper-part.seed1": 0.8,
+        },
+    }
+    steps, _ = ablation_of(tmp_path, values)
+    # differences of 0.1, 0, 0.1 and 0: mean 0.05, deviation 0.0577, error 0.0289
+    assert steps == {"3D-HC": ("", ""), "paper-part": ("3D-HC", "5.00 ± 2.89")}
+    assert mean_difference([-0.03, 0.02]).text == "+0.0 ± 0.0"
+
+
+def test_steps_of_the_ladder_are_variants_of_the_configuration():
+    variants = yaml.safe_load((PROJECT / "config/config.yaml").read_text())["variants"]
+    steps = TABLES["ablation"].steps
+    assert {*steps, *steps.values()} <= set(variants)
 
 
 def test_averaging_orders_are_not_mixed_and_pooled_protocols_have_no_number_per_scene():
