@@ -16,6 +16,6 @@ def picture(path, category, name, **labels):
 
 
 def scene_picture(name):
-    path = f"<results>/figures/{{dataset}}/{{scene}}/{name}.png"
+    path = f"<results>/figures/{{dataset}}/{{scene}}/{name}.webp"
     labels = {"figure": targets.PICTURES[name]}
     return picture(path, "Scenes", name, subcategory="{dataset}/{scene}", labels=labels)

@@ -101,7 +101,7 @@ class FinishedScene:
         settings.
         """
         own, scene = self.folder / self.variant, self.folder.resolve()
-        panel = scene.parent.parent / "figures" / scene.parent.name / scene.name / "panel.png"
+        panel = scene.parent.parent / "figures" / scene.parent.name / scene.name / "panel.webp"
         records = map(read_provenance, (own / "scores.csv", own / "names", panel))
         settings = next((record.settings.get("evaluate", {}) for record in records if record), None)
         if settings is None:

@@ -164,6 +164,6 @@ def figures(plan: Plan) -> list[str]:
         compared = not plan.run.sweep_scenes or row.scene in plan.run.sweep_scenes
         generated = GENERATORS[row.generated.generator].pictures if row.generated else ()
         pictures = ["panel", *generated, *(["comparison"] if compared else [])]
-        found += [f"{plan.run.results}/figures/{row.name}/{picture}.png" for picture in pictures]
+        found += [f"{plan.run.results}/figures/{row.name}/{picture}.webp" for picture in pictures]
         found.append(plan.path(row, "default/names"))
     return found

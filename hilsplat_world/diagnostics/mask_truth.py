@@ -15,7 +15,7 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import stage_log, track
 from hilsplat.base.tables import markdown_table, write_csv
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
-from hilsplat.query.pictures import grey, save_png_and_pdf, show
+from hilsplat.query.pictures import grey, save_with_pdf, show
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks, region_ious
 from hilsplat.segment.origin import masks_label
@@ -76,7 +76,7 @@ def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, o
             numbers = [str(len(of_level)), str(len(best)), f"{iou:.4f}", f"{recall:.4f}"]
             numbers += [f"{num_masks / len(of_level):.1f}", f"{precision:.4f}"]
             rows.append([scene.name, masks_label(masks_folder), level.label, *numbers])
-        save_png_and_pdf(draw_fits(scene, truth, masks_folder, fits), out)
+        save_with_pdf(draw_fits(scene, truth, masks_folder, fits), out)
         write_csv(Path(out).with_suffix(".csv"), COLUMNS, rows)
     return markdown_table(COLUMNS, rows, 3)
 

@@ -17,9 +17,9 @@ OUTPUTS = {
     "field": "results/synthetic/tiny/default/field.safetensors",
     "method": "results/synthetic/tiny/lifted/field.safetensors",
     "evaluate": "results/synthetic/tiny/default/scores.csv",
-    "figures": "results/figures/synthetic/tiny/panel.png",
-    "mask_truth": "results/figures/synthetic/tiny/masks.png",
-    "comparison": "results/figures/synthetic/tiny/comparison.png",
+    "figures": "results/figures/synthetic/tiny/panel.webp",
+    "mask_truth": "results/figures/synthetic/tiny/masks.webp",
+    "comparison": "results/figures/synthetic/tiny/comparison.webp",
     "table": "results/tables/hierarchy.csv",
     "sweep_plot": "results/figures/sweep-theta.png",
 }

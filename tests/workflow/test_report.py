@@ -4,8 +4,8 @@ import json
 
 from tests.workflow.conftest import Project
 
-NAMES = ("hierarchy.html", "waymo.html", "panel.png", "registration.png", "fit.png", "comparison.png")
-NAMES += ("views.png", "features.png", "sweep-theta.png")
+NAMES = ("hierarchy.html", "waymo.html", "panel.webp", "registration.webp", "fit.webp", "comparison.webp")
+NAMES += ("views.webp", "features.webp", "sweep-theta.png")
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>--><!-- {{ alert(3) }}"
 
 

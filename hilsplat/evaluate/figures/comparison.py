@@ -19,7 +19,7 @@ from hilsplat.evaluate.protocols.views import rule_of
 from hilsplat.evaluate.tables.measured import row_name
 from hilsplat.query.field_answers import field_colours
 from hilsplat.query.language_scene import LanguageScene
-from hilsplat.query.pictures import label_left, paint_answer, save_png_and_pdf, show
+from hilsplat.query.pictures import label_left, paint_answer, save_with_pdf, show
 from hilsplat.query.scene_views import Opened
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.scene.scene import Scene
@@ -86,14 +86,14 @@ def run_comparison(
     queries: Sequence[str] = (),
     threads: int = 1,
 ) -> None:
-    """Draw the three figures of a scene as PNG and PDF; without ground-truth regions, `queries` are shown.
+    """Draw the three figures of a scene as WebP and PDF; without ground-truth regions, `queries` are shown.
 
     Args:
         folder: `results/<dataset>/<scene>`, in which every variant is finished.
         variants: variants to compare, each under its own evaluation settings. "default" has rows for
             its tree and its field, other variants only for the field.
         names: variant -> its name in tables.
-        out: PNG of the comparison; `views.png` and `features.png` are written beside it.
+        out: WebP of the comparison; `views.webp` and `features.webp` are written beside it.
         evaluate: settings for ground-truth regions and for converting maps to masks.
         labels: labels of a published data set instead of `truth`, such as "lerf_ovs/figurines".
 
@@ -120,9 +120,9 @@ def run_comparison(
                 one = Answerer(row_name(variant, method, names), method, answers)
                 shown = one.masks(rows, evaluate), one.masks(several, evaluate), one.features(view)
                 columns.append(Column(one.title, *shown))
-        save_png_and_pdf(draw_methods(scene, image, columns, rows), out)
-        save_png_and_pdf(draw_views(scene, image, columns, several), Path(out).with_name("views.png"))
-        save_png_and_pdf(draw_features(scene, image, columns, view), Path(out).with_name("features.png"))
+        save_with_pdf(draw_methods(scene, image, columns, rows), out)
+        save_with_pdf(draw_views(scene, image, columns, several), Path(out).with_name("views.webp"))
+        save_with_pdf(draw_features(scene, image, columns, view), Path(out).with_name("features.webp"))
         counts |= {"methods": len(columns), "queries": len(rows), "views": len(several)}
 
 

@@ -1,6 +1,5 @@
 """The panel of a scene: photograph, masks, field, and answers to queries."""
 
-import shutil
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from jaxtyping import Bool
 from matplotlib.figure import Figure, FigureBase
 
 from hilsplat.base.artifacts import read_index
-from hilsplat.base.atomic import atomic_path
+from hilsplat.base.images import read_image, write_webp
 from hilsplat.base.levels import LEVELS, Level, path_of
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.registry import open_labelled
@@ -26,7 +25,7 @@ from hilsplat.query.pictures import (
     label_left,
     paint_answer,
     paint_relevancy,
-    save_png_and_pdf,
+    save_with_pdf,
     show,
 )
 from hilsplat.scene.finished import SceneParts
@@ -91,15 +90,14 @@ def run_figures(
         labels: labels of a published data set instead of `truth`, such as "lerf_ovs/figurines".
     """
     if fit is not None:
-        copies = {"registration.png": parts.scene / "registration.png", "fit.png": fit / "test_views.png"}
+        copies = {"registration": parts.scene / "registration.png", "fit": fit / "test_views.png"}
         for name, source in copies.items():
-            with atomic_path(out.with_name(name)) as temporary:
-                shutil.copyfile(source, temporary)
+            write_webp(out.with_name(f"{name}.webp"), read_image(source))
     answers = LanguageScene.from_parts(parts, evaluate, threads=threads)
     with stage_log("figures", answers.scene.name) as counts:
         truths = shown_truths(answers.scene, truth, labels, data_root, evaluate)
         rows = annotated_rows(truths, settings) if truths else free_rows(answers, queries, settings)
-        save_png_and_pdf(draw_panel(answers, parts.masks, rows, evaluate), out)
+        save_with_pdf(draw_panel(answers, parts.masks, rows, evaluate), out)
         counts["queries"] = len(rows)
 
 

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.tables import read_csv
-from hilsplat.query.pictures import save_png_and_pdf
+from hilsplat.query.pictures import save_with_pdf
 
 SWEEPS = {"theta": ("coverage threshold theta", 0.9), "omega": ("similarity degree Omega", 10.0)}
 """Sweep -> axis label, and the setting of the default variant, which its table row doesn't state."""
@@ -26,7 +26,7 @@ def run_sweep_plot(name: str, table: Path, out: Path) -> None:
     """
     if name not in SWEEPS:
         raise ArtifactError(f"there is no sweep {name!r}", expected=f"one of {', '.join(SWEEPS)}")
-    save_png_and_pdf(draw_sweep(name, read_lines(table, SWEEPS[name][1])), out)
+    save_with_pdf(draw_sweep(name, read_lines(table, SWEEPS[name][1])), out)
 
 
 def read_lines(table: Path, default: float) -> Lines:

@@ -5,6 +5,7 @@ import pytest
 from PIL import Image
 
 from hilsplat.base.errors import MisalignedArtifactError, SceneError
+from hilsplat.base.images import read_image, write_png
 from hilsplat.base.levels import Level
 from hilsplat.datasets.labelled import LabelledScene
 from hilsplat.datasets.registry import open_labelled
@@ -32,16 +33,17 @@ def test_queries_of_every_method_are_timed(block_world):
 
 
 def test_the_panel_is_written_with_the_pictures_of_poses_and_fit_beside_it(opened, tmp_path):
-    (opened.parts.scene / "registration.png").write_bytes(b"cameras")
-    (tmp_path / "fit").mkdir()
-    (tmp_path / "fit/test_views.png").write_bytes(b"renders")
-    out, settings = tmp_path / "panel.png", FiguresSettings(queries_per_level=1)
+    for number, path in enumerate((opened.parts.scene / "registration.png", tmp_path / "fit/test_views.png")):
+        path.parent.mkdir(exist_ok=True)
+        write_png(path, np.full((20, 30, 3), 100 * number, np.uint8))
+    out, settings = tmp_path / "panel.webp", FiguresSettings(queries_per_level=1)
     given = {"fit": tmp_path / "fit", "truth": opened.truth}
     panel.run_figures(opened.parts, out, settings, EvaluateSettings(), **given)
     with Image.open(out) as picture:
-        assert (picture.width, picture.info["Software"]) == (1430, "hilsplat")
-    assert (tmp_path / "registration.png").read_bytes() == b"cameras"
-    assert (tmp_path / "fit.png").read_bytes() == b"renders"
+        assert (picture.width, picture.format) == (1430, "WEBP")
+    for number, name in enumerate(("registration", "fit")):
+        copied = read_image(tmp_path / f"{name}.webp")
+        assert copied.shape == (20, 30, 3) and np.abs(copied.astype(int) - 100 * number).max() <= 2
 
 
 def labelled(block_world, views=("001.png",), levels=True):

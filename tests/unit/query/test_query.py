@@ -239,7 +239,7 @@ def bear_without(root, *missing):
 
 def test_a_scene_opens_with_the_settings_of_its_evaluation_or_panel(tmp_path, caplog):
     folder = bear_without(tmp_path)
-    scores, panel = folder / "default/scores.csv", tmp_path / "results/figures/photos/bear/panel.png"
+    scores, panel = folder / "default/scores.csv", tmp_path / "results/figures/photos/bear/panel.webp"
     assert FinishedScene.locate(folder).evaluate_settings() == EvaluateSettings()
     assert "using the defaults" in caplog.text
     caplog.clear()

@@ -310,14 +310,14 @@ def test_tables_have_their_own_scenes_and_variants(tmp_path):
 
 def test_a_run_of_photographs_leaves_tables_alone(tmp_path):
     assert targets.default(plan(tmp_path, groups=["photos"])) == [
-        "results/figures/photos/desk/panel.png",
-        "results/figures/photos/desk/comparison.png",
+        "results/figures/photos/desk/panel.webp",
+        "results/figures/photos/desk/comparison.webp",
         "results/photos/desk/default/names",
     ]
     requested = targets.default(plan(tmp_path, sweep_scenes=["one"], theta_variants=["theta"]))
-    assert "results/figures/synthetic/one/comparison.png" in requested
-    assert "results/figures/synthetic/two/comparison.png" not in requested
-    assert "results/figures/synthetic/two/masks.png" in requested
+    assert "results/figures/synthetic/one/comparison.webp" in requested
+    assert "results/figures/synthetic/two/comparison.webp" not in requested
+    assert "results/figures/synthetic/two/masks.webp" in requested
     assert "results/tables/lerf.csv" in requested and "results/figures/sweep-theta.png" in requested
 
 

@@ -23,7 +23,7 @@ def found_masks() -> HierarchicalMasks:
 def test_table_and_picture(block_world, tmp_path):
     found_masks().save(tmp_path / "masks" / f"{VIEW}.npz")
     write_index(tmp_path / "masks", {VIEW: {}}, segmenter="graph", model=None)
-    out = tmp_path / "masks.png"
+    out = tmp_path / "masks.webp"
     text = run_mask_truth(block_world.folder / "scene", block_world.folder / "truth", tmp_path / "masks", out)
     rows = out.with_suffix(".csv").read_text().splitlines()
     assert rows[1:] == [  # best IoUs: 1 and 0.5; 0.75 and 0; the nose has only 64 px

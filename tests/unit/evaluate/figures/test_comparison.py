@@ -69,27 +69,27 @@ def compare(block_world, tmp_path, monkeypatch):
     monkeypatch.setattr(comparison, "open_variant", lambda *how: block_world.answers)
 
     def run(name, variants, names, **more):
-        out, settings = tmp_path / name / "comparison.png", FiguresSettings(queries_per_level=1)
+        out, settings = tmp_path / name / "comparison.webp", FiguresSettings(queries_per_level=1)
         run_comparison(block_world.folder, variants, names, out, settings, EVALUATE, **more)
 
     return run
 
 
-def test_all_figures_are_written_as_png_and_pdf_twice_the_same(block_world, tmp_path, compare):
+def test_all_figures_are_written_as_webp_and_pdf_twice_the_same(block_world, tmp_path, compare):
     for name in ("one", "two"):
         compare(name, ["default", "paper"], {"paper": "hilsplat (paper)"}, truth=block_world.folder / "truth")
     for figure in ("comparison", "views", "features"):
-        for suffix in (".png", ".pdf"):
+        for suffix in (".webp", ".pdf"):
             first, second = ((tmp_path / name / f"{figure}{suffix}").read_bytes() for name in ("one", "two"))
             assert first == second and len(first) > 1000
-        with Image.open(tmp_path / "one" / f"{figure}.png") as picture:
+        with Image.open(tmp_path / "one" / f"{figure}.webp") as picture:
             assert picture.width == 1430
 
 
 def test_scenes_without_labels_show_the_queries_of_the_configuration(compare, monkeypatch):
     drawn = []
     monkeypatch.setattr(comparison, "draw_methods", lambda *of: drawn.append(of[-1]) or None)
-    monkeypatch.setattr(comparison, "save_png_and_pdf", lambda figure, out: None)
+    monkeypatch.setattr(comparison, "save_with_pdf", lambda figure, out: None)
     compare("free", ["default"], {}, queries=["bear"])
     assert [(row.text, row.truth) for row in drawn[0]] == [("bear", None)]
 
