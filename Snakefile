@@ -128,8 +128,6 @@ onstart:
 
 
 onsuccess:
-    for line in targets.summary(PLAN):
-        logger.info(line)
     unmark_run()
 
 

@@ -1,7 +1,8 @@
 """Errors that a user can fix."""
 
+import difflib
 import errno
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -49,7 +50,7 @@ def system_error(error: BaseException) -> HilsplatError | None:
 
 
 KILLED = "probably because memory ran out"
-KILLED_FIX = "use fewer cores (hilsplat run -- --cores 1), smaller images (poses.max_side_px) or more memory"
+KILLED_FIX = "use fewer cores (hilsplat run --cores 1), smaller images (poses.max_side_px) or more memory"
 
 
 def visible(text: object) -> str:
@@ -66,6 +67,24 @@ def first_line(error: object) -> str:
 def in_one_line(error: HilsplatError) -> str:
     """Return an error's message and lines as one line."""
     return "; ".join(" ".join(line.split()) for line in str(error).splitlines())
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return the known name that was probably meant or, if none is similar, the first known names.
+
+    Names such as `photos/desk` are also compared by their last parts.
+    """
+    names = list(known)
+    parts = {part: each for each in names for part in (each.rpartition("/")[2], each)}
+    for part in (name, name.rpartition("/")[2]):
+        if near := difflib.get_close_matches(part, parts, n=1):
+            return f"did you mean {parts[near[0]]!r}?"
+    more = f" and {len(names) - NUM_LISTED} more" if len(names) > NUM_LISTED else ""
+    return f"one of {', '.join(names[:NUM_LISTED])}{more}"
+
+
+NUM_LISTED = 12
+"""Maximum number of known names in a message."""
 
 
 def require_working_directory() -> None:

@@ -2,7 +2,7 @@
 
 import csv
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -56,3 +56,14 @@ def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[object]], wor
     numbers = len(columns) - words
     lines = [columns, ["---"] * words + ["---:"] * numbers, *rows]
     return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
+
+
+def aligned_table(rows: Sequence[Sequence[object]], words: Collection[str]) -> list[str]:
+    """Return rows as aligned lines, the header first; the columns named in `words` begin at the left."""
+    cells = [[str(cell) for cell in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    sides = [str.ljust if name in words else str.rjust for name in cells[0]]
+    return [
+        "  ".join(side(cell, width) for side, cell, width in zip(sides, row, widths, strict=True)).rstrip()
+        for row in cells
+    ]

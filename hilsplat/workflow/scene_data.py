@@ -4,7 +4,6 @@ A *job* is any object with the attributes `dataset` and `scene` and, in a varian
 wildcards of a rule, or a row of the sheet. Only evaluation and figures read labels.
 """
 
-import difflib
 import functools
 import os
 from collections.abc import Callable, Iterable, Sequence
@@ -12,7 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Protocol, runtime_checkable
 
-from hilsplat.base.errors import SettingsError
+from hilsplat.base.errors import SettingsError, nearest
 from hilsplat.base.lineage import digests_of, sha256_of_json
 from hilsplat.datasets.registry import readers_of
 from hilsplat.datasets.sources import absence, image_files, is_exported, label_files, label_sets
@@ -67,10 +66,9 @@ class SceneData:
         row = self._row_of.get((job.dataset, job.scene))
         if row is None:
             name = f"{job.dataset}/{job.scene}"
-            near = difflib.get_close_matches(name, [row.name for row in self._row_of.values()], n=1)
             raise SettingsError(
                 f"no scene is named {name!r}",
-                expected=f"did you mean {near[0]!r}?" if near else "a scene of the sheet",
+                expected=nearest(name, [row.name for row in self._row_of.values()]),
                 fix="correct the path, or add the scene to the sheet",
             )
         return row

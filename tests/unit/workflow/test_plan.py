@@ -102,7 +102,8 @@ def test_photographs_that_you_annotated_are_scored_without_replacing_the_tables(
     file.write_text("{}")
     found = plan(tmp_path, groups=["photos"], data_root=str(tmp_path))
     job = Job("photos", "desk")
-    assert targets.default(found) == [*alone, "results/photos/desk/default/scores.csv"]
+    assert targets.default(found) == [*alone, "results/photos/desk/scores.md"]
+    assert targets.means_of(found)(job) == ["results/photos/desk/default/scores.csv"]
     assert found.data.label_files(job) == [str(file)] and str(file) not in found.data.image_files(job)
     assert found.data.label_names(job) == ("annotated/photos/desk",)
     assert found.data.label_readers(job) == ("hilsplat.datasets.images.hi:ANNOTATED",)

@@ -1,0 +1,83 @@
+"""The last lines of a run: what exists of each scene, how good it is, and the next command."""
+
+from pathlib import Path
+
+from hilsplat.base.artifacts import rebuild_command
+from hilsplat.base.tables import read_csv
+from hilsplat.evaluate.scenes import SceneState, scene_lines
+from hilsplat.evaluate.tables.means import mean_lines
+from hilsplat.scene.finished import command_name, scenes_in
+from hilsplat.scene.sheet import SceneRow
+from hilsplat.workflow import targets
+from hilsplat.workflow.models import doubt_about_photographs
+from hilsplat.workflow.plan import Plan
+
+DETAILED = 3
+"""Maximum number of scenes that are described one by one; more scenes share a table."""
+
+PSNR_WORDS = ((25.0, "good"), (20.0, "fair"))
+"""Lowest PSNR of held-out views, in dB, for each word; below, the fit is poor. The words are ours; 3D
+Gaussian Splatting has 23 to 29 dB on its photographs (Kerbl et al. 2023, Tab. 1)."""
+
+
+def summary(plan: Plan) -> list[str]:
+    """Return the summary of a plan's scenes that have poses.
+
+    Raises:
+        ArtifactError: an artifact is damaged.
+    """
+    found = set(scenes_in(plan.results))
+    rows = [row for row in plan.scenes if row.name in found]
+    if len(rows) > DETAILED:
+        lines = scene_lines(plan.results, [row.name for row in rows])[0]
+    else:
+        lines = [line for row in rows for line in _scene(plan, row)]
+    tables = [path for path in targets.tables(plan) if Path(path).is_file()]
+    if tables and any(map(targets.data_of, rows)):
+        lines.append(
+            f"tables: {Path(tables[0]).parent}/*.md; as one page: hilsplat run -- --report report.html"
+        )
+    return lines
+
+
+def _scene(plan: Plan, row: SceneRow) -> list[str]:
+    """Return a heading and the facts about one scene."""
+    folder, figures = Path(plan.path(row)), plan.results / "figures" / row.name
+    scene, name, means = SceneState.read(folder), command_name(folder), folder / "scores.csv"
+    counts = ", ".join(f"{number} {level}" for level, number in scene.nodes.items())
+    pictures = ", ".join(sorted(path.name for path in figures.glob("*.png")))
+    scores = read_csv(means, None, rebuild_command(means)) if means.is_file() else []
+    table = mean_lines([list(scores[0]), *(list(each.values()) for each in scores)]) if scores else []
+    uses = f'hilsplat query {name} "..."  or  hilsplat view {name}'
+    facts = {
+        "poses": _poses(scene),
+        "Gaussians": _fit(scene),
+        "nodes": f"{counts} ({scene.models})" if counts else "",
+        "pictures": f"{pictures} in {figures}" if pictures else "",
+        "doubt": "" if row.generated else doubt_about_photographs(plan.stages(row)),
+        "scores": f"in %, also in {means.with_suffix('.md')} and {means.name}:" if table else "",
+    }
+    lines = [f"{what:<10} {fact}" for what, fact in facts.items() if fact] + [f"  {line}" for line in table]
+    lines.append(f"{'next':<10} {uses if 'tree' in scene.state else f'hilsplat run {name}'}")
+    return [f"{row.name}:", *(f"  {line}" for line in lines)]
+
+
+def _poses(scene: SceneState) -> str:
+    report, (train, test) = scene.poses, scene.views.values()
+    error = report.get("mean_reprojection_error_px")
+    registered = f"{report.get('registered', train + test)} of {report.get('images', train + test)} views"
+    return f"{registered} registered" + ("" if error is None else f"; reprojection error {error:.2f} px")
+
+
+def _fit(scene: SceneState) -> str:
+    """Return the number of Gaussians and their PSNR, with a word if it was measured in held-out views."""
+    if not scene.fit:
+        return ""
+    psnr_db, of_test = scene.fit["psnr_db"], scene.fit["split"] == "test"
+    word = next((word for least, word in PSNR_WORDS if psnr_db >= least), "poor")
+    where = (
+        f"in {scene.views['test']} held-out views: {word}"
+        if of_test
+        else "in training views; none is held out"
+    )
+    return f"{scene.fit['gaussians']}; PSNR {psnr_db:.1f} dB {where}"
