@@ -2,7 +2,7 @@
 
 import difflib
 import errno
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -79,12 +79,13 @@ def nearest(name: str, known: Iterable[str]) -> str:
     for part in (name, name.rpartition("/")[2]):
         if near := difflib.get_close_matches(part, parts, n=1):
             return f"did you mean {parts[near[0]]!r}?"
-    more = f" and {len(names) - NUM_LISTED} more" if len(names) > NUM_LISTED else ""
-    return f"one of {', '.join(names[:NUM_LISTED])}{more}"
+    return f"one of {shorten_list(names, 12)}"
 
 
-NUM_LISTED = 12
-"""Maximum number of known names in a message."""
+def shorten_list(names: Sequence[str], count: int = 3) -> str:
+    """Return the first names, and the number of remaining names."""
+    more = f" and {len(names) - count} more" if len(names) > count else ""
+    return ", ".join(names[:count]) + more
 
 
 def require_working_directory() -> None:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from hilsplat.base.errors import SettingsError
+from hilsplat.base.errors import SettingsError, shorten_list
 from hilsplat.base.files import INSTALLED, project_path
 from hilsplat.baselines import method_of
 from hilsplat.configuration import SECTIONS, RunSettings, StageSettings, parse_run, require_known
@@ -564,9 +564,3 @@ def without_scene(run: RunSettings, rows: Iterable[SceneRow]) -> list[str]:
             raise SettingsError(line, expected=f"did you mean {near[0]!r}?", fix="correct or remove the name")
         lines.append(f"{line}; it is ignored")
     return lines
-
-
-def shorten_list(names: list[str]) -> str:
-    """Return the first three names, and the number of remaining names."""
-    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-    return ", ".join(names[:3]) + more

@@ -31,12 +31,11 @@ from hilsplat.workflow.scene_data import Job
 NOTHING_TO_DO = "Nothing to be done"
 """Beginning of the only message of Snakemake that is printed although it is no warning."""
 
-FOLLOWING = (
-    "At least one job did not complete",
-    "Exiting because a job execution failed",
-    "CalledProcessError",
-)
+FOLLOWING = ("At least one job did not complete", "Exiting because a job execution failed")
 """Parts of errors that only repeat that a job has failed."""
+
+COMMAND_FAILED = "CalledProcessError"
+"""Part of an error that quotes the command of a failed job, just before the event of its failure."""
 
 TARGETS = ("all", "everything", "tables", "total")  # entries of the job counts that are not jobs
 
@@ -277,7 +276,8 @@ class ProgressDisplay:
         elif record.levelno >= logging.WARNING:
             lines = [self.text(record)]
             self._was_killed |= any(sign in lines[0] for sign in SIGKILL)
-            if self.run.failures and any(words in lines[0] for words in FOLLOWING):
+            is_repeated = self.run.failures and any(words in lines[0] for words in FOLLOWING)
+            if is_repeated or COMMAND_FAILED in lines[0]:
                 lines = []
         elif (event is None and _is_ours(record)) or record.getMessage().startswith(NOTHING_TO_DO):
             lines = [self.text(record)]

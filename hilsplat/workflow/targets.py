@@ -3,12 +3,13 @@
 from collections.abc import Callable
 from typing import Any
 
+from hilsplat.base.errors import shorten_list
 from hilsplat.datasets.generators import GENERATORS
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.datasets.sources import published
 from hilsplat.evaluate.tables.kinds import TABLES
 from hilsplat.scene.sheet import SceneRow
-from hilsplat.workflow.plan import Plan, shorten_list
+from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.scene_data import Job, of_variant
 
 PICTURES = {
