@@ -33,7 +33,7 @@ from hilsplat.scene.layouts import vertex_count
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.settings import GaussiansSettings, MasksSettings
 from hilsplat.stages import all_stages, family_of, stage_of
-from hilsplat.workflow.plan import Plan
+from hilsplat.workflow.plan import SCORED, Plan
 from hilsplat.workflow.scene_data import Job
 
 with Path(__file__).with_suffix(".tsv").open(encoding="utf-8") as _stream:
@@ -64,6 +64,10 @@ of the graph segmenter per megapixel."""
 
 TRAINED_S_PER_MP, LITERAL_S_PER_MP = 0.08, 0.15
 """Core seconds per step, level and megapixel of a trained baseline, and of the literal trainer."""
+
+QUERY_S_PER_MP = 0.24
+"""Core seconds to score a labelled query per megapixel of its view: 74 s for 2092 queries at 384 x 384 px, by
+tree and field (docs/benchmarks.md)."""
 
 NETWORK_S = 10.0  # core seconds to train an autoencoder
 
@@ -121,6 +125,7 @@ class JobResources:
         self._per_variant = 1 if many else self._per_scene
         self.size = functools.cache(self._size)
         self.gaussians = functools.cache(self._gaussians)
+        self.queries = functools.cache(plan.data.num_labelled)
         self._seconds = functools.cache(self._estimate)
 
     def threads(self, wildcards: Job) -> int:
@@ -200,7 +205,11 @@ class JobResources:
 
     def core_seconds(self, rule: str, job: Job) -> float:
         """Return the estimated core seconds of a scene's job."""
-        return START_S + self._seconds(cost_name(rule), *self.plan.which(job), self.size(self.plan.row(job)))
+        row = self.plan.row(job)
+        seconds = self._seconds(cost_name(rule), *self.plan.which(job), self.size(row))
+        if rule == SCORED:
+            seconds = max(seconds, QUERY_S_PER_MP * self.queries(row) * self.size(row).view_mp)
+        return START_S + seconds
 
     def card_seconds(self, rule: str, job: Job) -> float | None:
         """Return how many seconds a job would take on a card (`GPU`), or None if it has no work for one."""

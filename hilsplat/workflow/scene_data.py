@@ -12,11 +12,15 @@ from types import SimpleNamespace
 from typing import Any, Protocol, runtime_checkable
 
 from hilsplat.base.errors import SettingsError, nearest
+from hilsplat.base.files import IMAGE_SUFFIXES
 from hilsplat.base.lineage import digests_of, sha256_of_json
 from hilsplat.datasets.registry import readers_of
 from hilsplat.datasets.sources import absence, image_files, is_exported, label_files, label_sets
 from hilsplat.scene.layouts import dataparser_of, photo_files, transforms_of
 from hilsplat.scene.sheet import DATA_PREFIX, SceneRow
+
+CATEGORY = b'"category"'
+"""Key of the text of an object in a file of labels."""
 
 
 @runtime_checkable  # for the type checker of the tests
@@ -175,6 +179,15 @@ class SceneData:
             path for labels in self.labels(self.row(job)) for path in label_files(labels, self.data_root)
         )
         return [portable(path.resolve()) for path in found]
+
+    def num_labelled(self, row: SceneRow) -> int:
+        """Return the number of labelled regions in a scene's images: objects in JSON files, or mask files.
+
+        Several objects of one category in a view count separately, although they are one query.
+        """
+        files = [Path(path) for path in self.label_files(row)]
+        masks = sum(path.suffix.lower() in IMAGE_SUFFIXES for path in files)
+        return masks + sum(path.read_bytes().count(CATEGORY) for path in files if path.suffix == ".json")
 
     def truth(self, job: Job) -> list[str]:
         """Return the input that contains a generated scene's annotations; empty for other scenes."""
