@@ -29,6 +29,7 @@ class LogHandler(LogHandlerBase):
         unchanged = settings.dryrun or settings.verbose or settings.quiet
         self.display = None if unchanged else ProgressDisplay(self.stream, self.format, RunProgress())
         self.is_dry = settings.dryrun and not settings.quiet
+        estimates.is_dry = settings.dryrun
         self.estimate: RunEstimate | None = None
 
     def emit(self, record: logging.LogRecord) -> None:

@@ -291,12 +291,15 @@ def _check_files(row: SceneRow, cells: dict[str, str], fault: Callable[..., Scen
 
 
 def _resolved(sheet: Path, cell: str, data_root: str) -> Path | None:
-    """Resolve a path against the project root or, for `data:`, the data root (None if that is not set)."""
+    """Resolve a path against the project root or, for `data:`, the data root (None if that is not set).
+
+    A relative data root starts from the working folder, even if the sheet is the installed one.
+    """
     base = project_root(sheet)
     if cell.startswith(DATA_PREFIX):
         if not data_root:
             return None
-        base = base / Path(data_root).expanduser()
+        base = Path(data_root).expanduser()
     return (base / Path(cell.removeprefix(DATA_PREFIX)).expanduser()).resolve()
 
 

@@ -15,7 +15,7 @@ from hilsplat.baselines import method_of
 from hilsplat.configuration import SECTIONS, RunSettings, StageSettings, parse_run, require_known
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.datasets.sources import unlisted
-from hilsplat.models.store import AUTO, model_digest, model_path, read_model
+from hilsplat.models.store import AUTO, model_digest, model_path, planned_model
 from hilsplat.scene.finished import KEY_VIEWS
 from hilsplat.scene.sheet import (
     DEFAULT_SHEET,
@@ -123,11 +123,11 @@ class Plan:
         if not self.scenes:
             raise SettingsError(
                 "there are no scenes to run",
-                expected=f"scenes of {sheet}: {', '.join(f'{row.name} ({row.group})' for row in self.rows)}",
-                found="; ".join(
+                expected=f"scenes of {sheet}, such as {shorten_list([row.name for row in self.rows], 12)}",
+                found="\n            ".join(
                     [
                         f"groups {list(run.groups)}, only {list(run.only)}, data_root {run.data_root!r}",
-                        *(f"{name} is skipped: {reason}" for name, reason in self.absent.items()),
+                        *self.absent_lines(),
                     ]
                 ),
                 fix="select a scene (hilsplat run photos/desk) or other groups, or set data_root",
@@ -158,6 +158,14 @@ class Plan:
         self._first_alike = functools.cache(self._first_with_equal_identity)
         for row in self.scenes:
             self.data.require_no_braces(row)
+
+    def absent_lines(self) -> list[str]:
+        """Return a line for each data set with skipped scenes, or for each reason if there are several."""
+        found: dict[tuple[str, str], list[str]] = {}
+        for name, reason in self.absent.items():
+            dataset, _, scene = name.partition("/")
+            found.setdefault((dataset, reason), []).append(scene)
+        return [f"{data} ({shorten_list(names)}) is skipped: {why}" for (data, why), names in found.items()]
 
     def require_usable(self, *, devices: bool) -> None:
         """Check that the models exist and, with `devices`, that this machine has the configured devices."""
@@ -455,7 +463,7 @@ class Plan:
         of_photographs = job.variant == "default" and row.group == PHOTOS and not row.features
         if not of_photographs or KEY_VIEWS not in self.run.variants:
             return False
-        model = read_model(Path(masks.model)) if masks.segmenter == "sam" else None
+        model = planned_model(Path(masks.model)) if masks.segmenter == "sam" else None
         is_slow = model is not None and not model.embedded
         return is_slow and len(self.data.image_files(job)) >= MIN_PHOTOGRAPHS
 

@@ -80,11 +80,13 @@ class RunningJob:
 class Estimates:
     """Core seconds of jobs: estimates by rule, scaled by the measured times of finished jobs.
 
-    Without `resources`, which needs a plan, each job is estimated at `START_S`.
+    Without `resources`, which needs a plan, each job is estimated at `START_S`. `is_dry` is set by the logger
+    plugin before the Snakefile is read.
     """
 
     def __init__(self, resources: JobResources | None = None) -> None:
         self.resources = resources
+        self.is_dry = False
         self._measured, self._estimated = defaultdict[str, float](float), defaultdict[str, float](float)
         self._means: dict[str, float] = {}
 

@@ -28,7 +28,7 @@ from hilsplat.baselines import TrainedSettings
 from hilsplat.configuration import StageSettings
 from hilsplat.datasets.generators import GENERATORS
 from hilsplat.models.card import card_problem
-from hilsplat.models.store import model_path, read_model
+from hilsplat.models.store import RELEASES, model_path, planned_model
 from hilsplat.scene.layouts import vertex_count
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.settings import GaussiansSettings, MasksSettings
@@ -236,7 +236,7 @@ class JobResources:
         """Return whether a job runs a released SAM or CLIP."""
         if rule not in EMBEDDED_S or (rule == "masks" and stages.masks.segmenter != "sam"):
             return False
-        model = read_model(Path(getattr(stages, rule).model))
+        model = planned_model(Path(getattr(stages, rule).model))
         return model is not None and not model.embedded
 
     def _estimate(self, rule: str, variant: str, scopes: tuple[str, ...], size: Size) -> float:
@@ -346,7 +346,10 @@ def _first_mp(images: Iterable[str], max_side_px: int) -> float:
 
 @functools.cache
 def _model_memory_mb(folder: Path, variant: str, batch: int | str, threads: int) -> int:
-    """Return the memory of a stage's model, MB; 0 if the folder is unreadable (the stage reports it)."""
+    """Return the memory of a stage's model, MB; 0 if the folder is unreadable (the stage reports it).
+
+    For a released model that is missing, it is the size of the download, a lower limit.
+    """
     from hilsplat.models.folder import open_model_folder
     from hilsplat.models.memory import MIB, needs_of  # onnxruntime is slow to import
     from hilsplat.segment.sam import own_thresholds
@@ -355,5 +358,6 @@ def _model_memory_mb(folder: Path, variant: str, batch: int | str, threads: int)
         model = open_model_folder(folder, variant=variant)
         prompts = own_thresholds(model).points_per_batch if isinstance(batch, str) else batch
     except ModelError:
-        return 0
+        known = {release.name: release.megabytes for release in RELEASES}
+        return 0 if folder.exists() else known.get(folder.name, 0)
     return round(needs_of(model, prompts).total_mib(threads) * MIB / 1e6)

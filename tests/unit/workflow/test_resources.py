@@ -158,3 +158,16 @@ def test_masks_of_a_data_set_count_as_queries(tmp_path):
     rows = ("3d_ovs bed 3d_ovs data:3d_ovs/bed arbitrary", "synthetic one benchmark world:tabletop:1 metre")
     found = plan_of(tmp_path, rows, groups=["3d_ovs", "benchmark"], data_root=str(tmp_path))
     assert [found.data.num_labelled(row) for row in found.rows] == [4, 0]
+
+
+def test_a_released_model_has_its_cost_before_it_is_fetched(tmp_path, monkeypatch):
+    monkeypatch.setenv("HILSPLAT_MODELS", str(tmp_path / "none"))
+    seconds, megabytes = {}, {}
+    for name in ("sam-vit-huge", "sam2.1-hiera-small", "unknown"):
+        masks = {"segmenter": "sam", "model": f"models/{name}"}
+        found = JobResources(plan(tmp_path, masks=masks, world={"views": 10, "image_px": 128}))
+        seconds[name] = found.core_seconds("masks", JOB)
+        megabytes[name] = found.memory_mb("masks")(JOB, 1, 1)
+    assert seconds["sam-vit-huge"] > seconds["sam2.1-hiera-small"] + 800 > 900
+    assert seconds["unknown"] == 10 * 1.5 + 2, "as the embedded model"
+    assert megabytes["sam-vit-huge"] > 2570 > megabytes["unknown"]
