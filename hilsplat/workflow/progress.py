@@ -174,7 +174,8 @@ class RunProgress:
         found: dict[str, str] = {}
         for job in self.failures.values():
             error = last_error(job.log) if job.log is not None else ""
-            found.setdefault(error or job.name, f"{job.name} failed; its log is {job.log}\n{error}".rstrip())
+            where = f"; its log is {job.log}" if job.log is not None else ""
+            found.setdefault(error or job.name, f"{job.name} failed{where}\n{error}".rstrip())
         return [*found.values()]
 
     def end(self, number: int) -> list[str]:

@@ -197,8 +197,11 @@ def run(
         with suppress(HilsplatError), _locked_results(plan.results):
             remove_leftovers(plan.results)  # left by killed jobs
         return status
-    for line in summary(plan):
-        logger.info("%s", line)
+    try:
+        for line in summary(plan, [target for target in targets if target.startswith(files)]):
+            logger.info("%s", line)
+    except HilsplatError as error:  # the run has succeeded, but an earlier artifact is damaged
+        logger.warning("%s", error)
     return 0
 
 
@@ -207,6 +210,10 @@ def _config_file(name: Path) -> Path:
     named = CONFIG.with_name(f"{name.name}.yaml")
     if name.suffix or len(name.parts) != 1 or name.exists():
         return project_path(name)
+    if "=" in str(name):
+        raise SettingsError(
+            f"{name} is not a file", fix=f"pass keys after --: hilsplat run -- --config {name}"
+        )
     if not (found := project_path(named)).exists():
         known = {
             path.stem for folder in (Path(), INSTALLED) for path in (folder / named).parent.glob("*.yaml")

@@ -1,5 +1,6 @@
 """The last lines of a run: what exists of each scene, how good it is, and the next command."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from hilsplat.base.artifacts import rebuild_command
@@ -20,14 +21,16 @@ PSNR_WORDS = ((25.0, "good"), (20.0, "fair"))
 Gaussian Splatting has 23 to 29 dB on its photographs (Kerbl et al. 2023, Tab. 1)."""
 
 
-def summary(plan: Plan) -> list[str]:
-    """Return the summary of a plan's scenes that have poses.
+def summary(plan: Plan, files: Sequence[str] = ()) -> list[str]:
+    """Return the summary of a plan's scenes that have poses; if files were made, only of theirs.
 
     Raises:
         ArtifactError: an artifact is damaged.
     """
     found = set(scenes_in(plan.results))
     rows = [row for row in plan.scenes if row.name in found]
+    if files:
+        rows = [row for row in rows if any(file.startswith(f"{plan.path(row)}/") for file in files)]
     if len(rows) > DETAILED:
         lines = scene_lines(plan.results, [row.name for row in rows])[0]
     else:

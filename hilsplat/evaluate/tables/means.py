@@ -29,7 +29,7 @@ METRICS = {
     "accuracy": ("pixel_accuracy", "macc_present", "macc_all"),
     "AP": ("ap",),
 }
-"""Column -> metrics, of which the first that a protocol has is shown."""
+"""Column -> metrics; the first that a protocol has is shown."""
 
 COLUMNS = (
     *("method", "mIoU", *(level.label for level in LEVELS), "localized", "accuracy", "AP"),

@@ -244,7 +244,9 @@ def test_key_views_are_embedded_before_a_full_size_sam_segments_the_others(tmp_p
     desk, key, one = Job("photos", "desk"), Job("photos", "desk", "key-views"), Job()
     assert not found.first_answer(desk)  # sam-tiny takes seconds
 
-    monkeypatch.setattr("hilsplat.workflow.plan.planned_model", lambda folder: SimpleNamespace(embedded=False))
+    monkeypatch.setattr(
+        "hilsplat.workflow.plan.planned_model", lambda folder: SimpleNamespace(embedded=False)
+    )
     assert found.first_answer(desk)
     assert not found.first_answer(key) and not found.first_answer(one)
     assert found.masks_priority(desk) < found.masks_priority(key)

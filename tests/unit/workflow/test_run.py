@@ -203,6 +203,8 @@ def test_a_configuration_is_found_by_its_name(folder, project, started):
     assert configs == [str(project / "config/demo.yaml"), "config/mine.yaml"]
     with pytest.raises(SettingsError, match=r"no configuration is named 'dem'(.|\n)*did you mean 'demo'"):
         runs.run([], [Path("dem")], ["-n"])
+    with pytest.raises(SettingsError, match=r"pass keys after --: hilsplat run -- --config seed=3"):
+        runs.run([], [Path("seed=3")], ["-n"])
     with pytest.raises(SettingsError, match=r"other\.yaml is missing"):
         runs.run([], [Path("other.yaml")], ["-n"])
 

@@ -80,6 +80,23 @@ def test_many_scenes_share_a_table(project):
     ]
 
 
+def test_a_run_of_files_describes_their_scenes_only(project):
+    shutil.copytree("results/photos/desk/scene", "results/photos/chair/scene")
+    found = plan_of(project, ROWS, groups=["photos"])
+    lines = summary(found, ["results/photos/chair/scene", "results/tables/lerf.csv"])
+    assert [line for line in lines if line.endswith(":")] == ["photos/chair:"]
+
+
+def test_damage_is_reported_after_a_run_that_succeeded(project, monkeypatch, caplog):
+    plan_of(project, ROWS, groups=["photos"])
+    Path("config/config.yaml").write_text("groups: [photos]\n")
+    Path("Snakefile").write_text("")
+    Path("results/photos/desk/scene/index.json").write_text("{}")
+    monkeypatch.setattr(runs, "_run", lambda command: 0)
+    assert runs.run(["desk"], [], []) == 0
+    assert "results/photos/desk/scene/index.json is not an artifact index" in caplog.text
+
+
 def test_every_run_that_succeeds_ends_with_the_summary(project, monkeypatch, caplog):
     plan_of(project, ROWS, groups=["photos"])
     Path("config/config.yaml").write_text("groups: [photos]\n")
