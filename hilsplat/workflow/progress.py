@@ -28,8 +28,11 @@ from hilsplat.stages import all_stages
 from hilsplat.workflow.resources import START_S, JobResources
 from hilsplat.workflow.scene_data import Job
 
-NOTHING_TO_DO = "Nothing to be done"
-"""Beginning of the only message of Snakemake that is printed although it is no warning."""
+KEPT = ("Nothing to be done", "This was a dry-run")
+"""Beginnings of the messages of Snakemake that are printed although they are no warnings."""
+
+PLANNED = frozenset({"run_info", "job_info", "shellcmd"})
+"""Events that a dry run prints."""
 
 FOLLOWING = ("At least one job did not complete", "Exiting because a job execution failed")
 """Parts of errors that only repeat that a job has failed."""
@@ -282,7 +285,7 @@ class ProgressDisplay:
             is_repeated = self.run.failures and any(words in lines[0] for words in FOLLOWING)
             if is_repeated or COMMAND_FAILED in lines[0]:
                 lines = []
-        elif (event is None and _is_ours(record)) or record.getMessage().startswith(NOTHING_TO_DO):
+        elif is_shown(record):
             lines = [self.text(record)]
         self._print(lines, {logging.WARNING: "yellow", logging.ERROR: "red"}.get(record.levelno))
         self._line.refresh()
@@ -304,9 +307,10 @@ class ProgressDisplay:
         return Text(self.run.line() if self._console.is_terminal else "", no_wrap=True, overflow="ellipsis")
 
 
-def _is_ours(record: logging.LogRecord) -> bool:
-    """Return whether a message is from our Snakefile or rules, not from a module of Snakemake."""
-    return Path(record.pathname).suffix != ".py"
+def is_shown(record: logging.LogRecord) -> bool:
+    """Return whether a message is a warning, is in `KEPT`, or is from our Snakefile or rules."""
+    is_ours = getattr(record, "event", None) is None and Path(record.pathname).suffix != ".py"
+    return record.levelno >= logging.WARNING or is_ours or record.getMessage().startswith(KEPT)
 
 
 def duration(seconds: float) -> str:
