@@ -86,9 +86,16 @@ def mark_run(results: Path) -> None:
 
 def record_run(results: Path, configs: Sequence[Path], overrides: Mapping[str, Any]) -> None:
     """Record a run's configuration in the results, for the commands that messages suggest (`run_command`)."""
-    files = [os.path.relpath(path) for path in configs]
+    files = [_config_name(Path(path)) for path in configs]
     values = [f"{key}={json.dumps(value)}" for key, value in overrides.items() if key != "only"]
     write_json(results / RUN, {"results": [str(results)], "config": files, "overrides": values})
+
+
+def _config_name(path: Path) -> str:
+    """Return the name of a configuration for `--config`: that of an installed one, or a relative path."""
+    beside = CONFIG.with_name(path.name)
+    is_installed = not beside.exists() and path.resolve() == (INSTALLED / beside).resolve()
+    return path.stem if is_installed else os.path.relpath(path)
 
 
 def unmark_run() -> None:

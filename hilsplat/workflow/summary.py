@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from hilsplat.base.artifacts import rebuild_command
+from hilsplat.base.artifacts import rebuild_command, run_command
 from hilsplat.base.tables import read_csv
 from hilsplat.evaluate.scenes import SceneState, scene_lines
 from hilsplat.evaluate.tables.means import mean_lines
+from hilsplat.query.hits import counted
 from hilsplat.scene.finished import command_name, scenes_in
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.workflow import targets
@@ -37,9 +38,7 @@ def summary(plan: Plan, files: Sequence[str] = ()) -> list[str]:
         lines = [line for row in rows for line in _scene(plan, row)]
     tables = [path for path in targets.tables(plan) if Path(path).is_file()]
     if tables and any(map(targets.data_of, rows)):
-        lines.append(
-            f"tables: {Path(tables[0]).parent}/*.md; as one page: hilsplat run -- --report report.html"
-        )
+        lines.append(f"tables: {Path(tables[0]).parent}/*.md")
     return lines
 
 
@@ -61,7 +60,8 @@ def _scene(plan: Plan, row: SceneRow) -> list[str]:
         "scores": f"in %, also in {means.with_suffix('.md')} and {means.name}:" if table else "",
     }
     lines = [f"{what:<10} {fact}" for what, fact in facts.items() if fact] + [f"  {line}" for line in table]
-    lines.append(f"{'next':<10} {uses if 'tree' in scene.state else f'hilsplat run {name}'}")
+    following = uses if "tree" in scene.state else run_command(folder, scene=row.name)
+    lines.append(f"{'next':<10} {following}")
     return [f"{row.name}:", *(f"  {line}" for line in lines)]
 
 
@@ -78,9 +78,6 @@ def _fit(scene: SceneState) -> str:
         return ""
     psnr_db, of_test = scene.fit["psnr_db"], scene.fit["split"] == "test"
     word = next((word for least, word in PSNR_WORDS if psnr_db >= least), "poor")
-    where = (
-        f"in {scene.views['test']} held-out views: {word}"
-        if of_test
-        else "in training views; none is held out"
-    )
+    held_out = f"in {counted(scene.views['test'], 'held-out view')}: {word}"
+    where = held_out if of_test else "in training views; none is held out"
     return f"{scene.fit['gaussians']}; PSNR {psnr_db:.1f} dB {where}"

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from hilsplat.base.artifacts import run_command
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.cli.main import app
 from hilsplat.workflow import run as runs
@@ -207,6 +208,13 @@ def test_a_configuration_is_found_by_its_name(folder, project, started):
         runs.run([], [Path("seed=3")], ["-n"])
     with pytest.raises(SettingsError, match=r"other\.yaml is missing"):
         runs.run([], [Path("other.yaml")], ["-n"])
+
+
+def test_a_run_records_installed_configurations_by_name_for_the_commands_of_messages(folder, project):
+    Path("config/mine.yaml").write_text("")
+    runs.record_run(Path("results"), [project / "config/ci.yaml", folder / "config/mine.yaml"], {})
+    command = "hilsplat run --config ci --config config/mine.yaml results/a/b/scene"
+    assert run_command(Path("results/a/b/scene")) == command
 
 
 def test_the_snakefile_is_beside_the_configuration_or_the_installed_one(

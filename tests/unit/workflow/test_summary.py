@@ -42,7 +42,7 @@ def test_a_scene_is_described_with_its_numbers_files_and_next_commands(project):
     write_csv(folder / "scores.csv", ["method", "mIoU", "protocol"], [["hilsplat (tree)", "75.0", "lerf"]])
     found = described(project)
     assert found["poses"] == "6 of 7 views registered; reprojection error 0.61 px"
-    assert found["Gaussians"] == "864; PSNR 20.0 dB in 1 held-out views: fair"
+    assert found["Gaussians"] == "864; PSNR 20.0 dB in 1 held-out view: fair"
     assert found["nodes"] == "2 whole, 2 part, 1 subpart (graph, colours)"
     assert found["pictures"] == "fit.png, panel.png in results/figures/photos/desk"
     assert found["scores"] == "in %, also in results/photos/desk/scores.md and scores.csv:"
@@ -53,8 +53,8 @@ def test_a_scene_is_described_with_its_numbers_files_and_next_commands(project):
 @pytest.mark.parametrize(
     ("psnr_db", "split", "words"),
     [
-        (25.0, "test", "PSNR 25.0 dB in 1 held-out views: good"),
-        (19.9, "test", "PSNR 19.9 dB in 1 held-out views: poor"),
+        (25.0, "test", "PSNR 25.0 dB in 1 held-out view: good"),
+        (19.9, "test", "PSNR 19.9 dB in 1 held-out view: poor"),
         (31.0, "train", "PSNR 31.0 dB in training views; none is held out"),
     ],
 )
@@ -67,6 +67,10 @@ def test_only_held_out_views_are_judged(project, psnr_db, split, words):
 def test_a_scene_without_a_tree_continues_with_a_run(project):
     shutil.rmtree("results/photos/desk/default")
     assert described(project)["next"] == "hilsplat run photos/desk"
+    runs.record_run(Path("results"), [Path("config/mine.yaml")], {"seed": 5})
+    assert (
+        described(project)["next"] == "hilsplat run --config config/mine.yaml photos/desk -- --config seed=5"
+    )
 
 
 def test_many_scenes_share_a_table(project):
