@@ -8,6 +8,7 @@ import pytest
 from hilsplat.base.artifacts import write_json
 from hilsplat.base.tables import write_csv
 from hilsplat.workflow import run as runs
+from hilsplat.workflow import summary as summaries
 from hilsplat.workflow.summary import summary
 from tests.unit.workflow.plans import plan_of
 
@@ -82,6 +83,13 @@ def test_many_scenes_share_a_table(project):
         "scene",
         *(f"photos/{name}" for name in ("a", "b", "c", "desk")),
     ]
+
+
+def test_very_many_scenes_are_only_counted(project, monkeypatch):
+    monkeypatch.setattr(summaries, "TABLED", 0)
+    monkeypatch.setattr(summaries, "DETAILED", 0)
+    lines = summary(plan_of(project, ROWS, groups=["photos"]))
+    assert lines == ["1 scenes have poses; to list them: hilsplat scenes --results results"]
 
 
 def test_a_run_of_files_describes_their_scenes_only(project):
