@@ -15,8 +15,8 @@ from hilsplat.workflow.models import doubt_about_photographs
 from hilsplat.workflow.plan import Plan
 
 DETAILED, TABLED = 3, 30
-"""Maximum number of scenes that are described one by one, and that share a table; a labelled scene of 490 files
-takes 50 ms to read."""
+"""Maximum number of scenes that are described one by one, and that share a table; reading a labelled scene of
+490 files takes 50 ms."""
 
 PSNR_WORDS = ((25.0, "good"), (20.0, "fair"))
 """Lowest PSNR of held-out views, in dB, for each word; below, the fit is poor. The words are ours; 3D
