@@ -60,10 +60,9 @@ def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[object]], wor
 
 def aligned_table(rows: Sequence[Sequence[object]], words: Collection[str]) -> list[str]:
     """Return rows as aligned lines, the header first; the columns named in `words` begin at the left."""
-    cells = [[str(cell) for cell in row] for row in rows]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    sides = [str.ljust if name in words else str.rjust for name in cells[0]]
-    return [
-        "  ".join(side(cell, width) for side, cell, width in zip(sides, row, widths, strict=True)).rstrip()
-        for row in cells
-    ]
+    columns = []
+    for column in zip(*rows, strict=True):
+        texts = [str(cell) for cell in column]
+        width, side = max(map(len, texts)), str.ljust if column[0] in words else str.rjust
+        columns.append([side(text, width) for text in texts])
+    return ["  ".join(row).rstrip() for row in zip(*columns, strict=True)]

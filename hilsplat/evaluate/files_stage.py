@@ -16,6 +16,7 @@ from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, Setting
 from hilsplat.base.images import read_mask
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import stage_log
+from hilsplat.base.tables import aligned_table
 from hilsplat.datasets.labelled import image_size_hw
 from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
@@ -32,7 +33,7 @@ from hilsplat.evaluate.protocols.points import (
 from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth, truths_of
 from hilsplat.evaluate.protocols.views import consistency_rows
 from hilsplat.evaluate.scores import COLUMNS, Measured, Score, write_instances, write_scores
-from hilsplat.evaluate.tables.means import mean_lines, mean_rows
+from hilsplat.evaluate.tables.means import TEXTS, mean_rows
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import EvaluateSettings
 
@@ -130,7 +131,8 @@ def run_evaluate_files(
         scans = {scene: found for (_, scene, *_), found in matches.items()}
         precisions = measure_instances(METHOD, scans, "files") if scans else ()
         every = [*scores, *(score(view="", **vars(row)) for row in precisions)]
-        return "\n".join(mean_lines(mean_rows(pd.DataFrame(map(vars, every), columns=list(COLUMNS)), {})))
+        frame = pd.DataFrame(map(vars, every), columns=list(COLUMNS))
+        return "\n".join(aligned_table(mean_rows(frame, {}), TEXTS))
 
 
 def _mask_rows(

@@ -38,7 +38,6 @@ class SceneState:
     """What a run has computed for a scene.
 
     Attributes:
-        name: `<dataset>/<scene>`.
         poses: the registration report; empty if there are no poses.
         views: number of views by split.
         fit: the report of the Gaussians; empty if there are none.
@@ -49,7 +48,6 @@ class SceneState:
         date: local time at which its newest artifact was written, or an empty string.
     """
 
-    name: str
     poses: dict[str, Any]
     views: dict[str, int]
     fit: dict[str, Any]
@@ -86,7 +84,6 @@ class SceneState:
         stats = stats_of(files_below(folder))
         times = [stat.st_mtime for path, stat in stats.items() if path.name.endswith(RECORD)]
         return SceneState(
-            name=f"{folder.parent.name}/{folder.name}",
             poses=read_json(registration) if has_poses and registration.is_file() else {},
             views=views,
             fit=read_json(report) if report.is_file() else {},

@@ -16,6 +16,7 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from difflib import get_close_matches
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
@@ -234,16 +235,14 @@ def _config_file(name: Path) -> Path:
 def _require_known(targets: Sequence[str], rows: Sequence[SceneRow], results: str) -> None:
     """Refuse a target that is neither a scene nor a rule and cannot be a results file."""
     known = [*TARGET_RULES, *(row.name for row in rows)]
+    names = [*known, *(row.scene for row in rows)]
     for target in targets:
-        expected = nearest(target, known)
-        may_be_file = "/" in target and not is_pattern(target) and not expected.startswith("did you")
+        may_be_file = "/" in target and not (is_pattern(target) or get_close_matches(target, names))
         if target not in TARGET_RULES and not may_be_file:
             raise HilsplatError(
                 f"no scene, rule or file is named {target!r}",
-                expected=expected
-                if expected.startswith("did you")
-                else f"{expected}, or a file in {results}/",
-                fix="correct the name; to add photographs: hilsplat new NAME FOLDER",
+                expected=nearest(target, known),
+                fix=f"correct the name; files are in {results}/; for photographs: hilsplat new NAME FOLDER",
             )
 
 

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hilsplat.base.artifacts import rebuild_command, run_command
-from hilsplat.base.tables import read_csv
+from hilsplat.base.tables import aligned_table, read_csv
 from hilsplat.evaluate.scenes import SceneState, scene_lines
-from hilsplat.evaluate.tables.means import mean_lines
+from hilsplat.evaluate.tables.means import TEXTS
 from hilsplat.query.hits import counted
 from hilsplat.scene.finished import command_name, scenes_in
 from hilsplat.scene.sheet import SceneRow
@@ -52,7 +52,7 @@ def _scene(plan: Plan, row: SceneRow) -> list[str]:
     counts = ", ".join(f"{number} {level}" for level, number in scene.nodes.items())
     pictures = ", ".join(sorted(path.name for path in figures.glob("*.png")))
     scores = read_csv(means, None, rebuild_command(means)) if means.is_file() else []
-    table = mean_lines([list(scores[0]), *(list(each.values()) for each in scores)]) if scores else []
+    table = aligned_table([[*scores[0]], *([*each.values()] for each in scores)], TEXTS) if scores else []
     uses = f'hilsplat query {name} "..."  or  hilsplat view {name}'
     facts = {
         "poses": _poses(scene),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from hilsplat.base.artifacts import write_text
 from hilsplat.base.levels import LEVELS
-from hilsplat.base.tables import aligned_table, markdown_table, plain_markdown, write_csv
+from hilsplat.base.tables import markdown_table, plain_markdown, write_csv
 from hilsplat.evaluate.protocols.cards import INSTANCES, card_of
 from hilsplat.evaluate.scores import read_scores
 from hilsplat.evaluate.tables.measured import level_cells, percent, row_name, row_place
@@ -16,15 +16,9 @@ from hilsplat.evaluate.tables.rows import Cell
 if TYPE_CHECKING:
     import pandas as pd
 
+IOUS = ("iou", "miou_absent_as_one", "miou_occurring", "miou_all", "miou_present", "frequency_weighted_iou")
 METRICS = {
-    "mIoU": (
-        "iou",
-        "miou_absent_as_one",
-        "miou_occurring",
-        "miou_all",
-        "miou_present",
-        "frequency_weighted_iou",
-    ),
+    "mIoU": IOUS,
     "localized": ("localization_mask",),
     "accuracy": ("pixel_accuracy", "macc_present", "macc_all"),
     "AP": ("ap",),
@@ -37,7 +31,7 @@ COLUMNS = (
 )
 """Columns of a table of means; empty ones are omitted. All values but the number of queries are in %."""
 
-WORDS = ("method", "protocol")
+TEXTS = ("method", "protocol")  # columns that are not numbers
 
 
 def mean_rows(scores: "pd.DataFrame", labels: Mapping[str, str]) -> list[list[str]]:
@@ -97,8 +91,3 @@ def run_score_means(paths: Sequence[Path], labels: Mapping[str, str], out: Path)
     lines = [[plain_markdown(cell) for cell in row] for row in rows]
     write_text(out, markdown_table(columns, lines, 1) + "\n")
     write_csv(out.with_suffix(".csv"), columns, rows)
-
-
-def mean_lines(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return the rows of `mean_rows` as aligned lines; empty if there are no scores."""
-    return aligned_table(rows, WORDS) if len(rows) > 1 else []

@@ -6,7 +6,7 @@ from hilsplat.base.tables import read_csv
 from hilsplat.cli.main import app
 from hilsplat.datasets.classes import WAYMO_22
 from hilsplat.evaluate.scores import COLUMNS, write_scores
-from hilsplat.evaluate.tables.means import mean_lines, mean_rows
+from hilsplat.evaluate.tables.means import mean_rows
 from tests.unit.evaluate.builders import score
 
 LABELS = {"default": "hilsplat"}
@@ -69,9 +69,3 @@ def test_the_means_of_a_scene_are_written_as_markdown_and_csv(tmp_path):
     write_scores(files[0], [])
     app([words[0], str(files[0]), *words[3:]], standalone_mode=False)
     assert read_csv(out.with_suffix(".csv"), None, "") == []
-
-
-def test_lines_are_aligned_and_nothing_is_printed_without_scores():
-    rows = [["method", "mIoU", "protocol"], ["tree", "5.0", "p"], ["field, path", "55.0", "q"]]
-    assert mean_lines(rows) == ["method       mIoU  protocol", "tree          5.0  p", "field, path  55.0  q"]
-    assert mean_lines([]) == []
