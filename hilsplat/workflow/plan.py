@@ -107,6 +107,10 @@ class Plan:
         """Read the sheet; raise HilsplatError if it or the configuration is invalid, or no scene is left."""
         self.run = run = parse_run(dict(config))
         self.results = Path(run.results)
+        if self.results.exists() and not self.results.is_dir():
+            raise SettingsError(
+                f"results: {self.results} is not a folder", fix="move that file, or choose another folder"
+            )
         require_variant_sections(run)
         sheet = project_path(run.scenes)
         rows = read_sheet(sheet, run.groups, run.data_root)
@@ -169,10 +173,6 @@ class Plan:
 
     def require_usable(self, *, devices: bool) -> None:
         """Check that the models exist and, with `devices`, that this machine has the configured devices."""
-        if self.results.exists() and not self.results.is_dir():
-            raise SettingsError(
-                f"results: {self.results} is not a folder", fix="move that file, or choose another folder"
-            )
         where: dict[StageSettings, str] = {}
         for row in self.scenes:
             for variant in self.run.variant_names():
