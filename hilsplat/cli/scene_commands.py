@@ -44,7 +44,7 @@ def run_command(
 ) -> None:
     """Run the workflow for everything in the configuration, or only for given scenes, tables or files.
 
-    Rerunning resumes a killed run. Options after -- are passed to Snakemake: hilsplat run -- --touch
+    Rerunning resumes a killed run. Options after -- are passed to Snakemake: hilsplat run -- --retries 2
     """
     from hilsplat.workflow.run import run
 
