@@ -22,10 +22,10 @@ export PATH := $(CURDIR)/$(BIN):$(PATH)
 .PHONY: run demo test lint docs bench gpu chaos published report setup
 
 run: $(STAMP)
-	hilsplat run -- --cores $(CORES)
+	hilsplat run --cores $(CORES)
 
 demo: $(STAMP)
-	hilsplat run --config config/demo.yaml -- --cores $(CORES)
+	hilsplat run --config demo --cores $(CORES)
 
 setup: $(STAMP)
 

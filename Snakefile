@@ -50,13 +50,18 @@ try:
     PLAN = Plan(
         merged_config([], config)
     )  # a module's `config:` replaces the configfile
-    PLAN.require_usable(devices=CORES is not None)
 except HilsplatError as error:  # users can fix these errors without a traceback
     raise WorkflowError(str(error)) from None
+try:
+    PLAN.require_usable(devices=CORES is not None)
+except HilsplatError as error:
+    if not estimates.is_dry:  # the estimate of a dry run needs no models
+        raise WorkflowError(str(error)) from None
+    logger.warning(str(error))
 RESOURCES = JobResources(PLAN, CORES)
 estimates.resources = RESOURCES
-for name, reason in PLAN.absent.items():
-    logger.warning(f"{name} is skipped: {reason}")
+for line in PLAN.absent_lines():
+    logger.warning(line)
 LABELS = {"files": PLAN.data.label_files, "plugins": PLAN.data.label_readers}
 
 
@@ -128,8 +133,6 @@ onstart:
 
 
 onsuccess:
-    for line in targets.summary(PLAN):
-        logger.info(line)
     unmark_run()
 
 

@@ -14,7 +14,7 @@ from pydantic.fields import FieldInfo
 
 from hilsplat import settings
 from hilsplat.base.artifacts import parse_json
-from hilsplat.base.errors import SettingsError
+from hilsplat.base.errors import SettingsError, nearest
 from hilsplat.base.files import NAME_RULE, name_problem, project_path, regular
 from hilsplat.base.levels import path_of
 from hilsplat.base.plugins import entry_points
@@ -292,12 +292,8 @@ def require_known(where: str, keys: Iterable[str], known: Collection[str]) -> No
     """Refuse unknown keys, which would have no effect, and suggest a known one."""
     for key in keys:
         if key not in known:
-            near = difflib.get_close_matches(key, known, n=1)
-            raise SettingsError(
-                f"{where}.{key}: unknown name",
-                expected=f"did you mean {near[0]!r}?" if near else f"one of {', '.join(known)}",
-                fix=f"correct the key, or remove it from {where}",
-            )
+            fix = f"correct the key, or remove it from {where}"
+            raise SettingsError(f"{where}.{key}: unknown name", expected=nearest(key, known), fix=fix)
 
 
 class _UniqueKeys(yaml.SafeLoader):  # type: ignore[misc]

@@ -455,6 +455,18 @@ def evaluate(
     )
 
 
+@stage(scope="scene", file="scores.md", beside=lambda out: (out.with_suffix(".csv"),))
+def score_means(
+    scores: Annotated[list[Path], typer.Argument(help="scores.csv of each variant"), Role.INPUT],
+    out: Annotated[Path, typer.Option(help="Markdown to write, with a CSV beside it"), Role.OUTPUT],
+    names: Names,
+) -> None:
+    """Average a scene's scores by method and protocol."""
+    from hilsplat.evaluate.tables.means import run_score_means
+
+    run_score_means(scores, names, out)
+
+
 @stage(scope="run", reads=_labels)
 def evaluate_files(
     predictions: Annotated[
@@ -474,11 +486,11 @@ def evaluate_files(
     min_region_px: Annotated[
         int | None, typer.Option(min=1, help="minimum area of a scored region in a generated scene")
     ] = None,
-) -> None:
-    """Score masks or point labels written by any program, under the same protocols."""
+) -> str:
+    """Score masks or point labels written by any program, and print the mean under each protocol."""
     from hilsplat.evaluate.files_stage import run_evaluate_files
 
-    run_evaluate_files(
+    return run_evaluate_files(
         predictions,
         out,
         method=method,

@@ -26,6 +26,24 @@ use rule stage as evaluate with:
         ),
 
 
+use rule stage as score_means with:
+    input:
+        scores=targets.means_of(PLAN),
+    output:
+        out="<results>/{dataset}/{scene}/scores.md",
+        csv="<results>/{dataset}/{scene}/scores.csv",
+    log:
+        PLAN.log("score_means"),
+    benchmark:
+        PLAN.benchmark("score_means")
+    priority: 2
+    threads: 1
+    resources:
+        **RESOURCES.of("score_means"),
+    params:
+        **PLAN.params("score_means"),
+
+
 use rule stage as table with:
     input:
         scores=targets.scores_of(PLAN, "scores.csv"),

@@ -1,7 +1,7 @@
 """Snakemake logger plugin that shows the progress of a run instead of Snakemake's block of lines per job.
 
-`profiles/default` enables it. With --verbose, --quiet, --dry-run or another --logger, Snakemake's own output
-is unchanged. After a dry run, a table estimates the run's time and memory.
+`profiles/default` enables it. With --verbose, --quiet or another --logger, Snakemake's own output is
+unchanged. A dry run prints its jobs, and a table that estimates the run's time and memory.
 """
 
 import logging
@@ -11,7 +11,7 @@ from snakemake_interface_logger_plugins.base import LogHandlerBase
 
 from hilsplat.base.errors import visible
 from hilsplat.workflow.estimate import RunEstimate
-from hilsplat.workflow.progress import ProgressDisplay, RunProgress, estimates
+from hilsplat.workflow.progress import PLANNED, ProgressDisplay, RunProgress, estimates, is_shown
 
 
 class LogHandler(LogHandlerBase):
@@ -29,6 +29,7 @@ class LogHandler(LogHandlerBase):
         unchanged = settings.dryrun or settings.verbose or settings.quiet
         self.display = None if unchanged else ProgressDisplay(self.stream, self.format, RunProgress())
         self.is_dry = settings.dryrun and not settings.quiet
+        estimates.is_dry = settings.dryrun
         self.estimate: RunEstimate | None = None
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -36,12 +37,16 @@ class LogHandler(LogHandlerBase):
         try:
             if self.display is not None:
                 self.display.show(record)
-            elif text := self.format(record):
+            elif self._is_printed(record) and (text := self.format(record)):
                 print(visible(text), file=self.stream, flush=True)
             if self.is_dry and getattr(record, "event", None) == "job_info":
                 self._count(record)
         except Exception:
             self.handleError(record)
+
+    def _is_printed(self, record: logging.LogRecord) -> bool:
+        is_filtered = self.is_dry and not self.common_settings.verbose
+        return not is_filtered or is_shown(record) or getattr(record, "event", None) in PLANNED
 
     def _count(self, record: logging.LogRecord) -> None:
         """Add a job to the estimate of a dry run; the Snakefile has already set the plan."""

@@ -47,8 +47,11 @@ def provenance_path(artifact: Path) -> Path:
     return artifact.parent / f"{artifact.name}{RECORD}"
 
 
-def run_command(path: Path, *options: str) -> str:
-    """Return the command that makes a results file, or all results, in the project that they belong to."""
+def run_command(path: Path, *options: str, scene: str = "", settings: Mapping[str, Any] | None = None) -> str:
+    """Return the command that makes a results file, or all results, in the project that they belong to.
+
+    Given a `scene`, the command makes this scene; `settings` are added to the overrides of the run.
+    """
     path = Path(path).resolve()
     folders = [path, *path.parents]
     results = next((folder for folder in folders if (folder / RUN).is_file()), None)
@@ -56,8 +59,10 @@ def run_command(path: Path, *options: str) -> str:
     results = results or next((folder for folder in folders if folder.name == "results"), path.parent)
     configs = [word for config in run.get("config", ()) for word in ("--config", config)]
     name = Path(*run.get("results", ["results"]))
-    target = [] if path == results else [str(name / path.relative_to(results))]
-    overrides = ["--", "--config", *run["overrides"]] if run.get("overrides") else []
+    target = [] if path == results else [scene or str(name / path.relative_to(results))]
+    values = [*run.get("overrides", ())]
+    values += [f"{section}={json.dumps(changed)}" for section, changed in (settings or {}).items()]
+    overrides = ["--", "--config", *values] if values else []
     return shlex.join(["hilsplat", "run", *configs, *options, *target, *overrides])
 
 

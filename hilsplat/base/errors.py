@@ -1,7 +1,8 @@
 """Errors that a user can fix."""
 
+import difflib
 import errno
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -49,7 +50,7 @@ def system_error(error: BaseException) -> HilsplatError | None:
 
 
 KILLED = "probably because memory ran out"
-KILLED_FIX = "use fewer cores (hilsplat run -- --cores 1), smaller images (poses.max_side_px) or more memory"
+KILLED_FIX = "use fewer cores (hilsplat run --cores 1), smaller images (poses.max_side_px) or more memory"
 
 
 def visible(text: object) -> str:
@@ -66,6 +67,25 @@ def first_line(error: object) -> str:
 def in_one_line(error: HilsplatError) -> str:
     """Return an error's message and lines as one line."""
     return "; ".join(" ".join(line.split()) for line in str(error).splitlines())
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return the known name that was probably meant or, if none is similar, the first known names.
+
+    Names such as `photos/desk` are also compared by their last parts.
+    """
+    names = list(known)
+    parts = {part: each for each in names for part in (each.rpartition("/")[2], each)}
+    for part in (name, name.rpartition("/")[2]):
+        if near := difflib.get_close_matches(part, parts, n=1):
+            return f"did you mean {parts[near[0]]!r}?"
+    return f"one of {shorten_list(names, 12)}"
+
+
+def shorten_list(names: Sequence[str], count: int = 3) -> str:
+    """Return the first names, and the number of remaining names."""
+    more = f" and {len(names) - count} more" if len(names) > count else ""
+    return ", ".join(names[:count]) + more
 
 
 def require_working_directory() -> None:

@@ -33,6 +33,7 @@ PROGRESS = re.compile(
     r"^\d{4}-.* INFO hilsplat\.base\.progress: (?P<what>.+): (?P<done>\d+) of (?P<total>\d+)$", re.M
 )
 WARNING = re.compile(r"^\d{4}-\S+ \S+ WARNING \S+ (?P<text>.+?)(?=\n\d{4}-|\Z)", re.M | re.S)
+ERROR = re.compile(r"^\d{4}-\S+ \S+ ERROR \S+ (?P<text>.+?)(?=\n\d{4}-|\Z)", re.M | re.S)
 
 
 def last_progress(log: Path) -> tuple[str, int, int] | None:
@@ -44,6 +45,12 @@ def last_progress(log: Path) -> tuple[str, int, int] | None:
 def warnings_in(log: Path) -> list[str]:
     """Return the warnings in a stage's log."""
     return [match["text"].rstrip() for match in WARNING.finditer(_tail(log, sys.maxsize))]
+
+
+def last_error(log: Path) -> str:
+    """Return the last error in a stage's log or, if the stage was killed, the log's last lines."""
+    *_, last = [None, *ERROR.finditer(_tail(log, sys.maxsize))]
+    return last["text"].rstrip() if last else "\n".join(_tail(log).splitlines()[-5:])
 
 
 def _tail(log: Path, num_bytes: int = LOG_TAIL_BYTES) -> str:

@@ -2,7 +2,7 @@
 
 import csv
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -56,3 +56,13 @@ def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[object]], wor
     numbers = len(columns) - words
     lines = [columns, ["---"] * words + ["---:"] * numbers, *rows]
     return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
+
+
+def aligned_table(rows: Sequence[Sequence[object]], words: Collection[str]) -> list[str]:
+    """Return rows as aligned lines, the header first; the columns named in `words` begin at the left."""
+    columns = []
+    for column in zip(*rows, strict=True):
+        texts = [str(cell) for cell in column]
+        width, side = max(map(len, texts)), str.ljust if column[0] in words else str.rjust
+        columns.append([side(text, width) for text in texts])
+    return ["  ".join(row).rstrip() for row in zip(*columns, strict=True)]

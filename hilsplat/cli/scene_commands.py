@@ -27,21 +27,36 @@ def run_command(
         typer.Argument(metavar="TARGET", help="scenes (photos/desk, desk or 'photos/*'), tables or files"),
     ] = None,
     config: Annotated[
-        list[Path] | None, typer.Option(help="file that overrides config/config.yaml; may be repeated")
+        list[Path] | None,
+        typer.Option(help="file that overrides config/config.yaml, or its name in config/; may be repeated"),
     ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", "-n", help="print jobs, disk space and hours; run nothing")
+    ] = False,
+    cores: Annotated[int | None, typer.Option("--cores", "-c", min=1, help="CPU cores; default: all")] = None,
+    forcerun: Annotated[
+        list[str] | None, typer.Option("--forcerun", "-R", help="stage or file to run again; may be repeated")
+    ] = None,
+    verbose: Annotated[bool, typer.Option("--verbose", help="print all lines of Snakemake")] = False,
     verify: Annotated[
         bool, typer.Option(help="read every byte of earlier results, and rebuild what is damaged")
     ] = False,
 ) -> None:
     """Run the workflow for everything in the configuration, or only for given scenes, tables or files.
 
-    Rerunning resumes a killed run. Options after -- are passed to Snakemake: hilsplat run desk -- --cores 1
+    Rerunning resumes a killed run. Options after -- are passed to Snakemake: hilsplat run -- --retries 2
     """
     from hilsplat.workflow.run import run
 
-    options = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else []
+    passed = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else []
     names = targets or []
-    raise typer.Exit(run(names[: len(names) - len(options)], config or [], options, every_byte=verify))
+    options = ["--dry-run"] if dry_run else []
+    options += ["--cores", str(cores)] if cores else []
+    options += ["--forcerun", *forcerun] if forcerun else []
+    options += ["--verbose"] if verbose else []
+    raise typer.Exit(
+        run(names[: len(names) - len(passed)], config or [], [*options, *passed], every_byte=verify)
+    )
 
 
 @app.command()

@@ -1,7 +1,6 @@
 """Commands that use a finished scene, check results or the machine, or print all settings."""
 
 import gc
-import glob
 import json
 from dataclasses import asdict
 from pathlib import Path
@@ -41,6 +40,12 @@ def query(
     out: Annotated[
         Path | None, typer.Option(help="folder; default: queries/TEXT in the scene's folder")
     ] = None,
+    masks: Annotated[
+        Path | None, typer.Option(help="new folder for masks of the answer in all views: PNG and COCO")
+    ] = None,
+    spz: Annotated[
+        bool, typer.Option("--spz", help="write selection.spz, too: compressed Gaussians")
+    ] = False,
     threads: Threads = 2,
 ) -> None:
     """Find the objects or parts that match a text in a finished scene.
@@ -59,6 +64,8 @@ def query(
         return
     if text is None:
         raise SettingsError(f"there is no text to search for in {scene}", fix="hilsplat query SCENE TEXT")
+    if masks is not None:
+        require_new_folder(masks)
     gc.disable()  # garbage collection would take two seconds, a tenth of the query time
     try:
         from hilsplat.query.answer import answer
@@ -73,6 +80,8 @@ def query(
             view=view,
             threshold=threshold,
             out=out,
+            masks=masks,
+            spz=spz,
             threads=threads,
         ):
             echo(found)
@@ -81,18 +90,22 @@ def query(
 
 
 def scene_folder(scene: str, results: Path) -> Path:
-    """Return the folder of a scene (name, dataset/scene or path); SettingsError if a name is ambiguous."""
-    named, path = results / scene, Path(scene)
-    if "/" not in scene:
-        found = sorted(folder.parent for folder in results.glob(f"*/{glob.escape(scene)}/scene"))
-        if len(found) > 1:
-            raise SettingsError(
-                f"{scene!r} matches several scenes",
-                expected=f"one of {', '.join(f'{folder.parent.name}/{scene}' for folder in found)}",
-            )
-        if found:
-            return found[0]
-    return path if path.is_dir() and not named.is_dir() else named
+    """Return the folder of a scene (name, dataset/scene or path).
+
+    Raises:
+        ArtifactError: there is no such scene; the message lists those of the results.
+        SettingsError: the name is ambiguous.
+    """
+    from hilsplat.scene.finished import require_scene_folder, scenes_in
+
+    found = [name for name in scenes_in(results) if scene in (name, name.partition("/")[2])]
+    if len(found) > 1:
+        expected = f"one of {', '.join(found)}"
+        raise SettingsError(f"{scene!r} matches several scenes", expected=expected)
+    named = results / (found[0] if found else scene)
+    folder = Path(scene) if not named.is_dir() and Path(scene).is_dir() else named
+    require_scene_folder(folder)
+    return folder
 
 
 @app.command("show-masks")

@@ -41,6 +41,7 @@ class Dataset:
         folder: the data set's folder below `data_root`, if it differs from the name.
         tables: names of the tables that show its scores (`evaluate.tables`).
         images_of: data set whose images it labels, if it has none of its own.
+        origin: where to get it, as text that is printed to users.
     """
 
     name: str
@@ -58,6 +59,7 @@ class Dataset:
     folder: str = ""
     tables: tuple[str, ...] = ()
     images_of: str = ""
+    origin: str = ""
 
     def root(self, data_root: Path | str) -> Path:
         """Return the data set's folder, to which all its paths are relative."""

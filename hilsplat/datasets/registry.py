@@ -81,6 +81,7 @@ def overview(data_root: Path | None) -> str:
     for dataset in DATASETS.values():
         lines = [
             f"{dataset.name}: {dataset.title}, labels on {dataset.labels}",
+            *([f"  get it    {dataset.origin}"] if dataset.origin else []),
             f"  citation  {dataset.citation}",
             f"  licence   {dataset.licence}",
             f"  terms     {dataset.terms}",

@@ -31,6 +31,8 @@ def absence(source: str, data_root: str) -> str | None:
     if not data_root:
         return "data_root is not set"
     root = Path(data_root).expanduser()
+    if not root.is_dir():
+        return f"data_root {data_root} is not a folder"
     place = published(source)
     if place is None:
         folder = root / source.removeprefix(DATA_PREFIX)

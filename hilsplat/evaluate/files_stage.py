@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Bool, Float64, Int64
 
 from hilsplat.base.artifacts import read_npz
@@ -15,6 +16,7 @@ from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, Setting
 from hilsplat.base.images import read_mask
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import stage_log
+from hilsplat.base.tables import aligned_table
 from hilsplat.datasets.labelled import image_size_hw
 from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
@@ -22,10 +24,16 @@ from hilsplat.evaluate.metrics.instances import InstanceMatches
 from hilsplat.evaluate.protocols import cards
 from hilsplat.evaluate.protocols.answers import mask_rows
 from hilsplat.evaluate.protocols.flat_views import argmax_rows
-from hilsplat.evaluate.protocols.points import class_set, instance_scan, measure_points
+from hilsplat.evaluate.protocols.points import (
+    class_set,
+    instance_scan,
+    measure_instances,
+    measure_points,
+)
 from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth, truths_of
 from hilsplat.evaluate.protocols.views import consistency_rows
-from hilsplat.evaluate.scores import Measured, Score, write_instances, write_scores
+from hilsplat.evaluate.scores import COLUMNS, Measured, Score, write_instances, write_scores
+from hilsplat.evaluate.tables.means import TEXTS, mean_rows
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import EvaluateSettings
 
@@ -59,7 +67,7 @@ def run_evaluate_files(
     dataset: str = "synthetic",
     name: str = "",
     min_region_px: int | None = None,
-) -> None:
+) -> str:
     """Score masks or point labels written by any program (see `read_view_masks` for the format).
 
     Masks without a level are scored under the text protocols, masks with levels under
@@ -72,6 +80,9 @@ def run_evaluate_files(
         truth: a generated scene's ground truth, instead of `labels`; needs the posed `scene` (which defines
             the test views), `source` as in `run_evaluate`, and the data set and name for the rows.
         min_region_px: smaller regions of a generated scene are not scored; None for the default setting.
+
+    Returns:
+        A table of the means under each protocol, in %.
 
     Raises:
         ArtifactError: a view has no predictions, or a file is missing or malformed.
@@ -112,13 +123,16 @@ def run_evaluate_files(
                 rows.append(("", result))
             else:
                 matches[dataset, name, method, "-", METHOD] = result
-        scores = [
-            Score(dataset=dataset, scene=name, variant=method, masks="-", view=view, **vars(row))
-            for view, row in rows
-        ]
+        score = partial(Score, dataset=dataset, scene=name, variant=method, masks="-")
+        scores = [score(view=view, **vars(row)) for view, row in rows]
         counts["views"], counts["rows"] = len(views), len(scores)
         write_instances(out, matches)
         write_scores(out, scores)
+        scans = {scene: found for (_, scene, *_), found in matches.items()}
+        precisions = measure_instances(METHOD, scans, "files") if scans else ()
+        every = [*scores, *(score(view="", **vars(row)) for row in precisions)]
+        frame = pd.DataFrame(map(vars, every), columns=list(COLUMNS))
+        return "\n".join(aligned_table(mean_rows(frame, {}), TEXTS))
 
 
 def _mask_rows(

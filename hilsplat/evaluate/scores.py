@@ -91,20 +91,3 @@ def read_instances(scores: Iterable[Path]) -> dict[tuple[str, ...], InstanceMatc
             *key, part = name.split("/")
             found.setdefault(tuple(key), {})[part] = array
     return {key: InstanceMatches(**arrays) for key, arrays in found.items()}
-
-
-def score_summary(scene: str, files: Mapping[str, Path]) -> list[str]:
-    """Return a user-facing table of mean IoU and localization; `files` maps variants to score files."""
-    lines = []
-    for name, path in files.items():
-        scores = read_scores([path])
-        for (method, protocol), rows in scores.groupby(["method", "protocol"]):
-            means = rows.groupby("metric")["value"].mean()
-            if "iou" not in means:
-                continue
-            localized = f"{means['localization_mask']:>9.1%}" if "localization_mask" in means else f"{'-':>9}"
-            queries = int((rows["metric"] == "iou").sum())
-            label = f"{name}, {method}"
-            lines.append(f"  {label:<26} {means['iou']:>7.1%} {localized} {queries:>9}  {protocol}")
-    heading = f"  {'':<26} {'mIoU':>7} {'localized':>9} {'queries':>9}  protocol"
-    return [f"scores of {scene} against your labels:", heading, *lines] if lines else []

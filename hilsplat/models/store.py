@@ -88,6 +88,14 @@ def read_model(folder: Path) -> PresentModel | None:
     return PresentModel(folder, LAYOUTS[layout].kind, is_embedded(config))
 
 
+def planned_model(folder: Path) -> PresentModel | None:
+    """Return the model in a folder or, if the folder is missing, the released model of that name."""
+    released = next((release for release in RELEASES if release.name == folder.name), None)
+    if released is not None and not model_path(folder).exists():
+        return PresentModel(folder, released.family, embedded=False)
+    return read_model(folder)
+
+
 def user_models() -> Path:
     """Return the folder of downloaded models, shared by all projects of a user."""
     named = os.environ.get("HILSPLAT_MODELS")

@@ -4,15 +4,20 @@ import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from hilsplat.base.atomic import atomic_folder, atomic_path
 from hilsplat.base.levels import LEVELS, PATH_SEPARATOR, path_of
 from hilsplat.base.lineage import sha256_of_bytes
 from hilsplat.base.ownership import require_own_picture
+from hilsplat.base.progress import track
 from hilsplat.query.hits import Hit, counted, doubts_of
 from hilsplat.query.language_scene import LanguageScene
+from hilsplat.query.mask_files import mask_files
 from hilsplat.query.node_search import NodeHits
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.segment.origin import made_from_truth, masks_label
 from hilsplat.semantic_tree.export import write_selection_ply
+from hilsplat.splat.gaussians import morton_order
+from hilsplat.splat.spz import fractional_bits, spz_bytes
 
 LISTED = 10
 """Maximum number of answers in a report."""
@@ -32,6 +37,8 @@ def answer(
     view: str | None = None,
     threshold: float | None = None,
     out: Path | None = None,
+    masks: Path | None = None,
+    spz: bool = False,
     threads: int = 1,
 ) -> Iterator[str]:
     """Query a scene: yield the report, then write `panel.png` and `selection.ply` and yield their names.
@@ -42,6 +49,8 @@ def answer(
     Args:
         views: number of views in the panel; `view`, if given, is the first.
         out: output folder for both files; by default `queries/<text>` in the scene's folder.
+        masks: new folder for the masks of the answer's nodes in all views (`mask_files`).
+        spz: whether to write the answer's Gaussians as `selection.spz`, too.
     """
     finished = FinishedScene.locate(Path(folder), variant)
     scene = LanguageScene.of(finished, threads=threads)
@@ -54,15 +63,31 @@ def answer(
     from hilsplat.query.query_panel import query_panel
 
     folder = Path(out) if out is not None else finished.folder / "queries" / file_name(text)
-    panel, selection = folder / "panel.png", folder / "selection.ply"
+    panel, selection, compressed = (folder / name for name in ("panel.png", "selection.ply", "selection.spz"))
     if out is not None:
-        require_own_picture(panel, beside=selection)
+        for beside in (selection, compressed) if spz else (selection,):
+            require_own_picture(panel, beside=beside)
     best = views_of(scene, scene.hits_of(nodes, LISTED), views)
     drawn = list(dict.fromkeys([*([view] if view else []), *best]))[:views]
     restriction = "" if view is None else f", in view {view}"
     query_panel(scene, text, nodes, drawn, panel, note=restriction + note, answerer=answerer)
     write_selection_ply(finished.parts.gaussians, scene.views.gaussians_of(nodes.ids), selection)
     yield f"wrote {panel} and {selection.name}"
+    if spz:
+        rows = scene.views.gaussians_of(nodes.ids)
+        ordered = rows[morton_order(scene.gaussians.means[rows])]
+        with atomic_path(compressed) as temporary:
+            temporary.write_bytes(spz_bytes(scene.gaussians, ordered, fractional_bits(scene.gaussians)))
+        yield f"wrote {compressed}"
+    if masks is not None:
+        of_views = mask_files(scene, [(text, nodes.ids.tolist())])
+        with atomic_folder(masks) as temporary:
+            for files in track(of_views, "masks of views", len(scene.views.names)):
+                for name, data in files.items():
+                    path = temporary / name
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    path.write_bytes(data)
+        yield f"wrote masks of {counted(len(nodes.ids), 'node')} to {masks}/<view>/<node>.png and coco.json"
 
 
 def views_of(scene: LanguageScene, hits: Sequence[Hit], count: int) -> list[str]:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from hilsplat.base.artifacts import read_index, run_command
-from hilsplat.base.errors import ArtifactError, HilsplatError, first_line
+from hilsplat.base.errors import ArtifactError, HilsplatError, first_line, nearest
 from hilsplat.base.levels import Level
 from hilsplat.embed.clip import ClipModel, open_clip_of
 from hilsplat.query.hits import Doubt, counted, doubts_of
@@ -22,7 +22,7 @@ from hilsplat.query.node_names import NodeNaming
 from hilsplat.query.node_queries import NodeQueries, caution_of
 from hilsplat.query.node_search import NodeHits
 from hilsplat.query.relevancy import relevancy_of_margins
-from hilsplat.scene.finished import FinishedScene, changed_input
+from hilsplat.scene.finished import FinishedScene, changed_input, scenes_in
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import EvaluateSettings
 
@@ -216,8 +216,9 @@ def open_scenes(results: Path | str = "results", pattern: str = "*", variant: st
     """
     results, skipped, found = Path(results), dict[str, str](), list[FoundScene]()
     models: dict[tuple[str, str], ClipModel] = {}
-    for folder in sorted(path.parent for path in results.glob("*/*/scene")):
-        name = f"{folder.parent.name}/{folder.name}"
+    names = scenes_in(results)
+    for name in names:
+        folder = results / name
         if not (fnmatchcase(name, pattern) or fnmatchcase(folder.name, pattern)):
             continue
         try:
@@ -237,6 +238,7 @@ def open_scenes(results: Path | str = "results", pattern: str = "*", variant: st
     if not found:
         raise ArtifactError(
             f"{results} has no finished scene" + (f" that matches {pattern!r}" if pattern != "*" else ""),
+            expected=nearest(pattern, names) if names and not skipped else None,
             found="; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3]) or None,
             fix="run the workflow, or specify the results folder",
         )

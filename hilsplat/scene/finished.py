@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from hilsplat.base.artifacts import provenance_path, read_index, run_command
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.errors import ArtifactError, nearest
 from hilsplat.base.lineage import read_provenance
 from hilsplat.base.plugins import entry_points
 from hilsplat.settings import EvaluateSettings
@@ -120,15 +120,29 @@ class FinishedScene:
             ) from error
 
 
+def scenes_in(results: Path) -> list[str]:
+    """Return the names, `<dataset>/<scene>`, of the scenes of a results folder that have a scene folder."""
+    places = [path for path in results.glob("*/*") if (path / "scene").is_dir()]
+    return sorted(f"{path.parent.name}/{path.name}" for path in places)
+
+
+def command_name(folder: Path) -> str:
+    """Return a scene's name in commands: `<dataset>/<scene>`, or its path if it is not in results/."""
+    return str(folder.relative_to("results") if folder.parts[0] == "results" else folder)
+
+
 def require_scene_folder(folder: Path) -> None:
-    """Raise ArtifactError if the folder of a scene does not exist."""
-    if not folder.is_dir():
-        raise ArtifactError(
-            f"scene folder {folder} is missing",
-            expected="a run's folder results/<dataset>/<scene>, or a copy of it",
-            found=f"no such folder in {Path.cwd()}",
-            fix="correct the path, or specify the results folder",
-        )
+    """Raise ArtifactError, with the scenes of its results folder, if the folder of a scene does not exist."""
+    if folder.is_dir():
+        return
+    parents = folder.absolute().parents
+    known = scenes_in(parents[1]) or scenes_in(parents[0])  # results/photos/desk, or results/desk
+    name = f"{folder.parent.name}/{folder.name}"
+    raise ArtifactError(
+        f"scene folder {folder} is missing",
+        expected=nearest(name, known) if known else "a run's folder results/<dataset>/<scene>, or a copy",
+        fix="correct the name, or make the scene: hilsplat run SCENE; to list all: hilsplat scenes",
+    )
 
 
 def refining(folder: Path) -> str:

@@ -5,12 +5,14 @@ import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
 
+from hilsplat.base.artifacts import run_command
 from hilsplat.base.atomic import work_folder
-from hilsplat.base.errors import RegistrationError, SceneError
+from hilsplat.base.errors import RegistrationError, SceneError, shorten_list
 from hilsplat.base.files import list_images
 from hilsplat.base.images import read_image, resize_to_fit
 from hilsplat.base.ownership import SOFTWARE, require_own_picture
@@ -48,7 +50,12 @@ NEIGHBOURS = 3
 """Number of registered photographs listed as neighbours of each unregistered one."""
 
 MAX_ROWS = 12
-"""Maximum number of unregistered photographs in the picture; registration.json lists all of them."""
+"""Maximum number of unregistered photographs in the picture, besides separate groups; registration.json lists
+all of them."""
+
+COLUMNS = 1 + NEIGHBOURS
+TITLE_LETTERS = 48
+"""Letters in a line of a picture's title; longer lines would run into the title of the next picture."""
 
 THUMBNAIL_PX = 400
 
@@ -95,13 +102,13 @@ def run_poses(
         try:
             if known is None:
                 unit = "arbitrary"
-                posed = _reconstruct(images, work, name, is_render, settings, seed, threads)
+                posed = _reconstruct(images, out, work, name, is_render, settings, seed, threads)
             else:
                 posed = import_poses(known, work, name, settings, seed, threads)
         except RegistrationError as error:
             if lost.exists():
                 shutil.copyfile(lost, picture)
-                where = "shows the unregistered photographs and where they belong"
+                where = "shows the unregistered photographs"
                 error.add_line("picture", f"{picture} {where}")
             raise
         report = posed[3]
@@ -115,7 +122,14 @@ def run_poses(
 
 
 def _reconstruct(
-    images: Path, work: Path, name: str, is_render: bool, settings: PosesSettings, seed: int, threads: int
+    images: Path,
+    out: Path,
+    work: Path,
+    name: str,
+    is_render: bool,
+    settings: PosesSettings,
+    seed: int,
+    threads: int,
 ) -> Posed:
     """Run structure from motion on a folder of photographs."""
     if not images.is_dir():
@@ -153,7 +167,7 @@ def _reconstruct(
     for source, reason in unreadable.items():
         lost = {"file": source.name, "registered": False, "why_not": reason.splitlines()[0]}
         report["views"].setdefault(source.name, lost)
-    check_registration(images, name, report, settings)
+    check_registration(images, out, name, report, settings)
     model, views = models[0], []
     for image in (model.images[image_id] for image_id in model.reg_image_ids()):
         pose, file = pose_matrix(image.cam_from_world()), work / "images" / image.name
@@ -190,10 +204,9 @@ def registration_report(
     warnings = []
     if 0 < len(errors) < len(images):
         warnings.append(f"{len(images) - len(errors)} of {len(images)} views are not registered")
-    connected = [size for _, size in sorted(groups.items()) if size > 1]
-    if len(connected) > 1:
-        sizes = ", ".join(map(str, connected))
-        warnings.append(f"{len(connected)} groups of photographs share no verified matches ({sizes} views)")
+    separate = [size for _, size in sorted(groups.items()) if size >= MIN_PHOTOS]
+    if len(separate) > 1:
+        warnings.append(groups_question(separate))
     if len(members) > 1:
         sizes = ", ".join(str(len(names)) for names in members)
         warnings.append(f"the views form {len(members)} separate models ({sizes} views); the largest is used")
@@ -252,28 +265,73 @@ def _why_not(
     return f"no pose found: too few matches with posed views (best pair: {best} matches)"
 
 
-def check_registration(images: Path, name: str, report: Mapping[str, Any], settings: PosesSettings) -> None:
-    """Refuse a reconstruction with too few views; otherwise log the unregistered ones."""
-    total, registered = report["images"], report["registered"]
-    lost = [entry for entry in report["views"].values() if not entry["registered"]]
-    if registered < max(1, settings.min_registered_share * total):
-        share, sizes = registered / total, ", ".join(map(str, report["models"])) or "no"
-        reasons = "".join(f"\n            {entry['file']}: {entry['why_not']}" for entry in lost)
+def groups_question(sizes: Sequence[int]) -> str:
+    """Describe groups of photographs that share no verified matches."""
+    different = sizes if len(set(sizes)) > 1 else sizes[:1]
+    named = " and ".join(filter(None, [", ".join(map(str, different[:-1])), str(different[-1])]))
+    return f"{len(sizes)} groups of {named} photographs without a common point: {len(sizes)} scenes?"
+
+
+def separate_groups(views: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
+    """Return the views of each group that could be a scene of its own, in the order of their numbers.
+
+    The list is empty if there are fewer than two. Unreadable photographs have no group.
+    """
+    groups: dict[int, list[str]] = {}
+    for view, entry in views.items():
+        groups.setdefault(entry.get("group", 0), []).append(view)
+    found = [groups[number] for number in sorted(groups) if number and len(groups[number]) >= MIN_PHOTOS]
+    return found if len(found) > 1 else []
+
+
+def lost_alone(views: Mapping[str, Mapping[str, Any]], groups: Sequence[Sequence[str]]) -> list[str]:
+    """Return the unregistered views that are not in a separate group without a registered view."""
+    lost = [group for group in groups if not any(views[view]["registered"] for view in group)]
+    grouped = {view for group in lost for view in group}
+    return [view for view, entry in views.items() if not entry["registered"] and view not in grouped]
+
+
+def check_registration(
+    images: Path, out: Path, name: str, report: Mapping[str, Any], settings: PosesSettings
+) -> None:
+    """Refuse a reconstruction with too few views; otherwise log the unregistered ones.
+
+    Args:
+        out: output of the stage, for the command in the message.
+    """
+    total, registered, views = report["images"], report["registered"], report["views"]
+    if registered >= max(1, settings.min_registered_share * total):
+        for entry in (entry for entry in views.values() if not entry["registered"]):
+            logger.warning("%s: %s is not registered: %s", name, entry["file"], entry["why_not"])
+        return
+    share, groups = registered / total, separate_groups(views)
+    sizes = ", ".join(map(str, report["models"])) or "no"
+    files = [[views[view]["file"] for view in group] for group in groups]
+    reasons = [f"group of {len(group)}: {shorten_list(group)}" for group in files]
+    reasons += [f"{views[view]['file']}: {views[view]['why_not']}" for view in lost_alone(views, groups)]
+    if groups:
+        problem = f"the photographs of {name} in {images} are {groups_question([*map(len, groups)])}"
+        advice = (
+            "move each group to a folder of its own and add it as a scene (hilsplat new NAME FOLDER), or add "
+            "photographs that connect them"
+        )
+    else:
+        problem = f"too few photographs of {name} in {images} could be registered"
         advice = (
             "add sharp photographs of textured surfaces between the unregistered ones and the others "
             "(neighbours less than about 10 degrees apart), or remove the unregistered ones from the folder"
         )
-        if registered:
-            advice += f"; to continue with {registered} views, set poses.min_registered_share to "
-            advice += f"{np.floor(share * 100) / 100:.2f} or less"
-        raise RegistrationError(
-            f"too few photographs of {name} in {images} could be registered",
-            expected=f"at least {settings.min_registered_share:.0%} of {total} (poses.min_registered_share)",
-            found=f"{registered} ({share:.1%}); models of {sizes} views; not registered:{reasons}",
-            fix=advice,
-        )
-    for entry in lost:
-        logger.warning("%s: %s is not registered: %s", name, entry["file"], entry["why_not"])
+    if registered:
+        enough = {"min_registered_share": float(np.floor(share * 100) / 100)}
+        command = run_command(out, scene=name, settings={"poses": enough})
+        advice += f"; to continue with {registered} views, now and in later runs: {command}"
+    details = "".join(f"\n            {reason}" for reason in reasons)
+    raise RegistrationError(
+        problem,
+        expected=f"at least {settings.min_registered_share:.0%} of {total} (poses.min_registered_share)",
+        found=f"{registered} ({share:.1%}); models of {sizes} views; not registered or separate:{details}",
+        fix=advice,
+    )
 
 
 def name_neighbours(shared: Mapping[str, Mapping[str, int]], views: Mapping[str, dict[str, Any]]) -> None:
@@ -289,28 +347,36 @@ def name_neighbours(shared: Mapping[str, Mapping[str, int]], views: Mapping[str,
 
 
 def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> None:
-    """Draw unregistered photographs, if any, with their registered neighbours."""
-    lost = [(view, entry) for view, entry in report["views"].items() if not entry["registered"]]
-    if not lost:
+    """Draw unregistered photographs, if any: separate groups, then others with registered neighbours."""
+    views, groups = report["views"], separate_groups(report["views"])
+    num_lost = sum(not entry["registered"] for entry in views.values())
+    if not num_lost:
         return
     from matplotlib.figure import Figure
 
-    num_rows = min(len(lost), MAX_ROWS)
-    figure = Figure(figsize=(12, 1.2 + 2.1 * num_rows), layout="constrained")
-    limit = f" (the first {MAX_ROWS})" if len(lost) > MAX_ROWS else ""
-    title = f"{len(lost)} of {report['images']} photographs are not registered{limit}"
-    figure.suptitle(f"{title}\n{ADVICE}", fontsize=10, parse_math=False)
-    cells = figure.subplots(num_rows, 1 + NEIGHBOURS, squeeze=False)
-    for row, (view, entry) in zip(cells, lost[:MAX_ROWS], strict=True):
-        near = entry["belongs_near"]
-        titles = [f"{entry['file']}: {entry['why_not'].partition(':')[0]}"]
-        titles += [f"{neighbour['view']}: {neighbour['matches']} shared matches" for neighbour in near]
-        names = [view, *(neighbour["view"] for neighbour in near)]
-        for axes, name, title in zip(row, names, titles, strict=False):
-            axes.imshow(resize_to_fit(read_image(images / name), THUMBNAIL_PX))
-            axes.set_title(title, fontsize=7, parse_math=False)
-        for axes in row:
+    rows: list[list[tuple[str, str]]] = []  # pictures: view, title
+    for number, group in enumerate(groups, 1):
+        shown = [group[place * len(group) // COLUMNS] for place in range(min(COLUMNS, len(group)))]
+        state = "registered" if any(views[view]["registered"] for view in group) else "not registered"
+        first = f"group {number}: {len(group)} photographs, {state}: {views[shown[0]]['file']}"
+        rows.append([(shown[0], first), *((view, views[view]["file"]) for view in shown[1:])])
+    alone = lost_alone(views, groups)
+    for view in alone[:MAX_ROWS]:
+        entry = views[view]
+        counts = {near["view"]: near["matches"] for near in entry["belongs_near"]}
+        neighbours = [(near, f"{near}: {count} shared matches") for near, count in counts.items()]
+        rows.append([(view, f"{entry['file']}: {entry['why_not'].partition(':')[0]}"), *neighbours])
+    figure = Figure(figsize=(12, 1.2 + 2.1 * len(rows)), layout="constrained")
+    limit = f" (the first {MAX_ROWS})" if len(alone) > MAX_ROWS else ""
+    title = f"{num_lost} of {report['images']} photographs are not registered{limit}"
+    advice = groups_question([*map(len, groups)]) if groups else ADVICE
+    figure.suptitle(f"{title}\n{advice}", fontsize=10, parse_math=False)
+    for cells, pictures in zip(figure.subplots(len(rows), COLUMNS, squeeze=False), rows, strict=True):
+        for axes, (view, words) in zip(cells, pictures, strict=False):
+            axes.imshow(resize_to_fit(read_image(images / view), THUMBNAIL_PX))
+            axes.set_title("\n".join(wrap(words, TITLE_LETTERS)), fontsize=7, parse_math=False)
+        for axes in cells:
             axes.set_axis_off()
-        if not near:
-            row[1].text(0, 0.5, "no verified match with a registered photograph", fontsize=8)
+        if len(pictures) == 1:
+            cells[1].text(0, 0.5, "no verified match with a registered photograph", fontsize=8)
     figure.savefig(path, format="png", dpi=100, metadata=SOFTWARE)

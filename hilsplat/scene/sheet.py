@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from hilsplat.base.errors import SceneError
+from hilsplat.base.errors import SceneError, nearest
 from hilsplat.base.files import IMAGE_SUFFIXES, NAME_RULE, list_images, name_problem, regular
 from hilsplat.base.plugins import entry_points
 from hilsplat.scene.layouts import NO_POSES, contents, has_known_poses, photo_folder
@@ -172,7 +172,7 @@ def choose_scenes(
         if not matches:
             raise SceneError(
                 f"setting `only`: no scene is named {name!r}",
-                expected=", ".join(row.name for row in in_groups or rows),
+                expected=nearest(name, [row.name for row in in_groups or rows]),
                 fix="correct the name, or add a row to the scene sheet",
             )
         chosen.update(row.name for row in matches)
@@ -291,12 +291,15 @@ def _check_files(row: SceneRow, cells: dict[str, str], fault: Callable[..., Scen
 
 
 def _resolved(sheet: Path, cell: str, data_root: str) -> Path | None:
-    """Resolve a path against the project root or, for `data:`, the data root (None if that is not set)."""
+    """Resolve a path against the project root or, for `data:`, the data root (None if that is not set).
+
+    A relative data root starts from the working folder, even if the sheet is the installed one.
+    """
     base = project_root(sheet)
     if cell.startswith(DATA_PREFIX):
         if not data_root:
             return None
-        base = base / Path(data_root).expanduser()
+        base = Path(data_root).expanduser()
     return (base / Path(cell.removeprefix(DATA_PREFIX)).expanduser()).resolve()
 
 

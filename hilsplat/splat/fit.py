@@ -222,6 +222,7 @@ def write_report(
     scores: dict[str, dict[str, float]] = {}
     flat: list[float] = []
     cells: list[UInt8[np.ndarray, "_ _ 3"]] = []
+    titles: list[str] = []
     for view in views:
         rendering = picture(view.camera)  # scored as a saved 8-bit image
         values, truth = to_float(rendering), to_float(view.image)
@@ -230,6 +231,8 @@ def write_report(
         if len(cells) < 3 * MAX_SHOWN:
             error = np.abs(view.image.astype(np.int32) - rendering) * ERROR_GAIN
             cells += [view.image, rendering, np.minimum(error, 255).astype(np.uint8)]
+            quality = f"fit, {scores[view.camera.name]['psnr_db']:.1f} dB"
+            titles += [view.camera.name, quality, f"error x {ERROR_GAIN}"]
     report: dict[str, Any] = {
         "split": split,
         **{name: float(np.mean([score[name] for score in scores.values()])) for name in ("psnr_db", "ssim")},
@@ -246,7 +249,7 @@ def write_report(
             "may be wrong"
         )
     with atomic_folder(folder) as temporary:
-        write_png(temporary / "test_views.png", contact_sheet(cells, columns=6))
+        write_png(temporary / "test_views.png", contact_sheet(cells, 6, titles))
         path = [view.camera for view in train or views]
         write_flyaround(temporary, path, lambda camera: picture(camera, 1), threads)
         if curve is not None:

@@ -1,12 +1,13 @@
 """Smooth camera paths around a scene or through given cameras; videos and contact sheets of renders."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
 import av
 import numpy as np
 from jaxtyping import Float64, UInt8
+from PIL import Image, ImageDraw, ImageFont
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.distance import cdist
@@ -26,6 +27,7 @@ SMOOTHING = 1 / 40
 
 MAX_SIDE_PX = 320  # longer side of a picture on a contact sheet
 GAP_PX = 4
+TITLE_PX = 15  # height of the line above a picture
 
 OPTIONS = {"crf": "20", "preset": "veryfast", "x264-params": "threads=1:mbtree=0"}
 """Macroblock-tree rate control is off: its output differs between runs, even on one thread (PyAV 18.1)."""
@@ -153,16 +155,31 @@ def encoded_film(
         film.mux(stream.encode())
 
 
-def contact_sheet(pictures: list[UInt8[np.ndarray, "_ _ 3"]], columns: int) -> UInt8[np.ndarray, "H W 3"]:
-    """Shrink pictures by integer factors to at most MAX_SIDE_PX and arrange them in rows on a white sheet."""
+def contact_sheet(
+    pictures: list[UInt8[np.ndarray, "_ _ 3"]], columns: int, titles: Sequence[str] = ()
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Shrink pictures by integer factors to at most MAX_SIDE_PX and arrange them in rows on a white sheet.
+
+    Each picture may have a title above it; a long title loses its beginning, because file names differ at the
+    end.
+    """
     cells = [_shrunk(picture, -(-max(picture.shape[:2]) // MAX_SIDE_PX)) for picture in pictures]
+    above = TITLE_PX if titles else 0
     height, width = (max(cell.shape[axis] for cell in cells) + GAP_PX for axis in (0, 1))
-    rows = -(-len(cells) // columns)
+    height, rows = height + above, -(-len(cells) // columns)
     sheet = np.full((rows * height, min(columns, len(cells)) * width, 3), 255, np.uint8)
-    for k, cell in enumerate(cells):
-        y, x = (k // columns) * height, (k % columns) * width
-        sheet[y : y + cell.shape[0], x : x + cell.shape[1]] = cell
-    return sheet
+    places = [((k // columns) * height, (k % columns) * width) for k in range(len(cells))]
+    for cell, (y, x) in zip(cells, places, strict=True):
+        sheet[y + above : y + above + cell.shape[0], x : x + cell.shape[1]] = cell
+    if not titles:
+        return sheet
+    image, font = Image.fromarray(sheet), ImageFont.load_default(TITLE_PX - GAP_PX)
+    for title, (y, x) in zip(titles, places, strict=True):
+        shown = title
+        while len(shown) > 1 and font.getlength(shown) > width - GAP_PX:
+            shown = f"…{shown[2:]}"
+        ImageDraw.Draw(image).text((x, y), shown, fill=(0, 0, 0), font=font)
+    return np.asarray(image)
 
 
 def _shrunk(picture: UInt8[np.ndarray, "_ _ 3"], factor: int) -> UInt8[np.ndarray, "_ _ 3"]:

@@ -1,7 +1,6 @@
 """Content of exported files (Gaussians, masks of all views, films)."""
 
 import io
-import json
 import zipfile
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -12,6 +11,7 @@ from jaxtyping import Int32, Int64
 from PIL import Image
 
 from hilsplat.query.language_scene import LanguageScene
+from hilsplat.query.mask_files import mask_files
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.export import write_selection_ply
@@ -19,7 +19,6 @@ from hilsplat.splat.flyaround import FRAMES_PER_S, closed_path, encoded_film, op
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.viewer.frames import Paint, painted
 from hilsplat.viewer.wire import Film, Group
-from hilsplat.web.coco import coco_content, coco_region
 
 STEP = {"mp4": 1, "gif": 2}
 """Frame step of each format. GIFs use every second frame; with all frames, they are far larger than MP4s."""
@@ -53,33 +52,18 @@ def selection_ply(gaussians_ply: Path, scene: LanguageScene, groups: Sequence[Gr
 
 
 def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
-    """Make a ZIP of node masks in all views: one PNG per visible node and view, and one COCO file.
-
-    Groups are the COCO categories; a node in several groups has one annotation per group.
-    """
-    nodes = sorted({node for group in groups for node in group.nodes})
-    views = scene.views.names
-    yield 0, len(views)
-    content = io.BytesIO()
-    description = f"{scene.scene.name}: masks of nodes, by hilsplat"
-    coco = coco_content(description, views, scene.scene.cameras, [group.name for group in groups])
+    """Make a ZIP of the groups' node masks in all views (`query.mask_files`)."""
+    total, content = len(scene.views.names), io.BytesIO()
+    yield 0, total
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
-        for number, view in enumerate(views):
-            for node in nodes:
-                mask = scene.views.node_masks(view, [node])
-                if not mask.any():
-                    continue
-                png = io.BytesIO()
-                Image.fromarray(mask).save(png, format="PNG")
-                name = f"masks/{Path(view).stem}/{node}.png"
-                archive.writestr(name, png.getvalue(), compress_type=zipfile.ZIP_STORED)
-                region = {"image_id": number, "node": node, **coco_region(mask)}
-                for category, group in enumerate(groups, 1):
-                    if node in group.nodes:
-                        ids = {"id": len(coco["annotations"]) + 1, "category_id": category}
-                        coco["annotations"].append({**ids, **region})
-            yield number + 1, len(views)
-        archive.writestr("coco.json", json.dumps(coco, ensure_ascii=False))
+        of_views = mask_files(scene, [(group.name, group.nodes) for group in groups])
+        for done, files in enumerate(of_views, 1):
+            for name, data in files.items():
+                if name.endswith(".png"):
+                    archive.writestr(f"masks/{name}", data, compress_type=zipfile.ZIP_STORED)
+                else:
+                    archive.writestr(name, data)
+            yield done, total
     return content.getvalue()
 
 

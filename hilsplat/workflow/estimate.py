@@ -4,11 +4,12 @@ import os
 import subprocess
 import sys
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
 
+from hilsplat.base.tables import aligned_table
 from hilsplat.models.store import read_model
 from hilsplat.scene.finished import KEY_VIEWS
 from hilsplat.scene.sheet import PHOTOS, SceneRow
@@ -73,7 +74,7 @@ class RunEstimate:
         names, scale = sorted(self._jobs, key=lambda name: (name == OTHERS, name)), machine_scale()
         rows = [_row(name, self._jobs[name], cores, scale) for name in names]
         total = _row("all", [job for name in names for job in self._jobs[name]], cores, scale)
-        return ["Estimate for this run:", *_aligned([head, *rows, total]), *NOTES]
+        return ["Estimate for this run:", *aligned_table([head, *rows, total], [head[0]]), *NOTES]
 
 
 def machine_scale() -> float:
@@ -98,13 +99,6 @@ def _row(name: str, jobs: Sequence[JobEstimate], cores: int, scale: float) -> tu
         f"{core_s / cores / 3600:.2f}",
         f"{with_gpu_s / 3600:.2f}",
     )
-
-
-def _aligned(rows: Sequence[tuple[str, ...]]) -> Iterator[str]:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for first, *others in rows:
-        cells = [value.rjust(width) for value, width in zip(others, widths[1:], strict=True)]
-        yield "  ".join([first.ljust(widths[0]), *cells]).rstrip()
 
 
 # ---- photographs ---------------------------------------------------------------------------------

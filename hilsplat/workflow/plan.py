@@ -9,13 +9,13 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from hilsplat.base.errors import SettingsError
+from hilsplat.base.errors import SettingsError, shorten_list
 from hilsplat.base.files import INSTALLED, project_path
 from hilsplat.baselines import method_of
 from hilsplat.configuration import SECTIONS, RunSettings, StageSettings, parse_run, require_known
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.datasets.sources import unlisted
-from hilsplat.models.store import AUTO, model_digest, model_path, read_model
+from hilsplat.models.store import AUTO, model_digest, model_path, planned_model
 from hilsplat.scene.finished import KEY_VIEWS
 from hilsplat.scene.sheet import (
     DEFAULT_SHEET,
@@ -107,6 +107,10 @@ class Plan:
         """Read the sheet; raise HilsplatError if it or the configuration is invalid, or no scene is left."""
         self.run = run = parse_run(dict(config))
         self.results = Path(run.results)
+        if self.results.exists() and not self.results.is_dir():
+            raise SettingsError(
+                f"results: {self.results} is not a folder", fix="move that file, or choose another folder"
+            )
         require_variant_sections(run)
         sheet = project_path(run.scenes)
         rows = read_sheet(sheet, run.groups, run.data_root)
@@ -123,11 +127,11 @@ class Plan:
         if not self.scenes:
             raise SettingsError(
                 "there are no scenes to run",
-                expected=f"scenes of {sheet}: {', '.join(f'{row.name} ({row.group})' for row in self.rows)}",
-                found="; ".join(
+                expected=f"scenes of {sheet}, such as {shorten_list([row.name for row in self.rows], 12)}",
+                found="\n            ".join(
                     [
                         f"groups {list(run.groups)}, only {list(run.only)}, data_root {run.data_root!r}",
-                        *(f"{name} is skipped: {reason}" for name, reason in self.absent.items()),
+                        *self.absent_lines(),
                     ]
                 ),
                 fix="select a scene (hilsplat run photos/desk) or other groups, or set data_root",
@@ -159,12 +163,16 @@ class Plan:
         for row in self.scenes:
             self.data.require_no_braces(row)
 
+    def absent_lines(self) -> list[str]:
+        """Return a line for each data set with skipped scenes, or for each reason if there are several."""
+        found: dict[tuple[str, str], list[str]] = {}
+        for name, reason in self.absent.items():
+            dataset, _, scene = name.partition("/")
+            found.setdefault((dataset, reason), []).append(scene)
+        return [f"{data} ({shorten_list(names)}) is skipped: {why}" for (data, why), names in found.items()]
+
     def require_usable(self, *, devices: bool) -> None:
         """Check that the models exist and, with `devices`, that this machine has the configured devices."""
-        if self.results.exists() and not self.results.is_dir():
-            raise SettingsError(
-                f"results: {self.results} is not a folder", fix="move that file, or choose another folder"
-            )
         where: dict[StageSettings, str] = {}
         for row in self.scenes:
             for variant in self.run.variant_names():
@@ -455,7 +463,7 @@ class Plan:
         of_photographs = job.variant == "default" and row.group == PHOTOS and not row.features
         if not of_photographs or KEY_VIEWS not in self.run.variants:
             return False
-        model = read_model(Path(masks.model)) if masks.segmenter == "sam" else None
+        model = planned_model(Path(masks.model)) if masks.segmenter == "sam" else None
         is_slow = model is not None and not model.embedded
         return is_slow and len(self.data.image_files(job)) >= MIN_PHOTOGRAPHS
 
@@ -571,9 +579,3 @@ def without_scene(run: RunSettings, rows: Iterable[SceneRow]) -> list[str]:
             raise SettingsError(line, expected=f"did you mean {near[0]!r}?", fix="correct or remove the name")
         lines.append(f"{line}; it is ignored")
     return lines
-
-
-def shorten_list(names: list[str]) -> str:
-    """Return the first three names, and the number of remaining names."""
-    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-    return ", ".join(names[:3]) + more

@@ -1,14 +1,15 @@
 """Progress of a run: a line per finished stage, and on a terminal a status line with the time left.
 
 This module reads only attributes of log records; `snakemake_logger_plugin_hilsplat` connects it to Snakemake.
-Warnings and errors are printed in full.
+Snakemake's own messages are only in its log file, except for warnings and errors. Errors of failed jobs are
+printed at the end of the run, so that they are the last lines.
 """
 
 import logging
 import math
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from io import TextIOBase
 from pathlib import Path
@@ -21,16 +22,23 @@ from rich.text import Text
 
 from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import KILLED, KILLED_FIX, visible
-from hilsplat.base.progress import last_progress, warnings_in
-from hilsplat.scene.finished import KEY_VIEWS, refining
+from hilsplat.base.progress import last_error, last_progress, warnings_in
+from hilsplat.scene.finished import KEY_VIEWS, command_name, refining
 from hilsplat.stages import all_stages
 from hilsplat.workflow.resources import START_S, JobResources
 from hilsplat.workflow.scene_data import Job
 
-REPLACED = frozenset({"progress", "job_started", "workflow_started", "resources_info"})
-"""Events that are not printed, besides the start and end of a job."""
+KEPT = ("Nothing to be done", "This was a dry-run")
+"""Beginnings of the messages of Snakemake that are printed although they are no warnings."""
 
-SELECTING = "Select jobs to execute..."  # message without an event; it is not printed
+PLANNED = frozenset({"run_info", "job_info", "shellcmd"})
+"""Events that a dry run prints."""
+
+FOLLOWING = ("At least one job did not complete", "Exiting because a job execution failed")
+"""Parts of errors that only repeat that a job has failed."""
+
+COMMAND_FAILED = "CalledProcessError"
+"""Part of an error that quotes the command of a failed job, just before the event of its failure."""
 
 TARGETS = ("all", "everything", "tables", "total")  # entries of the job counts that are not jobs
 
@@ -75,11 +83,13 @@ class RunningJob:
 class Estimates:
     """Core seconds of jobs: estimates by rule, scaled by the measured times of finished jobs.
 
-    Without `resources`, which needs a plan, each job is estimated at `START_S`.
+    Without `resources`, which needs a plan, each job is estimated at `START_S`. `is_dry` is set by the logger
+    plugin before the Snakefile is read.
     """
 
     def __init__(self, resources: JobResources | None = None) -> None:
         self.resources = resources
+        self.is_dry = False
         self._measured, self._estimated = defaultdict[str, float](float), defaultdict[str, float](float)
         self._means: dict[str, float] = {}
 
@@ -133,6 +143,7 @@ class RunProgress:
         self.total = self.done = self.failed = 0
         self.waiting = Counter[str]()
         self.running: dict[int, RunningJob] = {}
+        self.failures: dict[int, RunningJob] = {}
         self._hint_given = False
         self._refined: set[str] = set()
 
@@ -149,11 +160,26 @@ class RunProgress:
             self.waiting[job.rule] -= 1
         else:
             self.failed -= 1
+            self.failures.pop(number, None)
         self.running[number] = job
 
-    def fail(self, number: int) -> None:
-        if self.running.pop(number, None) is not None:
-            self.failed += 1
+    def fail(self, number: int) -> str:
+        """End a job that failed, and return the line to print; empty for an unknown job."""
+        job = self.running.pop(number, None)
+        if job is None:
+            return ""
+        self.failed += 1
+        self.failures[number] = job
+        return f"{job.name}: failed after {self.clock() - job.start_s:.0f} s"
+
+    def errors(self) -> list[str]:
+        """Return the errors of the jobs that failed and were not repeated, each once."""
+        found: dict[str, str] = {}
+        for job in self.failures.values():
+            error = last_error(job.log) if job.log is not None else ""
+            where = f"; its log is {job.log}" if job.log is not None else ""
+            found.setdefault(error or job.name, f"{job.name} failed{where}\n{error}".rstrip())
+        return [*found.values()]
 
     def end(self, number: int) -> list[str]:
         """End a job, and return the lines to print."""
@@ -206,7 +232,7 @@ class RunProgress:
         if not (job.log.parents[1] / needed / "index.json").is_file():
             return []
         folder = job.log.parents[2]
-        scene = str(folder.relative_to("results") if folder.parts[0] == "results" else folder)
+        scene = command_name(folder)
         commands = [] if self._hint_given else [f'  hilsplat query {scene} "..."', f"  hilsplat view {scene}"]
         if variant == KEY_VIEWS:
             self._refined.add(scene)
@@ -225,7 +251,7 @@ class ProgressDisplay:
     def __init__(
         self, stream: TextIOBase, text: Callable[[logging.LogRecord], str], run: RunProgress
     ) -> None:
-        self.text, self.run = text, run
+        self.text, self.run, self._was_killed = text, run, False
         file = cast(IO[str], stream)
         self._console = Console(file=file, highlight=False, markup=False, emoji=False, soft_wrap=True)
         self._line = Live(
@@ -239,36 +265,52 @@ class ProgressDisplay:
         self._line.start()
 
     def show(self, record: logging.LogRecord) -> None:
-        """Update the progress from a log record, and print finished jobs, warnings and errors."""
+        """Update the progress from a log record, and print jobs, warnings, errors and our messages."""
         event, facts, lines = getattr(record, "event", None), record.__dict__, []
         if event == "resources_info" and facts.get("cores"):
             self.run.cores = facts["cores"]
-        if event in REPLACED or record.getMessage() == SELECTING:
-            return
-        if event == "job_info":
+        elif event == "run_info":
+            self.run.begin(facts["stats"])
+        elif event == "job_info":
             log = next(map(Path, facts["log"]), None)
             job = RunningJob(facts["rule_name"], facts["wildcards"], facts["threads"], log, self.run.clock())
             self.run.start(facts["jobid"], job)
         elif event == "job_finished":
             lines = self.run.end(facts["job_id"])
-        else:
-            if event == "run_info":
-                self.run.begin(facts["stats"])
-            elif event == "job_error":
-                self.run.fail(facts["jobid"])
+        elif event == "job_error" and (failed := self.run.fail(facts["jobid"])):
+            lines = [failed]
+        elif record.levelno >= logging.WARNING:
             lines = [self.text(record)]
-            if any(sign in lines[0] for sign in SIGKILL):
-                lines.append(f"the job was killed, {KILLED}\n  fix       {KILLED_FIX}")
-        style = {logging.WARNING: "yellow", logging.ERROR: "red"}.get(record.levelno)
-        for line in lines:
-            self._console.print(visible(line), style=style)
+            self._was_killed |= any(sign in lines[0] for sign in SIGKILL)
+            is_repeated = self.run.failures and any(words in lines[0] for words in FOLLOWING)
+            if is_repeated or COMMAND_FAILED in lines[0]:
+                lines = []
+        elif is_shown(record):
+            lines = [self.text(record)]
+        self._print(lines, {logging.WARNING: "yellow", logging.ERROR: "red"}.get(record.levelno))
         self._line.refresh()
 
+    def _print(self, lines: Iterable[str], style: str | None) -> None:
+        for line in lines:
+            self._console.print(visible(line), style=style)
+
     def close(self) -> None:
+        """Remove the status line, and print the errors of failed jobs."""
         self._line.stop()
+        self._print(self.run.errors(), "red")
+        if self._was_killed:
+            self._print([f"a job was killed, {KILLED}\n  fix       {KILLED_FIX}"], "red")
+        self.run.failures.clear()
+        self._was_killed = False
 
     def _draw(self) -> Text:
         return Text(self.run.line() if self._console.is_terminal else "", no_wrap=True, overflow="ellipsis")
+
+
+def is_shown(record: logging.LogRecord) -> bool:
+    """Return whether a message is a warning, is in `KEPT`, or is from our Snakefile or rules."""
+    is_ours = getattr(record, "event", None) is None and Path(record.pathname).suffix != ".py"
+    return record.levelno >= logging.WARNING or is_ours or record.getMessage().startswith(KEPT)
 
 
 def duration(seconds: float) -> str:

@@ -29,12 +29,12 @@ from hilsplat.baselines import TrainedSettings
 from hilsplat.configuration import StageSettings
 from hilsplat.datasets.generators import GENERATORS
 from hilsplat.models.card import card_problem
-from hilsplat.models.store import model_path, read_model
+from hilsplat.models.store import RELEASES, model_path, planned_model
 from hilsplat.scene.layouts import vertex_count
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.settings import GaussiansSettings, MasksSettings
 from hilsplat.stages import all_stages, family_of, stage_of
-from hilsplat.workflow.plan import Plan
+from hilsplat.workflow.plan import SCORED, Plan
 from hilsplat.workflow.scene_data import Job
 
 with Path(__file__).with_suffix(".tsv").open(encoding="utf-8") as _stream:
@@ -64,6 +64,10 @@ FIT_S_PER_MP, FIT_S_PER_GAUSSIAN, GRAPH_S_PER_MP = 0.14, 0.9e-6, 4.0
 of the graph segmenter per megapixel."""
 
 TRAINED_S_PER_MP = 0.08  # core seconds per step, level and megapixel of a trained baseline
+
+QUERY_S_PER_MP = 0.24
+"""Core seconds to score a labelled query per megapixel of its view: 74 s for 2092 queries at 384 x 384 px, by
+tree and field (docs/benchmarks.md)."""
 
 NETWORK_S = 10.0  # core seconds to train an autoencoder
 
@@ -121,6 +125,7 @@ class JobResources:
         self._per_variant = 1 if many else self._per_scene
         self.size = functools.cache(self._size)
         self.gaussians = functools.cache(self._gaussians)
+        self.queries = functools.cache(plan.data.num_labelled)
         self._seconds = functools.cache(self._estimate)
 
     def threads(self, wildcards: Job) -> int:
@@ -200,7 +205,11 @@ class JobResources:
 
     def core_seconds(self, rule: str, job: Job) -> float:
         """Return the estimated core seconds of a scene's job."""
-        return START_S + self._seconds(cost_name(rule), *self.plan.which(job), self.size(self.plan.row(job)))
+        row = self.plan.row(job)
+        seconds = self._seconds(cost_name(rule), *self.plan.which(job), self.size(row))
+        if rule == SCORED:
+            seconds = max(seconds, QUERY_S_PER_MP * self.queries(row) * self.size(row).view_mp)
+        return START_S + seconds
 
     def card_seconds(self, rule: str, job: Job) -> float | None:
         """Return how many seconds a job would take on a card (`GPU`), or None if it has no work for one."""
@@ -227,7 +236,7 @@ class JobResources:
         """Return whether a job runs a released SAM or CLIP."""
         if rule not in EMBEDDED_S or (rule == "masks" and stages.masks.segmenter != "sam"):
             return False
-        model = read_model(Path(getattr(stages, rule).model))
+        model = planned_model(Path(getattr(stages, rule).model))
         return model is not None and not model.embedded
 
     def _estimate(self, rule: str, variant: str, scopes: tuple[str, ...], size: Size) -> float:
@@ -338,7 +347,10 @@ def _first_mp(images: Iterable[str], max_side_px: int) -> float:
 
 @functools.cache
 def _model_memory_mb(folder: Path, variant: str, batch: int | str, threads: int) -> int:
-    """Return the memory of a stage's model, MB; 0 if the folder is unreadable (the stage reports it)."""
+    """Return the memory of a stage's model, MB; 0 if the folder is unreadable (the stage reports it).
+
+    For a released model that is missing, it is the size of the download, a lower limit.
+    """
     from hilsplat.models.folder import open_model_folder
     from hilsplat.models.memory import needs_of  # onnxruntime is slow to import
     from hilsplat.segment.sam import own_thresholds
@@ -347,5 +359,6 @@ def _model_memory_mb(folder: Path, variant: str, batch: int | str, threads: int)
         model = open_model_folder(folder, variant=variant)
         prompts = own_thresholds(model).points_per_batch if isinstance(batch, str) else batch
     except ModelError:
-        return 0
+        known = {release.name: release.megabytes for release in RELEASES}
+        return 0 if folder.exists() else known.get(folder.name, 0)
     return round(needs_of(model, prompts).total_mib(threads) * MIB / 1e6)

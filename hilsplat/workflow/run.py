@@ -5,7 +5,6 @@ Plain `snakemake --cores 2` produces the same bytes.
 """
 
 import argparse
-import difflib
 import json
 import logging
 import os
@@ -17,6 +16,7 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from difflib import get_close_matches
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from typing import Any
 import yaml
 
 from hilsplat.base.artifacts import RUN, write_json, write_text
-from hilsplat.base.errors import HilsplatError, SettingsError
+from hilsplat.base.errors import HilsplatError, SettingsError, nearest
 from hilsplat.base.files import INSTALLED, project_path
 from hilsplat.base.processes import PARENT, end_with_workflow, lock, remove_leftovers
 from hilsplat.base.removal import delete
@@ -33,6 +33,7 @@ from hilsplat.scene.sheet import DEFAULT_SHEET, SceneRow, is_pattern, matches_of
 from hilsplat.workflow.estimate import forecasts
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.records import outdated
+from hilsplat.workflow.summary import summary
 
 logger = logging.getLogger(__name__)
 
@@ -86,9 +87,16 @@ def mark_run(results: Path) -> None:
 
 def record_run(results: Path, configs: Sequence[Path], overrides: Mapping[str, Any]) -> None:
     """Record a run's configuration in the results, for the commands that messages suggest (`run_command`)."""
-    files = [os.path.relpath(path) for path in configs]
+    files = [_config_name(Path(path)) for path in configs]
     values = [f"{key}={json.dumps(value)}" for key, value in overrides.items() if key != "only"]
     write_json(results / RUN, {"results": [str(results)], "config": files, "overrides": values})
+
+
+def _config_name(path: Path) -> str:
+    """Return the name of a configuration for `--config`: that of an installed one, or a relative path."""
+    beside = CONFIG.with_name(path.name)
+    is_installed = not beside.exists() and path.resolve() == (INSTALLED / beside).resolve()
+    return path.stem if is_installed else os.path.relpath(path)
 
 
 def unmark_run() -> None:
@@ -149,8 +157,9 @@ def run(
     parser.add_argument("--config", "-C", nargs="*", action="extend", default=[])
     parser.add_argument("--configfile", "--configfiles", nargs="+", action="extend", type=Path, default=[])
     parser.add_argument("--cores", "-c")
+    parser.add_argument("--forcerun", "-R", nargs="*", action="extend", default=[])
     given, others = parser.parse_known_args(list(options))
-    configs = [project_path(path) for path in (*configs, *given.configfile)]
+    configs = [_config_file(path) for path in (*configs, *given.configfile)]
     try:
         overrides = {
             key: yaml.safe_load(value) for key, _, value in (word.partition("=") for word in given.config)
@@ -169,7 +178,7 @@ def run(
     scenes = [target for target, found in matches_of(rows, targets).items() if found]
     files = f"{chosen.results}/"
     named = [each for each in targets if each not in scenes and not each.startswith(files)]
-    _require_known(named, rows, chosen.scenes)
+    _require_known(named, rows, chosen.results)
     if scenes:
         given.config.append(f"only={json.dumps(scenes)}")
         settings["only"] = scenes
@@ -184,36 +193,68 @@ def run(
             fix = "run in a folder of your own: hilsplat init there, or copy config/ to it"
             raise HilsplatError(f"{place} cannot be written, but Snakemake keeps its state there", fix=fix)
     if _has(others, "-n", "--dry-run", "--dryrun"):
-        return _start(command, plan, targets, scenes, every_byte)
+        return _start(command, plan, targets, scenes, given.forcerun, every_byte)
     with _locked_results(plan.results):
         _recover(command, plan.results)
     if not _has(others, *ELSEWHERE):
         cores = int(given.cores) if given.cores and given.cores.isdigit() else 0
         for line in forecasts(plan, cores or _all_cores()):
             logger.info("%s", line)
-    status = _start(command, plan, targets, scenes, every_byte)
+    status = _start(command, plan, targets, scenes, given.forcerun, every_byte)
     if status != 0:
         with suppress(HilsplatError), _locked_results(plan.results):
             remove_leftovers(plan.results)  # left by killed jobs
-    return status
+        return status
+    try:
+        for line in summary(plan, [target for target in targets if target.startswith(files)]):
+            logger.info("%s", line)
+    except HilsplatError as error:  # the run has succeeded, but an earlier artifact is damaged
+        logger.warning("%s", error)
+    return 0
 
 
-def _require_known(targets: Sequence[str], rows: Sequence[SceneRow], sheet: str) -> None:
+def _config_file(name: Path) -> Path:
+    """Return the path of a configuration file; `ci` means `config/ci.yaml`, here or in the installation."""
+    named = CONFIG.with_name(f"{name.name}.yaml")
+    if name.suffix or len(name.parts) != 1 or name.exists():
+        return project_path(name)
+    if "=" in str(name):
+        raise SettingsError(
+            f"{name} is not a file", fix=f"pass keys after --: hilsplat run -- --config {name}"
+        )
+    if not (found := project_path(named)).exists():
+        known = {
+            path.stem for folder in (Path(), INSTALLED) for path in (folder / named).parent.glob("*.yaml")
+        }
+        raise SettingsError(
+            f"no configuration is named {str(name)!r}", expected=nearest(str(name), sorted(known))
+        )
+    return found
+
+
+def _require_known(targets: Sequence[str], rows: Sequence[SceneRow], results: str) -> None:
     """Refuse a target that is neither a scene nor a rule and cannot be a results file."""
-    known = [*TARGET_RULES, *(name for row in rows for name in (row.scene, row.name))]
+    known = [*TARGET_RULES, *(row.name for row in rows)]
+    names = [*known, *(row.scene for row in rows)]
     for target in targets:
-        near = difflib.get_close_matches(target, known, n=1)
-        if target not in TARGET_RULES and (near or is_pattern(target) or "/" not in target):
+        may_be_file = "/" in target and not (is_pattern(target) or get_close_matches(target, names))
+        if target not in TARGET_RULES and not may_be_file:
             raise HilsplatError(
                 f"no scene, rule or file is named {target!r}",
-                expected=f"did you mean {near[0]!r}?" if near else f"a scene of {sheet}, or a file",
+                expected=nearest(target, known),
+                fix=f"correct the name; files are in {results}/; for photographs: hilsplat new NAME FOLDER",
             )
 
 
 def _start(
-    command: list[str], plan: Plan, targets: Sequence[str], scenes: Sequence[str], every_byte: bool
+    command: list[str],
+    plan: Plan,
+    targets: Sequence[str],
+    scenes: Sequence[str],
+    forced: Sequence[str],
+    every_byte: bool,
 ) -> int:
-    """Start Snakemake, and rebuild artifacts that don't match their provenance."""
+    """Start Snakemake, and rebuild `forced` artifacts and those that don't match their provenance."""
     files = [target for target in targets if target not in scenes]
     ending = ["--", *files] if files else []
     wrong = outdated(plan, every_byte=every_byte)
@@ -223,8 +264,8 @@ def _start(
         wrong = {output: reason for output, reason in wrong.items() if output in needed}
     for output, reason in wrong.items():
         logger.warning("rebuilding %s: %s", output, reason)
-    forced = ["--forcerun", *wrong] if wrong else []
-    return _run([sys.executable, "-P", "-m", *command, *forced, *ending])
+    rebuilt = ["--forcerun", *forced, *wrong] if forced or wrong else []
+    return _run([sys.executable, "-P", "-m", *command, *rebuilt, *ending])
 
 
 def _run(command: Sequence[str]) -> int:

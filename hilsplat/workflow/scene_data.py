@@ -4,7 +4,6 @@ A *job* is any object with the attributes `dataset` and `scene` and, in a varian
 wildcards of a rule, or a row of the sheet. Only evaluation and figures read labels.
 """
 
-import difflib
 import functools
 import os
 from collections.abc import Callable, Iterable, Sequence
@@ -12,12 +11,16 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Protocol, runtime_checkable
 
-from hilsplat.base.errors import SettingsError
+from hilsplat.base.errors import SettingsError, nearest
+from hilsplat.base.files import IMAGE_SUFFIXES
 from hilsplat.base.lineage import digests_of, sha256_of_json
 from hilsplat.datasets.registry import readers_of
 from hilsplat.datasets.sources import absence, image_files, is_exported, label_files, label_sets
 from hilsplat.scene.layouts import dataparser_of, photo_files, transforms_of
 from hilsplat.scene.sheet import DATA_PREFIX, SceneRow
+
+CATEGORY = b'"category"'
+"""Key of the text of an object in a file of labels."""
 
 
 @runtime_checkable  # for the type checker of the tests
@@ -67,10 +70,9 @@ class SceneData:
         row = self._row_of.get((job.dataset, job.scene))
         if row is None:
             name = f"{job.dataset}/{job.scene}"
-            near = difflib.get_close_matches(name, [row.name for row in self._row_of.values()], n=1)
             raise SettingsError(
                 f"no scene is named {name!r}",
-                expected=f"did you mean {near[0]!r}?" if near else "a scene of the sheet",
+                expected=nearest(name, [row.name for row in self._row_of.values()]),
                 fix="correct the path, or add the scene to the sheet",
             )
         return row
@@ -177,6 +179,15 @@ class SceneData:
             path for labels in self.labels(self.row(job)) for path in label_files(labels, self.data_root)
         )
         return [portable(path.resolve()) for path in found]
+
+    def num_labelled(self, row: SceneRow) -> int:
+        """Return the number of labelled regions in a scene's images: objects in JSON files, or mask files.
+
+        Several objects of one category in a view count separately, although they are one query.
+        """
+        files = [Path(path) for path in self.label_files(row)]
+        masks = sum(path.suffix.lower() in IMAGE_SUFFIXES for path in files)
+        return masks + sum(path.read_bytes().count(CATEGORY) for path in files if path.suffix == ".json")
 
     def truth(self, job: Job) -> list[str]:
         """Return the input that contains a generated scene's annotations; empty for other scenes."""

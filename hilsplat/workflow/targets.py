@@ -1,17 +1,16 @@
 """Targets of a run: tables, their scores, and pictures."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
+from hilsplat.base.errors import shorten_list
 from hilsplat.datasets.generators import GENERATORS
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.datasets.sources import published
-from hilsplat.evaluate.scores import score_summary
 from hilsplat.evaluate.tables.kinds import TABLES
 from hilsplat.scene.sheet import SceneRow
-from hilsplat.workflow.plan import Plan, shorten_list
-from hilsplat.workflow.scene_data import of_variant
+from hilsplat.workflow.plan import Plan
+from hilsplat.workflow.scene_data import Job, of_variant
 
 PICTURES = {
     "panel": "queries",
@@ -84,11 +83,6 @@ def labelled(plan: Plan) -> list[SceneRow]:
     return [row for row in plan.scenes if row.generated or plan.data.labels(row)]
 
 
-def annotated(plan: Plan) -> list[SceneRow]:
-    """Return the scenes that have only your own labels."""
-    return [row for row in labelled(plan) if not data_of(row)]
-
-
 def data_of(row: SceneRow) -> str:
     """Return the name of a scene's data in tables: its kind of generated scene, or its published data set."""
     if row.generated:
@@ -115,7 +109,7 @@ def tables(plan: Plan) -> list[str]:
 
 
 def default(plan: Plan) -> list[str]:
-    """Return all pictures, vectors of key views, scores of annotated scenes, tables and plots.
+    """Return all pictures, vectors of key views, mean scores, tables and plots.
 
     Tables and plots need a benchmark scene in the run. A run of photographs would otherwise replace a
     benchmark's tables with tables of reported rows only.
@@ -127,34 +121,26 @@ def default(plan: Plan) -> list[str]:
     ]
     early = [row for row in plan.scenes if plan.first_answer(of_variant(row, "default"))]
     answers = [plan.of_key_views("clip")(row) for row in early]
-    scores = [path for row in annotated(plan) for path in own_scores(plan, row).values()]
-    has_tables = len(labelled(plan)) > len(annotated(plan))
-    return [*figures(plan), *answers, *scores, *(tables(plan) + plots if has_tables else [])]
+    means = [plan.path(row, "scores.md") for row in labelled(plan)]
+    has_tables = any(data_of(row) for row in labelled(plan))
+    return [*figures(plan), *answers, *means, *(tables(plan) + plots if has_tables else [])]
 
 
-def own_scores(plan: Plan, row: SceneRow) -> dict[str, str]:
-    """Return the score files of a scene with your own labels, by the variant's name in tables.
+def means_of(plan: Plan) -> Callable[[Job], list[str]]:
+    """Return the input function of `score_means`: the scores of `default` and, if comparable, of LangSplat.
 
     A scene with LangSplat's features is compared with LangSplat on the same Gaussians, masks and vectors.
     """
-    variants = ["default"]
-    if row.features:
-        variants += [
-            name for name in plan.run.main_variants if plan.stages_of(name).method.name == "langsplat"
-        ]
-    return {
-        plan.run.labels.get(name, name): plan.path(row, name, "scores.csv")
-        for name in dict.fromkeys(variants)
-    }
 
+    def paths(job: Job) -> list[str]:
+        variants = ["default"]
+        if plan.row(job).features:
+            variants += [
+                name for name in plan.run.main_variants if plan.stages_of(name).method.name == "langsplat"
+            ]
+        return [plan.path(job, name, "scores.csv") for name in dict.fromkeys(variants)]
 
-def summary(plan: Plan) -> list[str]:
-    """Return a readable table of scores for each finished scene with your own labels."""
-    lines: list[str] = []
-    for row in annotated(plan):
-        paths = {name: Path(path) for name, path in own_scores(plan, row).items()}
-        lines += score_summary(row.name, {name: path for name, path in paths.items() if path.is_file()})
-    return lines
+    return paths
 
 
 def figures(plan: Plan) -> list[str]:

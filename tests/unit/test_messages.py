@@ -27,7 +27,7 @@ PROSE = {
     "in",
 }
 """What follows the name in sentences about hilsplat."""
-TO_SNAKEMAKE = {"--unlock", "--cores", "--forcerun"}
+TO_SNAKEMAKE = {"--unlock", "--config"}
 """Options of Snakemake that messages suggest after `--`."""
 
 

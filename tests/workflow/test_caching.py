@@ -2,7 +2,7 @@
 
 from tests.workflow.conftest import Project
 
-AFTER_FIELD = {"field", "evaluate", "table", "figures", "comparison", "sweep_plot"}
+AFTER_FIELD = {"field", "evaluate", "score_means", "table", "figures", "comparison", "sweep_plot"}
 FROM_CLIP = {"clip", "names", "autoencoder", "method"} | AFTER_FIELD
 
 

@@ -1,6 +1,7 @@
 """Published data sets in the workflow: absent ones are reported, labels are inputs of evaluation alone."""
 
 import re
+import sys
 from collections.abc import Iterator
 
 import pytest
@@ -33,8 +34,9 @@ def planned(project, tmp_path_factory) -> str:
     for path in (*LABELS, *OTHER_FILES):
         (copy.root / path).parent.mkdir(parents=True, exist_ok=True)
         (copy.root / path).touch()
-    models = ('masks={"model": "models/sam-tiny"}', 'clip={"model": "models/clip-tiny"}')
-    result = copy.snakemake("-n", "-p", "--config", *models, "data_root=data", config="paper", check=False)
+    command = (sys.executable, "-m", "hilsplat", "run", "-n", "--cores", "2", "--config", "paper")
+    models = {"HILSPLAT_MODELS": str(copy.root / "none")}  # the estimate needs none
+    result = copy.run(*command, "--", "-p", "--config", "data_root=data", **models)
     return result.stdout + result.stderr
 
 
@@ -59,9 +61,16 @@ def test_a_scan_is_exported_before_its_poses_are_imported(planned):
 
 
 def test_absent_scenes_are_listed_with_the_reason(planned):
-    assert "lerf/ramen is skipped: scene ramen of LERF-OVS is incomplete" in planned
-    assert re.search(r"replica/room_0 is skipped: .*in the wrong place", planned)
+    assert "lerf (ramen) is skipped: scene ramen of LERF-OVS is incomplete" in planned
+    assert re.search(r"replica \(office_0, .* and \d more\) is skipped: .*in the wrong place", planned)
     assert re.search(r" table replica .*--absent 'replica \(", planned)
+
+
+def test_missing_models_are_named_and_their_costs_are_known(planned):
+    assert "model folder models/clip-vit-b-16-laion2b is missing" in planned
+    assert "fetch it: hilsplat models get clip-vit-b-16-laion2b" in planned
+    hours = planned.partition("Estimate for this run:\n")[2].splitlines()[1].split()[-2]
+    assert float(hours) > 0.1, "SAM ViT-H takes minutes per photograph"
 
 
 def test_every_stage_and_table_is_planned(planned):
@@ -71,6 +80,7 @@ def test_every_stage_and_table_is_planned(planned):
 
 
 def test_a_dry_run_ends_with_the_estimate_table(planned):
+    assert "Building DAG" not in planned and "shared filesystem" not in planned
     table = planned.partition("Estimate for this run:\n")[2].splitlines()
     assert table[0].split() == ["scenes", "jobs", "disk", "memory", "hours,", "2", "cores", "hours,", "GPU"]
     assert [row.split()[0] for row in table[1:6]] == ["3d_ovs", "lerf", "scannet", "tables", "all"]

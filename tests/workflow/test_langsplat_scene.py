@@ -43,8 +43,10 @@ def test_a_scene_of_langsplat_answers_after_two_commands(
     assert "iteration_30000/point_cloud.ply" in said and "language_features" in said
     assert "chkpnt30000.pth" in said
     told = project.run(sys.executable, "-m", "hilsplat", "run", "theirs", "--", "--cores", "2").stderr
-    for answerer in ("hilsplat, tree", "hilsplat, field", "LangSplat (ours), field"):
-        assert re.search(rf"{re.escape(answerer)} +[0-9.]+% +[0-9.]+%", told), told
+    means = (project.root / "results/photos/theirs/scores.csv").read_text()
+    for answerer in ("hilsplat (tree)", "hilsplat (field)", "LangSplat (ours)"):
+        assert re.search(rf"{re.escape(answerer)} +[0-9.]+ +[0-9.]+", told), told
+        assert f"\n{answerer}," in means
     results = project.root / "results/photos/theirs"
     assert read_index(results / "default/masks")["segmenter"] == "langsplat"
     assert json.loads((results / "gaussians/report.json").read_text())["origin"]["kind"] == "imported"

@@ -22,11 +22,17 @@ def test_a_finished_stage_is_one_line_and_query_commands_follow(copy_of_finished
     assert "rule clip:" in printed and "synthetic/tiny clip: " not in printed
 
 
-def test_a_failed_job_is_shown_in_full_with_the_log_of_its_stage(copy_of_finished: Project) -> None:
+def test_the_error_of_a_failed_job_is_the_last_lines_of_a_run(copy_of_finished: Project) -> None:
     no_masks = 'masks={"predicted_iou_min": 1.0}'
-    failed = copy_of_finished.snakemake(f"{SCENE}/default/contributions", "--config", no_masks, check=False)
+    target = f"{SCENE}/default/contributions"
+    failed = copy_of_finished.snakemake(target, "--config", no_masks, check=False)
     assert failed.returncode != 0
-    assert "Error in rule contributions:" in failed.stderr
-    assert "shell:" in failed.stderr and " contributions --settings" in failed.stderr
-    assert "Logfile" in failed.stderr  # profiles/default was found
-    assert "has masks" in failed.stderr.partition("Logfile")[2]
+    log = f"{SCENE}/default/logs/contributions.log"
+    where = f"synthetic/tiny contributions failed; its log is {log}\n"
+    ending = failed.stderr.partition(where)[2].splitlines()  # profiles/default was found
+    assert "has masks" in ending[0] and all(line.startswith("  ") for line in ending[1:])
+    assert "Error in rule" not in failed.stderr
+    record = max((copy_of_finished.root / ".snakemake/log").iterdir(), key=lambda file: file.stat().st_mtime)
+    assert "Error in rule contributions:" in record.read_text()
+    shown = copy_of_finished.snakemake(target, "--config", no_masks, "--verbose", check=False).stderr
+    assert "Error in rule contributions:" in shown and " contributions --settings" in shown

@@ -86,6 +86,7 @@ DATASET = Dataset(
     scenes=("figurines", "ramen", "teatime"),
     licence="none stated for images and masks (the authors' code: Apache-2.0)",
     terms="For research use only; do not redistribute.",
+    origin="https://huggingface.co/mqye/Gaussian-Grouping, folder data/lerf_mask",
     citation="images: Kerr et al., LERF, ICCV 2023; masks: Ye et al., Gaussian Grouping, ECCV 2024",
     layout="""lerf_mask/
   figurines/  ramen/  teatime/

@@ -78,6 +78,7 @@ DATASET = Dataset(
     scenes=("figurines", "ramen", "teatime", "waldo_kitchen"),
     licence="none stated for images and labels",
     terms="For research use only; do not redistribute.",
+    origin="linked in the README of https://github.com/minghanqin/LangSplat",
     citation="images: Kerr et al., LERF, ICCV 2023; labels: Qin et al., LangSplat, CVPR 2024",
     layout="""lerf_ovs/
   figurines/  ramen/  teatime/  waldo_kitchen/

@@ -103,6 +103,7 @@ DATASET = Dataset(
     scenes=tuple(FRAMES["3d_ovs"]),
     licence="none stated for images and masks (the authors' code: MIT)",
     terms="For research use only; do not redistribute.",
+    origin="linked in the README of https://github.com/Kunhao-Liu/3D-OVS",
     citation="Liu et al., Weakly Supervised 3D Open-vocabulary Segmentation, NeurIPS 2023",
     layout="""3d_ovs/
   bed/  bench/  blue_sofa/  covered_desk/  lawn/  office_desk/  room/  snacks/  sofa/  table/

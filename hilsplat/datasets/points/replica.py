@@ -177,6 +177,7 @@ DATASET = Dataset(
     scenes=(*(f"office_{number}" for number in range(5)), *(f"room_{number}" for number in range(3))),
     licence="Replica Research Terms",
     terms="Non-commercial research and education only; do not redistribute the data.",
+    origin="https://github.com/facebookresearch/Replica-Dataset",
     citation="Straub et al., The Replica Dataset: A Digital Replica of Indoor Spaces, arXiv 1906.05797, 2019",
     layout="""replica/
   room_0/                        the original release

@@ -214,6 +214,7 @@ DATASET = Dataset(
     scenes=tuple(f"scene{number:04d}_00" for number in (0, 62, 70, 97, 140, 200, 347, 400, 590, 645)),
     licence="code MIT; data under the ScanNet Terms of Use",
     terms="Research use only, with a signed agreement; never redistribute scans or labels made from them.",
+    origin="https://github.com/ScanNet/ScanNet, after signing the terms of use",
     citation="Dai et al., ScanNet: Richly-annotated 3D Reconstructions of Indoor Scenes, CVPR 2017; "
     "ScanNet200: Rozenberszki et al., Language-Grounded Indoor 3D Semantic Segmentation, ECCV 2022",
     layout="""scannet/

@@ -104,6 +104,7 @@ DATASET = Segments(
     scenes=(),
     licence="code Apache-2.0; data under the Waymo Dataset License Agreement for Non-Commercial Use",
     terms="Non-commercial use after registration; do not redistribute the data.",
+    origin="https://waymo.com/open, after registration",
     citation="Sun et al., Scalability in Perception for Autonomous Driving: Waymo Open Dataset, CVPR 2020",
     layout="""waymo/
   validation/                          release 2.0.1, one parquet file per component and segment

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilsplat.base.errors import ArtifactError
-from hilsplat.base.tables import read_csv, write_csv
+from hilsplat.base.tables import aligned_table, read_csv, write_csv
 
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]) | st.sampled_from("'=+-@\t\r\n,\"1."), max_size=12)
 
@@ -63,3 +63,10 @@ def test_damaged_files_are_refused(tmp_path: Path, content: bytes, message: str)
     (tmp_path / "a.csv").write_bytes(content)
     with pytest.raises(ArtifactError, match=message):
         read_csv(tmp_path / "a.csv", ["x", "y"], "do it")
+
+
+def test_columns_of_numbers_end_at_the_right_and_no_rows_are_no_lines():
+    rows = [["method", "mIoU", "protocol"], ["tree", 5.0, "p"], ["field, path", 55.0, "q"]]
+    lines = ["method       mIoU  protocol", "tree          5.0  p", "field, path  55.0  q"]
+    assert aligned_table(rows, ("method", "protocol")) == lines
+    assert aligned_table([], ()) == []

@@ -86,7 +86,9 @@ def run(*words):
 
 
 def test_the_command_lists_data_sets_and_their_scenes(root):
-    assert "found" not in run("list")[1]
+    listed = run("list")[1]
+    assert "found" not in listed
+    assert "get it    https://huggingface.co/mqye/Gaussian-Grouping, folder data/lerf_mask" in listed
     code, output = run("list", "--data-root", root)
     assert code == 0
     for name, dataset in DATASETS.items():

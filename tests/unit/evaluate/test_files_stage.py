@@ -142,8 +142,10 @@ def data_set(monkeypatch):
 
 
 def scored(folder):
-    run_evaluate_files(folder, folder / "scores.csv", method="m", labels="set/s")
-    return read_scores([folder / "scores.csv"])
+    """Scores, and the printed means: protocol -> the words before it."""
+    printed = run_evaluate_files(folder, folder / "scores.csv", method="m", labels="set/s").splitlines()
+    end = printed[0].index("protocol")
+    return read_scores([folder / "scores.csv"]), {line[end:]: line[:end].split() for line in printed}
 
 
 def test_labels_of_a_data_set_take_grey_where_the_protocol_does(data_set, tmp_path):
@@ -152,7 +154,7 @@ def test_labels_of_a_data_set_take_grey_where_the_protocol_does(data_set, tmp_pa
     cards = ("3d-ovs/langsplat", "3d-ovs/langsplat-v2", "3d-ovs/argmax")
     data_set(LabelledScene("set", "s", {}, None, {"a.png": (region,)}), cards)
     write_png(tmp_path / "a" / "cup.png", grey.astype(np.uint8) * 255)
-    frame = scored(tmp_path)
+    frame, means = scored(tmp_path)
     ious = {row.protocol: row.value for row in frame[frame["metric"] == "iou"].itertuples()}
     assert ious["3d-ovs/langsplat-v2@3 (masks of files)"] == 1
     assert ious["3d-ovs/langsplat@2 (masks of files)"] == 0.5
@@ -161,6 +163,9 @@ def test_labels_of_a_data_set_take_grey_where_the_protocol_does(data_set, tmp_pa
     # an eighth has rows 4 and 12: the label has neither, and row 4 is in the mask
     assert ious["3d-ovs/argmax@3 (masks of files)"] == 0
     assert set(frame["scene"]) == {"s"}
+    assert means["protocol"] == ["method", "mIoU", "accuracy", "queries"]
+    assert means["3d-ovs/langsplat@2 (masks of files)"] == ["m", "50.0", "1"]
+    assert means["3d-ovs/argmax@3 (masks of files)"] == ["m", "0.0", "50.0", "1"]
 
 
 def test_a_text_without_a_mask_counts_zero_or_is_left_out(data_set, tmp_path):
@@ -169,7 +174,7 @@ def test_a_text_without_a_mask_counts_zero_or_is_left_out(data_set, tmp_path):
     cards = ("lerf-mask/gaussian-grouping", "lerf-mask/gaussian-grouping-skipping")
     data_set(LabelledScene("set", "s", {}, None, {"a.png": regions}), cards)
     write_png(tmp_path / "a" / "cup.png", cup.astype(np.uint8) * 255)
-    frame = scored(tmp_path)
+    frame, _ = scored(tmp_path)
     assert frame["protocol"].str.endswith(" (masks of files)").all()
     ious = {(row.protocol, row.query): row.value for row in frame[frame["metric"] == "iou"].itertuples()}
     expected = {("lerf-mask/gaussian-grouping-skipping@1", "cup"): 1}
@@ -197,7 +202,7 @@ def test_class_ids_of_points_score_as_the_same_labels_in_memory(data_set, tmp_pa
     (tmp_path / "nyu40.txt").write_text("\n".join(map(str, predicted)))
     of_ten = np.full(400, SCANNET_10.ids[0])
     (tmp_path / "scannet-10.txt").write_text("\n".join(map(str, of_ten)))
-    frame = scored(tmp_path)
+    frame, _ = scored(tmp_path)
     for classes, given in ((SCANNET_19, predicted), (SCANNET_10, of_ten)):
         card = card_of(f"scannet/opengaussian-{len(classes)}")
         truth = classes.labels(known.truth["nyu40"].class_id)
@@ -213,7 +218,8 @@ def test_instances_in_scannets_format_are_matched(data_set, tmp_path):
     (tmp_path / "masks").mkdir()
     (tmp_path / "masks" / "0.txt").write_text("\n".join(map(str, mask.astype(int))))
     (tmp_path / "instances.txt").write_text("masks/0.txt 2 0.9\n\n")
-    scored(tmp_path)
+    _, means = scored(tmp_path)
+    assert means["scannet200/instances@1 (points: files)"] == ["m", "100.0"]
     ((key, matches),) = read_instances([tmp_path / "scores.csv"]).items()
     assert key == ("set", "s", "m", "-", "files")
     assert matches.is_match.all()

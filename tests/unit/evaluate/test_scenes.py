@@ -1,6 +1,8 @@
 """The table over all scenes of a results folder."""
 
+import os
 import shutil
+import time
 from pathlib import Path
 
 import pytest
@@ -8,7 +10,7 @@ import pytest
 from hilsplat.base.artifacts import write_json
 from hilsplat.base.errors import ArtifactError
 from hilsplat.cli.main import app
-from hilsplat.evaluate.scenes import COLUMNS
+from hilsplat.evaluate.scenes import COLUMNS, SceneState
 from hilsplat.evaluate.scores import Score, write_scores
 
 
@@ -19,35 +21,54 @@ def score(method: str, protocol: str, value: float) -> Score:
 
 @pytest.fixture
 def results(desk, tmp_path) -> Path:
-    """A scene without report and scores, a scored one, and one that has only poses."""
+    """A scene without report and scores, a scored one, one with key views, and one that has only poses."""
     for name in ("photos/desk", "rooms/one"):
         shutil.copytree(desk, tmp_path / name)
-    shutil.copytree(desk / "scene", tmp_path / "rooms/posed/scene")
     one = tmp_path / "rooms/one"
     write_json(one / "gaussians/report.json", {"psnr_db": 21.456, "gaussians": 864})
     of_tree = [score("tree", "lerf/tree-nodes@5", value) for value in (0.5, 0.8)]
     others = [score("field", "lerf/langsplat@2", 0.1), score("tree", "hierarchy/level-auto@6", 0.3)]
     write_scores(one / "default/scores.csv", [*of_tree, *others])
+    for part in ("clip", "semantic_tree", "masks"):
+        shutil.copytree(desk / "default" / part, tmp_path / "rooms/early/key-views" / part)
+    for name in ("early", "posed"):
+        shutil.copytree(desk / "scene", tmp_path / "rooms" / name / "scene")
+    (tmp_path / "figures/rooms/one").mkdir(parents=True)
+    for record in tmp_path.rglob("*.provenance.json"):
+        os.utime(record, (0, 86400 * 365))
     return tmp_path
 
 
 def test_each_scene_has_a_row_with_what_its_run_has_computed(results, capsys):
     out = results / "scenes.csv"
     app(["scenes", "--results", str(results), "--out", str(out)], standalone_mode=False)
-    lines = [
-        ",".join(COLUMNS),
-        "photos/desk,5,1,,,2,2,1,",
-        "rooms/one,5,1,864,21.46,2,2,1,0.6500",
-        "rooms/posed,5,1,,,,,,",
+    header, *lines = out.read_text().splitlines()
+    assert header == ",".join(COLUMNS)
+    date = time.strftime("%Y-%m-%d %H:%M", time.localtime(86400 * 365))
+    models = '"graph, colours"'
+    assert lines == [
+        f'photos/desk,"tree, field",5,1,,,2,2,1,,0,{date},{models}',
+        f"rooms/early,tree of key views,5,1,,,2,2,1,,0,,{models}",
+        f'rooms/one,"tree, field",5,1,864,21.46,2,2,1,0.6500,0,{date},{models}',
+        "rooms/posed,poses,5,1,,,,,,,0,,",
     ]
-    assert out.read_text().splitlines() == lines
     printed = capsys.readouterr().out.splitlines()
-    assert [line.replace(" ", "")[1:-1].replace("|", ",") for line in printed[2:]] == lines[1:]
+    assert printed[0].split() == ["scene", "state", "views", "PSNR", "mIoU", "MB", "date", "models"]
+    assert printed[3].split()[:6] == ["rooms/one", "tree,", "field", "6", "21.46", "0.6500"]
+    assert printed[3].endswith(f"{date}  graph, colours")
     options = ("--results", str(results), "--protocol", "hierarchy/level-auto")
     app(["scenes", "rooms/o*", *options], standalone_mode=False)
-    assert capsys.readouterr().out.splitlines()[2:] == [
-        "| rooms/one | 5 | 1 | 864 | 21.46 | 2 | 2 | 1 | 0.3000 |"
-    ]
+    assert "0.3000" in capsys.readouterr().out.splitlines()[1]
+
+
+def test_the_size_of_a_scene_is_that_of_its_files(results):
+    (results / "rooms/posed/scene/large.bin").write_bytes(b"x" * 2_600_000)
+    assert (
+        SceneState.read(results / "rooms/posed").num_bytes // 1_000
+        == 2_600
+        + sum(path.stat().st_size for path in (results / "rooms/early/scene").rglob("*") if path.is_file())
+        // 1_000
+    )
 
 
 def test_a_foreign_file_is_kept_and_a_pattern_without_scenes_is_refused(results):
@@ -56,5 +77,7 @@ def test_a_foreign_file_is_kept_and_a_pattern_without_scenes_is_refused(results)
     with pytest.raises(ArtifactError, match=r"notes\.csv"):
         app(["scenes", "--results", str(results), "--out", str(out)], standalone_mode=False)
     assert out.read_text() == "my notes\n"
-    with pytest.raises(ArtifactError, match="no scene with poses that matches 'cellar'"):
-        app(["scenes", "cellar", "--results", str(results)], standalone_mode=False)
+    with pytest.raises(ArtifactError, match=r"no scene that matches 'dask'(.|\n)*did you mean 'photos/desk'"):
+        app(["scenes", "dask", "--results", str(results)], standalone_mode=False)
+    with pytest.raises(ArtifactError, match=r"no scene that matches '\*'(.|\n)*hilsplat run"):
+        app(["scenes", "--results", str(results / "figures")], standalone_mode=False)

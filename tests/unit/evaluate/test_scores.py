@@ -1,9 +1,9 @@
-"""Score files, and the table of scores that a run prints."""
+"""Score files."""
 
 import pytest
 
 from hilsplat.base.errors import ArtifactError
-from hilsplat.evaluate.scores import COLUMNS, read_scores, score_summary, write_scores
+from hilsplat.evaluate.scores import COLUMNS, read_scores, write_scores
 from tests.unit.evaluate.builders import score
 
 
@@ -39,21 +39,3 @@ def test_other_columns_are_refused_by_name(tmp_path):
     (tmp_path / "scores.csv").write_text("a,b\n1,2\n")
     with pytest.raises(ArtifactError, match=r"found     a, b"):
         read_scores([tmp_path / "scores.csv"])
-
-
-def test_the_summary_averages_over_queries_and_views(tmp_path):
-    tree, field = {"protocol": "lerf/tree-nodes@5"}, {"protocol": "lerf/langsplat@2", "method": "field"}
-    rows = [
-        score("iou", 0.5, query="mug", **tree),
-        score("iou", 1.0, query="pen", **tree),
-        score("localization_mask", 1.0, query="mug", **tree),
-        score("iou", 0.25, query="mug", **field),
-    ]
-    write_scores(tmp_path / "scores.csv", rows)
-    heading, columns, *lines = score_summary("photos/desk", {"hilsplat": tmp_path / "scores.csv"})
-    assert "photos/desk" in heading and columns.split() == ["mIoU", "localized", "queries", "protocol"]
-    assert [line.split() for line in lines] == [
-        ["hilsplat,", "field", "25.0%", "-", "1", field["protocol"]],
-        ["hilsplat,", "tree", "75.0%", "100.0%", "2", tree["protocol"]],
-    ]
-    assert score_summary("photos/desk", {}) == []

@@ -16,6 +16,7 @@ import hilsplat
 from hilsplat.annotate.labels import Label, label_path, write_labels
 from hilsplat.base.artifacts import read_index
 from hilsplat.base.errors import ArtifactError, ModelError, SettingsError
+from hilsplat.base.images import read_mask
 from hilsplat.cli.main import app
 from hilsplat.cli.user_commands import scene_folder
 from hilsplat.datasets.registry import open_labelled
@@ -27,6 +28,7 @@ from hilsplat.query.scene_views import Opened
 from hilsplat.scene.finished import FinishedScene
 from tests.unit.artifact_changes import change_index, write_record
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH
+from tests.unit.splat.spz_reader import decoded
 
 
 @pytest.fixture
@@ -152,6 +154,25 @@ def test_query_takes_a_path_from_any_folder(desk, elsewhere, capsys):
         assert (elsewhere / "answer" / name).stat().st_size > 1000
 
 
+def test_query_saves_the_masks_and_the_compressed_gaussians_of_its_answer(desk, elsewhere, capsys):
+    run("query", str(desk), "mug > handle", "--out", "answer", "--masks", "masks", "--spz")
+    assert capsys.readouterr().out.splitlines()[-2:] == [
+        "wrote answer/selection.spz",
+        "wrote masks of 1 node to masks/<view>/<node>.png and coco.json",
+    ]
+    (hit,) = (scene := hilsplat.open_scene(desk)).query("mug > handle")
+    for view in scene.views.names:
+        saved = read_mask(elsewhere / "masks" / Path(view).stem / f"{hit.node}.png") > 0
+        np.testing.assert_array_equal(saved, hit.mask(view))
+    coco = json.loads((elsewhere / "masks/coco.json").read_text())
+    assert [each["name"] for each in coco["categories"]] == ["mug > handle"]
+    assert len(coco["annotations"]) == len(scene.views.names)
+    spz = decoded((elsewhere / "answer/selection.spz").read_bytes())
+    assert len(spz) == len(hit.gaussians)
+    with pytest.raises(ArtifactError, match="masks exists"):
+        run("query", str(desk), "mug", "--out", "answer", "--masks", "masks")
+
+
 def test_a_scene_is_found_by_its_name_alone(desk_project, tmp_path):
     results = desk_project / "results"
     assert scene_folder("desk", results) == scene_folder("photos/desk", results) == results / "photos/desk"
@@ -160,6 +181,27 @@ def test_a_scene_is_found_by_its_name_alone(desk_project, tmp_path):
         (tmp_path / dataset / "desk/scene").mkdir(parents=True)
     with pytest.raises(SettingsError, match=r"several scenes(.|\n)*photos/desk, synthetic/desk"):
         scene_folder("desk", tmp_path)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("query", "dask", "mug"),
+        ("view", "dask", "--no-browser"),
+        ("annotate", "photos/dask"),
+        ("export", "dask"),
+    ],
+)
+def test_a_wrong_scene_name_suggests_the_right_one_in_every_command(desk_project, monkeypatch, command):
+    monkeypatch.chdir(desk_project)
+    with pytest.raises(ArtifactError, match=r"dask is missing(.|\n)*did you mean 'photos/desk'"):
+        run(*command)
+    for open_it in (
+        lambda: hilsplat.open_scene("results/photos/dask"),
+        lambda: hilsplat.open_scenes("results", "dask"),
+    ):
+        with pytest.raises(ArtifactError, match="did you mean 'photos/desk'"):
+            open_it()
 
 
 def test_export_writes_the_tree_to_any_folder(desk, elsewhere, capsys):

@@ -1,6 +1,7 @@
 """Photographs are posed, or refused with names and numbers; lost ones are drawn; EXIF has focal lengths."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -153,10 +154,12 @@ def found(registered, models):
 def test_too_few_registered_photographs_are_refused_with_all_reasons():
     def check(registered, models):
         settings = PosesSettings(min_registered_share=0.7)
-        check_registration(Path("photos"), "photos/test", found(registered, models), settings)
+        out, report = Path("results/photos/test/scene"), found(registered, models)
+        check_registration(Path("photos"), out, "photos/test", report, settings)
 
     check(7, [7, 3])
-    message = r"at least 70% of 10.*6 \(60\.0%\); models of 6, 4 .*9\.jpg: no features.*0\.60"
+    command = re.escape("""hilsplat run photos/test -- --config 'poses={"min_registered_share": 0.6}'""")
+    message = rf"at least 70% of 10.*6 \(60\.0%\); models of 6, 4 .*9\.jpg: no features.*{command}"
     with pytest.raises(RegistrationError, match=f"(?s){message}"):
         check(6, [6, 4])
     with pytest.raises(
@@ -222,7 +225,7 @@ def test_captures_of_one_place_join_and_photographs_of_another_place_are_named(
     report = json.loads((first / "registration.json").read_text())
     joined, other = sum(counts[:2]), counts[2]
     assert report["groups"] == report["models"] == [joined, other] and report["registered"] == joined
-    warning = f"2 groups of photographs share no verified matches ({joined}, {other} views)"
+    warning = f"2 groups of {joined} and {other} photographs without a common point: 2 scenes?"
     assert warning in report["warnings"]
     lost = {view: entry["why_not"] for view, entry in report["views"].items() if not entry["registered"]}
     assert list(lost) == [f"c{row:03d}.png" for row in range(other)]
@@ -233,6 +236,26 @@ def test_captures_of_one_place_join_and_photographs_of_another_place_are_named(
         np.testing.assert_allclose(found, turns[view] @ turns["a000.png"].T, atol=0.02)
     for file in first.rglob("*.*"):
         assert file.read_bytes() == (tmp_path / "second" / file.relative_to(first)).read_bytes(), file
+
+
+def test_photographs_of_two_places_are_reported_as_two_scenes(tmp_path):
+    photos = tmp_path / "photos"
+    for capture, place in (("desk", 1), ("shelf", 2)):
+        for view in plane_views(tmp_path / capture, 4, place=place).names:
+            photos.mkdir(exist_ok=True)
+            (tmp_path / capture / view).rename(photos / f"{capture}{view}")
+    write_noise(tmp_path / "other", 1, (160, 160))
+    (tmp_path / "other/0.png").rename(photos / "other.png")
+    with pytest.raises(RegistrationError) as caught:
+        pose_photos(photos, tmp_path / "results/photos/test/scene")
+    message = str(caught.value)
+    assert "are 2 groups of 4 photographs without a common point: 2 scenes?" in message.splitlines()[0]
+    for capture in ("desk", "shelf"):
+        files = ", ".join(f"{capture}{row:03d}.png" for row in range(3))
+        assert f"\n            group of 4: {files} and 1 more\n" in message
+    assert message.count("other.png: ") == 1 and "hilsplat new NAME FOLDER" in message
+    # a row for each group, and one for the photograph in no group
+    assert Image.open(tmp_path / "results/photos/test/not_registered.png").size == (1200, 120 + 3 * 210)
 
 
 def test_the_time_orders_photographs(tmp_path):

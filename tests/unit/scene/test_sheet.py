@@ -45,7 +45,7 @@ def test_named_scenes_are_chosen_alone_and_from_any_group(tmp_path):
     assert chosen("three", "a/one") == ["a/one", "a/three"]
     assert chosen("a/*") == ["a/one", "a/two"]  # in the groups
     assert chosen("b/*", "t[h]ree") == ["a/three", "b/two"]
-    with pytest.raises(SceneError, match=r"no scene is named 'tow'(.|\n)*a/one, a/two"):
+    with pytest.raises(SceneError, match=r"no scene is named 'tow'(.|\n)*did you mean 'a/two'"):
         chosen("tow")
 
 
@@ -112,11 +112,14 @@ def test_comments_are_skipped_optional_columns_may_be_missing_and_paths_start_at
     assert {row.features for row in found} == {None}
 
 
-def test_data_sources_are_below_the_data_root(tmp_path):
+def test_data_sources_are_below_the_data_root(tmp_path, monkeypatch):
+    """A relative data root starts from the working folder, as it does where the workflow looks for scenes."""
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "data").mkdir()
     (tmp_path / "data/theirs.ply").write_bytes(b"ply\n")
     row = ("lerf", "figurines", "lerf", "data:lerf_ovs/figurines", "arbitrary", "data:theirs.ply")
-    sheet = write_sheet(tmp_path, row, columns=COLUMNS[:6])
+    (tmp_path / "installed").mkdir()
+    sheet = write_sheet(tmp_path / "installed", row, columns=COLUMNS[:6])
     (found,) = read_sheet(sheet)  # the workflow skips it
     assert (found.folder, found.gaussians) == (None, None)
     (found,) = read_sheet(sheet, data_root="data")  # the workflow deals with missing ones

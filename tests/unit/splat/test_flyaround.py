@@ -116,3 +116,14 @@ def test_sheet_shrinks_by_averages(monkeypatch):
     assert sheet.shape == (2 * 7, 8, 3)
     assert (sheet[:3, :4] == 50).all()
     assert (sheet[3:7] == 255).all()
+
+
+def test_titles_are_above_their_pictures_and_stay_within_them():
+    picture = np.full((30, 60, 3), 200, np.uint8)
+    sheet = contact_sheet([picture, picture], 2, ["a", "a very long name of a photograph.jpg"])
+    assert sheet.shape == (flyaround.TITLE_PX + 34, 2 * 64, 3)
+    titles, below = sheet[: flyaround.TITLE_PX], sheet[flyaround.TITLE_PX :]
+    np.testing.assert_array_equal(below, contact_sheet([picture, picture], 2))
+    is_drawn = (titles < 128).any(axis=(0, 2))
+    assert is_drawn[:10].any() and not is_drawn[10:64].any()
+    assert is_drawn[64:].sum() > 20 and not is_drawn[124:].any()

@@ -52,10 +52,8 @@ def photographs(tmp_path, monkeypatch):
     (tmp_path / "desk").mkdir()
     for number in range(17):
         (tmp_path / f"desk/photo{number}.jpg").touch()
-    for module in ("estimate", "plan", "resources"):
-        monkeypatch.setattr(
-            f"hilsplat.workflow.{module}.read_model", lambda folder: SimpleNamespace(embedded=False)
-        )
+    for name in ("estimate.read_model", "plan.planned_model", "resources.planned_model"):
+        monkeypatch.setattr(f"hilsplat.workflow.{name}", lambda folder: SimpleNamespace(embedded=False))
     seconds = {"image": 19 - 10.24, "preview": 0.007, "masks": 0.01, "crop": 0.1}
     monkeypatch.setattr("hilsplat.embed.model_check.seconds_of", lambda *inputs: seconds)
     monkeypatch.setattr(estimate.JobResources, "core_seconds", lambda self, rule, job: 75.0)

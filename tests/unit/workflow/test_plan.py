@@ -55,6 +55,18 @@ def test_scenes_of_the_groups_are_run_and_missing_data_is_named(tmp_path):
     assert targets.absent(found, "replica") == []
 
 
+def test_a_wrong_data_root_is_reported_in_one_line_per_data_set(tmp_path):
+    rows = [
+        f"{data} {name} {data} data:{data}/{name} metre" for data in ("lerf", "3d_ovs") for name in "abcde"
+    ]
+    with pytest.raises(SettingsError) as caught:
+        plan_of(tmp_path, tuple(rows), groups=["lerf", "3d_ovs"], data_root="/none")
+    assert [line.strip() for line in str(caught.value).splitlines() if "is skipped" in line] == [
+        f"{data} (a, b, c and 2 more) is skipped: data_root /none is not a folder"
+        for data in ("lerf", "3d_ovs")
+    ]
+
+
 def test_segments_of_waymo_are_run_without_a_row(tmp_path):
     groups = ["benchmark", "waymo"]
     none = plan(tmp_path, groups=groups, data_root=str(tmp_path))
@@ -69,7 +81,7 @@ def test_segments_of_waymo_are_run_without_a_row(tmp_path):
 
 
 def test_a_run_without_scenes_lists_the_known_scenes(tmp_path):
-    with pytest.raises(SettingsError, match=r"no scenes to run(.|\n)*rooms/room \(benchmark\)"):
+    with pytest.raises(SettingsError, match=r"no scenes to run(.|\n)*such as (.|\n)*rooms/room"):
         plan(tmp_path, groups=["ci"])
 
 
@@ -131,7 +143,8 @@ def test_photographs_that_you_annotated_are_scored_without_replacing_the_tables(
     file.write_text("{}")
     found = plan(tmp_path, groups=["photos"], data_root=str(tmp_path))
     job = Job("photos", "desk")
-    assert targets.default(found) == [*alone, "results/photos/desk/default/scores.csv"]
+    assert targets.default(found) == [*alone, "results/photos/desk/scores.md"]
+    assert targets.means_of(found)(job) == ["results/photos/desk/default/scores.csv"]
     assert found.data.label_files(job) == [str(file)] and str(file) not in found.data.image_files(job)
     assert found.data.label_names(job) == ("annotated/photos/desk",)
     assert found.data.label_readers(job) == ("hilsplat.datasets.images.hi:ANNOTATED",)
@@ -255,7 +268,9 @@ def test_key_views_are_embedded_before_a_full_size_sam_segments_the_others(tmp_p
     desk, key, one = Job("photos", "desk"), Job("photos", "desk", "key-views"), Job()
     assert not found.first_answer(desk)  # sam-tiny takes seconds
 
-    monkeypatch.setattr("hilsplat.workflow.plan.read_model", lambda folder: SimpleNamespace(embedded=False))
+    monkeypatch.setattr(
+        "hilsplat.workflow.plan.planned_model", lambda folder: SimpleNamespace(embedded=False)
+    )
     assert found.first_answer(desk)
     assert not found.first_answer(key) and not found.first_answer(one)
     assert found.masks_priority(desk) < found.masks_priority(key)

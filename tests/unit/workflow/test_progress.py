@@ -67,7 +67,7 @@ class Screen:
         self.display = ProgressDisplay(stream, logging.Formatter().format, run)
 
     def tell(self, event: str = "", text: str = "a block", level: int = 20, **more: object) -> None:
-        record = logging.LogRecord("snakemake", level, __file__, 1, text, None, None)
+        record = logging.LogRecord("snakemake", level, more.pop("path", __file__), 1, text, None, None)
         record.__dict__.update(more, **({"event": event} if event else {}))
         self.display.show(record)
 
@@ -93,7 +93,9 @@ def screen(run) -> Screen:
 def test_in_a_file_a_finished_stage_is_one_plain_line(screen, clock):
     screen.tell("run_info", "Job stats", stats=JOBS)
     screen.tell("job_started", jobs=[1])
-    screen.tell(text="Select jobs to execute...")
+    for text in ("Building DAG of jobs...", "Using shell: /usr/bin/bash", "Select jobs to execute..."):
+        screen.tell(text=text)
+    screen.tell(text="a line of ours", path="/project/Snakefile")
     screen.start(1, "gaussians")
     clock.now = 290.0
     screen.end(1)
@@ -102,7 +104,13 @@ def test_in_a_file_a_finished_stage_is_one_plain_line(screen, clock):
     screen.start(0, "all")  # a target, not a job
     screen.end(0)
     screen.display.close()
-    assert screen.text == "Job stats\nphotos/desk gaussians: 290 s (1 of 3 done, about 2 min left)\n"
+    line = "photos/desk gaussians: 290 s (1 of 3 done, about 2 min left)"
+    assert screen.text == f"a line of ours\n{line}\n"
+
+
+def test_a_run_without_jobs_says_so(screen):
+    screen.tell(text="Nothing to be done (all requested files are present and up to date).")
+    assert screen.text.startswith("Nothing to be done")
 
 
 def test_texts_from_logs_and_jobs_cannot_control_the_terminal(run, tmp_path):
@@ -116,7 +124,7 @@ def test_texts_from_logs_and_jobs_cannot_control_the_terminal(run, tmp_path):
     lines.tell(text="job \x9b31m failed", level=logging.ERROR)
     lines.start(1, "gaussians", log)
     terminal = Screen(run, Terminal())
-    terminal.display.show(logging.makeLogRecord({"event": "progress", "msg": ""}))
+    terminal.display.show(logging.makeLogRecord({"event": "progress", "msg": "", "levelno": 20}))
     terminal.display.close()
     assert "\\x1b[2J 1 of 3" in terminal.text and "\x1b[2J:" not in terminal.text
     lines.end(1)
@@ -165,20 +173,42 @@ def test_queries_of_key_views_are_announced_before_those_of_all_views(screen, tm
     assert lines[6:] == ["photos/desk uses all photographs"]
 
 
-@pytest.mark.parametrize("how", ["died with <Signals.SIGKILL: 9>", "returned non-zero exit status 137"])
-def test_a_killed_job_is_explained(screen, how):
-    screen.tell(text=f"CalledProcessError: Command 'python' {how}.", level=logging.ERROR)
-    assert "the job was killed, probably because memory ran out\n  fix       use fewer cores" in screen.text
-
-
-def test_errors_are_shown_in_full_and_a_retry_counts_once(screen, run):
+def test_errors_of_failed_jobs_are_the_last_lines_with_their_fix_and_a_retry_counts_once(
+    screen, run, tmp_path
+):
+    first, second = tmp_path / "gaussians.log", tmp_path / "field.log"
+    error = "SceneError: no view\n  fix       hilsplat run desk"
+    log_lines(first, (20, "a", "start"), (logging.ERROR, "hilsplat", error), (20, "b", "ended"))
+    log_lines(second, (20, "a", "loop"), (20, "a", "killed here"))
     screen.tell("run_info", "Job stats", stats=JOBS)
-    screen.start(1, "gaussians")
-    screen.tell("job_error", "Error in rule gaussians:\n    the whole log", logging.ERROR, jobid=1)
-    assert screen.text.endswith("Error in rule gaussians:\n    the whole log\n")
-    assert run.counts() == "0 of 3 done, 1 failed, about 2 min left"
-    screen.start(1, "gaussians")
-    assert run.counts() == "0 of 3 done, about 7 min left"
+    for number, rule, log in ((1, "gaussians", first), (2, "field", second)):
+        screen.start(number, rule, log)
+        screen.tell("job_error", "Error in rule\n    shell: long", logging.ERROR, jobid=number)
+    screen.tell(text="Exiting because a job execution failed. Look above", level=logging.ERROR)
+    screen.tell("error", "CalledProcessError: returned non-zero exit status 1.", logging.ERROR)
+    assert screen.text == "photos/desk gaussians: failed after 0 s\nphotos/desk field: failed after 0 s\n"
+    assert run.counts() == "0 of 3 done, 2 failed, about 1 min left"
+    screen.start(2, "field", second)
+    assert "1 failed" in run.counts()
+    before = screen.text
+    screen.display.close()
+    assert screen.text.removeprefix(before) == f"photos/desk gaussians failed; its log is {first}\n{error}\n"
+
+
+@pytest.mark.parametrize("how", ["died with <Signals.SIGKILL: 9>", "returned non-zero exit status 137"])
+def test_a_killed_job_is_explained_at_the_end(screen, tmp_path, how):
+    log_lines(log := tmp_path / "gaussians.log", (20, "a", "step 5"))
+    screen.start(1, "gaussians", log)
+    screen.tell("job_error", "Error in rule", logging.ERROR, jobid=1)
+    screen.tell("error", f"CalledProcessError: Command 'python' {how}.", logging.ERROR)
+    screen.display.close()
+    killed = "a job was killed, probably because memory ran out\n  fix       use fewer cores"
+    assert "step 5\n" + killed in screen.text and "CalledProcessError" not in screen.text
+
+
+def test_an_error_of_snakemake_itself_is_shown(screen):
+    screen.tell("error", "WorkflowError: the settings are not valid", logging.ERROR)
+    assert screen.text == "WorkflowError: the settings are not valid\n"
 
 
 def test_a_terminal_has_a_status_line_below_the_others(run, clock):

@@ -124,3 +124,50 @@ def test_memory_grows_with_the_model_and_with_views_at_once(tmp_path):
     for without in ({"segmenter": "graph", "model": str(folder)}, {"model": str(tmp_path / "nowhere")}):
         small = JobResources(plan(tmp_path, masks=without))
         assert small.memory_mb("masks")(JOB, 32, 1) < 1000 + RUNNER_MB
+
+
+def test_the_time_of_an_evaluation_grows_with_the_labelled_queries(tmp_path, monkeypatch):
+    """2092 queries of a scene with 40 views of 384 x 384 px took 74 CPU seconds (docs/benchmarks.md)."""
+    monkeypatch.setattr(JobResources, "_size", lambda self, row: Size(40, 0.147))
+    source = tmp_path / "photos"
+    source.mkdir()
+    shutil.copy(PROJECT / "docs/images/panel.jpg", source / "1.jpg")
+    job, labels = Job("photos", "desk"), tmp_path / "annotated/photos/desk"
+    labels.mkdir(parents=True)
+    seconds = []
+    for count in (10, 2092):
+        objects = [{"category": "mug", "segmentation": []}] * count
+        (labels / "1.json").write_text(json.dumps({"objects": objects}))
+        found = plan_of(
+            tmp_path, ("photos desk photos photos metre",), groups=["photos"], data_root=str(tmp_path)
+        )
+        seconds.append(JobResources(found).core_seconds("evaluate", job))
+    unlabelled = JobResources(plan(tmp_path)).core_seconds("evaluate", JOB)
+    assert seconds[0] == unlabelled and seconds[1] == pytest.approx(74 + 2, rel=0.02)
+
+
+def test_masks_of_a_data_set_count_as_queries(tmp_path):
+    masks = tmp_path / "3d_ovs/bed/segmentations"
+    for view in ("00", "04"):
+        (masks / view).mkdir(parents=True)
+        for name in ("banana.png", "sheet.png"):
+            (masks / view / name).touch()
+    (masks / "classes.txt").write_text("banana\nsheet\n")
+    (tmp_path / "3d_ovs/bed/images").mkdir()
+    (tmp_path / "3d_ovs/bed/sparse").mkdir()
+    rows = ("3d_ovs bed 3d_ovs data:3d_ovs/bed arbitrary", "synthetic one benchmark world:tabletop:1 metre")
+    found = plan_of(tmp_path, rows, groups=["3d_ovs", "benchmark"], data_root=str(tmp_path))
+    assert [found.data.num_labelled(row) for row in found.rows] == [4, 0]
+
+
+def test_a_released_model_has_its_cost_before_it_is_fetched(tmp_path, monkeypatch):
+    monkeypatch.setenv("HILSPLAT_MODELS", str(tmp_path / "none"))
+    seconds, megabytes = {}, {}
+    for name in ("sam-vit-huge", "sam2.1-hiera-small", "unknown"):
+        masks = {"segmenter": "sam", "model": f"models/{name}"}
+        found = JobResources(plan(tmp_path, masks=masks, world={"views": 10, "image_px": 128}))
+        seconds[name] = found.core_seconds("masks", JOB)
+        megabytes[name] = found.memory_mb("masks")(JOB, 1, 1)
+    assert seconds["sam-vit-huge"] > seconds["sam2.1-hiera-small"] + 800 > 900
+    assert seconds["unknown"] == 10 * 1.5 + 2, "as the embedded model"
+    assert megabytes["sam-vit-huge"] > 2570 > megabytes["unknown"]

@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from hilsplat.base.errors import HilsplatError
+from hilsplat.base.artifacts import run_command
+from hilsplat.base.errors import HilsplatError, SettingsError
+from hilsplat.cli.main import app
 from hilsplat.workflow import run as runs
 from hilsplat.workflow.run import STATE
 from tests.unit.workflow.plans import write_sheet
@@ -90,11 +92,12 @@ def test_scenes_become_a_configuration_and_other_targets_stay(folder, started):
 
 
 def test_a_misspelt_scene_is_refused(folder, started):
-    with pytest.raises(HilsplatError, match="did you mean 'two'"):
+    with pytest.raises(HilsplatError, match="did you mean 'synthetic/two'"):
         runs.run(["twoo"], [], [])
     with pytest.raises(HilsplatError, match=r"no scene, rule or file is named 'photo/\*'"):
         runs.run(["photo/*"], [], [])
-    with pytest.raises(HilsplatError, match="no scene, rule or file is named 'desk'"):
+    known = "one of all, tables, efficiency, train_models, synthetic/one, synthetic/two\n"
+    with pytest.raises(HilsplatError, match=f"no scene, rule or file is named 'desk'(.|\n)*{known}"):
         runs.run(["desk"], [], [])
     assert started == []
 
@@ -169,6 +172,52 @@ def test_the_locks_of_another_machine_stay(folder, started, unlocked, caplog):
     leave_marker("elsewhere")
     runs.run([], [], [])
     assert unlocked == [] and "another machine may be running" in caplog.text
+
+
+def test_a_path_with_the_name_of_a_scene_at_its_end_may_be_a_file(folder, started):
+    runs.run(["models/the-two"], [], ["-n"])
+    assert started[0][-2:] == ["--", "models/the-two"]
+
+
+def test_options_of_the_command_need_no_separator(folder, started, monkeypatch):
+    words = ["run", "two", "-n", "--cores", "1", "--forcerun", "field", "-R", "clip", "--verbose"]
+    monkeypatch.setattr(sys, "argv", ["hilsplat", *words])
+    assert app(words, standalone_mode=False) == 3
+    [command] = started
+    assert {"--dry-run", "--verbose"} <= set(command) and value(command, "--cores") == "1"
+    assert command[-3:] == ["--forcerun", "field", "clip"]
+
+
+def test_a_forced_stage_is_run_again_together_with_damaged_artifacts(folder, started, monkeypatch):
+    ply = Path("results/synthetic/one/gaussians.ply")
+    (ply.parent / "scene").mkdir(parents=True)
+    ply.write_text("")
+    answer = subprocess.CompletedProcess([], 0, f"output_file\tdate\n{ply}\t-\n", "")
+    monkeypatch.setattr(runs.subprocess, "run", lambda words, **kwargs: answer)
+    runs.run([], [], ["--forcerun", "field"])
+    assert started[0][-3:] == ["--forcerun", "field", str(ply)]
+
+
+def test_a_configuration_is_found_by_its_name(folder, project, started):
+    Path("config/config.yaml").unlink()
+    write_sheet(Path("config/scenes.tsv"), ("synthetic table-1 benchmark world:tabletop:1 metre",))
+    Path("config/mine.yaml").write_text("seed: 5\n")
+    runs.run([], [Path("demo"), Path("mine")], ["-n"])
+    configs = started[0][started[0].index("--configfile") + 1 :][:2]
+    assert configs == [str(project / "config/demo.yaml"), "config/mine.yaml"]
+    with pytest.raises(SettingsError, match=r"no configuration is named 'dem'(.|\n)*did you mean 'demo'"):
+        runs.run([], [Path("dem")], ["-n"])
+    with pytest.raises(SettingsError, match=r"pass keys after --: hilsplat run -- --config seed=3"):
+        runs.run([], [Path("seed=3")], ["-n"])
+    with pytest.raises(SettingsError, match=r"other\.yaml is missing"):
+        runs.run([], [Path("other.yaml")], ["-n"])
+
+
+def test_a_run_records_installed_configurations_by_name_for_the_commands_of_messages(folder, project):
+    Path("config/mine.yaml").write_text("")
+    runs.record_run(Path("results"), [project / "config/ci.yaml", folder / "config/mine.yaml"], {})
+    command = "hilsplat run --config ci --config config/mine.yaml results/a/b/scene"
+    assert run_command(Path("results/a/b/scene")) == command
 
 
 def test_the_snakefile_is_beside_the_configuration_or_the_installed_one(

@@ -1,0 +1,41 @@
+"""Masks of nodes in all views as files: PNG and COCO."""
+
+import io
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from PIL import Image
+
+from hilsplat.query.language_scene import LanguageScene
+from hilsplat.web.coco import coco_content, coco_region
+
+
+def mask_files(
+    scene: LanguageScene, groups: Sequence[tuple[str, Sequence[int]]]
+) -> Iterator[dict[str, bytes]]:
+    """Yield the files of each view by relative path: `<view>/<node>.png` for each node that it shows.
+
+    The last view's files include `coco.json`. Groups (name, nodes) are the COCO categories; a node in several
+    groups has one annotation per group.
+    """
+    nodes = sorted({node for _, members in groups for node in members})
+    views, description = scene.views.names, f"{scene.scene.name}: masks of nodes, by hilsplat"
+    coco = coco_content(description, views, scene.scene.cameras, [name for name, _ in groups])
+    for number, view in enumerate(views):
+        files = {}
+        for node in nodes:
+            mask = scene.views.node_masks(view, [node])
+            if not mask.any():
+                continue
+            png = io.BytesIO()
+            Image.fromarray(mask).save(png, format="PNG")
+            files[f"{Path(view).stem}/{node}.png"] = png.getvalue()
+            region = {"image_id": number, "node": node, **coco_region(mask)}
+            for category, (_, members) in enumerate(groups, 1):
+                if node in members:
+                    ids = {"id": len(coco["annotations"]) + 1, "category_id": category}
+                    coco["annotations"].append({**ids, **region})
+        if number == len(views) - 1:
+            files["coco.json"] = json.dumps(coco, ensure_ascii=False).encode()
+        yield files

@@ -1,0 +1,71 @@
+"""Means of score files, as a run and `evaluate-files` print them."""
+
+import pandas as pd
+
+from hilsplat.base.tables import read_csv
+from hilsplat.cli.main import app
+from hilsplat.datasets.classes import WAYMO_22
+from hilsplat.evaluate.scores import COLUMNS, write_scores
+from hilsplat.evaluate.tables.means import mean_rows
+from tests.unit.evaluate.builders import score
+
+LABELS = {"default": "hilsplat"}
+
+
+def means(*rows):
+    """Rows of the table, each as a dict without empty cells."""
+    columns, *found = mean_rows(pd.DataFrame(map(vars, rows), columns=list(COLUMNS)), LABELS)
+    return [{name: cell for name, cell in zip(columns, row, strict=True) if cell} for row in found]
+
+
+def test_each_method_and_protocol_has_a_row_averaged_as_its_card_says():
+    tree, field = {"protocol": "lerf/tree-nodes@5"}, {"protocol": "lerf/langsplat@2", "method": "field"}
+    pairs = [score("iou", 0.5, query="mug", **tree), score("iou", 1.0, query="pen", **tree)]
+    localized = [score("localization_mask", 1.0, query="mug", **tree)]
+    of_level = [score("iou", 0.9, level="whole"), score("iou", 0.7), score("iou", 0.2, level="part")]
+    by_class = [
+        score("iou", value, query=query, view=view, protocol="lerf-mask/gaussian-grouping@1")
+        for query, view, value in (("mug", "1", 1.0), ("mug", "2", 1.0), ("pen", "1", 0.5))
+    ]
+    consistency = score("view_consistency", 0.4, protocol="world/view-consistency@2")
+    other = score("iou", 0.25, variant="langsplat", **field)
+    rows = means(*pairs, *localized, *of_level, *by_class, consistency, other)
+    assert rows == [
+        {"method": "hilsplat (tree)", "mIoU": "50.0", "whole": "80.0", "part": "20.0", "queries": "3"}
+        | {"protocol": "hierarchy/level-given@5"},
+        {"method": "hilsplat (tree)", "mIoU": "75.0", "queries": "3"}
+        | {"protocol": "lerf-mask/gaussian-grouping@1"},
+        {"method": "hilsplat (tree)", "mIoU": "75.0", "localized": "100.0", "queries": "2", **tree},
+        {"method": "langsplat", "mIoU": "25.0", "queries": "1", "protocol": field["protocol"]},
+    ]
+
+
+def test_classes_of_a_pooled_protocol_are_averaged_from_their_points():
+    """A class that is neither labelled nor predicted counts as 1 in Waymo's mean."""
+    place = {"protocol": "waymo/segmentation@1 (points: nearest)", "level": "", "n": 10}
+    rows = [
+        score(metric, value, query=name, **place)
+        for metric in ("class_iou", "class_accuracy")
+        for name, value in zip(WAYMO_22.texts[:2], (0.8, 0.4), strict=True)
+    ]
+    mean = f"{100 * (0.8 + 0.4 + 20) / 22:.1f}"
+    expected = {"method": "hilsplat (tree)", "mIoU": mean, "queries": "2", "protocol": place["protocol"]}
+    assert means(*rows) == [expected]
+
+
+def test_the_means_of_a_scene_are_written_as_markdown_and_csv(tmp_path):
+    files = [tmp_path / variant / "scores.csv" for variant in ("default", "langsplat")]
+    for path, value in zip(files, (0.75, 0.5), strict=True):
+        write_scores(path, [score("iou", value, variant=path.parent.name, protocol="lerf/tree-nodes@5")])
+    out = tmp_path / "scores.md"
+    words = ["score-means", *map(str, files), "--out", str(out), "--names", '{"langsplat": "LangSplat"}']
+    app(words, standalone_mode=False)
+    rows = read_csv(out.with_suffix(".csv"), None, "")
+    assert [(row["method"], row["mIoU"]) for row in rows] == [
+        ("hilsplat (tree)", "75.0"),
+        ("LangSplat, tree", "50.0"),
+    ]
+    assert "| hilsplat (tree) | 75.0 | 1 | lerf/tree-nodes@5 |" in out.read_text()
+    write_scores(files[0], [])
+    app([words[0], str(files[0]), *words[3:]], standalone_mode=False)
+    assert read_csv(out.with_suffix(".csv"), None, "") == []
