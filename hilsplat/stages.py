@@ -547,7 +547,7 @@ def table(
 @stage(
     scope="scene",
     reads=_labels,
-    beside=lambda out: (out.with_name("registration.png"), out.with_name("fit.png")),
+    beside=lambda out: (out.with_name("registration.webp"), out.with_name("fit.webp")),
 )
 def figures(
     scene: PathIn,
@@ -560,7 +560,7 @@ def figures(
     autoencoder: PathIn,
     out: Annotated[
         Path,
-        typer.Option(help="PNG to write, with registration.png and fit.png beside it"),
+        typer.Option(help="WebP to write, with registration.webp and fit.webp beside it"),
         Role.OUTPUT,
     ],
     settings: of.FiguresSettings,
@@ -593,14 +593,14 @@ def figures(
     scope="scene",
     loop="variants compared",
     reads=_labels,
-    beside=lambda out: (out.with_name("views.png"), out.with_name("features.png")),
+    beside=lambda out: (out.with_name("views.webp"), out.with_name("features.webp")),
 )
 def comparison(
     folder: Annotated[Path, typer.Option(help="finished scene, results/<dataset>/<scene>")],
     scores: Annotated[list[Path], typer.Option(help="scores.csv of each variant to compare"), Role.INPUT],
     out: Annotated[
         Path,
-        typer.Option(help="PNG to write, with views.png, features.png and PDFs beside it"),
+        typer.Option(help="WebP to write, with views.webp, features.webp and PDFs beside it"),
         Role.OUTPUT,
     ],
     names: Names,

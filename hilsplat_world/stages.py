@@ -53,7 +53,7 @@ def mask_truth(
     scene: PathIn,
     truth: PathIn,
     masks: PathIn,
-    out: Annotated[Path, typer.Option(help="PNG to write, with CSV and PDF beside it"), Role.OUTPUT],
+    out: Annotated[Path, typer.Option(help="WebP to write, with CSV and PDF beside it"), Role.OUTPUT],
 ) -> str:
     """Compare masks with ground-truth regions at each level, and draw the errors."""
     from hilsplat_world.diagnostics.mask_truth import run_mask_truth

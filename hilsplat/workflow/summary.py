@@ -50,7 +50,7 @@ def _scene(plan: Plan, row: SceneRow) -> list[str]:
     folder, figures = Path(plan.path(row)), plan.results / "figures" / row.name
     scene, name, means = SceneState.read(folder), command_name(folder), folder / "scores.csv"
     counts = ", ".join(f"{number} {level}" for level, number in scene.nodes.items())
-    pictures = ", ".join(sorted(path.name for path in figures.glob("*.png")))
+    pictures = ", ".join(sorted(path.name for path in figures.glob("*.webp")))
     scores = read_csv(means, None, rebuild_command(means)) if means.is_file() else []
     table = aligned_table([[*scores[0]], *([*each.values()] for each in scores)], TEXTS) if scores else []
     uses = f'hilsplat query {name} "..."  or  hilsplat view {name}'

@@ -39,13 +39,13 @@ def test_a_scene_is_described_with_its_numbers_files_and_next_commands(project):
     write_json(folder / "gaussians/report.json", {"psnr_db": 20.04, "gaussians": 864, "split": "test"})
     Path("results/figures/photos/desk").mkdir(parents=True)
     for name in ("panel", "fit"):
-        Path(f"results/figures/photos/desk/{name}.png").touch()
+        Path(f"results/figures/photos/desk/{name}.webp").touch()
     write_csv(folder / "scores.csv", ["method", "mIoU", "protocol"], [["hilsplat (tree)", "75.0", "lerf"]])
     found = described(project)
     assert found["poses"] == "6 of 7 views registered; reprojection error 0.61 px"
     assert found["Gaussians"] == "864; PSNR 20.0 dB in 1 held-out view: fair"
     assert found["nodes"] == "2 whole, 2 part, 1 subpart (graph, colours)"
-    assert found["pictures"] == "fit.png, panel.png in results/figures/photos/desk"
+    assert found["pictures"] == "fit.webp, panel.webp in results/figures/photos/desk"
     assert found["scores"] == "in %, also in results/photos/desk/scores.md and scores.csv:"
     assert found["hilsplat"].split() == ["(tree)", "75.0", "lerf"]
     assert found["next"] == 'hilsplat query photos/desk "..."  or  hilsplat view photos/desk'
