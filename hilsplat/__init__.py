@@ -50,6 +50,10 @@ _MODULES = {
 }
 
 
+def __dir__() -> list[str]:
+    return __all__
+
+
 def __getattr__(name: str) -> Any:
     """Load a public name on first use."""
     if name not in _MODULES:

@@ -61,6 +61,11 @@ class LanguageScene(NodeQueries):
     _rival_margins: dict[str, np.ndarray] = dataclasses.field(default_factory=dict, repr=False, kw_only=True)
     """Margins (W, n) of all nodes for `naming.rivals`, by answerer."""
 
+    def __repr__(self) -> str:
+        nodes = ", ".join(f"{len(self.tree.nodes_of(level))} {level.label}" for level in LEVELS)
+        counts = f"{len(self.views.names)} views, {len(self.gaussians)} Gaussians, nodes: {nodes}"
+        return f"LanguageScene({self.scene.name}: {counts})"
+
     @staticmethod
     def of(finished: FinishedScene, *, threads: int = 1, opened: Opened | None = None) -> "LanguageScene":
         """Open a finished scene with its own settings and the names of its nodes."""

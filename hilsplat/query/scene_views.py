@@ -10,13 +10,14 @@ import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64, UInt8
 
 from hilsplat.base.errors import SettingsError
+from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.contributions.compositing import normalised_weights
-from hilsplat.scene.cameras import Cameras
+from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import SemanticTree, ViewNodes
 from hilsplat.splat.gaussians import Gaussians
-from hilsplat.splat.rasterise.api import pixel_weights
+from hilsplat.splat.rasterise.api import pixel_weights, render
 
 MIN_VISIBLE_SHARE = 1e-4
 """Minimum share of a view's pixels that a visible node covers; 14 px of 384 x 384 are too few."""
@@ -105,6 +106,13 @@ class SceneViews:
             return pixels
 
         return self.cache.get(("image", view), read)
+
+    def render(self, view: str | Camera) -> UInt8[np.ndarray, "H W 3"]:
+        """Render the Gaussians from a view, or from any camera, such as `scene.cameras[view].scaled(...)`."""
+        if isinstance(view, str):
+            self.size_hw(view)
+        camera = self.scene.cameras[view] if isinstance(view, str) else view
+        return to_uint8(render(self.gaussians, camera, threads=self.threads))
 
     def pixel_weights(self, view: str) -> sp.csr_matrix:
         """Render a view's weight matrix W (pixels x Gaussians)."""

@@ -76,6 +76,19 @@ def test_public_names_are_the_types_that_open_returns(desk, named_desk):
         hilsplat.shut  # noqa: B018
 
 
+def test_a_scene_is_one_line_and_renders_its_views_and_other_cameras(desk):
+    assert dir(hilsplat) == sorted(hilsplat.__all__)
+    scene = hilsplat.open_scene(desk)
+    assert repr(scene).startswith("LanguageScene(photos/desk: 6 views, ") and "\n" not in repr(scene)
+    picture = scene.views.render("000.png")
+    photograph = scene.views.image("000.png")
+    assert picture.dtype == np.uint8 and picture.shape == photograph.shape
+    assert np.abs(picture.astype(int) - photograph).mean() < 40
+    assert scene.views.render(scene.scene.cameras["000.png"].scaled((12, 21))).shape == (12, 21, 3)
+    with pytest.raises(SettingsError, match="no view 'x'"):
+        scene.views.render("x")
+
+
 def test_a_moved_results_folder_finds_its_clip_by_digest(desk, desk_project, elsewhere):
     shutil.copytree(desk_project / "results", elsewhere / "archive/outcomes")
     shutil.copytree(desk_project / "models/colours", elsewhere / "archive/models/renamed")

@@ -16,6 +16,7 @@ from hilsplat.query.answer import answer
 from hilsplat.query.names import write_names
 from hilsplat.query.node_names import COMMON, NodeNaming, Vocabulary, named
 from hilsplat.query.relevancy import margins
+from hilsplat.viewer.payload import described_nodes
 from tests.unit.artifact_changes import change_index
 from tests.unit.query.test_search_scales import tree_of
 
@@ -127,3 +128,11 @@ def test_a_text_that_words_for_absent_things_match_as_well_is_doubted(desk):
     (doubt,) = scene.query("book", "whole")[0].doubts  # a third of the words finds the book as well
     assert doubt.chance == pytest.approx(31 / 101)
     assert str(doubt) == "'book' may not be in the scene: 31% of words for absent things score as high"
+
+
+def test_names_are_hidden_where_the_model_does_not_know_what_it_sees(desk, monkeypatch):
+    monkeypatch.setattr("hilsplat.query.language_scene.caution_of", lambda clip, scene: "meaningless")
+    scene = hilsplat.open_scene(desk)
+    assert not any(hit.name for hit in scene.query("mug"))
+    assert {node["called"] for node in described_nodes(scene)["nodes"]} == {""}
+    assert scene.query("unicorn")[0].doubts  # doubts need the words for absent things, not the names
