@@ -88,7 +88,8 @@ class ViewerScene(ShownScene):
         return ViewerScene(self.folder, self.first, self.threads)
 
     def news(self) -> dict[str, Any]:
-        return {**super().news(), "variants": self.variants}
+        names = {variant: scene.names.version for variant, (_, scene) in list(self._variants.items())}
+        return {**super().news(), "variants": self.variants, "names": names}
 
     @property
     def variants(self) -> list[str]:

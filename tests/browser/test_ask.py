@@ -71,6 +71,21 @@ def test_an_answer_outside_the_view_is_one_click_away(opened, desk_address):
     assert status.index("may not be in the scene") < status.index("answer")  # a doubt comes first
 
 
+def test_a_name_given_in_one_tab_appears_in_another(served, own_desk, opened):
+    page = served(own_desk)
+    other = page.context.new_page()
+    other.goto(page.url.partition("#")[0])
+    other.locator("body[data-ready=yes]").wait_for()
+    ask_and_wait(other, "mug")
+    ask_and_wait(page, "mug")
+    answers(page).first.click()
+    page.get_by_role("textbox", name="Name").fill("frog")
+    page.keyboard.press("Enter")
+    for name in (answers(other), other.get_by_role("tree", name="Outline")):
+        name.get_by_text("frog").first.wait_for()
+    other.close()
+
+
 def test_a_stopped_server_is_reported_until_it_is_started_again(opened, desk):
     opened.expected += ["ERR_CONNECTION_REFUSED", "403"]
     with serving(desk) as address:

@@ -7,7 +7,7 @@ import { restyle } from "./drawing.js";
 import { $, counted, make } from "./elements.js";
 import { askKeptAgain, keepFromStart } from "./kept.js";
 import { isStopped, showStopped } from "./stopped.js";
-import { failed, loadVariant, main, page, panes, sceneChanged, start, tell, variantOf } from "./state.js";
+import { failed, loadVariant, main, outlines, page, panes, sceneChanged, start, tell, variantOf } from "./state.js";
 
 const POLL_MS = 4000;
 
@@ -71,7 +71,25 @@ export async function watch() {
       showStopped(false);
       if (now.of !== page.scene.of || now.changed.length) sceneChanged(now.changed);
       else if (now.variants.join() !== page.scene.variants.join()) await moreAnswer(now.variants);
+      else await renamedElsewhere(now.names);
     } catch (error) { if (isStopped(error)) showStopped(true); else failed(error); }
+  }
+}
+
+// Show names that were given in another tab.
+async function renamedElsewhere(versions) {
+  for (const [variant, own] of outlines) {
+    if (!(variant in versions) || versions[variant] === own.version) continue;
+    const { nodes, version } = await api.variant(variant);
+    own.version = version;
+    nodes.forEach(({ name }, row) => {
+      if (own.nodes[row].name === name) return;
+      own.nodes[row].name = name;
+      for (const pane of panes) for (const hit of pane.answer?.hits ?? []) if (variantOf(pane) === variant && hit.node === row) hit.name = name;
+      if (own === main()) page.outline.renamed(row);
+    });
+    listAnswers();
+    restyle();
   }
 }
 
