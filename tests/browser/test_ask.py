@@ -71,6 +71,20 @@ def test_an_answer_outside_the_view_is_one_click_away(opened, desk_address):
     assert status.index("may not be in the scene") < status.index("answer")  # a doubt comes first
 
 
+def test_labels_of_boxes_do_not_cover_each_other(opened, desk_address):
+    page = opened(desk_address)
+    for text in ("mug", "mug > handle", "book"):
+        keep(page, text)
+    page.wait_for_timeout(300)
+    boxes = [label.bounding_box() for label in page.locator("#overlay text").all()]
+    assert len(boxes) >= 3
+    for number, one in enumerate(boxes):
+        for other in boxes[:number]:
+            apart = abs(one["y"] - other["y"]) >= 12
+            beside = one["x"] >= other["x"] + other["width"] or other["x"] >= one["x"] + one["width"]
+            assert apart or beside
+
+
 def test_a_name_given_in_one_tab_appears_in_another(served, own_desk, opened):
     page = served(own_desk)
     other = page.context.new_page()

@@ -1,6 +1,7 @@
 // Boxes and labels over the picture, as SVG.
 
 const EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
+const LETTER_PX = 8, LINE_PX = 16;   // size of a label
 const NS = "http://www.w3.org/2000/svg";
 
 function element(name, attributes, text) {
@@ -23,7 +24,7 @@ export function drawOverlay(svg, camera, panes, width, height, covered = 0) {
   svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
   const made = [], each = width / panes.length, k = camera.intrinsics(each, height);
   panes.forEach((pane, number) => {
-    const group = element("g", { transform: `translate(${number * each} 0)` });
+    const placed = [], group = element("g", { transform: `translate(${number * each} 0)` });
     if (number) group.append(element("path", { class: "split", d: `M0 0V${height}` }));
     for (const { corners, kind, label, node, stroke = null } of pane.boxes) {
       const at = corners.map((corner) => camera.project(corner, k));
@@ -32,7 +33,12 @@ export function drawOverlay(svg, camera, panes, width, height, covered = 0) {
       const d = EDGES.map(([a, b]) => `M${at[a][0].toFixed(1)} ${at[a][1].toFixed(1)}L${at[b][0].toFixed(1)} ${at[b][1].toFixed(1)}`).join("");
       group.append(element("path", { d, class: "shadow" }), element("path", { d, class: kind, "data-node": node, ...(stroke ? { stroke } : {}) }));
       const top = at.reduce((best, point) => point[1] < best[1] ? point : best);
-      if (label) group.append(element("text", { x: Math.max(4, Math.min(each - 8 * label.length, top[0])), y: Math.max(covered + 14, top[1] - 6) }, label));
+      if (!label) continue;
+      const x = Math.max(4, Math.min(each - LETTER_PX * label.length, top[0])), right = x + LETTER_PX * label.length;
+      let y = Math.max(covered + 14, top[1] - 6);
+      while (placed.some((other) => x < other.right && other.x < right && Math.abs(y - other.y) < LINE_PX)) y += LINE_PX;   // below other labels
+      placed.push({ x, right, y });
+      group.append(element("text", { x, y }, label));
     }
     if (pane.label) group.append(element("text", { x: 12, y: height - 12 }, pane.label));
     made.push(group);
