@@ -158,7 +158,7 @@ def draw_panel(
     columns = 7 if any(row.truth is not None for row in rows) else 6
     overview_in = 2 * (WIDTH_IN / 4 * aspect + 0.15)
     row_in = WIDTH_IN / columns * aspect + 0.1
-    queries_in = len(rows) * row_in + (0.2 if rows else 0)
+    queries_in = len(rows) * row_in + (0.4 if rows else 0)
     figure = Figure(figsize=(WIDTH_IN, overview_in + queries_in + 0.45), layout="constrained")
     label = masks_label(masks_folder)
     warning = " (diagnostic: masks made from the true labels)" if made_from_truth(label) else ""
@@ -193,9 +193,12 @@ def draw_queries(
 ) -> None:
     """Draw one row per query: ground truth, answers of tree and field, field relevancy at three levels.
 
-    A frame marks the level of the answer, a ring the field's localization point.
+    An orange frame marks the level of the answer, a ring the field's localization point.
     """
     grid = figure.subplots(len(rows), columns, squeeze=False)
+    figure.supxlabel(
+        "orange frame: level of the answer; white ring: localization point of the field", fontsize=9
+    )
     rule = rule_of(evaluate)
     for axes, row in zip(grid, track(rows, "queries drawn"), strict=True):
         image = answers.views.image(row.view)
