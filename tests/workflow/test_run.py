@@ -20,8 +20,8 @@ def test_all_tables_and_figures_are_there(finished: Project) -> None:
             assert (finished.root / f"results/tables/{table}.{suffix}").stat().st_size > 0, (table, suffix)
     figures = finished.root / "results/figures"
     for name in ("panel", "comparison", "views", "features"):
-        for suffix in (".png", ".pdf"):
-            assert (figures / "synthetic/tiny" / f"{name}{suffix}").stat().st_size > 20_000, name
+        for suffix in (".webp", ".pdf"):
+            assert (figures / "synthetic/tiny" / f"{name}{suffix}").stat().st_size > 5_000, name
     assert (figures / "sweep-theta.png").stat().st_size > 5_000
 
 
