@@ -33,7 +33,8 @@ def test_settings_and_models_rerun_the_stages_that_read_them(copy_of_finished: P
     assert copy_of_finished.planned() == AFTER_FIELD
     copy_of_finished.edit("config/config.yaml", "theta: 0.9", "theta: 0.8")
     by_head = ("--config", "theta_variants=[]", "omega_variants=[]")  # theta decides levels in the others
-    assert copy_of_finished.planned(*by_head) == ({"coverage_tree"} | AFTER_FIELD) - {"sweep_plot"}
+    rerun = {"coverage_tree", "method"} | AFTER_FIELD
+    assert copy_of_finished.planned(*by_head) == rerun - {"sweep_plot"}
     copy_of_finished.edit("config/config.yaml", "theta: 0.8", "theta: 0.9")
     copy_of_finished.edit("config/config.yaml", "omega: 5", "omega: 10")
     card = copy_of_finished.root / "models/clip-tiny/config.json"
