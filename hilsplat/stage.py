@@ -242,7 +242,7 @@ def _recorded(stage: Stage[..., Any], arguments: Mapping[str, Any]) -> Iterator[
     inputs = {**given, **models_of([*sections.values()]), **extra.inputs}
     out = arguments["out"]
     beside = (*(arguments[name] for name in stage.outputs[1:]), *stage.beside(out))
-    # A PNG has a PDF beside it, and a field a report; before the first run, such a file is the user's.
+    # A picture has a PDF beside it, and a field a report; before the first run, such a file is the user's.
     endings = {".png": ".pdf", ".webp": ".pdf", ".safetensors": ".report.json"}
     side_files = {
         path.with_suffix(endings[path.suffix]): path for path in (out, *beside) if path.suffix in endings
