@@ -51,6 +51,7 @@ VALUES = {
 WORDS = {
     "new": ("chair", "photos.zip"),
     "evaluate-files": ("predictions",),
+    "score-means": (str(VARIANT / "scores.csv"),),
     "table": ("lerf",),
     "sweep-plot": ("theta",),
     "query": ("photos/desk", "mug"),
