@@ -225,8 +225,8 @@ def write_png(
         )
 
 
-WEBP = {"quality": 80, "method": 4}
-"""Options of Pillow for pictures of reports: about an eighth of a PNG's size."""
+WEBP = {"quality": 70, "method": 4}
+"""Options of Pillow for pictures of reports: about a tenth of the size of a PNG."""
 
 
 def write_webp(path: Path, pixels: UInt8[np.ndarray, "H W 3"]) -> None:
