@@ -53,6 +53,12 @@ def query(
     Prints the score, level, position, size and best views of each answer. Writes a picture (panel.png) and
     the answers' Gaussians (selection.ply). With --all, prints the best answer of each of the best scenes.
     """
+    of_one = {"--out": out, "--masks": masks, "--spz": spz, "--view": view, "--answerer": answerer != "tree"}
+    given = [option for option, value in of_one.items() if value]
+    if all_scenes and given:
+        raise SettingsError(f"{given[0]} is for queries of one scene", fix=f"leave out {given[0]} or --all")
+    if as_json and not all_scenes:
+        raise SettingsError("--json is for queries of all scenes", fix="leave out --json, or add --all")
     if all_scenes:
         from hilsplat.query.scenes import open_scenes, report_of
 

@@ -186,6 +186,22 @@ def test_query_saves_the_masks_and_the_compressed_gaussians_of_its_answer(desk, 
         run("query", str(desk), "mug", "--out", "answer", "--masks", "masks")
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--all", "--masks", "m"),
+        ("--all", "--spz"),
+        ("--all", "--out", "o"),
+        ("--all", "--view", "0"),
+        ("--json",),
+    ],
+)
+def test_options_that_a_query_would_ignore_are_refused(desk, elsewhere, words):
+    with pytest.raises(SettingsError, match=f"{words[min(1, len(words) - 1)]} is for queries of"):
+        run("query", str(desk), "mug", *words)
+    assert not list(elsewhere.iterdir())
+
+
 def test_a_scene_is_found_by_its_name_alone(desk_project, tmp_path):
     results = desk_project / "results"
     assert scene_folder("desk", results) == scene_folder("photos/desk", results) == results / "photos/desk"
