@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from hilsplat.base.artifacts import provenance_path, read_index, run_command
+from hilsplat.base.artifacts import INDEX, provenance_path, read_index, run_command
 from hilsplat.base.errors import ArtifactError, nearest
 from hilsplat.base.lineage import read_provenance
 from hilsplat.base.plugins import entry_points
@@ -121,8 +121,8 @@ class FinishedScene:
 
 
 def scenes_in(results: Path) -> list[str]:
-    """Return the names, `<dataset>/<scene>`, of the scenes of a results folder that have a scene folder."""
-    places = [path for path in results.glob("*/*") if (path / "scene").is_dir()]
+    """Return the names, `<dataset>/<scene>`, of the scenes of a results folder that have poses."""
+    places = [path for path in results.glob("*/*") if (path / "scene" / INDEX).is_file()]
     return sorted(f"{path.parent.name}/{path.name}" for path in places)
 
 
@@ -136,7 +136,7 @@ def require_scene_folder(folder: Path) -> None:
     if folder.is_dir():
         return
     parents = folder.absolute().parents
-    known = scenes_in(parents[1]) or scenes_in(parents[0])  # results/photos/desk, or results/desk
+    known = scenes_in(parents[0]) or scenes_in(parents[1])  # results/desk, or results/photos/desk
     name = f"{folder.parent.name}/{folder.name}"
     raise ArtifactError(
         f"scene folder {folder} is missing",

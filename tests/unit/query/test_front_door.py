@@ -207,7 +207,7 @@ def test_a_scene_is_found_by_its_name_alone(desk_project, tmp_path):
     assert scene_folder("desk", results) == scene_folder("photos/desk", results) == results / "photos/desk"
     assert scene_folder(str(results / "photos/desk"), Path("elsewhere")) == results / "photos/desk"
     for dataset in ("photos", "synthetic"):
-        (tmp_path / dataset / "desk/scene").mkdir(parents=True)
+        shutil.copytree(results / "photos/desk/scene", tmp_path / dataset / "desk/scene")
     with pytest.raises(SettingsError, match=r"several scenes(.|\n)*photos/desk, synthetic/desk"):
         scene_folder("desk", tmp_path)
 
@@ -223,6 +223,7 @@ def test_a_scene_is_found_by_its_name_alone(desk_project, tmp_path):
 )
 def test_a_wrong_scene_name_suggests_the_right_one_in_every_command(desk_project, monkeypatch, command):
     monkeypatch.chdir(desk_project)
+    Path("tests/unit/scene").mkdir(parents=True, exist_ok=True)  # as in a checkout: no scene
     with pytest.raises(ArtifactError, match=r"dask is missing(.|\n)*did you mean 'photos/desk'"):
         run(*command)
     for open_it in (
