@@ -80,7 +80,7 @@ CONF
 
 copy() { # a project of its own, with the embedded models alone
     rm -rf "${folder:?}/$1" && mkdir -p "$folder/$1/models"
-    cp -r "$project"/{Snakefile,rules,workflow,profiles,config,hilsplat,snakemake_logger_plugin_hilsplat} "$folder/$1"
+    cp -r "$project"/{Snakefile,rules,workflow,profiles,config,cpusplat,hilsplat,hilsplat_world,snakemake_logger_plugin_hilsplat} "$folder/$1"
     cp -r "$project"/models/{sam-tiny,clip-tiny} "$folder/$1/models"
 }
 
@@ -124,11 +124,12 @@ cmp "$folder"/{local,cluster}/results/synthetic/tiny/default/field.safetensors |
 echo "ok: $compared tables and the field have the same bytes as those of the local run"
 
 : > "$folder/slurm/jobs.txt"
-on_slurm --forcerun mask_truth --set-resources "mask_truth:mem_mb=450*attempt" mask_truth:gpu=1 \
+half=$(grep -oE '"max_rss": [0-9]+' "$folder/local/results/synthetic/tiny/benchmarks/mask_truth.jsonl" | awk '{print int($2 / 2)}')
+on_slurm --forcerun mask_truth --set-resources "mask_truth:mem_mb=$half*attempt" mask_truth:gpu=1 \
     --retries 4 -- results/figures/synthetic/tiny/masks.png > "$folder/memory.log" 2>&1 ||
     fail "the job that ran out of memory did not finish: $folder/memory.log"
 grep -q "oom-kill event" "$folder"/slurm/slurmd-node?.log || fail "no job was killed for its memory"
 grep -q JobState=COMPLETED "$folder/slurm/jobs.txt" || fail "no attempt finished"
-echo "ok: out of memory with 450 MB, finished at attempt $(wc -l < "$folder/slurm/jobs.txt")"
+echo "ok: out of memory with $half MB, finished at attempt $(wc -l < "$folder/slurm/jobs.txt")"
 scontrol show jobs | grep -q "TresPerJob=gres:gpu:1" || fail "gpu=1 did not become a GPU of Slurm"
 echo "ok: gpu=1 became gres:gpu:1"

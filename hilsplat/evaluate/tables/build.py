@@ -94,3 +94,5 @@ def _warnings(blocks: Sequence[Block]) -> Iterator[str]:
         yield NOTES["true masks"]
     if any("Seeds" in row.names for row in rows):
         yield NOTES["seeds"]
+    if any("Scenes" in row.names for row in rows):
+        yield NOTES["scenes"]

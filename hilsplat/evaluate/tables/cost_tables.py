@@ -8,7 +8,13 @@ from hilsplat.evaluate.costs import Cost
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN
 from hilsplat.evaluate.tables.ablation import component_cells
 from hilsplat.evaluate.tables.kinds import TableKind
-from hilsplat.evaluate.tables.measured import kind_and_title, row_name, row_place, with_seeds
+from hilsplat.evaluate.tables.measured import (
+    kind_and_title,
+    row_name,
+    row_place,
+    scenes_of_row,
+    with_seeds,
+)
 from hilsplat.evaluate.tables.rows import Block, Cell, Row, Sources
 
 
@@ -16,12 +22,12 @@ def cost_blocks(kind: TableKind, sources: Sources) -> list[Block]:
     """Return times, memory and seconds per query in each scene."""
     blocks = []
     for data, answers in by_answer(sources).items():
-        rows = []
+        rows, scenes = [], scenes_of(answers)
         for variant, method, costs in answers:
             queries = {f"{cost.scene} query (s)": Cell.number(cost.query_s[method]) for cost in costs}
             names = {"Method": row_name(variant, method, sources.labels)}
+            names |= scenes_of_row(data, [cost.scene for cost in costs], scenes)
             rows.append(Row(names, time_cells(costs, method) | queries))
-        scenes = {cost.scene for *_, costs in answers for cost in costs}
         blocks.append(Block(*kind_and_title(data), tuple(rows), kind.columns_of(scenes)))
     return blocks
 
@@ -35,7 +41,7 @@ def quality_blocks(kind: TableKind, sources: Sources) -> list[Block]:
     scores = with_seeds(sources.scores)
     given = scores[(scores["seed"] == "0") & scores["protocol"].str.startswith(LEVEL_GIVEN.full_name)]
     for data, answers in by_answer(sources).items():
-        rows = []
+        rows, scenes = [], scenes_of(answers)
         for variant, method, costs in answers:
             part = given[
                 given["dataset"].isin([*LEVELLED, data])
@@ -45,7 +51,9 @@ def quality_blocks(kind: TableKind, sources: Sources) -> list[Block]:
             ]
             if method in kind.methods and not part.empty:
                 cells = component_cells(scores, part) | time_cells(costs, method)
-                rows.append(Row({"Method": row_name(variant, method, sources.labels)}, cells))
+                names = {"Method": row_name(variant, method, sources.labels)}
+                names |= scenes_of_row(data, [cost.scene for cost in costs], scenes)
+                rows.append(Row(names, cells))
         blocks.append(Block(*kind_and_title(data), tuple(rows), kind.columns_of(())))
     return blocks
 
@@ -62,6 +70,10 @@ def time_cells(costs: list[Cost], method: str) -> dict[str, Cell]:
         "Memory (GB)": Cell.number(max(cost.peak_mib for cost in costs) / 1024),
         "Query (s)": Cell.number(statistics.fmean(cost.query_s[method] for cost in costs)),
     }
+
+
+def scenes_of(answers: list[tuple[str, str, list[Cost]]]) -> set[str]:
+    return {cost.scene for *_, costs in answers for cost in costs}
 
 
 def by_answer(sources: Sources) -> dict[str, list[tuple[str, str, list[Cost]]]]:

@@ -5,6 +5,7 @@ much code, and writes an id and three classes per cell, so HTML files would be 1
 """
 
 import html
+import re
 from collections.abc import Iterator
 
 from hilsplat.base.tables import plain_markdown
@@ -40,17 +41,28 @@ HTML_STYLE = """<style>
 
 
 def csv_rows(table: Table) -> tuple[list[str], list[list[str]]]:
-    """Return the columns and rows of all blocks: measured values with two decimals, others as printed."""
+    """Return the columns and rows of all blocks: measured values with two decimals, others as printed.
+
+    A scene has one column, whatever its case and whether its words are joined, separated by spaces or by _.
+    """
     names = list(dict.fromkeys(name for block in table.blocks for name in block.names()))
-    values = list(dict.fromkeys(column for block in table.blocks for column in block.columns))
+    values: dict[str, str] = {}  # the paper writes Waldo kitchen, the data set waldo_kitchen
+    for block in table.blocks:
+        for column in block.columns:
+            values.setdefault(_column_key(column), column)
     rows = []
     for block in table.blocks:
+        own = {_column_key(column): column for column in block.columns}
         for row in block.rows:
-            cells = [row.cell(column) if column in block.columns else Cell() for column in values]
+            cells = [row.cell(own[key]) if key in own else Cell() for key in values]
             notes = " ".join(dict.fromkeys(cell.note for cell in cells if cell.note))
             texts = [_csv_value(cell, block.kind) for cell in cells]
             rows.append([block.kind, block.data, *(row.names.get(n, "") for n in names), *texts, notes])
-    return ["kind", "data", *(name.lower() for name in names), *values, "notes"], rows
+    return ["kind", "data", *(name.lower() for name in names), *values.values(), "notes"], rows
+
+
+def _column_key(column: str) -> str:
+    return re.sub("[ _]", "", column).casefold()
 
 
 def _csv_value(cell: Cell, kind: str) -> str:

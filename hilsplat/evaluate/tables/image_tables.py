@@ -4,15 +4,12 @@ from typing import TYPE_CHECKING, Any
 
 from hilsplat.evaluate.metrics.hierarchy import READINGS
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN, VIEW_CONSISTENCY
-from hilsplat.evaluate.tables.kinds import TableKind
+from hilsplat.evaluate.tables.kinds import TABLES, TableKind
 from hilsplat.evaluate.tables.measured import kind_and_title, level_cells, percent, same_row, scene_cells
 from hilsplat.evaluate.tables.rows import Block, Cell, Row, Sources
 
 if TYPE_CHECKING:
     import pandas as pd
-
-OVS_SCENES = ("bed", "bench", "room", "sofa", "lawn")
-"""Scenes in the paper's table; its column Overall is their average."""
 
 
 def lerf_cells(_: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
@@ -23,7 +20,7 @@ def ovs_cells(_: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
     """Return mIoU per scene, and mIoU and accuracy over the scenes of the paper."""
     cells = scene_cells(part, {"mIoU": "iou"})
     if (part["dataset"] == "3d_ovs").all():
-        part = part[part["scene"].isin(OVS_SCENES)]
+        part = part[part["scene"].isin(TABLES["3dovs"].averaged)]
     overall = {"Overall mIoU": "iou", "Overall accuracy": "pixel_accuracy"}
     return cells | {name: percent(part, metric) for name, metric in overall.items()}
 

@@ -28,6 +28,7 @@ class TableKind:
         reported: arguments of `rows.reported_block` for each block with the paper's values.
         protocols: prefixes of the protocols that have rows, for each set of measured blocks.
         methods: methods that have rows; empty for all.
+        averaged: scenes of a benchmark that averages cover; empty for all.
         columns: value columns. A group whose columns name `{scene}` is repeated for each scene.
         steps: variant -> the variant that its row extends, in ablations; others extend `default`.
         ranked_by_protocol: whether only rows of the same protocol are ranked together.
@@ -39,6 +40,7 @@ class TableKind:
     reported: tuple[dict[str, Any], ...]
     protocols: tuple[tuple[str, ...], ...] = ()
     methods: tuple[str, ...] = ()
+    averaged: tuple[str, ...] = ()
     columns: tuple[tuple[str, ...], ...] = ()
     unranked: tuple[str, ...] = ()
     steps: Mapping[str, str] = field(default_factory=dict)

@@ -5,10 +5,11 @@ A (view, query) pair without a prediction has a row with value 0 unless its prot
 
 import re
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from hilsplat.base.levels import LEVELS
+from hilsplat.datasets.registry import DATASETS
 from hilsplat.evaluate.protocols import cards
 from hilsplat.evaluate.tables.kinds import TableKind
 from hilsplat.evaluate.tables.rows import Block, Cell, Row, Sources
@@ -71,6 +72,7 @@ def measured_blocks(
                 names = _row_names(variant, masks, method, label, sources.labels)
                 if len(seeds) > 1:
                     names["Seeds"] = str(len(seeds))
+                names |= scenes_of_row(str(data), part["scene"], selected["scene"], kind.averaged)
                 cells = mean_over_seeds(seeds) | over_seeds(scores, part)
                 is_ranked = method != "truth" and not made_from_truth(masks)
                 group = label if kind.ranked_by_protocol else ""
@@ -95,6 +97,22 @@ def _row_names(
         "Masks": "-" if is_truth else masks,
         "Protocol": PROTOCOLS.get(label, label),
     }
+
+
+def scenes_of_row(
+    data: str, scenes: Collection[str], of_block: Collection[str], averaged: Collection[str] = ()
+) -> dict[str, str]:
+    """Return the column Scenes if a row's averages are over part of the scenes, otherwise nothing.
+
+    All scenes are those that the data set lists and those of any row in the block.
+
+    Args:
+        averaged: the scenes of a listed data set that are averaged; empty for all.
+    """
+    listed = DATASETS[data].scenes if data in DATASETS else ()
+    every = set(averaged) if listed and averaged else {*listed, *of_block}
+    number = len(every & set(scenes))
+    return {} if number == len(every) else {"Scenes": f"{number} of {len(every)}"}
 
 
 def with_seeds(scores: "pd.DataFrame") -> "pd.DataFrame":

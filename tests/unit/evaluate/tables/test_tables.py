@@ -123,6 +123,27 @@ def test_lerf_mask_means_go_over_texts_and_rows_of_a_published_data_set_are_meas
     assert "## Measured on lerf_mask" in forms[".md"] and "synthetic" not in forms[".md"]
 
 
+def test_a_scene_has_one_column_and_rows_over_part_of_the_scenes_say_so(tmp_path):
+    names = {**LERF, "dataset": "lerf_ovs"}
+    scenes = ("figurines", "ramen", "teatime", "waldo_kitchen")
+    scores = [score("iou", 0.5, scene=scene, **names) for scene in scenes]
+    scores.append(score("iou", 0.9, scene="waldo_kitchen", variant="half", method="field", **names))
+    rows, forms = built(tmp_path, "lerf", scores)
+    assert {row["Waldo kitchen mIoU"] for row in rows} >= {"37.9", "50.00", "90.00"}  # the paper's and ours
+    assert "waldo_kitchen mIoU" not in rows[0]
+    assert (measured(rows)["scenes"], measured(rows, method="half")["scenes"]) == ("", "1 of 4")
+    assert "not all of them" in forms[".md"] and '<td class="name">1 of 4</td>' in forms[".html"]
+
+
+def test_the_average_of_3d_ovs_is_over_the_scenes_of_the_paper(tmp_path):
+    names = {"dataset": "3d_ovs", "protocol": "3d-ovs/langsplat@2", "level": ""}
+    scores = [score("iou", 0.5, scene=scene, **names) for scene in ("bed", "bench", "room", "sofa", "lawn")]
+    rows, _ = built(tmp_path / "all", "3dovs", [*scores, score("iou", 0.9, scene="snacks", **names)])
+    assert "scenes" not in rows[0] and measured(rows)["Overall mIoU"] == "50.00"
+    rows, _ = built(tmp_path / "part", "3dovs", scores[:3])
+    assert measured(rows)["scenes"] == "3 of 5"
+
+
 def test_ablation_rows_take_localization_from_the_flat_protocol(tmp_path):
     rows, _ = built(tmp_path, "ablation", labels={"default": "hilsplat", "omega-2": "Omega 2"})
     row = measured(rows)
@@ -225,7 +246,10 @@ def test_an_unknown_table_is_an_error_that_lists_the_tables(tmp_path):
 
 
 def test_tables_do_not_load_torch_or_opencv(tmp_path):
-    arguments = f"'lerf', [], Path({str(PUBLISHED / 'lerf.csv')!r}), {{}}, Path({str(tmp_path / 'l.csv')!r})"
+    scores = tmp_path / "scores.csv"
+    write_scores(scores, [score("iou", 0.5, **LERF)])
+    published, out = PUBLISHED / "lerf.csv", tmp_path / "l.csv"
+    arguments = f"'lerf', [Path({str(scores)!r})], Path({str(published)!r}), {{}}, Path({str(out)!r})"
     code = (
         "import sys; from pathlib import Path; from hilsplat.evaluate.tables.build import run_table; "
         f"run_table({arguments}); "
