@@ -190,8 +190,8 @@ def shared_pairs(begin, end, masks, pairs, seen, least, min_iou):
 
 
 @compiled
-def neighbour_runs(indptr, indices, sums):
-    """Return each mask's neighbours in ascending order for `link`: start, stop, ids, values."""
+def neighbour_runs(indptr, indices, sums, ids, values):
+    """Write each mask's neighbours to `ids` and `values`, in ascending order; return their start and stop."""
     num = len(indptr) - 1
     start = np.zeros(num + 1, np.int64)
     for a in range(num):
@@ -200,7 +200,6 @@ def neighbour_runs(indptr, indices, sums):
             start[indices[k] + 1] += 1
     start = np.cumsum(start)
     stop = start[:num].copy()
-    ids, values = np.empty(start[num], np.int32), np.empty((start[num], 2))
     for a in range(num):
         for k in range(indptr[a], indptr[a + 1]):
             b = np.int64(indices[k])
@@ -208,7 +207,7 @@ def neighbour_runs(indptr, indices, sums):
                 ids[stop[own]] = other
                 values[stop[own], 0], values[stop[own], 1] = sums[k, 0], sums[k, 1]
                 stop[own] += 1
-    return start[:num].copy(), stop, ids, values
+    return start[:num].copy(), stop
 
 
 @compiled
@@ -272,7 +271,13 @@ def _place(view, begin, end, views):
     while begin + step <= end and views[begin + step - 1] < view:
         begin += step
         step *= 2
-    place = begin + np.searchsorted(views[begin : min(begin + step, end)], view)
+    place, above = begin, min(begin + step - 1, end)
+    while place < above:
+        middle = (place + above) // 2
+        if views[middle] < view:
+            place = middle + 1
+        else:
+            above = middle
     return place, place < end and views[place] == view
 
 
@@ -381,16 +386,18 @@ def link(pairs, neighbours, sizes, members, threshold, root, within):
     place_of = np.full(num, -1, np.int64)
     used_sizes, used_members = len(sizes[2]), len(members[2])
     # A comparison is outdated when one of the clusters has grown, which its number of masks shows.
-    queue = [(0.0, 0, 0, 0)]  # compared clusters: negative IoU, lowest masks, number of masks
+    # compared clusters: negative IoU, lowest masks, number of masks, intersection, union
+    queue = [(0.0, 0, 0, 0, 0.0, 0.0)]
     queue.pop()
     compared = {(0, 0): 0}  # two clusters -> number of masks when they were compared
     at = 0
     while at < len(ious) or len(queue):
-        if not len(queue) or (at < len(ious) and (-ious[at], firsts[at], seconds[at], 2) < queue[0]):
-            a, b, num_compared = np.int64(firsts[at]), np.int64(seconds[at]), 2
+        num_compared, both, union = 0, 0.0, 0.0
+        if not len(queue) or (at < len(ious) and (-ious[at], firsts[at], seconds[at]) < queue[0][:3]):
+            a, b = np.int64(firsts[at]), np.int64(seconds[at])
             at += 1
         else:
-            _, a, b, num_compared = heapq.heappop(queue)
+            _, a, b, num_compared, both, union = heapq.heappop(queue)
         i, j = np.int64(cluster[a]), np.int64(cluster[b])
         if i == j:
             continue
@@ -401,15 +408,15 @@ def link(pairs, neighbours, sizes, members, threshold, root, within):
             key = min(i, j), max(i, j)
             if key in compared and compared[key] == together:
                 continue
-            compared[key] = together
-        both, extra = _sums_with(i, j, neighbours, following_run, cluster)
-        few, many = (j, i) if sizes[1][i] - sizes[0][i] > sizes[1][j] - sizes[0][j] else (i, j)
-        union = _union(few, many, extra, sizes, members)
-        if num_compared != together:
-            if union > 0.0 and both / union >= threshold:
-                a, b = min(lowest[i], lowest[j]), max(lowest[i], lowest[j])
-                heapq.heappush(queue, (-both / union, a, b, together))
-            continue
+            both, extra = _sums_with(i, j, neighbours, following_run, cluster)
+            few, many = (j, i) if sizes[1][i] - sizes[0][i] > sizes[1][j] - sizes[0][j] else (i, j)
+            union = _union(few, many, extra, sizes, members)
+            if together > 2:
+                compared[key] = together
+                if union > 0.0 and both / union >= threshold:
+                    a, b = min(lowest[i], lowest[j]), max(lowest[i], lowest[j])
+                    heapq.heappush(queue, (-both / union, a, b, together, both, union))
+                continue
         within[0, j] += within[0, i] + both
         within[1, j] += within[1, i] + union
         sizes, used_sizes = _unite(i, j, used_sizes, sizes)

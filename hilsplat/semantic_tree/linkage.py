@@ -37,7 +37,10 @@ def prepared_linkage(evidence: Evidence, threshold: float) -> Callable[[], Linka
     pairs = masks, evidence.indices[chosen], iou[chosen]
     sizes = starts[:-1].copy(), starts[1:].copy(), evidence.size_views.copy(), evidence.sizes.copy()
     members = first.copy(), first + 1, evidence.view.copy(), np.ones(num)
-    neighbours = [neighbour_runs(evidence.indptr, evidence.indices, evidence.sums)]
+    # NumPy's large arrays have huge pages, which compiled code's don't; short runs are read in random order.
+    ids, values = np.empty(2 * len(iou), np.int32), np.empty((2 * len(iou), 2))
+    runs = neighbour_runs(evidence.indptr, evidence.indices, evidence.sums, ids, values)
+    neighbours = [(*runs, ids, values)]
 
     def linkage() -> Linkage:
         root, within = np.arange(num), np.zeros((2, num))

@@ -21,9 +21,6 @@ from hilsplat.settings import SemanticTreeSettings
 MIN_VISIBLE_PX = 0.3
 """A Gaussian counts as visible in a view if its mass there exceeds this."""
 
-MAX_LINKED_MEANWHILE = 150_000
-"""A level is compared while the one above is linked, unless it has more masks: their pairs take gigabytes."""
-
 SAMPLED_VIEWS = 8
 """Number of views whose pairs of masks are counted to estimate the memory of all pairs."""
 
@@ -164,7 +161,7 @@ def linked_nodes(
     with ThreadPoolExecutor(1, "linkage") as linker:
         linked: list[Future[Any]] = []
         for rows in rows_of_levels:
-            wait(() if meanwhile and len(rows) <= MAX_LINKED_MEANWHILE else linked)
+            wait(() if meanwhile else linked)
             found = evidence(rows)
             wait(linked)
             linked.append(linker.submit(prepared_linkage(found, settings.link_threshold)))
