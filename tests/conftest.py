@@ -14,6 +14,10 @@ from tests import lazy_checks
 
 PROJECT = Path(__file__).resolve().parents[1]
 
+CHECKED = "HILSPLAT_CHECKED"
+"""If this environment variable is set, as in one job of CI, the shapes and types of arguments and results are
+checked at every call. Tests then take up to twice the CPU time."""
+
 UNCHECKED = (
     "hilsplat.base.code",
     "hilsplat_world.objects.",
@@ -23,12 +27,12 @@ UNCHECKED = (
 """Modules of small functions that are called tens of thousands of times; checks would take five times as long
 as the tests themselves."""
 
-# All other modules have the shapes and types of arguments and results checked at every call.
-packages = ("cpusplat", "hilsplat", "hilsplat_world", "models/training")
-sources = [path for package in packages for path in (PROJECT / package).rglob("[!_]*.py")]
-files = [path.relative_to(PROJECT).with_suffix("") for path in sources]
-checked = [name for name in map(".".join, (file.parts for file in files)) if not name.startswith(UNCHECKED)]
-install_import_hook(checked, f"{lazy_checks.__name__}.checked")
+if os.environ.get(CHECKED):
+    packages = ("cpusplat", "hilsplat", "hilsplat_world", "models/training")
+    sources = [path for package in packages for path in (PROJECT / package).rglob("[!_]*.py")]
+    files = [".".join(path.relative_to(PROJECT).with_suffix("").parts) for path in sources]
+    checked = [name for name in files if not name.startswith(UNCHECKED)]
+    install_import_hook(checked, f"{lazy_checks.__name__}.checked")
 
 # Two test processes with two threads each on two cores are five times as slow.
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
