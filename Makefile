@@ -6,6 +6,7 @@
 # make bench   set up, then time the fast paths and a run on photographs; tables go to results/benchmarks (docs/benchmarks.md)
 #              with BASE=<commit>: what got slower since then, by runs of both versions in turn
 # make gpu     set up, then test and measure what needs an NVIDIA card; with DEVICE=cpu, at tiny sizes (docs/gpu.md)
+# make gpu-build  set up, then compile gsplat for a machine with a card; needs nvcc, but no card (docs/gpu.md)
 # make published  set up, then run config/paper.yaml over tiny data in the published layouts (docs/workflow.md)
 # make chaos   set up, then kill, freeze and starve runs of the ci configuration, and compare tables (docs/workflow.md)
 # make report  set up, run, and write results/report.html
@@ -19,7 +20,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: run demo test lint docs bench gpu chaos published report setup
+.PHONY: run demo test lint docs bench gpu gpu-build chaos published report setup
 
 run: $(STAMP)
 	hilsplat run --cores $(CORES)
@@ -52,6 +53,9 @@ docs: $(STAMP)
 
 gpu: $(STAMP)
 	python -m benchmarks.gpu --device $(DEVICE)
+
+gpu-build: $(STAMP)
+	python -m benchmarks.gpu_build $(TARGET)
 
 bench: $(STAMP)
 ifdef BASE

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
-import av
 import numpy as np
 from jaxtyping import Float64, UInt8
 from PIL import Image, ImageDraw, ImageFont
@@ -139,6 +138,8 @@ def encoded_film(
     because yuv420p needs even sides. Frames are consumed one by one to save memory. The file is complete when
     the iterator ends, so `path` must be temporary or from an atomic writer.
     """
+    import av  # lazy: a fit doesn't need it
+
     frames = iter(frames)
     first = next(frames)
     height, width = (side // 2 * 2 for side in first.shape[:2])
