@@ -1,6 +1,6 @@
 """Compile gsplat's kernels for a machine with a card, on a machine that has nvcc and needs no card.
 
-    make gpu-build                                     # for Python 3.12, torch 2.11.0 and cards of the H100's kind
+    make gpu-build                                     # for Python 3.12, torch 2.11.0 and H100 or H200 cards
     make gpu-build TARGET="--torch 2.13.0 --arch 8.6"  # for others; python -m benchmarks.gpu_build --help
     PYTHONPATH=build/gpu python3 -m benchmarks.gpu     # there, in a copy of the project
 
@@ -80,13 +80,9 @@ def main() -> None:
     given = parser.parse_args()
     os.environ.setdefault("CUDA_HOME", "/usr/local/cuda")
     if not (Path(os.environ["CUDA_HOME"]) / "bin/nvcc").exists():
-        sys.exit(
-            "nvcc is missing: install the toolkit of torch's CUDA version, and set CUDA_HOME to its folder"
-        )
+        sys.exit("nvcc is missing: install the toolkit of torch's CUDA version, and set CUDA_HOME")
     if not shutil.which(given.python):
-        sys.exit(
-            f"{given.python} is missing: install the other machine's version of Python, with its headers"
-        )
+        sys.exit(f"{given.python} is missing: install that version of Python, with its headers")
     built(given.out, given.python, given.torch, given.arch)
 
 
