@@ -27,11 +27,7 @@ use rule clip as imported_clip with:
     wildcard_constraints:
         dataset=PLAN.jobs_of("imported_clip"),
     params:
-        **PLAN.params(
-            "imported_clip",
-            files=PLAN.data.features,
-            features=PLAN.data.features_folder,
-        ),
+        **PLAN.params("imported_clip", **FEATURES),
 
 
 use rule stage as names with:

@@ -19,11 +19,7 @@ use rule stage as evaluate with:
     resources:
         **RESOURCES.of("evaluate"),
     params:
-        **PLAN.params(
-            "evaluate",
-            **LABELS,
-            name=PLAN.data.scene_name,
-        ),
+        **PLAN.params("evaluate", **LABELS, name=PLAN.data.scene_name),
 
 
 use rule stage as score_means with:
