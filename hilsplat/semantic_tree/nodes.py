@@ -253,12 +253,13 @@ def gaussian_nodes(
     add_views(_mass_arrays(mass), pair_view, pair_node, by_view, matrix, in_its_views)
     one_view = total_mass / np.maximum(num_views_of(visible_in(mass)), 1)
     share_there = share * total_mass[column] / (in_its_views + PRIOR_VIEWS * one_view[column])
-    row_of = _row_of(per_node)
-    ranked = np.lexsort((row_of, -share * share_there, column))
-    best = ranked[np.flatnonzero(np.diff(column[ranked], prepend=NONE))]
+    product, largest = share * share_there, np.zeros(shape[1])
+    np.maximum.at(largest, column, product)
+    # The last of several assignments counts, so entries are in descending order of their nodes.
+    best = np.flatnonzero(product == largest[column])[::-1]
     node_of_gaussian = np.full(shape[1], NONE, np.int32)
     membership = np.zeros(shape[1], np.float32)
-    node_of_gaussian[column[best]] = row_of[best]
+    node_of_gaussian[column[best]] = _row_of(per_node)[best]
     membership[column[best]] = share[best]
     return node_of_gaussian, membership
 
@@ -370,10 +371,13 @@ def level_ious(
 def best_fits(iou: sp.csr_matrix) -> tuple[Int32[np.ndarray, " m"], Float64[np.ndarray, " m"]]:
     """Return the column (lowest on a tie) and value of each row's maximum; -1 and 0 for empty rows."""
     best, value = np.full(iou.shape[0], NONE, np.int32), np.zeros(iou.shape[0])
-    row = _row_of(iou)
-    order = np.lexsort((iou.indices, -iou.data, row))
-    first = order[np.flatnonzero(np.diff(row[order], prepend=NONE))]
-    best[row[first]], value[row[first]] = iou.indices[first], iou.data[first]
+    counts = np.diff(iou.indptr)
+    filled = np.flatnonzero(counts)
+    if len(filled):
+        starts = iou.indptr[filled]
+        value[filled] = np.maximum.reduceat(iou.data, starts)
+        is_largest = iou.data == np.repeat(value, counts)
+        best[filled] = np.minimum.reduceat(np.where(is_largest, iou.indices, iou.shape[1]), starts)
     return best, value
 
 
