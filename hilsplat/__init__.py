@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from hilsplat.base.errors import HilsplatError
     from hilsplat.base.levels import Level
+    from hilsplat.evaluate.score import Scores, score
     from hilsplat.query.hits import Doubt, Hit
     from hilsplat.query.language_scene import LanguageScene, open_scene
     from hilsplat.query.scenes import SceneHit, Scenes, open_scenes
@@ -31,8 +32,10 @@ __all__ = [
     "Level",
     "SceneHit",
     "Scenes",
+    "Scores",
     "open_scene",
     "open_scenes",
+    "score",
     "show",
 ]
 
@@ -44,8 +47,10 @@ _MODULES = {
     "LanguageScene": "hilsplat.query.language_scene",
     "SceneHit": "hilsplat.query.scenes",
     "Scenes": "hilsplat.query.scenes",
+    "Scores": "hilsplat.evaluate.score",
     "open_scene": "hilsplat.query.language_scene",
     "open_scenes": "hilsplat.query.scenes",
+    "score": "hilsplat.evaluate.score",
     "show": "hilsplat.viewer.app",
 }
 
