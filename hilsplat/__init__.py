@@ -13,6 +13,7 @@ The names in `__all__` are the public interface (docs/python.md); everything els
 package loads no large library.
 """
 
+import sys
 from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -102,7 +103,7 @@ def __getattr__(name: str) -> Any:
     return getattr(import_module(_MODULES[name]), name)
 
 
-class CallablePackage(ModuleType):
+class _CallablePackage(ModuleType):
     """A subpackage that has the name of a public function, and is called as this function."""
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
@@ -111,3 +112,15 @@ class CallablePackage(ModuleType):
     @property
     def __wrapped__(self) -> Any:
         return __getattr__(self.__name__.rpartition(".")[2])
+
+
+class _Root(ModuleType):
+    """This package, in which an import of the subpackage `segment` doesn't hide the function `segment`."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in _MODULES and isinstance(value, ModuleType):
+            value.__class__ = _CallablePackage
+        super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Root

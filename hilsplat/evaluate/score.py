@@ -258,10 +258,11 @@ def flat_rows(
         level: level whose texts are queried, on a stand-in with levels; None if the labels have no levels.
         are_masks: whether the answers of all views are masks, not relevancy.
     """
+    words: list[str] = []
     if card in OF_EVERY_TEXT:
-        queries, words = truth.categories, []
+        queries = truth.categories
     elif level is None:
-        queries, words = (*truth.categories, *truth.absent), []
+        queries = (*truth.categories, *truth.absent)
     else:
         queries = tuple(query for query in truth.queries if query.level is level)
         words = ["wholes"] if level is Level.WHOLE else []

@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -97,18 +96,24 @@ def segment_views(
     origin: dict[str, Any] = {"segmenter": settings.segmenter}
     if settings.segmenter == "graph":
         logger.info("masks %s: graph segmenter (no model); the levels are three scales", scene.name)
-        segment_view = partial(_graph_masks, scene, cache=view_cache, settings=settings)
+
+        def segment_view(view: str) -> HierarchicalMasks:
+            return _graph_masks(scene, view, view_cache, settings)
     else:
         model, threads = _opened_sam(scene, view_cache.folder.parent, settings, threads, memory_mib)
         origin |= {"model": settings.model, "model_sha256": model.digest, "precision": model.precision}
         origin |= recorded(model.device)
-        segment_view = partial(sam_masks, scene, model=model, cache=view_cache, settings=settings)
+
+        def segment_view(view: str) -> HierarchicalMasks:
+            points = prompts(view) if prompts else None
+            return sam_masks(scene, view, model, view_cache, settings, points)
+
     finished_digests = digests_in(finished) if finished else {}
 
     def segment(view: str) -> HierarchicalMasks:
         if finished and view in finished_digests:
             return load_masks(finished, view, finished_digests)
-        masks = segment_view(view, points=prompts(view)) if prompts else segment_view(view)
+        masks = segment_view(view)
         if settings.levels == "head":
             return masks
         return with_tree_levels(masks, settings.theta or CoverageTreeSettings().theta)
