@@ -1,8 +1,11 @@
 """MkDocs hook: publish README.md and every project file that it links, without copies in docs/."""
 
+import base64
 import re
-from pathlib import Path
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
 
+import nbformat
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
@@ -23,6 +26,31 @@ def linked_files(project: Path, start: Path) -> set[Path]:
     return found
 
 
+class NotebookPage(File):
+    """A notebook, published as a page."""
+
+    def is_documentation_page(self) -> bool:
+        return True
+
+
+def notebook_files(project: Path, path: str, config: MkDocsConfig) -> Iterator[File]:
+    """Yield the page of a notebook (cells and saved outputs as Markdown) and its pictures."""
+    parts: list[str] = []
+    stem = PurePosixPath(path).with_suffix("")
+    for number, cell in enumerate(nbformat.read(project / path, as_version=4).cells):
+        parts.append(cell.source if cell.cell_type == "markdown" else f"```python\n{cell.source}\n```")
+        for output in cell.get("outputs", ()):
+            data = output.get("data", {})
+            if "image/png" in data:
+                picture = f"{stem}-{number}.png"
+                pixels = base64.b64decode(data["image/png"])
+                yield File.generated(config, picture, content=pixels)
+                parts.append(f"![output of the cell above]({PurePosixPath(picture).name})")
+            elif text := output.get("text") or data.get("text/plain"):
+                parts.append(f"```text\n{text.rstrip()}\n```")
+    yield NotebookPage.generated(config, path, content="\n\n".join(parts))
+
+
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Replace the files found in docs/ with README.md and the files reachable from it.
 
@@ -30,8 +58,10 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """
     project = Path(config.docs_dir).resolve().parent
     theme_files = [each for each in files if each.src_dir != config.docs_dir]
-    paths = sorted(
-        path.relative_to(project).as_posix() for path in linked_files(project, project / "README.md")
-    )
-    pages = [File(path, str(project), config.site_dir, config.use_directory_urls) for path in paths]
-    return Files([*theme_files, *pages])
+    published: list[File] = []
+    for path in sorted(each.relative_to(project) for each in linked_files(project, project / "README.md")):
+        if path.suffix == ".ipynb":
+            published += notebook_files(project, path.as_posix(), config)
+        else:
+            published.append(File(path.as_posix(), str(project), config.site_dir, config.use_directory_urls))
+    return Files([*theme_files, *published])

@@ -2,52 +2,94 @@
 
     import hilsplat
 
-    scene = hilsplat.open_scene("results/photos/desk")
-    for hit in scene.query("mug > handle"):
+    scene = hilsplat.reconstruct("photos/")  # or hilsplat.load_scene, from COLMAP, nerfstudio or results
+    gaussians = hilsplat.fit(scene)
+    tree = hilsplat.link(scene, gaussians, hilsplat.segment(scene))
+    for hit in tree.query("mug > handle"):
         print(hit.score, hit.level.label, hit.gaussians)
-    for hit in hilsplat.open_scenes("results").query("mug"):  # the scenes that match best
-        print(hit.score, hit.scene, hit.picture)
+    tree = hilsplat.open_scene("results/photos/desk")  # what `hilsplat run` finished
 
 The names in `__all__` are the public interface (docs/python.md); everything else may change. Importing the
 package loads no large library.
 """
 
+import sys
 from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hilsplat.base.errors import HilsplatError
     from hilsplat.base.levels import Level
-    from hilsplat.query.hits import Doubt, Hit
+    from hilsplat.evaluate.score import Scores, score
+    from hilsplat.library import (
+        SceneMasks,
+        fit,
+        link,
+        load_gaussians,
+        load_scene,
+        reconstruct,
+        render,
+        segment,
+    )
+    from hilsplat.query.hits import Doubt, Hit, Node
     from hilsplat.query.language_scene import LanguageScene, open_scene
     from hilsplat.query.scenes import SceneHit, Scenes, open_scenes
+    from hilsplat.scene.cameras import Camera
+    from hilsplat.scene.scene import Scene
+    from hilsplat.segment.masks import HierarchicalMasks
+    from hilsplat.splat.gaussians import Gaussians
+    from hilsplat.splat.rasterise.api import Rendering
     from hilsplat.viewer.app import show
 
 __all__ = [
+    "Camera",
     "Doubt",
+    "Gaussians",
+    "HierarchicalMasks",
     "HilsplatError",
     "Hit",
     "LanguageScene",
     "Level",
+    "Node",
+    "Rendering",
+    "Scene",
     "SceneHit",
+    "SceneMasks",
     "Scenes",
+    "Scores",
+    "fit",
+    "link",
+    "load_gaussians",
+    "load_scene",
     "open_scene",
     "open_scenes",
+    "reconstruct",
+    "render",
+    "score",
+    "segment",
     "show",
 ]
 
-_MODULES = {
-    "HilsplatError": "hilsplat.base.errors",
-    "Level": "hilsplat.base.levels",
-    "Doubt": "hilsplat.query.hits",
-    "Hit": "hilsplat.query.hits",
-    "LanguageScene": "hilsplat.query.language_scene",
-    "SceneHit": "hilsplat.query.scenes",
-    "Scenes": "hilsplat.query.scenes",
-    "open_scene": "hilsplat.query.language_scene",
-    "open_scenes": "hilsplat.query.scenes",
-    "show": "hilsplat.viewer.app",
+_NAMES = {
+    "hilsplat.base.errors": ("HilsplatError",),
+    "hilsplat.base.levels": ("Level",),
+    "hilsplat.evaluate.score": ("Scores", "score"),
+    "hilsplat.library": (
+        *("SceneMasks", "fit", "link", "load_gaussians"),
+        *("load_scene", "reconstruct", "render", "segment"),
+    ),
+    "hilsplat.query.hits": ("Doubt", "Hit", "Node"),
+    "hilsplat.query.language_scene": ("LanguageScene", "open_scene"),
+    "hilsplat.query.scenes": ("SceneHit", "Scenes", "open_scenes"),
+    "hilsplat.scene.cameras": ("Camera",),
+    "hilsplat.scene.scene": ("Scene",),
+    "hilsplat.segment.masks": ("HierarchicalMasks",),
+    "hilsplat.splat.gaussians": ("Gaussians",),
+    "hilsplat.splat.rasterise.api": ("Rendering",),
+    "hilsplat.viewer.app": ("show",),
 }
+_MODULES = {name: module for module, names in _NAMES.items() for name in names}
 
 
 def __dir__() -> list[str]:
@@ -59,3 +101,26 @@ def __getattr__(name: str) -> Any:
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(_MODULES[name]), name)
+
+
+class _CallablePackage(ModuleType):
+    """A subpackage that has the name of a public function, and is called as this function."""
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        return self.__wrapped__(*arguments, **named)
+
+    @property
+    def __wrapped__(self) -> Any:
+        return __getattr__(self.__name__.rpartition(".")[2])
+
+
+class _Root(ModuleType):
+    """This package, in which an import of the subpackage `segment` doesn't hide the function `segment`."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in _MODULES and isinstance(value, ModuleType):
+            value.__class__ = _CallablePackage
+        super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Root

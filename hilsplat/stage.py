@@ -280,6 +280,8 @@ def _recorded(stage: Stage[..., Any], arguments: Mapping[str, Any]) -> Iterator[
 
 
 def _command() -> list[str]:
-    """Return the command line without `--log`, so that a copied command prints to the terminal."""
+    """Return the command line without `--log`, so that a copied command prints; nothing in other programs."""
+    if "hilsplat.cli.main" not in sys.modules:
+        return []
     words = ["hilsplat", *sys.argv[1:]]
     return words[:1] + words[3:] if words[1:2] == ["--log"] else words

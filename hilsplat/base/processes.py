@@ -15,6 +15,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Thread
+from types import ModuleType
 from typing import IO, Any, TypeVar
 
 from hilsplat.base.errors import KILLED, KILLED_FIX, HilsplatError
@@ -207,12 +208,24 @@ def in_own_process(work: Callable[..., Result], *arguments: Any) -> Result:
         stderr = Path(folder) / "stderr"
         try:
             with _pool(1, _begin_alone, os.getpid(), stderr) as pool:
-                return pool.submit(work, *arguments).result()
+                with _hidden_main():
+                    result = pool.submit(work, *arguments)
+                return result.result()
         except BrokenProcessPool:
             last = stderr.read_text(errors="replace")[-2000:] if stderr.exists() else ""
             raise ChildProcessError(
                 f"{work.__module__}.{work.__name__} was terminated by a library\n{last}"
             ) from None
+
+
+@contextmanager
+def _hidden_main() -> Iterator[None]:
+    """Hide the main module in the block, because a process started there would run a user's script again."""
+    main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 def _begin_alone(parent: int, stderr: Path) -> None:

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Sized
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import TypeVar
 
@@ -27,6 +28,9 @@ class LogFormatter(logging.Formatter):  # noqa: TID251
 
 
 LOG_EVERY_S = 5.0  # seconds between progress lines if stderr is not a terminal
+
+BARS = ContextVar("bars", default=True)
+"""Whether loops show bars on a terminal."""
 
 LOG_TAIL_BYTES = 20_000
 PROGRESS = re.compile(
@@ -66,7 +70,7 @@ def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterato
     """Yield the items and show how many are done; `what` is a label such as "masks of views"."""
     if total is None:
         total = len(items) if isinstance(items, Sized) else None
-    if sys.stderr.isatty():
+    if sys.stderr.isatty() and BARS.get():
         from rich.console import Console  # slow to import
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -81,6 +85,23 @@ def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterato
         if now - last >= LOG_EVERY_S:
             logger.info("%s: %d of %s", what, done, total if total is not None else "?")
             last = now
+
+
+@contextmanager
+def reporting(progress: bool) -> Iterator[None]:
+    """Print what the block does to stderr; without `progress`, only what loggers of the user print."""
+    logs, handler = logging.getLogger("hilsplat"), logging.StreamHandler()
+    handler.setFormatter(LogFormatter("%(message)s"))
+    level, bars = logs.level, BARS.set(progress)
+    if progress:
+        logs.addHandler(handler)
+        logs.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        BARS.reset(bars)
+        logs.removeHandler(handler)
+        logs.setLevel(level)
 
 
 @contextmanager

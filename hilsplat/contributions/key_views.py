@@ -31,7 +31,7 @@ def run_key_masks(
     threads: int,
     memory_mib: float | None = None,
 ) -> None:
-    """Segment only the key views; arguments as in `segment.stage.run_sam_masks`."""
+    """Segment only the key views; arguments as in `segment.stage.run_masks`."""
     views = key_views(Scene.load(scene_folder), gaussians_ply, settings.key_views, threads)
     run_masks(scene_folder, out, cache, settings, threads, memory_mib, views)
 

@@ -1,9 +1,7 @@
 """The evaluate-files stage: scores any program's predictions without the pipeline; writes `scores.csv`."""
 
-import difflib
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 
@@ -14,7 +12,6 @@ from jaxtyping import Bool, Float64, Int64
 from hilsplat.base.artifacts import read_npz
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, SettingsError
 from hilsplat.base.images import read_mask
-from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import stage_log
 from hilsplat.base.tables import aligned_table
 from hilsplat.datasets.labelled import image_size_hw
@@ -22,16 +19,14 @@ from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.metrics.instances import InstanceMatches
 from hilsplat.evaluate.protocols import cards
-from hilsplat.evaluate.protocols.answers import mask_rows
-from hilsplat.evaluate.protocols.flat_views import argmax_rows
 from hilsplat.evaluate.protocols.points import (
     class_set,
     instance_scan,
     measure_instances,
     measure_points,
 )
-from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth, truths_of
-from hilsplat.evaluate.protocols.views import consistency_rows
+from hilsplat.evaluate.protocols.view_truth import ViewTruth, truths_of
+from hilsplat.evaluate.score import METHOD, OF_EVERY_TEXT, check_answers, flat_rows, key_of, level_rows
 from hilsplat.evaluate.scores import COLUMNS, Measured, Score, write_instances, write_scores
 from hilsplat.evaluate.tables.means import TEXTS, mean_rows
 from hilsplat.scene.scene import Scene
@@ -39,19 +34,8 @@ from hilsplat.settings import EvaluateSettings
 
 logger = logging.getLogger(__name__)
 
-METHOD = "files"
-"""Method in the score rows; the variant is the program's name."""
-
-WORDS = "masks of files"
-"""Bracketed suffix of a protocol's name: masks were supplied, so the protocol's map rule was not applied."""
-
-MASK_METRICS = (*cards.MASK, "acc_25", "acc_50")
-"""Metrics computed for masks from files; the other metrics need relevancy maps."""
-
 FOREGROUND = 128
 """Pixels with a grey value above this are foreground, as in Gaussian Grouping's script."""
-
-Masks = Mapping[tuple[str, str], Bool[np.ndarray, "h w"]]
 
 
 def run_evaluate_files(
@@ -145,90 +129,16 @@ def _mask_rows(
     if not levels:  # every folder is empty: nothing was found in any view
         levels = {query.level.label for truth in truths.values() for query in truth.queries if query.level}
         levels.add("")
-    texts: dict[str, set[str]] = {}
-    for truth in truths.values():
-        for query in (*truth.categories, *truth.absent, *truth.queries):
-            texts.setdefault(query.level.label if query.level else "", set()).add(query.text)
+    check_answers(predicted, truths)
     for view, truth in truths.items():
-        masks = predicted[view]
-        _check(view, masks, truth, texts)
-        flat = _flat_rows(masks, truth, extra) if "" in levels else ()
-        levelled = _level_rows(masks, truth) if levels - {""} else ()
-        yield from ((view, row) for row in (*flat, *levelled))
-
-
-def _check(view: str, masks: Masks, truth: ViewTruth, texts: Mapping[str, set[str]]) -> None:
-    """Check the sizes and texts of a view's masks; error messages name the view."""
-    for (level, text), mask in masks.items():
-        where = f"{view}: {level}/{text}" if level else f"{view}: {text}"
-        of_level = sorted(texts.get(level, ()))
-        if text not in of_level:
-            near = difflib.get_close_matches(text, of_level, n=1)
-            raise MisalignedArtifactError(
-                f"{where}: the labels have no text {text!r}" + (f" at level {level}" if level else ""),
-                expected=f"one of {', '.join(of_level)}",
-                found=text,
-                fix=f"rename it to {near[0]!r}" if near else "remove it, or correct its name",
-            )
-        shape = next((query.truth.shape for query in (*truth.categories, *truth.absent)), mask.shape)
-        if mask.shape != shape:
-            raise MisalignedArtifactError(
-                f"{where}: the mask and the labels differ in size",
-                expected=f"{shape[0]} x {shape[1]} (height x width)",
-                found=f"{mask.shape[0]} x {mask.shape[1]}",
-                fix="resize the prediction to the size of the labels by nearest neighbour",
-            )
-
-
-def _flat_rows(masks: Masks, truth: ViewTruth, extra: ExtraProtocols) -> Iterator[Measured]:
-    """Yield rows of masks without a level: LERF's protocols for all texts, then the data set's protocols."""
-    for query in truth.categories:
-        for card in (cards.LERF_LANGSPLAT, cards.LERF_OPENGAUSSIAN):
-            yield from _text_rows(card, query, masks.get(("", query.text)), [WORDS])
-    words = [*(["wholes"] if extra.level is Level.WHOLE else []), WORDS]
-    queries = [query for query in truth.queries if query.level is extra.level]
-    flat = [*truth.categories, *truth.absent] if extra.level is None else queries
-    for card in extra.flat:
-        if card is cards.OVS_ARGMAX:
-            yield from argmax_rows(METHOD, flat, partial(_cosine, masks), words, extra.level is not None)
-        elif card is not cards.OVS_NODES:  # masks from files are not nodes of a tree
-            for query in flat:
-                yield from _text_rows(card, replace(query, level=None), masks.get(("", query.text)), words)
-
-
-def _text_rows(
-    card: cards.ProtocolCard, query: Query, mask: Bool[np.ndarray, "H W"] | None, words: list[str]
-) -> Iterator[Measured]:
-    region = query.region(card.truth)
-    if not region.any() or (mask is None and card.missing == "left out"):
-        return  # not visible in the view, or not answered
-    metrics = tuple(metric for metric in card.metrics if metric in MASK_METRICS)
-    answer = np.zeros_like(region) if mask is None else mask
-    protocol = card.labelled(words)
-    yield from mask_rows(METHOD, replace(query, truth=region), protocol, answer, metrics=metrics)
-
-
-def _cosine(
-    masks: Masks, texts: Sequence[str], pixels: Int64[np.ndarray, " P"]
-) -> Float64[np.ndarray, "K 1 P"]:
-    """Return 1 inside a text's mask and -inf elsewhere, so that a pixel in no mask is a miss."""
-    nothing = np.zeros(len(pixels), dtype=bool)
-    given = [masks["", text].reshape(-1)[pixels] if ("", text) in masks else nothing for text in texts]
-    return np.where(np.stack(given), 1.0, -np.inf)[:, None]
-
-
-def _level_rows(masks: Masks, truth: ViewTruth) -> Iterator[Measured]:
-    """Yield the rows of masks with levels, and their hierarchical consistency."""
-    protocol = cards.LEVEL_GIVEN.labelled([WORDS])
-    for query in truth.queries:
-        assert query.level is not None
-        yield from _text_rows(cards.LEVEL_GIVEN, query, masks.get((query.level.label, query.text)), [WORDS])
-
-    def mask_of(path: tuple[str, ...]) -> Bool[np.ndarray, "H W"]:
-        mask = masks.get((Level(len(path)).label, path[-1]))
-        return np.zeros_like(truth.regions[path]) if mask is None else truth.own_part(path, mask)
-
-    yield from consistency_rows(METHOD, protocol, truth, mask_of)
+        rows: list[Iterator[Measured]] = []
+        if "" in levels:
+            # masks from files are not nodes of a tree
+            flat = (*OF_EVERY_TEXT, *(card for card in extra.flat if card is not cards.OVS_NODES))
+            rows += [flat_rows(card, predicted[view], truth, extra.level) for card in flat]
+        if levels - {""}:
+            rows.append(level_rows(predicted[view], truth))
+        yield from ((view, row) for of_card in rows for row in of_card)
 
 
 def _files_of(card: cards.ProtocolCard) -> list[str]:
@@ -289,7 +199,7 @@ def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.nd
         )
     if packed.is_file():
         arrays = read_npz(packed, max_gib=2.0)  # 500 masks of 4 megapixels
-        return {_key(name): _as_mask(array, f"{packed}: {name}") for name, array in arrays.items()}
+        return {key_of(name): _as_mask(array, f"{packed}: {name}") for name, array in arrays.items()}
     if not images.is_dir():
         raise ArtifactError(
             f"view {stem} has no predictions",
@@ -297,7 +207,7 @@ def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.nd
             fix="write them, or create an empty folder if nothing was found",
         )
     files = sorted(images.rglob("*.png"))
-    names = {path: _key(path.relative_to(images).with_suffix("").as_posix()) for path in files}
+    names = {path: key_of(path.relative_to(images).with_suffix("").as_posix()) for path in files}
     return {name: _as_mask(read_mask(path), str(path)) for path, name in names.items()}
 
 
@@ -356,11 +266,6 @@ def read_point_instances(
         masks.append(read_point_classes(path.parent / name, num_points) != 0)
     stacked = np.array(masks, dtype=bool).reshape(len(masks), num_points)
     return stacked, np.array(classes, dtype=np.int64), np.array(confidences, dtype=np.float64)
-
-
-def _key(name: str) -> tuple[str, str]:
-    first, _, rest = name.partition("/")
-    return (first, rest) if rest and first in [level.label for level in LEVELS] else ("", name)
 
 
 def _as_mask(array: np.ndarray, where: str) -> Bool[np.ndarray, "h w"]:

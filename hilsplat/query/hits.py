@@ -7,7 +7,7 @@ from jaxtyping import Bool, Int64
 
 from hilsplat.base.levels import Level
 from hilsplat.query.node_search import NodeHits
-from hilsplat.query.scene_views import SceneViews
+from hilsplat.query.scene_views import SceneViews, View
 from hilsplat.semantic_tree.tree import OrientedBox
 
 LIKELY_CHANCE = 0.05
@@ -40,46 +40,66 @@ class Doubt:
         return f"{self.text!r} may not be in the scene: {share} score as high"
 
 
-@dataclass(frozen=True)
-class Hit:
-    """One ranked answer; lengths are in scene units.
+@dataclass(frozen=True, repr=False)
+class Node:
+    """A node of a scene's tree; lengths are in scene units.
 
     Attributes:
         node: row of the semantic tree.
-        score: relevancy of the node and, with a lower weight, of its ancestors, in (0, 1). Answers are sorted
-            by score; at 0.5, the query fits no better than a generic word. For route "like": a cosine.
+        parent: row of the coarser node that contains this one, -1 for none.
         box: lower and upper corner of the axis-aligned box.
         oriented_box: the box along the node's own axes.
         best_views: up to three training views in which the node is largest.
-        route: as in `NodeHits`, or "like".
-        doubts: texts of the query that may match nothing; all answers to the query have the same doubts.
         name: the user's name for the node, otherwise its vocabulary name; empty if no name fits.
     """
 
     node: int
     level: Level
-    score: float
+    parent: int
     centroid: tuple[float, float, float]
     box: tuple[tuple[float, float, float], tuple[float, float, float]]
     oriented_box: OrientedBox
     best_views: tuple[str, ...]
-    route: str
-    doubts: tuple[Doubt, ...]
     name: str
-    _views: SceneViews = field(repr=False, compare=False)
+    _views: SceneViews = field(compare=False)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.node}, {self.level.label}, {self.name!r})"
 
     @property
     def gaussians(self) -> Int64[np.ndarray, " g"]:
         """Rows of the node's Gaussians in `gaussians.ply`."""
         return self._views.gaussians_of([self.node])
 
-    def mask(self, view: str) -> Bool[np.ndarray, "H W"]:
-        """Return the pixels of a view in which the node's Gaussians have more than half of the weight.
+    def mask(self, view: View) -> Bool[np.ndarray, "H W"]:
+        """Return the pixels in which the node's Gaussians have more than half of the weight.
+
+        Args:
+            view: name of a view, or any camera in scene coordinates.
 
         Raises:
             SettingsError: the scene has no such view.
         """
         return self._views.node_masks(view, [self.node])
+
+
+@dataclass(frozen=True, repr=False)
+class Hit(Node):
+    """One ranked answer.
+
+    Attributes:
+        score: relevancy of the node and, with a lower weight, of its ancestors, in (0, 1). Answers are sorted
+            by score; at 0.5, the query fits no better than a generic word. For route "like": a cosine.
+        route: as in `NodeHits`, or "like".
+        doubts: texts of the query that may match nothing; all answers to the query have the same doubts.
+    """
+
+    score: float
+    route: str
+    doubts: tuple[Doubt, ...]
+
+    def __repr__(self) -> str:
+        return f"{super().__repr__()[:-1]}, score {self.score:.2f})"
 
 
 def doubts_of(hits: NodeHits) -> tuple[Doubt, ...]:

@@ -20,19 +20,21 @@ from hilsplat.base.lineage import require_made_from, sha256_of_file
 from hilsplat.embed.clip import ClipModel, open_clip_of
 from hilsplat.field.code import LanguageField, autoencoder_file, load_code
 from hilsplat.query.field_answers import FieldAnswers
-from hilsplat.query.hits import Doubt, Hit, doubts_of
+from hilsplat.query.hits import Doubt, Hit, Node, doubts_of
 from hilsplat.query.names import NodeNames, read_names
 from hilsplat.query.node_names import NodeNaming
 from hilsplat.query.node_queries import NodeQueries, caution_of
 from hilsplat.query.node_search import NodeHits
 from hilsplat.query.relevancy import relevancy_of_margins
-from hilsplat.query.scene_views import Opened, SceneViews, ViewStore
+from hilsplat.query.scene_views import Opened, SceneViews, View, ViewStore
+from hilsplat.scene.cameras import Camera
 from hilsplat.scene.finished import FinishedScene, SceneParts
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import OrientedBox, SemanticTree
 from hilsplat.settings import EvaluateSettings
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply
+from hilsplat.splat.rasterise.api import Rendering, rendering
 
 logger = logging.getLogger(__name__)
 
@@ -133,6 +135,19 @@ class LanguageScene(NodeQueries):
         return self.views.tree
 
     @property
+    def nodes(self) -> tuple[Node, ...]:
+        """The tree's nodes, by row, as queries return them."""
+        return tuple(map(self._node, range(len(self.tree))))
+
+    def camera(self, view: str) -> Camera:
+        """Return the camera of a view; raise SettingsError if the scene has no such view."""
+        return self.views.camera(view)
+
+    def render(self, view: View) -> Rendering:
+        """Render the Gaussians in a view of the scene or any camera, over black; errors as in `camera`."""
+        return rendering(self.gaussians, self.views.camera(view), threads=self.views.threads)
+
+    @property
     def field(self) -> FieldAnswers:
         """Relevancy from the language field; raises ArtifactError if it is not computed yet."""
         if self.decoded_field is None:
@@ -214,19 +229,20 @@ class LanguageScene(NodeQueries):
         ]
 
     def _hit(self, node: int, score: float, route: str, doubts: tuple[Doubt, ...]) -> Hit:
+        return Hit(**vars(self._node(node)), score=score, route=route, doubts=doubts)
+
+    def _node(self, node: int) -> Node:
         area = self.tree.view_area_px[node]
         order = np.argsort(-area, kind="stable")[:BEST_VIEWS]
         low, high = self.tree.box[node].tolist()
-        return Hit(
+        return Node(
             node,
             Level(int(self.tree.level[node])),
-            score,
+            int(self.tree.parent[node]),
             tuple(self.tree.centroid[node].tolist()),
             (tuple(low), tuple(high)),
             OrientedBox.from_array(self.tree.oriented_box[node]),
             tuple(self.tree.view_names[row] for row in order if area[row] > 0),
-            route,
-            doubts,
             self.name_of(node),
             self.views,
         )

@@ -10,14 +10,13 @@ import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64, UInt8
 
 from hilsplat.base.errors import SettingsError
-from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import SemanticTree, ViewNodes
 from hilsplat.splat.gaussians import Gaussians
-from hilsplat.splat.rasterise.api import pixel_weights, render
+from hilsplat.splat.rasterise.api import pixel_weights
 
 MIN_VISIBLE_SHARE = 1e-4
 """Minimum share of a view's pixels that a visible node covers; 14 px of 384 x 384 are too few."""
@@ -25,6 +24,9 @@ MIN_VISIBLE_SHARE = 1e-4
 VIEW_CACHE_MIB = 1024.0
 
 Nodes = Sequence[int] | Int64[np.ndarray, " n"]
+
+View = str | Camera
+"""The name of a view of the scene, or any camera in scene coordinates."""
 
 
 class Opened:
@@ -86,15 +88,25 @@ class SceneViews:
         """Names of all views, in camera order."""
         return self.scene.cameras.names
 
-    def size_hw(self, view: str) -> tuple[int, int]:
-        """Return the image size of a view; raise SettingsError if the scene has no such view."""
+    def camera(self, view: View) -> Camera:
+        """Return the camera of a view; raise SettingsError if the scene has no such view."""
+        if isinstance(view, Camera):
+            return view
         if view not in self.names:
             raise SettingsError(
                 f"{self.scene.name} has no view {view!r}",
                 expected=f"one of {', '.join(self.names[:3])}, ... ({len(self.names)} views)",
                 found=view,
             )
-        return self.scene.cameras[view].size_hw
+        return self.scene.cameras[view]
+
+    def size_hw(self, view: View) -> tuple[int, int]:
+        """Return the image size of a view; errors as in `camera`."""
+        return self.camera(view).size_hw
+
+    def _cached(self, kind: str, view: View, compute: Callable[[], Any], *more: Any) -> Any:
+        """Return the cached result for a view of the scene; those of other cameras aren't cached."""
+        return self.cache.get((kind, view, *more), compute) if isinstance(view, str) else compute()
 
     def image(self, view: str) -> UInt8[np.ndarray, "H W 3"]:
         """Return a view's undistorted photograph, a cached read-only array: copy it to change pixels."""
@@ -105,30 +117,24 @@ class SceneViews:
             pixels.setflags(write=False)
             return pixels
 
-        return self.cache.get(("image", view), read)
+        return self._cached("image", view, read)
 
-    def render(self, view: str | Camera) -> UInt8[np.ndarray, "H W 3"]:
-        """Render the Gaussians from a view, or from any camera, such as `scene.cameras[view].scaled(...)`."""
-        if isinstance(view, str):
-            self.size_hw(view)
-        camera = self.scene.cameras[view] if isinstance(view, str) else view
-        return to_uint8(render(self.gaussians, camera, threads=self.threads))
-
-    def pixel_weights(self, view: str) -> sp.csr_matrix:
+    def pixel_weights(self, view: View) -> sp.csr_matrix:
         """Render a view's weight matrix W (pixels x Gaussians)."""
-        camera, min_weight = self.scene.cameras[view], self.tree.min_weight
+        camera, min_weight = self.camera(view), self.tree.min_weight
         return pixel_weights(self.gaussians, camera, min_weight=min_weight, threads=self.threads)
 
-    def view_weights(self, view: str) -> sp.csr_matrix:
+    def view_weights(self, view: View) -> sp.csr_matrix:
         """Return W with rows divided by alpha; rows with an alpha below 0.5 are empty."""
-        return self.cache.get(("weights", view), lambda: normalised_weights(self.pixel_weights(view)))
+        return self._cached("weights", view, lambda: normalised_weights(self.pixel_weights(view)))
 
-    def view_nodes(self, view: str, level: Level) -> ViewNodes:
+    def view_nodes(self, view: View, level: Level) -> ViewNodes:
         """Return the nodes of a level in each pixel of a view."""
-        return self.cache.get(
-            ("nodes", view, level),
-            lambda: ViewNodes.of(self.view_weights(view), self.tree.node_of_gaussian[:, level.index]),
-        )
+
+        def summed() -> ViewNodes:
+            return ViewNodes.of(self.view_weights(view), self.tree.node_of_gaussian[:, level.index])
+
+        return self._cached("nodes", view, summed, level)
 
     def visible_nodes(self, view: str) -> Bool[np.ndarray, " n"]:
         """Return whether each node's mask covers at least `MIN_VISIBLE_SHARE` of a view."""
@@ -139,13 +145,13 @@ class SceneViews:
             area_px = np.sum([self.view_nodes(view, level).area_px(num) for level in LEVELS], axis=0)
             return np.asarray(area_px >= MIN_VISIBLE_SHARE * height * width)
 
-        return self.cache.get(("visible", view), measure)
+        return self._cached("visible", view, measure)
 
     def gaussians_of(self, ids: Nodes) -> Int64[np.ndarray, " g"]:
         """Return the rows of `gaussians.ply` that belong to any of the nodes."""
         return np.flatnonzero(np.isin(self.tree.node_of_gaussian, np.asarray(ids)).any(axis=1))
 
-    def node_masks(self, view: str, ids: Nodes) -> Bool[np.ndarray, "H W"]:
+    def node_masks(self, view: View, ids: Nodes) -> Bool[np.ndarray, "H W"]:
         """Return the pixels in which the nodes' Gaussians have more than half of the total weight."""
         ids = np.asarray(ids, np.int64)
         size_hw = self.size_hw(view)

@@ -1,6 +1,6 @@
 """Posed pinhole cameras of a scene, keyed by view name."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from jaxtyping import Float, Int32
 
 from hilsplat.base.arrays import require_types
 from hilsplat.base.artifacts import read_npz, rebuild_command, write_npz
-from hilsplat.base.errors import ArtifactError, SceneError
+from hilsplat.base.errors import ArtifactError, SceneError, shorten_list
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 
 MAX_SIDE_PX = 2**15
@@ -52,6 +52,10 @@ class Camera:
     size_hw: tuple[int, int]
     photo: Photo | None = None
 
+    def __repr__(self) -> str:
+        height, width = self.size_hw
+        return f"Camera({self.name}: {width} x {height} px, focal length {self.K[0, 0]:.1f} px)"
+
     @property
     def centre(self) -> Float[np.ndarray, " 3"]:
         """Camera centre in world coordinates, scene units."""
@@ -83,15 +87,22 @@ class Cameras:
     def __len__(self) -> int:
         return len(self.names)
 
-    def __getitem__(self, name: str) -> Camera:
+    def __iter__(self) -> Iterator[Camera]:
+        return (self[row] for row in range(len(self)))
+
+    def __repr__(self) -> str:
+        return f"Cameras({len(self)} views: {shorten_list(self.names)})"
+
+    def __getitem__(self, view: str | int) -> Camera:
+        """Return the camera of a view, by name or row; raise SceneError if there is none."""
         try:
-            row = self.names.index(name)
-        except ValueError as error:
+            row = range(len(self))[view] if isinstance(view, int) else self.names.index(view)
+        except (ValueError, IndexError) as error:
             raise SceneError(
-                f"view {name!r} has no camera",
+                f"view {view!r} has no camera",
                 expected=f"one of {len(self.names)} views: {', '.join(self.names[:5])}, ...",
             ) from error
-        height, width = self.size_hw[row].tolist()
+        name, (height, width) = self.names[row], self.size_hw[row].tolist()
         return Camera(name, self.cam_from_world[row], self.K[row], (height, width), self.photos.get(name))
 
     def save(self, path: Path) -> None:

@@ -32,6 +32,15 @@ class Scene:
     points_rgb: UInt8[np.ndarray, "P 3"]
     scene_from_source: Float[np.ndarray, "4 4"]
 
+    def __repr__(self) -> str:
+        views = f"{len(self.names)} views ({len(self.views('test'))} held out)"
+        return f"Scene({self.name}: {views}, {len(self.points_xyz)} points)"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all views, in camera order."""
+        return self.cameras.names
+
     def views(self, split: str | None = None) -> list[str]:
         """Return the view names of a split ("train", "test") or all view names, in camera order."""
         return [name for name in self.cameras.names if split is None or self.split[name] == split]

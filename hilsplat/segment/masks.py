@@ -97,6 +97,9 @@ class HierarchicalMasks:
     def __len__(self) -> int:
         return len(self.level)
 
+    def __repr__(self) -> str:
+        return f"HierarchicalMasks({len(self)} masks of {self.size_hw[1]} x {self.size_hw[0]} px)"
+
     @staticmethod
     def from_dense(
         masks: Bool[np.ndarray, "M H W"],

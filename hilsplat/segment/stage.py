@@ -1,7 +1,7 @@
 """Stages that segment training views at three levels, with SAM or with the graph segmenter."""
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,98 +48,107 @@ def run_masks(
     threads: int,
     memory_mib: float | None = None,
     views: Sequence[str] | None = None,
+    prompts: Callable[[str], np.ndarray] | None = None,
+    finished: Path | None = None,
 ) -> None:
-    """Segment training views with the segmenter in the settings; arguments as in `run_sam_masks`."""
-    if settings.segmenter == "sam":
-        run_sam_masks(scene_folder, out, cache, settings, threads, memory_mib, views)
-    elif settings.segmenter == "graph":
-        run_graph_masks(scene_folder, out, cache, settings, threads, views)
-    else:
+    """Segment training views, and write their masks to `out` (`write_masks`).
+
+    For other arguments, see `segment_views`.
+    """
+    scene, view_cache = Scene.load(scene_folder), ViewCache(cache / "masks")
+    with stage_log("masks", scene.name) as counts:
+        chosen = train_views(scene) if views is None else views
+        masks, origin = segment_views(
+            scene, chosen, view_cache, settings, threads, memory_mib, prompts, finished
+        )
+        counts.update(write_masks(out, scene, masks, len(chosen), **origin))
+        counts.update(from_cache=view_cache.hits)
+
+
+def segment_views(
+    scene: Scene,
+    views: Sequence[str],
+    view_cache: ViewCache,
+    settings: MasksSettings,
+    threads: int,
+    memory_mib: float | None = None,
+    prompts: Callable[[str], np.ndarray] | None = None,
+    finished: Path | None = None,
+) -> tuple[Iterator[tuple[str, HierarchicalMasks]], dict[str, Any]]:
+    """Segment views with the segmenter in the settings.
+
+    Args:
+        view_cache: contains SAM's candidates and the masks, so changing thresholds doesn't rerun the
+            networks, and changing levels needs no computation.
+        threads: views processed in parallel if they fit into memory; the result does not depend on it.
+        memory_mib: memory that SAM may use; None for all free memory.
+        prompts: function that returns a view's prompt points (x, y, px) for SAM; None for the grid.
+        finished: earlier output of this stage whose views are reused unchanged.
+
+    Returns:
+        each view with its masks, computed on demand, and the origin of the masks, for their index.
+    """
+    if settings.segmenter not in ("sam", "graph"):
         raise SettingsError(
             f"masks.segmenter {settings.segmenter} needs a generated scene's ground truth",
             fix="set masks.segmenter to sam or graph; the workflow runs `hilsplat world perturb`",
         )
-
-
-def run_sam_masks(
-    scene_folder: Path,
-    out: Path,
-    cache: Path,
-    settings: MasksSettings,
-    threads: int,
-    memory_mib: float | None = None,
-    views: Sequence[str] | None = None,
-    prompts: Callable[[str], np.ndarray] | None = None,
-    finished: Path | None = None,
-) -> None:
-    """Segment training views with SAM.
-
-    Args:
-        out: folder to write (`write_masks`).
-        cache: folder of the view cache. It contains the decoder's candidates and the masks, so changing
-            thresholds doesn't rerun the networks, and changing levels needs no computation.
-        threads: views processed in parallel if they fit into memory; the result does not depend on it.
-        memory_mib: memory that the stage may use; None for all free memory.
-        views: views to segment; None for every training view.
-        prompts: function that returns a view's prompt points (x, y, px); None for the grid.
-        finished: earlier output of this stage whose views are reused unchanged.
-    """
-    scene, view_cache = Scene.load(scene_folder), ViewCache(cache / "masks")
-    finished_digests = digests_in(finished) if finished else {}
-    with stage_log("masks", scene.name) as counts:
-        model = SamModel.load(Path(settings.model), settings.variant, settings.device)
-        training = train_views(scene)
-        checked = training[:: max(1, len(training) // CHECKED_VIEWS)][:CHECKED_VIEWS]
-        model.choose_precision(settings.precision, [scene.image(view) for view in checked], cache, threads)
-        limit = model.thresholds(settings).points_per_batch
-        batch = model.prompts_per_call(limit, settings.points_per_side**2)
-        needs = needs_of(model.model, batch, as_exported=model.as_exported)
-        threads = needs.views_at_once(threads, memory_mib)
-        logger.info("masks %s: %d views at once, %.0f MiB each", scene.name, threads, needs.view_mib)
-
-        def segment(view: str) -> HierarchicalMasks:
-            if finished and view in finished_digests:
-                return load_masks(finished, view, finished_digests)
-            points = prompts(view) if prompts else None
-            return _with_levels(sam_masks(scene, view, model, view_cache, settings, points), settings)
-
-        chosen = training if views is None else views
-        masks = zip(chosen, in_order(segment, chosen, threads), strict=True)
-        origin = {"model": settings.model, "model_sha256": model.digest, "precision": model.precision}
-        origin |= recorded(model.device)
-        counts.update(write_masks(out, scene, masks, len(chosen), "sam", **origin))
-        counts.update(from_cache=view_cache.hits)
-
-
-def run_graph_masks(
-    scene_folder: Path,
-    out: Path,
-    cache: Path,
-    settings: MasksSettings,
-    threads: int,
-    views: Sequence[str] | None = None,
-) -> None:
-    """Segment training views with the graph segmenter; arguments as in `run_sam_masks`."""
-    scene, view_cache = Scene.load(scene_folder), ViewCache(cache / "masks")
-    with stage_log("masks", scene.name) as counts:
-        arguments = settings.graph_scales, settings.min_area_px
+    origin: dict[str, Any] = {"segmenter": settings.segmenter}
+    if settings.segmenter == "graph":
         logger.info("masks %s: graph segmenter (no model); the levels are three scales", scene.name)
 
-        def segment(view: str) -> HierarchicalMasks:
-            key = sha256_of_json(
-                {
-                    "image": sha256_of_file(scene.image_path(view)),
-                    "settings": arguments,
-                    "code": code_digest(segment_graph, HierarchicalMasks),
-                }
-            )
-            arrays = view_cache.get(key, lambda: segment_graph(scene.image(view), *arguments).arrays())
-            return _with_levels(HierarchicalMasks.from_arrays(arrays), settings)
+        def segment_view(view: str) -> HierarchicalMasks:
+            return _graph_masks(scene, view, view_cache, settings)
+    else:
+        model, threads = _opened_sam(scene, view_cache.folder.parent, settings, threads, memory_mib)
+        origin |= {"model": settings.model, "model_sha256": model.digest, "precision": model.precision}
+        origin |= recorded(model.device)
 
-        chosen = train_views(scene) if views is None else views
-        masks = zip(chosen, in_order(segment, chosen, threads), strict=True)
-        counts.update(write_masks(out, scene, masks, len(chosen), "graph"))
-        counts.update(from_cache=view_cache.hits)
+        def segment_view(view: str) -> HierarchicalMasks:
+            points = prompts(view) if prompts else None
+            return sam_masks(scene, view, model, view_cache, settings, points)
+
+    finished_digests = digests_in(finished) if finished else {}
+
+    def segment(view: str) -> HierarchicalMasks:
+        if finished and view in finished_digests:
+            return load_masks(finished, view, finished_digests)
+        masks = segment_view(view)
+        if settings.levels == "head":
+            return masks
+        return with_tree_levels(masks, settings.theta or CoverageTreeSettings().theta)
+
+    return zip(views, in_order(segment, views, threads), strict=True), origin
+
+
+def _opened_sam(
+    scene: Scene, cache: Path, settings: MasksSettings, threads: int, memory_mib: float | None
+) -> tuple[SamModel, int]:
+    """Return the model in the precision that the settings select, and the number of views at once."""
+    model = SamModel.load(Path(settings.model), settings.variant, settings.device)
+    training = train_views(scene)
+    checked = training[:: max(1, len(training) // CHECKED_VIEWS)][:CHECKED_VIEWS]
+    model.choose_precision(settings.precision, [scene.image(view) for view in checked], cache, threads)
+    limit = model.thresholds(settings).points_per_batch
+    batch = model.prompts_per_call(limit, settings.points_per_side**2)
+    needs = needs_of(model.model, batch, as_exported=model.as_exported)
+    threads = needs.views_at_once(threads, memory_mib)
+    logger.info("masks %s: %d views at once, %.0f MiB each", scene.name, threads, needs.view_mib)
+    return model, threads
+
+
+def _graph_masks(scene: Scene, view: str, cache: ViewCache, settings: MasksSettings) -> HierarchicalMasks:
+    """Segment one view with the graph segmenter."""
+    arguments = settings.graph_scales, settings.min_area_px
+    key = sha256_of_json(
+        {
+            "image": sha256_of_file(scene.image_path(view)),
+            "settings": arguments,
+            "code": code_digest(segment_graph, HierarchicalMasks),
+        }
+    )
+    arrays = cache.get(key, lambda: segment_graph(scene.image(view), *arguments).arrays())
+    return HierarchicalMasks.from_arrays(arrays)
 
 
 def write_masks(
@@ -171,12 +180,6 @@ def write_masks(
         if not total:
             logger.warning("masks %s: no view has a mask at level %s", scene.name, level)
     return {"views": number, **totals}
-
-
-def _with_levels(masks: HierarchicalMasks, settings: MasksSettings) -> HierarchicalMasks:
-    if settings.levels == "head":
-        return masks
-    return with_tree_levels(masks, settings.theta or CoverageTreeSettings().theta)
 
 
 def sam_masks(

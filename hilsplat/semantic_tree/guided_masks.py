@@ -12,7 +12,7 @@ from hilsplat.base.lineage import require_made_from, sha256_of_file
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.sam import point_grid
-from hilsplat.segment.stage import run_sam_masks
+from hilsplat.segment.stage import run_masks
 from hilsplat.semantic_tree.tree import SemanticTree, ViewNodes
 from hilsplat.settings import MasksSettings
 from hilsplat.splat.ply import load_ply
@@ -30,7 +30,7 @@ def run_guided_masks(
     threads: int,
     memory_mib: float | None = None,
 ) -> None:
-    """Segment the remaining training views with guided prompts (see `segment.stage.run_sam_masks`).
+    """Segment the remaining training views with guided prompts (see `segment.stage.segment_views`).
 
     The masks of the key views are kept unchanged; `semantic_tree_folder` contains their semantic tree.
 
@@ -54,7 +54,7 @@ def run_guided_masks(
         }
         return guided_points(labels, grid, settings.min_area_px)
 
-    run_sam_masks(
+    run_masks(
         scene_folder, out, cache, settings, threads, memory_mib, prompts=points, finished=key_masks_folder
     )
 

@@ -19,6 +19,9 @@ class Gaussians:
     def __len__(self) -> int:
         return len(self.means)
 
+    def __repr__(self) -> str:
+        return f"Gaussians({len(self)}, colours of degree {self.sh_degree})"
+
     @property
     def opacities(self) -> Float32[np.ndarray, " N"]:
         """Peak alphas in (0, 1)."""

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 from hilsplat.base.artifacts import write_text
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.tables import markdown_table, plain_markdown, write_csv
-from hilsplat.evaluate.protocols.cards import INSTANCES, card_of
+from hilsplat.evaluate.protocols.cards import INSTANCES, ProtocolCard, card_of
 from hilsplat.evaluate.scores import read_scores
-from hilsplat.evaluate.tables.measured import level_cells, percent, row_name, row_place
+from hilsplat.evaluate.tables.measured import level_values, row_name, row_place, table_value
 from hilsplat.evaluate.tables.rows import Cell
 
 if TYPE_CHECKING:
@@ -60,24 +60,38 @@ def mean_rows(scores: "pd.DataFrame", labels: Mapping[str, str]) -> list[list[st
 
 def _means(protocol: str, part: "pd.DataFrame") -> dict[str, Cell]:
     """Return the mean of each column's metric under one protocol, and mIoU at each level that has rows."""
-    card, pooled = card_of(protocol), dict[str, float]()
+    card = card_of(protocol)
+    means = metric_means(card, part)
+
+    def cell(metrics: Sequence[str]) -> Cell:
+        return Cell.percent(means.get(next((each for each in metrics if each in card.metrics), ""), math.nan))
+
+    cells = {column: cell(metrics) for column, metrics in METRICS.items()}
+    if card.averaging == "levels":
+        cells |= {lv.label: Cell.percent(means.get(f"iou/{lv.label}", math.nan)) for lv in LEVELS}
+    return cells
+
+
+def metric_means(card: ProtocolCard, part: "pd.DataFrame") -> dict[str, float]:
+    """Return each metric's mean over the rows of one method, in the order that the protocol's card states.
+
+    Under a protocol with levels, the mean at each level that has rows is added, as `iou/whole`.
+    """
     if card is INSTANCES:
-        pooled = dict(zip(part["metric"], part["value"], strict=True))
-    elif card.averaging == "pooled":
+        return dict(zip(part["metric"], part["value"], strict=True))
+    if card.averaging == "pooled":
         from hilsplat.evaluate.protocols.points import class_set, pooled_points
 
-        pooled = pooled_points(card, part.itertuples(), class_set(card.classes)[1])
-
-    def mean_of(metrics: Sequence[str]) -> Cell:
-        metric = next((metric for metric in metrics if metric in card.metrics), "")
-        if card.averaging == "pooled":
-            return Cell.percent(pooled.get(metric, math.nan))
-        return level_cells(part, metric)["Avg"] if card.averaging == "levels" else percent(part, metric)
-
-    means = {column: mean_of(metrics) for column, metrics in METRICS.items()}
-    if card.averaging == "levels":
-        of_level = level_cells(part)
-        means |= {level.label: of_level[f"L{int(level)}"] for level in LEVELS}
+        return pooled_points(card, part.itertuples(), class_set(card.classes)[1])
+    means: dict[str, float] = {}
+    measured = part["metric"].unique()
+    for metric in (each for each in card.metrics if each in measured and not each.startswith("class_")):
+        if part.loc[part["metric"] == metric, "level"].any():
+            of_levels = level_values(part, metric)
+            means[metric] = sum(of_levels.values()) / len(of_levels)
+            means |= {f"{metric}/{level.label}": value for level, value in of_levels.items()}
+        else:
+            means[metric] = table_value(part, metric)
     return means
 
 

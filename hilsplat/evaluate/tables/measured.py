@@ -8,7 +8,7 @@ import statistics
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from hilsplat.base.levels import LEVELS
+from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.evaluate.protocols import cards
 from hilsplat.evaluate.tables.kinds import TableKind
@@ -188,10 +188,16 @@ def scene_cells(
 
 def level_cells(part: "pd.DataFrame", metric: str = "iou") -> dict[str, Cell]:
     """Return L1, L2, L3 and Avg, the mean of the levels that have rows."""
-    values = {f"L{int(level)}": table_value(part, metric, level.label) for level in LEVELS}
-    present = [value for value in values.values() if value == value]
-    values["Avg"] = sum(present) / len(present) if present else float("nan")
-    return {name: Cell.percent(value) for name, value in values.items()}
+    present = level_values(part, metric)
+    cells = {f"L{int(level)}": Cell.percent(present.get(level, float("nan"))) for level in LEVELS}
+    cells["Avg"] = Cell.percent(sum(present.values()) / len(present) if present else float("nan"))
+    return cells
+
+
+def level_values(part: "pd.DataFrame", metric: str) -> dict[Level, float]:
+    """Return the metric's value at each level that has rows (`table_value`)."""
+    values = {level: table_value(part, metric, level.label) for level in LEVELS}
+    return {level: value for level, value in values.items() if value == value}
 
 
 def same_row(

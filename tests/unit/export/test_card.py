@@ -21,7 +21,7 @@ from hilsplat.models.torch_network import TorchNetwork
 from hilsplat.segment.generate import decode_candidates, edge_windows
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.sam import Frame, SamModel, in_input, point_grid, positive_boxes, read_logits
-from hilsplat.segment.stage import run_masks, run_sam_masks
+from hilsplat.segment.stage import run_masks
 from hilsplat.segment.torch_decoder import TorchDecoder
 from hilsplat.settings import ClipSettings, MasksSettings
 from tests.conftest import PROJECT
@@ -155,9 +155,9 @@ def test_the_stage_masks(sam2_parts, photograph, tmp_path, monkeypatch, device):
     settings = MasksSettings(
         model=str(sam2_parts[-1]), points_per_side=6, min_area_px=4, precision="fp32", **LOOSE
     )
-    run_sam_masks(scene, tmp_path / "cpu", tmp_path / "cache", settings, threads=2)
+    run_masks(scene, tmp_path / "cpu", tmp_path / "cache", settings, threads=2)
     monkeypatch.setattr("hilsplat.segment.sam.network_device", lambda *given: device)
-    run_sam_masks(scene, tmp_path / "card", tmp_path / "cache", settings, threads=2)
+    run_masks(scene, tmp_path / "card", tmp_path / "cache", settings, threads=2)
     first, second = (read_index(tmp_path / name) for name in ("cpu", "card"))
     assert "device" not in first and second["device"] == device
     assert sum(entry["subpart"] + entry["whole"] for entry in first["views"].values()) > 2

@@ -17,7 +17,7 @@ from hilsplat.segment import decoder_network
 from hilsplat.segment.coverage import run_coverage_tree
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.pictures import THUMB_PX, masks_overview
-from hilsplat.segment.stage import run_graph_masks, run_sam_masks
+from hilsplat.segment.stage import run_masks
 from hilsplat.settings import CoverageTreeSettings, MasksSettings
 from tests.unit.segment.handmade import assert_equal_masks, save_scene, write_disc_sam
 
@@ -53,15 +53,15 @@ def calls(monkeypatch) -> list[str]:
 
 
 def test_second_run_calls_no_network_and_writes_the_same_bytes(scene, tmp_path, settings, calls):
-    run_sam_masks(scene, tmp_path / "first", tmp_path / "cache", settings, threads=2)
+    run_masks(scene, tmp_path / "first", tmp_path / "cache", settings, threads=2)
     # two training views: one encoder call each, four prompts in calls of two
     assert sorted(calls) == ["prompt_encoder_mask_decoder"] * 4 + ["vision_encoder"] * 2
     calls.clear()
-    run_sam_masks(scene, tmp_path / "second", tmp_path / "cache", settings, threads=1)
+    run_masks(scene, tmp_path / "second", tmp_path / "cache", settings, threads=1)
     assert calls == []
     assert sha256_of_path(tmp_path / "first") == sha256_of_path(tmp_path / "second")
     stricter = settings.model_copy(update={"predicted_iou_min": 0.75})
-    run_sam_masks(scene, tmp_path / "third", tmp_path / "cache", stricter, threads=1)
+    run_masks(scene, tmp_path / "third", tmp_path / "cache", stricter, threads=1)
     assert calls == []
     index = read_index(tmp_path / "third")
     assert index["model_sha256"] == open_model_folder(Path(settings.model)).digest
@@ -80,11 +80,11 @@ def celled(tmp_path) -> MasksSettings:
 
 
 def test_prompts_that_repeat_others_in_the_preview_are_skipped(scene, tmp_path, celled, calls):
-    run_sam_masks(scene, tmp_path / "some", tmp_path / "cache", celled, threads=1)
+    run_masks(scene, tmp_path / "some", tmp_path / "cache", celled, threads=1)
     assert (calls.count(PREVIEW), calls.count(DECODER)) == (2 * 16, 2)
     (Path(celled.model) / "onnx" / f"{PREVIEW}.onnx").unlink()
     calls.clear()
-    run_sam_masks(scene, tmp_path / "all", tmp_path / "cache", celled, threads=1)
+    run_masks(scene, tmp_path / "all", tmp_path / "cache", celled, threads=1)
     assert (calls.count(PREVIEW), calls.count(DECODER)) == (0, 2 * 16)
     some, every = (HierarchicalMasks.load(tmp_path / name / "000.png.npz") for name in ("some", "all"))
     assert len(every) == 12
@@ -94,7 +94,7 @@ def test_prompts_that_repeat_others_in_the_preview_are_skipped(scene, tmp_path, 
 @pytest.mark.parametrize("change", [{"box_nms_iou": 0.95}, {"generator": "official"}])
 def test_all_prompts_are_decoded_where_repeated_masks_could_stay(scene, tmp_path, celled, calls, change):
     chosen = celled.model_copy(update=change)
-    run_sam_masks(scene, tmp_path / "masks", tmp_path / "cache", chosen, threads=1, views=["000.png"])
+    run_masks(scene, tmp_path / "masks", tmp_path / "cache", chosen, threads=1, views=["000.png"])
     assert (calls.count(PREVIEW), calls.count(DECODER)) == (0, 16)
 
 
@@ -102,14 +102,14 @@ def test_memory_limits_the_views_at_once_and_masks_do_not_depend_on_it(scene, tm
     caplog.set_level("INFO")
     for number, (threads, memory) in enumerate([(1, 8000.0), (2, 8000.0), (2, 1.0)]):
         folders = tmp_path / f"masks-{number}", tmp_path / f"cache-{number}"
-        run_sam_masks(scene, *folders, settings, threads, memory_mib=memory)
+        run_masks(scene, *folders, settings, threads, memory_mib=memory)
     assert [line.split(":")[1][:2] for line in caplog.messages if "at once" in line] == [" 1", " 2", " 1"]
     assert len({sha256_of_path(tmp_path / f"masks-{number}") for number in range(3)}) == 1
 
 
 def test_discs_nest_in_the_tree_and_the_overview_shows_them(scene, tmp_path, settings):
     masks_folder, tree_folder = tmp_path / "masks", tmp_path / "coverage_tree"
-    run_sam_masks(scene, masks_folder, tmp_path / "cache", settings, threads=1)
+    run_masks(scene, masks_folder, tmp_path / "cache", settings, threads=1)
     run_coverage_tree(masks_folder, tree_folder, CoverageTreeSettings())
     arrays = read_npz(tree_folder / "000.png.npz")
     masks = HierarchicalMasks.load(masks_folder / "000.png.npz")
@@ -127,5 +127,5 @@ def test_discs_nest_in_the_tree_and_the_overview_shows_them(scene, tmp_path, set
 
 def test_graph_segmenter_needs_no_model(scene, tmp_path):
     settings = MasksSettings(segmenter="graph", model="nowhere")
-    run_graph_masks(scene, tmp_path / "masks", tmp_path / "cache", settings, threads=1)
+    run_masks(scene, tmp_path / "masks", tmp_path / "cache", settings, threads=1)
     assert read_index(tmp_path / "masks")["segmenter"] == "graph"

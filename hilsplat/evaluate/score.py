@@ -1,0 +1,361 @@
+"""Scores of arrays under a protocol, without files and without the pipeline (`hilsplat.score`)."""
+
+import difflib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float, Int, Int64
+
+from hilsplat.base.errors import MisalignedArtifactError, SettingsError
+from hilsplat.base.levels import LEVELS, Level, path_of
+from hilsplat.datasets.labelled import LabelledRegion
+from hilsplat.datasets.points.labelled_points import LabelledPoints
+from hilsplat.evaluate.metrics.masks import peak_points
+from hilsplat.evaluate.metrics.relevancy_rule import RelevancyRule, SmoothedRelevancy, relevancy_mask
+from hilsplat.evaluate.protocols import cards
+from hilsplat.evaluate.protocols.answers import NO_POINTS, mask_rows
+from hilsplat.evaluate.protocols.flat_views import argmax_rows
+from hilsplat.evaluate.protocols.points import class_set, instance_scan, measure_instances, measure_points
+from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
+from hilsplat.evaluate.protocols.views import consistency_rows
+from hilsplat.evaluate.scores import Measured
+from hilsplat.evaluate.tables.means import metric_means
+
+METHOD = "files"
+"""Method in the score rows; the variant is the program's name."""
+
+WORDS = "masks of files"
+"""Bracketed suffix of a protocol's name: masks were supplied, so the protocol's map rule was not applied."""
+
+MASK_METRICS = (*cards.MASK, "acc_25", "acc_50")
+"""Metrics of masks; localization needs relevancy maps."""
+
+OF_EVERY_TEXT = (cards.LERF_LANGSPLAT, cards.LERF_OPENGAUSSIAN)
+"""Protocols that score every text of a view, merged over levels."""
+
+OF_THE_PIPELINE = (
+    *(cards.TREE_NODES, cards.OVS_NODES, cards.LEVEL_AUTO, cards.PATH, cards.SCENE_WIDE),
+    *(cards.ANNOTATIONS, cards.VIEW_CONSISTENCY),
+)
+"""Protocols that need more than arrays: our tree, a method's choice of levels, or exact geometry."""
+
+SCORED = {card.full_name: card for card in cards.CARDS if card not in OF_THE_PIPELINE}
+"""Protocols that score arrays."""
+
+Answer = Bool[np.ndarray, "_ _"] | Float[np.ndarray, "_ _ _"]
+"""A mask (H, W), or relevancy (3, H, W); under `3d-ovs/argmax`, cosines (L, H, W)."""
+
+Answers = Mapping[tuple[str, str], Answer]
+"""Answers in one view by (level, text); the level is "" for answers without a level."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """What `hilsplat.score` measured.
+
+    Attributes:
+        protocol: full name, with version and non-default settings.
+        means: metric -> mean, averaged as the protocol's card says. IoUs, accuracies and consistencies are
+            shares in [0, 1]. Under protocols with levels, `iou/whole` etc. are the means of each level.
+        rows: one dict per view, query and metric: view, query, level, metric, value, n (`Measured`).
+    """
+
+    protocol: str
+    means: dict[str, float]
+    rows: tuple[dict[str, Any], ...]
+
+    def __getitem__(self, metric: str) -> float:
+        if metric not in self.means:
+            raise SettingsError(
+                f"{self.protocol} did not measure {metric!r}", expected=f"one of {', '.join(self.means)}"
+            )
+        return self.means[metric]
+
+    def __repr__(self) -> str:
+        return f"Scores({self.protocol}: {', '.join(f'{name} {v:.4f}' for name, v in self.means.items())})"
+
+
+def score(predictions: Any, labels: Any, protocol: str = "lerf/langsplat") -> Scores:
+    """Score predictions of any program under a protocol, as `hilsplat evaluate-files` does.
+
+    Args:
+        predictions: for images, view -> text -> answer. An answer is a mask, (H, W) bool, to which no rule of
+            the protocol is applied, or relevancy at the levels whole, part, subpart, (3, H, W) float, from
+            which the protocol's rule makes the mask (under `3d-ovs/argmax`: cosines, (L, H, W) float). Under
+            `hierarchy/level-given`, keys are "whole/mug", "part/handle" etc. Texts may be missing; views may
+            not. For points: class ids, (P,) int, 0 for none; for `scannet200/instances`: masks (M, P) bool,
+            class ids (M,) int and confidences (M,) float.
+        labels: for images, view -> text -> region, (H, W) bool, of the predictions' size; with levels, texts
+            are paths such as "mug > handle". For points: class ids as in the data set's files, (P,) int; for
+            instances: class ids (P,) and instance ids (P,) int, 0 for none.
+        protocol: name, with or without version, such as "scannet/opengaussian-19@1".
+
+    Raises:
+        SettingsError: the protocol is unknown or does not score arrays, or an array has a wrong type.
+        MisalignedArtifactError: predictions and labels differ in size, views, texts or number of points.
+    """
+    names = {name: card for full, card in SCORED.items() for name in (full, card.name)}
+    if protocol not in names:
+        known = protocol in cards.BY_NAME
+        raise SettingsError(
+            f"protocol {protocol!r} {'needs more than arrays' if known else 'is unknown'}",
+            expected=f"one of {', '.join(SCORED)}",
+            fix="score a finished scene: hilsplat evaluate" if known else None,
+        )
+    card = names[protocol]
+    if card.classes:
+        rows = [("", row) for row in _rows_of_points(card, predictions, labels)]
+    else:
+        rows = list(_rows_of_images(card, predictions, labels))
+    if not rows:
+        raise MisalignedArtifactError(
+            f"the labels contain nothing that {card.full_name} scores",
+            expected="a non-empty region, or a point of the protocol's classes",
+            fix="check the labels' texts, levels and class ids",
+        )
+    frame = pd.DataFrame([{**vars(row), "scene": "", "view": view} for view, row in rows])
+    shown = frame[["view", "query", "level", "metric", "value", "n"]].to_dict("records")
+    return Scores(rows[0][1].protocol, metric_means(card, frame), tuple(shown))
+
+
+def _rows_of_images(
+    card: cards.ProtocolCard, predictions: Any, labels: Any
+) -> Iterator[tuple[str, Measured]]:
+    """Yield the rows of all views."""
+    if lacking := sorted(set(labels) ^ set(predictions)):
+        has_labels = lacking[0] in labels
+        raise MisalignedArtifactError(
+            f"view {lacking[0]!r} has no {'predictions' if has_labels else 'labels'}",
+            expected="the same views in predictions and labels",
+            fix="pass an empty dict if nothing was found" if has_labels else "remove its predictions",
+        )
+    truths = {view: _truth_of(card, view, regions) for view, regions in labels.items()}
+    answers = {
+        view: {key_of(name): np.asarray(array) for name, array in of_view.items()}
+        for view, of_view in predictions.items()
+    }
+    are_masks = _are_masks(card, answers)
+    check_answers(answers, truths)
+    for view, truth in truths.items():
+        if _has_levels(card):
+            rows = level_rows(answers[view], truth, are_masks)
+        else:
+            rows = flat_rows(card, answers[view], truth, None, are_masks)
+        yield from ((view, row) for row in rows)
+
+
+def _truth_of(card: cards.ProtocolCard, view: str, regions: Mapping[str, Any]) -> ViewTruth:
+    """Return a view's ground truth from regions by text, or by path from the whole down."""
+    found = []
+    for name, region in regions.items():
+        mask = np.asarray(region)
+        if mask.dtype != bool or mask.ndim != 2:
+            raise SettingsError(
+                f"{view}: label {name!r} is not a region",
+                expected="(H, W) bool",
+                found=f"{mask.shape} {mask.dtype}",
+            )
+        path = path_of(name) if _has_levels(card) else (name,)
+        if len(path) > len(LEVELS):
+            raise SettingsError(f"{view}: label {name!r} has more than {len(LEVELS)} levels")
+        level = Level(len(path)) if _has_levels(card) else None
+        pixels = partial(np.asarray, mask)
+        found.append(LabelledRegion(path[-1], mask.shape, pixels, level=level, path=path))
+    sizes = sorted({region.size_hw for region in found})
+    if len(sizes) != 1:
+        raise MisalignedArtifactError(
+            f"{view}: the labels differ in size" if sizes else f"{view}: there are no labels",
+            expected="regions of one size, that of the predictions",
+            found=", ".join(map(str, sizes)) or None,
+        )
+    return ViewTruth.of_regions(found, sizes[0])
+
+
+def _are_masks(card: cards.ProtocolCard, answers: Mapping[str, Mapping[tuple[str, str], np.ndarray]]) -> bool:
+    """Return whether answers are masks, not relevancy; all must be of one kind that the protocol scores."""
+    kinds, is_argmax = set[str](), card is cards.OVS_ARGMAX
+    for view, of_view in answers.items():
+        for (level, text), answer in of_view.items():
+            kind = answer.dtype.kind
+            is_map = kind == "f" and answer.ndim == 3 and not np.isnan(answer).any()
+            is_map &= is_argmax or len(answer) == len(LEVELS)
+            if not (is_map or (kind == "b" and answer.ndim == 2)) or bool(level) != _has_levels(card):
+                name = "'part/handle'" if _has_levels(card) else "'handle', without a level"
+                raise SettingsError(
+                    f"{view}: {level}{'/' * bool(level)}{text} cannot be scored under {card.full_name}",
+                    expected=f"mask (H, W) bool, or relevancy (3, H, W) float without NaN, named like {name}",
+                    found=f"{answer.shape} {answer.dtype}",
+                )
+            kinds.add(kind)
+    if len(kinds) > 1 or (kinds == {"f"} and not is_argmax and _rule_of(card) is None):
+        raise SettingsError(
+            f"{card.full_name} cannot score these predictions",
+            expected="only masks, or only relevancy under a protocol that has a rule for it: "
+            + ", ".join(name for name, each in SCORED.items() if _rule_of(each)),
+        )
+    return kinds != {"f"}
+
+
+def _has_levels(card: cards.ProtocolCard) -> bool:
+    return card is cards.LEVEL_GIVEN
+
+
+def _rule_of(card: cards.ProtocolCard) -> RelevancyRule | None:
+    """Return the rule that makes masks from relevancy; LERF-Mask, which states none, uses LangSplat's."""
+    is_lerf_mask = card in (cards.LERF_MASK, cards.LERF_MASK_SKIPPING)
+    return cards.LERF_LANGSPLAT.rule if is_lerf_mask else card.rule
+
+
+def key_of(name: str) -> tuple[str, str]:
+    """Split the name of an answer, such as "part/handle", into level ("" for none) and text."""
+    first, _, rest = name.partition("/")
+    return (first, rest) if rest and first in [level.label for level in LEVELS] else ("", name)
+
+
+def check_answers(answers: Mapping[str, Answers], truths: Mapping[str, ViewTruth]) -> None:
+    """Check the texts and sizes of all views' answers; messages name the view.
+
+    Raises:
+        MisalignedArtifactError: the labels have no such text, or another size.
+    """
+    texts: dict[str, set[str]] = {}
+    for truth in truths.values():
+        for query in (*truth.categories, *truth.absent, *truth.queries):
+            texts.setdefault(query.level.label if query.level else "", set()).add(query.text)
+    for view, truth in truths.items():
+        for (level, text), answer in answers[view].items():
+            where = f"{view}: {level}/{text}" if level else f"{view}: {text}"
+            of_level = sorted(texts.get(level, ()))
+            if text not in of_level:
+                near = difflib.get_close_matches(text, of_level, n=1)
+                raise MisalignedArtifactError(
+                    f"{where}: the labels have no text {text!r}" + (f" at level {level}" if level else ""),
+                    expected=f"one of {', '.join(of_level)}",
+                    found=text,
+                    fix=f"rename it to {near[0]!r}" if near else "remove it, or correct its name",
+                )
+            size_hw = answer.shape[-2:]
+            shape = next((query.truth.shape for query in (*truth.categories, *truth.absent)), size_hw)
+            if size_hw != shape:
+                raise MisalignedArtifactError(
+                    f"{where}: the {'mask' if answer.ndim == 2 else 'map'} and the labels differ in size",
+                    expected=f"{shape[0]} x {shape[1]} (height x width)",
+                    found=f"{size_hw[0]} x {size_hw[1]}",
+                    fix="resize the prediction to the size of the labels by nearest neighbour",
+                )
+
+
+def flat_rows(
+    card: cards.ProtocolCard, answers: Answers, truth: ViewTruth, level: Level | None, are_masks: bool = True
+) -> Iterator[Measured]:
+    """Yield a view's rows under a protocol without levels.
+
+    Args:
+        level: level whose texts are queried, on a stand-in with levels; None if the labels have no levels.
+        are_masks: whether the answers of all views are masks, not relevancy.
+    """
+    words: list[str] = []
+    if card in OF_EVERY_TEXT:
+        queries = truth.categories
+    elif level is None:
+        queries = (*truth.categories, *truth.absent)
+    else:
+        queries = tuple(query for query in truth.queries if query.level is level)
+        words = ["wholes"] if level is Level.WHOLE else []
+    words += [WORDS] if are_masks else []
+    if card is cards.OVS_ARGMAX:
+        yield from argmax_rows(METHOD, queries, partial(_cosine, answers), words, level is not None)
+        return
+    for query in queries:
+        other = answers.get(("", dict(card.united).get(query.text, "")))
+        yield from _text_rows(card, replace(query, level=None), answers.get(("", query.text)), words, other)
+
+
+def level_rows(answers: Answers, truth: ViewTruth, are_masks: bool = True) -> Iterator[Measured]:
+    """Yield the rows of a view's answers with levels, and their hierarchical consistency."""
+    card, words = cards.LEVEL_GIVEN, [WORDS] if are_masks else []
+    for query in truth.queries:
+        assert query.level is not None
+        yield from _text_rows(card, query, answers.get((query.level.label, query.text)), words)
+
+    def mask_of(path: tuple[str, ...]) -> Bool[np.ndarray, "H W"]:
+        answer = answers.get((Level(len(path)).label, path[-1]))
+        if answer is None:
+            return np.zeros_like(truth.regions[path])
+        return truth.own_part(path, _mask_and_peak(card, Level(len(path)), answer)[0])
+
+    yield from consistency_rows(METHOD, card.labelled(words), truth, mask_of)
+
+
+def _text_rows(
+    card: cards.ProtocolCard,
+    query: Query,
+    answer: Answer | None,
+    words: Sequence[str],
+    united: Answer | None = None,
+) -> Iterator[Measured]:
+    region = query.region(card.truth)
+    if not region.any() or (answer is None and card.missing == "left out"):
+        return  # not visible in the view, or not answered
+    mask, points = np.zeros_like(region), NO_POINTS
+    if answer is not None:
+        mask, points = _mask_and_peak(card, query.level, answer, united)
+    measured = MASK_METRICS if WORDS in words else (*MASK_METRICS, *cards.LOCALIZATION)
+    metrics = tuple(metric for metric in card.metrics if metric in measured)
+    answered = replace(query, truth=region)
+    yield from mask_rows(METHOD, answered, card.labelled(words), mask, points, metrics)
+
+
+def _mask_and_peak(
+    card: cards.ProtocolCard, level: Level | None, answer: Answer, united: Answer | None = None
+) -> tuple[Bool[np.ndarray, "H W"], Int[np.ndarray, "P 2"]]:
+    """Return an answer's mask, made from relevancy by the protocol's rule, and the peaks of the relevancy."""
+    if answer.ndim == 2:
+        return answer, NO_POINTS
+    rule = _rule_of(card)
+    assert rule is not None  # `_are_masks`
+    smoothed = SmoothedRelevancy.of(answer, rule)
+    return relevancy_mask(smoothed, level, rule, united), peak_points(smoothed.filtered, level)
+
+
+def _cosine(
+    answers: Answers, texts: Sequence[str], pixels: Int64[np.ndarray, " P"]
+) -> Float[np.ndarray, "K L P"]:
+    """Return cosines at pixels; a mask counts as 1 inside and -inf outside, where a pixel is then a miss."""
+    of_texts = [answers[key] for text in texts if (key := ("", text)) in answers]
+    count = max((answer.shape[0] for answer in of_texts if answer.ndim == 3), default=1)
+    cosines = np.full((len(texts), count, len(pixels)), -np.inf)
+    for row, text in enumerate(texts):
+        if (answer := answers.get(("", text))) is not None:
+            values = answer if answer.ndim == 3 else np.where(answer, 1.0, -np.inf)[None]
+            cosines[row] = values.reshape(len(values), -1)[:, pixels]
+    return cosines
+
+
+def _rows_of_points(card: cards.ProtocolCard, predictions: Any, labels: Any) -> Iterator[Measured]:
+    """Yield the rows of labelled points or instances."""
+    _, classes = class_set(card.classes)
+    is_scan = card is cards.INSTANCES
+    given = [np.asarray(each) for each in ((*predictions, *labels) if is_scan else (predictions, labels))]
+    sizes = dict(zip("MP", given[0].shape, strict=False)) if is_scan else {"P": len(labels)}
+    axes, ids = (("MP", "M", "M", "P", "P"), (1, 3, 4)) if is_scan else (("P", "P"), (0, 1))
+    shapes = [tuple(sizes.get(axis) for axis in each) for each in axes]
+    if [array.shape for array in given] != shapes or any(given[row].dtype.kind not in "iu" for row in ids):
+        scan = "masks (M, P) bool, class ids (M,) and confidences (M,); class ids (P,) and instance ids (P,)"
+        raise MisalignedArtifactError(
+            f"predictions and labels do not match under {card.full_name}",
+            expected=scan if is_scan else "integer class ids of the same points, (P,) and (P,)",
+            found=", ".join(f"{array.shape} {array.dtype}" for array in given),
+        )
+    if not is_scan:
+        predicted, truth = map(classes.labels, given)
+        yield from measure_points(card, METHOD, truth, predicted, classes, METHOD)
+        return
+    masks, class_ids, confidences, *truth_ids = given
+    points = LabelledPoints(np.zeros((sizes["P"], 3)), *(array.astype(np.int32) for array in truth_ids))
+    matches = instance_scan(points, classes, masks.astype(bool), class_ids, confidences.astype(np.float64))
+    yield from measure_instances(METHOD, {"": matches}, METHOD)

@@ -1,0 +1,237 @@
+"""The pipeline from Python on the desk: the same bytes as the stages, no files left, errors that help."""
+
+import logging
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hilsplat
+from hilsplat import stages
+from hilsplat.base.errors import ArtifactError, HilsplatError, ModelError, SceneError, SettingsError
+from hilsplat.base.lineage import sha256_of_path
+from hilsplat.scene.exporting import write_colmap
+from hilsplat.segment.digests import digest_of, digests_in, load_masks
+from hilsplat.semantic_tree.tree import SemanticTree
+from hilsplat.settings import GaussiansSettings, MasksSettings
+from hilsplat.splat.ply import save_ply
+from hilsplat.splat.rasterise.api import pixel_weights
+from hilsplat.splat.rasterise.api import render as render_rgb
+
+
+@pytest.fixture
+def temporary(tmp_path, monkeypatch) -> Path:
+    """The folder of temporary files."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    return folder
+
+
+@pytest.fixture
+def scene(desk) -> hilsplat.Scene:
+    return hilsplat.load_scene(desk)
+
+
+@pytest.fixture
+def masks(desk) -> hilsplat.SceneMasks:
+    """The desk's own masks."""
+    folder, digests = desk / "default/masks", digests_in(desk / "default/masks")
+    origin = {"segmenter": "graph", "model": None, "model_sha256": None}
+    return hilsplat.SceneMasks({view: load_masks(folder, view, digests) for view in digests}, origin)
+
+
+@pytest.fixture
+def linked(desk, desk_project, scene, masks, temporary) -> hilsplat.LanguageScene:
+    gaussians = hilsplat.load_gaussians(desk / "gaussians.ply")
+    return hilsplat.link(scene, gaussians, masks, model=str(desk_project / "models/colours"), threads=1)
+
+
+def test_objects_are_one_line_each_and_cameras_are_found_by_name_and_row(desk, scene, masks, linked):
+    hit, rendering = linked.query("mug")[0], linked.render("000.png")
+    scores = hilsplat.score({"v": {"a": hit.mask("000.png")}}, {"v": {"a": hit.mask("000.png")}})
+    every = (scene, scene.cameras, scene.cameras[0], linked.gaussians, rendering, masks, hit, linked, scores)
+    for each in (*every, linked.nodes[0], masks["000.png"]):
+        assert "\n" not in repr(each) and len(repr(each)) < 150, repr(each)
+    assert repr(scene) == "Scene(photos/desk: 6 views (1 held out), 0 points)"
+    assert [camera.name for camera in scene.cameras] == list(scene.names)
+    np.testing.assert_array_equal(scene.cameras[-1].K, scene.cameras["005.png"].K)
+    for wrong in (6, "6.png"):
+        with pytest.raises(SceneError, match="has no camera"):
+            scene.cameras[wrong]
+    assert scene.image("000.png").shape == (*scene.cameras[0].size_hw, 3)
+
+
+@pytest.mark.parametrize("iterations", [40, None])
+def test_a_fit_equals_that_of_the_stage(scene, tmp_path, monkeypatch, iterations):
+    monkeypatch.setattr("hilsplat.settings.LEAST_FIT_STEPS", 20)
+    settings = {"max_gaussians": 500, "densify_every": 10, "device": "cpu"}
+    settings |= {} if iterations else {"steps_per_view": 5}
+    found = hilsplat.fit(scene, iterations, seed=3, threads=2, **settings)
+    steps = {"iterations": iterations, "steps_per_view": iterations} if iterations else {}
+    out, section = tmp_path / "gaussians.ply", GaussiansSettings(**settings, **steps)
+    assert section.steps(5) == (iterations or 25)
+    stages.gaussians(scene.folder, out, tmp_path / "report", section, cache=tmp_path / "cache", seed=3)
+    save_ply(tmp_path / "ours.ply", found)
+    assert (tmp_path / "ours.ply").read_bytes() == out.read_bytes()
+    other = hilsplat.fit(scene, iterations, seed=4, threads=1, **settings)
+    assert len(other) != len(found) or not np.array_equal(other.means, found.means)
+
+
+def test_masks_equal_those_of_the_stage(scene, tmp_path, temporary):
+    found = hilsplat.segment(scene, segmenter="graph", graph_scales=(0.3, 0.1, 0.05), threads=2)
+    section = MasksSettings(segmenter="graph", graph_scales=(0.3, 0.1, 0.05))
+    stages.masks(scene.folder, tmp_path / "masks", section, tmp_path / "cache")
+    digests = digests_in(tmp_path / "masks")
+    assert {view: digest_of(each) for view, each in found.items()} == digests
+    assert found.origin == {"segmenter": "graph"}
+    assert not list(temporary.iterdir())
+    # a cache keeps finished views
+    kept = tmp_path / "kept"
+    hilsplat.segment(scene, segmenter="graph", cache=kept)
+    entries = sha256_of_path(kept)
+    hilsplat.segment(scene, segmenter="graph", cache=kept)
+    assert sha256_of_path(kept) == entries and len(list(kept.rglob("*.npz"))) == len(found)
+
+
+def test_the_automatic_segmenter_is_the_best_model_or_the_graph(scene, caplog):
+    found = hilsplat.segment(scene)  # tests see the embedded models only, which are not for photographs
+    assert found.origin == {"segmenter": "graph"}
+    with pytest.raises(ModelError, match="nowhere"):
+        hilsplat.segment(scene, model="nowhere")
+
+
+def test_the_tree_equals_that_of_the_stages_and_answers_alike(desk, desk_project, linked, temporary):
+    own = SemanticTree.load(desk / "default/semantic_tree", desk / "default/clip")
+    for name, values in vars(own).items():
+        np.testing.assert_array_equal(getattr(linked.tree, name), values, err_msg=name)
+    opened = hilsplat.open_scene(desk)
+    for text in ("mug", "mug > handle", "book"):
+        ours, theirs = linked.query(text), opened.query(text)
+        assert [(hit.node, hit.score, hit.route) for hit in ours] == [
+            (hit.node, hit.score, hit.route) for hit in theirs
+        ]
+    assert linked.query("unicorn")[0].doubts
+    assert not list(temporary.iterdir())
+    with pytest.raises(ArtifactError, match="no language field"):
+        _ = linked.field
+
+
+def test_an_answer_has_a_mask_in_any_camera(linked):
+    hit, view = linked.query("mug > handle")[0], "002.png"
+    camera = linked.camera(view)
+    np.testing.assert_array_equal(hit.mask(camera), hit.mask(view))
+    assert hit.mask(view).any()
+    half = camera.scaled(tuple(side // 2 for side in camera.size_hw))
+    assert hit.mask(half).shape == half.size_hw and hit.mask(half).any()
+    for call in (hit.mask, linked.camera, linked.render):
+        with pytest.raises(SettingsError, match="has no view 'x'"):
+            call("x")
+
+
+def test_nodes_are_those_of_the_tree(linked):
+    assert [node.node for node in linked.nodes] == list(range(len(linked.tree)))
+    hit = linked.query("mug > handle")[0]
+    node = linked.nodes[hit.node]
+    assert (node.level, node.parent, node.box, node.name) == (hit.level, hit.parent, hit.box, hit.name)
+    assert linked.nodes[node.parent].level == hilsplat.Level.WHOLE
+    np.testing.assert_array_equal(node.gaussians, hit.gaussians)
+
+
+def test_a_rendering_has_colours_depth_features_and_alpha(linked):
+    gaussians, camera = linked.gaussians, linked.camera("001.png")
+    features = np.random.default_rng(0).normal(size=(len(gaussians), 5)).astype(np.float32)
+    found = hilsplat.render(gaussians, camera, features, background=(1.0, 0.5, 0.0), threads=1)
+    expected = render_rgb(gaussians, camera, background=(1.0, 0.5, 0.0))
+    np.testing.assert_array_equal(found.colours, expected)
+    weights = pixel_weights(gaussians, camera, min_weight=0.0)
+    height, width = camera.size_hw
+    blended = (weights @ features).reshape(height, width, 5)
+    np.testing.assert_allclose(found.features, blended, atol=1e-5)
+    np.testing.assert_allclose(found.alpha, np.asarray(weights.sum(axis=1)).reshape(height, width), atol=1e-5)
+    seen = found.alpha > 0
+    np.testing.assert_allclose(found.depth[seen], 30.0, atol=1e-3)  # all Gaussians are in one plane
+    assert np.isnan(found.depth[~seen]).all()
+    plain = linked.render("001.png")
+    assert plain.features.shape == (height, width, 0)
+    np.testing.assert_array_equal(plain.colours, render_rgb(gaussians, camera))
+
+
+def test_a_folder_keeps_a_scene_that_opens(desk, desk_project, scene, masks, tmp_path):
+    gaussians = hilsplat.load_gaussians(desk / "gaussians.ply")
+    folder, model = tmp_path / "results/photos/again", str(desk_project / "models/colours")
+    linked = hilsplat.link(scene, gaussians, masks, model=model, folder=folder)
+    assert linked.scene is scene  # whose temporary files live as long as it does
+    again = hilsplat.open_scene(folder)
+    assert [hit.node for hit in again.query("mug")] == [hit.node for hit in linked.query("mug")]
+    assert hilsplat.load_scene(folder).names == scene.names
+    with pytest.raises(ArtifactError, match=r"gaussians.ply already exists(.|\n)*open_scene"):
+        hilsplat.link(scene, gaussians, masks, model=model, folder=folder)
+
+
+def test_files_of_imported_poses_are_deleted_with_the_scene(desk, tmp_path, temporary):
+    exported = tmp_path / "colmap"
+    write_colmap(hilsplat.load_scene(desk), exported)
+    imported = hilsplat.load_scene(exported, test_every=0)
+    folder = imported.folder
+    assert imported.names == tuple(f"{number:03d}.png" for number in range(6))
+    assert imported.views("test") == [] and imported.name == "photos/colmap"
+    assert folder.is_relative_to(temporary) and imported.image("000.png").any()
+    gaussians = hilsplat.load_gaussians(desk / "gaussians.ply", imported)
+    own = hilsplat.load_scene(desk).cameras[0]
+    difference = (
+        hilsplat.render(gaussians, imported.cameras[0]).colours
+        - hilsplat.render(hilsplat.load_gaussians(desk / "gaussians.ply"), own).colours
+    )
+    assert np.abs(difference).mean() < 0.01
+    del imported
+    assert not folder.exists() and not list(temporary.iterdir())
+    kept = hilsplat.load_scene(exported, folder=tmp_path / "results/photos/kept")
+    assert kept.folder == tmp_path / "results/photos/kept/scene"
+
+
+def test_wrong_paths_and_settings_are_explained(desk, desk_project, scene, tmp_path, monkeypatch, temporary):
+    monkeypatch.chdir(desk_project)
+    with pytest.raises(ArtifactError, match="did you mean 'photos/desk'"):
+        hilsplat.load_scene("results/photos/dask")
+    with pytest.raises(SettingsError, match="is posed already"):
+        hilsplat.load_scene(desk, max_side_px=800)
+    with pytest.raises(SettingsError, match="max_side: unknown key; did you mean 'max_side_px'"):
+        hilsplat.reconstruct(desk / "scene/images", max_side=800)
+    with pytest.raises(SettingsError, match="iteratons: unknown key"):
+        hilsplat.fit(scene, iteratons=5)
+    with pytest.raises(SceneError, match=r"has no known poses(.|\n)*hilsplat.reconstruct"):
+        hilsplat.load_scene(desk / "scene/images")
+    with pytest.raises(SceneError, match="is missing"):
+        hilsplat.reconstruct(tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(HilsplatError, match="too few images"):
+        hilsplat.reconstruct(tmp_path / "empty")
+    assert not list(temporary.iterdir())
+
+
+def test_progress_is_reported_only_on_request(scene, capsys):
+    logs = logging.getLogger("hilsplat")
+    before = logs.level, list(logs.handlers)
+    hilsplat.segment(scene, segmenter="graph")
+    assert capsys.readouterr().err == ""
+    hilsplat.segment(scene, segmenter="graph", progress=True)
+    assert "graph segmenter" in capsys.readouterr().err
+    assert (logs.level, logs.handlers) == before
+
+
+SCRIPT = """
+from hilsplat.base.processes import in_own_process
+print("once", in_own_process(sorted, [2, 1]))
+"""
+
+
+def test_a_script_without_a_guard_is_not_run_again_by_child_processes(tmp_path, project):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    how = {"capture_output": True, "text": True, "env": {"PYTHONPATH": str(project)}, "timeout": 60}
+    done = subprocess.run([sys.executable, str(script)], **how)
+    assert done.stdout == "once [1, 2]\n", done.stderr
