@@ -20,7 +20,15 @@ ROOT = Path(__file__).resolve().parents[1]
 
 CARRIED = (
     *("beartype", "jaxtyping", "wadler-lindig", "plyfile", "pydantic", "pydantic-core", "annotated-types"),
-    *("typing-inspection", "typer", "annotated-doc", "shellingham", "hypothesis", "sortedcontainers"),
+    *(
+        "typing-inspection",
+        "typer",
+        "annotated-doc",
+        "shellingham",
+        "platformdirs",
+        "hypothesis",
+        "sortedcontainers",
+    ),
 )
 """Packages that are installed beside gsplat, in the versions of this environment."""
 
