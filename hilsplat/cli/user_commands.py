@@ -198,11 +198,19 @@ def export(
             "labels: the scene's annotations in LERF-OVS format",
         ),
     ] = "tree",
-    variant: Annotated[str, typer.Option(help="variant, for tree and langsplat")] = "default",
+    variant: Annotated[str, typer.Option(help="variant, for tree, langsplat, --only, --without")] = "default",
     results: Results = Path("results"),
     data_root: DataRoot = Path(),
     out: Annotated[
         Path | None, typer.Option(help="new folder; default: export/FORM in the scene's folder (overwritten)")
+    ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="with --as ply: write only what matches a query, or a node's number; repeatable"),
+    ] = None,
+    without: Annotated[
+        list[str] | None,
+        typer.Option(help="with --as ply: leave out what matches a query, or a node's number; repeatable"),
     ] = None,
     threads: Threads = 2,
 ) -> None:
@@ -212,17 +220,28 @@ def export(
     """
     from hilsplat.base.ownership import replaced_folder
 
+    if (only or without) and form != "ply":
+        raise SettingsError("--only and --without are for --as ply", fix="add --as ply, or leave them out")
     folder = scene_folder(scene, results)
     if out is not None:
         require_new_folder(out)
-        echo(_export(folder, form, variant, data_root, out, threads))
+        echo(_export(folder, form, variant, data_root, out, only or [], without or [], threads))
         return
     out = folder / "export" / (form if variant == "default" else f"{form}-{variant}")
     with replaced_folder(out):
-        echo(_export(folder, form, variant, data_root, out, threads))
+        echo(_export(folder, form, variant, data_root, out, only or [], without or [], threads))
 
 
-def _export(folder: Path, form: str, variant: str, data_root: Path, out: Path, threads: int) -> str:
+def _export(
+    folder: Path,
+    form: str,
+    variant: str,
+    data_root: Path,
+    out: Path,
+    only: list[str],
+    without: list[str],
+    threads: int,
+) -> str:
     """Write an export, and return the line to print."""
     if form == "tree":
         from hilsplat.query.tree_picture import export_tree
@@ -231,8 +250,14 @@ def _export(folder: Path, form: str, variant: str, data_root: Path, out: Path, t
     if form == "ply":
         from hilsplat.splat.coordinates import write_source_ply
 
-        ply = out / "point_cloud.ply"
-        return f"wrote {write_source_ply(folder / 'gaussians.ply', ply)} Gaussians to {ply}"
+        ply, rows, lines = out / "point_cloud.ply", None, list[str]()
+        if only or without:
+            from hilsplat.query.cropped import remaining_rows
+            from hilsplat.query.language_scene import open_scene
+
+            rows, lines = remaining_rows(open_scene(folder, variant, threads=threads), only, without)
+        number = write_source_ply(folder / "gaussians.ply", ply, rows)
+        return "\n".join([*lines, f"wrote {number} Gaussians to {ply}"])
     from hilsplat.scene.scene import Scene
 
     opened = Scene.load(folder / "scene")

@@ -21,7 +21,7 @@ from hilsplat.base.images import read_image
 from hilsplat.query.names import write_names
 from hilsplat.query.tree_picture import crop
 from hilsplat.viewer import payload, wire
-from hilsplat.viewer.frames import painted, pick
+from hilsplat.viewer.frames import painted, pick, within
 from hilsplat.viewer.openapi import description
 from hilsplat.viewer.saved_files import SavedFiles
 from hilsplat.viewer.viewer_scene import ViewerScene
@@ -63,12 +63,14 @@ class Viewer:
             post("/api/like", wire.Like, _like),
             post("/api/field", wire.FieldRelevancy, _field),
             post("/api/pick", wire.Pick, _pick),
+            post("/api/members", wire.Members, _members),
+            post("/api/within", wire.Region, _within),
             post("/api/frame", wire.Frame, _frame),
             Route("/api/names", self._names, methods=["PUT"]),
             *SavedFiles(self.thread, self.pages.static).routes(),
         ]
         routes.append(Route("/openapi.json", lambda request: answer(description(routes))))
-        return guarded(routes, token, embedded=embedded)
+        return guarded(routes, token, wire.MAX_BODY_BYTES, embedded=embedded)
 
     async def _splats(self, request: Request) -> Response:
         """Send a chunk of the Gaussians as SPZ."""
@@ -136,14 +138,31 @@ def _pick(shown: ViewerScene, asked: wire.Pick) -> dict[str, Any]:
     """Return the nodes at a pixel of a camera, with their shares."""
     has_tree = asked.variant in shown.variants
     of_gaussian = shown.answering(asked.variant).tree.node_of_gaussian if has_tree else None
-    picked = pick(shown.gaussians, of_gaussian, asked.camera.camera(), asked.x, asked.y, shown.threads)
+    gaussians = shown.remaining(asked.removed)
+    picked = pick(gaussians, of_gaussian, asked.camera.camera(), asked.x, asked.y, shown.threads)
     return picked or {"nodes": [], "alpha": 0}
+
+
+def _members(shown: ViewerScene, asked: wire.Members) -> bytes:
+    """Return one bit for each Gaussian: whether it belongs to one of the nodes."""
+    scene, members = shown.answering(asked.variant), np.zeros(len(shown.gaussians), np.bool_)
+    members[scene.views.gaussians_of([scene.existing_node(node) for node in asked.nodes])] = True
+    return shown.bits_of(members)
+
+
+def _within(shown: ViewerScene, asked: wire.Region) -> bytes:
+    """Return one bit for each Gaussian: whether its centre is in a region of a picture."""
+    found = within(shown.gaussians.means, asked.camera.camera(), asked.points, asked.radius)
+    paint = shown.paint(asked.variant, asked.style)
+    if paint is not None and paint.mode == "isolate":
+        found &= paint.share > 0
+    return shown.bits_of(found)
 
 
 def _frame(shown: ViewerScene, asked: wire.Frame) -> Response:
     """Return a picture of the scene."""
     paint = shown.paint(asked.variant, asked.style)
-    pixels = painted(shown.gaussians, asked.camera.camera(), paint, shown.threads)
+    pixels = painted(shown.remaining(asked.removed), asked.camera.camera(), paint, shown.threads)
     return plain(encoded(pixels, asked.image, asked.quality), f"image/{asked.image}")
 
 

@@ -42,12 +42,16 @@ def labelled(
     return rows, label[rows]
 
 
-def selection_ply(gaussians_ply: Path, scene: LanguageScene, groups: Sequence[Group]) -> bytes:
-    """Return the groups' Gaussians as a 3DGS PLY, with group labels."""
-    rows, labels = labelled(scene, groups)
+def ply(
+    gaussians_ply: Path,
+    rows: Int64[np.ndarray, " g"],
+    labels: Int32[np.ndarray, " g"] | None = None,
+    names: Sequence[str] = (),
+) -> bytes:
+    """Return Gaussians as a 3DGS PLY; for labels and their names, see `write_selection_ply`."""
     with TemporaryDirectory() as folder:
         out = Path(folder) / "selection.ply"
-        write_selection_ply(gaussians_ply, rows, out, labels, [group.name for group in groups])
+        write_selection_ply(gaussians_ply, rows, out, labels, names)
         return out.read_bytes()
 
 

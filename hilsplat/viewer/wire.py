@@ -21,6 +21,16 @@ MAX_NODES = 131_071
 
 Nodes = Annotated[list[Annotated[int, Field(ge=0)]], Field(max_length=MAX_NODES)]
 
+MAX_GAUSSIANS = 10_000_000
+"""Maximum number of Gaussians; more do not fit in textures of 4096 x 16384 texels (degree 3: four texels per
+Gaussian) or a few GiB of memory."""
+
+Bits = Annotated[str, Field(max_length=(MAX_GAUSSIANS // 8 // 3 + 1) * 4)]
+"""Base64 of one bit per Gaussian in the page's order, least significant bit first; empty if no bit is set."""
+
+MAX_BODY_BYTES = 4 << 20
+"""Maximum size of a request: the table of a style, and the marks of two sets of Gaussians."""
+
 
 class WireCamera(Message):
     """A camera with OpenCV axes; the centre of the top-left pixel is at (0.5, 0.5)."""
@@ -57,6 +67,7 @@ class Style(Message):
         use: whether each level is used; the finest used level with an alpha above 0 sets the colour.
         mode: style of Gaussians whose alpha is 0.
         ramp: base64 of 256 RGB colours; if given, colours show the field's relevancy to `text` at `level`.
+        marked: Gaussians that the user has selected for editing.
     """
 
     table: Annotated[str, Field(max_length=6 * (MAX_NODES + 1))] = ""
@@ -65,6 +76,7 @@ class Style(Message):
     ramp: Annotated[str, Field(max_length=1024)] = ""
     text: str = ""
     level: LevelName = "auto"
+    marked: Bits = ""
 
     @model_validator(mode="after")
     def _ramp_has_text(self) -> "Style":
@@ -74,14 +86,14 @@ class Style(Message):
 
 
 def rows_of(text: str, width: int, count: int) -> UInt8[np.ndarray, "count width"]:
-    """Return the rows of bytes stored in a style as base64; an empty string gives zeros."""
+    """Return the rows of bytes in a text of base64; an empty text gives zeros."""
     if not text:
         return np.zeros((count, width), np.uint8)
     try:
         return np.frombuffer(base64.b64decode(text, validate=True), np.uint8).reshape(count, width)
     except ValueError as error:
         raise SettingsError(
-            "the style is invalid",
+            "the colours or marks do not fit the scene",
             expected=f"base64 of {count} rows of {width} bytes",
             found=str(error),
             fix="reload the page",
@@ -92,6 +104,12 @@ class Asked(Message):
     """Base class of requests about one variant of the scene."""
 
     variant: Annotated[str, Field(max_length=100)] = "default"
+
+
+class Edited(Asked):
+    """Base class of requests about the scene without the Gaussians that the user has removed."""
+
+    removed: Bits = ""
 
 
 class Question(Message):
@@ -124,7 +142,7 @@ class FieldRelevancy(Asked):
     order: Literal["file", "page"] = "file"
 
 
-class Pick(Asked):
+class Pick(Edited):
     """A pixel of the page's picture."""
 
     camera: WireCamera
@@ -132,7 +150,28 @@ class Pick(Asked):
     y: float
 
 
-class Frame(Asked):
+class Members(Asked):
+    """Nodes whose Gaussians are selected."""
+
+    nodes: Nodes
+
+
+class Region(Asked):
+    """A region of the page's picture: a rectangle with two opposite corners, or a stroke of a round brush.
+
+    Attributes:
+        points: the corners, or the vertices of the stroke, px.
+        radius: radius of the brush, px; 0 for a rectangle.
+        style: style of the picture; Gaussians that it hides are not selected.
+    """
+
+    camera: WireCamera
+    points: Annotated[tuple[tuple[float, float], ...], Field(min_length=1, max_length=10_000)]
+    radius: Annotated[float, Field(ge=0, le=MAX_SIDE_PX)] = 0
+    style: Style = Style()
+
+
+class Frame(Edited):
     """A picture rendered by the server."""
 
     camera: WireCamera
@@ -141,7 +180,7 @@ class Frame(Asked):
     image: Literal["jpeg", "png"] = "jpeg"
 
 
-class Film(Asked):
+class Film(Edited):
     """A film along a tour of the training cameras, or along a path of cameras."""
 
     style: Style = Style()
@@ -158,7 +197,7 @@ class Group(Message):
     nodes: Nodes
 
 
-class Selection(Asked):
+class Selection(Edited):
     """Groups of nodes, which may overlap."""
 
     groups: Annotated[list[Group], Field(min_length=1, max_length=40)]
@@ -170,7 +209,7 @@ class Names(Asked):
     names: dict[int, Annotated[str, Field(max_length=200)]]
 
 
-class Page(Asked):
+class Page(Edited):
     """A page as one HTML file, with the answers to kept queries and to the last query."""
 
     kept: Annotated[tuple[Question, ...], Field(max_length=40)] = ()

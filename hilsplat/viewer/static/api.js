@@ -31,6 +31,8 @@ export const sorter = () => new Worker("static/sorter.js");
 export const query = async (asked, signal) => (await send(at("api/query"), asked, { signal })).json();
 export const like = async (asked, signal) => (await send(at("api/like"), asked, { signal })).json();
 export const field = async (asked, signal) => (await send(at("api/field"), { ...asked, order: "page" }, { signal })).arrayBuffer();
+export const members = async (asked) => (await send(at("api/members"), asked)).arrayBuffer();
+export const within = async (asked) => (await send(at("api/within"), asked)).arrayBuffer();
 export const pick = async (asked, signal) => (await send(at("api/pick"), asked, { signal })).json();
 export const frame = async (asked, signal) => (await send(at("api/frame"), asked, { signal })).blob();
 export const names = async (asked, version) =>

@@ -17,14 +17,15 @@ export function currentStyles() {
   if (!styles.length) {
     styles = panes.map((pane, k) => {
       const own = !k || variantOf(pane) === variantOf(panes[0]);
-      return styleOf({ outline: outlines.get(variantOf(pane)), answer: pane.answer, colour: $("colour").value, mode: $("mode").value, field: pane.field, threshold: threshold(), kept: keptIn(k),
+      const style = styleOf({ outline: outlines.get(variantOf(pane)), answer: pane.answer, colour: $("colour").value, mode: $("mode").value, field: pane.field, threshold: threshold(), kept: keptIn(k),
         level: levelIndex(pane.answer), chosen: own ? page.chosen : -1, hover: own ? page.hover : -1 });
+      return { ...style, marked: page.marked };
     });
   }
   return styles;
 }
 
-export const painted = () => currentStyles().map((style, k) => ({ variant: variantOf(panes[k]), style }));
+export const painted = () => currentStyles().map((style, k) => ({ variant: variantOf(panes[k]), style, removed: page.removed }));
 
 function paint(now) {
   if (!dirty || !page.painter || !page.camera) return;

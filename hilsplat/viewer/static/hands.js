@@ -5,6 +5,7 @@ import { ask, askPicture, clear, clearAnswer, fillField, framed, keepAnswer, lik
 import { children } from "./card.js";
 import { choose, pointed, tapped } from "./choosing.js";
 import { attach } from "./controls.js";
+import { attachEditing, draw, edit, leaveTool, placeBrush, pressed, redo, resizeBrush, saved, tool, undo } from "./editing.js";
 import { currentStyles, painted, redraw, rememberedAs, restyle } from "./drawing.js";
 import { $, counted, nameOf } from "./elements.js";
 import { flyTo, nearestView, setMoving, stand, step, touched } from "./flights.js";
@@ -34,14 +35,17 @@ const MODES = ["tint", "ghost", "isolate", "plain"];
 
 export function attachHands() {
   const rested = () => setMoving(false);
-  const touch = attach(host, { camera: () => page.camera, changed: touched, rested, tapped, pointed, framed });
+  const drawing = (event) => event.altKey ? { draw: framed } : tool() !== "move" && event.button === 0 ? { draw, taps: tool() === "brush" } : null;
+  const touch = attach(host, { camera: () => page.camera, changed: touched, rested, tapped, tool: drawing, pointed: (x, y) => { placeBrush(x, y); pointed(x, y); } });
   const nudge = (work) => { work(); touch(); };
   const setLevel = (value) => { document.querySelector(`[name=level][value=${value}]`).checked = true; levelChanged(); };
   const levelChanged = () => { if (page.asked?.text && !api.offline) ask(true); else restyle(); };
 
   attachKeys({
     ask: () => { $("text").focus(); $("text").select(); },
-    clear, step, home: () => stand(page.camera.first), help: () => $("help").showModal(),
+    clear: () => { if (!leaveTool()) clear(); }, step: (by) => { if (!resizeBrush(by)) step(by); }, edit: () => { if (!api.offline) edit(); }, edited: pressed,
+    undone: ({ key, shiftKey }) => { const letter = key.toLowerCase(); if (letter === "z" || letter === "y") (shiftKey || letter === "y" ? redo : undo)(); return letter === "z" || letter === "y"; },
+    home: () => stand(page.camera.first), help: () => $("help").showModal(),
     zoom: (factor) => nudge(() => page.camera.zoom(factor)), orbit: (x, y) => nudge(() => page.camera.orbit(0.1 * x, 0.1 * y)),
     move: (x, y, z) => nudge(() => page.camera.move(0.06 * x, 0.06 * y, 0.06 * z)),
     photo: () => $("blend").click(), fly: () => flyTo(page.chosen), like: () => like(page.chosen), level: setLevel, keep: keepAnswer, path: addToPath,
@@ -56,6 +60,7 @@ export function attachHands() {
   for (const radio of document.querySelectorAll("[name=level]")) radio.addEventListener("change", levelChanged);
   for (const id of ["left", "right"]) $(id).addEventListener("change", choosePanes);
   $("keep").addEventListener("click", keepAnswer);
+  attachEditing();
   $("path-add").addEventListener("click", addToPath);
   $("path-clear").addEventListener("click", () => { page.path = []; showPath(); });
   $("mode").addEventListener("change", restyle);
@@ -106,8 +111,9 @@ export function attachHands() {
       if (kind === "link") { await navigator.clipboard.writeText(location.href); tell("Link copied. It opens this view while the viewer is running."); return; }
       const side = Number($("still-side").value), scale = side ? side / Math.max(host.clientWidth, host.clientHeight) : devicePixelRatio, size = [host.clientWidth, host.clientHeight].map((px) => Math.round(px * scale));
       const flown = $("path").value === "path" ? { path: page.path.map((camera) => camera.wire(host.clientWidth, host.clientHeight)) } : {};
-      await save(kind, { variant: variantOf(panes[0]), groups: selected(), style: currentStyles()[0], capture: () => page.painter.capture(page.camera, painted(), ...size), flown,
+      await save(kind, { variant: variantOf(panes[0]), groups: selected(), removed: page.removed, style: currentStyles()[0], capture: () => page.painter.capture(page.camera, painted(), ...size), flown,
         kept: page.kept.map((query) => query.asked), last: page.asked?.query, camera: page.camera.toText(), name: page.scene.name.split("/").at(-1), told: tell });
+      if (kind.startsWith("scene")) saved();
       redraw();
     } catch (error) { failed(error); }
   });

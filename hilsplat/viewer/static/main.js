@@ -66,7 +66,7 @@ function arriving(here, chunks) { Object.assign($("arriving"), { value: here, ma
 
 // Hide everything that needs a server: an exported page has only its stored answers.
 function onlyWhatIsHere() {
-  for (const element of [$("picture-button"), $("here").parentElement, $("left").parentElement, $("right").parentElement]) element.hidden = true;
+  for (const element of [$("picture-button"), $("here").parentElement, $("left").parentElement, $("right").parentElement, $("edit-button")]) element.hidden = true;
   for (const button of $("save").querySelectorAll("[data-save]:not([data-save=still])")) button.hidden = true;
   for (const row of $("save").querySelectorAll(".sized:not(:has([data-save=still]))")) row.hidden = true;
   for (const line of $("save").querySelectorAll("hr")) line.hidden = true;

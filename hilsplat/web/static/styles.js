@@ -1,6 +1,8 @@
 // The colours of all nodes, for both painters.
 
 export const ANSWER = [255, 122, 0], CHOSEN = [58, 150, 255], HOVER = [255, 225, 70], SHARED = [255, 255, 255];
+// Gaussians selected for editing, and the weight of their colour.
+export const MARKED = [255, 0, 160], MARKED_SHARE = 0.7;
 // Colours of kept queries; style.css has the same colours for the query chips.
 export const KEPT = [[0, 200, 140], [235, 120, 200], [70, 215, 235], [180, 215, 50], [160, 120, 255], [235, 80, 80]];
 const STOPS = [[0, 0, 4], [31, 12, 72], [85, 15, 109], [136, 34, 106], [186, 54, 85], [227, 89, 51], [249, 140, 10], [249, 201, 50], [252, 255, 164]];
@@ -75,7 +77,7 @@ export function styleOf({ outline, answer, colour, mode, level, chosen, hover, f
   return { table, use, mode, ramp: null, ...(colour === "relevancy" ? range : {}) };
 }
 
-const base64 = (bytes) => {
+export const base64 = (bytes) => {
   let text = "";
   for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
   return btoa(text);
@@ -86,7 +88,8 @@ const sent = new WeakMap();
 export function wireStyle(style) {
   if (!sent.has(style)) {
     const plain = !style.ramp && style.mode === "plain" && style.table.every((v, k) => k % 4 !== 3 || v === 0);
-    sent.set(style, plain ? {} : style.ramp ? { ramp: base64(style.ramp), ...style.field } : { table: base64(style.table), use: style.use, mode: style.mode });
+    const colours = plain ? {} : style.ramp ? { ramp: base64(style.ramp), ...style.field } : { table: base64(style.table), use: style.use, mode: style.mode };
+    sent.set(style, style.marked ? { ...colours, marked: style.marked } : colours);
   }
   return sent.get(style);
 }
