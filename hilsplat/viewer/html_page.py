@@ -46,7 +46,7 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
         },
         "variant": shown.described_variant(asked.variant),
         "asked": [question.model_dump(exclude_none=True) for question in questions],
-        "answers": [payload.answer(scene, question) for question in questions],
+        "answers": [payload.answer(scene, question, asked.answerer) for question in questions],
         "kept": len(asked.kept),
         "photos": [_text(encoded(image, quality=75)) for image in images],
         "opening": asked.start,

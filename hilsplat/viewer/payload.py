@@ -10,14 +10,14 @@ from jaxtyping import Float32, Float64, Int64
 from typing_extensions import TypedDict  # pydantic needs this class before Python 3.12
 
 from hilsplat.base.levels import LEVELS, path_of
-from hilsplat.query.hits import Hit, doubts_of
+from hilsplat.query.hits import Hit, NodeGroup, doubts_of
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.scene_views import upright
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import OrientedBox, SemanticTree
 from hilsplat.splat.gaussians import Gaussians, morton_order
-from hilsplat.viewer.wire import Group, Question
+from hilsplat.viewer.wire import Question
 from hilsplat.web.server import view_name
 
 CHUNK = 65_536
@@ -211,7 +211,7 @@ def _answer(scene: LanguageScene, text: str, hits: Sequence[Hit], relevancy: np.
     }
 
 
-def boxes(scene: LanguageScene, groups: Sequence[Group]) -> dict[str, Any]:
+def boxes(scene: LanguageScene, groups: Sequence[NodeGroup]) -> dict[str, Any]:
     """Return node boxes for other programs; a node in several groups has one box per group."""
     tree = scene.tree
     return {
@@ -225,6 +225,8 @@ def boxes(scene: LanguageScene, groups: Sequence[Group]) -> dict[str, Any]:
                 "group": group.name,
                 "node": node,
                 "name": scene.name_of(node),
+                "score": group.score_of(node),
+                "doubts": group.doubts,
                 "level": int(tree.level[node]),
                 "parent": int(tree.parent[node]),
                 "centre": tree.oriented_box[node][0].tolist(),

@@ -17,6 +17,7 @@ from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 
 from hilsplat.base.errors import HilsplatError
+from hilsplat.query.hits import NodeGroup, label_comments
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.splat.gaussians import morton_order
 from hilsplat.viewer import exports, payload, wire
@@ -87,9 +88,10 @@ class SavedFiles:
 
 def _ply(shown: ViewerScene, asked: wire.Selection) -> bytes:
     """Return the Gaussians of nodes as a 3DGS PLY, with labels."""
+    scene, groups = _selected(shown, asked)
     rows, labels = _rows(shown, asked)
     with shown.unchanged():
-        return exports.ply(shown.ply, rows, labels, [group.name for group in asked.groups])
+        return exports.ply(shown.ply, rows, labels, label_comments(groups, scene.name_of))
 
 
 def _spz(shown: ViewerScene, asked: wire.Selection) -> bytes:
@@ -133,13 +135,13 @@ def _rows(shown: ViewerScene, asked: wire.Selection) -> tuple[np.ndarray, np.nda
     return rows[kept], labels[kept]
 
 
-def _selected(shown: ViewerScene, asked: wire.Selection) -> tuple[LanguageScene, list[wire.Group]]:
+def _selected(shown: ViewerScene, asked: wire.Selection) -> tuple[LanguageScene, list[NodeGroup]]:
     """Return the variant and the groups; raise SettingsError if a node does not exist."""
     scene = shown.answering(asked.variant)
     for group in asked.groups:
         for node in group.nodes:
             scene.existing_node(node)
-    return scene, asked.groups
+    return scene, [group.group() for group in asked.groups]
 
 
 def _step(steps: exports.Steps) -> tuple[int, int] | bytes:

@@ -9,12 +9,14 @@ from pydantic import Field, field_validator, model_validator
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import MAX_TEXT
+from hilsplat.query.hits import NodeGroup
 from hilsplat.scene.cameras import Camera
 from hilsplat.web.messages import MAX_SIDE_PX, Message
 
 Row3 = tuple[float, float, float]
 Row4 = tuple[float, float, float, float]
 LevelName = Literal["auto", "whole", "part", "subpart"]
+Answerer = Literal["tree", "field"]
 
 MAX_NODES = 131_071
 """Maximum number of nodes that the page shows: the table of a style must fit into a request of 1 MiB."""
@@ -124,7 +126,7 @@ class Question(Message):
 class Query(Asked, Question):
     """A query of a variant's tree or field."""
 
-    answerer: Literal["tree", "field"] = "tree"
+    answerer: Answerer = "tree"
 
 
 class Like(Asked):
@@ -191,10 +193,22 @@ class Film(Edited):
 
 
 class Group(Message):
-    """Named nodes: the answers to a query, or a selection."""
+    """Named nodes: the answers to a query, with their scores and doubts, or a selection (`NodeGroup`)."""
 
     name: Annotated[str, Field(max_length=MAX_TEXT)]
     nodes: Nodes
+    scores: Annotated[tuple[float, ...], Field(max_length=MAX_NODES)] = ()
+    doubts: Annotated[tuple[Annotated[str, Field(max_length=1000)], ...], Field(max_length=10)] = ()
+
+    @model_validator(mode="after")
+    def _a_score_for_each_node(self) -> "Group":
+        if self.scores and len(self.scores) != len(self.nodes):
+            raise ValueError("the number of scores differs from the number of nodes")
+        return self
+
+    def group(self) -> NodeGroup:
+        """Return the group as the package's type."""
+        return NodeGroup(self.name, tuple(self.nodes), self.scores, self.doubts)
 
 
 class Selection(Edited):
@@ -214,5 +228,6 @@ class Page(Edited):
 
     kept: Annotated[tuple[Question, ...], Field(max_length=40)] = ()
     last: Question | None = None
+    answerer: Answerer = "tree"
     start: Annotated[str, Field(max_length=400, pattern=r"^(v\d+|[-+.,e\d]*)$")] = ""
     """Initial camera, in the format of the page's address; empty for the first photograph's camera."""

@@ -49,11 +49,13 @@ export function overlay() {
   page.photos.mark(page.camera.view, page.asked?.shows ?? []);
 }
 
+const labelOf = ({ name, score }, text = "") => [...new Set([text, name].filter(Boolean)), score.toFixed(2)].join(" ");
+
 function boxes(pane, k) {
   const own = outlines.get(variantOf(pane));
   if (!own || $("colour").value === "none") return [];
-  const found = $("colour").value === "answers" ? keptIn(k).flatMap(({ answer, rgb, text }) => shownHits(answer).map((hit) => ({ node: hit.node, kind: "kept", stroke: `rgb(${rgb.join(" ")})`, label: text }))) : [];
-  for (const hit of shownHits(pane.answer)) found.push({ node: hit.node, kind: "answer", label: `${hit.name} ${hit.score.toFixed(2)}`.trim() });
+  const found = $("colour").value === "answers" ? keptIn(k).flatMap(({ answer, rgb, text }) => shownHits(answer).map((hit) => ({ node: hit.node, kind: "kept", stroke: `rgb(${rgb.join(" ")})`, label: labelOf(hit, text) }))) : [];
+  for (const hit of shownHits(pane.answer)) found.push({ node: hit.node, kind: "answer", label: labelOf(hit) });
   if (!k || variantOf(pane) === variantOf(panes[0])) {
     if (page.chosen >= 0) found.push({ node: page.chosen, kind: "chosen", label: nameOf(own, page.chosen) });
     if (page.hover >= 0 && page.hover !== page.chosen) found.push({ node: page.hover, kind: "hover", label: nameOf(own, page.hover) });

@@ -9,10 +9,10 @@ import { attachEditing, draw, edit, leaveTool, placeBrush, pressed, redo, resize
 import { currentStyles, painted, redraw, rememberedAs, restyle } from "./drawing.js";
 import { $, counted, nameOf } from "./elements.js";
 import { flyTo, nearestView, setMoving, stand, step, touched } from "./flights.js";
-import { groups } from "./kept.js";
+import { groups, scoreOf } from "./kept.js";
 import { attachKeys } from "./keyboard.js";
 import { save } from "./saves.js";
-import { failed, host, main, page, panes, start, tell, variantOf } from "./state.js";
+import { answererOf, failed, host, main, page, panes, start, tell, variantOf } from "./state.js";
 import { choosePanes } from "./variants.js";
 
 // The path of a film: views in the order in which they were added.
@@ -97,7 +97,7 @@ export function attachHands() {
     if (text) ask();
   });
 
-  const selected = () => page.chosen >= 0 ? [{ name: nameOf(main(), page.chosen), nodes: [page.chosen] }] : groups();
+  const selected = () => page.chosen >= 0 ? [{ name: nameOf(main(), page.chosen), nodes: [page.chosen], ...scoreOf(page.chosen) }] : groups();
   $("save").addEventListener("toggle", () => {
     const chosen = selected(), count = chosen.reduce((sum, group) => sum + group.nodes.length, 0);
     $("save-what").textContent = page.chosen >= 0 ? `For ${chosen[0].name}` : chosen.length ? `For ${counted(count, "answer")} to ${chosen.map((group) => group.name).join(", ")}` : "Run a query or select a node to save its Gaussians, boxes and masks.";
@@ -111,7 +111,7 @@ export function attachHands() {
       if (kind === "link") { await navigator.clipboard.writeText(location.href); tell("Link copied. It opens this view while the viewer is running."); return; }
       const side = Number($("still-side").value), scale = side ? side / Math.max(host.clientWidth, host.clientHeight) : devicePixelRatio, size = [host.clientWidth, host.clientHeight].map((px) => Math.round(px * scale));
       const flown = $("path").value === "path" ? { path: page.path.map((camera) => camera.wire(host.clientWidth, host.clientHeight)) } : {};
-      await save(kind, { variant: variantOf(panes[0]), groups: selected(), removed: page.removed, style: currentStyles()[0], capture: () => page.painter.capture(page.camera, painted(), ...size), flown,
+      await save(kind, { variant: variantOf(panes[0]), answerer: answererOf(panes[0]), groups: selected(), removed: page.removed, style: currentStyles()[0], capture: () => page.painter.capture(page.camera, painted(), ...size), flown,
         kept: page.kept.map((query) => query.asked), last: page.asked?.query, camera: page.camera.toText(), name: page.scene.name.split("/").at(-1), told: tell });
       if (kind.startsWith("scene")) saved();
       redraw();

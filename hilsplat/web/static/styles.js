@@ -40,6 +40,8 @@ export const shownHits = (answer) => answer?.route === "like" ? answer.hits.slic
 // Doubtful answers are painted paler.
 export const isDoubtful = (answer) => Boolean(answer?.hits.length && (answer.doubts.length || (answer.route !== "like" && answer.hits[0].score < 0.5)));
 
+const strength = (answer) => isDoubtful(answer) ? 0.5 : 1;
+
 /*
  * outline: the nodes of a variant; answer: the current answer, or null; kept: [{answer, rgb}] of kept queries;
  * colour, mode: the page's settings; level: 0, 1 or 2, for colours by level; chosen, hover: nodes, or -1;
@@ -64,9 +66,8 @@ export function styleOf({ outline, answer, colour, mode, level, chosen, hover, f
     if (colour === "nodes" || threshold === null) mode = "plain";
   } else if (colour === "answers" && (answer || kept.length)) {
     const hits = shownHits(answer), painted = new Set();
-    for (const { answer: other, rgb } of kept) for (const { node } of shownHits(other)) { set(node, painted.has(node) ? SHARED : rgb, 0.62); painted.add(node); }
-    const strength = isDoubtful(answer) ? 0.5 : 1;
-    hits.forEach(({ node }, rank) => set(node, painted.has(node) ? SHARED : ANSWER, strength * (0.72 - 0.42 * rank / Math.max(hits.length, 4))));
+    for (const { answer: other, rgb } of kept) for (const { node } of shownHits(other)) { set(node, painted.has(node) ? SHARED : rgb, 0.62 * strength(other)); painted.add(node); }
+    hits.forEach(({ node }, rank) => set(node, painted.has(node) ? SHARED : ANSWER, strength(answer) * (0.72 - 0.42 * rank / Math.max(hits.length, 4))));
     if (!hits.length && !painted.size) mode = "plain";
   } else if (chosen < 0 || colour === "none") mode = "plain";
   if (chosen >= 0 && colour !== "none") {
