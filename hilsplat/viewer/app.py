@@ -20,7 +20,7 @@ from hilsplat.base.errors import ImageError, SettingsError
 from hilsplat.base.images import read_image
 from hilsplat.query.names import write_names
 from hilsplat.query.tree_picture import crop
-from hilsplat.viewer import payload, wire
+from hilsplat.viewer import exports, payload, wire
 from hilsplat.viewer.frames import painted, pick, within
 from hilsplat.viewer.openapi import description
 from hilsplat.viewer.saved_files import SavedFiles
@@ -66,6 +66,7 @@ class Viewer:
             post("/api/members", wire.Members, _members),
             post("/api/within", wire.Region, _within),
             post("/api/frame", wire.Frame, _frame),
+            post("/api/path", wire.Film, _path),
             Route("/api/names", self._names, methods=["PUT"]),
             *SavedFiles(self.thread, self.pages.static).routes(),
         ]
@@ -164,6 +165,11 @@ def _frame(shown: ViewerScene, asked: wire.Frame) -> Response:
     paint = shown.paint(asked.variant, asked.style)
     pixels = painted(shown.remaining(asked.removed), asked.camera.camera(), paint, shown.threads)
     return plain(encoded(pixels, asked.image, asked.quality), f"image/{asked.image}")
+
+
+def _path(shown: ViewerScene, asked: wire.Film) -> list[dict[str, Any]]:
+    """Return the cameras of a film's frames."""
+    return [payload.described_camera(camera) for camera in exports.flight(asked, shown.scene)]
 
 
 def _picture(text: str) -> np.ndarray:

@@ -13,7 +13,7 @@ from hilsplat.base.levels import LEVELS, path_of
 from hilsplat.query.hits import Hit, NodeGroup, doubts_of
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.scene_views import upright
-from hilsplat.scene.cameras import Cameras
+from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import OrientedBox, SemanticTree
 from hilsplat.splat.gaussians import Gaussians, morton_order
@@ -66,13 +66,17 @@ def described_scene(scene: Scene, gaussians: Gaussians) -> dict[str, Any]:
             {
                 "name": name,
                 "split": scene.split[name],
-                "size_hw": list(cameras[name].size_hw),
-                "K": cameras[name].K.tolist(),
-                "cam_from_world": cameras[name].cam_from_world.tolist(),
+                **described_camera(cameras[name]),
             }
             for name in cameras.names
         ],
     }
+
+
+def described_camera(camera: Camera) -> dict[str, Any]:
+    """Describe a camera in the format of `wire.WireCamera`."""
+    pose, K = camera.cam_from_world.tolist(), camera.K.tolist()
+    return {"cam_from_world": pose, "K": K, "size_hw": list(camera.size_hw)}
 
 
 def crossing(cameras: Cameras) -> Float64[np.ndarray, " 3"]:

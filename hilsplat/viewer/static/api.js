@@ -31,6 +31,7 @@ export const sorter = () => new Worker("static/sorter.js");
 export const query = async (asked, signal) => (await send(at("api/query"), asked, { signal })).json();
 export const like = async (asked, signal) => (await send(at("api/like"), asked, { signal })).json();
 export const field = async (asked, signal) => (await send(at("api/field"), { ...asked, order: "page" }, { signal })).arrayBuffer();
+export const path = async (asked) => (await send(at("api/path"), asked)).json();
 export const members = async (asked) => (await send(at("api/members"), asked)).arrayBuffer();
 export const within = async (asked) => (await send(at("api/within"), asked)).arrayBuffer();
 export const pick = async (asked, signal) => (await send(at("api/pick"), asked, { signal })).json();

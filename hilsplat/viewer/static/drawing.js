@@ -7,7 +7,7 @@ import { showScale } from "./scale.js";
 import { host, keptIn, level, levelIndex, main, options, outlines, page, panes, threshold, variantOf } from "./state.js";
 import { shownHits, styleOf } from "./styles.js";
 
-const SLOW_MS = 60;
+const SLOW_MS = 60, FRUSTUM = 0.08;   // depth of a drawn camera, in multiples of the photographs' mean distance
 let dirty = true, styles = [], lastFrame = 0, frames = 0;
 
 export const redraw = () => { dirty = true; requestAnimationFrame(paint); };
@@ -41,12 +41,19 @@ function paint(now) {
 
 export function overlay() {
   const width = host.clientWidth, height = host.clientHeight;
-  drawOverlay($("overlay"), page.camera, panes.map((pane, k) => ({ boxes: boxes(pane, k), label: panes.length > 1 ? pane.by.replace("|", ", ") : "" })), width, height, $("tools").offsetTop + $("tools").offsetHeight);
+  drawOverlay($("overlay"), page.camera, panes.map((pane, k) => ({ boxes: boxes(pane, k), frustums: frustums(), label: panes.length > 1 ? pane.by.replace("|", ", ") : "" })), width, height, $("tools").offsetTop + $("tools").offsetHeight);
   showScale(currentStyles()[0]);
   const hits = shownHits(panes[0].answer), own = main(), each = width / panes.length;
   $("look").hidden = !hits.length || hits.some((hit) => inPicture(page.camera, own.nodes[hit.node].corners, each, height));
   page.photos.place(page.camera, width, height, panes.length);
   page.photos.mark(page.camera.view, page.asked?.shows ?? []);
+}
+
+// Cameras of the photographs, and views of the path.
+function frustums() {
+  const depth = FRUSTUM * page.scene.reach, photographs = page.frustums ? page.scene.views : [];
+  return [...photographs.map((view, number) => ({ number, name: view.name, kind: view.split === "test" ? "frustum test" : "frustum", corners: page.camera.ofView(view).corners(depth) })),
+    ...(page.previewing ? [] : page.path).map((camera, k) => ({ kind: "frustum path", label: String(k + 1), corners: camera.corners(depth) }))];
 }
 
 const labelOf = ({ name, score }, text = "") => [...new Set([text, name].filter(Boolean)), score.toFixed(2)].join(" ");

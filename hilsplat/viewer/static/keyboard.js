@@ -53,7 +53,7 @@ export function attachKeys(act) {
     const on = (selector) => event.target.closest(selector), letter = event.key.toLowerCase();
     const keys = {
       "/": act.ask, "?": act.help, "[": () => act.step(-1), "]": () => act.step(1), "+": () => act.zoom(0.9), "=": () => act.zoom(0.9), "-": () => act.zoom(1 / 0.9),
-      o: act.photo, f: act.fly, m: act.like, n: act.name, k: act.keep, v: act.path, g: act.mode, x: act.edit, u: act.parent, j: act.child,
+      o: act.photo, f: act.fly, m: act.like, n: act.name, k: act.keep, v: act.path, p: act.frustums, g: act.mode, x: act.edit, u: act.parent, j: act.child,
       0: () => act.level("auto"), 1: () => act.level("whole"), 2: () => act.level("part"), 3: () => act.level("subpart"),
     };
     if (on("select")) return;

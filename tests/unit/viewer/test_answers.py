@@ -263,6 +263,16 @@ def test_a_film_follows_a_path(client, shown, camera):
     assert np.abs(frames[0] - still).mean() < 8 < np.abs(frames[-1] - still).mean()
 
 
+def test_the_cameras_of_a_film_are_sent_for_its_preview(client, shown, camera):
+    views = [wire_camera(camera), {**wire_camera(camera), "cam_from_world": np.eye(4).tolist()}]
+    found = client.post("/api/path", json={"frames": 7, "side_px": 64, "path": views}).json()
+    assert len(found) == 7 and all(each["size_hw"] == [36, 64] for each in found)
+    np.testing.assert_allclose(found[0]["cam_from_world"], camera.cam_from_world, atol=1e-9)
+    np.testing.assert_allclose(found[-1]["cam_from_world"], np.eye(4), atol=1e-9)
+    np.testing.assert_allclose(found[3]["K"], camera.scaled((36, 64)).K, atol=1e-9)
+    assert len(client.post("/api/path", json={"frames": 5}).json()) == 5
+
+
 def test_a_gif_around_the_scene_has_every_other_frame_in_the_requested_size(client):
     progress, data = in_steps(client, "film", frames=7, side_px=96, format="gif")
     assert progress == [(made, 4) for made in range(5)]
