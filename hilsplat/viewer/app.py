@@ -43,10 +43,15 @@ from hilsplat.web.server import (
 
 
 class Viewer:
-    """Request handlers of the viewer page for one scene."""
+    """Request handlers of the viewer page.
 
-    def __init__(self, shown: ViewerScene) -> None:
-        self.thread = SceneThread(shown)
+    Args:
+        shown: the scene that the page opens with.
+        others: whether the page may open the other scenes of the results folder.
+    """
+
+    def __init__(self, shown: ViewerScene, *, others: bool = True) -> None:
+        self.thread = SceneThread(shown, shown.beside if others else None)
         self.pages = Pages("index.html", "hilsplat.viewer")
 
     def app(self, token: str, *, embedded: bool = False) -> Guard:
@@ -55,6 +60,7 @@ class Viewer:
         routes = [
             *self.pages.routes(),
             *self.thread.routes(),
+            get("/api/scenes", _scenes),
             get("/api/variant/{variant}", _variant),
             Route("/api/splats/{chunk:int}", self._splats),
             get("/api/nodes/{variant}", _nodes),
@@ -94,6 +100,11 @@ class Viewer:
             return {"version": names.version, "names": dict(names.of_node)}
 
         return answer(await self.thread.do(request, write))
+
+
+def _scenes(shown: ViewerScene, path: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the scenes of the results folder, with the state and date of `hilsplat scenes`."""
+    return shown.listed()
 
 
 def _variant(shown: ViewerScene, path: Mapping[str, Any]) -> dict[str, Any]:
@@ -242,4 +253,6 @@ def show(
         proxy: address containing `{port}` through which browsers on other machines reach a port of this
             machine, such as "/user/me/proxy/{port}/" on a JupyterHub.
     """
-    return EmbeddedViewer(Viewer(ViewerScene(Path(folder), variant, threads)), text, height, proxy)
+    return EmbeddedViewer(
+        Viewer(ViewerScene(Path(folder), variant, threads), others=False), text, height, proxy
+    )

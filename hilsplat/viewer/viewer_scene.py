@@ -11,13 +11,20 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from hilsplat.base.artifacts import read_index, run_command
-from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError
+from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError, first_line, nearest
 from hilsplat.base.lineage import sha256_of_file
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.names import NodeNames, tree_digest
+from hilsplat.query.scene_state import SceneState
 from hilsplat.query.scene_views import Opened
-from hilsplat.scene.finished import FinishedScene, SceneParts, finished_variants, require_scene_folder
+from hilsplat.scene.finished import (
+    FinishedScene,
+    SceneParts,
+    finished_variants,
+    require_scene_folder,
+    scenes_in,
+)
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.origin import masks_label
 from hilsplat.semantic_tree.tree import ViewNodes
@@ -83,6 +90,34 @@ class ViewerScene(ShownScene):
 
     def opened_again(self) -> "ViewerScene":
         return ViewerScene(self.folder, self.first, self.threads)
+
+    @property
+    def results(self) -> Path:
+        """The results folder."""
+        return self.folder.absolute().parent.parent
+
+    def beside(self, name: str) -> "ViewerScene":
+        """Open another scene of the results folder; raise SettingsError if it has no such scene."""
+        if name not in (known := scenes_in(self.results)):  # reject anything but listed names, such as paths
+            raise SettingsError(f"{self.results} has no scene {name!r}", expected=nearest(name, known))
+        return ViewerScene(self.results / name, self.first, self.threads)
+
+    def listed(self) -> list[dict[str, Any]]:
+        """Return name, state and date of each scene of the results folder, and whether it can be shown."""
+        scenes = []
+        for name in scenes_in(self.results):
+            try:
+                state = SceneState.read(self.results / name)
+                told = {"state": state.state, "date": state.date}
+            except HilsplatError as error:
+                told = {"state": first_line(error), "date": ""}
+            folder = self.results / name
+            places = {
+                "can_open": (folder / self.ply.name).is_file(),
+                "current": folder == self.folder.absolute(),
+            }
+            scenes.append({"name": name, **told, **places})
+        return scenes
 
     def news(self) -> dict[str, Any]:
         names = {variant: scene.names.version for variant, (_, scene) in list(self._variants.items())}

@@ -99,4 +99,8 @@ function remember() {
     history[isNew ? "pushState" : "replaceState"](null, "", `${location.pathname}${api.offline ? location.search : keptSearch()}#${link}`);
   }, 400);
 }
-const keptSearch = () => options.has("embedded") ? location.search : options.get("painter") ? `?painter=${options.get("painter")}` : "";
+function keptSearch() {
+  if (options.has("embedded")) return location.search;
+  const kept = new URLSearchParams([...options].filter(([key, value]) => ["scene", "painter"].includes(key) && value));
+  return kept.size ? `?${kept}` : "";
+}

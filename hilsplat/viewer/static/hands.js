@@ -13,6 +13,7 @@ import { groups, scoreOf } from "./kept.js";
 import { attachKeys } from "./keyboard.js";
 import { addToPath, attachPath, flown } from "./path.js";
 import { save } from "./saves.js";
+import { attachScenes } from "./scenes.js";
 import { answererOf, failed, host, main, page, panes, start, tell, variantOf } from "./state.js";
 import { choosePanes } from "./variants.js";
 
@@ -61,6 +62,7 @@ export function attachHands() {
   $("keep").addEventListener("click", keepAnswer);
   attachEditing();
   attachPath();
+  attachScenes();
   $("mode").addEventListener("change", restyle);
   const thresholdChanged = () => {
     $("threshold-at").disabled = !$("threshold-on").checked;
