@@ -220,7 +220,7 @@ class ViewerScene(ShownScene):
         return kept
 
     def _remaining(self, removed: str) -> Gaussians:
-        """Return all Gaussians, with invisible ones in place of removed ones, so that rows keep their numbers."""
+        """Return all Gaussians, removed ones invisible: rows keep their numbers."""
         return faded(self.gaussians, ~self.marked(removed)) if removed else self.gaussians
 
     def spz(self, rows: np.ndarray) -> bytes:
