@@ -73,10 +73,8 @@ def answer(
     drawn = list(dict.fromkeys([*([view] if view else []), *best]))[:views]
     restriction = "" if view is None else f", in view {view}"
     query_panel(scene, text, nodes, drawn, panel, note=restriction + note, answerer=answerer)
-    group, rows = (
-        NodeGroup.of(text, scene.hits_of(nodes, len(nodes.ids))),
-        scene.views.gaussians_of(nodes.ids),
-    )
+    rows = scene.views.gaussians_of(nodes.ids)
+    group = NodeGroup.of(text, scene.hits_of(nodes, len(nodes.ids)))
     comments = label_comments([group], scene.name_of)
     write_selection_ply(finished.parts.gaussians, rows, selection, np.ones(len(rows), np.int32), comments)
     yield f"wrote {panel} and {selection.name}"

@@ -127,7 +127,8 @@ def within(
     region = np.zeros((height, width), np.uint8)
     corners = np.rint(16 * (np.array(points) - 0.5)).astype(np.int32)  # OpenCV: pixel centres are integers
     if radius:
-        cv2.polylines(region, [corners], False, 1, max(1, round(2 * radius)), cv2.LINE_8, shift=4)
+        line = np.concatenate([corners[:1], corners])  # a single point is not a line
+        cv2.polylines(region, [line], False, 1, max(1, round(2 * radius)), cv2.LINE_8, shift=4)
     else:
         cv2.rectangle(region, corners[0], corners[-1], 1, cv2.FILLED, cv2.LINE_8, shift=4)
     pose = camera.cam_from_world

@@ -16,7 +16,7 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 
-from hilsplat.base.errors import HilsplatError
+from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.query.hits import NodeGroup, label_comments
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.splat.gaussians import morton_order
@@ -132,6 +132,8 @@ def _rows(shown: ViewerScene, asked: wire.Selection) -> tuple[np.ndarray, np.nda
     """Return the rows and labels of `exports.labelled` without removed Gaussians."""
     rows, labels = exports.labelled(*_selected(shown, asked))
     kept = ~shown.marked(asked.removed)[rows]
+    if not kept.any():
+        raise SettingsError("no Gaussian remains to be saved", fix="undo the removal, or select other nodes")
     return rows[kept], labels[kept]
 
 

@@ -252,7 +252,7 @@ class ViewerScene(ShownScene):
             paint = Paint.of(style, scene.tree.node_of_gaussian, len(scene.tree), relevancy)
         else:
             paint = Paint.plain(len(self.gaussians))
-        return paint.marking(self.marked(style.marked))
+        return paint.marking(self.marked(style.marked)) if style.marked else paint
 
     def warm_up(self) -> None:
         """Compile the loops of rendering, picking and masks before the page opens."""

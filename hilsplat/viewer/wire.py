@@ -13,6 +13,7 @@ from hilsplat.query.hits import NodeGroup
 from hilsplat.scene.cameras import Camera
 from hilsplat.web.messages import MAX_SIDE_PX, Message
 
+Place = Annotated[float, Field(ge=-4 * MAX_SIDE_PX, le=4 * MAX_SIDE_PX)]
 Row3 = tuple[float, float, float]
 Row4 = tuple[float, float, float, float]
 LevelName = Literal["auto", "whole", "part", "subpart"]
@@ -168,8 +169,8 @@ class Region(Asked):
     """
 
     camera: WireCamera
-    points: Annotated[tuple[tuple[float, float], ...], Field(min_length=1, max_length=10_000)]
-    radius: Annotated[float, Field(ge=0, le=MAX_SIDE_PX)] = 0
+    points: Annotated[tuple[tuple[Place, Place], ...], Field(min_length=1, max_length=10_000)]
+    radius: Annotated[float, Field(ge=0, le=MAX_SIDE_PX)] = 0.0
     style: Style = Style()
 
 

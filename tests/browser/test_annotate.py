@@ -352,7 +352,7 @@ def test_undo_works_in_the_text_box_once_its_text_is_saved(page, tmp_path):
     assert [label.text for label in kept(tmp_path)] == ["mug"]
 
 
-def test_the_page_shows_the_saved_scores(annotating, own_desk):
+def test_the_page_shows_the_saved_scores(own_desk, annotating):
     write_csv(own_desk / "scores.csv", ("method", "mIoU", "protocol"), [("tree", "65.0", "lerf/langsplat@2")])
     assert annotating(own_desk).get_by_text("mIoU: tree 65.0 % (lerf/langsplat@2).").is_visible()
 

@@ -100,7 +100,7 @@ def test_a_threshold_cuts_the_colours_and_counts_the_gaussians_above(opened, des
     assert "least=0.9" in page.url
 
 
-def test_another_scene_opens_on_the_same_server(served, desk_project, tmp_path):
+def test_another_scene_opens_on_the_same_server(desk_project, tmp_path, served):
     shutil.copytree(desk_project / "models", tmp_path / "models")
     for name in ("desk", "other"):
         shutil.copytree(desk_project / SCENE, tmp_path / "results/photos" / name)

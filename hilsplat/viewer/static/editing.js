@@ -53,6 +53,8 @@ function changed() {
 
 function showCounts() {
   const selected = count(SELECTED), removed = count(REMOVED);
+  $("save-scene").hidden = !removed;
+  $("save-scene").textContent = `Without ${counted(removed, "removed Gaussian")}`;
   $("edit-told").textContent = `${selected.toLocaleString("en")} selected, ${removed.toLocaleString("en")} removed of ${counted(marks.length, "Gaussian")}`;
   for (const id of ["edit-remove", "edit-crop", "edit-none"]) $(id).disabled = !selected;
   $("edit-undo").disabled = !done.length;

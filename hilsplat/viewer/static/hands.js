@@ -36,7 +36,7 @@ const MODES = ["tint", "ghost", "isolate", "plain"];
 export function attachHands() {
   const rested = () => setMoving(false);
   const drawing = (event) => event.altKey ? { draw: framed } : tool() !== "move" && event.button === 0 ? { draw, taps: tool() === "brush" } : null;
-  const touch = attach(host, { camera: () => page.camera, changed: touched, rested, tapped: (x, y) => { if (!tappedFrustum(x, y)) tapped(x, y); }, tool: drawing, pointed: (x, y) => { placeBrush(x, y); pointed(x, y); } });
+  const touch = attach(host, { camera: () => page.camera, changed: touched, rested, tapped: (x, y) => { if (!tappedFrustum(x, y)) tapped(x, y); }, tool: drawing, pointed: (x, y) => { placeBrush(x, y); pointed(...(tool() === "move" ? [x, y] : [-1, -1])); } });
   const nudge = (work) => { work(); touch(); };
   const setLevel = (value) => { document.querySelector(`[name=level][value=${value}]`).checked = true; levelChanged(); };
   const levelChanged = () => { if (page.asked?.text && !api.offline) ask(true); else restyle(); };

@@ -63,7 +63,7 @@ def test_a_stroke_selects_what_is_within_its_radius():
     clear = np.abs(distance - radius) > 1.5  # the region is drawn in whole pixels
     np.testing.assert_array_equal(found[clear], (in_picture & (distance < radius))[clear])
     assert found.sum() > 50 and clear.mean() > 0.8
-    (single,) = np.flatnonzero(within(np.array([[0, 0, 1]], np.float32), camera, [(152.0, 101.0)], 4))
+    (single,) = np.flatnonzero(within(np.array([[0, 0, 1]], np.float32), camera, [(152.0, 101.0)], 4.0))
     assert single == 0
 
 
@@ -141,6 +141,8 @@ def test_selections_and_pages_leave_out_removed_gaussians(shown, client, left):
     vertex = PlyData.read(io.BytesIO(client.post("/api/export/ply", json=sent).content))["vertex"]
     np.testing.assert_array_equal(vertex["x"], shown.gaussians.means[rows[~removed[rows]], 0])
     assert len(decoded(client.post("/api/export/spz", json=sent).content)) == len(vertex)
+    gone = {**sent, "removed": bits(shown, left)}
+    assert client.post("/api/export/ply", json=gone).status_code == 422  # the mug is on the left
     _, page = in_steps(client, "page", removed=bits(shown, left))
     assert f'"gaussians":{(~left).sum()},'.encode() in page
 
