@@ -157,7 +157,7 @@ class OpenedScene(ShownScene):
         }
 
     def scores(self) -> str:
-        """Return the first mean scores of the last run in one line; empty if there are none."""
+        """Return the first mean scores that the last run saved, in one line; empty if there are none."""
         means = self.folder / "scores.csv"
         if not means.is_file():
             return ""

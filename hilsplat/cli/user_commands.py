@@ -4,7 +4,7 @@ import gc
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -212,6 +212,9 @@ def export(
         list[str] | None,
         typer.Option(help="with --as ply: leave out what matches a query, or a node's number; repeatable"),
     ] = None,
+    clean: Annotated[
+        bool, typer.Option("--clean", help="with --as ply: leave out Gaussians of no node, such as floaters")
+    ] = False,
     threads: Threads = 2,
 ) -> None:
     """Write a scene for other programs: tree, Gaussians, poses, LangSplat's features, or labels.
@@ -220,29 +223,23 @@ def export(
     """
     from hilsplat.base.ownership import replaced_folder
 
-    if (only or without) and form != "ply":
-        raise SettingsError("--only and --without are for --as ply", fix="add --as ply, or leave them out")
+    crop = {"only": only or [], "without": without or [], "clean": clean}
+    if any(crop.values()) and form != "ply":
+        raise SettingsError("--only, --without and --clean are for --as ply", fix="add --as ply")
     folder = scene_folder(scene, results)
     if out is not None:
         require_new_folder(out)
-        echo(_export(folder, form, variant, data_root, out, only or [], without or [], threads))
+        echo(_export(folder, form, variant, data_root, out, crop, threads))
         return
     out = folder / "export" / (form if variant == "default" else f"{form}-{variant}")
     with replaced_folder(out):
-        echo(_export(folder, form, variant, data_root, out, only or [], without or [], threads))
+        echo(_export(folder, form, variant, data_root, out, crop, threads))
 
 
 def _export(
-    folder: Path,
-    form: str,
-    variant: str,
-    data_root: Path,
-    out: Path,
-    only: list[str],
-    without: list[str],
-    threads: int,
+    folder: Path, form: str, variant: str, data_root: Path, out: Path, crop: dict[str, Any], threads: int
 ) -> str:
-    """Write an export, and return the line to print."""
+    """Write an export, and return the text to print; `crop` has the arguments of `remaining_rows`."""
     if form == "tree":
         from hilsplat.query.tree_picture import export_tree
 
@@ -251,11 +248,11 @@ def _export(
         from hilsplat.splat.coordinates import write_source_ply
 
         ply, rows, lines = out / "point_cloud.ply", None, list[str]()
-        if only or without:
+        if any(crop.values()):
             from hilsplat.query.cropped import remaining_rows
             from hilsplat.query.language_scene import open_scene
 
-            rows, lines = remaining_rows(open_scene(folder, variant, threads=threads), only, without)
+            rows, lines = remaining_rows(open_scene(folder, variant, threads=threads), **crop)
         number = write_source_ply(folder / "gaussians.ply", ply, rows)
         return "\n".join([*lines, f"wrote {number} Gaussians to {ply}"])
     from hilsplat.scene.scene import Scene

@@ -11,13 +11,14 @@ from hilsplat.query.language_scene import LanguageScene
 
 
 def remaining_rows(
-    scene: LanguageScene, only: Sequence[str], without: Sequence[str]
+    scene: LanguageScene, only: Sequence[str], without: Sequence[str], clean: bool
 ) -> tuple[Int64[np.ndarray, " g"], list[str]]:
-    """Return the rows of the Gaussians that remain, in ascending order, and a line of text for each argument.
+    """Return the rows of the Gaussians that remain, in ascending order, and a line of text for each removal.
 
     Args:
         only: queries, or numbers of nodes, whose Gaussians are kept; empty to keep all.
         without: queries, or numbers of nodes, whose Gaussians are removed.
+        clean: whether Gaussians that belong to no node are removed.
 
     Raises:
         SettingsError: nothing matches a query, a node doesn't exist, or no Gaussian remains.
@@ -29,6 +30,10 @@ def remaining_rows(
             rows, line = _found(scene, what)
             kept[rows] = keeps
             lines.append(f"{'only' if keeps else 'without'} {line}")
+    if clean:
+        loose = scene.views.loose
+        kept &= ~loose
+        lines.append(f"without {counted(int(loose.sum()), 'Gaussian')} of no node")
     if not kept.any():
         raise SettingsError("no Gaussian remains", fix="keep more, or remove less")
     return np.flatnonzero(kept), lines

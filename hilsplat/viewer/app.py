@@ -156,8 +156,9 @@ def _pick(shown: ViewerScene, asked: wire.Pick) -> dict[str, Any]:
 
 
 def _members(shown: ViewerScene, asked: wire.Members) -> bytes:
-    """Return one bit for each Gaussian: whether it belongs to one of the nodes."""
-    scene, members = shown.answering(asked.variant), np.zeros(len(shown.gaussians), np.bool_)
+    """Return one bit for each Gaussian: whether it belongs to one of the nodes, or to none."""
+    scene = shown.answering(asked.variant)
+    members = scene.views.loose if asked.loose else np.zeros(len(shown.gaussians), np.bool_)
     members[scene.views.gaussians_of([scene.existing_node(node) for node in asked.nodes])] = True
     return shown.bits_of(members)
 

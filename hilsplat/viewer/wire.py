@@ -154,9 +154,10 @@ class Pick(Edited):
 
 
 class Members(Asked):
-    """Nodes whose Gaussians are selected."""
+    """Nodes whose Gaussians are selected, or, with `loose`, the Gaussians that belong to no node."""
 
-    nodes: Nodes
+    nodes: Nodes = Field(default_factory=list)
+    loose: bool = False
 
 
 class Region(Asked):

@@ -12,6 +12,7 @@ from hilsplat.splat.ply import load_ply
 from hilsplat.viewer.frames import within
 from hilsplat.viewer.wire import WireCamera
 from tests.browser.conftest import ask_and_wait, keep, on_page, phone_fits, save, wire_camera
+from tests.unit.artifact_changes import loosen
 from tests.unit.splat.spz_reader import decoded
 
 
@@ -156,3 +157,13 @@ def test_the_edit_bar_fits_on_a_phone(opened, desk_address):
     page = opened(desk_address)
     edit(page)
     assert phone_fits(page)
+
+
+def test_loose_gaussians_are_selected_and_removed(own_desk, served):
+    loosen(own_desk, np.arange(100, 140))
+    page = served(own_desk)
+    edit(page)
+    page.get_by_role("button", name="Select loose").click()
+    assert counts(page) == (40, 0)
+    press(page, "Delete")
+    assert counts(page) == (0, 40)

@@ -46,7 +46,8 @@ def test_the_cameras_of_the_photographs_are_drawn_and_a_click_flies_there(
     assert apex == pytest.approx((x / z, y / z), abs=0.1)
     rim = shown.nth(4).get_attribute("d")[1:].split("Z")[0].split("L")
     corners = np.array([[float(value) for value in corner.split()] for corner in rim])
-    page.mouse.click(*(corners.mean(axis=0) + (view["x"], view["y"])))
+    x, y = corners.mean(axis=0)
+    page.mouse.click(view["x"] + x, view["y"] + y)
     page.wait_for_timeout(800)
     assert page.evaluate("hilsplat.camera.view") == 4
     page.get_by_role("button", name="cameras").click()

@@ -74,7 +74,11 @@ function select(packed, how) {
 async function selectNodes() {
   const nodes = page.chosen >= 0 ? [page.chosen] : groups().flatMap((group) => group.nodes);
   if (!nodes.length) { tell("Run a query or select a node first."); return; }
-  try { select(new Uint8Array(await api.members({ variant: variantOf(panes[0]), nodes })), $("how").value); } catch (error) { failed(error); }
+  await selectMembers({ nodes });
+}
+
+async function selectMembers(which) {
+  try { select(new Uint8Array(await api.members({ variant: variantOf(panes[0]), ...which })), $("how").value); } catch (error) { failed(error); }
 }
 
 // Show the region that is being drawn, and select the Gaussians in it once it is `finished`.
@@ -141,7 +145,7 @@ const remove = () => become((mark) => mark === SELECTED ? REMOVED : mark);
 const invert = () => become((mark) => mark === REMOVED ? mark : SELECTED - mark);
 export const undo = () => exchange(done, undone), redo = () => exchange(undone, done);
 const ACTIONS = {
-  "edit-nodes": selectNodes, "edit-invert": invert, "edit-none": () => become((mark) => mark === SELECTED ? 0 : mark), "edit-remove": remove,
+  "edit-nodes": selectNodes, "edit-loose": () => selectMembers({ loose: true }), "edit-invert": invert, "edit-none": () => become((mark) => mark === SELECTED ? 0 : mark), "edit-remove": remove,
   "edit-crop": () => become((mark) => mark === SELECTED ? 0 : REMOVED), "edit-undo": undo, "edit-redo": redo,
   "edit-save": () => { $("save").open = true; $("save").querySelector("[data-save=scene-ply]").focus(); },
 };

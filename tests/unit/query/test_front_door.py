@@ -28,7 +28,7 @@ from hilsplat.query.names import NO_FILE, NodeNames
 from hilsplat.query.scene_views import Opened
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.splat.ply import load_ply
-from tests.unit.artifact_changes import change_index, write_record
+from tests.unit.artifact_changes import change_index, loosen, write_record
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH
 from tests.unit.splat.spz_reader import decoded
 
@@ -212,13 +212,24 @@ def test_export_leaves_out_or_keeps_what_matches_a_query_or_a_node(desk, elsewhe
     exported("--without", "unicorn > rim", "doubtful")
     assert "doubtful: 'unicorn' may not be in the scene" in capsys.readouterr().out
     for words, message in (
-        (("--as", "tree", "--without", "book"), "--only and --without are for --as ply"),
+        (("--as", "tree", "--without", "book"), "--only, --without and --clean are for --as ply"),
+        (("--as", "tree", "--clean"), "--only, --without and --clean are for --as ply"),
         (("--as", "ply", "--without", "99"), "node 99 does not exist"),
         (("--as", "ply", "--only", "book", "--without", "book"), "no Gaussian remains"),
     ):
         with pytest.raises(SettingsError, match=message):
             run("export", str(desk), *words, "--out", "refused")
     assert not (elsewhere / "refused").exists()
+
+
+def test_a_clean_export_leaves_out_gaussians_of_no_node(copied, elsewhere, capsys):
+    loosen(copied, np.arange(100, 140))
+    (book,) = (scene := hilsplat.open_scene(copied)).query("book")
+    run("export", str(copied), "--as", "ply", "--clean", "--without", str(book.node), "--out", "clean")
+    assert "without 40 Gaussians of no node" in capsys.readouterr().out
+    gone = np.union1d(scene.views.gaussians_of([book.node]), np.arange(100, 140))
+    found = load_ply(elsewhere / "clean/point_cloud.ply").means
+    np.testing.assert_array_equal(found, np.delete(scene.gaussians.means, gone, axis=0))
 
 
 @pytest.mark.parametrize(

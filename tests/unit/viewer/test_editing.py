@@ -13,9 +13,11 @@ from hilsplat.scene.cameras import Camera
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import render
 from hilsplat.viewer.frames import within
+from hilsplat.viewer.viewer_scene import ViewerScene
+from tests.unit.artifact_changes import loosen
 from tests.unit.finished_desk import SCENE
 from tests.unit.splat.spz_reader import decoded
-from tests.unit.viewer.conftest import in_steps, wire_camera
+from tests.unit.viewer.conftest import browsing, in_steps, wire_camera
 
 
 def bits(shown, marked: np.ndarray) -> str:
@@ -75,6 +77,14 @@ def test_nodes_select_their_gaussians(shown, client):
     both = marked(shown, client.post("/api/members", json={"nodes": [mug.node, handle.node]}).content)
     assert both.sum() > found.sum()
     assert client.post("/api/members", json={"nodes": [99]}).status_code == 422
+
+
+def test_gaussians_of_no_node_are_selected(own_desk):
+    loosen(own_desk, np.arange(100, 140))
+    shown = ViewerScene(own_desk)
+    with browsing(shown) as client:
+        found = marked(shown, client.post("/api/members", json={"loose": True}).content)
+    np.testing.assert_array_equal(np.flatnonzero(found), np.arange(100, 140))
 
 
 def test_gaussians_that_the_style_hides_are_not_selected(shown, client, camera):
