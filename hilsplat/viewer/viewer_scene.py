@@ -172,6 +172,7 @@ class ViewerScene(ShownScene):
 
     def described(self) -> dict[str, Any]:
         state = {"variants": self.variants, "of": self.state, "folder": self.folder.name}
+        state["gaussians_sha256"] = self.splats_tag
         state["restart"] = shlex.join(["hilsplat", "view", str(self.folder)])
         return payload.described_scene(self.scene, self.gaussians) | state
 

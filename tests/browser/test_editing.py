@@ -167,3 +167,20 @@ def test_loose_gaussians_are_selected_and_removed(own_desk, served):
     assert counts(page) == (40, 0)
     press(page, "Delete")
     assert counts(page) == (0, 40)
+
+
+@pytest.mark.parametrize("painter", ["gl", "server"])
+def test_removed_gaussians_are_kept_over_a_reload_until_they_are_restored(opened, desk_address, painter):
+    page = opened(desk_address, painter)
+    edit(page)
+    use(page, "box")
+    drag(page, (21.5, 16.5), (29.5, 20.5))
+    press(page, "Delete")
+    page.wait_for_timeout(800)
+    page.reload()
+    page.locator("body[data-ready=yes]").wait_for()
+    assert counts(page) == (0, 32) and colour(page, 25, 18).max() < 40
+    page.get_by_role("button", name="Restore all").click()
+    assert counts(page) == (0, 0) and colour(page, 25, 18)[2] > 150
+    press(page, "Control+z")
+    assert counts(page) == (0, 32)

@@ -1,5 +1,5 @@
 // Removal of Gaussians, with undo: marks of selected and removed Gaussians, in the page's order. Files of the scene never
-// change; saved pictures and files leave out what is removed.
+// change; saved pictures and files leave out what is removed, and the browser keeps it until the Gaussians change.
 
 import * as api from "./api.js";
 import { paneAt } from "./choosing.js";
@@ -11,8 +11,9 @@ import { base64, wireStyle } from "./styles.js";
 
 const SELECTED = 1, REMOVED = 2;
 const LEAST_PX = 4, MOST_PX = 200;   // diameters of the brush
-let marks = new Uint8Array(0), done = [], undone = [], isSaved = true;
+let marks = new Uint8Array(0), done = [], undone = [], isKept = true;
 
+const key = () => `hilsplat removed of ${page.scene.name}`;
 export const isEditing = () => !$("edit").hidden;
 export const tool = () => isEditing() ? document.querySelector("[name=tool]:checked").value : "move";
 const count = (mark) => marks.reduce((sum, each) => sum + (each === mark), 0);
@@ -43,9 +44,8 @@ function bits(mark) {
 }
 
 function changed() {
-  const removed = bits(REMOVED);
-  if (removed !== page.removed) isSaved = !removed;
-  Object.assign(page, { removed, marked: bits(SELECTED) });
+  Object.assign(page, { removed: bits(REMOVED), marked: bits(SELECTED) });
+  try { localStorage.setItem(key(), `${page.scene.gaussians_sha256} ${page.removed}`); isKept = true; } catch { isKept = !page.removed; }
   page.painter.mark(marks);
   showCounts();
   restyle();
@@ -56,6 +56,7 @@ function showCounts() {
   $("save-scene").hidden = !removed;
   $("save-scene").textContent = `Without ${counted(removed, "removed Gaussian")}`;
   $("edit-told").textContent = `${selected.toLocaleString("en")} selected, ${removed.toLocaleString("en")} removed of ${counted(marks.length, "Gaussian")}`;
+  $("edit-restore").disabled = !removed;
   for (const id of ["edit-remove", "edit-crop", "edit-none"]) $(id).disabled = !selected;
   $("edit-undo").disabled = !done.length;
   $("edit-redo").disabled = !undone.length;
@@ -141,12 +142,23 @@ export function edit(open = !isEditing()) {
   showCounts();
 }
 
+// Remove what the browser has kept as removed from these Gaussians.
+export function restoreRemoved() {
+  let kept = ["", ""];
+  try { kept = (localStorage.getItem(key()) ?? " ").split(" "); } catch { /* a frame in another site's page may have no storage */ }
+  if (kept[0] !== page.scene.gaussians_sha256 || !kept[1]) return;
+  const packed = Uint8Array.from(atob(kept[1]), (letter) => letter.charCodeAt(0));
+  marks = Uint8Array.from({ length: page.scene.gaussians }, (_, row) => packed[row >> 3] >> (row & 7) & 1 ? REMOVED : 0);
+  changed();
+  edit(true);
+}
+
 const remove = () => become((mark) => mark === SELECTED ? REMOVED : mark);
 const invert = () => become((mark) => mark === REMOVED ? mark : SELECTED - mark);
 export const undo = () => exchange(done, undone), redo = () => exchange(undone, done);
 const ACTIONS = {
   "edit-nodes": selectNodes, "edit-loose": () => selectMembers({ loose: true }), "edit-invert": invert, "edit-none": () => become((mark) => mark === SELECTED ? 0 : mark), "edit-remove": remove,
-  "edit-crop": () => become((mark) => mark === SELECTED ? 0 : REMOVED), "edit-undo": undo, "edit-redo": redo,
+  "edit-crop": () => become((mark) => mark === SELECTED ? 0 : REMOVED), "edit-restore": () => become((mark) => mark === REMOVED ? 0 : mark), "edit-undo": undo, "edit-redo": redo,
   "edit-save": () => { $("save").open = true; $("save").querySelector("[data-save=scene-ply]").focus(); },
 };
 const KEYS = { b: () => setTool("box"), c: () => setTool("brush"), h: () => setTool("move"), i: invert, delete: remove, backspace: remove };
@@ -158,11 +170,9 @@ export function pressed(key) {
   return true;
 }
 
-export const saved = () => { isSaved = true; };
-
 export function attachEditing() {
   for (const [id, act] of Object.entries(ACTIONS)) $(id).addEventListener("click", act);
   for (const radio of document.querySelectorAll("[name=tool]")) radio.addEventListener("change", toolChanged);
   $("edit-button").addEventListener("click", () => edit());
-  window.addEventListener("beforeunload", (event) => { if (!isSaved) event.preventDefault(); });
+  window.addEventListener("beforeunload", (event) => { if (!isKept) event.preventDefault(); });
 }

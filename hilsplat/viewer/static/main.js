@@ -3,6 +3,7 @@
 import * as api from "./api.js";
 import { Camera } from "./camera.js";
 import { acts, paneAt, quickPick } from "./choosing.js";
+import { restoreRemoved } from "./editing.js";
 import { drawn, overlay, painted, redraw } from "./drawing.js";
 import { $, counted, make } from "./elements.js";
 import { stand } from "./flights.js";
@@ -51,6 +52,7 @@ async function begin() {
     }
   }
   page.painter = made;
+  if (!api.offline) restoreRemoved();
   redraw();
   if (api.offline) onlyWhatIsHere();
   if (page.scene.variants.length) {
