@@ -14,7 +14,7 @@ const LEAST_PX = 4, MOST_PX = 200;   // diameters of the brush
 let marks = new Uint8Array(0), done = [], undone = [], isKept = true;
 
 const key = () => `hilsplat removed of ${page.scene.name}`;
-export const isEditing = () => !$("edit").hidden;
+const isEditing = () => !$("edit").hidden;
 export const tool = () => isEditing() ? document.querySelector("[name=tool]:checked").value : "move";
 const count = (mark) => marks.reduce((sum, each) => sum + (each === mark), 0);
 
