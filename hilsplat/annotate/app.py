@@ -28,7 +28,9 @@ from hilsplat.annotate.labels import (
     write_labels,
 )
 from hilsplat.annotate.proposals import Clicks, Proposals
+from hilsplat.base.artifacts import rebuild_command
 from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError, first_line
+from hilsplat.base.tables import read_csv
 from hilsplat.datasets.images.isat import fill_polygons
 from hilsplat.scene.scene import Scene
 from hilsplat.web.file_changes import version_of
@@ -36,6 +38,9 @@ from hilsplat.web.guard import Guard
 from hilsplat.web.messages import Message
 from hilsplat.web.scene_thread import SceneThread, ShownScene
 from hilsplat.web.server import BYTES, Pages, answer, guarded, plain, read, serve, version_sent, view_name
+
+SCORES = 3
+"""Maximum number of mean scores that the page shows."""
 
 MAX_BODY_BYTES = 16 << 20
 """Maximum size of a request, enough for a COCO file of a whole scene."""
@@ -141,6 +146,7 @@ class OpenedScene(ShownScene):
             "of": self.state,
             "folder": str(self.labels),
             "restart": shlex.join([*words, "--data-root", str(self.labels.parents[2])]),
+            "scores": self.scores(),
             "proposes": self.proposals.of,
             "segments": self.clicks.name,
             "carries": self.proposals.gaussians is not None,
@@ -149,6 +155,22 @@ class OpenedScene(ShownScene):
                 for name in cameras.names
             ],
         }
+
+    def scores(self) -> str:
+        """Return the first mean scores that the last run saved, in one line; empty if there are none."""
+        means = self.folder / "scores.csv"
+        if not means.is_file():
+            return ""
+        try:
+            rows = [row for row in read_csv(means, None, rebuild_command(means)) if row.get("mIoU")]
+        except ArtifactError as error:
+            return first_line(error)
+        shown = [f"{row['method']} {row['mIoU']} % ({row['protocol']})" for row in rows[:SCORES]]
+        more = [f"all in {means.with_suffix('.md')}"] if len(rows) > SCORES else []
+        scored = means.stat().st_mtime
+        is_old = any(path.stat().st_mtime > scored for path in self.labels.glob("*.json"))
+        old = ["of earlier annotations: the next run updates them"] if is_old else []
+        return "; ".join([*shown, *more, *old]) if shown else ""
 
     def known(self) -> dict[str, list[Label]]:
         """Return the annotations of all annotated views."""

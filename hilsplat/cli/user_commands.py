@@ -4,7 +4,7 @@ import gc
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -198,12 +198,23 @@ def export(
             "labels: the scene's annotations in LERF-OVS format",
         ),
     ] = "tree",
-    variant: Annotated[str, typer.Option(help="variant, for tree and langsplat")] = "default",
+    variant: Annotated[str, typer.Option(help="variant, for tree, langsplat, --only, --without")] = "default",
     results: Results = Path("results"),
     data_root: DataRoot = Path(),
     out: Annotated[
         Path | None, typer.Option(help="new folder; default: export/FORM in the scene's folder (overwritten)")
     ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="with --as ply: write only what matches a query, or a node's number; repeatable"),
+    ] = None,
+    without: Annotated[
+        list[str] | None,
+        typer.Option(help="with --as ply: leave out what matches a query, or a node's number; repeatable"),
+    ] = None,
+    clean: Annotated[
+        bool, typer.Option("--clean", help="with --as ply: leave out Gaussians of no node, such as floaters")
+    ] = False,
     threads: Threads = 2,
 ) -> None:
     """Write a scene for other programs: tree, Gaussians, poses, LangSplat's features, or labels.
@@ -212,18 +223,23 @@ def export(
     """
     from hilsplat.base.ownership import replaced_folder
 
+    crop = {"only": only or [], "without": without or [], "clean": clean}
+    if any(crop.values()) and form != "ply":
+        raise SettingsError("--only, --without and --clean are for --as ply", fix="add --as ply")
     folder = scene_folder(scene, results)
     if out is not None:
         require_new_folder(out)
-        echo(_export(folder, form, variant, data_root, out, threads))
+        echo(_export(folder, form, variant, data_root, out, crop, threads))
         return
     out = folder / "export" / (form if variant == "default" else f"{form}-{variant}")
     with replaced_folder(out):
-        echo(_export(folder, form, variant, data_root, out, threads))
+        echo(_export(folder, form, variant, data_root, out, crop, threads))
 
 
-def _export(folder: Path, form: str, variant: str, data_root: Path, out: Path, threads: int) -> str:
-    """Write an export, and return the line to print."""
+def _export(
+    folder: Path, form: str, variant: str, data_root: Path, out: Path, crop: dict[str, Any], threads: int
+) -> str:
+    """Write an export, and return the text to print; `crop` has the arguments of `remaining_rows`."""
     if form == "tree":
         from hilsplat.query.tree_picture import export_tree
 
@@ -231,8 +247,14 @@ def _export(folder: Path, form: str, variant: str, data_root: Path, out: Path, t
     if form == "ply":
         from hilsplat.splat.coordinates import write_source_ply
 
-        ply = out / "point_cloud.ply"
-        return f"wrote {write_source_ply(folder / 'gaussians.ply', ply)} Gaussians to {ply}"
+        ply, rows, lines = out / "point_cloud.ply", None, list[str]()
+        if any(crop.values()):
+            from hilsplat.query.cropped import remaining_rows
+            from hilsplat.query.language_scene import open_scene
+
+            rows, lines = remaining_rows(open_scene(folder, variant, threads=threads), **crop)
+        number = write_source_ply(folder / "gaussians.ply", ply, rows)
+        return "\n".join([*lines, f"wrote {number} Gaussians to {ply}"])
     from hilsplat.scene.scene import Scene
 
     opened = Scene.load(folder / "scene")

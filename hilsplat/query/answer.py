@@ -4,12 +4,14 @@ import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from hilsplat.base.atomic import atomic_folder, atomic_path
 from hilsplat.base.levels import LEVELS, PATH_SEPARATOR, path_of
 from hilsplat.base.lineage import sha256_of_bytes
 from hilsplat.base.ownership import require_own_picture
 from hilsplat.base.progress import track
-from hilsplat.query.hits import Hit, counted, doubts_of
+from hilsplat.query.hits import Hit, NodeGroup, counted, doubts_of, label_comments
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.mask_files import mask_files
 from hilsplat.query.node_search import NodeHits
@@ -71,16 +73,18 @@ def answer(
     drawn = list(dict.fromkeys([*([view] if view else []), *best]))[:views]
     restriction = "" if view is None else f", in view {view}"
     query_panel(scene, text, nodes, drawn, panel, note=restriction + note, answerer=answerer)
-    write_selection_ply(finished.parts.gaussians, scene.views.gaussians_of(nodes.ids), selection)
+    rows = scene.views.gaussians_of(nodes.ids)
+    group = NodeGroup.of(text, scene.hits_of(nodes, len(nodes.ids)))
+    comments = label_comments([group], scene.name_of)
+    write_selection_ply(finished.parts.gaussians, rows, selection, np.ones(len(rows), np.int32), comments)
     yield f"wrote {panel} and {selection.name}"
     if spz:
-        rows = scene.views.gaussians_of(nodes.ids)
         ordered = rows[morton_order(scene.gaussians.means[rows])]
         with atomic_path(compressed) as temporary:
             temporary.write_bytes(spz_bytes(scene.gaussians, ordered, fractional_bits(scene.gaussians)))
         yield f"wrote {compressed}"
     if masks is not None:
-        of_views = mask_files(scene, [(text, nodes.ids.tolist())])
+        of_views = mask_files(scene, [group])
         with atomic_folder(masks) as temporary:
             for files in track(of_views, "masks of views", len(scene.views.names)):
                 for name, data in files.items():

@@ -1,5 +1,6 @@
 """Answers as users see them: the node, its position, its best views and any doubts."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -100,6 +101,45 @@ class Hit(Node):
 
     def __repr__(self) -> str:
         return f"{super().__repr__()[:-1]}, score {self.score:.2f})"
+
+
+@dataclass(frozen=True)
+class NodeGroup:
+    """Named nodes in saved files: the answers to a query, or a selection.
+
+    Attributes:
+        nodes: rows of the semantic tree.
+        scores: score of each node; empty if the nodes are not answers.
+        doubts: doubts about the answers.
+    """
+
+    name: str
+    nodes: tuple[int, ...]
+    scores: tuple[float, ...] = ()
+    doubts: tuple[str, ...] = ()
+
+    @staticmethod
+    def of(text: str, hits: Sequence[Hit]) -> "NodeGroup":
+        """Return the answers to a query."""
+        nodes, scores = tuple(hit.node for hit in hits), tuple(round(hit.score, 4) for hit in hits)
+        return NodeGroup(text, nodes, scores, tuple(str(doubt) for doubt in hits[0].doubts) if hits else ())
+
+    def score_of(self, node: int) -> float | None:
+        """Return the score of a node of the group, or None if the nodes are not answers."""
+        return self.scores[self.nodes.index(node)] if self.scores else None
+
+
+def label_comments(groups: Sequence[NodeGroup], name_of: Callable[[int], str]) -> list[str]:
+    """Return comments for a PLY whose labels number the groups from 1: names, nodes, scores and doubts."""
+    comments = []
+    for number, group in enumerate(groups, 1):
+        comments.append(f"label {number}: {group.name}")
+        for node in group.nodes:
+            score = group.score_of(node)
+            named = f"label {number}, node {node}: {name_of(node) or '?'}"
+            comments.append(named if score is None else f"{named}, score {score:.4f}")
+        comments += [f"label {number}, doubtful: {doubt}" for doubt in group.doubts]
+    return comments
 
 
 def doubts_of(hits: NodeHits) -> tuple[Doubt, ...]:

@@ -7,21 +7,22 @@ from pathlib import Path
 
 from PIL import Image
 
+from hilsplat.query.hits import NodeGroup
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.web.coco import coco_content, coco_region
 
 
-def mask_files(
-    scene: LanguageScene, groups: Sequence[tuple[str, Sequence[int]]]
-) -> Iterator[dict[str, bytes]]:
+def mask_files(scene: LanguageScene, groups: Sequence[NodeGroup]) -> Iterator[dict[str, bytes]]:
     """Yield the files of each view by relative path: `<view>/<node>.png` for each node that it shows.
 
-    The last view's files include `coco.json`. Groups (name, nodes) are the COCO categories; a node in several
-    groups has one annotation per group.
+    The last view's files include `coco.json`. Groups are the COCO categories, with their doubts; a node in
+    several groups has one annotation per group, with the node's name and score.
     """
-    nodes = sorted({node for _, members in groups for node in members})
+    nodes = sorted({node for group in groups for node in group.nodes})
     views, description = scene.views.names, f"{scene.scene.name}: masks of nodes, by hilsplat"
-    coco = coco_content(description, views, scene.scene.cameras, [name for name, _ in groups])
+    coco = coco_content(description, views, scene.scene.cameras, [group.name for group in groups])
+    for category, group in zip(coco["categories"], groups, strict=True):
+        category["doubts"] = group.doubts
     for number, view in enumerate(views):
         files = {}
         for node in nodes:
@@ -31,11 +32,12 @@ def mask_files(
             png = io.BytesIO()
             Image.fromarray(mask).save(png, format="PNG")
             files[f"{Path(view).stem}/{node}.png"] = png.getvalue()
-            region = {"image_id": number, "node": node, **coco_region(mask)}
-            for category, (_, members) in enumerate(groups, 1):
-                if node in members:
+            region = {"image_id": number, "node": node, "name": scene.name_of(node), **coco_region(mask)}
+            for category, group in enumerate(groups, 1):
+                if node in group.nodes:
                     ids = {"id": len(coco["annotations"]) + 1, "category_id": category}
-                    coco["annotations"].append({**ids, **region})
+                    scored = {} if group.score_of(node) is None else {"score": group.score_of(node)}
+                    coco["annotations"].append({**ids, **region, **scored})
         if number == len(views) - 1:
             files["coco.json"] = json.dumps(coco, ensure_ascii=False).encode()
         yield files

@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64, UInt8
 
 from hilsplat.base.errors import SettingsError
-from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.scene.scene import Scene
@@ -150,6 +150,11 @@ class SceneViews:
     def gaussians_of(self, ids: Nodes) -> Int64[np.ndarray, " g"]:
         """Return the rows of `gaussians.ply` that belong to any of the nodes."""
         return np.flatnonzero(np.isin(self.tree.node_of_gaussian, np.asarray(ids)).any(axis=1))
+
+    @property
+    def loose(self) -> Bool[np.ndarray, " N"]:
+        """Gaussians that belong to no node at any level, such as floaters."""
+        return (self.tree.node_of_gaussian == NONE).all(axis=1)
 
     def node_masks(self, view: View, ids: Nodes) -> Bool[np.ndarray, "H W"]:
         """Return the pixels in which the nodes' Gaussians have more than half of the total weight."""

@@ -52,18 +52,17 @@ def write_selection_ply(
     rows: Int64[np.ndarray, " g"],
     out: Path,
     labels: Int32[np.ndarray, " g"] | None = None,
-    names: Sequence[str] = (),
+    comments: Sequence[str] = (),
 ) -> None:
     """Copy selected Gaussians from a 3DGS PLY, such as the answer to a query.
 
     Args:
         labels: label of each Gaussian, counted from 1; written as the property `label`.
-        names: name of each label; the header gets one comment per label, such as `label 1: mug`.
+        comments: lines of the header, such as `label 1: mug`.
     """
     # PLY headers are ASCII, and a comment is one line.
-    plain = [" ".join(name.split()).encode("ascii", "backslashreplace").decode() for name in names]
-    comments = [f"label {number + 1}: {name}" for number, name in enumerate(plain)]
-    _write(gaussians_ply, rows, {} if labels is None else {"label": labels}, out, comments)
+    plain = [" ".join(comment.split()).encode("ascii", "backslashreplace").decode() for comment in comments]
+    _write(gaussians_ply, rows, {} if labels is None else {"label": labels}, out, plain)
 
 
 def _write(

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int64
 from scipy.special import sph_harm_y
 
 from hilsplat.base.artifacts import read_json, run_command, write_json
@@ -14,7 +14,7 @@ from hilsplat.base.lineage import require_as_written, require_made_from, sha256_
 from hilsplat.base.rotations import are_rotations, multiply, quaternion_of
 from hilsplat.scene.importers.nerfstudio import source_from_dataparser
 from hilsplat.scene.scene import Scene
-from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.ply import import_ply, load_ply, save_ply
 
 logger = logging.getLogger(__name__)
@@ -193,11 +193,18 @@ def import_gaussians(
     return move_gaussians(gaussians, transform), origin
 
 
-def write_source_ply(ply: Path, out: Path) -> int:
-    """Write a scene's Gaussians in the coordinates of the scene's source, and return their number."""
+def write_source_ply(ply: Path, out: Path, rows: Int64[np.ndarray, " g"] | None = None) -> int:
+    """Write a scene's Gaussians in the coordinates of the scene's source, and return their number.
+
+    Args:
+        rows: the Gaussians to write; None writes all.
+    """
     source_from_scene = read_source_from_scene(ply)
     if source_from_scene is None:
         raise ArtifactError(f"{ply.with_suffix('.json')} is missing", fix=run_command(ply))
-    gaussians = move_gaussians(load_ply(ply), source_from_scene)
+    gaussians = load_ply(ply)
+    if rows is not None:
+        gaussians = Gaussians(*(getattr(gaussians, name)[rows] for name in FIELDS))
+    gaussians = move_gaussians(gaussians, source_from_scene)
     save_ply(out, gaussians)
     return len(gaussians)

@@ -20,8 +20,8 @@ from hilsplat.base.errors import ImageError, SettingsError
 from hilsplat.base.images import read_image
 from hilsplat.query.names import write_names
 from hilsplat.query.tree_picture import crop
-from hilsplat.viewer import payload, wire
-from hilsplat.viewer.frames import painted, pick
+from hilsplat.viewer import exports, payload, wire
+from hilsplat.viewer.frames import painted, pick, within
 from hilsplat.viewer.openapi import description
 from hilsplat.viewer.saved_files import SavedFiles
 from hilsplat.viewer.viewer_scene import ViewerScene
@@ -43,10 +43,15 @@ from hilsplat.web.server import (
 
 
 class Viewer:
-    """Request handlers of the viewer page for one scene."""
+    """Request handlers of the viewer page.
 
-    def __init__(self, shown: ViewerScene) -> None:
-        self.thread = SceneThread(shown)
+    Args:
+        shown: the scene that the page opens with.
+        others: whether the page may open the other scenes of the results folder.
+    """
+
+    def __init__(self, shown: ViewerScene, *, others: bool = True) -> None:
+        self.thread = SceneThread(shown, shown.beside if others else None)
         self.pages = Pages("index.html", "hilsplat.viewer")
 
     def app(self, token: str, *, embedded: bool = False) -> Guard:
@@ -55,6 +60,7 @@ class Viewer:
         routes = [
             *self.pages.routes(),
             *self.thread.routes(),
+            get("/api/scenes", _scenes),
             get("/api/variant/{variant}", _variant),
             Route("/api/splats/{chunk:int}", self._splats),
             get("/api/nodes/{variant}", _nodes),
@@ -63,12 +69,15 @@ class Viewer:
             post("/api/like", wire.Like, _like),
             post("/api/field", wire.FieldRelevancy, _field),
             post("/api/pick", wire.Pick, _pick),
+            post("/api/members", wire.Members, _members),
+            post("/api/within", wire.Region, _within),
             post("/api/frame", wire.Frame, _frame),
+            post("/api/path", wire.Film, _path),
             Route("/api/names", self._names, methods=["PUT"]),
             *SavedFiles(self.thread, self.pages.static).routes(),
         ]
         routes.append(Route("/openapi.json", lambda request: answer(description(routes))))
-        return guarded(routes, token, embedded=embedded)
+        return guarded(routes, token, wire.MAX_BODY_BYTES, embedded=embedded)
 
     async def _splats(self, request: Request) -> Response:
         """Send a chunk of the Gaussians as SPZ."""
@@ -91,6 +100,11 @@ class Viewer:
             return {"version": names.version, "names": dict(names.of_node)}
 
         return answer(await self.thread.do(request, write))
+
+
+def _scenes(shown: ViewerScene, path: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the scenes of the results folder, with the state and date of `hilsplat scenes`."""
+    return shown.listed()
 
 
 def _variant(shown: ViewerScene, path: Mapping[str, Any]) -> dict[str, Any]:
@@ -136,15 +150,38 @@ def _pick(shown: ViewerScene, asked: wire.Pick) -> dict[str, Any]:
     """Return the nodes at a pixel of a camera, with their shares."""
     has_tree = asked.variant in shown.variants
     of_gaussian = shown.answering(asked.variant).tree.node_of_gaussian if has_tree else None
-    picked = pick(shown.gaussians, of_gaussian, asked.camera.camera(), asked.x, asked.y, shown.threads)
+    gaussians = shown.remaining(asked.removed)
+    picked = pick(gaussians, of_gaussian, asked.camera.camera(), asked.x, asked.y, shown.threads)
     return picked or {"nodes": [], "alpha": 0}
+
+
+def _members(shown: ViewerScene, asked: wire.Members) -> bytes:
+    """Return one bit for each Gaussian: whether it belongs to one of the nodes, or to none."""
+    scene = shown.answering(asked.variant)
+    members = scene.views.loose if asked.loose else np.zeros(len(shown.gaussians), np.bool_)
+    members[scene.views.gaussians_of([scene.existing_node(node) for node in asked.nodes])] = True
+    return shown.bits_of(members)
+
+
+def _within(shown: ViewerScene, asked: wire.Region) -> bytes:
+    """Return one bit for each Gaussian: whether its centre is in a region of a picture."""
+    found = within(shown.gaussians.means, asked.camera.camera(), asked.points, asked.radius)
+    paint = shown.paint(asked.variant, asked.style)
+    if paint is not None and paint.mode == "isolate":
+        found &= paint.share > 0
+    return shown.bits_of(found)
 
 
 def _frame(shown: ViewerScene, asked: wire.Frame) -> Response:
     """Return a picture of the scene."""
     paint = shown.paint(asked.variant, asked.style)
-    pixels = painted(shown.gaussians, asked.camera.camera(), paint, shown.threads)
+    pixels = painted(shown.remaining(asked.removed), asked.camera.camera(), paint, shown.threads)
     return plain(encoded(pixels, asked.image, asked.quality), f"image/{asked.image}")
+
+
+def _path(shown: ViewerScene, asked: wire.Film) -> list[dict[str, Any]]:
+    """Return the cameras of a film's frames."""
+    return [payload.described_camera(camera) for camera in exports.flight(asked, shown.scene)]
 
 
 def _picture(text: str) -> np.ndarray:
@@ -217,4 +254,6 @@ def show(
         proxy: address containing `{port}` through which browsers on other machines reach a port of this
             machine, such as "/user/me/proxy/{port}/" on a JupyterHub.
     """
-    return EmbeddedViewer(Viewer(ViewerScene(Path(folder), variant, threads)), text, height, proxy)
+    return EmbeddedViewer(
+        Viewer(ViewerScene(Path(folder), variant, threads), others=False), text, height, proxy
+    )

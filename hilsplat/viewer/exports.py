@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Int32, Int64
 from PIL import Image
 
+from hilsplat.query.hits import NodeGroup
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.mask_files import mask_files
 from hilsplat.scene.cameras import Camera
@@ -18,7 +19,7 @@ from hilsplat.semantic_tree.export import write_selection_ply
 from hilsplat.splat.flyaround import FRAMES_PER_S, closed_path, encoded_film, open_path
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.viewer.frames import Paint, painted
-from hilsplat.viewer.wire import Film, Group
+from hilsplat.viewer.wire import Film
 
 STEP = {"mp4": 1, "gif": 2}
 """Frame step of each format. GIFs use every second frame; with all frames, they are far larger than MP4s."""
@@ -28,7 +29,7 @@ Steps = Generator[tuple[int, int], None, bytes]
 
 
 def labelled(
-    scene: LanguageScene, groups: Sequence[Group]
+    scene: LanguageScene, groups: Sequence[NodeGroup]
 ) -> tuple[Int64[np.ndarray, " g"], Int32[np.ndarray, " g"]]:
     """Return the rows of all groups' Gaussians in ascending order, and each row's group, numbered from 1.
 
@@ -42,21 +43,25 @@ def labelled(
     return rows, label[rows]
 
 
-def selection_ply(gaussians_ply: Path, scene: LanguageScene, groups: Sequence[Group]) -> bytes:
-    """Return the groups' Gaussians as a 3DGS PLY, with group labels."""
-    rows, labels = labelled(scene, groups)
+def ply(
+    gaussians_ply: Path,
+    rows: Int64[np.ndarray, " g"],
+    labels: Int32[np.ndarray, " g"] | None = None,
+    comments: Sequence[str] = (),
+) -> bytes:
+    """Return Gaussians as a 3DGS PLY; for labels and comments, see `write_selection_ply`."""
     with TemporaryDirectory() as folder:
         out = Path(folder) / "selection.ply"
-        write_selection_ply(gaussians_ply, rows, out, labels, [group.name for group in groups])
+        write_selection_ply(gaussians_ply, rows, out, labels, comments)
         return out.read_bytes()
 
 
-def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
+def masks_zip(scene: LanguageScene, groups: Sequence[NodeGroup]) -> Steps:
     """Make a ZIP of the groups' node masks in all views (`query.mask_files`)."""
     total, content = len(scene.views.names), io.BytesIO()
     yield 0, total
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
-        of_views = mask_files(scene, [(group.name, group.nodes) for group in groups])
+        of_views = mask_files(scene, groups)
         for done, files in enumerate(of_views, 1):
             for name, data in files.items():
                 if name.endswith(".png"):

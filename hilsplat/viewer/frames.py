@@ -1,10 +1,12 @@
 """Pictures and picked pixels, computed by the pipeline's own rasteriser."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int32, Int64, Num, UInt8
 from scipy.special import logit
 
 from cpusplat.blend import MAX_ALPHA, MIN_TRANSMITTANCE
@@ -24,6 +26,13 @@ TINT = np.float32(0.35)
 GHOST = np.float32(0.08)
 """Opacity factor of unselected Gaussians in `ghost` mode."""
 
+MARKED = np.array([255, 0, 160], np.float32) / 255
+MARKED_SHARE = np.float32(0.7)
+"""Colour of Gaussians selected for editing, and its weight; `styles.js` has the same numbers."""
+
+NEAR = 0.01
+"""Minimum depth of a Gaussian that can be selected, as in the rasteriser."""
+
 SEEN = 0.05
 """Minimum alpha of a pixel that can be picked."""
 
@@ -35,6 +44,16 @@ class Paint:
     rgb: Float32[np.ndarray, "N 3"]
     share: Float32[np.ndarray, " N"]
     mode: str
+
+    @staticmethod
+    def plain(count: int) -> "Paint":
+        """Return the scene's own colours."""
+        return Paint(np.zeros((count, 3), np.float32), np.zeros(count, np.float32), "plain")
+
+    def marking(self, marked: Bool[np.ndarray, " N"]) -> "Paint":
+        """Return the paint with Gaussians that are selected for editing in their colour."""
+        rgb = np.where(marked[:, None], MARKED, self.rgb)
+        return replace(self, rgb=rgb, share=np.where(marked, MARKED_SHARE, self.share))
 
     @staticmethod
     def of(
@@ -63,6 +82,12 @@ class Paint:
         return Paint(colours[:, :3], np.ascontiguousarray(colours[:, 3]), style.mode)
 
 
+def faded(gaussians: Gaussians, factor: Num[np.ndarray, " N"] | Bool[np.ndarray, " N"]) -> Gaussians:
+    """Multiply each opacity by a factor; a Gaussian with factor 0 is invisible."""
+    logits = logit(np.clip(gaussians.opacities * factor, 1e-13, 1 - 1e-6)).astype(np.float32)
+    return replace(gaussians, opacity_logits=logits)
+
+
 def painted(
     gaussians: Gaussians, camera: Camera, paint: Paint | None = None, threads: int = 1
 ) -> UInt8[np.ndarray, "H W 3"]:
@@ -77,9 +102,7 @@ def painted(
         return to_uint8(blend_forward(view, view.colours, threads)[0])
     others = paint.share == 0
     if paint.mode in ("ghost", "isolate"):
-        opacity = gaussians.opacities * np.where(others, GHOST if paint.mode == "ghost" else 0, 1)
-        logits = logit(np.clip(opacity, 1e-13, 1 - 1e-6)).astype(np.float32)
-        gaussians = replace(gaussians, opacity_logits=logits)
+        gaussians = faded(gaussians, np.where(others, GHOST if paint.mode == "ghost" else 0, 1))
     view = project_gaussians(gaussians, camera, degree, threads)
     colours = view.colours
     if paint.mode == "tint":
@@ -87,6 +110,36 @@ def painted(
     share = paint.share[:, None]
     colours = np.ascontiguousarray(colours * (1 - share) + paint.rgb * share, np.float32)
     return to_uint8(blend_forward(view, colours, threads)[0])
+
+
+def within(
+    means: Float32[np.ndarray, "N 3"],
+    camera: Camera,
+    points: Sequence[tuple[float, float]],
+    radius: float,
+) -> Bool[np.ndarray, " N"]:
+    """Return which points of the scene are projected into a region of a view, up to its pixels.
+
+    The region is a rectangle with two opposite corners (radius 0, first and last point), or all pixels within
+    `radius` of a line through `points`; all in px.
+    """
+    height, width = camera.size_hw
+    region = np.zeros((height, width), np.uint8)
+    corners = np.rint(16 * (np.array(points) - 0.5)).astype(np.int32)  # OpenCV: pixel centres are integers
+    if radius:
+        line = np.concatenate([corners[:1], corners])  # a single point is not a line
+        cv2.polylines(region, [line], False, 1, max(1, round(2 * radius)), cv2.LINE_8, shift=4)
+    else:
+        cv2.rectangle(region, corners[0], corners[-1], 1, cv2.FILLED, cv2.LINE_8, shift=4)
+    pose = camera.cam_from_world
+    in_camera = means.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
+    ahead = np.flatnonzero(in_camera[:, 2] > NEAR)
+    x, y, z = (in_camera[ahead] @ camera.K.T).T
+    column, row = np.floor(x / z), np.floor(y / z)
+    in_picture = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    inside = np.zeros(len(means), np.bool_)
+    inside[ahead[in_picture]] = region[row[in_picture].astype(int), column[in_picture].astype(int)] > 0
+    return inside
 
 
 def weights_at(

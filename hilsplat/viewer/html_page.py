@@ -32,7 +32,7 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
         SettingsError: a text is empty, or the variant cannot be queried.
         StaleSceneError: a part of the scene was rewritten since it was opened.
     """
-    scene = shown.answering(asked.variant)
+    scene, rows = shown.answering(asked.variant), shown.kept_rows(asked.removed)
     questions = [*asked.kept, *([asked.last] if asked.last else [])]
     with shown.unchanged():
         images = [resize_to_fit(scene.views.image(view), PHOTO_PX) for view in scene.views.names]
@@ -40,12 +40,13 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
         "scene": {
             **shown.described(),
             "variants": [asked.variant],
-            "chunk": len(shown.gaussians),
+            "gaussians": len(rows),
+            "chunk": len(rows),
             "restart": "",
         },
         "variant": shown.described_variant(asked.variant),
         "asked": [question.model_dump(exclude_none=True) for question in questions],
-        "answers": [payload.answer(scene, question) for question in questions],
+        "answers": [payload.answer(scene, question, asked.answerer) for question in questions],
         "kept": len(asked.kept),
         "photos": [_text(encoded(image, quality=75)) for image in images],
         "opening": asked.start,
@@ -75,8 +76,8 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
     parts = {
         "data": as_json(described).decode(),
         "sorter": sorter,
-        "splats": _text(shown.spz(shown.order)),
-        "nodes": _text(payload.packed_nodes(scene.tree, shown.order)),
+        "splats": _text(shown.spz(rows)),
+        "nodes": _text(payload.packed_nodes(scene.tree, rows)),
     }
     data = "\n".join(
         f'<script type="text/plain" id="{name}">{_inert(text)}</script>' for name, text in parts.items()

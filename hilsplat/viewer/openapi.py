@@ -62,7 +62,8 @@ def description(routes: Sequence[Route]) -> dict[str, Any]:
             "title": "hilsplat view",
             "version": "1",
             "description": "Open the printed address first: it sets the cookie that every request needs. A "
-            "POST request also needs the header Origin: http://HOST, with the host of the address.",
+            "POST request also needs the header Origin: http://HOST, with the host of the address. Requests "
+            "about another scene of the results folder add ?scene=DATASET/SCENE.",
         },
         "paths": paths,
         "components": {"schemas": schemas},

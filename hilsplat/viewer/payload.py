@@ -10,14 +10,14 @@ from jaxtyping import Float32, Float64, Int64
 from typing_extensions import TypedDict  # pydantic needs this class before Python 3.12
 
 from hilsplat.base.levels import LEVELS, path_of
-from hilsplat.query.hits import Hit, doubts_of
+from hilsplat.query.hits import Hit, NodeGroup, doubts_of
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.scene_views import upright
-from hilsplat.scene.cameras import Cameras
+from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import OrientedBox, SemanticTree
 from hilsplat.splat.gaussians import Gaussians, morton_order
-from hilsplat.viewer.wire import Group, Question
+from hilsplat.viewer.wire import Question
 from hilsplat.web.server import view_name
 
 CHUNK = 65_536
@@ -66,13 +66,17 @@ def described_scene(scene: Scene, gaussians: Gaussians) -> dict[str, Any]:
             {
                 "name": name,
                 "split": scene.split[name],
-                "size_hw": list(cameras[name].size_hw),
-                "K": cameras[name].K.tolist(),
-                "cam_from_world": cameras[name].cam_from_world.tolist(),
+                **described_camera(cameras[name]),
             }
             for name in cameras.names
         ],
     }
+
+
+def described_camera(camera: Camera) -> dict[str, Any]:
+    """Describe a camera in the format of `wire.WireCamera`."""
+    pose, K = camera.cam_from_world.tolist(), camera.K.tolist()
+    return {"cam_from_world": pose, "K": K, "size_hw": list(camera.size_hw)}
 
 
 def crossing(cameras: Cameras) -> Float64[np.ndarray, " 3"]:
@@ -211,7 +215,7 @@ def _answer(scene: LanguageScene, text: str, hits: Sequence[Hit], relevancy: np.
     }
 
 
-def boxes(scene: LanguageScene, groups: Sequence[Group]) -> dict[str, Any]:
+def boxes(scene: LanguageScene, groups: Sequence[NodeGroup]) -> dict[str, Any]:
     """Return node boxes for other programs; a node in several groups has one box per group."""
     tree = scene.tree
     return {
@@ -225,6 +229,8 @@ def boxes(scene: LanguageScene, groups: Sequence[Group]) -> dict[str, Any]:
                 "group": group.name,
                 "node": node,
                 "name": scene.name_of(node),
+                "score": group.score_of(node),
+                "doubts": group.doubts,
                 "level": int(tree.level[node]),
                 "parent": int(tree.parent[node]),
                 "centre": tree.oriented_box[node][0].tolist(),

@@ -10,12 +10,14 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
+import numpy as np
 from pydantic import BaseModel
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 
-from hilsplat.base.errors import HilsplatError
+from hilsplat.base.errors import HilsplatError, SettingsError
+from hilsplat.query.hits import NodeGroup, label_comments
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.splat.gaussians import morton_order
 from hilsplat.viewer import exports, payload, wire
@@ -39,6 +41,8 @@ class SavedFiles:
             post("/api/export/ply", wire.Selection, _ply),
             post("/api/export/spz", wire.Selection, _spz),
             post("/api/export/boxes", wire.Selection, _boxes),
+            post("/api/export/scene-ply", wire.Edited, _scene_ply),
+            post("/api/export/scene-spz", wire.Edited, _scene_spz),
             self._slow("/api/export/masks", wire.Selection, _masks),
             self._slow("/api/export/film", wire.Film, _film, self.films),
             self._slow("/api/export/page", wire.Page, partial(html_page, static=self.static)),
@@ -84,14 +88,28 @@ class SavedFiles:
 
 def _ply(shown: ViewerScene, asked: wire.Selection) -> bytes:
     """Return the Gaussians of nodes as a 3DGS PLY, with labels."""
-    selected = _selected(shown, asked)
+    scene, groups = _selected(shown, asked)
+    rows, labels = _rows(shown, asked)
     with shown.unchanged():
-        return exports.selection_ply(shown.folder / "gaussians.ply", *selected)
+        return exports.ply(shown.ply, rows, labels, label_comments(groups, scene.name_of))
 
 
 def _spz(shown: ViewerScene, asked: wire.Selection) -> bytes:
     """Return the Gaussians of nodes as SPZ."""
-    rows, _ = exports.labelled(*_selected(shown, asked))
+    rows, _ = _rows(shown, asked)
+    return shown.spz(rows[morton_order(shown.gaussians.means[rows])])
+
+
+def _scene_ply(shown: ViewerScene, asked: wire.Edited) -> bytes:
+    """Return the scene without removed Gaussians as a 3DGS PLY, with the values of the scene's PLY."""
+    rows = np.sort(shown.kept_rows(asked.removed))
+    with shown.unchanged():
+        return exports.ply(shown.ply, rows)
+
+
+def _scene_spz(shown: ViewerScene, asked: wire.Edited) -> bytes:
+    """Return the scene without removed Gaussians as SPZ."""
+    rows = np.sort(shown.kept_rows(asked.removed))
     return shown.spz(rows[morton_order(shown.gaussians.means[rows])])
 
 
@@ -106,16 +124,26 @@ def _masks(shown: ViewerScene, asked: wire.Selection) -> exports.Steps:
 
 def _film(shown: ViewerScene, asked: wire.Film) -> exports.Steps:
     cameras, paint = exports.flight(asked, shown.scene), shown.paint(asked.variant, asked.style)
-    return exports.film(shown.gaussians, cameras, paint, kind=asked.format, threads=shown.threads)
+    gaussians = shown.remaining(asked.removed)
+    return exports.film(gaussians, cameras, paint, kind=asked.format, threads=shown.threads)
 
 
-def _selected(shown: ViewerScene, asked: wire.Selection) -> tuple[LanguageScene, list[wire.Group]]:
+def _rows(shown: ViewerScene, asked: wire.Selection) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows and labels of `exports.labelled` without removed Gaussians."""
+    rows, labels = exports.labelled(*_selected(shown, asked))
+    kept = ~shown.marked(asked.removed)[rows]
+    if not kept.any():
+        raise SettingsError("no Gaussian remains to be saved", fix="undo the removal, or select other nodes")
+    return rows[kept], labels[kept]
+
+
+def _selected(shown: ViewerScene, asked: wire.Selection) -> tuple[LanguageScene, list[NodeGroup]]:
     """Return the variant and the groups; raise SettingsError if a node does not exist."""
     scene = shown.answering(asked.variant)
     for group in asked.groups:
         for node in group.nodes:
             scene.existing_node(node)
-    return scene, asked.groups
+    return scene, [group.group() for group in asked.groups]
 
 
 def _step(steps: exports.Steps) -> tuple[int, int] | bytes:

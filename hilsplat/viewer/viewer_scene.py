@@ -8,16 +8,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 
 from hilsplat.base.artifacts import read_index, run_command
-from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError
+from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError, first_line, nearest
 from hilsplat.base.lineage import sha256_of_file
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.names import NodeNames, tree_digest
+from hilsplat.query.scene_state import SceneState
 from hilsplat.query.scene_views import Opened
-from hilsplat.scene.finished import FinishedScene, SceneParts, finished_variants, require_scene_folder
+from hilsplat.scene.finished import (
+    FinishedScene,
+    SceneParts,
+    finished_variants,
+    require_scene_folder,
+    scenes_in,
+)
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.origin import masks_label
 from hilsplat.semantic_tree.tree import ViewNodes
@@ -26,8 +33,8 @@ from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 from hilsplat.splat.spz import fractional_bits, spz_bytes
 from hilsplat.viewer import payload
-from hilsplat.viewer.frames import Paint, painted, pick
-from hilsplat.viewer.wire import MAX_NODES, Style
+from hilsplat.viewer.frames import Paint, faded, painted, pick
+from hilsplat.viewer.wire import MAX_GAUSSIANS, MAX_NODES, Style, rows_of
 from hilsplat.web.scene_thread import ShownScene
 
 VIEWS_MIB = 256.0
@@ -38,10 +45,6 @@ CACHED_RELEVANCIES = 8
 
 ANSWERING = ("semantic_tree", "clip", "masks", "autoencoder", "field.safetensors")
 """Parts of a variant on which its answers depend."""
-
-MAX_GAUSSIANS = 10_000_000
-"""Maximum number of Gaussians; more do not fit in textures of 4096 x 16384 texels (degree 3: four texels per
-Gaussian) or a few GiB of memory."""
 
 logger = logging.getLogger(__name__)
 
@@ -61,7 +64,7 @@ class ViewerScene(ShownScene):
         super().__init__()
         self.folder, self.first, self.threads = Path(folder), variant, threads
         self.opened = Opened(VIEWS_MIB)
-        ply = self.folder / "gaussians.ply"
+        self.ply = ply = self.folder / "gaussians.ply"
         require_scene_folder(self.folder)
         if not ply.exists():
             raise ArtifactError(
@@ -83,9 +86,38 @@ class ViewerScene(ShownScene):
         self._variants: dict[str, tuple[SceneParts, LanguageScene]] = {}
         self.field_relevancy = lru_cache(CACHED_RELEVANCIES)(self._field_relevancy)
         self.paint = lru_cache(1)(self._paint)
+        self.remaining = lru_cache(1)(self._remaining)
 
     def opened_again(self) -> "ViewerScene":
         return ViewerScene(self.folder, self.first, self.threads)
+
+    @property
+    def results(self) -> Path:
+        """The results folder."""
+        return self.folder.absolute().parent.parent
+
+    def beside(self, name: str) -> "ViewerScene":
+        """Open another scene of the results folder; raise SettingsError if it has no such scene."""
+        if name not in (known := scenes_in(self.results)):  # reject anything but listed names, such as paths
+            raise SettingsError(f"{self.results} has no scene {name!r}", expected=nearest(name, known))
+        return ViewerScene(self.results / name, self.first, self.threads)
+
+    def listed(self) -> list[dict[str, Any]]:
+        """Return name, state and date of each scene of the results folder, and whether it can be shown."""
+        scenes = []
+        for name in scenes_in(self.results):
+            try:
+                state = SceneState.read(self.results / name)
+                told = {"state": state.state, "date": state.date}
+            except HilsplatError as error:
+                told = {"state": first_line(error), "date": ""}
+            folder = self.results / name
+            places = {
+                "can_open": (folder / self.ply.name).is_file(),
+                "current": folder == self.folder.absolute(),
+            }
+            scenes.append({"name": name, **told, **places})
+        return scenes
 
     def news(self) -> dict[str, Any]:
         names = {variant: scene.names.version for variant, (_, scene) in list(self._variants.items())}
@@ -140,6 +172,7 @@ class ViewerScene(ShownScene):
 
     def described(self) -> dict[str, Any]:
         state = {"variants": self.variants, "of": self.state, "folder": self.folder.name}
+        state["gaussians_sha256"] = self.splats_tag
         state["restart"] = shlex.join(["hilsplat", "view", str(self.folder)])
         return payload.described_scene(self.scene, self.gaussians) | state
 
@@ -168,6 +201,29 @@ class ViewerScene(ShownScene):
             raise SettingsError(f"chunk {number} does not exist", expected=f"0 to {num_chunks - 1}")
         return self.spz(self.order[number * payload.CHUNK : (number + 1) * payload.CHUNK])
 
+    def marked(self, bits: str) -> Bool[np.ndarray, " N"]:
+        """Return which rows of `gaussians.ply` the page marks; raise SettingsError if the bits do not fit."""
+        count = len(self.gaussians)
+        packed = rows_of(bits, 1, -(-count // 8)).ravel()
+        marked = np.zeros(count, np.bool_)
+        marked[self.order] = np.unpackbits(packed, count=count, bitorder="little")
+        return marked
+
+    def bits_of(self, marked: Bool[np.ndarray, " N"]) -> bytes:
+        """Return one bit for each Gaussian in the page's order, the inverse of `marked` before base64."""
+        return np.packbits(marked[self.order], bitorder="little").tobytes()
+
+    def kept_rows(self, removed: str) -> np.ndarray:
+        """Return the rows of the Gaussians that remain, in the page's order; raise SettingsError if none."""
+        kept = self.order[~self.marked(removed)[self.order]]
+        if not len(kept):
+            raise SettingsError("every Gaussian is removed", fix="undo, or restore some Gaussians")
+        return kept
+
+    def _remaining(self, removed: str) -> Gaussians:
+        """Return all Gaussians, removed ones invisible: rows keep their numbers."""
+        return faded(self.gaussians, ~self.marked(removed)) if removed else self.gaussians
+
     def spz(self, rows: np.ndarray) -> bytes:
         """Return the given Gaussians as SPZ."""
         return spz_bytes(self.gaussians, rows, self._bits)
@@ -176,7 +232,7 @@ class ViewerScene(ShownScene):
     def splats_tag(self) -> str:
         """Digest of the Gaussians, for the browser's cache."""
         with self.unchanged():
-            return self.opened.get(sha256_of_file, self.folder / "gaussians.ply")[:32]
+            return self.opened.get(sha256_of_file, self.ply)[:32]
 
     def _field_relevancy(self, variant: str, text: str, level: str) -> UInt8[np.ndarray, " N"]:
         """Return `FieldAnswers.gaussian_relevancy`, in steps of 1/255."""
@@ -189,11 +245,15 @@ class ViewerScene(ShownScene):
         Raises:
             SettingsError: the style does not fit the tree.
         """
-        if not style.table and not style.ramp:
+        if not (style.table or style.ramp or style.marked):
             return None
-        scene = self.answering(variant)
-        relevancy = self.field_relevancy(variant, style.text, style.level) if style.ramp else None
-        return Paint.of(style, scene.tree.node_of_gaussian, len(scene.tree), relevancy)
+        if style.table or style.ramp:
+            scene = self.answering(variant)
+            relevancy = self.field_relevancy(variant, style.text, style.level) if style.ramp else None
+            paint = Paint.of(style, scene.tree.node_of_gaussian, len(scene.tree), relevancy)
+        else:
+            paint = Paint.plain(len(self.gaussians))
+        return paint.marking(self.marked(style.marked)) if style.marked else paint
 
     def warm_up(self) -> None:
         """Compile the loops of rendering, picking and masks before the page opens."""

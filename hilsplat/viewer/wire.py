@@ -9,17 +9,30 @@ from pydantic import Field, field_validator, model_validator
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import MAX_TEXT
+from hilsplat.query.hits import NodeGroup
 from hilsplat.scene.cameras import Camera
 from hilsplat.web.messages import MAX_SIDE_PX, Message
 
+Place = Annotated[float, Field(ge=-4 * MAX_SIDE_PX, le=4 * MAX_SIDE_PX)]
 Row3 = tuple[float, float, float]
 Row4 = tuple[float, float, float, float]
 LevelName = Literal["auto", "whole", "part", "subpart"]
+Answerer = Literal["tree", "field"]
 
 MAX_NODES = 131_071
 """Maximum number of nodes that the page shows: the table of a style must fit into a request of 1 MiB."""
 
 Nodes = Annotated[list[Annotated[int, Field(ge=0)]], Field(max_length=MAX_NODES)]
+
+MAX_GAUSSIANS = 10_000_000
+"""Maximum number of Gaussians; more do not fit in textures of 4096 x 16384 texels (degree 3: four texels per
+Gaussian) or a few GiB of memory."""
+
+Bits = Annotated[str, Field(max_length=(MAX_GAUSSIANS // 8 // 3 + 1) * 4)]
+"""Base64 of one bit per Gaussian in the page's order, least significant bit first; empty if no bit is set."""
+
+MAX_BODY_BYTES = 4 << 20
+"""Maximum size of a request: the table of a style, and the marks of two sets of Gaussians."""
 
 
 class WireCamera(Message):
@@ -57,6 +70,7 @@ class Style(Message):
         use: whether each level is used; the finest used level with an alpha above 0 sets the colour.
         mode: style of Gaussians whose alpha is 0.
         ramp: base64 of 256 RGB colours; if given, colours show the field's relevancy to `text` at `level`.
+        marked: Gaussians that the user has selected for editing.
     """
 
     table: Annotated[str, Field(max_length=6 * (MAX_NODES + 1))] = ""
@@ -65,6 +79,7 @@ class Style(Message):
     ramp: Annotated[str, Field(max_length=1024)] = ""
     text: str = ""
     level: LevelName = "auto"
+    marked: Bits = ""
 
     @model_validator(mode="after")
     def _ramp_has_text(self) -> "Style":
@@ -74,14 +89,14 @@ class Style(Message):
 
 
 def rows_of(text: str, width: int, count: int) -> UInt8[np.ndarray, "count width"]:
-    """Return the rows of bytes stored in a style as base64; an empty string gives zeros."""
+    """Return the rows of bytes in a text of base64; an empty text gives zeros."""
     if not text:
         return np.zeros((count, width), np.uint8)
     try:
         return np.frombuffer(base64.b64decode(text, validate=True), np.uint8).reshape(count, width)
     except ValueError as error:
         raise SettingsError(
-            "the style is invalid",
+            "the colours or marks do not fit the scene",
             expected=f"base64 of {count} rows of {width} bytes",
             found=str(error),
             fix="reload the page",
@@ -92,6 +107,12 @@ class Asked(Message):
     """Base class of requests about one variant of the scene."""
 
     variant: Annotated[str, Field(max_length=100)] = "default"
+
+
+class Edited(Asked):
+    """Base class of requests about the scene without the Gaussians that the user has removed."""
+
+    removed: Bits = ""
 
 
 class Question(Message):
@@ -106,7 +127,7 @@ class Question(Message):
 class Query(Asked, Question):
     """A query of a variant's tree or field."""
 
-    answerer: Literal["tree", "field"] = "tree"
+    answerer: Answerer = "tree"
 
 
 class Like(Asked):
@@ -124,7 +145,7 @@ class FieldRelevancy(Asked):
     order: Literal["file", "page"] = "file"
 
 
-class Pick(Asked):
+class Pick(Edited):
     """A pixel of the page's picture."""
 
     camera: WireCamera
@@ -132,7 +153,29 @@ class Pick(Asked):
     y: float
 
 
-class Frame(Asked):
+class Members(Asked):
+    """Nodes whose Gaussians are selected, or, with `loose`, the Gaussians that belong to no node."""
+
+    nodes: Nodes = Field(default_factory=list)
+    loose: bool = False
+
+
+class Region(Asked):
+    """A region of the page's picture: a rectangle with two opposite corners, or a stroke of a round brush.
+
+    Attributes:
+        points: the corners, or the vertices of the stroke, px.
+        radius: radius of the brush, px; 0 for a rectangle.
+        style: style of the picture; Gaussians that it hides are not selected.
+    """
+
+    camera: WireCamera
+    points: Annotated[tuple[tuple[Place, Place], ...], Field(min_length=1, max_length=10_000)]
+    radius: Annotated[float, Field(ge=0, le=MAX_SIDE_PX)] = 0.0
+    style: Style = Style()
+
+
+class Frame(Edited):
     """A picture rendered by the server."""
 
     camera: WireCamera
@@ -141,7 +184,7 @@ class Frame(Asked):
     image: Literal["jpeg", "png"] = "jpeg"
 
 
-class Film(Asked):
+class Film(Edited):
     """A film along a tour of the training cameras, or along a path of cameras."""
 
     style: Style = Style()
@@ -152,13 +195,25 @@ class Film(Asked):
 
 
 class Group(Message):
-    """Named nodes: the answers to a query, or a selection."""
+    """Named nodes: the answers to a query, with their scores and doubts, or a selection (`NodeGroup`)."""
 
     name: Annotated[str, Field(max_length=MAX_TEXT)]
     nodes: Nodes
+    scores: Annotated[tuple[float, ...], Field(max_length=MAX_NODES)] = ()
+    doubts: Annotated[tuple[Annotated[str, Field(max_length=1000)], ...], Field(max_length=10)] = ()
+
+    @model_validator(mode="after")
+    def _a_score_for_each_node(self) -> "Group":
+        if self.scores and len(self.scores) != len(self.nodes):
+            raise ValueError("the number of scores differs from the number of nodes")
+        return self
+
+    def group(self) -> NodeGroup:
+        """Return the group as the package's type."""
+        return NodeGroup(self.name, tuple(self.nodes), self.scores, self.doubts)
 
 
-class Selection(Asked):
+class Selection(Edited):
     """Groups of nodes, which may overlap."""
 
     groups: Annotated[list[Group], Field(min_length=1, max_length=40)]
@@ -170,10 +225,11 @@ class Names(Asked):
     names: dict[int, Annotated[str, Field(max_length=200)]]
 
 
-class Page(Asked):
+class Page(Edited):
     """A page as one HTML file, with the answers to kept queries and to the last query."""
 
     kept: Annotated[tuple[Question, ...], Field(max_length=40)] = ()
     last: Question | None = None
+    answerer: Answerer = "tree"
     start: Annotated[str, Field(max_length=400, pattern=r"^(v\d+|[-+.,e\d]*)$")] = ""
     """Initial camera, in the format of the page's address; empty for the first photograph's camera."""

@@ -18,6 +18,7 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from hilsplat.base.artifacts import INDEX
+from hilsplat.base.errors import SettingsError
 from hilsplat.base.images import resize_to_fit
 from hilsplat.base.lineage import sha256_of_json
 from hilsplat.scene.scene import Scene
@@ -25,6 +26,8 @@ from hilsplat.web.file_changes import StaleSceneError
 from hilsplat.web.server import answer, encoded, plain, read, view_name
 
 THUMB_PX = 160
+MOST_OPEN = 2
+"""Maximum number of scenes that a page keeps in memory besides the first."""
 
 
 class ShownScene:
@@ -103,10 +106,16 @@ Work = Callable[[Any, Any], Any]
 
 
 class SceneThread(Generic[Shown]):
-    """A scene and the thread that runs all code that reads the scene."""
+    """The scenes of a page and the thread that runs all code that reads them.
 
-    def __init__(self, shown: Shown) -> None:
-        self.shown = shown
+    Args:
+        shown: the scene of requests that name none.
+        named: opens the scene that a request names with `scene`; None if there is only one.
+    """
+
+    def __init__(self, shown: Shown, named: Callable[[str], Shown] | None = None) -> None:
+        self.opened: dict[str, Shown] = {"": shown}
+        self.named = named
         self.worker = ThreadPoolExecutor(1, thread_name_prefix="scene")
         self.behind = asyncio.Lock()
 
@@ -155,15 +164,17 @@ class SceneThread(Generic[Shown]):
         """Run `work` on the scene thread (or `worker`) if the page shows the current state of the scene.
 
         A page sends, as `of`, the state with which it was loaded, so that its cameras, nodes and Gaussians
-        are never mixed with those of a different state. Without `of`, the current state is used.
+        are never mixed with those of a different state. Without `of`, the current state is used. A page of
+        another scene also sends its name, as `scene`.
 
         Raises:
+            SettingsError: there is no scene with this name.
             StaleSceneError: the page was loaded with a different state.
         """
         state = request.query_params.get("of")
 
         def run() -> Result:
-            shown = self.shown
+            shown = self._shown(request)
             if state not in (None, shown.state):
                 raise StaleSceneError("the scene has changed since this page was loaded", fix="reload it")
             return work(shown)
@@ -174,11 +185,24 @@ class SceneThread(Generic[Shown]):
         """Run `work` on the scene thread (or `worker`), regardless of the scene's state."""
         return await asyncio.get_running_loop().run_in_executor(worker or self.worker, work)
 
+    def _shown(self, request: Request) -> Shown:
+        """Return the scene that a request names; raise SettingsError if there is no such scene."""
+        name = request.query_params.get("scene", "")
+        if name not in self.opened:
+            if self.named is None:
+                raise SettingsError(f"this page has no scene {name!r}", fix="reload the page")
+            self.opened[name] = self.named(name)
+            for oldest in [name for name in self.opened if name][:-MOST_OPEN]:
+                del self.opened[oldest]
+        return self.opened[name]
+
     def _reopened(self, shown: Shown, path: Mapping[str, Any]) -> dict[str, Any]:
         """Describe the scene: views, Gaussians, variants; if it has changed, it is reopened."""
-        if shown.changed():
-            self.shown = shown.opened_again()
-        return self.shown.described()
+        if not shown.changed():
+            return shown.described()
+        (name,) = [name for name, each in self.opened.items() if each is shown]
+        self.opened[name] = shown.opened_again()
+        return self.opened[name].described()
 
 
 def _photo(shown: ShownScene, path: Mapping[str, Any]) -> Response:

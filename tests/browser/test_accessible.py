@@ -32,6 +32,10 @@ def test_the_viewer_has_no_serious_violation_in_the_colours_of_the_user(
     assert violations(page) == []
     ask(page, "mug > handle")
     answers(page).first.click()
+    page.keyboard.press("x")
+    page.keyboard.press("v")
+    page.get_by_text("Scenes", exact=True).click()
+    page.locator("#scene-list a").first.wait_for()
     page.locator("#save summary").click()
     assert violations(page) == []
     page.locator("#view").press("?")

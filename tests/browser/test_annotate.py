@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from hilsplat.annotate.labels import Label, label_path, read_labels, write_labels
+from hilsplat.base.tables import write_csv
 from hilsplat.datasets.registry import open_labelled
 from hilsplat.web.file_changes import version_of
 from tests.browser.conftest import phone_fits, serving
@@ -349,6 +350,11 @@ def test_undo_works_in_the_text_box_once_its_text_is_saved(page, tmp_path):
     text.press("Control+z")
     saved(page)
     assert [label.text for label in kept(tmp_path)] == ["mug"]
+
+
+def test_the_page_shows_the_saved_scores(own_desk, annotating):
+    write_csv(own_desk / "scores.csv", ("method", "mIoU", "protocol"), [("tree", "65.0", "lerf/langsplat@2")])
+    assert annotating(own_desk).get_by_text("mIoU: tree 65.0 % (lerf/langsplat@2).").is_visible()
 
 
 def test_the_page_explains_the_first_steps_and_a_missing_sam(page):

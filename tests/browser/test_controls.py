@@ -1,9 +1,12 @@
 """Camera, history, pending pictures and refused queries of the viewer."""
 
+import shutil
+
 import numpy as np
 import pytest
 
 from tests.browser.conftest import answers, ask, ask_and_wait, wire_camera
+from tests.unit.finished_desk import SCENE
 
 
 def distance(page) -> float:
@@ -95,3 +98,30 @@ def test_a_threshold_cuts_the_colours_and_counts_the_gaussians_above(opened, des
         counts.append(int(scale.inner_text().split()[2].replace(",", "")))
     assert counts == [24 * 16, 0]  # the mug's, whose score is 0.79
     assert "least=0.9" in page.url
+
+
+def test_another_scene_opens_on_the_same_server(desk_project, tmp_path, served):
+    shutil.copytree(desk_project / "models", tmp_path / "models")
+    for name in ("desk", "other"):
+        shutil.copytree(desk_project / SCENE, tmp_path / "results/photos" / name)
+    shutil.copytree(desk_project / SCENE / "scene", tmp_path / "results/photos/posed/scene")
+    page = served(tmp_path / "results/photos/desk")
+    page.get_by_text("Scenes", exact=True).click()
+    scenes = page.locator("#scene-list li")
+    scenes.nth(2).wait_for()
+    assert [scene.inner_text().split("\n")[0] for scene in scenes.all()] == [
+        *("photos/desk", "photos/other", "photos/posed")
+    ]
+    assert "tree, field" in scenes.nth(1).inner_text() and "poses" in scenes.nth(2).inner_text()
+    assert scenes.nth(0).locator("a").get_attribute("aria-current") == "page"
+    origin = page.url.partition("/?")[0]
+    with page.expect_request(f"{origin}/api/scene?*scene=photos%2Fother*"):
+        scenes.nth(1).locator("a").click()
+    page.locator("body[data-ready=yes]").wait_for()
+    ask_and_wait(page, "mug")
+    page.wait_for_timeout(800)
+    assert page.url.startswith(origin) and "scene=photos%2Fother" in page.url and "q=mug" in page.url
+    page.get_by_text("Scenes", exact=True).click()
+    scenes.nth(1).wait_for()
+    assert scenes.nth(1).locator("a").get_attribute("aria-current") == "page"
+    assert scenes.nth(2).locator("a").get_attribute("href") is None

@@ -2,8 +2,11 @@
 
 import json
 import re
+import zipfile
 
 import av
+import pytest
+from plyfile import PlyData
 
 from tests.browser.conftest import answers, ask, ask_and_wait, chips, drawn, keep, pixels, save
 
@@ -39,7 +42,7 @@ def test_the_overlap_of_two_queries_is_reported(opened, desk_address):
     page.get_by_text("1 answer inside an answer to another query.").wait_for()
     ask(page, "mug")
     page.get_by_text("White: 1 node found by several queries.").wait_for()
-    page.locator("#overlay text", has_text=re.compile(r"^mug \+ ")).wait_for()
+    page.locator("#overlay text", has_text=re.compile(r"^mug 0\.\d\d \+ ")).wait_for()
 
 
 def test_a_kept_query_is_edited_with_its_threshold_at_its_photograph(opened, desk_address):
@@ -75,6 +78,50 @@ def test_kept_queries_are_saved_together(opened, desk_address, scene, tmp_path):
     size = save(page, "Masks in all photographs", tmp_path / "masks.zip").stat().st_size
     page.get_by_role("status").get_by_text(f"Saved desk-masks.zip, {-(-size // 1000)} kB.").wait_for()
     assert page.locator("#saving").is_hidden()
+
+
+def test_kept_queries_and_saved_files_have_scores_and_doubts(opened, desk_address, scene, tmp_path):
+    page = opened(desk_address)
+    keep(page, "book")
+    keep(page, "unicorn > rim")
+    (book,), (rim,) = scene.query("book"), scene.query("unicorn > rim")
+    assert rim.doubts and not book.doubts
+    sure, doubtful = chips(page).all()
+    assert f"1 answer, best {book.score:.2f}" in sure.inner_text() and "doubtful" not in sure.inner_text()
+    assert f"best {rim.score:.2f}" in doubtful.inner_text() and "doubtful" in doubtful.inner_text()
+    assert str(rim.doubts[0]) in doubtful.locator(".words").get_attribute("title")
+    assert page.locator("#overlay text", has_text=f"book {book.score:.2f}").count() == 1
+    style = page.evaluate("Array.from(hilsplat.painted()[0].style.table)")
+    assert style[4 * rim.node + 7] == pytest.approx(style[4 * book.node + 7] / 2, abs=1)
+    header = PlyData.read(save(page, "Gaussians, PLY", tmp_path / "found.ply")).comments
+    assert [line for line in header if "node" in line] == [
+        f"label {number}, node {hit.node}: ?, score {hit.score:.4f}"
+        for number, hit in enumerate((book, rim), 1)
+    ]
+    assert [line.partition(": ")[2] for line in header if "doubtful" in line] == [str(rim.doubts[0])]
+    with zipfile.ZipFile(save(page, "Masks in all photographs", tmp_path / "masks.zip")) as archive:
+        coco = json.loads(archive.read("coco.json"))
+    assert [category["doubts"] for category in coco["categories"]] == [[], [str(rim.doubts[0])]]
+    scores = {each["node"]: each["score"] for each in coco["annotations"]}
+    assert scores == pytest.approx({book.node: book.score, rim.node: rim.score}, abs=1e-4)
+    offline = page.context.new_page()
+    offline.goto(save(page, "Page with answers", tmp_path / "page.html").as_uri())
+    offline.locator("body[data-ready=yes]").wait_for()
+    told = [[chip.locator(".words").inner_text() for chip in chips(each).all()] for each in (page, offline)]
+    assert told[0] == told[1]
+
+
+@pytest.mark.parametrize("answerer", ["tree", "field"])
+def test_a_saved_page_has_the_answers_of_the_page(opened, desk_address, scene, tmp_path, answerer):
+    page = opened(desk_address)
+    page.get_by_label("Answers by").select_option(f"default|{answerer}")
+    ask_and_wait(page, "mug")
+    shown = answers(page).first.inner_text()
+    assert f"{scene.query('mug', answerer=answerer)[0].score:.2f}" in shown
+    offline = page.context.new_page()
+    offline.goto(save(page, "Page with answers", tmp_path / "page.html").as_uri())
+    answers(offline).first.wait_for()
+    assert answers(offline).first.inner_text() == shown
 
 
 def test_a_film_follows_the_path_of_the_user(opened, desk_address, tmp_path):

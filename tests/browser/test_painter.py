@@ -1,13 +1,17 @@
 """Both painters of the page, compared with the pipeline."""
 
+import io
+
 import numpy as np
 import pytest
+from PIL import Image
 
 from hilsplat.base.images import to_uint8
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import render
 from hilsplat.splat.spz import fractional_bits, spz_bytes
+from hilsplat.viewer.frames import Paint, faded, painted, within
 from hilsplat.viewer.wire import WireCamera
 from tests.browser.conftest import drawn, pixels, wire_camera
 from tests.unit.splat.spz_reader import decoded
@@ -75,3 +79,34 @@ def test_a_photograph_is_aligned_with_its_view(opened, desk_address, painter):
     left, top = wire["K"][0][2] - 0.5 * scale, wire["K"][1][2] - 0.5 * scale
     found = (box["x"] - view["x"], box["y"] - view["y"], box["width"], box["height"])
     np.testing.assert_allclose(found, (left, top, 42 * scale, 24 * scale), atol=0.6)
+
+
+@pytest.mark.parametrize("painter", ["gl", "server"])
+def test_selected_and_removed_gaussians_are_shown_by_both_painters(opened, cloud, cloud_address, painter):
+    page = opened(cloud_address, painter)
+    gaussians = load_ply(cloud / "gaussians.ply")
+    page.locator("#view").focus()
+    page.keyboard.press("x")
+    page.keyboard.press("b")
+    page.wait_for_timeout(600)
+    view = page.locator("#view").bounding_box()
+    camera = WireCamera.model_validate(wire_camera(page)).camera()
+    found = []
+    for left, right in ((90.0, 180.0), (200.0, 330.0)):
+        page.mouse.move(view["x"] + left, view["y"] + 100)
+        page.mouse.down()
+        page.mouse.move(view["x"] + right, view["y"] + 190, steps=3)
+        page.mouse.up()
+        page.wait_for_timeout(800)
+        found.append(within(gaussians.means, camera, [(left, 100.0), (right, 190.0)], 0.0))
+        if len(found) == 1:
+            page.keyboard.press("Delete")
+            page.wait_for_timeout(800)
+    removed, selected = found
+    assert removed.sum() > 100 < selected.sum()
+    paint = Paint.plain(len(gaussians)).marking(selected)
+    expected = painted(faded(gaussians, ~removed), camera, paint)
+    picture = Image.open(io.BytesIO(page.locator("#view > canvas").screenshot())).convert("RGB")
+    assert psnr(expected, painted(gaussians, camera)) < 20
+    visible = np.s_[120:200]  # neither the tools nor the scale cover these rows
+    assert psnr(np.asarray(picture)[visible], expected[visible]) > 30

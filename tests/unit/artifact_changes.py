@@ -4,6 +4,8 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hilsplat.base.artifacts import provenance_path, read_index, write_index, write_json
 from hilsplat.base.atomic import atomic_folder
 
@@ -28,3 +30,12 @@ def change_index(folder: Path, **entries: Any) -> None:
     """Change entries of a folder's index, and update its seal."""
     index = {**read_index(folder), **entries}
     write_index(folder, index.pop("views"), **index)
+
+
+def loosen(scene: Path, rows: np.ndarray) -> None:
+    """Remove Gaussians from all nodes of a scene's tree."""
+    folder = scene / "default/semantic_tree"
+    arrays = dict(np.load(folder / "tree.npz"))
+    arrays["node_of_gaussian"][rows] = -1
+    np.savez(folder / "tree.npz", **arrays)
+    change_index(folder)

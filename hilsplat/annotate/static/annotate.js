@@ -378,6 +378,8 @@ async function begin() {
   $("propose-label").hidden = !scene.proposes;
   $("segment-label").hidden = !scene.segments;
   $("about").textContent = `${scene.name}${scene.proposes ? `. Proposals: ${scene.proposes}` : ""}${scene.carries ? ", things from other photographs" : ""}.`;
+  $("scores").hidden = !scene.scores;
+  $("scores").textContent = `mIoU: ${scene.scores}.`;
   makeStrip(scene.views, stand);
   await store.load();
   store.recall(scene.folder);

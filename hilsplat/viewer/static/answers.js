@@ -36,6 +36,12 @@ function bar(score) {
   return make("span", { class: "score" }, score.toFixed(2), make("i", { "aria-hidden": "true" }, filled));
 }
 
+// Doubts about an answer, as in saved files.
+export function doubtsOf(answer) {
+  if (answer.doubts.length || !isDoubtful(answer)) return answer.doubts;
+  return ["the object may be absent: the best score is below 0.5"];
+}
+
 export function summary(answer) {
   if (!answer.hits.length) return `No node matches “${answer.text}”.`;
   const best = answer.hits[0], alike = answer.route === "like";
@@ -43,9 +49,7 @@ export function summary(answer) {
     ? `${counted(answer.hits.length, "node")}, most similar first, best ${best.score.toFixed(2)}. The first ${shownHits(answer).length} are highlighted.`
     : `${counted(answer.total, "answer")}, best ${best.score.toFixed(2)}, ${answer.level}`];
   if (answer.route === "fallback") lines.push("No answer is part of a match for the first text: the whole scene was searched.");
-  const doubts = answer.doubts.map((doubt) => `${doubt}.`);
-  if (isDoubtful(answer) && !doubts.length) doubts.push("The object may be absent: the best score is below 0.5.");
-  return [...doubts, ...lines].map((line) => line[0].toUpperCase() + line.slice(1)).join("\n");
+  return [...doubtsOf(answer).map((doubt) => `${doubt}.`), ...lines].map((line) => line[0].toUpperCase() + line.slice(1)).join("\n");
 }
 
 export function markChosen(node) {

@@ -11,7 +11,8 @@ let state = "";
 // In a notebook, the page is a frame on another site and gets no cookie, so its address contains the token. Paths are
 // relative, because a proxy may serve the page under any path.
 const token = new URLSearchParams(location.search).has("embedded") ? new URLSearchParams(location.search).get("token") : "";
-const at = (path, of = `of=${state}`) => `${path}?${of}${token ? `&token=${token}` : ""}`;
+const named = new URLSearchParams(location.search).get("scene");
+const at = (path, of = `of=${state}`) => `${path}?${of}${named ? `&scene=${encodeURIComponent(named)}` : ""}${token ? `&token=${token}` : ""}`;
 
 export async function scene() {
   const described = await (await get(at("api/scene", ""))).json();
@@ -19,6 +20,7 @@ export async function scene() {
   restartWith(token ? "" : described.restart);
   return described;
 }
+export const scenes = async () => (await get(at("api/scenes"))).json();
 export const changes = async () => (await get(at("api/changes", ""))).json();
 export const variant = async (name) => (await get(at(`api/variant/${encodeURIComponent(name)}`))).json();
 export const splats = async (chunk) => (await get(at(`api/splats/${chunk}`))).arrayBuffer();
@@ -31,6 +33,9 @@ export const sorter = () => new Worker("static/sorter.js");
 export const query = async (asked, signal) => (await send(at("api/query"), asked, { signal })).json();
 export const like = async (asked, signal) => (await send(at("api/like"), asked, { signal })).json();
 export const field = async (asked, signal) => (await send(at("api/field"), { ...asked, order: "page" }, { signal })).arrayBuffer();
+export const path = async (asked) => (await send(at("api/path"), asked)).json();
+export const members = async (asked) => (await send(at("api/members"), asked)).arrayBuffer();
+export const within = async (asked) => (await send(at("api/within"), asked)).arrayBuffer();
 export const pick = async (asked, signal) => (await send(at("api/pick"), asked, { signal })).json();
 export const frame = async (asked, signal) => (await send(at("api/frame"), asked, { signal })).blob();
 export const names = async (asked, version) =>

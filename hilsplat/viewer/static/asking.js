@@ -129,8 +129,8 @@ export async function askPicture(source, part = null) {
 }
 
 // Query with the framed part of the photograph, or of the rendered picture.
-export async function framed(from, to, done) {
-  const [x0, x1] = [from[0], to[0]].sort((a, b) => a - b), [y0, y1] = [from[1], to[1]].sort((a, b) => a - b);
+export async function framed(points, done) {
+  const [from, to] = [points[0], points.at(-1)], [x0, x1] = [from[0], to[0]].sort((a, b) => a - b), [y0, y1] = [from[1], to[1]].sort((a, b) => a - b);
   overlay();
   const svg = $("overlay"), path = document.createElementNS(svg.namespaceURI, "path");
   path.setAttribute("class", "hover");
@@ -141,7 +141,7 @@ export async function framed(from, to, done) {
     const photo = await (await fetch(api.photoUrl(page.camera.view))).blob(), { s, x, y } = page.camera.frame(host.clientWidth / panes.length, host.clientHeight);
     await askPicture(photo, [(x0 - x) / s, (y0 - y) / s, (x1 - x0) / s, (y1 - y0) / s]);
   } else {
-    const plain = [{ variant: "", style: styleOf({ outline: null, colour: "none", mode: "plain", chosen: -1, hover: -1 }) }];
+    const plain = [{ variant: "", style: styleOf({ outline: null, colour: "none", mode: "plain", chosen: -1, hover: -1 }), removed: page.removed }];
     await askPicture(await page.painter.capture(page.camera, plain, host.clientWidth, host.clientHeight), [x0, y0, x1 - x0, y1 - y0]);
     redraw();
   }

@@ -34,6 +34,20 @@ export class Camera {
     this.view = number;
   }
 
+  // Return the camera of a photograph.
+  ofView(view) {
+    const next = this.copy();
+    next.standAt(view, -1);
+    return next;
+  }
+
+  // Return the centre, and the corners of the picture at a depth.
+  corners(depth) {
+    const { fx, fy, cx, cy, w, h } = this.lens;
+    const corner = ([u, v]) => [(u - cx) / fx, (v - cy) / fy, 1].reduce((at, value, axis) => add(at, this.R[axis], depth * value), this.c);
+    return [this.c, ...[[0, 0], [w, 0], [w, h], [0, h]].map(corner)];
+  }
+
   // Orbit about the point ahead that is nearest to the cameras' focus.
   aimAhead() {
     const ahead = dot(add(this.focus, this.c, -1), this.R[2]);

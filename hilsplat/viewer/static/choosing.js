@@ -33,7 +33,7 @@ export function paneAt(x) {
 }
 
 const exactPick = async (at, y) => {
-  const { nodes } = await api.pick({ variant: variantOf(panes[at.k]), camera: page.camera.wire(at.width, at.height), x: at.x, y });
+  const { nodes } = await api.pick({ variant: variantOf(panes[at.k]), camera: page.camera.wire(at.width, at.height), x: at.x, y, removed: page.removed });
   return nodes.map(([node]) => node);
 };
 export const quickPick = (at, y) => page.painter.nodesAt(variantOf(panes[at.k]), page.painter.gaussianAt(page.camera, painted()[at.k], at.x, y, at.width, at.height));

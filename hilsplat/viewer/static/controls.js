@@ -1,11 +1,12 @@
 // Mouse, touch and wheel: drag orbits, two fingers or the right button move, wheel and pinch zoom, a tap picks,
-// and a frame drawn with Alt held queries with the content of the frame.
+// and a frame drawn with Alt held queries with the content of the frame. A tool, if one is chosen, takes the drag.
 
 const TAP_PX = 4;
 
-export function attach(host, { camera, changed, rested, tapped, pointed, framed }) {
+// tool: returns null, or { draw(points, done, event), taps } for a drag that draws instead of moving; taps: whether a tap does, too.
+export function attach(host, { camera, changed, rested, tapped, pointed, tool }) {
   const pointers = new Map();
-  let moved = 0, rest = 0, apart = 0, start = null;
+  let moved = 0, rest = 0, apart = 0, stroke = null, points = [];
   const touch = () => { clearTimeout(rest); changed(); rest = setTimeout(rested, 180); };
   const place = (event) => { const box = host.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
   const size = () => Math.min(host.clientWidth, host.clientHeight);
@@ -14,7 +15,8 @@ export function attach(host, { camera, changed, rested, tapped, pointed, framed 
     if (event.target.closest("button, select, details")) return;
     host.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, { x: event.clientX, y: event.clientY, button: event.button });
-    if (pointers.size === 1) { moved = 0; start = event.altKey ? place(event) : null; }
+    stroke = pointers.size === 1 ? tool(event) : null;   // a second finger moves the camera instead
+    if (pointers.size === 1) { moved = 0; points = [place(event)]; }
     apart = 0;
   });
 
@@ -25,7 +27,7 @@ export function attach(host, { camera, changed, rested, tapped, pointed, framed 
     moved += Math.abs(dx) + Math.abs(dy);
     Object.assign(last, { x: event.clientX, y: event.clientY });
     if (moved < TAP_PX) return;
-    if (start) { framed(start, place(event), false); return; }
+    if (stroke) { points.push(place(event)); stroke.draw(points, false, event); return; }
     host.classList.add("dragging");
     if (pointers.size === 2) {
       const [a, b] = [...pointers.values()], now = Math.hypot(a.x - b.x, a.y - b.y);
@@ -41,7 +43,7 @@ export function attach(host, { camera, changed, rested, tapped, pointed, framed 
     const last = pointers.get(event.pointerId), box = host.getBoundingClientRect();
     pointers.delete(event.pointerId);
     host.classList.remove("dragging");
-    if (start && moved >= TAP_PX) { framed(start, place(event), true); start = null; return; }
+    if (stroke && event.type === "pointerup" && (moved >= TAP_PX || stroke.taps)) { stroke.draw(points, true, event); stroke = null; return; }
     if (event.type === "pointerup" && last && moved < TAP_PX && last.button === 0) tapped(event.clientX - box.left, event.clientY - box.top);
   };
   host.addEventListener("pointerup", up);

@@ -7,7 +7,7 @@ import { showScale } from "./scale.js";
 import { host, keptIn, level, levelIndex, main, options, outlines, page, panes, threshold, variantOf } from "./state.js";
 import { shownHits, styleOf } from "./styles.js";
 
-const SLOW_MS = 60;
+const SLOW_MS = 60, FRUSTUM = 0.08;   // depth of a drawn camera, in multiples of the photographs' mean distance
 let dirty = true, styles = [], lastFrame = 0, frames = 0;
 
 export const redraw = () => { dirty = true; requestAnimationFrame(paint); };
@@ -17,14 +17,15 @@ export function currentStyles() {
   if (!styles.length) {
     styles = panes.map((pane, k) => {
       const own = !k || variantOf(pane) === variantOf(panes[0]);
-      return styleOf({ outline: outlines.get(variantOf(pane)), answer: pane.answer, colour: $("colour").value, mode: $("mode").value, field: pane.field, threshold: threshold(), kept: keptIn(k),
+      const style = styleOf({ outline: outlines.get(variantOf(pane)), answer: pane.answer, colour: $("colour").value, mode: $("mode").value, field: pane.field, threshold: threshold(), kept: keptIn(k),
         level: levelIndex(pane.answer), chosen: own ? page.chosen : -1, hover: own ? page.hover : -1 });
+      return { ...style, marked: page.marked };
     });
   }
   return styles;
 }
 
-export const painted = () => currentStyles().map((style, k) => ({ variant: variantOf(panes[k]), style }));
+export const painted = () => currentStyles().map((style, k) => ({ variant: variantOf(panes[k]), style, removed: page.removed }));
 
 function paint(now) {
   if (!dirty || !page.painter || !page.camera) return;
@@ -40,7 +41,7 @@ function paint(now) {
 
 export function overlay() {
   const width = host.clientWidth, height = host.clientHeight;
-  drawOverlay($("overlay"), page.camera, panes.map((pane, k) => ({ boxes: boxes(pane, k), label: panes.length > 1 ? pane.by.replace("|", ", ") : "" })), width, height, $("tools").offsetTop + $("tools").offsetHeight);
+  drawOverlay($("overlay"), page.camera, panes.map((pane, k) => ({ boxes: boxes(pane, k), frustums: frustums(), label: panes.length > 1 ? pane.by.replace("|", ", ") : "" })), width, height, $("tools").offsetTop + $("tools").offsetHeight);
   showScale(currentStyles()[0]);
   const hits = shownHits(panes[0].answer), own = main(), each = width / panes.length;
   $("look").hidden = !hits.length || hits.some((hit) => inPicture(page.camera, own.nodes[hit.node].corners, each, height));
@@ -48,11 +49,20 @@ export function overlay() {
   page.photos.mark(page.camera.view, page.asked?.shows ?? []);
 }
 
+// Cameras of the photographs, and views of the path.
+function frustums() {
+  const depth = FRUSTUM * page.scene.reach, photographs = page.frustums ? page.scene.views : [];
+  return [...photographs.map((view, number) => ({ number, name: view.name, kind: view.split === "test" ? "frustum test" : "frustum", corners: page.camera.ofView(view).corners(depth) })),
+    ...(page.previewing ? [] : page.path).map((camera, k) => ({ kind: "frustum path", label: String(k + 1), corners: camera.corners(depth) }))];
+}
+
+const labelOf = ({ name, score }, text = "") => [...new Set([text, name].filter(Boolean)), score.toFixed(2)].join(" ");
+
 function boxes(pane, k) {
   const own = outlines.get(variantOf(pane));
   if (!own || $("colour").value === "none") return [];
-  const found = $("colour").value === "answers" ? keptIn(k).flatMap(({ answer, rgb, text }) => shownHits(answer).map((hit) => ({ node: hit.node, kind: "kept", stroke: `rgb(${rgb.join(" ")})`, label: text }))) : [];
-  for (const hit of shownHits(pane.answer)) found.push({ node: hit.node, kind: "answer", label: `${hit.name} ${hit.score.toFixed(2)}`.trim() });
+  const found = $("colour").value === "answers" ? keptIn(k).flatMap(({ answer, rgb, text }) => shownHits(answer).map((hit) => ({ node: hit.node, kind: "kept", stroke: `rgb(${rgb.join(" ")})`, label: labelOf(hit, text) }))) : [];
+  for (const hit of shownHits(pane.answer)) found.push({ node: hit.node, kind: "answer", label: labelOf(hit) });
   if (!k || variantOf(pane) === variantOf(panes[0])) {
     if (page.chosen >= 0) found.push({ node: page.chosen, kind: "chosen", label: nameOf(own, page.chosen) });
     if (page.hover >= 0 && page.hover !== page.chosen) found.push({ node: page.hover, kind: "hover", label: nameOf(own, page.hover) });
@@ -89,4 +99,8 @@ function remember() {
     history[isNew ? "pushState" : "replaceState"](null, "", `${location.pathname}${api.offline ? location.search : keptSearch()}#${link}`);
   }, 400);
 }
-const keptSearch = () => options.has("embedded") ? location.search : options.get("painter") ? `?painter=${options.get("painter")}` : "";
+function keptSearch() {
+  if (options.has("embedded")) return location.search;
+  const kept = new URLSearchParams([...options].filter(([key, value]) => ["scene", "painter"].includes(key) && value));
+  return kept.size ? `?${kept}` : "";
+}

@@ -15,7 +15,7 @@ export function setMoving(now) {
 
 export const touched = () => { flight++; setMoving(true); redraw(); };
 
-function goTo(target) {
+export function goTo(target) {
   const mine = ++flight;
   if (calm.matches || page.painter.kind === "server" || page.slow) { page.camera = target; setMoving(false); redraw(); return; }
   const from = page.camera.copy(), begin = performance.now(), lasts = 450;
@@ -29,6 +29,23 @@ function goTo(target) {
   };
   requestAnimationFrame(next);
 }
+
+// Show cameras in real time, then return to the present one; anything else that moves the camera ends it.
+export function play(cameras, perSecond, ended) {
+  const mine = ++flight, before = page.camera, begin = performance.now();
+  setMoving(true);
+  const next = (now) => {
+    const k = Math.max(0, Math.floor((now - begin) / 1000 * perSecond)), over = k >= cameras.length;
+    if (mine === flight) page.camera = over ? before : cameras[k];
+    redraw();
+    if (mine === flight && !over) { requestAnimationFrame(next); return; }
+    setMoving(false);
+    ended();
+  };
+  requestAnimationFrame(next);
+}
+
+export const halt = () => { flight++; };
 
 export function stand(number) {
   const target = page.camera.copy();

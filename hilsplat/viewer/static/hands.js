@@ -5,46 +5,50 @@ import { ask, askPicture, clear, clearAnswer, fillField, framed, keepAnswer, lik
 import { children } from "./card.js";
 import { choose, pointed, tapped } from "./choosing.js";
 import { attach } from "./controls.js";
+import { attachEditing, draw, edit, leaveTool, placeBrush, pressed, redo, resizeBrush, tool, undo } from "./editing.js";
 import { currentStyles, painted, redraw, rememberedAs, restyle } from "./drawing.js";
 import { $, counted, nameOf } from "./elements.js";
 import { flyTo, nearestView, setMoving, stand, step, touched } from "./flights.js";
-import { groups } from "./kept.js";
+import { groups, scoreOf } from "./kept.js";
 import { attachKeys } from "./keyboard.js";
+import { addToPath, attachPath, flown } from "./path.js";
 import { save } from "./saves.js";
-import { failed, host, main, page, panes, start, tell, variantOf } from "./state.js";
+import { attachScenes } from "./scenes.js";
+import { answererOf, failed, host, main, page, panes, start, tell, variantOf } from "./state.js";
 import { choosePanes } from "./variants.js";
 
-// The path of a film: views in the order in which they were added.
-function showPath() {
-  const count = page.path.length, flies = $("path").querySelector("[value=path]");
-  flies.disabled = count < 2;
-  flies.textContent = `along your path (${counted(count, "view")})`;
-  if (count < 2) $("path").value = "around";
-  $("path-clear").hidden = !count;
+function showFrustums() {
+  $("frustums").setAttribute("aria-pressed", String(!page.frustums));
+  page.frustums = !page.frustums;
+  redraw();
 }
 
-function addToPath() {
-  page.path.push(page.camera.copy());
-  showPath();
-  if (page.path.length > 1) $("path").value = "path";
-  tell(page.path.length < 2 ? "The path begins here. Add another view to make saved films follow the path." : `${counted(page.path.length, "view")} in the path. Saved films follow it.`);
+// Fly to the photograph whose camera is at a position of the view; false if there is none.
+function tappedFrustum(x, y) {
+  const box = host.getBoundingClientRect(), number = document.elementsFromPoint(x + box.left, y + box.top).find((element) => element.dataset.view)?.dataset.view;
+  if (number === undefined) return false;
+  stand(Number(number));
+  return true;
 }
 
 const MODES = ["tint", "ghost", "isolate", "plain"];
 
 export function attachHands() {
   const rested = () => setMoving(false);
-  const touch = attach(host, { camera: () => page.camera, changed: touched, rested, tapped, pointed, framed });
+  const drawing = (event) => event.altKey ? { draw: framed } : tool() !== "move" && event.button === 0 ? { draw, taps: tool() === "brush" } : null;
+  const touch = attach(host, { camera: () => page.camera, changed: touched, rested, tapped: (x, y) => { if (!tappedFrustum(x, y)) tapped(x, y); }, tool: drawing, pointed: (x, y) => { placeBrush(x, y); pointed(...(tool() === "move" ? [x, y] : [-1, -1])); } });
   const nudge = (work) => { work(); touch(); };
   const setLevel = (value) => { document.querySelector(`[name=level][value=${value}]`).checked = true; levelChanged(); };
   const levelChanged = () => { if (page.asked?.text && !api.offline) ask(true); else restyle(); };
 
   attachKeys({
     ask: () => { $("text").focus(); $("text").select(); },
-    clear, step, home: () => stand(page.camera.first), help: () => $("help").showModal(),
+    clear: () => { if (!leaveTool()) clear(); }, step: (by) => { if (!resizeBrush(by)) step(by); }, edit: () => { if (!api.offline) edit(); }, edited: pressed,
+    undone: ({ key, shiftKey }) => { const letter = key.toLowerCase(); if (letter === "z" || letter === "y") (shiftKey || letter === "y" ? redo : undo)(); return letter === "z" || letter === "y"; },
+    home: () => stand(page.camera.first), help: () => $("help").showModal(),
     zoom: (factor) => nudge(() => page.camera.zoom(factor)), orbit: (x, y) => nudge(() => page.camera.orbit(0.1 * x, 0.1 * y)),
     move: (x, y, z) => nudge(() => page.camera.move(0.06 * x, 0.06 * y, 0.06 * z)),
-    photo: () => $("blend").click(), fly: () => flyTo(page.chosen), like: () => like(page.chosen), level: setLevel, keep: keepAnswer, path: addToPath,
+    photo: () => $("blend").click(), fly: () => flyTo(page.chosen), like: () => like(page.chosen), level: setLevel, keep: keepAnswer, path: addToPath, frustums: showFrustums,
     name: () => $("card").querySelector(".name")?.focus(),
     mode: () => { $("mode").value = MODES[(MODES.indexOf($("mode").value) + 1) % MODES.length]; restyle(); },
     parent: () => { if (page.chosen >= 0 && main().nodes[page.chosen].parent >= 0) choose(main().nodes[page.chosen].parent); },
@@ -56,8 +60,9 @@ export function attachHands() {
   for (const radio of document.querySelectorAll("[name=level]")) radio.addEventListener("change", levelChanged);
   for (const id of ["left", "right"]) $(id).addEventListener("change", choosePanes);
   $("keep").addEventListener("click", keepAnswer);
-  $("path-add").addEventListener("click", addToPath);
-  $("path-clear").addEventListener("click", () => { page.path = []; showPath(); });
+  attachEditing();
+  attachPath();
+  attachScenes();
   $("mode").addEventListener("change", restyle);
   const thresholdChanged = () => {
     $("threshold-at").disabled = !$("threshold-on").checked;
@@ -74,6 +79,7 @@ export function attachHands() {
     fillField();
   });
   $("blend").addEventListener("click", () => { if (page.camera.view < 0) stand(nearestView()); page.photos.cycle(); redraw(); });
+  $("frustums").addEventListener("click", showFrustums);
   $("look").addEventListener("click", () => { flyTo(panes[0].answer.hits[0].node); $("view").focus(); });
   $("reload").addEventListener("click", () => location.reload());
   $("help-button").addEventListener("click", () => $("help").showModal());
@@ -92,7 +98,7 @@ export function attachHands() {
     if (text) ask();
   });
 
-  const selected = () => page.chosen >= 0 ? [{ name: nameOf(main(), page.chosen), nodes: [page.chosen] }] : groups();
+  const selected = () => page.chosen >= 0 ? [{ name: nameOf(main(), page.chosen), nodes: [page.chosen], ...scoreOf(page.chosen) }] : groups();
   $("save").addEventListener("toggle", () => {
     const chosen = selected(), count = chosen.reduce((sum, group) => sum + group.nodes.length, 0);
     $("save-what").textContent = page.chosen >= 0 ? `For ${chosen[0].name}` : chosen.length ? `For ${counted(count, "answer")} to ${chosen.map((group) => group.name).join(", ")}` : "Run a query or select a node to save its Gaussians, boxes and masks.";
@@ -105,8 +111,7 @@ export function attachHands() {
     try {
       if (kind === "link") { await navigator.clipboard.writeText(location.href); tell("Link copied. It opens this view while the viewer is running."); return; }
       const side = Number($("still-side").value), scale = side ? side / Math.max(host.clientWidth, host.clientHeight) : devicePixelRatio, size = [host.clientWidth, host.clientHeight].map((px) => Math.round(px * scale));
-      const flown = $("path").value === "path" ? { path: page.path.map((camera) => camera.wire(host.clientWidth, host.clientHeight)) } : {};
-      await save(kind, { variant: variantOf(panes[0]), groups: selected(), style: currentStyles()[0], capture: () => page.painter.capture(page.camera, painted(), ...size), flown,
+      await save(kind, { variant: variantOf(panes[0]), answerer: answererOf(panes[0]), groups: selected(), removed: page.removed, style: currentStyles()[0], capture: () => page.painter.capture(page.camera, painted(), ...size), flown: flown(),
         kept: page.kept.map((query) => query.asked), last: page.asked?.query, camera: page.camera.toText(), name: page.scene.name.split("/").at(-1), told: tell });
       redraw();
     } catch (error) { failed(error); }

@@ -1,5 +1,6 @@
 // Kept queries: each has a colour, and can be hidden, edited or removed.
 
+import { doubtsOf } from "./answers.js";
 import * as api from "./api.js";
 import { restyle } from "./drawing.js";
 import { $, counted, make } from "./elements.js";
@@ -45,12 +46,18 @@ export async function askKeptAgain() {
   showKept();
 }
 
-// Return the nodes of all shown queries, for saved files.
+// Return the nodes of all shown queries with scores and doubts, for saved files.
 export function groups() {
-  const found = keptIn(0).map(({ answer, text }) => ({ name: text, nodes: answer.hits.map((hit) => hit.node) }));
-  const answer = panes[0].answer;
-  if (answer) found.push({ name: answer.text, nodes: answer.hits.map((hit) => hit.node) });
+  const saved = ({ answer, text }) => ({ name: text, nodes: answer.hits.map((hit) => hit.node), scores: answer.hits.map((hit) => hit.score), doubts: doubtsOf(answer) });
+  const found = keptIn(0).map(saved), answer = panes[0].answer;
+  if (answer) found.push(saved({ answer, text: answer.text }));
   return found.filter((group) => group.nodes.length);
+}
+
+// Return the score and doubts of a node that is an answer.
+export function scoreOf(node) {
+  const group = groups().find(({ nodes }) => nodes.includes(node));
+  return group ? { scores: [group.scores[group.nodes.indexOf(node)]], doubts: group.doubts } : {};
 }
 
 let reopen = () => {};
@@ -60,12 +67,12 @@ export function showKept() {
   $("kept-section").hidden = !page.kept.length && !page.asked?.text;
   $("keep").hidden = !page.asked?.text || !panes[0].answer?.hits.length || api.offline;
   $("kept").replaceChildren(...page.kept.map((query) => {
-    const { text, level: at, threshold: least } = query.asked, count = query.answers[0].total;
+    const { text, level: at, threshold: least } = query.asked, [{ total, level: found, hits }] = query.answers, doubts = doubtsOf(query.answers[0]);
     const swatch = make("button", { type: "button", class: `swatch kept-${query.colour}`, "aria-pressed": String(query.shown), "aria-label": `Show ${text}`, title: query.shown ? "Hide" : "Show",
       onclick: () => { query.shown = !query.shown; showKept(); } });
     return make("li", {}, swatch,
-      make("button", { type: "button", class: "words", title: "Edit", disabled: api.offline, onclick: () => { drop(query); reopen(query.asked); } },
-        text, make("small", {}, [at === "auto" ? query.answers[0].level : at, counted(count, "answer"), ...(least ? [`score at least ${least.toFixed(2)}`] : [])].join(", "))),
+      make("button", { type: "button", class: "words", title: ["Edit", ...doubts].join("\n"), disabled: api.offline, onclick: () => { drop(query); reopen(query.asked); } },
+        text, make("small", {}, [...(doubts.length ? ["doubtful"] : []), at === "auto" ? found : at, counted(total, "answer"), ...(hits.length ? [`best ${hits[0].score.toFixed(2)}`] : []), ...(least ? [`score at least ${least.toFixed(2)}`] : [])].join(", "))),
       api.offline ? null : make("button", { type: "button", class: "drop", "aria-label": `Remove ${text}`, title: "Remove", onclick: () => drop(query) }, "×"));
   }));
   $("overlaps").textContent = overlaps();

@@ -45,6 +45,7 @@ export function attachKeys(act) {
   document.addEventListener("keyup", (event) => glide.held.delete(event.key.toLowerCase()));
   window.addEventListener("blur", () => glide.held.clear());
   document.addEventListener("keydown", (event) => {
+    if ((event.ctrlKey || event.metaKey) && !event.target.closest("input:not([type=radio]):not([type=checkbox]):not([type=range])") && act.undone(event)) { event.preventDefault(); return; }
     if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
     const typing = event.target.closest("input:not([type=radio]):not([type=checkbox]), textarea, [contenteditable]");
     if (event.key === "Escape") { act.clear(); return; }
@@ -52,13 +53,14 @@ export function attachKeys(act) {
     const on = (selector) => event.target.closest(selector), letter = event.key.toLowerCase();
     const keys = {
       "/": act.ask, "?": act.help, "[": () => act.step(-1), "]": () => act.step(1), "+": () => act.zoom(0.9), "=": () => act.zoom(0.9), "-": () => act.zoom(1 / 0.9),
-      o: act.photo, f: act.fly, m: act.like, n: act.name, k: act.keep, v: act.path, g: act.mode, u: act.parent, j: act.child,
+      o: act.photo, f: act.fly, m: act.like, n: act.name, k: act.keep, v: act.path, p: act.frustums, g: act.mode, x: act.edit, u: act.parent, j: act.child,
       0: () => act.level("auto"), 1: () => act.level("whole"), 2: () => act.level("part"), 3: () => act.level("subpart"),
     };
     if (on("select")) return;
     const free = on("#view") || event.target === document.body;   // lists and radio buttons use the arrow keys and Home themselves
     if ((ORBITS[event.key] || event.key === "Home") && !free) return;
     if (event.key === "Home") act.home();
+    else if (act.edited(letter)) { /* a key of the edit bar */ }
     else if (ORBITS[event.key] || MOVES[letter]) { if (!event.repeat) glide.press(letter, ORBITS[event.key] ? "orbit" : "move", ORBITS[event.key] ?? MOVES[letter]); }
     else if (keys[event.key] ?? keys[letter]) (keys[event.key] ?? keys[letter])();
     else return;

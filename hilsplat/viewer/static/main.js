@@ -3,11 +3,13 @@
 import * as api from "./api.js";
 import { Camera } from "./camera.js";
 import { acts, paneAt, quickPick } from "./choosing.js";
+import { restoreRemoved } from "./editing.js";
 import { drawn, overlay, painted, redraw } from "./drawing.js";
 import { $, counted, make } from "./elements.js";
 import { stand } from "./flights.js";
 import { attachHands } from "./hands.js";
 import { Outline } from "./outline.js";
+import { restorePath } from "./path.js";
 import { Photos } from "./photos.js";
 import { describe, Renderer } from "./renderer.js";
 import { ServerPainter } from "./server_painter.js";
@@ -36,6 +38,7 @@ async function begin() {
   page.camera.fromText(start.get("c") ?? api.opening, page.scene.views);
   page.photos = new Photos(page.scene.views, stand);
   page.outline = new Outline(acts);
+  if (!api.offline) restorePath();
   for (const [id, key] of [["colour", "colour"], ["mode", "mode"]]) if ([...$(id).options].some((o) => o.value === start.get(key))) $(id).value = start.get(key);
   const radio = [...document.querySelectorAll("[name=level]")].find((each) => each.value === start.get("level"));
   if (radio) radio.checked = true;
@@ -49,6 +52,7 @@ async function begin() {
     }
   }
   page.painter = made;
+  if (!api.offline) restoreRemoved();
   redraw();
   if (api.offline) onlyWhatIsHere();
   if (page.scene.variants.length) {
@@ -66,7 +70,7 @@ function arriving(here, chunks) { Object.assign($("arriving"), { value: here, ma
 
 // Hide everything that needs a server: an exported page has only its stored answers.
 function onlyWhatIsHere() {
-  for (const element of [$("picture-button"), $("here").parentElement, $("left").parentElement, $("right").parentElement]) element.hidden = true;
+  for (const element of [$("picture-button"), $("here").parentElement, $("left").parentElement, $("right").parentElement, $("edit-button"), $("path-add")]) element.hidden = true;
   for (const button of $("save").querySelectorAll("[data-save]:not([data-save=still])")) button.hidden = true;
   for (const row of $("save").querySelectorAll(".sized:not(:has([data-save=still]))")) row.hidden = true;
   for (const line of $("save").querySelectorAll("hr")) line.hidden = true;

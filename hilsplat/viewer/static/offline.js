@@ -30,4 +30,4 @@ export async function query({ text, level, threshold }) {
   return found;
 }
 
-export const changes = none, like = none, field = none, pick = none, frame = none, names = none, saved = none, savedInSteps = none;
+export const scenes = none, changes = none, like = none, field = none, pick = none, path = none, members = none, within = none, frame = none, names = none, saved = none, savedInSteps = none;

@@ -19,13 +19,21 @@ export function inPicture(camera, corners, width, height) {
   return before.length > 0 && (before.length < at.length || !isOutside(at, width, height));
 }
 
-// panes: [{boxes: [{corners, kind, label, node, stroke}]}], side by side in width x height CSS px; tools cover the top `covered` px.
+// panes: [{boxes: [{corners, kind, label, node, stroke}], frustums: [{corners, kind, number, name, label}]}], side by side in width x height CSS px; tools cover the top `covered` px.
 export function drawOverlay(svg, camera, panes, width, height, covered = 0) {
   svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
   const made = [], each = width / panes.length, k = camera.intrinsics(each, height);
   panes.forEach((pane, number) => {
     const placed = [], group = element("g", { transform: `translate(${number * each} 0)` });
     if (number) group.append(element("path", { class: "split", d: `M0 0V${height}` }));
+    for (const { corners, kind, number, name, label } of pane.frustums) {
+      const at = corners.map((corner) => camera.project(corner, k));
+      if (at.some((point) => !point) || isOutside(at, each, height)) continue;
+      const [apex, ...rim] = at.map(([x, y]) => `${x.toFixed(1)} ${y.toFixed(1)}`), made = element("path", { class: kind, d: `M${rim.join("L")}Z${rim.map((corner) => `M${apex}L${corner}`).join("")}`, "data-view": number ?? "" });
+      if (name) made.append(element("title", {}, name));
+      group.append(made);
+      if (label) group.append(element("text", { x: at[0][0], y: at[0][1] }, label));
+    }
     for (const { corners, kind, label, node, stroke = null } of pane.boxes) {
       const at = corners.map((corner) => camera.project(corner, k));
       if (at.some((point) => !point)) continue;   // a corner is behind the camera

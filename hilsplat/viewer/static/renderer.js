@@ -39,6 +39,7 @@ export class Renderer {
     this.geometry = this.texture(gl.RGBA32UI, gaussians);
     this.rest = this.texture(gl.RGBA32UI, texels * gaussians);
     this.nodeTextures.set("", this.texture(gl.RGBA16UI, gaussians));
+    this.marks = this.texture(gl.R8UI, gaussians);
     this.style = gl.createTexture(); this.ramp = gl.createTexture();
     this.styleBytes = null;
     this.arrays();
@@ -86,6 +87,14 @@ export class Renderer {
     for (let i = 0; i < bytes.length; i++) values[4 * i + 3] = bytes[i];
     this.gl.deleteTexture(this.nodeTextures.get(variant));
     this.putNodes(variant, values);
+  }
+
+  // Show marks: 1 for selected Gaussians, 2 for removed ones.
+  mark(marks) {
+    const gl = this.gl, rows = Math.ceil(marks.length / WIDTH), full = new Uint8Array(WIDTH * rows);
+    full.set(marks);
+    gl.bindTexture(gl.TEXTURE_2D, this.marks);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, rows, gl.RED_INTEGER, gl.UNSIGNED_BYTE, full);
   }
 
   link(vertexText, fragmentText) {
@@ -190,7 +199,7 @@ export class Renderer {
     gl.useProgram(this.program);
     this.uploadStyle(pane.style);
     const textures = [["geometry", this.geometry], ["rest", this.rest],
-      ["nodes", this.nodeTextures.get(pane.variant) ?? this.nodeTextures.get("")], ["style", this.style], ["ramp", this.ramp]];
+      ["nodes", this.nodeTextures.get(pane.variant) ?? this.nodeTextures.get("")], ["style", this.style], ["ramp", this.ramp], ["marks", this.marks]];
     textures.forEach(([name, texture], number) => {
       gl.activeTexture(gl.TEXTURE0 + number);
       gl.bindTexture(gl.TEXTURE_2D, texture);

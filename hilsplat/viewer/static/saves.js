@@ -12,18 +12,18 @@ export function download(blob, name) {
   setTimeout(() => URL.revokeObjectURL(link.href), 60000);
 }
 
-const KINDS = { ply: "selection.ply", spz: "selection.spz", boxes: "boxes.json", masks: "masks.zip", still: "picture.png", mp4: "flight.mp4", gif: "flight.gif", page: "page.html" };
+const KINDS = { "scene-ply": "scene.ply", "scene-spz": "scene.spz", ply: "selection.ply", spz: "selection.spz", boxes: "boxes.json", masks: "masks.zip", still: "picture.png", mp4: "flight.mp4", gif: "flight.gif", page: "page.html" };
 const IN_STEPS = { masks: ["Masks", "photographs"], mp4: ["Film", "pictures"], gif: ["Film", "pictures"], page: ["Page", "crops"] };
 const sized = (bytes) => bytes < 1e6 ? `${Math.ceil(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`;
 
-export async function save(kind, { variant, groups, style, capture, flown, kept, last, camera, name, told }) {
+export async function save(kind, { variant, answerer, groups, removed, style, capture, flown, kept, last, camera, name, told }) {
   const asked = {
-    masks: { variant, groups }, page: { variant, kept, ...(last ? { last } : {}), start: camera },
-    mp4: { variant, style: wireStyle(style), format: "mp4", side_px: Number($("mp4-side").value), ...flown },
-    gif: { variant, style: wireStyle(style), format: "gif", side_px: Number($("gif-side").value), ...flown },
+    masks: { variant, groups }, page: { variant, answerer, removed, kept, ...(last ? { last } : {}), start: camera },
+    mp4: { variant, removed, style: wireStyle(style), format: "mp4", side_px: Number($("mp4-side").value), ...flown },
+    gif: { variant, removed, style: wireStyle(style), format: "gif", side_px: Number($("gif-side").value), ...flown },
   }[kind];
   told(asked ? "Saving in the background." : "Saving…");
-  const blob = kind === "still" ? await capture() : asked ? await inSteps(kind, asked, told) : await api.saved(kind, { variant, groups });
+  const blob = kind === "still" ? await capture() : asked ? await inSteps(kind, asked, told) : await api.saved(kind, kind.startsWith("scene") ? { removed } : { variant, groups, removed });
   if (!blob) return;
   download(blob, `${name}-${KINDS[kind]}`);
   told(`Saved ${name}-${KINDS[kind]}, ${sized(blob.size)}.`);

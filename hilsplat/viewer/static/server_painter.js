@@ -5,7 +5,7 @@ import { latest } from "./latest.js";
 import { wireStyle } from "./styles.js";
 
 const asked = (camera, pane, [width, height], quality, image) =>
-  ({ variant: pane.variant || "default", camera: camera.wire(width, height), style: wireStyle(pane.style), quality, image });
+  ({ variant: pane.variant || "default", camera: camera.wire(width, height), style: wireStyle(pane.style), removed: pane.removed, quality, image });
 const fetched = async (frame) => createImageBitmap(await api.frame(frame));
 
 export class ServerPainter {
@@ -25,6 +25,7 @@ export class ServerPainter {
   async load() {}
   async loadNodes() {}
   loadField() {}   // a frame request contains the text
+  mark() {}        // and the marks
   get settled() { return this.drawn === this.asked; }
 
   resize(width, height) {

@@ -1,11 +1,13 @@
 // Shaders equivalent to `hilsplat.splat.rasterise.api.render`: EWA projection with the ray clamped to
 // 30 % beyond the image, 0.3 px^2 added, alpha below 1/255 dropped and cut at 0.999, colour max(0, 0.5 + SH).
 
+import { MARKED, MARKED_SHARE } from "./styles.js";
+
 export const vertex = (bases, texels) => `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D;
 #define BASES ${bases}
 #define TEXELS ${texels}
-uniform usampler2D geometry, rest, nodes;
+uniform usampler2D geometry, rest, nodes, marks;
 uniform sampler2D style, ramp;
 uniform mat3 rotation;
 uniform vec3 translation, centre;
@@ -59,6 +61,9 @@ void main() {
     vec4 found = texelFetch(style, at(own[level]), 0);
     if (found.a > 0.0) chosen = found;
   }
+  uint mark = texelFetch(marks, at(index), 0).r;
+  if (mark == 2u) return;
+  if (mark == 1u) chosen = vec4(${MARKED.map((value) => (value / 255).toFixed(6))}, ${MARKED_SHARE.toFixed(6)});
   bool other = chosen.a == 0.0;
   if (other && mode == 3) return;
   if (other && mode == 2) opacity *= 0.08;

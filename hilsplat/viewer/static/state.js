@@ -8,7 +8,7 @@ import { KEPT } from "./styles.js";
 export const host = $("view"), options = new URLSearchParams(location.search);
 export const start = new URLSearchParams(location.hash.slice(1));
 
-export const page = { scene: null, camera: null, painter: null, photos: null, outline: null, chosen: -1, hover: -1, asked: null, kept: [], path: [], waiting: false, moving: false, slow: false };
+export const page = { scene: null, camera: null, painter: null, photos: null, outline: null, chosen: -1, hover: -1, asked: null, kept: [], path: [], frustums: false, previewing: false, removed: "", marked: "", waiting: false, moving: false, slow: false };
 export const outlines = new Map();                             // by variant
 export const panes = [{ by: "", answer: null, field: null }]; // one, or two side by side
 

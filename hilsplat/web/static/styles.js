@@ -1,6 +1,8 @@
 // The colours of all nodes, for both painters.
 
 export const ANSWER = [255, 122, 0], CHOSEN = [58, 150, 255], HOVER = [255, 225, 70], SHARED = [255, 255, 255];
+// Gaussians selected for editing, and the weight of their colour.
+export const MARKED = [255, 0, 160], MARKED_SHARE = 0.7;
 // Colours of kept queries; style.css has the same colours for the query chips.
 export const KEPT = [[0, 200, 140], [235, 120, 200], [70, 215, 235], [180, 215, 50], [160, 120, 255], [235, 80, 80]];
 const STOPS = [[0, 0, 4], [31, 12, 72], [85, 15, 109], [136, 34, 106], [186, 54, 85], [227, 89, 51], [249, 140, 10], [249, 201, 50], [252, 255, 164]];
@@ -38,6 +40,8 @@ export const shownHits = (answer) => answer?.route === "like" ? answer.hits.slic
 // Doubtful answers are painted paler.
 export const isDoubtful = (answer) => Boolean(answer?.hits.length && (answer.doubts.length || (answer.route !== "like" && answer.hits[0].score < 0.5)));
 
+const strength = (answer) => isDoubtful(answer) ? 0.5 : 1;
+
 /*
  * outline: the nodes of a variant; answer: the current answer, or null; kept: [{answer, rgb}] of kept queries;
  * colour, mode: the page's settings; level: 0, 1 or 2, for colours by level; chosen, hover: nodes, or -1;
@@ -62,9 +66,8 @@ export function styleOf({ outline, answer, colour, mode, level, chosen, hover, f
     if (colour === "nodes" || threshold === null) mode = "plain";
   } else if (colour === "answers" && (answer || kept.length)) {
     const hits = shownHits(answer), painted = new Set();
-    for (const { answer: other, rgb } of kept) for (const { node } of shownHits(other)) { set(node, painted.has(node) ? SHARED : rgb, 0.62); painted.add(node); }
-    const strength = isDoubtful(answer) ? 0.5 : 1;
-    hits.forEach(({ node }, rank) => set(node, painted.has(node) ? SHARED : ANSWER, strength * (0.72 - 0.42 * rank / Math.max(hits.length, 4))));
+    for (const { answer: other, rgb } of kept) for (const { node } of shownHits(other)) { set(node, painted.has(node) ? SHARED : rgb, 0.62 * strength(other)); painted.add(node); }
+    hits.forEach(({ node }, rank) => set(node, painted.has(node) ? SHARED : ANSWER, strength(answer) * (0.72 - 0.42 * rank / Math.max(hits.length, 4))));
     if (!hits.length && !painted.size) mode = "plain";
   } else if (chosen < 0 || colour === "none") mode = "plain";
   if (chosen >= 0 && colour !== "none") {
@@ -75,7 +78,7 @@ export function styleOf({ outline, answer, colour, mode, level, chosen, hover, f
   return { table, use, mode, ramp: null, ...(colour === "relevancy" ? range : {}) };
 }
 
-const base64 = (bytes) => {
+export const base64 = (bytes) => {
   let text = "";
   for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
   return btoa(text);
@@ -86,7 +89,8 @@ const sent = new WeakMap();
 export function wireStyle(style) {
   if (!sent.has(style)) {
     const plain = !style.ramp && style.mode === "plain" && style.table.every((v, k) => k % 4 !== 3 || v === 0);
-    sent.set(style, plain ? {} : style.ramp ? { ramp: base64(style.ramp), ...style.field } : { table: base64(style.table), use: style.use, mode: style.mode });
+    const colours = plain ? {} : style.ramp ? { ramp: base64(style.ramp), ...style.field } : { table: base64(style.table), use: style.use, mode: style.mode };
+    sent.set(style, style.marked ? { ...colours, marked: style.marked } : colours);
   }
   return sent.get(style);
 }

@@ -1,6 +1,7 @@
 """Server of the annotation page: access, versions of saved files, shapes, proposals, transfer to views."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from starlette.testclient import TestClient
 from hilsplat.annotate.app import Annotator, OpenedScene
 from hilsplat.annotate.labels import Label, traced
 from hilsplat.base.errors import ArtifactError
+from hilsplat.base.tables import write_csv
 from hilsplat.datasets.registry import open_labelled
 from hilsplat.segment.masks import HierarchicalMasks
 from tests.unit.annotate.test_clicks import iou
@@ -53,6 +55,24 @@ def test_requests_of_strangers_are_refused_and_photographs_must_exist(desk, labe
     assert put(stranger, 0, [MUG], "none").status_code == 403
     assert put(client, 99, [MUG], "none").status_code == 422
     assert not labels.exists()
+
+
+def test_the_page_shows_the_saved_scores_and_whether_they_are_older_than_the_annotations(own_desk, labels):
+    def line() -> str:
+        return opened(own_desk, labels).get("/api/scene").json()["scores"]
+
+    assert line() == ""
+    means = own_desk / "scores.csv"
+    of_methods = [("tree", "65.0"), ("field", "40.1"), ("LangSplat", "30.2"), ("LERF", "20.0"), ("none", "")]
+    rows = [(method, iou, "12", "lerf/langsplat@2") for method, iou in of_methods]
+    write_csv(means, ("method", "mIoU", "queries", "protocol"), rows)
+    shown = [f"{method} {iou} % (lerf/langsplat@2)" for method, iou in of_methods[:3]]
+    assert line() == "; ".join([*shown, f"all in {means.with_suffix('.md')}"])
+    assert put(opened(own_desk, labels), 0, [MUG], "none").status_code == 200
+    os.utime(means, (0, 0))
+    assert line().endswith("; of earlier annotations: the next run updates them")
+    means.write_text("a,b\n1\n")
+    assert "scores.csv cannot be read" in line()
 
 
 # -- saving -----------------------------------------------------------------------------------------

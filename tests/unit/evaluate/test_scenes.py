@@ -10,8 +10,9 @@ import pytest
 from hilsplat.base.artifacts import write_json
 from hilsplat.base.errors import ArtifactError
 from hilsplat.cli.main import app
-from hilsplat.evaluate.scenes import COLUMNS, SceneState
+from hilsplat.evaluate.scenes import COLUMNS
 from hilsplat.evaluate.scores import Score, write_scores
+from hilsplat.query.scene_state import SceneState
 
 
 def score(method: str, protocol: str, value: float) -> Score:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from plyfile import PlyData
 
 import hilsplat
 from hilsplat.annotate.labels import Label, label_path, write_labels
@@ -26,7 +27,8 @@ from hilsplat.query.answer import answer
 from hilsplat.query.names import NO_FILE, NodeNames
 from hilsplat.query.scene_views import Opened
 from hilsplat.scene.finished import FinishedScene
-from tests.unit.artifact_changes import change_index, write_record
+from hilsplat.splat.ply import load_ply
+from tests.unit.artifact_changes import change_index, loosen, write_record
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH
 from tests.unit.splat.spz_reader import decoded
 
@@ -175,10 +177,54 @@ def test_query_saves_the_masks_and_the_compressed_gaussians_of_its_answer(desk, 
     coco = json.loads((elsewhere / "masks/coco.json").read_text())
     assert [each["name"] for each in coco["categories"]] == ["mug > handle"]
     assert len(coco["annotations"]) == len(scene.views.names)
+    assert {(each["node"], each["score"]) for each in coco["annotations"]} == {
+        (hit.node, round(hit.score, 4))
+    }
     spz = decoded((elsewhere / "answer/selection.spz").read_bytes())
+    header = PlyData.read(elsewhere / "answer/selection.ply").comments
+    assert header == ["label 1: mug > handle", f"label 1, node {hit.node}: ?, score {hit.score:.4f}"]
     assert len(spz) == len(hit.gaussians)
     with pytest.raises(ArtifactError, match="masks exists"):
         run("query", str(desk), "mug", "--out", "answer", "--masks", "masks")
+
+
+def test_export_leaves_out_or_keeps_what_matches_a_query_or_a_node(desk, elsewhere, capsys):
+    scene = hilsplat.open_scene(desk)
+    (book,), (handle,) = scene.query("book"), scene.query("mug > handle")
+    gone, kept = (scene.views.gaussians_of([hit.node]) for hit in (book, handle))
+
+    def exported(*words: str) -> np.ndarray:
+        run("export", str(desk), "--as", "ply", "--out", words[-1], *words[:-1])
+        return load_ply(elsewhere / words[-1] / "point_cloud.ply").means
+
+    found = exported("--without", "book", "rest")
+    line = f"without 'book': node {book.node} (?, {book.score:.2f}), {len(gone)} Gaussians"
+    assert line in capsys.readouterr().out
+    np.testing.assert_array_equal(found, np.delete(scene.gaussians.means, gone, axis=0))
+    found = exported("--only", "mug", "--only", str(book.node), "--without", str(handle.node), "some")
+    mug = scene.views.gaussians_of([hit.node for hit in scene.query("mug")])
+    np.testing.assert_array_equal(found, scene.gaussians.means[np.setdiff1d(np.union1d(mug, gone), kept)])
+    exported("--without", "unicorn > rim", "doubtful")
+    assert "doubtful: 'unicorn' may not be in the scene" in capsys.readouterr().out
+    for words, message in (
+        (("--as", "tree", "--without", "book"), "--only, --without and --clean are for --as ply"),
+        (("--as", "tree", "--clean"), "--only, --without and --clean are for --as ply"),
+        (("--as", "ply", "--without", "99"), "node 99 does not exist"),
+        (("--as", "ply", "--only", "book", "--without", "book"), "no Gaussian remains"),
+    ):
+        with pytest.raises(SettingsError, match=message):
+            run("export", str(desk), *words, "--out", "refused")
+    assert not (elsewhere / "refused").exists()
+
+
+def test_a_clean_export_leaves_out_gaussians_of_no_node(copied, elsewhere, capsys):
+    loosen(copied, np.arange(100, 140))
+    (book,) = (scene := hilsplat.open_scene(copied)).query("book")
+    run("export", str(copied), "--as", "ply", "--clean", "--without", str(book.node), "--out", "clean")
+    assert "without 40 Gaussians of no node" in capsys.readouterr().out
+    gone = np.union1d(scene.views.gaussians_of([book.node]), np.arange(100, 140))
+    found = load_ply(elsewhere / "clean/point_cloud.ply").means
+    np.testing.assert_array_equal(found, np.delete(scene.gaussians.means, gone, axis=0))
 
 
 @pytest.mark.parametrize(

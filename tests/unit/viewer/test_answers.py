@@ -170,20 +170,33 @@ def test_names_are_stored_and_matched_and_need_the_last_version(client, scene, d
 
 def test_a_saved_selection_has_the_gaussians_boxes_and_labels_of_its_groups(client, scene, shown, tmp_path):
     (mug,), (handle,) = scene.query("mug", "whole"), scene.query("mug > handle")
-    groups = [{"name": "mug > hëndle", "nodes": [handle.node]}, {"name": "mug", "nodes": [mug.node]}]
+    doubt = "'mug' may be absent"
+    groups = [
+        {"name": "mug > hëndle", "nodes": [handle.node], "scores": [0.62], "doubts": [doubt]},
+        {"name": "mug", "nodes": [mug.node]},
+    ]
     sent = {"groups": groups}
     (tmp_path / "selection.ply").write_bytes(client.post("/api/export/ply", json=sent).content)
     saved, rows = load_ply(tmp_path / "selection.ply"), scene.views.gaussians_of([mug.node, handle.node])
     np.testing.assert_array_equal(saved.means, shown.gaussians.means[rows])
     np.testing.assert_array_equal(saved.sh, shown.gaussians.sh[rows])
     labelled = PlyData.read(tmp_path / "selection.ply")
-    assert labelled.comments == ["label 1: mug > h\\xebndle", "label 2: mug"]
+    assert labelled.comments == [
+        "label 1: mug > h\\xebndle",
+        f"label 1, node {handle.node}: ?, score 0.6200",
+        f"label 1, doubtful: {doubt}",
+        "label 2: mug",
+        f"label 2, node {mug.node}: ?",
+    ]
     # the handle belongs to both: it is labelled as the smaller
     expected = np.where(np.isin(rows, scene.views.gaussians_of([handle.node])), 1, 2)
     np.testing.assert_array_equal(labelled["vertex"]["label"], expected)
     boxes = client.post("/api/export/boxes", json=sent).json()["boxes"]
     found = [(box["group"], box["node"]) for box in boxes]
     assert found == [("mug > hëndle", handle.node), ("mug", mug.node)]
+    assert [(box["score"], box["doubts"]) for box in boxes] == [(0.62, [doubt]), (None, [])]
+    wrong = {"groups": [{**groups[0], "scores": [0.62, 0.5]}]}
+    assert client.post("/api/export/boxes", json=wrong).status_code == 400
     np.testing.assert_allclose(boxes[0]["corners"], handle.oriented_box.corners(), atol=1e-4)
     compressed = decoded(client.post("/api/export/spz", json=sent).content)
     assert sorted(compressed.means[:, 0]) == pytest.approx(sorted(saved.means[:, 0]), abs=1e-3)
@@ -196,12 +209,16 @@ def test_saved_masks_are_those_of_the_hits_in_every_view_and_of_every_group(clie
     (mug,), (handle,) = scene.query("mug", "whole"), scene.query("mug > handle")
     named = (("handle", handle), ("mug", mug), ("cup", mug))
     groups = [{"name": name, "nodes": [hit.node]} for name, hit in named]
+    groups[0] |= {"scores": [0.62], "doubts": ["it may be absent"]}
     progress, data = in_steps(client, "masks", groups=groups)
     assert progress == [(made, len(scene.views.names)) for made in range(len(scene.views.names) + 1)]
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         coco = json.loads(archive.read("coco.json"))
         assert [image["file_name"] for image in coco["images"]] == list(scene.views.names)
         assert [each["name"] for each in coco["categories"]] == ["handle", "mug", "cup"]
+        assert [each["doubts"] for each in coco["categories"]] == [["it may be absent"], [], []]
+        found = {(each["category_id"], each.get("score"), each["name"]) for each in coco["annotations"]}
+        assert found == {(1, 0.62, ""), (2, None, ""), (3, None, "")}
         assert [each["id"] for each in coco["annotations"]] == list(range(1, 1 + 3 * len(scene.views.names)))
         for entry in coco["annotations"]:
             view, (_, hit) = scene.views.names[entry["image_id"]], named[entry["category_id"] - 1]
@@ -244,6 +261,16 @@ def test_a_film_follows_a_path(client, shown, camera):
     assert frames[0].shape == (36, 64, 3) and frames[0].std() > 20
     still = painted(shown.gaussians, camera.scaled((36, 64))).astype(float)
     assert np.abs(frames[0] - still).mean() < 8 < np.abs(frames[-1] - still).mean()
+
+
+def test_the_cameras_of_a_film_are_sent_for_its_preview(client, shown, camera):
+    views = [wire_camera(camera), {**wire_camera(camera), "cam_from_world": np.eye(4).tolist()}]
+    found = client.post("/api/path", json={"frames": 7, "side_px": 64, "path": views}).json()
+    assert len(found) == 7 and all(each["size_hw"] == [36, 64] for each in found)
+    np.testing.assert_allclose(found[0]["cam_from_world"], camera.cam_from_world, atol=1e-9)
+    np.testing.assert_allclose(found[-1]["cam_from_world"], np.eye(4), atol=1e-9)
+    np.testing.assert_allclose(found[3]["K"], camera.scaled((36, 64)).K, atol=1e-9)
+    assert len(client.post("/api/path", json={"frames": 5}).json()) == 5
 
 
 def test_a_gif_around_the_scene_has_every_other_frame_in_the_requested_size(client):

@@ -4,6 +4,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from hilsplat.viewer.app import Viewer
+from hilsplat.viewer.wire import MAX_BODY_BYTES
 from hilsplat.web.server import Pages
 from tests.unit.viewer.conftest import ADDRESS, TOKEN
 
@@ -51,7 +52,7 @@ def test_other_ports_of_this_machine_are_accepted(client, host):
 
 
 def test_large_bodies_are_refused(client):
-    assert client.post("/api/query", json={"text": "x" * (1 << 20)}).status_code == 413
+    assert client.post("/api/query", json={"text": "x" * MAX_BODY_BYTES}).status_code == 413
 
 
 FILES = ("/static/%2e%2e%2fguard.py", "/static/..%5cguard.py", "/static//etc/passwd")

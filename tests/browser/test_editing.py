@@ -1,0 +1,186 @@
+"""Gaussians selected by an answer, a box and a brush, removed, restored and saved."""
+
+import io
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+from plyfile import PlyData
+
+from hilsplat.splat.ply import load_ply
+from hilsplat.viewer.frames import within
+from hilsplat.viewer.wire import WireCamera
+from tests.browser.conftest import ask_and_wait, keep, on_page, phone_fits, save, wire_camera
+from tests.unit.artifact_changes import loosen
+from tests.unit.splat.spz_reader import decoded
+
+
+def edit(page) -> None:
+    page.get_by_role("button", name="Edit", exact=True).click()
+    page.wait_for_timeout(300)  # the view is lower now
+
+
+def counts(page) -> tuple[int, int]:
+    """Numbers of selected and removed Gaussians."""
+    page.wait_for_timeout(400)
+    return tuple(int(number) for number in re.findall(r"\d+", page.locator("#edit-told").inner_text())[:2])
+
+
+def use(page, tool: str) -> None:
+    page.get_by_role("toolbar", name="Edit").get_by_text(tool, exact=True).click()
+
+
+def drag(page, *points: tuple[float, float], held: str = "") -> None:
+    """Drag over points of the desk's plane."""
+    places = on_page(page, *[(x, y, 0) for x, y in points])
+    if held:
+        page.keyboard.down(held)
+    page.mouse.move(*places[0])
+    page.mouse.down()
+    for place in places[1:]:
+        page.mouse.move(*place, steps=4)
+    page.mouse.up()
+    if held:
+        page.keyboard.up(held)
+
+
+def colour(page, x: float, y: float) -> np.ndarray:
+    """Colour of the picture at a point of the desk's plane."""
+    page.wait_for_timeout(600)
+    page.mouse.move(5, 5)
+    ((left, top),) = on_page(page, (x, y, 0))
+    picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
+    return picture[round(top), round(left)]
+
+
+def press(page, key: str) -> None:
+    page.locator("#view").focus()
+    page.keyboard.press(key)
+
+
+@pytest.mark.parametrize("painter", ["gl", "server"])
+def test_gaussians_in_a_box_are_selected_removed_and_restored(opened, desk_address, painter):
+    page = opened(desk_address, painter)
+    edit(page)
+    use(page, "box")
+    drag(page, (21.5, 16.5), (29.5, 20.5))
+    assert counts(page) == (8 * 4, 0)
+    assert np.abs(colour(page, 25, 18) - (0.7 * 255, 0, 0.3 * 250 + 0.7 * 160)).max() < 40
+    press(page, "Delete")
+    assert counts(page) == (0, 32)
+    assert colour(page, 25, 18).max() < 40
+    drag(page, (19.5, 14.5), (29.5, 20.5))  # what is removed is not selected again
+    assert counts(page) == (10 * 6 - 32, 32)
+    press(page, "Control+z")
+    press(page, "Control+z")
+    assert counts(page) == (32, 0)
+    press(page, "Control+z")
+    assert counts(page) == (0, 0) and colour(page, 25, 18)[2] > 150
+    page.get_by_role("button", name="Redo").click()
+    press(page, "Control+Shift+z")
+    assert counts(page) == (0, 32)
+
+
+def test_the_brush_adds_and_subtracts(opened, desk_address, desk):
+    page = opened(desk_address)
+    gaussians = load_ply(desk / "gaussians.ply")
+    edit(page)
+    press(page, "c")
+    page.get_by_label("Size").fill("60")
+    camera = WireCamera.model_validate(wire_camera(page)).camera()
+    view = page.locator("#view").bounding_box()
+    places = on_page(page, (6, 8, 0), (26, 14, 0)) - (view["x"], view["y"])
+    points = [tuple(place) for place in places.tolist()]
+    expected = int(within(gaussians.means, camera, points, 30.0).sum())
+    drag(page, (6, 8), (26, 14))
+    selected, _ = counts(page)
+    assert abs(selected - expected) <= 0.05 * expected and expected > 60
+    drag(page, (6, 20), (8, 20), held="Shift")
+    more, _ = counts(page)
+    assert more > selected
+    drag(page, (6, 20), (8, 20), held="Control")
+    assert counts(page)[0] == pytest.approx(selected, abs=2)
+    size = float(page.get_by_label("Size").input_value())
+    press(page, "]")
+    assert float(page.get_by_label("Size").input_value()) > size
+    press(page, "i")
+    assert counts(page)[0] == pytest.approx(len(gaussians) - selected, abs=2)
+    press(page, "Escape")  # dragging moves the camera again
+    before = wire_camera(page)
+    drag(page, (6, 8), (12, 8))
+    assert wire_camera(page) != before
+
+
+def test_an_answer_is_removed_and_the_rest_is_saved(opened, desk_address, desk, scene, tmp_path):
+    page = opened(desk_address)
+    keep(page, "book")
+    ask_and_wait(page, "mug > handle")
+    (book,), (handle,) = scene.query("book"), scene.query("mug > handle")
+    edit(page)
+    page.get_by_role("button", name="Select answers").click()
+    both = scene.views.gaussians_of([book.node, handle.node])
+    assert counts(page) == (len(both), 0)
+    press(page, "Escape")  # clears the answer, but not the selection
+    page.get_by_role("button", name="Show book").click()
+    page.locator(f"[role=treeitem][data-node='{handle.node}'] > .row .label").click()
+    page.get_by_label("Selection").select_option("subtract")
+    page.get_by_role("button", name="Select answers").click()
+    rows = np.setdiff1d(both, handle.gaussians)
+    assert counts(page) == (len(rows), 0)
+    page.get_by_role("button", name="Remove", exact=True).click()
+    before = (desk / "gaussians.ply").read_bytes()
+    found = PlyData.read(save(page, "Whole scene, PLY", tmp_path / "scene.ply"))["vertex"].data
+    kept = np.setdiff1d(np.arange(864), rows)
+    np.testing.assert_array_equal(found, PlyData.read(desk / "gaussians.ply")["vertex"].data[kept])
+    compressed = decoded(save(page, "Whole scene, SPZ", tmp_path / "scene.spz").read_bytes())
+    assert len(compressed) == len(kept)
+    assert (desk / "gaussians.ply").read_bytes() == before
+
+
+def test_only_the_selection_is_kept_in_the_saved_page(opened, desk_address, tmp_path):
+    page = opened(desk_address)
+    edit(page)
+    press(page, "b")
+    drag(page, (-0.5, -0.5), (15.5, 23.5))
+    page.get_by_role("button", name="Keep only").click()
+    assert counts(page) == (0, 864 - 16 * 24)
+    saved = save(page, "Page with answers", tmp_path / "page.html")
+    offline = page.context.new_page()
+    offline.goto(saved.as_uri())
+    offline.locator("body[data-ready=yes]").wait_for()
+    assert offline.evaluate("hilsplat.painter.count") == 16 * 24
+    assert not offline.get_by_role("button", name="Edit", exact=True).is_visible()
+
+
+def test_the_edit_bar_fits_on_a_phone(opened, desk_address):
+    page = opened(desk_address)
+    edit(page)
+    assert phone_fits(page)
+
+
+def test_loose_gaussians_are_selected_and_removed(own_desk, served):
+    loosen(own_desk, np.arange(100, 140))
+    page = served(own_desk)
+    edit(page)
+    page.get_by_role("button", name="Select loose").click()
+    assert counts(page) == (40, 0)
+    press(page, "Delete")
+    assert counts(page) == (0, 40)
+
+
+@pytest.mark.parametrize("painter", ["gl", "server"])
+def test_removed_gaussians_are_kept_over_a_reload_until_they_are_restored(opened, desk_address, painter):
+    page = opened(desk_address, painter)
+    edit(page)
+    use(page, "box")
+    drag(page, (21.5, 16.5), (29.5, 20.5))
+    press(page, "Delete")
+    page.wait_for_timeout(800)
+    page.reload()
+    page.locator("body[data-ready=yes]").wait_for()
+    assert counts(page) == (0, 32) and colour(page, 25, 18).max() < 40
+    page.get_by_role("button", name="Restore all").click()
+    assert counts(page) == (0, 0) and colour(page, 25, 18)[2] > 150
+    press(page, "Control+z")
+    assert counts(page) == (0, 32)
