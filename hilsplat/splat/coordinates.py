@@ -9,10 +9,11 @@ from jaxtyping import Float, Float64, Int64
 from scipy.special import sph_harm_y
 
 from hilsplat.base.artifacts import read_json, run_command, write_json
-from hilsplat.base.errors import ArtifactError, HilsplatError
+from hilsplat.base.errors import ArtifactError, HilsplatError, SceneError, foreign
 from hilsplat.base.lineage import require_as_written, require_made_from, sha256_of_file
 from hilsplat.base.rotations import are_rotations, multiply, quaternion_of
-from hilsplat.scene.importers.nerfstudio import source_from_dataparser
+from hilsplat.scene.layouts import read_json_object
+from hilsplat.scene.posed_images import rigid_pose
 from hilsplat.scene.scene import Scene
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.ply import import_ply, load_ply, save_ply
@@ -20,7 +21,10 @@ from hilsplat.splat.ply import import_ply, load_ply, save_ply
 logger = logging.getLogger(__name__)
 
 FIX = "export it again as an uncompressed 3DGS PLY, or correct the gaussians column of the scene sheet"
+COPY_AGAIN = "copy it again from nerfstudio"
 TOLERANCE = 1e-5  # maximum deviation of a matrix from a scaled rotation, relative to the scale
+BEFORE_APPLIED_TRANSFORM = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
+"""Transform of COLMAP coordinates by `ns-process-data` versions that do not record `applied_transform`."""
 
 
 def decompose(similarity: Float[np.ndarray, "4 4"]) -> tuple[float, Float64[np.ndarray, "3 3"], np.ndarray]:
@@ -144,6 +148,40 @@ def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
     if matrix.shape != (4, 4):
         raise ArtifactError(f"{path}: source_from_scene is not a 4 x 4 matrix", found=f"shape {matrix.shape}")
     return matrix
+
+
+def source_from_dataparser(dataparser: Path, transforms: Path | None) -> Float64[np.ndarray, "4 4"]:
+    """Return the similarity from nerfstudio's training coordinates to those of the source's poses.
+
+    `dataparser_transforms.json` maps original coordinates, usually COLMAP's, to training coordinates:
+    `x_training = scale * (transform @ [x_original, 1])`. The poses in `transforms.json` are in a third
+    coordinate system, which `applied_transform` and `applied_scale` in that file relate to the original one.
+    If `transforms` is None, the poses are those of a COLMAP model.
+    """
+    content = read_json_object(dataparser, COPY_AGAIN)
+    applied, applied_scale = np.eye(4), 1.0
+    if transforms is not None:
+        saved = read_json_object(transforms, COPY_AGAIN)
+        if "applied_transform" in saved:
+            applied = _matrix(transforms, "applied_transform", saved)
+        elif (transforms.parent / "colmap/sparse/0").is_dir():
+            applied[:3] = BEFORE_APPLIED_TRANSFORM
+        applied_scale = _scale(transforms, "applied_scale", {"applied_scale": 1.0, **saved})
+    training_from_source = _matrix(dataparser, "transform", content) @ np.linalg.inv(applied)
+    training_from_source[:3] *= _scale(dataparser, "scale", content) / applied_scale
+    return np.linalg.inv(training_from_source)
+
+
+def _matrix(path: Path, key: str, content: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
+    with foreign(f"{path}: {key}", fix=COPY_AGAIN):
+        return rigid_pose(np.array(content[key], np.float64), f"{path}: {key}")
+
+
+def _scale(path: Path, key: str, content: dict[str, Any]) -> float:
+    value = content.get(key)
+    if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value < float("inf"):
+        raise SceneError(f"{path}: {key} is not a positive number", found=repr(value)[:80])
+    return float(value)
 
 
 def read_gaussians(ply: Path) -> tuple[Gaussians, list[str]]:

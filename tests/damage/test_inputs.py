@@ -29,11 +29,10 @@ from hilsplat.embed.langsplat_files import read_view
 from hilsplat.photos.intake import unpack_photographs
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.scene.importers.known_views import KnownView, Source
-from hilsplat.scene.importers.nerfstudio import source_from_dataparser
 from hilsplat.scene.importers.reading import read_source
 from hilsplat.scene.layouts import find_known_poses
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.splat.coordinates import decompose
+from hilsplat.splat.coordinates import decompose, source_from_dataparser
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import import_ply, load_ply, save_ply
 from hilsplat.workflow.plan import Plan

@@ -4,16 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from models.training import sam_loss
 from models.training.batches import CropStage
 from models.training.clip import contrastive_loss
 from models.training.crops import list_crops
 from models.training.loop import Budget, Tuning
 from models.training.measure_clip import measure_clip, measure_queries
 from models.training.measure_sam import measure_everything
-from models.training.sam_loss import segmentation_loss
 from models.training.train_clip import train_clip
-from models.training.train_sam import train_sam
+from models.training.train_sam import segmentation_loss, train_sam, training_loss
 from tests.unit.training.drawn import drawn_masks, drawn_views
 
 SMALL = (CropStage(1.0, 64, 4, 8, 128),)
@@ -46,7 +44,7 @@ def test_an_interrupted_and_extended_training_gives_the_weights_of_a_single_run(
     def killed(*args):
         if next(steps) == 3:
             raise KeyboardInterrupt
-        return sam_loss.training_loss(*args)
+        return training_loss(*args)
 
     with monkeypatch.context() as context, pytest.raises(KeyboardInterrupt):
         context.setattr("models.training.train_sam.training_loss", killed)
