@@ -74,6 +74,12 @@ def opened_image(path: Path, what: str = "image") -> Iterator[Image.Image]:
         raise ImageError(f"{what} {path} cannot be read: {error}", fix=fix) from error
 
 
+def image_size_hw(path: Path) -> tuple[int, int]:
+    """Read an image's height and width, as stored, from its header; raise ImageError if it is unreadable."""
+    with opened_image(path) as image:
+        return image.height, image.width
+
+
 def exif_tags(image: Image.Image, ifd: ExifTags.IFD | None = None) -> Mapping[int, Any]:
     """Return an image's EXIF tags, those of its main directory or of `ifd`; skip damaged ones."""
     values = {}

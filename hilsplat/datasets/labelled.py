@@ -17,7 +17,7 @@ from jaxtyping import Bool, Int
 
 from hilsplat.base.errors import ImageError, SceneError
 from hilsplat.base.files import list_images
-from hilsplat.base.images import opened_image, read_mask
+from hilsplat.base.images import image_size_hw, read_mask
 from hilsplat.base.levels import Level, plain_text
 from hilsplat.datasets.dataset import SceneReport
 from hilsplat.scene.cameras import Camera
@@ -29,9 +29,7 @@ if TYPE_CHECKING:  # imports pycolmap, which evaluation doesn't need
     from hilsplat.scene.importers.known_views import KnownView
 
 logger = logging.getLogger(__name__)
-
-ROUNDING_PX = 1.0
-"""Rounding tolerance, px, for the height of a label scaled to the width of its image."""
+ROUNDING_PX = 1.0  # rounding tolerance, px, for the height of a label scaled to the width of its image
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,12 +197,6 @@ def images_by_view(folder: Path) -> dict[str, Path]:
             )
         images[view] = path
     return images
-
-
-def image_size_hw(path: Path) -> tuple[int, int]:
-    """Read an image's height and width, as stored, from its header; raise ImageError if it is unreadable."""
-    with opened_image(path) as image:
-        return image.height, image.width
 
 
 def mask_region(

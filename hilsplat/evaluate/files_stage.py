@@ -11,10 +11,9 @@ from jaxtyping import Bool, Float64, Int64
 
 from hilsplat.base.artifacts import read_npz
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, SettingsError
-from hilsplat.base.images import read_mask
+from hilsplat.base.images import image_size_hw, read_mask
 from hilsplat.base.progress import stage_log
 from hilsplat.base.tables import aligned_table
-from hilsplat.datasets.labelled import image_size_hw
 from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.metrics.instances import InstanceMatches

@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
 
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.labelled import check_label_size, image_size_hw
+from hilsplat.base.images import image_size_hw
+from hilsplat.datasets.labelled import check_label_size
 from hilsplat.scene.layouts import read_json_object
 
 Polygon = Float[np.ndarray, "_ 2"] | Int[np.ndarray, "_ 2"] | Sequence[tuple[int, int]]

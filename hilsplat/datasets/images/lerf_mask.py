@@ -9,11 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
+from hilsplat.base.images import image_size_hw
 from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.labelled import (
     LabelledRegion,
     LabelledScene,
-    image_size_hw,
     images_by_view,
     mask_region,
     posed_images,

@@ -8,11 +8,11 @@ with ground truth `any grey`. A missing file or folder, or an unusable classes.t
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
+from hilsplat.base.images import image_size_hw
 from hilsplat.datasets.dataset import ABLATIONS, Dataset
 from hilsplat.datasets.labelled import (
     LabelledRegion,
     LabelledScene,
-    image_size_hw,
     images_by_view,
     mask_region,
     require_images,
@@ -22,8 +22,7 @@ from hilsplat.scene.layouts import POSES_BOUNDS
 from hilsplat.scene.placement import SHAPE_TOLERANCE
 from hilsplat.scene.view_names import view_name
 
-FOREGROUND = 255
-"""The original loader computes int8(value / 255), which is 0 for smaller values."""
+FOREGROUND = 255  # the original loader computes int8(value / 255), which is 0 for smaller values
 
 
 def open_scene(root: Path, scene: str) -> LabelledScene:

@@ -19,9 +19,9 @@ from jaxtyping import Float, Int, Int32
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import list_images
+from hilsplat.base.images import image_size_hw
 from hilsplat.datasets.classes import REPLICA_NAMES
 from hilsplat.datasets.dataset import Dataset, listing
-from hilsplat.datasets.labelled import image_size_hw
 from hilsplat.datasets.points.labelled_points import (
     UNPACK_AGAIN,
     LabelledPoints,

@@ -16,9 +16,9 @@ from jaxtyping import Int32
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import list_images
+from hilsplat.base.images import image_size_hw
 from hilsplat.datasets.classes import SCANNET200
 from hilsplat.datasets.dataset import Dataset
-from hilsplat.datasets.labelled import image_size_hw
 from hilsplat.datasets.points.labelled_points import (
     LabelledPoints,
     PlyMesh,

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 
 from hilsplat.base.errors import HilsplatError, SceneError, foreign, in_one_line
 from hilsplat.base.files import IMAGE_SUFFIXES, is_outside, list_images
-from hilsplat.base.images import opened_image
+from hilsplat.base.images import image_size_hw
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.cameras import MAX_SIDE_PX
 from hilsplat.scene.colmap import Points, pycolmap
@@ -148,12 +148,6 @@ def require_valid(view: KnownView) -> None:
     raise SceneError(f"the camera {fault} of view {view.name} is not valid", expected=expected, found=found)
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Return width and height of an image as stored, px."""
-    with opened_image(path) as image:
-        return image.size
-
-
 def find_images(root: Path, names: Sequence[str]) -> dict[str, Path | None]:
     """Return the image of each name in a pose file, from `root`, its `images/` or folders below, or None.
 
@@ -259,7 +253,7 @@ def read_llff(known: KnownPoses) -> Source:
         down, right, back, position, (height_px, width_px, focal_px) = matrix.T
         pose = np.stack([right, down, -back, position], axis=1)
         source_from_cam = rigid_pose(pose, f"{path}, row {number}")
-        width, height = image_size(image)
+        height, width = image_size_hw(image)
         if abs(width * height_px - height * width_px) > ASPECT_TOLERANCE * width * height_px:
             source.notes.append(f"{image.name} has another shape than {path.name} states")
         params = [float(focal_px * width / width_px), width / 2, height / 2]

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from hilsplat.base.errors import SceneError, foreign
+from hilsplat.base.images import image_size_hw
 from hilsplat.scene.colmap import Points, pycolmap
 from hilsplat.scene.importers.known_views import (
     Keys,
     KnownView,
     Source,
     find_images,
-    image_size,
     require_inside,
 )
 from hilsplat.scene.importers.ply_file import read_ply
@@ -44,7 +44,7 @@ COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_g
 
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 
-# applied_transform and applied_scale are used for Gaussians, see `nerfstudio.py`.
+# applied_transform and applied_scale are used for Gaussians, see `splat/coordinates.py`.
 USED = """frames file_path transform_matrix w h cx cy k1 k2 k3 k4 p1 p2 camera_model is_fisheye ply_file_path
 applied_transform applied_scale"""
 HARMLESS = """aabb_scale scale offset n_frames from_na up sharpness rotation render_aabb orientation_override
@@ -143,7 +143,7 @@ def _lens(where: str, frame: Mapping[str, Any], image: Path | None, notes: list[
             )
         width, height = values.get("w"), values.get("h")
         if width is None or height is None:
-            width, height = image_size(image) if image is not None else (2, 2)  # not used without an image
+            height, width = image_size_hw(image) if image is not None else (2, 2)  # not used without an image
         width, height = int(width), int(height)
         focal = {
             axis: _focal(frame, axis, side, notes)

@@ -13,11 +13,10 @@ from PIL import EpsImagePlugin, Image
 
 from hilsplat.base.artifacts import read_npy, read_npz
 from hilsplat.base.errors import ArtifactError, HilsplatError, ImageError, SceneError
-from hilsplat.base.images import FORMATS, open_image, read_image, require_usable_size
+from hilsplat.base.images import FORMATS, image_size_hw, open_image, read_image, require_usable_size
 from hilsplat.base.levels import Level
 from hilsplat.base.ownership import require_own_picture
 from hilsplat.datasets.hierarchy import HierarchyAnnotations, label_path
-from hilsplat.datasets.labelled import image_size_hw
 from hilsplat.embed.langsplat_files import read_view
 from hilsplat.evaluate.files_stage import read_view_masks
 from hilsplat.photos.inspection import inspect_photos
