@@ -16,6 +16,6 @@ def replace_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the code for cards run on the CPU, on a card of 1 TiB that passed its self-test."""
     monkeypatch.setattr(cuda, "DEVICE", "cpu")
     monkeypatch.setattr(device, "CHOSEN", {"auto": "cuda", "cuda": "cuda", "cpu": "cpu"})
-    monkeypatch.setattr(device, "free_card_bytes", lambda: 2**40)
+    monkeypatch.setattr(device, "free_mib", lambda: 2.0**20)
     for name in KERNELS:
         monkeypatch.setattr(gsplat, name, getattr(gsplat_on_cpu, name))

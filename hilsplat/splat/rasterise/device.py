@@ -14,6 +14,7 @@ from typing import Literal
 from hilsplat.base.cache import forget, remembered
 from hilsplat.base.cards import has_driver, release_card
 from hilsplat.base.errors import DeviceError, first_line
+from hilsplat.models.card import MIB, free_mib
 from hilsplat.splat.rasterise.drawn import Device
 from hilsplat.splat.rasterise.parity import KIND, cuda_disagreement
 
@@ -26,9 +27,7 @@ ABSENT = ("gsplat is not installed", "no NVIDIA driver is installed", "torch ")
 TOO_MUCH = "needs more memory than the card has free"
 
 Requested = Literal["auto", "cpu", "cuda"]
-
-CHOSEN: dict[Requested, Device] = {}
-"""Device of each setting in this process."""
+CHOSEN: dict[Requested, Device] = {}  # device of each setting in this process
 
 
 @cache
@@ -129,7 +128,7 @@ def require_card_memory(requested: Requested, needed: int, user: str, fix: str) 
     Raises:
         DeviceError: if `cuda` was requested, and its free memory is less.
     """
-    if choose_device(requested) == "cpu" or needed <= (free := free_card_bytes()):
+    if choose_device(requested) == "cpu" or needed <= (free := int(free_mib() * MIB)):
         return choose_device(requested)
     problem = f"{user} needs about {_gib(needed)} of the card's memory; {_gib(free)} are free"
     if requested == "cuda":
@@ -140,14 +139,6 @@ def require_card_memory(requested: Requested, needed: int, user: str, fix: str) 
     CHOSEN[requested] = "cpu"  # also for the provenance record
     release_card()
     return "cpu"
-
-
-def free_card_bytes() -> int:
-    """Return the memory of the current CUDA device that this process can use: free, or kept by torch."""
-    import torch
-
-    kept = torch.cuda.memory_reserved() - torch.cuda.memory_allocated()
-    return int(torch.cuda.mem_get_info()[0]) + kept
 
 
 def _gib(size: int) -> str:

@@ -306,7 +306,7 @@ def test_needed_bytes_are_those_of_gaussians_and_images():
 
 
 def test_too_small_a_card_is_an_error_or_selects_the_cpu(scene, monkeypatch, caplog):
-    monkeypatch.setattr(device, "free_card_bytes", lambda: 2**20)
+    monkeypatch.setattr(device, "free_mib", lambda: 1.0)
     large = SETTINGS.model_copy(update={"max_gaussians": 3_000_000})
     with pytest.raises(
         DeviceError, match=r"(?s)more memory.*about 3\.\d GiB.*0\.0 GiB.*gaussians.max_gaussians"
@@ -316,11 +316,11 @@ def test_too_small_a_card_is_an_error_or_selects_the_cpu(scene, monkeypatch, cap
         assert fit.fit_device(scene, large.model_copy(update={"device": "auto"})) == "cpu"
     assert "about 3." in caplog.text and "gaussians.image_scale" in caplog.text
     assert device.choose_device("auto") == "cpu"  # and so the provenance record says
-    monkeypatch.setattr(device, "free_card_bytes", lambda: 2**32)
+    monkeypatch.setattr(device, "free_mib", lambda: 2.0**12)
     assert fit.fit_device(scene, large) == "cuda"
     # frozen points are not limited by max_gaussians
     frozen = large.model_copy(update={"initial": "frozen"})
-    monkeypatch.setattr(device, "free_card_bytes", lambda: 2**23)
+    monkeypatch.setattr(device, "free_mib", lambda: 8.0)
     assert fit.fit_device(scene, frozen) == "cuda"
 
 
