@@ -1,14 +1,11 @@
 """Compiled loops of matching."""
 
-from typing import no_type_check
-
 import numpy as np
 
 from cpusplat.compiled import compiled
 
 
 @compiled
-@no_type_check  # the test suite's shape checks cannot be compiled
 def two_nearest(products, first, best, second, column, best_of_column, second_of_column, row_of_column):
     """Update the two largest products per row and column with a block that starts at row `first`."""
     columns = products.shape[1]

@@ -6,7 +6,7 @@ of a block. A prompt has H (T - 1) factors per layer: each head's softmax weight
 """
 
 from collections import namedtuple
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,8 +27,7 @@ from cpusplat.lanes import (
     transpose,
 )
 
-LEAST = np.float32(-126)
-"""Lowest exponent of a normal float32."""
+LEAST = np.float32(-126)  # lowest exponent of a normal float32
 one_row, three_rows, four_rows, six_rows, seven_rows, eight_rows = map(rows_of_products, (1, 3, 4, 6, 7, 8))
 
 ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
@@ -91,7 +90,6 @@ class MaskPrompts(NamedTuple):
 
 
 @compiled
-@no_type_check
 def multiply(y, y0, y_step, a, a0, a_step, x, x0, x_step, rows, inner, columns, begin):
     """Compute y[r, c] = sum over k of a[r, k] x[k, c]; unless `begin`, add the sum to y[r, c] instead.
 
@@ -126,7 +124,6 @@ def multiply(y, y0, y_step, a, a0, a_step, x, x0, x_step, rows, inner, columns, 
 
 
 @compiled
-@no_type_check
 def linear(x, weights, bias, rows, inner, y):
     """Compute y (rows, outer) = x (rows, inner) W + bias; outer is a multiple of 16.
 
@@ -141,14 +138,12 @@ def linear(x, weights, bias, rows, inner, y):
 
 
 @compiled
-@no_type_check
 def dense(y, y0, a, a0, x, x0, rows, inner, columns, begin):
     """Run `multiply` with contiguous matrices."""
     multiply(y, y0, columns, a, a0, inner, x, x0, columns, rows, inner, columns, begin)
 
 
 @compiled
-@no_type_check
 def by_head(y, y0, a, a0, x, x0, heads, rows, inner, columns):
     """Run `dense` for each head."""
     for h in range(heads):
@@ -157,7 +152,6 @@ def by_head(y, y0, a, a0, x, x0, heads, rows, inner, columns):
 
 
 @compiled
-@no_type_check
 def multiply_below(y, y_step, a, a0, x, rows, columns):
     """Add to `y` the product of a square matrix's lower triangle and `x`."""
     for r in range(0, rows, MOST_ROWS):
@@ -166,7 +160,6 @@ def multiply_below(y, y_step, a, a0, x, rows, columns):
 
 
 @compiled
-@no_type_check
 def scale_and_shift(y, x, x0, scale, shift, shift0, rows, pixels):
     """Compute y = scale * x + shift for rows of pixels; `scale` is one row."""
     for c in range(0, pixels, WIDTH):
@@ -177,7 +170,6 @@ def scale_and_shift(y, x, x0, scale, shift, shift0, rows, pixels):
 
 
 @compiled
-@no_type_check
 def token_shares(s, offset, offset0, scale, heads, tokens, pixels, e, e0):
     """Compute each head's softmax over the tokens at each pixel; the last token's share is omitted.
 
@@ -206,7 +198,6 @@ def token_shares(s, offset, offset0, scale, heads, tokens, pixels, e, e0):
 
 
 @compiled
-@no_type_check
 def pixel_weights(s, scaled, offset, offset0, u, v, top, top0, sums, sums0, width, rows, pixels):
     """Compute the weights of a block's pixels in softmaxes over all pixels, and update the running sums.
 
@@ -254,7 +245,6 @@ def pixel_weights(s, scaled, offset, offset0, u, v, top, top0, sums, sums0, widt
 
 
 @compiled
-@no_type_check
 def weighted_sums(sums, sums0, width, weights, values, values0, heads, tokens, pixels, depth):
     """Add a block to the sums over pixels (H * T, width) of values (H, P, depth) by weights (H * T, P)."""
     for h in range(heads):
@@ -265,7 +255,6 @@ def weighted_sums(sums, sums0, width, weights, values, values0, heads, tokens, p
 
 
 @compiled
-@no_type_check
 def read_image(sizes, rows, keys, values, top, sums):
     """Compute the first token-to-pixel attention, whose keys and values depend on the image only.
 
@@ -296,7 +285,6 @@ def read_image(sizes, rows, keys, values, top, sums):
 
 
 @compiled
-@no_type_check
 def first_factors(sizes, b, i, rows, queries, s, e, none, ones):
     """Compute each token's share in each pixel at the first layer (H, T - 1, P)."""
     _, _, heads, tokens, dim, pixels, _ = sizes
@@ -306,7 +294,6 @@ def first_factors(sizes, b, i, rows, queries, s, e, none, ones):
 
 
 @compiled
-@no_type_check
 def second_factors(sizes, b, i, rows, low, offset, scaled_q, fixed_q, s1, q, s, e):
     """Write the second layer's shares to `e`, in the rows that follow those of the first layer."""
     _, _, heads, tokens, dim, pixels, _ = sizes
@@ -319,7 +306,6 @@ def second_factors(sizes, b, i, rows, low, offset, scaled_q, fixed_q, s1, q, s, 
 
 
 @compiled
-@no_type_check
 def read_by_factors(sizes, b, i, image, prompt, u, v, factors, padded, e, e_t, k, s, scaled, top, sums):
     """Add a block to a token-to-pixel attention whose keys and values are sums of factored terms.
 
@@ -351,7 +337,6 @@ def read_by_factors(sizes, b, i, image, prompt, u, v, factors, padded, e, e_t, k
 
 
 @compiled
-@no_type_check
 def update_and_read_first(sizes, channels, eps, image, prompt, top, sums, s1_out, e_out):
     """Compute the first pixel-to-token attention, its layer norm, and the second token-to-pixel attention.
 
@@ -402,7 +387,6 @@ def update_and_read_first(sizes, channels, eps, image, prompt, top, sums, s1_out
 
 
 @compiled
-@no_type_check
 def update_and_read_second(sizes, channels, eps, image, prompt, s1_in, e_in, top, sums, s2_out, e_out):
     """Compute the second pixel-to-token attention, its layer norm, and the final token-to-pixel attention.
 
@@ -473,7 +457,6 @@ def update_and_read_second(sizes, channels, eps, image, prompt, s1_in, e_in, top
 
 
 @compiled
-@no_type_check
 def gelu(x):
     """Return x times the normal CDF at x, within 1e-6 (Abramowitz and Stegun 7.1.26)."""
     size = larger(x, lanes(ZERO) - x)
@@ -487,7 +470,6 @@ def gelu(x):
 
 
 @compiled
-@no_type_check
 def rebuild_factors(
     sizes, queries, scaled_queries, fixed_queries, keys0, keys1, low, offset, s1_in, s2_in, e_out
 ):
@@ -515,7 +497,6 @@ def rebuild_factors(
 
 
 @compiled
-@no_type_check
 def mask_logits(sizes, fine, eps, weights, image, prompt, s1_in, s2_in, e_in, padded, grid_width, out):
     """Compute mask logits from the factors of both layers.
 

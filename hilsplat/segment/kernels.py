@@ -3,8 +3,6 @@
 Loops are sequential, so results do not depend on the number of threads.
 """
 
-from typing import no_type_check
-
 import numpy as np
 
 from cpusplat.compiled import compiled
@@ -14,7 +12,6 @@ BAND_WORDS = 2**17
 
 
 @compiled
-@no_type_check
 def _push(out, count, length):
     """Append a run; a full buffer is doubled first."""
     if count == len(out):
@@ -26,7 +23,6 @@ def _push(out, count, length):
 
 
 @compiled
-@no_type_check
 def upscaled_runs(
     logits, offsets, windows, rows, first_y, weight_y, first_x, weight_x, top, left, height, width
 ):
@@ -119,7 +115,6 @@ def upscaled_runs(
 
 
 @compiled
-@no_type_check
 def areas_and_boxes(runs, offsets, width):
     """Return the area and box (xyxy, end exclusive) of each run-length encoded mask; 0 for empty masks."""
     number = len(offsets) - 1
@@ -146,7 +141,6 @@ def areas_and_boxes(runs, offsets, width):
 
 
 @compiled
-@no_type_check
 def _root(parent, node):
     while parent[node] != node:
         parent[node] = parent[parent[node]]
@@ -155,7 +149,6 @@ def _root(parent, node):
 
 
 @compiled
-@no_type_check
 def _region_areas(row, start, stop, value, of, parent, area):
     """Find the 8-connected regions of segments whose value is `of`: roots in `parent`, areas at the roots."""
     number = len(row)
@@ -188,7 +181,6 @@ def _region_areas(row, start, stop, value, of, parent, area):
 
 
 @compiled
-@no_type_check
 def cleaned_runs(runs, offsets, width, min_area):
     """Fill holes and drop islands (8-connected) smaller than `min_area`, but keep the largest island.
 
@@ -244,7 +236,6 @@ def cleaned_runs(runs, offsets, width, min_area):
 
 
 @compiled
-@no_type_check
 def _bits_set(word):
     """Count the ones in a 64-bit word."""
     word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
@@ -254,7 +245,6 @@ def _bits_set(word):
 
 
 @compiled
-@no_type_check
 def _set_bits(words, start, stop):
     """Set bits start..stop-1 of a row of 64-bit words."""
     full = np.uint64(0xFFFFFFFFFFFFFFFF)
@@ -271,7 +261,6 @@ def _set_bits(words, start, stop):
 
 
 @compiled
-@no_type_check
 def shared_pixels(runs, offsets, boxes, height, width):
     """Count the pixels that each pair of masks shares, int64 (M, M), as set bits of packed masks.
 
@@ -327,7 +316,6 @@ def shared_pixels(runs, offsets, boxes, height, width):
 
 
 @compiled
-@no_type_check
 def paint_runs(runs, offsets, order, canvas):
     """Write each row number of `order` to the pixels of its mask in the flat canvas; later rows win."""
     for row in order:
