@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from hilsplat.base.errors import visible
+from hilsplat.cli.common import Results, echo
 from hilsplat.stage import Threads
 from hilsplat_world.stages import consistency, mask_truth, tree_truth
 
@@ -14,11 +14,6 @@ app = typer.Typer(help="Make and inspect scenes of the synthetic world.", no_arg
 
 SceneWithMasks = Annotated[str, typer.Argument(help="synthetic scene that has masks, as dataset/scene")]
 MeasuredVariant = Annotated[str, typer.Option(help="variant that is measured")]
-Results = Annotated[Path, typer.Option(help="results folder")]
-
-
-def echo(text: str) -> None:
-    typer.echo(visible(text))  # noqa: TID251
 
 
 @app.command("show")

@@ -7,8 +7,7 @@ from typing import Annotated
 import typer
 
 from hilsplat.cli.common import app, echo
-
-POSES_HELP = "COLMAP model or transforms.json, or its folder; none: compute poses; default: use any found"
+from hilsplat.stages import POSES_HELP
 
 
 @app.command()
