@@ -68,13 +68,6 @@ class Scores:
     means: dict[str, float]
     rows: tuple[dict[str, Any], ...]
 
-    def __getitem__(self, metric: str) -> float:
-        if metric not in self.means:
-            raise SettingsError(
-                f"{self.protocol} did not measure {metric!r}", expected=f"one of {', '.join(self.means)}"
-            )
-        return self.means[metric]
-
     def __repr__(self) -> str:
         return f"Scores({self.protocol}: {', '.join(f'{name} {v:.4f}' for name, v in self.means.items())})"
 

@@ -160,16 +160,22 @@ def test_a_rendering_has_colours_depth_features_and_alpha(linked):
     np.testing.assert_array_equal(plain.colours, render_rgb(gaussians, camera))
 
 
-def test_a_folder_keeps_a_scene_that_opens(desk, desk_project, scene, masks, tmp_path):
-    gaussians = hilsplat.load_gaussians(desk / "gaussians.ply")
+def test_a_folder_keeps_a_scene_that_opens(desk, desk_project, masks, tmp_path):
+    write_colmap(hilsplat.load_scene(desk), tmp_path / "colmap")
     folder, model = tmp_path / "results/photos/again", str(desk_project / "models/colours")
-    linked = hilsplat.link(scene, gaussians, masks, model=model, folder=folder)
-    assert linked.scene is scene  # whose temporary files live as long as it does
+    scene = hilsplat.load_scene(tmp_path / "colmap", folder=folder, test_every=6)
+    assert (scene.name, scene.folder) == ("photos/again", folder / "scene")
+    gaussians = hilsplat.load_gaussians(desk / "gaussians.ply", scene)
+    views = scene.views("train")
+    of_views = hilsplat.SceneMasks({view: masks[view] for view in views if view in masks}, masks.origin)
+    linked = hilsplat.link(scene, gaussians, of_views, model=model, folder=folder)
     again = hilsplat.open_scene(folder)
+    assert len(again.nodes) == len(linked.nodes) > 0
     assert [hit.node for hit in again.query("mug")] == [hit.node for hit in linked.query("mug")]
     assert hilsplat.load_scene(folder).names == scene.names
-    with pytest.raises(ArtifactError, match=r"gaussians.ply already exists(.|\n)*open_scene"):
-        hilsplat.link(scene, gaussians, masks, model=model, folder=folder)
+    for other in (folder, tmp_path / "elsewhere"):
+        with pytest.raises(ArtifactError, match=r"cannot be used for photos/again(.|\n)*open_scene"):
+            hilsplat.link(scene, gaussians, of_views, model=model, folder=other)
 
 
 def test_files_of_imported_poses_are_deleted_with_the_scene(desk, tmp_path, temporary):
