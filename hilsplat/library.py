@@ -12,12 +12,11 @@ import os
 import weakref
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, TypeVar
+from typing import Any
 
-from pydantic import ValidationError
 from threadpoolctl import threadpool_limits
 
 from hilsplat import settings as of
@@ -27,7 +26,7 @@ from hilsplat.base.cache import ViewCache
 from hilsplat.base.errors import ArtifactError, SceneError, SettingsError
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import reporting, track
-from hilsplat.configuration import resolve_auto, settings_error
+from hilsplat.configuration import resolve_auto, validated
 from hilsplat.models.store import AUTO
 from hilsplat.photos.intake import prepared_photographs
 from hilsplat.query.language_scene import LanguageScene
@@ -42,34 +41,21 @@ from hilsplat.splat.fit import fit_gaussians
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply, save_ply
 
-Section = TypeVar("Section", bound=of.Section)
-
 FRAMES = 60
 """Maximum number of frames of videos, as in `hilsplat new`."""
 
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, eq=False)
-class SceneMasks(Mapping[str, HierarchicalMasks]):
-    """Masks of a scene's training views, by view.
+class SceneMasks(dict[str, HierarchicalMasks]):
+    """Masks of a scene's training views, by view; `dense()` of a view's masks returns them as (M, H, W) bool.
 
-    Attributes:
-        of_view: masks of each view; `dense()` returns them as (M, H, W) bool.
-        origin: segmenter and model, as recorded in the index of a `masks` artifact.
+    `origin` has segmenter and model, as recorded in the index of a `masks` artifact.
     """
 
-    of_view: dict[str, HierarchicalMasks]
-    origin: dict[str, Any]
-
-    def __getitem__(self, view: str) -> HierarchicalMasks:
-        return self.of_view[view]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.of_view)
-
-    def __len__(self) -> int:
-        return len(self.of_view)
+    def __init__(self, of_views: Mapping[str, HierarchicalMasks], origin: Mapping[str, Any]) -> None:
+        super().__init__(of_views)
+        self.origin = dict(origin)
 
     def __repr__(self) -> str:
         counts = {level: sum(len(masks.rows_of(level)) for masks in self.values()) for level in LEVELS}
@@ -149,7 +135,7 @@ def _posed(
     progress: bool,
 ) -> Scene:
     """Run the stage `poses`; without a folder, the scene's files are deleted with the returned object."""
-    source, section = source.resolve(), _section(of.PosesSettings, settings)
+    source, section = source.resolve(), _section("poses", settings)
     with ExitStack() as files:
         base = files.enter_context(_folder(folder))
         with _running(progress), prepared_photographs(source, base / "source", FRAMES) as (images, _):
@@ -188,7 +174,7 @@ def fit(
         DeviceError: `device="cuda"` cannot be used.
     """
     steps = {} if iterations is None else {"iterations": iterations, "steps_per_view": iterations}
-    section = _section(of.GaussiansSettings, steps | settings)
+    section = _section("gaussians", steps | settings)
     with _running(progress):
         return fit_gaussians(scene, section, seed=seed, threads=_threads(threads))[0]
 
@@ -230,7 +216,7 @@ def segment(
         ModelError: the model is missing or incomplete.
     """
     segmenter = AUTO if model == AUTO else "sam"
-    chosen = _section(of.MasksSettings, {"segmenter": segmenter, "model": str(model), **settings})
+    chosen = _section("masks", {"segmenter": segmenter, "model": str(model), **settings})
     section, views = resolve_auto(chosen), train_views(scene)
     with _running(progress), _folder(cache) as folder:
         views_and_masks, origin = segment_views(
@@ -269,8 +255,8 @@ def link(
         MisalignedArtifactError: the masks are not those of the scene's training views.
         ModelError: the model is missing or incomplete.
     """
-    section, number = _section(of.SemanticTreeSettings, settings), _threads(threads)
-    clip = resolve_auto(_section(of.ClipSettings, {"model": str(model), "crops": "nodes"}))
+    section, number = _section("semantic_tree", settings), _threads(threads)
+    clip = resolve_auto(_section("clip", {"model": str(model), "crops": "nodes"}))
     results = [Path(folder) / name for name in ("gaussians.ply", "default")] if folder else []
     if folder and (scene.folder != Path(folder) / "scene" or any(map(Path.exists, results))):
         raise ArtifactError(
@@ -298,14 +284,6 @@ def link(
     return replace(linked, views=replace(linked.views, scene=scene, gaussians=gaussians))
 
 
-def _section(kind: type[Section], values: Mapping[str, Any]) -> Section:
-    """Return a section of the settings; raise SettingsError if a name is unknown or a value invalid."""
-    try:
-        return kind.model_validate(values)
-    except ValidationError as error:
-        raise settings_error(error, "", kind) from error
-
-
 @contextmanager
 def _running(progress: bool) -> Iterator[None]:
     """Report progress, and sum in linear algebra libraries in one thread, as commands do for equal bytes."""
@@ -318,6 +296,10 @@ def _folder(path: Path | str | None) -> Iterator[Path]:
     """Yield the folder, or a temporary one."""
     with nullcontext(path) if path else TemporaryDirectory(prefix="hilsplat-") as folder:
         yield Path(folder)
+
+
+def _section(name: str, values: Mapping[str, Any]) -> Any:
+    return validated(name, values, name)
 
 
 def _threads(number: int | None) -> int:
