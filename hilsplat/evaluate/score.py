@@ -1,4 +1,4 @@
-"""Scores of arrays under a protocol, without files and without the pipeline (`hilsplat.score`)."""
+"""Scoring of arrays under a protocol, without files and without the pipeline (`hilsplat.score`)."""
 
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
@@ -237,7 +237,7 @@ def flat_rows(
 
     Args:
         level: level whose texts are queried, on a stand-in with levels; None if the labels have no levels.
-        are_masks: whether the answers of all views are masks, not relevancy.
+        are_masks: whether all views have masks as answers, not relevancy.
     """
     words: list[str] = []
     if card in OF_EVERY_TEXT:
