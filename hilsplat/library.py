@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 
 from hilsplat import settings as of
 from hilsplat import stages
-from hilsplat.base.artifacts import INDEX
+from hilsplat.base.artifacts import INDEX, read_memo
 from hilsplat.base.cache import ViewCache
 from hilsplat.base.errors import ArtifactError, SceneError, SettingsError
 from hilsplat.base.levels import LEVELS
@@ -43,6 +43,9 @@ from hilsplat.splat.ply import load_ply, save_ply
 
 FRAMES = 60
 """Maximum number of frames of videos, as in `hilsplat new`."""
+
+GIVEN = "given"
+"""Kind of Gaussians that `link` stored, in the JSON file beside the PLY."""
 
 logger = logging.getLogger(__name__)
 
@@ -245,30 +248,26 @@ def link(
         gaussians: in the scene's coordinates.
         model: folder of a CLIP model; "auto" uses the best pretrained one that is installed, or else
             models/clip-tiny, whose answers about photographs are meaningless.
-        folder: the folder given to `reconstruct` or `load_scene`, in which all results are then stored;
-            `open_scene`, `show` and `hilsplat view` open it. By default, nothing is stored.
+        folder: the folder given to `reconstruct` or `load_scene`, in which all results are then stored, in
+            place of those of an earlier call; `open_scene`, `show` and `hilsplat view` open it. By default,
+            nothing is stored.
         cache: as in `segment`.
         settings: those of section `semantic_tree`, such as `min_views=2`.
 
     Raises:
-        ArtifactError: the masks are empty, or the folder has results or another scene.
+        ArtifactError: the masks are empty, or the folder has results of a run or another scene.
         MisalignedArtifactError: the masks are not those of the scene's training views.
         ModelError: the model is missing or incomplete.
     """
     section, number = _section("semantic_tree", settings), _threads(threads)
     clip = resolve_auto(_section("clip", {"model": str(model), "crops": "nodes"}))
-    results = [Path(folder) / name for name in ("gaussians.ply", "default")] if folder else []
-    if folder and (scene.folder != Path(folder) / "scene" or any(map(Path.exists, results))):
-        raise ArtifactError(
-            f"{folder} cannot be used for {scene.name}, whose poses are in {scene.folder}",
-            expected="the folder given to `reconstruct` or `load_scene`, without gaussians.ply and default/",
-            fix="choose another folder there, or open this scene: hilsplat.open_scene(...)",
-        )
+    if folder:
+        _require_own(Path(folder), scene)
     with _running(progress), _folder(cache) as cached, _folder(folder) as base:
         own, ply = base / "default", base / "gaussians.ply"
         parts = SceneParts(scene.folder, ply, own / "semantic_tree", None, None, own / "clip", own / "masks")
         save_ply(ply, gaussians)
-        write_coordinates(ply, scene, gaussians, {"kind": "given"})
+        write_coordinates(ply, scene, gaussians, {"kind": GIVEN})
         write_masks(parts.masks, scene, masks.items(), len(masks), **masks.origin)
         contributions = own / "contributions"
         weights = of.ContributionsSettings(keep="none")
@@ -282,6 +281,19 @@ def link(
         logger.warning("%s: %s", scene.name, linked.caution)
     # The views keep the given scene, whose temporary files are deleted with it.
     return replace(linked, views=replace(linked.views, scene=scene, gaussians=gaussians))
+
+
+def _require_own(folder: Path, scene: Scene) -> None:
+    """Raise ArtifactError unless a folder has the scene and nothing else, or what `link` stored."""
+    is_new = not any((folder / name).exists() for name in ("gaussians.ply", "default"))
+    origin = read_memo(folder / "gaussians.json", dict[str, Any]).get("origin")
+    is_own = is_new or origin == {"kind": GIVEN}
+    if not is_own or scene.folder.resolve() != (folder / "scene").resolve():
+        raise ArtifactError(
+            f"{folder} cannot be used for {scene.name}, whose poses are in {scene.folder}",
+            expected="the folder given to `reconstruct` or `load_scene`, without results of a run",
+            fix="give another folder to both functions, or open this scene: hilsplat.open_scene(...)",
+        )
 
 
 @contextmanager

@@ -134,7 +134,7 @@ class LanguageScene(NodeQueries):
         """The scene's nodes."""
         return self.views.tree
 
-    @property
+    @cached_property
     def nodes(self) -> tuple[Node, ...]:
         """The tree's nodes, by row, as queries return them."""
         return tuple(map(self._node, range(len(self.tree))))

@@ -1,6 +1,7 @@
 """The pipeline from Python on the desk: the same bytes as the stages, no files left, errors that help."""
 
 import logging
+import os
 import subprocess
 import sys
 import tempfile
@@ -12,7 +13,7 @@ import pytest
 import hilsplat
 from hilsplat import stages
 from hilsplat.base.errors import ArtifactError, HilsplatError, ModelError, SceneError, SettingsError
-from hilsplat.base.lineage import sha256_of_path
+from hilsplat.base.lineage import read_provenance, sha256_of_path
 from hilsplat.scene.exporting import write_colmap
 from hilsplat.segment.digests import digest_of, digests_in, load_masks
 from hilsplat.semantic_tree.tree import SemanticTree
@@ -160,7 +161,7 @@ def test_a_rendering_has_colours_depth_features_and_alpha(linked):
     np.testing.assert_array_equal(plain.colours, render_rgb(gaussians, camera))
 
 
-def test_a_folder_keeps_a_scene_that_opens(desk, desk_project, masks, tmp_path):
+def test_a_folder_keeps_a_scene_that_opens(own_desk, desk, desk_project, masks, tmp_path):
     write_colmap(hilsplat.load_scene(desk), tmp_path / "colmap")
     folder, model = tmp_path / "results/photos/again", str(desk_project / "models/colours")
     scene = hilsplat.load_scene(tmp_path / "colmap", folder=folder, test_every=6)
@@ -173,9 +174,11 @@ def test_a_folder_keeps_a_scene_that_opens(desk, desk_project, masks, tmp_path):
     assert len(again.nodes) == len(linked.nodes) > 0
     assert [hit.node for hit in again.query("mug")] == [hit.node for hit in linked.query("mug")]
     assert hilsplat.load_scene(folder).names == scene.names
-    for other in (folder, tmp_path / "elsewhere"):
-        with pytest.raises(ArtifactError, match=r"cannot be used for photos/again(.|\n)*open_scene"):
-            hilsplat.link(scene, gaussians, of_views, model=model, folder=other)
+    few = hilsplat.link(scene, gaussians, of_views, model=model, folder=folder, min_views=9)  # replaces it
+    assert len(few.nodes) == len(hilsplat.open_scene(folder).nodes) == 0
+    for of_run, other in ((scene, tmp_path / "elsewhere"), (hilsplat.load_scene(own_desk), own_desk)):
+        with pytest.raises(ArtifactError, match=r"cannot be used for photos/(.|\n)*open_scene"):
+            hilsplat.link(of_run, gaussians, of_views, model=model, folder=other)
 
 
 def test_files_of_imported_poses_are_deleted_with_the_scene(desk, tmp_path, temporary):
@@ -230,14 +233,20 @@ def test_progress_is_reported_only_on_request(scene, capsys):
 
 
 SCRIPT = """
+import sys
+import hilsplat
 from hilsplat.base.processes import in_own_process
-print("once", in_own_process(sorted, [2, 1]))
+scene = hilsplat.load_scene(sys.argv[1], folder="kept")
+print("once", in_own_process(sorted, [2, 1]), scene.name)
 """
 
 
-def test_a_script_without_a_guard_is_not_run_again_by_child_processes(tmp_path, project):
-    script = tmp_path / "script.py"
-    script.write_text(SCRIPT)
-    how = {"capture_output": True, "text": True, "env": {"PYTHONPATH": str(project)}, "timeout": 60}
-    done = subprocess.run([sys.executable, str(script)], **how)
-    assert done.stdout == "once [1, 2]\n", done.stderr
+def test_a_script_without_a_guard_is_not_run_again_by_child_processes(desk, tmp_path, project):
+    (tmp_path / "script.py").write_text(SCRIPT)
+    write_colmap(hilsplat.load_scene(desk), tmp_path / "colmap")
+    paths = os.pathsep.join([str(project), os.environ.get("PYTHONPATH", "")])
+    how = {"capture_output": True, "text": True, "cwd": tmp_path, "timeout": 120}
+    how["env"] = {**os.environ, "PYTHONPATH": paths}
+    done = subprocess.run([sys.executable, "script.py", "colmap"], **how)
+    assert done.stdout == "once [1, 2] photos/kept\n", done.stderr
+    assert read_provenance(tmp_path / "kept/scene").command == ()  # not that of the script
