@@ -87,6 +87,7 @@ def reconstruct(
     Raises:
         SceneError, ImageError: the photographs cannot be used.
         RegistrationError: too few photographs could be registered.
+        ArtifactError: the folder has results of a run.
     """
     return _posed(Path(photos), NO_POSES, settings, folder, seed, threads, progress)
 
@@ -139,6 +140,7 @@ def _posed(
 ) -> Scene:
     """Run the stage `poses`; without a folder, the scene's files are deleted with the returned object."""
     source, section = source.resolve(), _section("poses", settings)
+    _require_own(folder)
     with ExitStack() as files:
         base = files.enter_context(_folder(folder))
         with _running(progress), prepared_photographs(source, base / "source", FRAMES) as (images, _):
@@ -261,8 +263,12 @@ def link(
     """
     section, number = _section("semantic_tree", settings), _threads(threads)
     clip = resolve_auto(_section("clip", {"model": str(model), "crops": "nodes"}))
-    if folder:
-        _require_own(Path(folder), scene)
+    _require_own(folder)
+    if folder and scene.folder.resolve() != (Path(folder) / "scene").resolve():
+        raise ArtifactError(
+            f"{folder} is not the folder of {scene.name}, whose poses are in {scene.folder}",
+            fix="give the same folder to `reconstruct` or `load_scene`, and to `link`",
+        )
     with _running(progress), _folder(cache) as cached, _folder(folder) as base:
         own, ply = base / "default", base / "gaussians.ply"
         parts = SceneParts(scene.folder, ply, own / "semantic_tree", None, None, own / "clip", own / "masks")
@@ -283,16 +289,15 @@ def link(
     return replace(linked, views=replace(linked.views, scene=scene, gaussians=gaussians))
 
 
-def _require_own(folder: Path, scene: Scene) -> None:
-    """Raise ArtifactError unless a folder has the scene and nothing else, or what `link` stored."""
-    is_new = not any((folder / name).exists() for name in ("gaussians.ply", "default"))
-    origin = read_memo(folder / "gaussians.json", dict[str, Any]).get("origin")
-    is_own = is_new or origin == {"kind": GIVEN}
-    if not is_own or scene.folder.resolve() != (folder / "scene").resolve():
+def _require_own(folder: Path | str | None) -> None:
+    """Raise ArtifactError if a folder has Gaussians or variants that `link` did not store."""
+    names = ("gaussians.ply", "default") if folder else ()
+    origin = read_memo(Path(folder or "") / "gaussians.json", dict[str, Any]).get("origin")
+    if any((Path(folder or "") / name).exists() for name in names) and origin != {"kind": GIVEN}:
         raise ArtifactError(
-            f"{folder} cannot be used for {scene.name}, whose poses are in {scene.folder}",
-            expected="the folder given to `reconstruct` or `load_scene`, without results of a run",
-            fix="give another folder to both functions, or open this scene: hilsplat.open_scene(...)",
+            f"{folder} has results of a run",
+            expected="a new folder, or one with results of `hilsplat.link`",
+            fix="choose another folder, or open this scene: hilsplat.open_scene(...)",
         )
 
 

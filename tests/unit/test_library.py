@@ -176,9 +176,17 @@ def test_a_folder_keeps_a_scene_that_opens(own_desk, desk, desk_project, masks, 
     assert hilsplat.load_scene(folder).names == scene.names
     few = hilsplat.link(scene, gaussians, of_views, model=model, folder=folder, min_views=9)  # replaces it
     assert len(few.nodes) == len(hilsplat.open_scene(folder).nodes) == 0
-    for of_run, other in ((scene, tmp_path / "elsewhere"), (hilsplat.load_scene(own_desk), own_desk)):
-        with pytest.raises(ArtifactError, match=r"cannot be used for photos/(.|\n)*open_scene"):
-            hilsplat.link(of_run, gaussians, of_views, model=model, folder=other)
+    with pytest.raises(ArtifactError, match="elsewhere is not the folder of photos/again"):
+        hilsplat.link(scene, gaussians, of_views, model=model, folder=tmp_path / "elsewhere")
+    before = sha256_of_path(own_desk)
+    for call in (
+        lambda: hilsplat.link(hilsplat.load_scene(own_desk), gaussians, of_views, folder=own_desk),
+        lambda: hilsplat.load_scene(tmp_path / "colmap", folder=own_desk),
+        lambda: hilsplat.reconstruct(tmp_path / "colmap", folder=own_desk),
+    ):
+        with pytest.raises(ArtifactError, match=r"has results of a run(.|\n)*open_scene"):
+            call()
+    assert sha256_of_path(own_desk) == before
 
 
 def test_files_of_imported_poses_are_deleted_with_the_scene(desk, tmp_path, temporary):
