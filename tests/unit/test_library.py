@@ -230,7 +230,7 @@ def test_wrong_paths_and_settings_are_explained(desk, desk_project, scene, tmp_p
     assert not list(temporary.iterdir())
 
 
-def test_progress_is_reported_only_on_request(scene, capsys):
+def test_progress_is_reported_only_on_request(scene, capsys, monkeypatch):
     logs = logging.getLogger("hilsplat")
     before = logs.level, list(logs.handlers)
     hilsplat.segment(scene, segmenter="graph")
@@ -238,6 +238,11 @@ def test_progress_is_reported_only_on_request(scene, capsys):
     hilsplat.segment(scene, segmenter="graph", progress=True)
     assert "graph segmenter" in capsys.readouterr().err
     assert (logs.level, logs.handlers) == before
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)  # bars, too
+    hilsplat.segment(scene, segmenter="graph")
+    assert capsys.readouterr().err == ""
+    hilsplat.segment(scene, segmenter="graph", progress=True)
+    assert "masks of views" in capsys.readouterr().err
 
 
 SCRIPT = """
