@@ -29,7 +29,6 @@ if TYPE_CHECKING:
         load_gaussians,
         load_scene,
         reconstruct,
-        render,
         segment,
     )
     from hilsplat.query.hits import Doubt, Hit, Node
@@ -39,7 +38,7 @@ if TYPE_CHECKING:
     from hilsplat.scene.scene import Scene
     from hilsplat.segment.masks import HierarchicalMasks
     from hilsplat.splat.gaussians import Gaussians
-    from hilsplat.splat.rasterise.api import Rendering
+    from hilsplat.splat.rasterise.rendering import Rendering, render
     from hilsplat.viewer.app import show
 
 __all__ = [
@@ -77,7 +76,7 @@ _NAMES = {
     "hilsplat.evaluate.score": ("Scores", "score"),
     "hilsplat.library": (
         *("SceneMasks", "fit", "link", "load_gaussians"),
-        *("load_scene", "reconstruct", "render", "segment"),
+        *("load_scene", "reconstruct", "segment"),
     ),
     "hilsplat.query.hits": ("Doubt", "Hit", "Node"),
     "hilsplat.query.language_scene": ("LanguageScene", "open_scene"),
@@ -86,7 +85,7 @@ _NAMES = {
     "hilsplat.scene.scene": ("Scene",),
     "hilsplat.segment.masks": ("HierarchicalMasks",),
     "hilsplat.splat.gaussians": ("Gaussians",),
-    "hilsplat.splat.rasterise.api": ("Rendering",),
+    "hilsplat.splat.rasterise.rendering": ("Rendering", "render"),
     "hilsplat.viewer.app": ("show",),
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names}

@@ -2,39 +2,34 @@
 
 Each function runs what its stage runs (`stages.py`), with the same bytes for the same settings and seed, and
 returns objects. Files are temporary unless a folder is given. Further keyword arguments are settings of the
-stage's section with their defaults (`hilsplat settings`). `threads` does not affect results; None uses all
-cores. With `progress`, loops and stages are reported on stderr.
+stage's section with their defaults (`hilsplat settings`); SettingsError is raised if one is unknown or
+invalid. `threads` does not affect results; None uses all cores. With `progress`, loops and stages are
+reported on stderr.
 """
 
 import logging
 import os
-import shutil
 import weakref
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from contextlib import ExitStack, contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, TypeVar
+from typing import Any
 
-import numpy as np
-from jaxtyping import Float32
-from pydantic import ValidationError
 from threadpoolctl import threadpool_limits
 
 from hilsplat import settings as of
 from hilsplat import stages
-from hilsplat.base.artifacts import INDEX, provenance_path
-from hilsplat.base.atomic import atomic_folder
+from hilsplat.base.artifacts import INDEX, read_memo
 from hilsplat.base.cache import ViewCache
 from hilsplat.base.errors import ArtifactError, SceneError, SettingsError
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import reporting, track
-from hilsplat.configuration import resolve_auto, settings_error
+from hilsplat.configuration import resolve_auto, validated
 from hilsplat.models.store import AUTO
 from hilsplat.photos.intake import prepared_photographs
 from hilsplat.query.language_scene import LanguageScene
-from hilsplat.scene.cameras import Camera
 from hilsplat.scene.finished import FinishedScene, SceneParts, require_scene_folder
 from hilsplat.scene.layouts import NO_POSES, has_known_poses
 from hilsplat.scene.scene import Scene
@@ -45,33 +40,25 @@ from hilsplat.splat.coordinates import import_gaussians, write_coordinates
 from hilsplat.splat.fit import fit_gaussians
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply, save_ply
-from hilsplat.splat.rasterise.api import Rendering, rendering
 
-Section = TypeVar("Section", bound=of.Section)
+FRAMES = 60
+"""Maximum number of frames of videos, as in `hilsplat new`."""
+
+GIVEN = "given"
+"""Kind of Gaussians that `link` stored, in the JSON file beside the PLY."""
 
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, eq=False)
-class SceneMasks(Mapping[str, HierarchicalMasks]):
-    """Masks of a scene's training views, by view.
+class SceneMasks(dict[str, HierarchicalMasks]):
+    """Masks of a scene's training views, by view; `dense()` of a view's masks returns them as (M, H, W) bool.
 
-    Attributes:
-        of_view: masks of each view; `dense()` returns them as (M, H, W) bool.
-        origin: segmenter and model, as recorded in the index of a `masks` artifact.
+    `origin` has segmenter and model, as recorded in the index of a `masks` artifact.
     """
 
-    of_view: dict[str, HierarchicalMasks]
-    origin: dict[str, Any]
-
-    def __getitem__(self, view: str) -> HierarchicalMasks:
-        return self.of_view[view]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.of_view)
-
-    def __len__(self) -> int:
-        return len(self.of_view)
+    def __init__(self, of_views: Mapping[str, HierarchicalMasks], origin: Mapping[str, Any]) -> None:
+        super().__init__(of_views)
+        self.origin = dict(origin)
 
     def __repr__(self) -> str:
         counts = {level: sum(len(masks.rows_of(level)) for masks in self.values()) for level in LEVELS}
@@ -82,9 +69,7 @@ class SceneMasks(Mapping[str, HierarchicalMasks]):
 def reconstruct(
     photos: Path | str,
     *,
-    name: str = "",
     folder: Path | str | None = None,
-    frames: int = 60,
     seed: int = 0,
     threads: int | None = None,
     progress: bool = False,
@@ -94,36 +79,23 @@ def reconstruct(
 
     Args:
         photos: a folder of photographs or of videos, a video, or a zip of photographs; poses in the folder
-            are ignored (see `load_scene`).
-        name: name of the scene in messages, as dataset/scene; by default, photos/<name of `photos`>.
+            are ignored (see `load_scene`). Up to 60 frames of videos are used.
         folder: folder of a results scene, such as results/photos/desk, in which `scene/` and the frames of
             videos are stored. By default, they are deleted with the returned object.
-        frames: maximum number of frames of videos.
         settings: those of section `poses`, such as `max_side_px=800`.
 
     Raises:
         SceneError, ImageError: the photographs cannot be used.
         RegistrationError: too few photographs could be registered.
-        SettingsError: a setting is unknown or invalid.
+        ArtifactError: the folder has results of a run.
     """
-    return _posed(
-        Path(photos),
-        _section(of.PosesSettings, settings),
-        poses=NO_POSES,
-        frames=frames,
-        name=name,
-        folder=folder,
-        seed=seed,
-        threads=threads,
-        progress=progress,
-    )
+    return _posed(Path(photos), NO_POSES, settings, folder, seed, threads, progress)
 
 
 def load_scene(
     path: Path | str,
     *,
     poses: Path | str | None = None,
-    name: str = "",
     folder: Path | str | None = None,
     seed: int = 0,
     threads: int | None = None,
@@ -136,13 +108,12 @@ def load_scene(
         path: results/<dataset>/<scene>; or a folder (or zip) that has poses of COLMAP (`sparse/`),
             nerfstudio (`transforms.json`), LLFF, Polycam or Record3D.
         poses: a COLMAP model or transforms.json to use instead of the poses in the folder.
-        name, folder, settings: for an import, as in `reconstruct`.
+        folder, settings: for an import, as in `reconstruct`.
         seed: for an import without sparse points, which are then triangulated.
 
     Raises:
         ArtifactError: the path does not exist; the message lists the scenes of its results folder.
         SceneError: the folder has no poses, or they cannot be used.
-        SettingsError: a setting is unknown or invalid, or the scene is already posed.
     """
     path = Path(path)
     for posed in (path / "scene", path):
@@ -155,44 +126,32 @@ def load_scene(
             return Scene.load(posed)
     if not path.is_file():
         require_scene_folder(path)
-    return _posed(
-        path,
-        _section(of.PosesSettings, settings),
-        poses=None if poses is None else Path(poses),
-        frames=1,  # a video has no poses
-        name=name,
-        folder=folder,
-        seed=seed,
-        threads=threads,
-        progress=progress,
-    )
+    return _posed(path, Path(poses) if poses else None, settings, folder, seed, threads, progress)
 
 
 def _posed(
     source: Path,
-    section: of.PosesSettings,
-    *,
     poses: Path | None,
-    frames: int,
-    name: str,
+    settings: Mapping[str, Any],
     folder: Path | str | None,
     seed: int,
     threads: int | None,
     progress: bool,
 ) -> Scene:
     """Run the stage `poses`; without a folder, the scene's files are deleted with the returned object."""
-    source = source.resolve()
+    source, section = source.resolve(), _section("poses", settings)
+    _require_own(folder)
     with ExitStack() as files:
-        base = Path(folder or files.enter_context(TemporaryDirectory(prefix="hilsplat-")))
-        with _running(progress), prepared_photographs(source, base / "source", frames) as (images, _):
+        base = files.enter_context(_folder(folder))
+        with _running(progress), prepared_photographs(source, base / "source", FRAMES) as (images, _):
             if poses is None and not has_known_poses(images):
                 raise SceneError(
                     f"{source} has no known poses",
                     expected="poses of COLMAP, nerfstudio, LLFF, Polycam or Record3D",
                     fix="compute poses: hilsplat.reconstruct(...), or pass poses=",
                 )
-            name, number = name or f"{PHOTOS}/{source.stem}", _threads(threads)
-            out = base / "scene"
+            name, out = f"{PHOTOS}/{base.name if folder else source.stem}", base / "scene"
+            number = _threads(threads)
             stages.poses(images, out, section, name=name, poses=poses, seed=seed, threads=number)
         scene = Scene.load(out)
         weakref.finalize(scene, files.pop_all().close)
@@ -218,10 +177,9 @@ def fit(
     Raises:
         SceneError: the scene has no training views, or all Gaussians became transparent.
         DeviceError: `device="cuda"` cannot be used.
-        SettingsError: a setting is unknown or invalid.
     """
     steps = {} if iterations is None else {"iterations": iterations, "steps_per_view": iterations}
-    section = _section(of.GaussiansSettings, steps | settings)
+    section = _section("gaussians", steps | settings)
     with _running(progress):
         return fit_gaussians(scene, section, seed=seed, threads=_threads(threads))[0]
 
@@ -238,26 +196,6 @@ def load_gaussians(path: Path | str, scene: Scene | None = None) -> Gaussians:
         ArtifactError: the file is missing, or is not a 3DGS PLY.
     """
     return load_ply(Path(path)) if scene is None else import_gaussians(Path(path), scene)[0]
-
-
-def render(
-    gaussians: Gaussians,
-    camera: Camera,
-    features: Float32[np.ndarray, "N D"] | None = None,
-    *,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    threads: int | None = None,
-) -> Rendering:
-    """Render colours, depth, features and alpha of a view on the CPU.
-
-    Args:
-        camera: such as `scene.cameras[0]`, `scene.cameras["000.png"]`, or one of these `.scaled((H, W))`.
-        features: D values per Gaussian, blended like its colours.
-
-    Raises:
-        HilsplatError: Gaussians have non-finite parameters.
-    """
-    return rendering(gaussians, camera, features, background=background, threads=_threads(threads))
 
 
 def segment(
@@ -281,12 +219,11 @@ def segment(
     Raises:
         SceneError: the scene has no training views.
         ModelError: the model is missing or incomplete.
-        SettingsError: a setting is unknown or invalid.
     """
     segmenter = AUTO if model == AUTO else "sam"
-    chosen = _section(of.MasksSettings, {"segmenter": segmenter, "model": str(model), **settings})
+    chosen = _section("masks", {"segmenter": segmenter, "model": str(model), **settings})
     section, views = resolve_auto(chosen), train_views(scene)
-    with _running(progress), _cache_folder(cache) as folder:
+    with _running(progress), _folder(cache) as folder:
         views_and_masks, origin = segment_views(
             scene, views, ViewCache(folder / "masks"), section, _threads(threads)
         )
@@ -313,70 +250,55 @@ def link(
         gaussians: in the scene's coordinates.
         model: folder of a CLIP model; "auto" uses the best pretrained one that is installed, or else
             models/clip-tiny, whose answers about photographs are meaningless.
-        folder: folder of a results scene to write, such as results/photos/desk, which `open_scene`, `show`
-            and `hilsplat view` open; it must not have Gaussians or variants yet. None writes nothing.
+        folder: the folder given to `reconstruct` or `load_scene`, in which all results are then stored, in
+            place of those of an earlier call; `open_scene`, `show` and `hilsplat view` open it. By default,
+            nothing is stored.
         cache: as in `segment`.
         settings: those of section `semantic_tree`, such as `min_views=2`.
 
     Raises:
-        ArtifactError: the masks are empty, or the folder has results.
+        ArtifactError: the masks are empty, or the folder has results of a run or another scene.
         MisalignedArtifactError: the masks are not those of the scene's training views.
         ModelError: the model is missing or incomplete.
-        SettingsError: a setting is unknown or invalid.
     """
-    section, number = _section(of.SemanticTreeSettings, settings), _threads(threads)
-    clip = resolve_auto(_section(of.ClipSettings, {"model": str(model), "crops": "nodes"}))
-    evaluate = of.EvaluateSettings()
-    with _running(progress), _cache_folder(cache) as cached, _results(folder, scene) as base:
+    section, number = _section("semantic_tree", settings), _threads(threads)
+    clip = resolve_auto(_section("clip", {"model": str(model), "crops": "nodes"}))
+    _require_own(folder)
+    if folder and scene.folder.resolve() != (Path(folder) / "scene").resolve():
+        raise ArtifactError(
+            f"{folder} is not the folder of {scene.name}, whose poses are in {scene.folder}",
+            fix="give the same folder to `reconstruct` or `load_scene`, and to `link`",
+        )
+    with _running(progress), _folder(cache) as cached, _folder(folder) as base:
         own, ply = base / "default", base / "gaussians.ply"
         parts = SceneParts(scene.folder, ply, own / "semantic_tree", None, None, own / "clip", own / "masks")
         save_ply(ply, gaussians)
-        write_coordinates(ply, scene, gaussians, {"kind": "given"})
+        write_coordinates(ply, scene, gaussians, {"kind": GIVEN})
         write_masks(parts.masks, scene, masks.items(), len(masks), **masks.origin)
         contributions = own / "contributions"
         weights = of.ContributionsSettings(keep="none")
         stages.contributions(scene.folder, ply, parts.masks, contributions, weights, cached, number)
         stages.semantic_tree(contributions, parts.masks, parts.semantic_tree, section, number)
         stages.clip(scene.folder, parts.masks, parts.clip, clip, parts.semantic_tree, cached, number)
-        names = own / "names"
-        stages.names(parts.semantic_tree, parts.clip, names, of.QuerySettings(), evaluate, cached)
+        naming = of.QuerySettings(), of.EvaluateSettings(), cached
+        stages.names(parts.semantic_tree, parts.clip, own / "names", *naming)
         linked = LanguageScene.of(FinishedScene(base, "default", parts), threads=number)
-    # The views must keep the given scene, whose temporary files are deleted with it.
     if linked.caution:
         logger.warning("%s: %s", scene.name, linked.caution)
+    # The views keep the given scene, whose temporary files are deleted with it.
     return replace(linked, views=replace(linked.views, scene=scene, gaussians=gaussians))
 
 
-@contextmanager
-def _results(folder: Path | str | None, scene: Scene) -> Iterator[Path]:
-    """Yield a temporary folder for a results scene, or the given one, with a copy of the posed scene."""
-    if folder is None:
-        with TemporaryDirectory(prefix="hilsplat-") as temporary:
-            yield Path(temporary)
-        return
-    base = Path(folder)
-    posed, is_own = base / "scene", scene.folder.resolve() == (base / "scene").resolve()
-    for path in (base / "gaussians.ply", base / "default", *([] if is_own else [posed])):
-        if path.exists():
-            raise ArtifactError(
-                f"{path} already exists",
-                expected="a new folder, or the folder given to `reconstruct` or `load_scene`",
-                fix="choose another folder, or open the scene: hilsplat.open_scene(...)",
-            )
-    if not is_own:
-        with atomic_folder(posed) as copy:
-            shutil.copytree(scene.folder, copy, dirs_exist_ok=True)
-        if (record := provenance_path(scene.folder)).is_file():
-            shutil.copyfile(record, provenance_path(posed))
-    yield base
-
-
-def _section(kind: type[Section], values: Mapping[str, Any]) -> Section:
-    """Return a section of the settings; raise SettingsError if a name is unknown or a value invalid."""
-    try:
-        return kind.model_validate(values)
-    except ValidationError as error:
-        raise settings_error(error, "", kind) from error
+def _require_own(folder: Path | str | None) -> None:
+    """Raise ArtifactError if a folder has Gaussians or variants that `link` did not store."""
+    names = ("gaussians.ply", "default") if folder else ()
+    origin = read_memo(Path(folder or "") / "gaussians.json", dict[str, Any]).get("origin")
+    if any((Path(folder or "") / name).exists() for name in names) and origin != {"kind": GIVEN}:
+        raise ArtifactError(
+            f"{folder} has results of a run",
+            expected="a new folder, or one with results of `hilsplat.link`",
+            fix="choose another folder, or open this scene: hilsplat.open_scene(...)",
+        )
 
 
 @contextmanager
@@ -387,12 +309,14 @@ def _running(progress: bool) -> Iterator[None]:
 
 
 @contextmanager
-def _cache_folder(cache: Path | str | None) -> Iterator[Path]:
-    if cache is not None:
-        yield Path(cache)
-        return
-    with TemporaryDirectory(prefix="hilsplat-") as temporary:
-        yield Path(temporary)
+def _folder(path: Path | str | None) -> Iterator[Path]:
+    """Yield the folder, or a temporary one."""
+    with nullcontext(path) if path else TemporaryDirectory(prefix="hilsplat-") as folder:
+        yield Path(folder)
+
+
+def _section(name: str, values: Mapping[str, Any]) -> Any:
+    return validated(name, values, name)
 
 
 def _threads(number: int | None) -> int:

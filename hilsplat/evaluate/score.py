@@ -1,4 +1,4 @@
-"""Scores of arrays under a protocol, without files and without the pipeline (`hilsplat.score`)."""
+"""Scoring of arrays under a protocol, without files and without the pipeline (`hilsplat.score`)."""
 
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
@@ -8,19 +8,16 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Bool, Float, Int, Int64
+from jaxtyping import Bool, Float, Int64
 
 from hilsplat.base.errors import MisalignedArtifactError, SettingsError
 from hilsplat.base.levels import LEVELS, Level, path_of
 from hilsplat.datasets.labelled import LabelledRegion
 from hilsplat.datasets.points.labelled_points import LabelledPoints
-from hilsplat.evaluate.metrics.masks import peak_points
-from hilsplat.evaluate.metrics.relevancy_rule import RelevancyRule, SmoothedRelevancy, relevancy_mask
 from hilsplat.evaluate.protocols import cards
-from hilsplat.evaluate.protocols.answers import NO_POINTS, mask_rows
-from hilsplat.evaluate.protocols.flat_views import argmax_rows
+from hilsplat.evaluate.protocols.flat_views import Answer, answer_rows, argmax_rows, mask_of, rule_of
 from hilsplat.evaluate.protocols.points import class_set, instance_scan, measure_instances, measure_points
-from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
+from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import consistency_rows
 from hilsplat.evaluate.scores import Measured
 from hilsplat.evaluate.tables.means import metric_means
@@ -46,9 +43,6 @@ OF_THE_PIPELINE = (
 SCORED = {card.full_name: card for card in cards.CARDS if card not in OF_THE_PIPELINE}
 """Protocols that score arrays."""
 
-Answer = Bool[np.ndarray, "_ _"] | Float[np.ndarray, "_ _ _"]
-"""A mask (H, W), or relevancy (3, H, W); under `3d-ovs/argmax`, cosines (L, H, W)."""
-
 Answers = Mapping[tuple[str, str], Answer]
 """Answers in one view by (level, text); the level is "" for answers without a level."""
 
@@ -67,13 +61,6 @@ class Scores:
     protocol: str
     means: dict[str, float]
     rows: tuple[dict[str, Any], ...]
-
-    def __getitem__(self, metric: str) -> float:
-        if metric not in self.means:
-            raise SettingsError(
-                f"{self.protocol} did not measure {metric!r}", expected=f"one of {', '.join(self.means)}"
-            )
-        return self.means[metric]
 
     def __repr__(self) -> str:
         return f"Scores({self.protocol}: {', '.join(f'{name} {v:.4f}' for name, v in self.means.items())})"
@@ -191,23 +178,17 @@ def _are_masks(card: cards.ProtocolCard, answers: Mapping[str, Mapping[tuple[str
                     found=f"{answer.shape} {answer.dtype}",
                 )
             kinds.add(kind)
-    if len(kinds) > 1 or (kinds == {"f"} and not is_argmax and _rule_of(card) is None):
+    if len(kinds) > 1 or (kinds == {"f"} and not is_argmax and rule_of(card) is None):
         raise SettingsError(
             f"{card.full_name} cannot score these predictions",
             expected="only masks, or only relevancy under a protocol that has a rule for it: "
-            + ", ".join(name for name, each in SCORED.items() if _rule_of(each)),
+            + ", ".join(name for name, each in SCORED.items() if rule_of(each)),
         )
     return kinds != {"f"}
 
 
 def _has_levels(card: cards.ProtocolCard) -> bool:
     return card is cards.LEVEL_GIVEN
-
-
-def _rule_of(card: cards.ProtocolCard) -> RelevancyRule | None:
-    """Return the rule that makes masks from relevancy; LERF-Mask, which states none, uses LangSplat's."""
-    is_lerf_mask = card in (cards.LERF_MASK, cards.LERF_MASK_SKIPPING)
-    return cards.LERF_LANGSPLAT.rule if is_lerf_mask else card.rule
 
 
 def key_of(name: str) -> tuple[str, str]:
@@ -256,7 +237,7 @@ def flat_rows(
 
     Args:
         level: level whose texts are queried, on a stand-in with levels; None if the labels have no levels.
-        are_masks: whether the answers of all views are masks, not relevancy.
+        are_masks: whether all views have masks as answers, not relevancy.
     """
     words: list[str] = []
     if card in OF_EVERY_TEXT:
@@ -272,7 +253,8 @@ def flat_rows(
         return
     for query in queries:
         other = answers.get(("", dict(card.united).get(query.text, "")))
-        yield from _text_rows(card, replace(query, level=None), answers.get(("", query.text)), words, other)
+        flat, answer = replace(query, level=None), answers.get(("", query.text))
+        yield from answer_rows(METHOD, card, flat, answer, words, _metrics(card, are_masks), other)
 
 
 def level_rows(answers: Answers, truth: ViewTruth, are_masks: bool = True) -> Iterator[Measured]:
@@ -280,46 +262,22 @@ def level_rows(answers: Answers, truth: ViewTruth, are_masks: bool = True) -> It
     card, words = cards.LEVEL_GIVEN, [WORDS] if are_masks else []
     for query in truth.queries:
         assert query.level is not None
-        yield from _text_rows(card, query, answers.get((query.level.label, query.text)), words)
+        answer = answers.get((query.level.label, query.text))
+        yield from answer_rows(METHOD, card, query, answer, words, _metrics(card, are_masks))
 
-    def mask_of(path: tuple[str, ...]) -> Bool[np.ndarray, "H W"]:
+    def mask_of_path(path: tuple[str, ...]) -> Bool[np.ndarray, "H W"]:
         answer = answers.get((Level(len(path)).label, path[-1]))
         if answer is None:
             return np.zeros_like(truth.regions[path])
-        return truth.own_part(path, _mask_and_peak(card, Level(len(path)), answer)[0])
+        return truth.own_part(path, mask_of(card, Level(len(path)), answer)[0])
 
-    yield from consistency_rows(METHOD, card.labelled(words), truth, mask_of)
-
-
-def _text_rows(
-    card: cards.ProtocolCard,
-    query: Query,
-    answer: Answer | None,
-    words: Sequence[str],
-    united: Answer | None = None,
-) -> Iterator[Measured]:
-    region = query.region(card.truth)
-    if not region.any() or (answer is None and card.missing == "left out"):
-        return  # not visible in the view, or not answered
-    mask, points = np.zeros_like(region), NO_POINTS
-    if answer is not None:
-        mask, points = _mask_and_peak(card, query.level, answer, united)
-    measured = MASK_METRICS if WORDS in words else (*MASK_METRICS, *cards.LOCALIZATION)
-    metrics = tuple(metric for metric in card.metrics if metric in measured)
-    answered = replace(query, truth=region)
-    yield from mask_rows(METHOD, answered, card.labelled(words), mask, points, metrics)
+    yield from consistency_rows(METHOD, card.labelled(words), truth, mask_of_path)
 
 
-def _mask_and_peak(
-    card: cards.ProtocolCard, level: Level | None, answer: Answer, united: Answer | None = None
-) -> tuple[Bool[np.ndarray, "H W"], Int[np.ndarray, "P 2"]]:
-    """Return an answer's mask, made from relevancy by the protocol's rule, and the peaks of the relevancy."""
-    if answer.ndim == 2:
-        return answer, NO_POINTS
-    rule = _rule_of(card)
-    assert rule is not None  # `_are_masks`
-    smoothed = SmoothedRelevancy.of(answer, rule)
-    return relevancy_mask(smoothed, level, rule, united), peak_points(smoothed.filtered, level)
+def _metrics(card: cards.ProtocolCard, are_masks: bool) -> list[str]:
+    """Return the metrics of a protocol for masks or relevancy."""
+    measured = MASK_METRICS if are_masks else (*MASK_METRICS, *cards.LOCALIZATION)
+    return [metric for metric in card.metrics if metric in measured]
 
 
 def _cosine(

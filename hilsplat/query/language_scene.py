@@ -34,7 +34,7 @@ from hilsplat.semantic_tree.tree import OrientedBox, SemanticTree
 from hilsplat.settings import EvaluateSettings
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply
-from hilsplat.splat.rasterise.api import Rendering, rendering
+from hilsplat.splat.rasterise.rendering import Rendering, render
 
 logger = logging.getLogger(__name__)
 
@@ -134,7 +134,7 @@ class LanguageScene(NodeQueries):
         """The scene's nodes."""
         return self.views.tree
 
-    @property
+    @cached_property
     def nodes(self) -> tuple[Node, ...]:
         """The tree's nodes, by row, as queries return them."""
         return tuple(map(self._node, range(len(self.tree))))
@@ -145,7 +145,7 @@ class LanguageScene(NodeQueries):
 
     def render(self, view: View) -> Rendering:
         """Render the Gaussians in a view of the scene or any camera, over black; errors as in `camera`."""
-        return rendering(self.gaussians, self.views.camera(view), threads=self.views.threads)
+        return render(self.gaussians, self.views.camera(view), threads=self.views.threads)
 
     @property
     def field(self) -> FieldAnswers:

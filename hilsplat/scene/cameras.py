@@ -96,7 +96,7 @@ class Cameras:
     def __getitem__(self, view: str | int) -> Camera:
         """Return the camera of a view, by name or row; raise SceneError if there is none."""
         try:
-            row = range(len(self))[view] if isinstance(view, int) else self.names.index(view)
+            row = self.names.index(view) if isinstance(view, str) else range(len(self))[view]
         except (ValueError, IndexError) as error:
             raise SceneError(
                 f"view {view!r} has no camera",

@@ -1,6 +1,7 @@
 """The pipeline from Python on the desk: the same bytes as the stages, no files left, errors that help."""
 
 import logging
+import os
 import subprocess
 import sys
 import tempfile
@@ -12,7 +13,7 @@ import pytest
 import hilsplat
 from hilsplat import stages
 from hilsplat.base.errors import ArtifactError, HilsplatError, ModelError, SceneError, SettingsError
-from hilsplat.base.lineage import sha256_of_path
+from hilsplat.base.lineage import read_provenance, sha256_of_path
 from hilsplat.scene.exporting import write_colmap
 from hilsplat.segment.digests import digest_of, digests_in, load_masks
 from hilsplat.semantic_tree.tree import SemanticTree
@@ -160,16 +161,32 @@ def test_a_rendering_has_colours_depth_features_and_alpha(linked):
     np.testing.assert_array_equal(plain.colours, render_rgb(gaussians, camera))
 
 
-def test_a_folder_keeps_a_scene_that_opens(desk, desk_project, scene, masks, tmp_path):
-    gaussians = hilsplat.load_gaussians(desk / "gaussians.ply")
+def test_a_folder_keeps_a_scene_that_opens(own_desk, desk, desk_project, masks, tmp_path):
+    write_colmap(hilsplat.load_scene(desk), tmp_path / "colmap")
     folder, model = tmp_path / "results/photos/again", str(desk_project / "models/colours")
-    linked = hilsplat.link(scene, gaussians, masks, model=model, folder=folder)
-    assert linked.scene is scene  # whose temporary files live as long as it does
+    scene = hilsplat.load_scene(tmp_path / "colmap", folder=folder, test_every=6)
+    assert (scene.name, scene.folder) == ("photos/again", folder / "scene")
+    gaussians = hilsplat.load_gaussians(desk / "gaussians.ply", scene)
+    views = scene.views("train")
+    of_views = hilsplat.SceneMasks({view: masks[view] for view in views if view in masks}, masks.origin)
+    linked = hilsplat.link(scene, gaussians, of_views, model=model, folder=folder)
     again = hilsplat.open_scene(folder)
+    assert len(again.nodes) == len(linked.nodes) > 0
     assert [hit.node for hit in again.query("mug")] == [hit.node for hit in linked.query("mug")]
     assert hilsplat.load_scene(folder).names == scene.names
-    with pytest.raises(ArtifactError, match=r"gaussians.ply already exists(.|\n)*open_scene"):
-        hilsplat.link(scene, gaussians, masks, model=model, folder=folder)
+    few = hilsplat.link(scene, gaussians, of_views, model=model, folder=folder, min_views=9)  # replaces it
+    assert len(few.nodes) == len(hilsplat.open_scene(folder).nodes) == 0
+    with pytest.raises(ArtifactError, match="elsewhere is not the folder of photos/again"):
+        hilsplat.link(scene, gaussians, of_views, model=model, folder=tmp_path / "elsewhere")
+    before = sha256_of_path(own_desk)
+    for call in (
+        lambda: hilsplat.link(hilsplat.load_scene(own_desk), gaussians, of_views, folder=own_desk),
+        lambda: hilsplat.load_scene(tmp_path / "colmap", folder=own_desk),
+        lambda: hilsplat.reconstruct(tmp_path / "colmap", folder=own_desk),
+    ):
+        with pytest.raises(ArtifactError, match=r"has results of a run(.|\n)*open_scene"):
+            call()
+    assert sha256_of_path(own_desk) == before
 
 
 def test_files_of_imported_poses_are_deleted_with_the_scene(desk, tmp_path, temporary):
@@ -213,7 +230,7 @@ def test_wrong_paths_and_settings_are_explained(desk, desk_project, scene, tmp_p
     assert not list(temporary.iterdir())
 
 
-def test_progress_is_reported_only_on_request(scene, capsys):
+def test_progress_is_reported_only_on_request(scene, capsys, monkeypatch):
     logs = logging.getLogger("hilsplat")
     before = logs.level, list(logs.handlers)
     hilsplat.segment(scene, segmenter="graph")
@@ -221,17 +238,28 @@ def test_progress_is_reported_only_on_request(scene, capsys):
     hilsplat.segment(scene, segmenter="graph", progress=True)
     assert "graph segmenter" in capsys.readouterr().err
     assert (logs.level, logs.handlers) == before
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)  # bars, too
+    hilsplat.segment(scene, segmenter="graph")
+    assert capsys.readouterr().err == ""
+    hilsplat.segment(scene, segmenter="graph", progress=True)
+    assert "masks of views" in capsys.readouterr().err
 
 
 SCRIPT = """
+import sys
+import hilsplat
 from hilsplat.base.processes import in_own_process
-print("once", in_own_process(sorted, [2, 1]))
+scene = hilsplat.load_scene(sys.argv[1], folder="kept")
+print("once", in_own_process(sorted, [2, 1]), scene.name)
 """
 
 
-def test_a_script_without_a_guard_is_not_run_again_by_child_processes(tmp_path, project):
-    script = tmp_path / "script.py"
-    script.write_text(SCRIPT)
-    how = {"capture_output": True, "text": True, "env": {"PYTHONPATH": str(project)}, "timeout": 60}
-    done = subprocess.run([sys.executable, str(script)], **how)
-    assert done.stdout == "once [1, 2]\n", done.stderr
+def test_a_script_without_a_guard_is_not_run_again_by_child_processes(desk, tmp_path, project):
+    (tmp_path / "script.py").write_text(SCRIPT)
+    write_colmap(hilsplat.load_scene(desk), tmp_path / "colmap")
+    paths = os.pathsep.join([str(project), os.environ.get("PYTHONPATH", "")])
+    how = {"capture_output": True, "text": True, "cwd": tmp_path, "timeout": 120}
+    how["env"] = {**os.environ, "PYTHONPATH": paths}
+    done = subprocess.run([sys.executable, "script.py", "colmap"], **how)
+    assert done.stdout == "once [1, 2] photos/kept\n", done.stderr
+    assert read_provenance(tmp_path / "kept/scene").command == ()  # not that of the script

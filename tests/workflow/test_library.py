@@ -23,7 +23,7 @@ def settings_of(artifact: Path, section: str) -> dict:
 def test_each_step_gives_the_bytes_of_the_workflow(finished: Project, tmp_path: Path) -> None:
     folder = finished.root / SCENE
     own = folder / "default"
-    poses = settings_of(folder / "scene", "poses")
+    poses = settings_of(folder / "scene", "poses") | {"camera_model": "simple_pinhole"}  # the option --render
     scene = hilsplat.reconstruct(folder / "world/images", seed=0, threads=2, **poses)
     expected = hilsplat.load_scene(folder)
     for name in ("cam_from_world", "K", "size_hw"):
@@ -54,8 +54,6 @@ def test_the_example_of_the_page_runs(
     names: dict = {}
     exec(compile(example.replace("iterations=2000", "iterations=200"), "docs/python.md", "exec"), names)
     printed = capsys.readouterr().out
-    assert (
-        "Scene(photos/photos: 12 views" in printed and "Scores(lerf/langsplat@2 (masks of files)" in printed
-    )
+    assert "Scene(photos/desk: 12 views" in printed and "Scores(lerf/langsplat@2 (masks of files)" in printed
     assert Path("answer.png").is_file() and names["rendering"].depth.shape == (300, 400)
     assert hilsplat.open_scene("results/photos/desk").query("car")

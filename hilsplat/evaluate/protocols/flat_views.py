@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Int, Int64
 
 from hilsplat.base.levels import Level
 from hilsplat.evaluate.metrics.masks import argmax_masks, iou, peak_points, pixel_accuracy
@@ -29,6 +29,12 @@ from hilsplat.evaluate.scores import Measured
 
 if TYPE_CHECKING:
     from hilsplat.query.language_scene import LanguageScene
+
+
+Answer = Bool[np.ndarray, "_ _"] | Float[np.ndarray, "_ _ _"]
+"""A mask (H, W), or relevancy (3, H, W); under `3d-ovs/argmax`, cosines (L, H, W)."""
+
+Smooth = Callable[[Float[np.ndarray, "_ _ _"], RelevancyRule], SmoothedRelevancy]
 
 
 class FlatProtocols:
@@ -73,26 +79,18 @@ class FlatProtocols:
             """Smooth once for all rules with the same filter, because smoothing takes most of the time."""
             return SmoothedRelevancy.of(relevancy, RelevancyRule(filter_px, mix, border=border))
 
-        masks_only = (LERF_MASK, LERF_MASK_SKIPPING)
+        def smooth(relevancy: np.ndarray, rule: RelevancyRule) -> SmoothedRelevancy:
+            return smoothed_by(rule.filter_px, rule.mix, rule.border)
+
         for card in self.cards:
-            rule = LERF_LANGSPLAT.rule if card in masks_only else card.rule
-            region = flat.region(card.truth)
-            if not region.any():
-                continue  # not visible in the view
-            points = NO_POINTS
-            if nodes_mask is not None and card in (*masks_only, OVS_NODES):
-                mask = nodes_mask
-            elif rule is None:
-                continue  # needs nodes, or all texts (`finish`)
-            else:
-                smoothed = smoothed_by(rule.filter_px, rule.mix, rule.border)
+            is_of_nodes = nodes_mask is not None and card in (LERF_MASK, LERF_MASK_SKIPPING, OVS_NODES)
+            if is_of_nodes:
+                yield from answer_rows(method, card, flat, nodes_mask, self.words, card.metrics)
+            elif rule_of(card) is not None:  # other protocols need nodes, or all texts (`finish`)
                 other = dict(card.united).get(flat.text)
                 united = relevancy_of(self.scene, method, (other,), self.view)[0] if other else None
-                mask = relevancy_mask(smoothed, None, rule, united)
-                if {"localization_box", "localization_mask"} & set(card.metrics):
-                    points = peak_points(smoothed.filtered, None)
-            answered = replace(flat, truth=region)
-            yield from mask_rows(method, answered, card.labelled(self.words), mask, points, card.metrics)
+                how = self.words, card.metrics, united, smooth
+                yield from answer_rows(method, card, flat, relevancy, *how)
         if OVS_ARGMAX in self.cards:
             self._queries.setdefault(method, {})[flat.text] = flat
 
@@ -106,6 +104,52 @@ class FlatProtocols:
     def _cosine(self, method: str, texts: Sequence[str], pixels: Int64[np.ndarray, " P"]) -> np.ndarray:
         render = self.scene.field.cosine if method == "field" else self.scene.node_cosine
         return np.asarray(render(tuple(texts), self.view, pixels), np.float32)
+
+
+def rule_of(card: ProtocolCard) -> RelevancyRule | None:
+    """Return the rule that makes masks from relevancy; LERF-Mask, which states none, uses LangSplat's."""
+    return LERF_LANGSPLAT.rule if card in (LERF_MASK, LERF_MASK_SKIPPING) else card.rule
+
+
+def mask_of(
+    card: ProtocolCard,
+    level: Level | None,
+    answer: Answer,
+    united: Answer | None = None,
+    smooth: Smooth = SmoothedRelevancy.of,
+) -> tuple[Bool[np.ndarray, "H W"], Int[np.ndarray, "P 2"]]:
+    """Return an answer's mask, made from relevancy by the protocol's rule, and the peaks of the relevancy.
+
+    `united` is the relevancy of a second text that the protocol merges with the first.
+    """
+    rule = rule_of(card)
+    if answer.ndim == 2 or rule is None:
+        return answer, NO_POINTS
+    smoothed = smooth(answer, rule)
+    return relevancy_mask(smoothed, level, rule, united), peak_points(smoothed.filtered, level)
+
+
+def answer_rows(
+    method: str,
+    card: ProtocolCard,
+    query: Query,
+    answer: Answer | None,
+    words: Sequence[str],
+    metrics: Sequence[str],
+    united: Answer | None = None,
+    smooth: Smooth = SmoothedRelevancy.of,
+) -> Iterator[Measured]:
+    """Yield the rows of a text's answer (see `mask_of`), or of an empty mask without an answer.
+
+    A text has no rows if the view doesn't show it, or if it has no answer and the protocol leaves it out.
+    """
+    region = query.region(card.truth)
+    if region.any() and not (answer is None and card.missing == "left out"):
+        mask, points = np.zeros_like(region), NO_POINTS
+        if answer is not None:
+            mask, points = mask_of(card, query.level, answer, united, smooth)
+        answered = replace(query, truth=region)
+        yield from mask_rows(method, answered, card.labelled(words), mask, points, metrics)
 
 
 def argmax_rows(
