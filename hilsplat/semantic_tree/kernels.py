@@ -8,6 +8,9 @@ from cpusplat.compiled import compiled
 from hilsplat.contributions.kernels import enlarged
 
 
+MAX_READS = 2  # a cluster's neighbours are read this many times before those that have been joined become one
+
+
 @compiled
 def _unpack(view, indptr, indices, data, out, fill):
     """Write a view's values to their columns of `out`, or zeros if `fill` is false; no view if negative."""
@@ -382,7 +385,7 @@ def link(pairs, neighbours, sizes, members, threshold, root, within):
     cluster, lowest, num_masks = np.arange(num).astype(np.int32), np.arange(num), np.ones(num, np.int64)
     following, last_mask = np.full(num, -1, np.int64), np.arange(num)
     following_run, last_run = np.full(num, -1, np.int64), np.arange(num)  # a shortened chain keeps its first
-    num_neighbours = neighbours[1] - neighbours[0]
+    num_neighbours, num_read = neighbours[1] - neighbours[0], np.zeros(num, np.int64)
     place_of = np.full(num, -1, np.int64)
     used_sizes, used_members = len(sizes[2]), len(members[2])
     # A comparison is outdated when one of the clusters has grown, which its number of masks shows.
@@ -408,6 +411,10 @@ def link(pairs, neighbours, sizes, members, threshold, root, within):
             key = min(i, j), max(i, j)
             if key in compared and compared[key] == together:
                 continue
+            num_read[i] += num_neighbours[i]
+            if num_read[i] > MAX_READS * num_neighbours[i]:
+                num_neighbours[i], last_run[i] = _shorten(i, i, neighbours, following_run, cluster, place_of)
+                num_read[i] = 0
             both, extra = _sums_with(i, j, neighbours, following_run, cluster)
             few, many = (j, i) if sizes[1][i] - sizes[0][i] > sizes[1][j] - sizes[0][j] else (i, j)
             union = _union(few, many, extra, sizes, members)
