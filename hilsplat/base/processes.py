@@ -8,6 +8,7 @@ import os
 import secrets
 import signal
 import socket
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -15,7 +16,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Thread
-from types import ModuleType
 from typing import IO, Any, TypeVar
 
 from hilsplat.base.errors import KILLED, KILLED_FIX, HilsplatError
@@ -178,60 +178,78 @@ def in_processes(
         for item in items:
             yield work(*item)
         return
+    from concurrent.futures import ProcessPoolExecutor  # imported late: most commands need no pool
     from concurrent.futures.process import BrokenProcessPool
+    from multiprocessing import get_context
 
     try:
-        with _pool(min(workers, len(items)), end_with_parent, os.getpid()) as pool:
+        context, how = get_context("spawn"), (end_with_parent, (os.getpid(),))
+        with ProcessPoolExecutor(min(workers, len(items)), context, *how) as pool:
             yield from pool.map(work, *zip(*items, strict=True), chunksize=chunk)
     except BrokenProcessPool as error:
         raise HilsplatError(f"a process of {work} was killed, {KILLED}", fix=KILLED_FIX) from error
 
 
-def _pool(workers: int, initializer: Callable[..., None], *arguments: Any) -> Any:
-    from concurrent.futures import ProcessPoolExecutor  # imported late: most commands need no pool
-    from multiprocessing import get_context
-
-    return ProcessPoolExecutor(workers, get_context("spawn"), initializer, arguments)
+OWN_PROCESS = """
+import sys
+sys.path += [entry for entry in sys.argv[3:] if entry not in sys.path]
+from hilsplat.base.processes import run_alone
+run_alone(*map(int, sys.argv[1:3]))
+"""
 
 
 def in_own_process(work: Callable[..., Result], *arguments: Any) -> Result:
     """Return `work(*arguments)`, computed in a separate process that a library may terminate.
 
+    Processes of `multiprocessing` would run a user's script again unless it has a guard, and leave a process
+    that delays the end of a notebook's kernel, which is then killed before it can delete temporary files.
+
     Raises:
         ChildProcessError: the process ended without a result; the message contains the last 2000 characters
             of its stderr, which is otherwise not shown.
     """
-    from concurrent.futures.process import BrokenProcessPool
-    from tempfile import TemporaryDirectory
+    from multiprocessing.connection import Pipe
+    from tempfile import TemporaryFile
 
-    with TemporaryDirectory() as folder:
-        stderr = Path(folder) / "stderr"
+    ours, theirs = Pipe()
+    ids = str(theirs.fileno()), str(os.getpid())
+    command = [sys.executable, "-P", "-c", OWN_PROCESS, *ids, *sys.path]
+    with (
+        TemporaryFile() as stderr,
+        ours,
+        subprocess.Popen(command, stderr=stderr, pass_fds=[theirs.fileno()]) as process,
+    ):
+        theirs.close()
         try:
-            with _pool(1, _begin_alone, os.getpid(), stderr) as pool:
-                with _hidden_main():
-                    result = pool.submit(work, *arguments)
-                return result.result()
-        except BrokenProcessPool:
-            last = stderr.read_text(errors="replace")[-2000:] if stderr.exists() else ""
-            raise ChildProcessError(
-                f"{work.__module__}.{work.__name__} was terminated by a library\n{last}"
-            ) from None
+            ours.send((work, arguments))
+            result, error = ours.recv()
+        except (EOFError, OSError):
+            process.wait()
+            stderr.seek(max(0, stderr.tell() - 2000))
+            last = stderr.read().decode(errors="replace")
+            name = f"{work.__module__}.{work.__name__}"
+            raise ChildProcessError(f"{name} was terminated by a library\n{last}") from None
+        except BaseException:
+            process.kill()
+            raise
+    if error is not None:
+        raise error
+    return result
 
 
-@contextmanager
-def _hidden_main() -> Iterator[None]:
-    """Hide the main module in the block, because a process started there would run a user's script again."""
-    main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
-    try:
-        yield
-    finally:
-        sys.modules["__main__"] = main
+def run_alone(descriptor: int, parent: int) -> None:
+    """Receive a call from a pipe, and send its result and its exception."""
+    from multiprocessing.connection import Connection
 
-
-def _begin_alone(parent: int, stderr: Path) -> None:
     end_with_parent(parent)
-    with stderr.open("wb") as stream:
-        os.dup2(stream.fileno(), 2)
+    result, error = None, None
+    with Connection(descriptor) as pipe:
+        work, arguments = pipe.recv()
+        try:
+            result = work(*arguments)
+        except Exception as raised:
+            error = raised
+        pipe.send((result, error))
 
 
 def in_order(work: Callable[[Item], Result], items: Sequence[Item], threads: int) -> Iterator[Result]:

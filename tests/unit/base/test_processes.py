@@ -123,7 +123,9 @@ def test_the_processes_of_a_pool_end_with_it(tmp_path):
 
 def test_a_library_that_ends_its_process_raises_an_error():
     assert in_own_process(sorted, [2, 1]) == [1, 2]
-    with pytest.raises(ChildProcessError, match="was terminated by a library"):
+    with pytest.raises(ChildProcessError, match=r"was terminated by a library\nwhy it ended$"):
+        in_own_process(exec, "import os; os.write(2, b'why it ended'); os._exit(0)")
+    with pytest.raises(ChildProcessError, match=r"abort was terminated"):
         in_own_process(os.abort)
     with pytest.raises(ZeroDivisionError):
         in_own_process(divmod, 1, 0)
