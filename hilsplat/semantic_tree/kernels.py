@@ -7,7 +7,6 @@ import numpy as np
 from cpusplat.compiled import compiled
 from hilsplat.contributions.kernels import enlarged
 
-
 MAX_READS = 2  # a cluster's neighbours are read this many times before those that have been joined become one
 
 
