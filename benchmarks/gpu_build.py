@@ -5,7 +5,7 @@
     PYTHONPATH=build/gpu python3 -m benchmarks.gpu     # there, in a copy of the project
 
 The folder also has the small packages that `benchmarks.gpu` imports. It expects on the other machine what
-images with PyTorch hold: torch, torchvision's needs, numba, scipy, OpenCV, onnx, onnxruntime, pytest, pandas.
+images with PyTorch hold: torch, numba, scipy, OpenCV, onnx, onnxruntime, pytest, pandas.
 """
 
 import argparse
@@ -19,16 +19,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 
 CARRIED = (
-    *("beartype", "jaxtyping", "wadler-lindig", "plyfile", "pydantic", "pydantic-core", "annotated-types"),
-    *(
-        "typing-inspection",
-        "typer",
-        "annotated-doc",
-        "shellingham",
-        "platformdirs",
-        "hypothesis",
-        "sortedcontainers",
-    ),
+    *("annotated-doc", "annotated-types", "beartype", "hypothesis", "jaxtyping", "platformdirs", "plyfile"),
+    *("pydantic", "pydantic-core", "shellingham", "sortedcontainers", "typer", "typing-inspection"),
+    "wadler-lindig",
 )
 """Packages that are installed beside gsplat, in the versions of this environment."""
 
