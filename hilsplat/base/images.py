@@ -44,12 +44,16 @@ def open_image(file: Path | io.BytesIO, max_side_px: int = 2**16) -> Image.Image
         ImageError: the header specifies more pixels than a photograph can have, or sides above `max_side_px`.
         OSError: the file is missing or has none of the `FORMATS`.
     """
-    import pillow_heif
+    formats: tuple[str, ...] = FORMATS
+    if _has_boxes(file):
+        import pillow_heif  # 30 MB of libraries, which other formats don't need
 
-    pillow_heif.register_heif_opener()
+        pillow_heif.register_heif_opener()
+    else:
+        formats = tuple(name for name in FORMATS if name != "HEIF")
     try:
         with warnings.catch_warnings(action="ignore"):  # about large images and odd EXIF tags
-            image = Image.open(file, formats=FORMATS)
+            image = Image.open(file, formats=formats)
         if max(image.size) > max_side_px:
             raise Image.DecompressionBombError(f"{image.width} x {image.height} px")
     except Image.DecompressionBombError as error:
@@ -61,6 +65,14 @@ def open_image(file: Path | io.BytesIO, max_side_px: int = 2**16) -> Image.Image
     if image.format == "TIFF":
         image.filename = ""  # else Pillow 13 maps the file into memory, and scrambles turned pictures
     return image
+
+
+def _has_boxes(file: Path | io.BytesIO) -> bool:
+    """Whether a file is made of ISO's boxes, as HEIF and AVIF are."""
+    if isinstance(file, io.BytesIO):
+        return bytes(file.getbuffer()[4:8]) == b"ftyp"
+    with file.open("rb") as held:
+        return held.read(8)[4:] == b"ftyp"
 
 
 @contextmanager

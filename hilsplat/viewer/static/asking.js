@@ -86,12 +86,10 @@ export async function ask(keepChoice = false) {
 export async function keepAnswer() {
   const asked = page.asked?.query;
   if (!asked || !panes[0].answer?.hits.length) { tell("Run a query to keep its answer."); return; }
-  try {
-    if (!await keep(asked)) return;
-    clearAnswer();
-    tell(`Kept “${asked.text}”. You can run another query.`);
-    $("text").focus();
-  } catch (error) { failed(error); }
+  if (!await keep(asked) || page.asked?.query !== asked) return;   // another query may have been run meanwhile
+  clearAnswer();
+  tell(`Kept “${asked.text}”. You can run another query.`);
+  $("text").focus();
 }
 
 whenReopened(({ text, level: at, threshold: least, view }) => {

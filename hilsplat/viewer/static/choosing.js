@@ -6,7 +6,7 @@ import { showCard } from "./card.js";
 import { painted, restyle } from "./drawing.js";
 import { LEVELS } from "./elements.js";
 import { flyTo } from "./flights.js";
-import { latest } from "./latest.js";
+import { inOrder, latest } from "./latest.js";
 import { failed, host, level, loadVariant, main, outlines, page, panes, tell, variantOf } from "./state.js";
 
 // Actions of lists and cards of nodes; asking.js adds `like`.
@@ -46,12 +46,14 @@ function deeper(nodes) {
   return there[(at + 1) % Math.max(there.length, 1)] ?? -1;
 }
 
-export async function tapped(x, y) {
+const next = inOrder(failed);
+
+export function tapped(x, y) {
   host.focus({ preventScroll: true });
   const at = paneAt(x);
   if (!main()) { tell("Nothing to select yet: the semantic tree is not loaded."); return; }
   if (variantOf(panes[at.k]) !== variantOf(panes[0])) { tell("This side shows a different tree. Select nodes on the left."); return; }
-  try { choose(deeper(api.offline ? quickPick(at, y) : await exactPick(at, y))); } catch (error) { failed(error); }
+  next(async () => choose(deeper(api.offline ? quickPick(at, y) : await exactPick(at, y))));
 }
 
 const hoverAt = latest(async (x, y) => {

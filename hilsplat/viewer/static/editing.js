@@ -6,6 +6,7 @@ import { paneAt } from "./choosing.js";
 import { currentStyles, overlay, restyle } from "./drawing.js";
 import { $, counted } from "./elements.js";
 import { groups } from "./kept.js";
+import { inOrder } from "./latest.js";
 import { failed, host, page, panes, tell, variantOf } from "./state.js";
 import { base64, wireStyle } from "./styles.js";
 
@@ -17,6 +18,9 @@ const key = () => `hilsplat removed of ${page.scene.name}`;
 const isEditing = () => !$("edit").hidden;
 export const tool = () => isEditing() ? document.querySelector("[name=tool]:checked").value : "move";
 const count = (mark) => marks.reduce((sum, each) => sum + (each === mark), 0);
+
+const next = inOrder(failed);   // what is removed while a selection is on its way is that selection
+export const edited = () => next(() => {});   // once all steps are taken
 
 // Set all marks to `markOf` of the present mark and the number of the Gaussian, as one step that can be undone.
 function become(markOf) {
@@ -72,18 +76,19 @@ function select(packed, how) {
 }
 
 // Select the Gaussians of the selected node, otherwise of all answers that are shown.
-async function selectNodes() {
+function selectNodes() {
   const nodes = page.chosen >= 0 ? [page.chosen] : groups().flatMap((group) => group.nodes);
   if (!nodes.length) { tell("Run a query or select a node first."); return; }
-  await selectMembers({ nodes });
+  selectMembers({ nodes });
 }
 
-async function selectMembers(which) {
-  try { select(new Uint8Array(await api.members({ variant: variantOf(panes[0]), ...which })), $("how").value); } catch (error) { failed(error); }
+function selectMembers(which) {
+  const variant = variantOf(panes[0]), how = $("how").value;
+  next(async () => select(new Uint8Array(await api.members({ variant, ...which })), how));
 }
 
 // Show the region that is being drawn, and select the Gaussians in it once it is `finished`.
-export async function draw(points, finished, { shiftKey, ctrlKey, metaKey }) {
+export function draw(points, finished, { shiftKey, ctrlKey, metaKey }) {
   const at = paneAt(points[0][0]), isBrush = tool() === "brush", left = at.k * at.width, [[x0, y0], [x1, y1]] = [points[0], points.at(-1)];
   overlay();
   placeBrush(...points.at(-1));
@@ -96,10 +101,9 @@ export async function draw(points, finished, { shiftKey, ctrlKey, metaKey }) {
     return;
   }
   const region = { points: (isBrush ? points : [points[0], points.at(-1)]).map(([x, y]) => [x - left, y]), radius: isBrush ? Number($("brush-size").value) / 2 : 0 };
-  try {
-    const found = await api.within({ variant: variantOf(panes[at.k]) || "default", camera: page.camera.wire(at.width, at.height), style: wireStyle(currentStyles()[at.k]), ...region });
-    select(new Uint8Array(found), shiftKey ? "add" : ctrlKey || metaKey ? "subtract" : $("how").value);
-  } catch (error) { failed(error); }
+  const asked = { variant: variantOf(panes[at.k]) || "default", camera: page.camera.wire(at.width, at.height), style: wireStyle(currentStyles()[at.k]), ...region };
+  const how = shiftKey ? "add" : ctrlKey || metaKey ? "subtract" : $("how").value;
+  next(async () => select(new Uint8Array(await api.within(asked)), how));
 }
 
 export function placeBrush(x, y) {
@@ -153,12 +157,13 @@ export function restoreRemoved() {
   edit(true);
 }
 
-const remove = () => become((mark) => mark === SELECTED ? REMOVED : mark);
-const invert = () => become((mark) => mark === REMOVED ? mark : SELECTED - mark);
-export const undo = () => exchange(done, undone), redo = () => exchange(undone, done);
+const change = (markOf) => next(() => become(markOf));
+const remove = () => change((mark) => mark === SELECTED ? REMOVED : mark);
+const invert = () => change((mark) => mark === REMOVED ? mark : SELECTED - mark);
+export const undo = () => next(() => exchange(done, undone)), redo = () => next(() => exchange(undone, done));
 const ACTIONS = {
-  "edit-nodes": selectNodes, "edit-loose": () => selectMembers({ loose: true }), "edit-invert": invert, "edit-none": () => become((mark) => mark === SELECTED ? 0 : mark), "edit-remove": remove,
-  "edit-crop": () => become((mark) => mark === SELECTED ? 0 : REMOVED), "edit-restore": () => become((mark) => mark === REMOVED ? 0 : mark), "edit-undo": undo, "edit-redo": redo,
+  "edit-nodes": selectNodes, "edit-loose": () => selectMembers({ loose: true }), "edit-invert": invert, "edit-none": () => change((mark) => mark === SELECTED ? 0 : mark), "edit-remove": remove,
+  "edit-crop": () => change((mark) => mark === SELECTED ? 0 : REMOVED), "edit-restore": () => change((mark) => mark === REMOVED ? 0 : mark), "edit-undo": undo, "edit-redo": redo,
   "edit-save": () => { $("save").open = true; $("save").querySelector("[data-save=scene-ply]").focus(); },
 };
 const KEYS = { b: () => setTool("box"), c: () => setTool("brush"), h: () => setTool("move"), i: invert, delete: remove, backspace: remove };

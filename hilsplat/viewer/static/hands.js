@@ -5,7 +5,7 @@ import { ask, askPicture, clear, clearAnswer, fillField, framed, keepAnswer, lik
 import { children } from "./card.js";
 import { choose, pointed, tapped } from "./choosing.js";
 import { attach } from "./controls.js";
-import { attachEditing, draw, edit, leaveTool, placeBrush, pressed, redo, resizeBrush, tool, undo } from "./editing.js";
+import { attachEditing, draw, edit, edited, leaveTool, placeBrush, pressed, redo, resizeBrush, tool, undo } from "./editing.js";
 import { currentStyles, painted, redraw, rememberedAs, restyle } from "./drawing.js";
 import { $, counted, nameOf } from "./elements.js";
 import { flyTo, nearestView, setMoving, stand, step, touched } from "./flights.js";
@@ -110,6 +110,7 @@ export function attachHands() {
     $("save").open = false;
     try {
       if (kind === "link") { await navigator.clipboard.writeText(location.href); tell("Link copied. It opens this view while the viewer is running."); return; }
+      await edited();
       const side = Number($("still-side").value), scale = side ? side / Math.max(host.clientWidth, host.clientHeight) : devicePixelRatio, size = [host.clientWidth, host.clientHeight].map((px) => Math.round(px * scale));
       await save(kind, { variant: variantOf(panes[0]), answerer: answererOf(panes[0]), groups: selected(), removed: page.removed, style: currentStyles()[0], capture: () => page.painter.capture(page.camera, painted(), ...size), flown: flown(),
         kept: page.kept.map((query) => query.asked), last: page.asked?.query, camera: page.camera.toText(), name: page.scene.name.split("/").at(-1), told: tell });

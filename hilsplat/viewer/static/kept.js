@@ -4,7 +4,8 @@ import { doubtsOf } from "./answers.js";
 import * as api from "./api.js";
 import { restyle } from "./drawing.js";
 import { $, counted, make } from "./elements.js";
-import { answererOf, keptIn, level, main, page, panes, start, tell, threshold, variantOf } from "./state.js";
+import { inOrder } from "./latest.js";
+import { answererOf, failed, keptIn, level, main, page, panes, start, tell, threshold, variantOf } from "./state.js";
 import { KEPT, shownHits } from "./styles.js";
 
 const MOST = 12;
@@ -24,7 +25,10 @@ function freeColour() {
   return used.indexOf(Math.min(...used));
 }
 
-export async function keep(asked) {
+const next = inOrder(failed);   // of two at once, the second finds the first
+export const keep = (asked) => next(() => keepNext(asked));
+
+async function keepNext(asked) {
   if (page.kept.length >= MOST) { tell(`At most ${MOST} queries can be kept: remove one first.`, true); return false; }
   const same = page.kept.findIndex((query) => JSON.stringify(query.asked) === JSON.stringify(asked)), query = same < 0 ? { asked, shown: true, colour: freeColour() } : page.kept[same];
   await answered(query);

@@ -10,3 +10,9 @@ export function latest(work) {
     }
   };
 }
+
+// Take steps one after another, in the order in which they were asked for, whatever the server's time for each.
+export function inOrder(failed) {
+  let last = Promise.resolve();
+  return (step) => last = last.then(step).catch(failed);
+}

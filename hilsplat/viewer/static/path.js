@@ -62,12 +62,10 @@ export function addToPath() {
 // Move the camera as a saved film would; a second click, or moving the camera, ends it.
 async function preview() {
   if (page.previewing) { halt(); return; }
-  try {
-    const cameras = (await api.path(flown())).map((wire) => viewed((camera) => camera.standAt(wire, -1)));
-    page.previewing = true;
-    $("path-preview").textContent = "Stop";
-    play(cameras, FRAMES_PER_S, () => { page.previewing = false; $("path-preview").textContent = "Preview"; });
-  } catch (error) { failed(error); }
+  const ended = () => { page.previewing = false; $("path-preview").textContent = "Preview"; };
+  page.previewing = true;
+  $("path-preview").textContent = "Stop";
+  try { play((await api.path(flown())).map((wire) => viewed((camera) => camera.standAt(wire, -1))), FRAMES_PER_S, ended); } catch (error) { ended(); failed(error); }
 }
 
 function saveJson() {

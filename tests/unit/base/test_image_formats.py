@@ -14,6 +14,8 @@ from hilsplat.base.errors import ImageError
 from hilsplat.base.files import list_images
 from hilsplat.base.images import read_image
 
+pillow_heif.register_heif_opener()  # for writing; reading registers it itself
+
 GREY = np.array([[0, 128, 255], [10, 20, 30]], np.uint8)
 
 
@@ -98,14 +100,12 @@ def gradient() -> Image.Image:
 
 @pytest.mark.parametrize("suffix", [".heic", ".HEIF", ".avif", ".webp", ".TIF", ".JPG", ".bmp"])
 def test_phone_and_web_formats_are_listed_and_read(tmp_path, suffix):
-    pillow_heif.register_heif_opener()  # for writing; reading registers it itself
     path = saved(tmp_path, gradient(), suffix, quality=95)
     assert list_images(tmp_path) == [path]
     assert np.abs(read_image(path).astype(int) - np.asarray(gradient())).mean() < 4
 
 
 def test_reading_heif_needs_no_preparation(tmp_path, project):
-    pillow_heif.register_heif_opener()
     path = saved(tmp_path, gradient(), ".heic")
     read = f"from pathlib import Path; import hilsplat.base.images as i; i.read_image(Path({str(path)!r}))"
     subprocess.run([sys.executable, "-c", read], check=True, cwd=project)
@@ -113,7 +113,6 @@ def test_reading_heif_needs_no_preparation(tmp_path, project):
 
 @pytest.mark.parametrize("suffix", [".heic", ".jpg", ".avif"])
 def test_exif_orientation_turns_the_picture_upright(tmp_path, suffix):
-    pillow_heif.register_heif_opener()
     exif = Image.Exif()
     exif[0x0112] = 6  # shown a quarter turn clockwise
     path = saved(tmp_path, gradient(), suffix, quality=95, exif=exif.tobytes())  # HEIF: as `irot`
