@@ -158,16 +158,21 @@ def annotating(served, tmp_path) -> Callable:
     return lambda folder, **more: served(folder, "annotate", "--data-root", str(tmp_path), **more)
 
 
+def until(page, holds: Callable[[], object]) -> None:
+    """Wait until a condition holds."""
+    for _ in range(600):
+        if holds():
+            return
+        page.wait_for_timeout(50)
+    raise AssertionError("the condition didn't become true")
+
+
 def drawn(page, act: Callable[[], object]) -> None:
     """Run `act` and wait until the picture is redrawn."""
     view = page.locator("#view")
     before = int(view.get_attribute("data-drawn"))
     act()
-    for _ in range(600):
-        if int(view.get_attribute("data-drawn")) > before:
-            return
-        page.wait_for_timeout(50)
-    raise AssertionError("nothing was drawn")
+    until(page, lambda: int(view.get_attribute("data-drawn")) > before)
 
 
 def pixels(page) -> np.ndarray:

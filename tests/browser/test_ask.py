@@ -23,6 +23,7 @@ from tests.browser.conftest import (
     pixels,
     save,
     serving,
+    until,
     wire_camera,
 )
 from tests.unit.artifact_changes import change_index
@@ -298,8 +299,8 @@ def test_a_rewritten_scene_is_reported_and_reloaded_without_the_old_choice(opene
     ask(page, "mug > handle")
     answers(page).first.click()
     page.locator("#overlay path.chosen").first.wait_for(state="attached")
-    page.wait_for_timeout(800)  # until the address holds the choice
-    assert "node=" in page.url and not page.get_by_role("alert").is_visible()
+    until(page, lambda: "node=" in page.url)
+    assert not page.get_by_role("alert").is_visible()
     tree = own_desk / "default/semantic_tree"
     with np.load(tree / "tree.npz") as held:
         arrays = {**held, "quality": held["quality"] * 0.5}

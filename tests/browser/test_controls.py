@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from tests.browser.conftest import answers, ask, ask_and_wait, wire_camera
+from tests.browser.conftest import answers, ask, ask_and_wait, until, wire_camera
 from tests.unit.finished_desk import SCENE
 
 
@@ -90,14 +90,11 @@ def test_a_threshold_cuts_the_colours_and_counts_the_gaussians_above(opened, des
     assert scale.inner_text().split() == page.evaluate(
         "[hilsplat.painted()[0].style.low, hilsplat.painted()[0].style.high].map((value) => value.toFixed(2))"
     )
-    counts = []
     page.get_by_label("score at least").check()
-    for least in ("0.5", "0.9"):
+    for least, count in (("0.5", 24 * 16), ("0.9", 0)):  # the mug's, whose score is 0.79
         page.get_by_role("slider", name="Minimum score").fill(least)
-        page.wait_for_timeout(800)
-        counts.append(int(scale.inner_text().split()[2].replace(",", "")))
-    assert counts == [24 * 16, 0]  # the mug's, whose score is 0.79
-    assert "least=0.9" in page.url
+        until(page, lambda count=count: scale.inner_text().split()[2:3] == [str(count)])
+    until(page, lambda: "least=0.9" in page.url)
 
 
 def test_another_scene_opens_on_the_same_server(desk_project, tmp_path, served):
@@ -119,8 +116,8 @@ def test_another_scene_opens_on_the_same_server(desk_project, tmp_path, served):
         scenes.nth(1).locator("a").click()
     page.locator("body[data-ready=yes]").wait_for()
     ask_and_wait(page, "mug")
-    page.wait_for_timeout(800)
-    assert page.url.startswith(origin) and "scene=photos%2Fother" in page.url and "q=mug" in page.url
+    until(page, lambda: "q=mug" in page.url)
+    assert page.url.startswith(origin) and "scene=photos%2Fother" in page.url
     page.get_by_text("Scenes", exact=True).click()
     scenes.nth(1).wait_for()
     assert scenes.nth(1).locator("a").get_attribute("aria-current") == "page"

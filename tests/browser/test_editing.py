@@ -2,7 +2,6 @@
 
 import io
 import re
-import time
 from collections.abc import Callable
 
 import numpy as np
@@ -13,7 +12,7 @@ from plyfile import PlyData
 from hilsplat.splat.ply import load_ply
 from hilsplat.viewer.frames import within
 from hilsplat.viewer.wire import WireCamera
-from tests.browser.conftest import ask_and_wait, keep, on_page, phone_fits, save, wire_camera
+from tests.browser.conftest import ask_and_wait, keep, on_page, phone_fits, save, until, wire_camera
 from tests.unit.artifact_changes import loosen
 from tests.unit.splat.spz_reader import decoded
 
@@ -41,11 +40,8 @@ def counts(page) -> tuple[int, int]:
 
 def has(page, selected: int, removed: int) -> None:
     """Wait until these numbers of Gaussians are selected and removed."""
-    from playwright.sync_api import expect
-
-    expect(page.locator("#edit-told")).to_contain_text(
-        f"{selected} selected, {removed} removed", timeout=20_000
-    )
+    told = f"{selected} selected, {removed} removed"
+    until(page, lambda: told in page.locator("#edit-told").inner_text())
 
 
 def use(page, tool: str) -> None:
@@ -68,7 +64,6 @@ def drag(page, *points: tuple[float, float], held: str = "") -> None:
 
 def colour(page, x: float, y: float) -> np.ndarray:
     """Colour of the picture at a point of the desk's plane."""
-    page.wait_for_timeout(200)
     page.mouse.move(5, 5)
     ((left, top),) = on_page(page, (x, y, 0))
     picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
@@ -77,9 +72,7 @@ def colour(page, x: float, y: float) -> np.ndarray:
 
 def shows(page, x: float, y: float, is_right: Callable[[np.ndarray], bool]) -> None:
     """Wait until a point of the desk's plane has the right colour."""
-    end = time.monotonic() + 20
-    while not is_right(found := colour(page, x, y)):
-        assert time.monotonic() < end, found
+    until(page, lambda: is_right(colour(page, x, y)))
 
 
 def press(page, key: str) -> None:

@@ -8,12 +8,11 @@ import av
 import pytest
 from plyfile import PlyData
 
-from tests.browser.conftest import answers, ask, ask_and_wait, chips, drawn, keep, pixels, save
+from tests.browser.conftest import answers, ask, ask_and_wait, chips, drawn, keep, pixels, save, until
 
 
 def greenish(page) -> float:
     """Share of the picture in the colour of the first kept query."""
-    page.wait_for_timeout(500)
     picture = pixels(page).astype(int)
     return float(((picture[..., 1] - picture[..., 0] > 60) & (picture[..., 2] > 60)).mean())
 
@@ -27,10 +26,10 @@ def test_kept_queries_have_colours_and_can_be_hidden_and_dropped(opened, desk_ad
     (book,), (handle,) = scene.query("book"), scene.query("mug > handle")
     painted = {int(path.get_attribute("data-node")) for path in page.locator("#overlay path.kept").all()}
     assert painted == {book.node, handle.node}
-    assert greenish(page) > 0.02
+    until(page, lambda: greenish(page) > 0.02)
     drawn(page, page.get_by_role("button", name="Show book").click)
     assert page.get_by_role("button", name="Show book").get_attribute("aria-pressed") == "false"
-    assert greenish(page) < 0.005
+    until(page, lambda: greenish(page) < 0.005)
     page.get_by_role("button", name="Remove book").click()
     assert chips(page).count() == 1
 

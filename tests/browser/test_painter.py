@@ -13,7 +13,7 @@ from hilsplat.splat.rasterise.api import render
 from hilsplat.splat.spz import fractional_bits, spz_bytes
 from hilsplat.viewer.frames import Paint, faded, painted, within
 from hilsplat.viewer.wire import WireCamera
-from tests.browser.conftest import drawn, pixels, wire_camera
+from tests.browser.conftest import drawn, pixels, until, wire_camera
 from tests.unit.splat.spz_reader import decoded
 
 
@@ -97,12 +97,13 @@ def test_selected_and_removed_gaussians_are_shown_by_both_painters(opened, cloud
         page.mouse.down()
         page.mouse.move(view["x"] + right, view["y"] + 190, steps=3)
         page.mouse.up()
-        page.wait_for_timeout(800)
         found.append(within(gaussians.means, camera, [(left, 100.0), (right, 190.0)], 0.0))
         if len(found) == 1:
             page.keyboard.press("Delete")
-            page.wait_for_timeout(800)
     removed, selected = found
+    told = f"{selected.sum():,} selected, {removed.sum():,} removed"
+    until(page, lambda: told in page.locator("#edit-told").inner_text())
+    page.wait_for_timeout(800)
     assert removed.sum() > 100 < selected.sum()
     paint = Paint.plain(len(gaussians)).marking(selected)
     expected = painted(faded(gaussians, ~removed), camera, paint)

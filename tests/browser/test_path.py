@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilsplat.scene.scene import Scene
-from tests.browser.conftest import drawn, wire_camera
+from tests.browser.conftest import drawn, until, wire_camera
 
 
 def steps(page):
@@ -35,10 +35,10 @@ def test_the_cameras_of_the_photographs_are_drawn_and_a_click_flies_there(
     for _ in range(20):
         page.keyboard.press("-")
     page.keyboard.press("p")
-    page.wait_for_timeout(500)
     cameras = Scene.load(desk / "scene").cameras
     shown = page.locator("#overlay path.frustum")
-    assert shown.count() == len(cameras) and page.locator("#overlay path.test").count() == 1
+    until(page, lambda: shown.count() == len(cameras))
+    assert page.locator("#overlay path.test").count() == 1
     wire, view = wire_camera(page), page.locator("#view").bounding_box()
     centre = np.array(wire["cam_from_world"]) @ [*cameras[cameras.names[4]].centre, 1]
     x, y, z = np.array(wire["K"]) @ centre[:3]
@@ -48,11 +48,9 @@ def test_the_cameras_of_the_photographs_are_drawn_and_a_click_flies_there(
     corners = np.array([[float(value) for value in corner.split()] for corner in rim])
     x, y = corners.mean(axis=0)
     page.mouse.click(view["x"] + x, view["y"] + y)
-    page.wait_for_timeout(800)
-    assert page.evaluate("hilsplat.camera.view") == 4
+    until(page, lambda: page.evaluate("hilsplat.camera.view") == 4)
     page.get_by_role("button", name="cameras").click()
-    page.wait_for_timeout(400)
-    assert shown.count() == 0
+    until(page, lambda: shown.count() == 0)
 
 
 def test_the_views_of_a_path_are_reordered_replaced_removed_and_kept(opened, desk_address):
@@ -69,8 +67,7 @@ def test_the_views_of_a_path_are_reordered_replaced_removed_and_kept(opened, des
     assert places(page) == ["001.png", "004.png"]
     assert page.evaluate("document.activeElement.getAttribute('aria-label')") == "Remove view 2"
     steps(page).nth(0).get_by_title("Go to this view").click()
-    page.wait_for_timeout(300)
-    assert page.evaluate("hilsplat.camera.view") == 1
+    until(page, lambda: page.evaluate("hilsplat.camera.view") == 1)
     page.reload()
     page.locator("body[data-ready=yes]").wait_for()
     assert places(page) == ["001.png", "004.png"]
