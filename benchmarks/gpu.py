@@ -64,7 +64,8 @@ class Sizes:
     fit: tuple[int, int, int, int]  # Gaussians of the scene, views, image side, steps
     long_fit: tuple[int, int, int, int] | None
     contributions: tuple[int, int, int, int]  # Gaussians, views, width, masks
-    crops: tuple[int, ...]
+    crops: tuple[int, ...]  # numbers in a batch
+    prompts: tuple[int, ...]
     points_per_side: int
 
 
@@ -76,6 +77,7 @@ CARD = Sizes(
     (1_000_000, 24, 800, 7000),
     (1_000_000, 24, 986, 300),
     (1, 64, 256),
+    (16, 64, 256, 1024),
     32,
 )
 TINY = Sizes(
@@ -86,6 +88,7 @@ TINY = Sizes(
     None,
     (2000, 2, 160, 30),
     (1, 8),
+    (4, 16),
     8,
 )
 
@@ -152,7 +155,7 @@ def tests(device: str, sizes: Sizes, models: Path | None) -> dict[str, Any]:
 
 
 def steps(device: str, sizes: Sizes, models: Path | None) -> dict[str, Any]:
-    """Time of a fit's step, its longest operations, and its peak memory."""
+    """Time of a fit's step, its longest operations, copied bytes, and peak memory."""
     return {"steps": [step_of(number, size_hw, device) for number, size_hw in sizes.steps]}
 
 
@@ -179,8 +182,22 @@ def step_of(number: int, size_hw: tuple[int, int], device: str) -> dict[str, Any
         "megapixels": size_hw[0] * size_hw[1] / 1e6,
         "step_ms": step_ms,
         "peak_mib": peak / 2**20,
+        "copied_mb": copied_mb(profile),
         "longest_ms": {event.key[:60]: getattr(event, spent) / 1e3 for event in longest},
     }
+
+
+def copied_mb(profile: torch.profiler.profile) -> dict[str, float]:
+    """Megabytes that crossed the bus or were copied on the card, by direction."""
+    copied: dict[str, float] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        trace = Path(folder) / "trace.json"
+        profile.export_chrome_trace(str(trace))
+        events = json.loads(trace.read_text())["traceEvents"]
+    for event in events:
+        if event.get("cat") == "gpu_memcpy":
+            copied[event["name"]] = copied.get(event["name"], 0) + event["args"].get("bytes", 0) / 1e6
+    return copied
 
 
 def fit(device: str, sizes: Sizes, models: Path | None) -> dict[str, Any]:
@@ -223,7 +240,7 @@ def fitted(device: str, number: int, views: int, side_px: int, iterations: int) 
 
 
 def networks(device: str, sizes: Sizes, models: Path | None) -> dict[str, Any]:
-    """SAM and CLIP on the device: milliseconds per picture and per crop."""
+    """SAM and CLIP on the device: milliseconds per picture, and per prompt and crop by batch."""
     from hilsplat.models.folder import open_model_folder
     from hilsplat.models.store import EMBEDDED
 
@@ -241,8 +258,16 @@ def times_of_sam(model: ModelFolder, device: str, sizes: Sizes) -> dict[str, Any
     sam = SamModel(model, device)
     picture = np.random.default_rng(0).integers(0, 256, (600, 800, 3)).astype(np.uint8)
     settings = MasksSettings(points_per_side=sizes.points_per_side)
+    encoded, rng = sam.encode(picture), np.random.default_rng(1)
+
+    def prompt_ms(number: int) -> float:
+        points = rng.uniform(0, (800, 600), (number, 2))
+        return median_ms(lambda: sam.decode(encoded, points), device, 3) / number
+
+    fixed = 0 if sam.factored else sam.decoder.prompts_per_call
     return {
         "encode_ms": median_ms(lambda: sam.encode(picture), device, 3),
+        "prompt_ms": {number: prompt_ms(number) for number in ([fixed] if fixed else sizes.prompts)},
         "picture_ms": median_ms(lambda: decode_candidates(picture, sam, settings, None), device, 2),
         "decoder": "factored" if sam.factored else "as exported",
     }
