@@ -72,6 +72,12 @@ FORMS = {  # the lens, the keys that describe it, and the least PSNR
     "x_fov": (SQUARE, {**SIZE, "x_fov": np.degrees(angle(WIDTH, FX))}, 45),
     "y_fov": (SQUARE, {**SIZE, "y_fov": np.degrees(angle(HEIGHT, FX))}, 45),
     "null values": (PLAIN, {**NUMBERS, "k1": None, "camera_angle_x": None, "is_fisheye": None}, 45),
+    "null centre and model": (
+        world.pinhole(FX, FY, WIDTH / 2, HEIGHT / 2),
+        {**NUMBERS, "cx": None, "cy": None, "camera_model": None},
+        45,
+    ),
+    "ordinary axes": (PLAIN, {**NUMBERS, "from_na": False}, 45),
     "zero distortion": (PLAIN, {**NUMBERS, "camera_model": "OPENCV", "k1": 0, "p2": 0.0}, 45),
     "PINHOLE in small letters": (PLAIN, {**NUMBERS, "camera_model": "pinhole"}, 45),
     "false flags": (PLAIN, {**NUMBERS, "is_fisheye": False, "ortho": False, "k5": 0}, 45),
@@ -124,6 +130,8 @@ def test_lenses_of_frames_replace_those_of_the_file(tmp_path, imported):
         {"shift_x": 0.1},
         {"ftheta_p0": 0.5},
         {"latlong": 1},
+        {"from_na": True},  # NeuS2: camera axes of OpenCV
+        {"normal_mts_args": {"spp": 4}},  # Mitsuba's camera axes, in instant-ngp
         {"fl_x": "wide"},
         {"fl_x": None, "fl_y": None},
         {"fl_x": -120},
@@ -136,6 +144,25 @@ def test_what_cannot_be_applied_is_refused(head, tmp_path, imported):
     folder = write(tmp_path / "in", PLAIN, {**NUMBERS, **head}, "a")
     with pytest.raises(HilsplatError):
         imported(folder)
+
+
+@pytest.mark.parametrize(
+    ("head", "message"),
+    [
+        ({**SIZE, "camera_angle_x": 40.0}, "camera_angle_x is 40, not an angle in radians"),  # tan(20) > 0
+        ({**SIZE, "y_fov": 400.0}, "y_fov is 400, not an angle in degrees"),
+        ({**SIZE, "x_fov": 0.9}, "sides of an image of 112 x 84 px"),  # radians
+        ({**NUMBERS, "fl_x": FX / WIDTH, "fl_y": FY / HEIGHT}, "0.1 to 50 sides of an image"),
+        ({**NUMBERS, "cx": CX / WIDTH, "cy": CY / HEIGHT}, "not px"),
+        (
+            {**LENS, "cx": 4 * CX, "cy": 4 * CY},
+            "another size of the image, and w and h are missing",
+        ),  # images_4
+    ],
+)
+def test_numbers_of_another_unit_or_size_are_refused(head, message, tmp_path, imported):
+    with pytest.raises(HilsplatError, match=message):
+        imported(write(tmp_path / "in", PLAIN, head, "a"))
 
 
 def test_unknown_keys_and_contradictions_are_reported_once(tmp_path):
@@ -189,6 +216,18 @@ def test_names_of_images_are_matched(name, tmp_path, imported):
 def test_names_in_another_unicode_form_are_matched(stem, name, tmp_path):
     folder = write(tmp_path, PLAIN, NUMBERS, "ab", name=f"images/{name}.png", stem=stem)
     assert all(view.image is not None for view in read_source(find_known_poses(folder)).views)
+
+
+@pytest.mark.parametrize("maps", ["masks", "masks_4", "Depth", "normals", "segmentations", "exports/a"])
+def test_a_map_does_not_replace_a_missing_image(maps, tmp_path):
+    folder = write(tmp_path, PLAIN, NUMBERS)
+    world.save(folder / maps, {letter: np.zeros((HEIGHT, WIDTH), np.uint8) for letter in POSES})
+    (folder / "images/c.png").unlink()
+    images = {view.name: view.image for view in read_source(find_known_poses(folder)).views}
+    assert images == {name: folder / name if name != "images/c.png" else None for name in NAMES}
+    path = folder / maps / "c.png"
+    named = changed(folder, lambda content: content["frames"][2].update(file_path=f"{maps}/c.png"))
+    assert path in [view.image for view in read_source(find_known_poses(named)).views]
 
 
 def posed(matrix):

@@ -15,7 +15,7 @@ from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.cameras import MAX_SIDE_PX
 from hilsplat.scene.colmap import Points, pycolmap
 from hilsplat.scene.importers.colmap_model import ModelImage, read_model
-from hilsplat.scene.layouts import KnownPoses, images_below
+from hilsplat.scene.layouts import KnownPoses, used_images
 from hilsplat.scene.posed_images import rigid_pose
 from hilsplat.scene.view_names import match_names
 
@@ -119,7 +119,7 @@ class Keys:
                     raise SceneError(
                         f"{file} describes {self.refused[key]}, which is not supported",
                         found=f"{key}: {str(content[key])[:60]}",
-                        fix="export undistorted images of ordinary cameras",
+                        fix="export undistorted images of ordinary cameras, in the usual axes",
                     )
             unknown |= content.keys() - self.used - self.harmless - self.refused.keys()
         return [f"keys of {file.name} that are not used: {', '.join(sorted(unknown))}"] if unknown else []
@@ -164,7 +164,7 @@ def find_images(root: Path, names: Sequence[str]) -> dict[str, Path | None]:
         paths = [] if is_outside(name) else [base / f"{plain}{end}" for base in bases for end in ends]
         images[name] = next((path for path in paths if path.is_file()), None)
     if missing := [name for name, image in images.items() if image is None]:
-        below = {path.relative_to(root).as_posix(): path for path in images_below(root)}
+        below = {path.relative_to(root).as_posix(): path for path in used_images(root)}
         for name, match in match_names(missing, below).items():
             if match is None:
                 require_inside(root, name)
@@ -239,7 +239,7 @@ def read_llff(known: KnownPoses) -> Source:
             found=f"{rows.dtype} of shape {rows.shape}",
             fix="unpack it again",
         )
-    images = sorted(list_images(folder if folder.is_dir() else known.root), key=lambda image: image.stem)
+    images = sorted(list_images(folder if folder.is_dir() else known.root), key=lambda image: image.name)
     if len(images) != len(rows):
         raise SceneError(
             f"{path} has {len(rows)} poses for {len(images)} images",

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 
 from hilsplat.base.errors import SceneError, foreign
 from hilsplat.base.images import image_size_hw
@@ -32,6 +33,9 @@ FOCAL_KEYS = frozenset((*FOCAL["x"], *FOCAL["y"]))
 FOCAL_TOLERANCE = 0.01
 """Relative difference between several statements of one focal length, above which they contradict."""
 
+MIN_FOCAL, MAX_FOCAL = 0.1, 50
+"""Range of focal lengths, in sides of the image; other numbers have another unit than the key's."""
+
 PERSPECTIVES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
 FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 MODELS = dict.fromkeys(PERSPECTIVES, "OPENCV") | dict.fromkeys(FISHEYES, "OPENCV_FISHEYE")
@@ -47,7 +51,7 @@ SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 # applied_transform and applied_scale are used for Gaussians, see `splat/coordinates.py`.
 USED = """frames file_path transform_matrix w h cx cy k1 k2 k3 k4 p1 p2 camera_model is_fisheye ply_file_path
 applied_transform applied_scale"""
-HARMLESS = """aabb_scale scale offset n_frames from_na up sharpness rotation render_aabb orientation_override
+HARMLESS = """aabb_scale scale offset n_frames up sharpness rotation render_aabb orientation_override
 colmap_im_id depth_file_path depth_path depth_unit_scale_factor integer_depth_scale enable_depth_loading
 normal_file_path sharpen white_transparent black_transparent timestamp auto_scale_poses_override center_method
 version"""
@@ -57,6 +61,7 @@ REFUSED = {
     "rolling_shutter transform_matrix_start transform_matrix_end": "a rolling shutter",
     "shift_x shift_y skew": "a shifted or skewed lens",
     "ftheta_p0 ftheta_p1 ftheta_p2 ftheta_p3 ftheta_p4 lens_mode": "a special lens",
+    "from_na from_mitsuba normal_mts_args": "camera axes other than OpenGL's",  # NeuS2, Mitsuba
     "k5 k6 p3 p4 s1 s2 s3 s4 b1 b2 distortion_params": "more lens distortion",
 }
 KEYS = Keys(
@@ -128,8 +133,8 @@ def _view(
 def _lens(where: str, frame: Mapping[str, Any], image: Path | None, notes: list[str]) -> pycolmap.Camera:
     """Return the lens of a frame: PINHOLE, or with distortion OPENCV, FULL_OPENCV or OPENCV_FISHEYE."""
     with foreign(where, expected="finite numbers", fix="export it again"):
-        stated = str(frame.get("camera_model", "OPENCV")).upper()
         values = {key: value for key, value in frame.items() if value is not None}
+        stated = str(values.get("camera_model", "OPENCV")).upper()
         if (fisheye := values.get("is_fisheye", False)) not in (True, False):
             raise ValueError(f"is_fisheye is {fisheye!r}, not true or false")
         model = "OPENCV_FISHEYE" if fisheye else MODELS.get(stated, "")
@@ -154,13 +159,28 @@ def _lens(where: str, frame: Mapping[str, Any], image: Path | None, notes: list[
         if not focal_x or not focal_y:
             expected = "fl_x (px), camera_angle_x (radians) or x_fov (degrees), or the same for y"
             raise SceneError(f"{where} has no focal length", expected=expected, fix="export it again")
-        params = [focal_x, focal_y, float(frame.get("cx", width / 2)), float(frame.get("cy", height / 2))]
+        params = [focal_x, focal_y, float(values.get("cx", width / 2)), float(values.get("cy", height / 2))]
+        if image is not None:
+            is_stated = values.keys() >= {"w", "h"}
+            _require_pixels(np.array(params).reshape(2, 2), (width, height), is_stated=is_stated)
         coefficients = [bends[key] for key in COEFFICIENTS[model]]
         if model == "OPENCV" and bends["k3"]:
             model, coefficients = "FULL_OPENCV", [*coefficients, 0.0, 0.0, 0.0]
         elif model == "OPENCV":
             model, coefficients = (model, coefficients[:4]) if any(coefficients) else ("PINHOLE", [])
         return pycolmap.Camera(model=model, width=width, height=height, params=params + coefficients)
+
+
+def _require_pixels(lens: Float64[np.ndarray, "2 2"], size: tuple[int, int], *, is_stated: bool) -> None:
+    """Raise ValueError if focal lengths and centre (rows) can't be px of an image of this size."""
+    (focal, centre), sides = lens, np.array(size)
+    if ((focal > 0) & ((focal < MIN_FOCAL * sides) | (focal > MAX_FOCAL * sides))).any():
+        expected = f"{MIN_FOCAL} to {MAX_FOCAL} sides of an image of {size[0]} x {size[1]} px"
+        raise ValueError(f"the focal length is {focal.tolist()} px, not {expected}: another unit?")
+    if (np.abs(centre) <= 1).all():
+        raise ValueError(f"cx and cy are {centre.tolist()}, not px")
+    if not is_stated and (np.abs(centre - sides / 2) > sides / 4).any():
+        raise ValueError("cx and cy belong to another size of the image, and w and h are missing")
 
 
 def _focal(frame: Mapping[str, Any], axis: str, side_px: int, notes: list[str]) -> float:
@@ -170,6 +190,9 @@ def _focal(frame: Mapping[str, Any], axis: str, side_px: int, notes: list[str]) 
         if frame.get(key) is not None:
             value = float(frame[key])
             angle = math.radians(value) if key.endswith("fov") else value
+            if not key.startswith("fl_") and not 0 < angle < math.pi:
+                unit = "degrees" if key.endswith("fov") else "radians"
+                raise ValueError(f"{key} is {value:g}, not an angle in {unit}")
             stated[key] = value if key.startswith("fl_") else side_px / 2 / math.tan(angle / 2)
     first, *others = stated
     for key in others:
