@@ -12,6 +12,7 @@ import re
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -164,6 +165,10 @@ POLYGONS = {"polygon", "oriented_rectangle", "rotation", "quadrilateral"}
 """Shape types of labelme, and of X-AnyLabeling, which has the same format."""
 
 
+HOLE = "__background__"
+"""Category of ISAT for regions that are cut out of those in lower layers, such as holes."""
+
+
 class Piece(NamedTuple):
     """A region in a file; pieces of a view with the same text and number are one object."""
 
@@ -268,12 +273,24 @@ Reader = Callable[[str, Any], Piece | str]
 def _isat_reader(name: str, content: Mapping[str, Any], cameras: Cameras) -> Reader:
     drawn_hw = stated_size(name, content.get("info"))
     view = _view(name, content["info"].get("name"), cameras)
+    holes: list[tuple[float, Bool[np.ndarray, "H W"]]] = []
+    for entry in content["objects"]:
+        with suppress(HilsplatError):  # `read` reports it
+            if (thing := read_object(name, entry, drawn_hw, [])).category == HOLE:
+                holes.append((entry.get("layer", 0), fill_polygons(thing.polygons, drawn_hw)))
 
-    def read(where: str, entry: Any) -> Piece:
+    def read(where: str, entry: Any) -> Piece | str:
         thing = read_object(where, entry, drawn_hw, [])
+        if thing.category == HOLE:
+            return f"of the background ({HOLE}), cut out of the regions below them"
+        above = [hole for layer, hole in holes if layer > entry.get("layer", 0)]
         # Without our keys, groups are ignored: in LERF-OVS's files, group numbers are not unique.
         number = entry.get("id", entry.get("group") if "level" in entry else None)
-        rings = placed_rings(thing.polygons, drawn_hw, cameras[view], where)
+        if above:
+            mask = fill_polygons(thing.polygons, drawn_hw) & ~np.any(above, axis=0)
+            rings = traced(placed(mask, cameras[view], where))
+        else:
+            rings = placed_rings(thing.polygons, drawn_hw, cameras[view], where)
         return Piece(view, thing.category, number, rings, entry)
 
     return read
