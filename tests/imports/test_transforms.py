@@ -122,6 +122,7 @@ def test_lenses_of_frames_replace_those_of_the_file(tmp_path, imported):
         {"camera_model": "EQUIRECTANGULAR"},
         {"camera_model": "ORTHOPHOTO"},
         {"camera_model": "FISHEYE624", "distortion_params": [0.1] * 12},
+        {"distortion": [0.1, 0, 0, 0]},
         {"ortho": True},
         {"k4": 0.01},
         {"k6": 0.01},

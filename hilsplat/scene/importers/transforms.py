@@ -62,7 +62,7 @@ REFUSED = {
     "shift_x shift_y skew": "a shifted or skewed lens",
     "ftheta_p0 ftheta_p1 ftheta_p2 ftheta_p3 ftheta_p4 lens_mode": "a special lens",
     "from_na from_mitsuba normal_mts_args": "camera axes other than OpenGL's",  # NeuS2, Mitsuba
-    "k5 k6 p3 p4 s1 s2 s3 s4 b1 b2 distortion_params": "more lens distortion",
+    "k5 k6 p3 p4 s1 s2 s3 s4 b1 b2 distortion distortion_params": "more lens distortion",
 }
 KEYS = Keys(
     used={*USED.split(), *FOCAL_KEYS, *SPLITS},
