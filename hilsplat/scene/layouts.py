@@ -299,10 +299,10 @@ IMAGE_LINE = re.compile(rb"^ *\d+( +[-+.\deE]+){7} +\d+ +[^ \r\n]", re.MULTILINE
 
 
 def polycam_folders(folder: Path) -> tuple[Path, Path] | None:
-    """Return a raw Polycam export's image and camera folders (corrected ones if present), or None."""
+    """Return a raw Polycam export's image and camera folders (corrected ones if not empty), or None."""
     for prefix in ("corrected_", ""):
         images, cameras = (folder / "keyframes" / f"{prefix}{what}" for what in ("images", "cameras"))
-        if images.is_dir() and cameras.is_dir():
+        if images.is_dir() and any(cameras.glob("*.json")):
             return images, cameras
     return None
 

@@ -22,6 +22,9 @@ from hilsplat.scene.view_names import match_names
 ASPECT_TOLERANCE = 0.01
 """Relative tolerance of an image's aspect ratio: a scaled copy is accepted, a different crop is not."""
 
+MIN_FOCAL, MAX_FOCAL = 0.1, 50
+"""Range of focal lengths, in sides of the image; other numbers have another unit than px."""
+
 MAX_COORDINATE = 1e9
 """Maximum coordinate, in the source's units; beyond it, 32-bit numbers are too coarse."""
 
@@ -146,6 +149,22 @@ def require_valid(view: KnownView) -> None:
     else:
         return
     raise SceneError(f"the camera {fault} of view {view.name} is not valid", expected=expected, found=found)
+
+
+def require_pixels(params: Sequence[float], size: tuple[int, int], *, is_stated: bool) -> None:
+    """Raise ValueError if fx, fy, cx, cy can't be px of an image of this size (width, height).
+
+    Args:
+        is_stated: the source states the size; otherwise, it is that of the image, which may be a scaled copy.
+    """
+    (focal, centre), sides = np.reshape(params, (2, 2)), np.array(size)
+    if ((focal > 0) & ((focal < MIN_FOCAL * sides) | (focal > MAX_FOCAL * sides))).any():
+        expected = f"{MIN_FOCAL} to {MAX_FOCAL} sides of an image of {size[0]} x {size[1]} px"
+        raise ValueError(f"the focal length is {focal.tolist()} px, not {expected}: another unit?")
+    if (np.abs(centre) <= 1).all():
+        raise ValueError(f"cx and cy are {centre.tolist()}, not px")
+    if not is_stated and (np.abs(centre - sides / 2) > sides / 4).any():
+        raise ValueError("cx and cy belong to another size of the image, and w and h are missing")
 
 
 def find_images(root: Path, names: Sequence[str]) -> dict[str, Path | None]:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
 from hilsplat.base.errors import SceneError, foreign
 from hilsplat.base.images import image_size_hw
@@ -20,6 +19,7 @@ from hilsplat.scene.importers.known_views import (
     Source,
     find_images,
     require_inside,
+    require_pixels,
 )
 from hilsplat.scene.importers.ply_file import read_ply
 from hilsplat.scene.layouts import KnownPoses, read_json_object
@@ -32,9 +32,6 @@ FOCAL_KEYS = frozenset((*FOCAL["x"], *FOCAL["y"]))
 
 FOCAL_TOLERANCE = 0.01
 """Relative difference between several statements of one focal length, above which they contradict."""
-
-MIN_FOCAL, MAX_FOCAL = 0.1, 50
-"""Range of focal lengths, in sides of the image; other numbers have another unit than the key's."""
 
 PERSPECTIVES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
 FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
@@ -161,26 +158,13 @@ def _lens(where: str, frame: Mapping[str, Any], image: Path | None, notes: list[
             raise SceneError(f"{where} has no focal length", expected=expected, fix="export it again")
         params = [focal_x, focal_y, float(values.get("cx", width / 2)), float(values.get("cy", height / 2))]
         if image is not None:
-            is_stated = values.keys() >= {"w", "h"}
-            _require_pixels(np.array(params).reshape(2, 2), (width, height), is_stated=is_stated)
+            require_pixels(params, (width, height), is_stated=values.keys() >= {"w", "h"})
         coefficients = [bends[key] for key in COEFFICIENTS[model]]
         if model == "OPENCV" and bends["k3"]:
             model, coefficients = "FULL_OPENCV", [*coefficients, 0.0, 0.0, 0.0]
         elif model == "OPENCV":
             model, coefficients = (model, coefficients[:4]) if any(coefficients) else ("PINHOLE", [])
         return pycolmap.Camera(model=model, width=width, height=height, params=params + coefficients)
-
-
-def _require_pixels(lens: Float64[np.ndarray, "2 2"], size: tuple[int, int], *, is_stated: bool) -> None:
-    """Raise ValueError if focal lengths and centre (rows) can't be px of an image of this size."""
-    (focal, centre), sides = lens, np.array(size)
-    if ((focal > 0) & ((focal < MIN_FOCAL * sides) | (focal > MAX_FOCAL * sides))).any():
-        expected = f"{MIN_FOCAL} to {MAX_FOCAL} sides of an image of {size[0]} x {size[1]} px"
-        raise ValueError(f"the focal length is {focal.tolist()} px, not {expected}: another unit?")
-    if (np.abs(centre) <= 1).all():
-        raise ValueError(f"cx and cy are {centre.tolist()}, not px")
-    if not is_stated and (np.abs(centre - sides / 2) > sides / 4).any():
-        raise ValueError("cx and cy belong to another size of the image, and w and h are missing")
 
 
 def _focal(frame: Mapping[str, Any], axis: str, side_px: int, notes: list[str]) -> float:
@@ -212,7 +196,7 @@ def read_ply_points(path: Path) -> Points:
             return xyz, np.full(xyz.shape, 128, dtype=np.uint8)
         rgb = np.stack([vertex[name] for name in names], axis=1)
         largest = float(np.nanmax(rgb)) if rgb.size else 0.0
-        # Floats are usually in [0, 1]; 16-bit colours of laser scanners may use only 8 bits.
-        limit = 1 if rgb.dtype.kind == "f" and largest <= 1 else 255 if largest <= 255 else 65535
+        # Floats are usually in [0, 1], up to rounding; 16-bit colours of laser scanners may use only 8 bits.
+        limit = 1 if rgb.dtype.kind == "f" and largest < 2 else 255 if largest <= 255 else 65535
         rgb = np.nan_to_num(rgb.astype(np.float64) * (255 / limit), nan=128.0)
     return xyz, np.clip(np.rint(rgb), 0, 255).astype(np.uint8)
