@@ -364,3 +364,15 @@ def test_blender_s_second_file_is_the_test_set_and_the_third_replaces_it(tmp_pat
         _, _, split, _ = imported(tmp_path / "in")
         assert [view for view, part in split.items() if part == "test"] == [f"{letter}.png"]
         (tmp_path / "in/transforms_test.json").unlink(missing_ok=True)
+
+
+@pytest.mark.parametrize("letters", ["abcdef", "bd"])
+def test_views_of_the_first_file_that_the_test_file_repeats_are_training_views(letters, tmp_path, imported):
+    """3DGS requires a test file, so people copy the one for training."""
+    for split, listed in (("train", "abcdef"), ("test", letters)):
+        write(tmp_path / "in", SQUARE, {"camera_angle_x": angle(WIDTH, FX)}, listed)
+        (tmp_path / "in/transforms.json").rename(tmp_path / f"in/transforms_{split}.json")
+    views, _, split, report = imported(tmp_path / "in")
+    world.require_right(views, right("abcdef"), 45)
+    assert set(split.values()) == {"train"}
+    assert report["warnings"] == [f"{len(letters)} of the views listed are repetitions, which are dropped"]
