@@ -28,7 +28,14 @@ from hilsplat.base.errors import HilsplatError, SceneError, first_line, foreign
 from hilsplat.base.images import open_image
 from hilsplat.datasets.generators import GENERATORS
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
-from hilsplat.datasets.images.isat import fill_polygons, read_object, stated_size
+from hilsplat.datasets.images.isat import (
+    BACKGROUND,
+    IsatObject,
+    cut_background,
+    fill_polygons,
+    read_object,
+    stated_size,
+)
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.scene.placement import placed, placement
 from hilsplat.scene.scene import Scene
@@ -165,10 +172,6 @@ POLYGONS = {"polygon", "oriented_rectangle", "rotation", "quadrilateral"}
 """Shape types of labelme, and of X-AnyLabeling, which has the same format."""
 
 
-HOLE = "__background__"
-"""Category of ISAT for regions that are cut out of those in lower layers, such as holes."""
-
-
 class Piece(NamedTuple):
     """A region in a file; pieces of a view with the same text and number are one object."""
 
@@ -273,24 +276,18 @@ Reader = Callable[[str, Any], Piece | str]
 def _isat_reader(name: str, content: Mapping[str, Any], cameras: Cameras) -> Reader:
     drawn_hw = stated_size(name, content.get("info"))
     view = _view(name, content["info"].get("name"), cameras)
-    holes: list[tuple[float, Bool[np.ndarray, "H W"]]] = []
+    things: list[IsatObject] = []
     for entry in content["objects"]:
         with suppress(HilsplatError):  # `read` reports it
-            if (thing := read_object(name, entry, drawn_hw, [])).category == HOLE:
-                holes.append((entry.get("layer", 0), fill_polygons(thing.polygons, drawn_hw)))
+            things.append(read_object(name, entry, drawn_hw, []))
 
     def read(where: str, entry: Any) -> Piece | str:
-        thing = read_object(where, entry, drawn_hw, [])
-        if thing.category == HOLE:
-            return f"of the background ({HOLE}), cut out of the regions below them"
-        above = [hole for layer, hole in holes if layer > entry.get("layer", 0)]
+        thing = cut_background(read_object(where, entry, drawn_hw, []), things, drawn_hw)
+        if thing.category == BACKGROUND:
+            return f"of the background ({BACKGROUND}), cut out of the regions below them"
         # Without our keys, groups are ignored: in LERF-OVS's files, group numbers are not unique.
         number = entry.get("id", entry.get("group") if "level" in entry else None)
-        if above:
-            mask = fill_polygons(thing.polygons, drawn_hw) & ~np.any(above, axis=0)
-            rings = traced(placed(mask, cameras[view], where))
-        else:
-            rings = placed_rings(thing.polygons, drawn_hw, cameras[view], where)
+        rings = placed_rings(thing.polygons, drawn_hw, cameras[view], where)
         return Piece(view, thing.category, number, rings, entry)
 
     return read

@@ -66,10 +66,10 @@ def read_polycam(known: KnownPoses) -> Source:
             entries = [float(content[f"t_{row}{column}"]) for row in range(3) for column in range(4)]
             params = [float(content[key]) for key in ("fx", "fy", "cx", "cy")]
             width, height = content.get("width"), content.get("height")
-            is_stated = width is not None and height is not None
-            if not is_stated:
+            if is_stated := width is not None and height is not None:
+                width, height = int(width), int(height)
+            else:
                 height, width = image_size_hw(image)
-            width, height = int(width), int(height)
             require_pixels(params, (width, height), is_stated=is_stated)
             camera = pycolmap.Camera(model="PINHOLE", params=params, width=width, height=height)
         pose = _phone_pose(np.array(entries).reshape(3, 4), str(file))
