@@ -222,7 +222,7 @@ def mask_region(
 
 
 def read_mask_file(path: Path, minimum: int) -> Bool[np.ndarray, "H W"]:
-    """Return which values of a mask file are at least `minimum`; raise ImageError for a binary mask below it."""
+    """Return which values of a mask file are at least `minimum`; raise ImageError if it is 0 and a lower one."""
     values = read_mask(path)
     if 0 < values.max() < minimum and len(np.unique(values)) <= 2:
         expected, fix = "0 and 255", "write the region as white on black"

@@ -16,7 +16,7 @@ from hilsplat.base.lineage import visible_files
 TRAINED = ("output", "outputs", "exports", "language_features")
 """Folders that 3DGS, nerfstudio and LangSplat write beside photographs."""
 
-MAPS = ("label", "segmentations", "test_mask", "mask", "masks", "depth", "depths", "normal", "normals")
+MAPS = ("label", "segmentations", "test_mask", "mask", "masks", "depth", "depths", "normals")
 """Folders of labels and maps, whose files are named after the photographs. Scaled copies are in `masks_4`."""
 
 UNUSED = (*TRAINED, *MAPS)
