@@ -222,7 +222,11 @@ def mask_region(
 
 
 def read_mask_file(path: Path, minimum: int) -> Bool[np.ndarray, "H W"]:
-    """Return which values of a mask file are at least `minimum`; raise ImageError if it is 0 and a lower one."""
+    """Return which values of a mask file are at least `minimum`.
+
+    Raises:
+        ImageError: it cannot be read, or has only 0 and one value below `minimum`.
+    """
     values = read_mask(path)
     if 0 < values.max() < minimum and len(np.unique(values)) <= 2:
         expected, fix = "0 and 255", "write the region as white on black"

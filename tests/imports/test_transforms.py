@@ -152,12 +152,12 @@ def test_what_cannot_be_applied_is_refused(head, tmp_path, imported):
     [
         ({**SIZE, "camera_angle_x": 40.0}, "camera_angle_x is 40, not an angle in radians"),  # tan(20) > 0
         ({**SIZE, "y_fov": 400.0}, "y_fov is 400, not an angle in degrees"),
-        ({**SIZE, "x_fov": 0.9}, "sides of an image of 112 x 84 px"),  # radians
-        ({**NUMBERS, "fl_x": FX / WIDTH, "fl_y": FY / HEIGHT}, "0.1 to 50 sides of an image"),
-        ({**NUMBERS, "cx": CX / WIDTH, "cy": CY / HEIGHT}, "not px"),
+        ({**SIZE, "x_fov": 0.9}, "a focal length of 0.1 to 50 sides"),  # radians
+        ({**NUMBERS, "fl_x": FX / WIDTH, "fl_y": FY / HEIGHT}, "a focal length of 0.1 to 50 sides"),
+        ({**NUMBERS, "cx": CX / WIDTH, "cy": CY / HEIGHT}, "a centre that is not a share"),
         (
             {**LENS, "cx": 4 * CX, "cy": 4 * CY},
-            "another size of the image, and w and h are missing",
+            "another size of the image, and the size is missing",
         ),  # images_4
     ],
 )

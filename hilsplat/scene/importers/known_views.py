@@ -23,7 +23,7 @@ ASPECT_TOLERANCE = 0.01
 """Relative tolerance of an image's aspect ratio: a scaled copy is accepted, a different crop is not."""
 
 MIN_FOCAL, MAX_FOCAL = 0.1, 50
-"""Range of focal lengths, in sides of the image; other numbers have another unit than px."""
+"""Range of focal lengths, in sides of the image; other numbers aren't px."""
 
 MAX_COORDINATE = 1e9
 """Maximum coordinate, in the source's units; beyond it, 32-bit numbers are too coarse."""
@@ -132,7 +132,8 @@ def require_valid(view: KnownView) -> None:
     """Raise SceneError if the lens or pose of a view is not valid."""
     values = np.array([*view.camera.params, view.camera.width, view.camera.height], np.float64)
     focal = [view.camera.params[row] for row in view.camera.focal_length_idxs()]
-    pose = view.cam_from_source
+    centre = [view.camera.params[row] for row in view.camera.principal_point_idxs()]
+    pose, sides = view.cam_from_source, values[-2:]
     is_size = (values[-2:] > 0).all() and (values[-2:] <= MAX_SIDE_PX).all()
     if not focal:
         fault, found = "lens", view.camera.model_name
@@ -140,6 +141,13 @@ def require_valid(view: KnownView) -> None:
     elif not np.isfinite(values).all() or min(focal) <= 0 or not is_size:
         fault, found = "lens", f"{view.camera.model_name} {values.tolist()}"
         expected = f"finite numbers, a focal length above 0, sides of 1 to {MAX_SIDE_PX} px"
+    elif view.image is not None and (
+        min(focal) < MIN_FOCAL * min(sides)
+        or max(focal) > MAX_FOCAL * max(sides)
+        or np.max(np.abs(centre)) <= 1
+    ):
+        fault, found = "lens", f"{view.camera.model_name} {values.tolist()}"
+        expected = f"px: a focal length of {MIN_FOCAL} to {MAX_FOCAL} sides, and a centre that is not a share"
     elif not np.isfinite(pose).all() or not are_rotations(pose[:3, :3], RIGID_TOLERANCE):
         fault, found = "rotation", np.array2string(pose[:3, :3], precision=4).replace("\n", "")
         expected = "a matrix that neither scales nor mirrors, or a quaternion of length 1"
@@ -151,20 +159,14 @@ def require_valid(view: KnownView) -> None:
     raise SceneError(f"the camera {fault} of view {view.name} is not valid", expected=expected, found=found)
 
 
-def require_pixels(params: Sequence[float], size: tuple[int, int], *, is_stated: bool) -> None:
-    """Raise ValueError if fx, fy, cx, cy can't be px of an image of this size (width, height).
+def require_centred(centre: Sequence[float], size: tuple[int, int]) -> None:
+    """Raise ValueError if cx, cy are far from the middle of an image whose source doesn't state its size.
 
-    Args:
-        is_stated: the source states the size; otherwise, it is that of the image, which may be a scaled copy.
+    They then belong to another size of the image, such as that of a full-size copy.
     """
-    (focal, centre), sides = np.reshape(params, (2, 2)), np.array(size)
-    if ((focal > 0) & ((focal < MIN_FOCAL * sides) | (focal > MAX_FOCAL * sides))).any():
-        expected = f"{MIN_FOCAL} to {MAX_FOCAL} sides of an image of {size[0]} x {size[1]} px"
-        raise ValueError(f"the focal length is {focal.tolist()} px, not {expected}: another unit?")
-    if (np.abs(centre) <= 1).all():
-        raise ValueError(f"cx and cy are {centre.tolist()}, not px")
-    if not is_stated and (np.abs(centre - sides / 2) > sides / 4).any():
-        raise ValueError("cx and cy belong to another size of the image, and w and h are missing")
+    sides = np.array(size)
+    if (np.abs(centre - sides / 2) > sides / 4).any():
+        raise ValueError("cx and cy belong to another size of the image, and the size is missing")
 
 
 def find_images(root: Path, names: Sequence[str]) -> dict[str, Path | None]:
