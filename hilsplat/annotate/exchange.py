@@ -278,7 +278,7 @@ def _isat_reader(name: str, content: Mapping[str, Any], cameras: Cameras) -> Rea
     view = _view(name, content["info"].get("name"), cameras)
     things: list[IsatObject] = []
     for entry in content["objects"]:
-        with suppress(HilsplatError):  # `read` reports it
+        with suppress(HilsplatError), foreign(name):  # `read` reports it
             things.append(read_object(name, entry, drawn_hw, []))
 
     def read(where: str, entry: Any) -> Piece | str:

@@ -32,7 +32,7 @@ def read_source(known: KnownPoses) -> Source:
         raise SceneError(
             f"all {len(poses)} views of {known.files[0]} have the same pose", fix="export it again"
         )
-    _require_one_view_per_image(source)
+    _keep_one_view_per_image(source)
     source.notes += [f"{other} also has poses, which are not used" for other in known.others]
     if source.points is not None:
         xyz, rgb = source.points
@@ -44,7 +44,7 @@ def read_source(known: KnownPoses) -> Source:
     return source
 
 
-def _require_one_view_per_image(source: Source) -> None:
+def _keep_one_view_per_image(source: Source) -> None:
     """Drop repetitions of a view, and leave out different views of the same image."""
     views: dict[object, list[KnownView]] = {}
     for view in source.views:
