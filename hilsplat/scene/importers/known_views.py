@@ -260,7 +260,7 @@ def read_llff(known: KnownPoses) -> Source:
             found=f"{rows.dtype} of shape {rows.shape}",
             fix="unpack it again",
         )
-    images = sorted(list_images(folder if folder.is_dir() else known.root), key=lambda image: image.name)
+    images = list_images(folder if folder.is_dir() else known.root)
     if len(images) != len(rows):
         raise SceneError(
             f"{path} has {len(rows)} poses for {len(images)} images",
