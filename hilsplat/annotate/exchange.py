@@ -12,6 +12,7 @@ import re
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -27,7 +28,14 @@ from hilsplat.base.errors import HilsplatError, SceneError, first_line, foreign
 from hilsplat.base.images import open_image
 from hilsplat.datasets.generators import GENERATORS
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
-from hilsplat.datasets.images.isat import fill_polygons, read_object, stated_size
+from hilsplat.datasets.images.isat import (
+    BACKGROUND,
+    IsatObject,
+    cut_background,
+    fill_polygons,
+    read_object,
+    stated_size,
+)
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.scene.placement import placed, placement
 from hilsplat.scene.scene import Scene
@@ -268,9 +276,15 @@ Reader = Callable[[str, Any], Piece | str]
 def _isat_reader(name: str, content: Mapping[str, Any], cameras: Cameras) -> Reader:
     drawn_hw = stated_size(name, content.get("info"))
     view = _view(name, content["info"].get("name"), cameras)
+    things: list[IsatObject] = []
+    for entry in content["objects"]:
+        with suppress(HilsplatError), foreign(name):  # `read` reports it
+            things.append(read_object(name, entry, drawn_hw, []))
 
-    def read(where: str, entry: Any) -> Piece:
-        thing = read_object(where, entry, drawn_hw, [])
+    def read(where: str, entry: Any) -> Piece | str:
+        thing = cut_background(read_object(where, entry, drawn_hw, []), things, drawn_hw)
+        if thing.category == BACKGROUND:
+            return f"of the background ({BACKGROUND}), cut out of the regions below them"
         # Without our keys, groups are ignored: in LERF-OVS's files, group numbers are not unique.
         number = entry.get("id", entry.get("group") if "level" in entry else None)
         rings = placed_rings(thing.polygons, drawn_hw, cameras[view], where)

@@ -166,13 +166,16 @@ def read_mask(path: Path) -> UInt8[np.ndarray, "H W"]:
     8-bit.
 
     Raises:
-        ImageError: the file is missing or not an image.
+        ImageError: the file is missing or not an image, or uses several colours of a palette.
     """
     with opened_image(path, "mask") as image:
         if image.mode == "P" and "transparency" not in image.info:
-            brightest = np.asarray(image.convert("RGB")).max(axis=2)
-            if np.unique(np.asarray(image)).size == 2 and (brightest == 0).any():
+            colours = np.asarray(image.convert("RGB"))
+            brightest, num_colours = colours.max(axis=2), np.unique(np.asarray(image)).size
+            if num_colours == 2 and (brightest == 0).any():
                 return np.where(brightest > 0, 255, 0).astype(np.uint8)
+            if num_colours > 2 and (colours != brightest[..., None]).any():
+                raise ValueError(f"it has {num_colours} colours, such as one for each class")
         if image.has_transparency_data:
             alpha = np.asarray(image.convert("RGBA"))[..., 3]
             if alpha.min() < alpha.max():

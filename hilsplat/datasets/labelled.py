@@ -222,11 +222,16 @@ def mask_region(
 
 
 def read_mask_file(path: Path, minimum: int) -> Bool[np.ndarray, "H W"]:
-    """Return which values of a mask file are at least `minimum`; raise ImageError if all are 0 or 1."""
+    """Return which values of a mask file are at least `minimum`.
+
+    Raises:
+        ImageError: it cannot be read, or has only 0 and one value below `minimum`.
+    """
     values = read_mask(path)
-    if values.max() == 1 < minimum:
-        expected, fix = "0 and 255", "multiply its values by 255"
-        raise ImageError(f"mask {path} has only the values 0 and 1", expected=expected, fix=fix)
+    if 0 < values.max() < minimum and len(np.unique(values)) <= 2:
+        expected, fix = "0 and 255", "write the region as white on black"
+        problem = f"mask {path} has only the values 0 and {values.max()}"
+        raise ImageError(problem, expected=expected, fix=fix)
     return values >= minimum
 
 

@@ -16,8 +16,11 @@ from hilsplat.base.lineage import visible_files
 TRAINED = ("output", "outputs", "exports", "language_features")
 """Folders that 3DGS, nerfstudio and LangSplat write beside photographs."""
 
-UNUSED = (*TRAINED, "label", "segmentations", "test_mask")
-"""Folders beside photographs whose images `poses` doesn't read: trained output, and labels of data sets."""
+MAPS = ("label", "segmentations", "test_mask", "mask", "masks", "depth", "depths", "normals")
+"""Folders of labels and maps, whose files are named after the photographs. Scaled copies are in `masks_4`."""
+
+UNUSED = (*TRAINED, *MAPS)
+"""Folders beside photographs whose images `poses` reads only if a pose names them with their folder."""
 
 PHOTO_FOLDERS = ("images", "input")
 """Folders of photographs: COLMAP's and nerfstudio's, then that of 3DGS's `convert.py`."""
@@ -159,6 +162,15 @@ def images_below(folder: Path) -> list[Path]:
     return [path for path in visible_files(folder) if path.suffix.lower() in IMAGE_SUFFIXES]
 
 
+def used_images(folder: Path) -> list[Path]:
+    """Return the images in a folder and its subfolders, without those in `UNUSED` ones."""
+    return [
+        path
+        for path in images_below(folder)
+        if re.sub(r"_\d$", "", path.relative_to(folder).parts[0].lower()) not in UNUSED
+    ]
+
+
 def folders_with_images(folder: Path) -> dict[Path, int]:
     """Return the number of images of each folder with images, up to two levels below a source."""
     counts = Counter(path.parent for path in images_below(folder))
@@ -287,10 +299,10 @@ IMAGE_LINE = re.compile(rb"^ *\d+( +[-+.\deE]+){7} +\d+ +[^ \r\n]", re.MULTILINE
 
 
 def polycam_folders(folder: Path) -> tuple[Path, Path] | None:
-    """Return a raw Polycam export's image and camera folders (corrected ones if present), or None."""
+    """Return a raw Polycam export's image and camera folders (corrected ones if not empty), or None."""
     for prefix in ("corrected_", ""):
         images, cameras = (folder / "keyframes" / f"{prefix}{what}" for what in ("images", "cameras"))
-        if images.is_dir() and cameras.is_dir():
+        if images.is_dir() and any(cameras.glob("*.json")):
             return images, cameras
     return None
 
@@ -315,8 +327,7 @@ def photo_files(folder: Path, named: Path | None = None) -> list[Path]:
         known = KnownPoses(folder, "", (folder / "sparse",))
     if known is None:
         return [path for path in list_images(photo_folder(folder)) if path.is_file()]
-    images = [] if known.kind in ("polycam", "record3d") else images_below(known.root)
-    files = {path for path in images if path.relative_to(known.root).parts[0] not in UNUSED}
+    files = set() if known.kind in ("polycam", "record3d") else set(used_images(known.root))
     for path in known.files:
         files.update(visible_files(path) if path.is_dir() else [path])
         if known.kind == "transforms":

@@ -288,6 +288,22 @@ def test_a_bad_object_of_isat_leaves_the_others():
     assert len(found["IMG_0002.png"]) == 2 and "1 invalid (x.json, object 2 has no category" in notes[0]
 
 
+def test_the_background_of_isat_is_cut_out_of_lower_layers_only():
+    def thing(category, layer, left, top, right, bottom):
+        points = [[left, top], [right - 1, top], [right - 1, bottom - 1], [left, bottom - 1]]
+        return {"category": category, "layer": layer, "segmentation": points}
+
+    info = {"name": "IMG_0001.jpg", "width": WIDTH, "height": HEIGHT}
+    hole = thing("__background__", 2.0, 20, 10, 30, 30)
+    lost = {**hole, "segmentation": [[900, 900]]}
+    objects = [thing("ring", 1.0, 10, 5, 40, 40), thing("gem", 3.0, 22, 12, 26, 20), hole, lost]
+    notes: list[str] = []
+    ring, gem = regions({"info": info, "objects": objects}, notes=notes)["IMG_0001.png"]
+    np.testing.assert_array_equal(ring, box(10, 5, 40, 40) & ~box(20, 10, 30, 30))
+    np.testing.assert_array_equal(gem, box(22, 12, 26, 20))
+    assert "2 of 4 annotations are left out: 1 of the background (__background__)" in notes[0]
+
+
 # -- labels for LangSplat's evaluation --------------------------------------------------------------
 
 

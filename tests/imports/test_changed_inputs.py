@@ -23,6 +23,7 @@ OTHERS = (
     "output/x/point_cloud.ply",
     "output/x/a.png",
     "label/1.jpg",
+    "masks_4/1.png",
     "segmentations/00/cup.png",
 )
 

@@ -59,7 +59,6 @@ def test_the_foreground_of_mask_files(kind, tmp_path):
     [
         Image.fromarray(MASK.astype(np.uint8)),  # 0 and 1
         Image.fromarray(MASK * np.uint16(1)),
-        palette(MASK + 2 * (IN > 300) + np.eye(*SIZE), (0, 0, 0), (128, 0, 0), (0, 0, 90)),  # two objects
     ],
 )
 def test_masks_without_a_clear_foreground_are_refused(image, tmp_path):
@@ -69,7 +68,20 @@ def test_masks_without_a_clear_foreground_are_refused(image, tmp_path):
         read_view_masks(tmp_path, "000.png")
 
 
-def test_label_bitmaps_of_zeros_and_ones_are_refused(tmp_path):
-    Image.fromarray(MASK.astype(np.uint8)).save(tmp_path / "cup.png")
-    with pytest.raises(ImageError, match=r"cup.png has only the values 0 and 1"):
+@pytest.mark.parametrize(
+    ("image", "reason"),
+    [
+        (Image.fromarray(MASK.astype(np.uint8)), "has only the values 0 and 1"),
+        (Image.fromarray(MASK * np.uint8(3)), "has only the values 0 and 3"),
+        (Image.fromarray(np.dstack([IN, NONE, NONE])), "has only the values 0 and 76"),  # red
+        (
+            palette(MASK + np.eye(*SIZE), (0, 0, 0), (128, 0, 0), (224, 224, 192)),
+            "has 3 colours",
+        ),  # VOC's border
+        (palette(MASK + np.eye(*SIZE), (0, 0, 0), (128, 0, 0), (0, 0, 90)), "has 3 colours"),  # two objects
+    ],
+)
+def test_maps_of_classes_and_other_values_are_refused(image, reason, tmp_path):
+    image.save(tmp_path / "cup.png")
+    with pytest.raises(ImageError, match=rf"cup.png .*{reason}"):
         read_mask_file(tmp_path / "cup.png", 129)

@@ -114,6 +114,9 @@ def test_one_damaged_camera_of_polycam_leaves_out_its_view(content, tmp_path, im
         (record3d, {"distortion": [0.1, 0]}),
         (record3d, {"poses": [[1, 2, 3]]}),
         (record3d, {"K": [1, 2]}),
+        (record3d, {"K": [90, 0, 56, 0, 91, 42, 0, 0, 1]}),  # by rows
+        (polycam, {"fx": 0.8, "fy": 0.8, "cx": 0.5, "cy": 0.5}),  # shares of the size
+        (polycam, {"width": None, "cx": 112, "cy": 84}),  # those of another size
         (record3d, {"K": None}),
         (record3d, {"w": "wide"}),
         (polycam, {"k1": 0.1}),
@@ -151,6 +154,13 @@ def test_corrected_pictures_of_polycam_come_first_and_their_border_scales(tmp_pa
     right = [[2 * fx, 0, 2 * cx - 30], [0, 2 * fy, 2 * cy - 30], [0, 0, 1]]
     np.testing.assert_allclose(view.camera.calibration_matrix(), right)
     assert (view.camera.width, view.camera.height) == (2 * WIDTH - 60, 2 * HEIGHT - 60)
+
+
+def test_corrected_folders_without_cameras_are_passed_over(tmp_path):
+    for what in ("images", "cameras"):
+        (tmp_path / f"keyframes/corrected_{what}").mkdir(parents=True)
+    source = read_source(find_known_poses(polycam(tmp_path)))
+    assert [view.image.parent.name for view in source.views] == ["images"] * 6
 
 
 def test_long_recordings_are_thinned_evenly(tmp_path, monkeypatch):

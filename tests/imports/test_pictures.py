@@ -75,8 +75,9 @@ def test_square_photographs_with_known_poses_stay_as_stored(turn, tmp_path, impo
     (tmp_path / "in/images").mkdir(parents=True)
     Image.fromarray(pixels).save(tmp_path / "in/images/a.png", exif=exif(turn))
     world.write_colmap(tmp_path / "in/sparse/0", "PINHOLE 80 80 36 36", (HEIGHT, HEIGHT), {"a.png": POSES[0]})
-    (view,), *_ = imported(tmp_path / "in")
+    (view,), _, _, report = imported(tmp_path / "in")
     np.testing.assert_array_equal(np.asarray(Image.open(view.image)), pixels)
+    assert ["are used as stored" in warning for warning in report["warnings"]] == [True] * (turn > 1)
 
 
 @pytest.mark.parametrize("turn", range(1, 9))
@@ -94,8 +95,9 @@ def test_poses_of_upright_pictures_get_upright_pictures(turn, tmp_path, imported
         world.write_colmap(
             tmp_path / "in/sparse/0", "PINHOLE 80 80 48 36", (WIDTH, HEIGHT), {"a.png": POSES[0]}
         )
-        (view,), *_ = imported(tmp_path / "in")
+        (view,), _, _, report = imported(tmp_path / "in")
         np.testing.assert_array_equal(np.asarray(Image.open(view.image)), upright)
+        assert not report["warnings"]
 
 
 def tiff(*entries, data=b""):

@@ -72,6 +72,12 @@ FORMS = {  # the lens, the keys that describe it, and the least PSNR
     "x_fov": (SQUARE, {**SIZE, "x_fov": np.degrees(angle(WIDTH, FX))}, 45),
     "y_fov": (SQUARE, {**SIZE, "y_fov": np.degrees(angle(HEIGHT, FX))}, 45),
     "null values": (PLAIN, {**NUMBERS, "k1": None, "camera_angle_x": None, "is_fisheye": None}, 45),
+    "null centre and model": (
+        world.pinhole(FX, FY, WIDTH / 2, HEIGHT / 2),
+        {**NUMBERS, "cx": None, "cy": None, "camera_model": None},
+        45,
+    ),
+    "ordinary axes": (PLAIN, {**NUMBERS, "from_na": False}, 45),
     "zero distortion": (PLAIN, {**NUMBERS, "camera_model": "OPENCV", "k1": 0, "p2": 0.0}, 45),
     "PINHOLE in small letters": (PLAIN, {**NUMBERS, "camera_model": "pinhole"}, 45),
     "false flags": (PLAIN, {**NUMBERS, "is_fisheye": False, "ortho": False, "k5": 0}, 45),
@@ -116,6 +122,7 @@ def test_lenses_of_frames_replace_those_of_the_file(tmp_path, imported):
         {"camera_model": "EQUIRECTANGULAR"},
         {"camera_model": "ORTHOPHOTO"},
         {"camera_model": "FISHEYE624", "distortion_params": [0.1] * 12},
+        {"distortion": [0.1, 0, 0, 0]},
         {"ortho": True},
         {"k4": 0.01},
         {"k6": 0.01},
@@ -124,6 +131,8 @@ def test_lenses_of_frames_replace_those_of_the_file(tmp_path, imported):
         {"shift_x": 0.1},
         {"ftheta_p0": 0.5},
         {"latlong": 1},
+        {"from_na": True},  # NeuS2: camera axes of OpenCV
+        {"normal_mts_args": {"spp": 4}},  # Mitsuba's camera axes, in instant-ngp
         {"fl_x": "wide"},
         {"fl_x": None, "fl_y": None},
         {"fl_x": -120},
@@ -136,6 +145,25 @@ def test_what_cannot_be_applied_is_refused(head, tmp_path, imported):
     folder = write(tmp_path / "in", PLAIN, {**NUMBERS, **head}, "a")
     with pytest.raises(HilsplatError):
         imported(folder)
+
+
+@pytest.mark.parametrize(
+    ("head", "message"),
+    [
+        ({**SIZE, "camera_angle_x": 40.0}, "camera_angle_x is 40, not an angle in radians"),  # tan(20) > 0
+        ({**SIZE, "y_fov": 400.0}, "y_fov is 400, not an angle in degrees"),
+        ({**SIZE, "x_fov": 0.9}, "a focal length of 0.1 to 50 sides"),  # radians
+        ({**NUMBERS, "fl_x": FX / WIDTH, "fl_y": FY / HEIGHT}, "a focal length of 0.1 to 50 sides"),
+        ({**NUMBERS, "cx": CX / WIDTH, "cy": CY / HEIGHT}, "a centre that is not a share"),
+        (
+            {**LENS, "cx": 4 * CX, "cy": 4 * CY},
+            "another size of the image, and the size is missing",
+        ),  # images_4
+    ],
+)
+def test_numbers_of_another_unit_or_size_are_refused(head, message, tmp_path, imported):
+    with pytest.raises(HilsplatError, match=message):
+        imported(write(tmp_path / "in", PLAIN, head, "a"))
 
 
 def test_unknown_keys_and_contradictions_are_reported_once(tmp_path):
@@ -189,6 +217,18 @@ def test_names_of_images_are_matched(name, tmp_path, imported):
 def test_names_in_another_unicode_form_are_matched(stem, name, tmp_path):
     folder = write(tmp_path, PLAIN, NUMBERS, "ab", name=f"images/{name}.png", stem=stem)
     assert all(view.image is not None for view in read_source(find_known_poses(folder)).views)
+
+
+@pytest.mark.parametrize("maps", ["masks", "masks_4", "Depth", "normals", "segmentations", "exports/a"])
+def test_a_map_does_not_replace_a_missing_image(maps, tmp_path):
+    folder = write(tmp_path, PLAIN, NUMBERS)
+    world.save(folder / maps, {letter: np.zeros((HEIGHT, WIDTH), np.uint8) for letter in POSES})
+    (folder / "images/c.png").unlink()
+    images = {view.name: view.image for view in read_source(find_known_poses(folder)).views}
+    assert images == {name: folder / name if name != "images/c.png" else None for name in NAMES}
+    path = folder / maps / "c.png"
+    named = changed(folder, lambda content: content["frames"][2].update(file_path=f"{maps}/c.png"))
+    assert path in [view.image for view in read_source(find_known_poses(named)).views]
 
 
 def posed(matrix):
@@ -281,6 +321,7 @@ def cloud(folder, colours, kind, names=("red", "green", "blue"), xyz=((0, 1, 2),
         ([[0, 102, 255], [1, 2, 3]], "u1", [[0, 102, 255], [1, 2, 3]]),
         ([[0, 0.4, 1], [0.1, 0.2, 0.31]], "f4", [[0, 102, 255], [26, 51, 79]]),
         ([[0, 0.4, 1], [0.1, 0.2, np.nan]], "f8", [[0, 102, 255], [26, 51, 128]]),
+        ([[0, 0.4, 1.001], [0.1, 0.2, 0.31]], "f4", [[0, 102, 255], [26, 51, 79]]),
         ([[0, 102, 255], [1, 2, 3]], "f4", [[0, 102, 255], [1, 2, 3]]),
         ([[0, 26214, 65535], [257, 514, 771]], "u2", [[0, 102, 255], [1, 2, 3]]),
         ([[0, 102, 255], [1, 2, 3]], "u2", [[0, 102, 255], [1, 2, 3]]),
@@ -323,3 +364,15 @@ def test_blender_s_second_file_is_the_test_set_and_the_third_replaces_it(tmp_pat
         _, _, split, _ = imported(tmp_path / "in")
         assert [view for view, part in split.items() if part == "test"] == [f"{letter}.png"]
         (tmp_path / "in/transforms_test.json").unlink(missing_ok=True)
+
+
+@pytest.mark.parametrize("letters", ["abcdef", "bd"])
+def test_views_of_the_first_file_that_the_test_file_repeats_are_training_views(letters, tmp_path, imported):
+    """3DGS requires a test file, so people copy the one for training."""
+    for split, listed in (("train", "abcdef"), ("test", letters)):
+        write(tmp_path / "in", SQUARE, {"camera_angle_x": angle(WIDTH, FX)}, listed)
+        (tmp_path / "in/transforms.json").rename(tmp_path / f"in/transforms_{split}.json")
+    views, _, split, report = imported(tmp_path / "in")
+    world.require_right(views, right("abcdef"), 45)
+    assert set(split.values()) == {"train"}
+    assert report["warnings"] == [f"{len(letters)} of the views listed are repetitions, which are dropped"]

@@ -2,11 +2,12 @@
 
 `objects` is a list. In each object, `category` is the text, `segmentation` is one polygon as a list of [x, y]
 (a list of polygons is also accepted), and `bbox` is [x1, y1, x2, y2]. `group` does not identify an object,
-because its numbers restart and repeat. Unknown keys are ignored.
+because its numbers restart and repeat. Regions of the category `BACKGROUND` are cut out of objects with a
+lower `layer`. Unknown keys are ignored.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,9 @@ from hilsplat.datasets.labelled import check_label_size
 from hilsplat.scene.layouts import read_json_object
 
 Polygon = Float[np.ndarray, "_ 2"] | Int[np.ndarray, "_ 2"] | Sequence[tuple[int, int]]
+
+BACKGROUND = "__background__"
+"""ISAT's category of regions that belong to no object, such as holes."""
 
 MAX_SIDE_PX = 20_000
 """Limit on the image size stated in a label file; drawing regions at a wrong size could exhaust memory."""
@@ -72,6 +76,11 @@ class IsatObject:
     box_xyxy: Int64[np.ndarray, " 4"]  # whole pixels inside the annotated box, borders included
     keys: Mapping[str, Any]  # all keys of the object in the file
 
+    @property
+    def layer(self) -> float:
+        layer = self.keys.get("layer")
+        return layer if isinstance(layer, int | float) else 0
+
 
 @dataclass(frozen=True, eq=False)
 class IsatFile:
@@ -103,10 +112,11 @@ def read_isat(path: Path, image: Path | None = None) -> IsatFile:
     name = content["info"].get("name")
     if isinstance(name, str) and name and Path(name).stem != path.stem:
         warnings.append(f"{path.name} names {name} as its image, but is used for {path.stem}")
-    objects = tuple(
+    things = [
         read_object(f"{path}, object {number}", entry, size_hw, warnings)
         for number, entry in enumerate(content["objects"])
-    )
+    ]
+    objects = tuple(cut_background(each, things, size_hw) for each in things if each.category != BACKGROUND)
     if image is not None:
         warnings += check_label_size(f"label file {path}", size_hw, image_size_hw(image))
     return IsatFile(path, size_hw, objects, tuple(warnings))
@@ -155,6 +165,20 @@ def read_object(where: str, entry: Any, size_hw: tuple[int, int], warnings: list
     if reach > SLACK_PX:
         warnings.append(f"{where}: a polygon extends {reach:g} px beyond the image; clipped")
     return IsatObject(category, polygons, _box(where, entry.get("bbox"), points, warnings), entry)
+
+
+def cut_background(thing: IsatObject, things: Sequence[IsatObject], size_hw: tuple[int, int]) -> IsatObject:
+    """Return an object without the `BACKGROUND` regions of a file that are in higher layers."""
+    holes = [
+        polygon
+        for other in things
+        if other.category == BACKGROUND and other.layer > thing.layer
+        for polygon in other.polygons
+    ]
+    if not holes:
+        return thing
+    mask = fill_polygons(thing.polygons, size_hw) & ~fill_polygons(holes, size_hw)
+    return replace(thing, polygons=tuple(trace_polygons(mask)))
 
 
 def _polygons(where: str, value: Any) -> tuple[Float[np.ndarray, "_ 2"], ...]:

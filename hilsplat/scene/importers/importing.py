@@ -47,9 +47,10 @@ def import_poses(
     with_image = [view for view in source.views if view.image is not None]
     files = [view.image for view in source.views if view.image is not None]
     posed: list[tuple[KnownView, PosedView]] = []
+    turned: list[str] = []
     for view, view_name in track([*zip(with_image, view_names(files), strict=True)], "images read"):
         try:
-            distorted = _with_pixels(view, view_name, work / "images", settings.max_side_px)
+            distorted = _with_pixels(view, view_name, work / "images", settings.max_side_px, turned)
             posed.append((view, undistort(distorted, work / "pinhole", settings.max_side_px)))
         except ImageError as error:
             source.leave_out(view.name, in_one_line(error))
@@ -69,6 +70,11 @@ def import_poses(
     images = list_images(beside) if known.kind == "colmap" and beside.is_dir() else []
     unposed = [path.name for path in images if path not in files]
     warnings = [*source.notes, *(f"left out: {reason}" for reason in source.left_out.values())]
+    if turned:
+        warnings.append(
+            f"{len(turned)} images, such as {turned[0]}, are used as stored, as COLMAP does, although EXIF "
+            "turns or mirrors them: poses, labels and maps of the upright images don't fit"
+        )
     if missing:
         warnings.append(f"{len(missing)} of {total} posed views have no image file")
     if unposed:
@@ -122,11 +128,17 @@ def _view_entries(
     return entries
 
 
-def _with_pixels(view: KnownView, view_name: str, folder: Path, max_side_px: int) -> PosedView:
-    """Read an image in the orientation of its camera, write the work image, and adapt the camera to it."""
+def _with_pixels(
+    view: KnownView, view_name: str, folder: Path, max_side_px: int, turned: list[str]
+) -> PosedView:
+    """Read an image in the orientation of its camera, write the work image, and adapt the camera to it.
+
+    Append the name to `turned` if it is used as stored against its EXIF orientation.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     assert view.image is not None  # the caller leaves out views without one
-    pixels = _read_as_described(view.image, view.camera)
+    pixels, as_stored = _read_as_described(view.image, view.camera)
+    turned += [view.name] * as_stored
     camera = pycolmap.Camera(view.camera.todict())
     camera.rescale(pixels.shape[1], pixels.shape[0])
     photo = photo_of(camera)
@@ -145,8 +157,11 @@ def _with_pixels(view: KnownView, view_name: str, folder: Path, max_side_px: int
     return PosedView(view_name, folder / view_name, camera, view.cam_from_source, cropped)
 
 
-def _read_as_described(path: Path, camera: pycolmap.Camera) -> UInt8[np.ndarray, "H W 3"]:
-    """Read an image in the orientation whose shape fits the camera, or as stored if both orientations fit."""
+def _read_as_described(path: Path, camera: pycolmap.Camera) -> tuple[UInt8[np.ndarray, "H W 3"], bool]:
+    """Read an image in the orientation whose shape fits the camera, or as stored if both orientations fit.
+
+    Also return whether its EXIF orientation was ignored.
+    """
     with opened_image(path) as image:
         is_turned = orientation(image) > 1
         width, height = image.size
@@ -154,7 +169,7 @@ def _read_as_described(path: Path, camera: pycolmap.Camera) -> UInt8[np.ndarray,
         pixels = read_image(path, as_stored=as_stored)
         ratio = (pixels.shape[1] / pixels.shape[0]) / (camera.width / camera.height)
         if abs(ratio - 1) <= ASPECT_TOLERANCE:
-            return pixels
+            return pixels, as_stored
     raise ImageError(
         f"image {path} does not match the size of its camera",
         expected=f"{camera.width} x {camera.height} px (width x height), or a scaled copy",

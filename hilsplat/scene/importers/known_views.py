@@ -15,12 +15,15 @@ from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.cameras import MAX_SIDE_PX
 from hilsplat.scene.colmap import Points, pycolmap
 from hilsplat.scene.importers.colmap_model import ModelImage, read_model
-from hilsplat.scene.layouts import KnownPoses, images_below
+from hilsplat.scene.layouts import KnownPoses, used_images
 from hilsplat.scene.posed_images import rigid_pose
 from hilsplat.scene.view_names import match_names
 
 ASPECT_TOLERANCE = 0.01
 """Relative tolerance of an image's aspect ratio: a scaled copy is accepted, a different crop is not."""
+
+MIN_FOCAL, MAX_FOCAL = 0.1, 50
+"""Range of focal lengths, in sides of the image; other numbers aren't px."""
 
 MAX_COORDINATE = 1e9
 """Maximum coordinate, in the source's units; beyond it, 32-bit numbers are too coarse."""
@@ -119,7 +122,7 @@ class Keys:
                     raise SceneError(
                         f"{file} describes {self.refused[key]}, which is not supported",
                         found=f"{key}: {str(content[key])[:60]}",
-                        fix="export undistorted images of ordinary cameras",
+                        fix="export undistorted images of ordinary cameras, in the usual axes",
                     )
             unknown |= content.keys() - self.used - self.harmless - self.refused.keys()
         return [f"keys of {file.name} that are not used: {', '.join(sorted(unknown))}"] if unknown else []
@@ -129,7 +132,8 @@ def require_valid(view: KnownView) -> None:
     """Raise SceneError if the lens or pose of a view is not valid."""
     values = np.array([*view.camera.params, view.camera.width, view.camera.height], np.float64)
     focal = [view.camera.params[row] for row in view.camera.focal_length_idxs()]
-    pose = view.cam_from_source
+    centre = [view.camera.params[row] for row in view.camera.principal_point_idxs()]
+    pose, sides = view.cam_from_source, values[-2:]
     is_size = (values[-2:] > 0).all() and (values[-2:] <= MAX_SIDE_PX).all()
     if not focal:
         fault, found = "lens", view.camera.model_name
@@ -137,6 +141,13 @@ def require_valid(view: KnownView) -> None:
     elif not np.isfinite(values).all() or min(focal) <= 0 or not is_size:
         fault, found = "lens", f"{view.camera.model_name} {values.tolist()}"
         expected = f"finite numbers, a focal length above 0, sides of 1 to {MAX_SIDE_PX} px"
+    elif view.image is not None and (
+        min(focal) < MIN_FOCAL * min(sides)
+        or max(focal) > MAX_FOCAL * max(sides)
+        or np.max(np.abs(centre)) <= 1
+    ):
+        fault, found = "lens", f"{view.camera.model_name} {values.tolist()}"
+        expected = f"px: a focal length of {MIN_FOCAL} to {MAX_FOCAL} sides, and a centre that is not a share"
     elif not np.isfinite(pose).all() or not are_rotations(pose[:3, :3], RIGID_TOLERANCE):
         fault, found = "rotation", np.array2string(pose[:3, :3], precision=4).replace("\n", "")
         expected = "a matrix that neither scales nor mirrors, or a quaternion of length 1"
@@ -146,6 +157,16 @@ def require_valid(view: KnownView) -> None:
     else:
         return
     raise SceneError(f"the camera {fault} of view {view.name} is not valid", expected=expected, found=found)
+
+
+def require_centred(centre: Sequence[float], size: tuple[int, int]) -> None:
+    """Raise ValueError if cx, cy are far from the middle of an image whose source doesn't state its size.
+
+    They then belong to another size of the image, such as that of a full-size copy.
+    """
+    sides = np.array(size)
+    if (np.abs(centre - sides / 2) > sides / 4).any():
+        raise ValueError("cx and cy belong to another size of the image, and the size is missing")
 
 
 def find_images(root: Path, names: Sequence[str]) -> dict[str, Path | None]:
@@ -164,7 +185,7 @@ def find_images(root: Path, names: Sequence[str]) -> dict[str, Path | None]:
         paths = [] if is_outside(name) else [base / f"{plain}{end}" for base in bases for end in ends]
         images[name] = next((path for path in paths if path.is_file()), None)
     if missing := [name for name, image in images.items() if image is None]:
-        below = {path.relative_to(root).as_posix(): path for path in images_below(root)}
+        below = {path.relative_to(root).as_posix(): path for path in used_images(root)}
         for name, match in match_names(missing, below).items():
             if match is None:
                 require_inside(root, name)
@@ -239,7 +260,7 @@ def read_llff(known: KnownPoses) -> Source:
             found=f"{rows.dtype} of shape {rows.shape}",
             fix="unpack it again",
         )
-    images = sorted(list_images(folder if folder.is_dir() else known.root), key=lambda image: image.stem)
+    images = list_images(folder if folder.is_dir() else known.root)
     if len(images) != len(rows):
         raise SceneError(
             f"{path} has {len(rows)} poses for {len(images)} images",

@@ -13,7 +13,7 @@ from hilsplat.base.errors import SceneError, foreign
 from hilsplat.base.files import list_images
 from hilsplat.base.images import image_size_hw
 from hilsplat.scene.colmap import pycolmap, rotation_matrix
-from hilsplat.scene.importers.known_views import Keys, KnownView, Source
+from hilsplat.scene.importers.known_views import Keys, KnownView, Source, require_centred
 from hilsplat.scene.layouts import KnownPoses, read_json_object
 from hilsplat.scene.posed_images import OPENGL_TO_OPENCV, rigid_pose
 
@@ -68,6 +68,7 @@ def read_polycam(known: KnownPoses) -> Source:
             width, height = content.get("width"), content.get("height")
             if width is None or height is None:
                 height, width = image_size_hw(image)
+                require_centred(params[2:], (width, height))
             camera = pycolmap.Camera(model="PINHOLE", params=params, width=int(width), height=int(height))
         pose = _phone_pose(np.array(entries).reshape(3, 4), str(file))
         return KnownView(image.name, image, camera, pose, border_px=border_px)
@@ -92,6 +93,8 @@ def read_record3d(known: KnownPoses) -> Source:
     expected = "K (9 numbers), w, h, and poses (rows of 7 numbers)"
     with foreign(file, expected=expected, fix=AGAIN):
         K = np.array(content["K"], dtype=np.float64).reshape(3, 3).T
+        if K[2].tolist() != [0, 0, 1]:
+            raise ValueError("K is not in column order")
         width, height = int(content["w"]), int(content["h"])
         rows = np.array(content["poses"], dtype=np.float64).reshape(-1, 7)
         lenses = np.tile([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], (len(rows), 1))

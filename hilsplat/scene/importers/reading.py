@@ -1,11 +1,9 @@
 """Posed views of a folder in any supported format."""
 
-from collections import Counter
-
 import numpy as np
 
 from hilsplat.base.errors import SceneError
-from hilsplat.scene.importers.known_views import Source, read_colmap, read_llff
+from hilsplat.scene.importers.known_views import KnownView, Source, read_colmap, read_llff
 from hilsplat.scene.importers.phones import read_polycam, read_record3d
 from hilsplat.scene.importers.transforms import read_transforms
 from hilsplat.scene.layouts import KnownPoses
@@ -22,8 +20,8 @@ READERS = {
 def read_source(known: KnownPoses) -> Source:
     """Read the posed views of a folder in any supported format, with points if available.
 
-    Views that cannot be used are left out, with the reason. Views are matched to images by name; points that
-    are not finite are dropped.
+    Views that cannot be used are left out, with the reason. Views are matched to images by name; a view that
+    several files list is used once, as the first describes it. Points that are not finite are dropped.
 
     Raises:
         SceneError: a file cannot be used, or at least three views all have one pose.
@@ -34,10 +32,7 @@ def read_source(known: KnownPoses) -> Source:
         raise SceneError(
             f"all {len(poses)} views of {known.files[0]} have the same pose", fix="export it again"
         )
-    num_views = Counter(view.image for view in source.views)
-    for view in [view for view in source.views if view.image is not None and num_views[view.image] > 1]:
-        source.views.remove(view)
-        source.leave_out(view.name, f"view {view.name}: other views have the same image {view.image}")
+    _keep_one_view_per_image(source)
     source.notes += [f"{other} also has poses, which are not used" for other in known.others]
     if source.points is not None:
         xyz, rgb = source.points
@@ -47,3 +42,25 @@ def read_source(known: KnownPoses) -> Source:
         # Without points, they are triangulated.
         source.points = (xyz[is_finite], rgb[is_finite]) if is_finite.any() else None
     return source
+
+
+def _keep_one_view_per_image(source: Source) -> None:
+    """Drop repetitions of a view, and leave out different views of the same image."""
+    views: dict[object, list[KnownView]] = {}
+    for view in source.views:
+        views.setdefault(view.image or id(view), []).append(view)
+    num_repeated = len(source.views) - len(views)
+    source.views = []
+    for first, *others in views.values():
+        if all(_is_same(first, other) for other in others):
+            source.views.append(first)
+            continue
+        num_repeated -= len(others)
+        for view in (first, *others):
+            source.leave_out(view.name, f"view {view.name}: other views have the same image {view.image}")
+    if num_repeated:
+        source.notes.append(f"{num_repeated} of the views listed are repetitions, which are dropped")
+
+
+def _is_same(view: KnownView, other: KnownView) -> bool:
+    return view.camera == other.camera and np.array_equal(view.cam_from_source, other.cam_from_source)

@@ -18,6 +18,7 @@ from hilsplat.scene.importers.known_views import (
     KnownView,
     Source,
     find_images,
+    require_centred,
     require_inside,
 )
 from hilsplat.scene.importers.ply_file import read_ply
@@ -47,7 +48,7 @@ SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 # applied_transform and applied_scale are used for Gaussians, see `splat/coordinates.py`.
 USED = """frames file_path transform_matrix w h cx cy k1 k2 k3 k4 p1 p2 camera_model is_fisheye ply_file_path
 applied_transform applied_scale"""
-HARMLESS = """aabb_scale scale offset n_frames from_na up sharpness rotation render_aabb orientation_override
+HARMLESS = """aabb_scale scale offset n_frames up sharpness rotation render_aabb orientation_override
 colmap_im_id depth_file_path depth_path depth_unit_scale_factor integer_depth_scale enable_depth_loading
 normal_file_path sharpen white_transparent black_transparent timestamp auto_scale_poses_override center_method
 version"""
@@ -57,7 +58,8 @@ REFUSED = {
     "rolling_shutter transform_matrix_start transform_matrix_end": "a rolling shutter",
     "shift_x shift_y skew": "a shifted or skewed lens",
     "ftheta_p0 ftheta_p1 ftheta_p2 ftheta_p3 ftheta_p4 lens_mode": "a special lens",
-    "k5 k6 p3 p4 s1 s2 s3 s4 b1 b2 distortion_params": "more lens distortion",
+    "from_na from_mitsuba normal_mts_args": "camera axes other than OpenGL's",  # NeuS2, Mitsuba
+    "k5 k6 p3 p4 s1 s2 s3 s4 b1 b2 distortion distortion_params": "more lens distortion",
 }
 KEYS = Keys(
     used={*USED.split(), *FOCAL_KEYS, *SPLITS},
@@ -128,8 +130,8 @@ def _view(
 def _lens(where: str, frame: Mapping[str, Any], image: Path | None, notes: list[str]) -> pycolmap.Camera:
     """Return the lens of a frame: PINHOLE, or with distortion OPENCV, FULL_OPENCV or OPENCV_FISHEYE."""
     with foreign(where, expected="finite numbers", fix="export it again"):
-        stated = str(frame.get("camera_model", "OPENCV")).upper()
         values = {key: value for key, value in frame.items() if value is not None}
+        stated = str(values.get("camera_model", "OPENCV")).upper()
         if (fisheye := values.get("is_fisheye", False)) not in (True, False):
             raise ValueError(f"is_fisheye is {fisheye!r}, not true or false")
         model = "OPENCV_FISHEYE" if fisheye else MODELS.get(stated, "")
@@ -154,7 +156,9 @@ def _lens(where: str, frame: Mapping[str, Any], image: Path | None, notes: list[
         if not focal_x or not focal_y:
             expected = "fl_x (px), camera_angle_x (radians) or x_fov (degrees), or the same for y"
             raise SceneError(f"{where} has no focal length", expected=expected, fix="export it again")
-        params = [focal_x, focal_y, float(frame.get("cx", width / 2)), float(frame.get("cy", height / 2))]
+        params = [focal_x, focal_y, float(values.get("cx", width / 2)), float(values.get("cy", height / 2))]
+        if image is not None and not values.keys() >= {"w", "h"}:
+            require_centred(params[2:], (width, height))
         coefficients = [bends[key] for key in COEFFICIENTS[model]]
         if model == "OPENCV" and bends["k3"]:
             model, coefficients = "FULL_OPENCV", [*coefficients, 0.0, 0.0, 0.0]
@@ -170,6 +174,9 @@ def _focal(frame: Mapping[str, Any], axis: str, side_px: int, notes: list[str]) 
         if frame.get(key) is not None:
             value = float(frame[key])
             angle = math.radians(value) if key.endswith("fov") else value
+            if not key.startswith("fl_") and not 0 < angle < math.pi:
+                unit = "degrees" if key.endswith("fov") else "radians"
+                raise ValueError(f"{key} is {value:g}, not an angle in {unit}")
             stated[key] = value if key.startswith("fl_") else side_px / 2 / math.tan(angle / 2)
     first, *others = stated
     for key in others:
@@ -189,7 +196,7 @@ def read_ply_points(path: Path) -> Points:
             return xyz, np.full(xyz.shape, 128, dtype=np.uint8)
         rgb = np.stack([vertex[name] for name in names], axis=1)
         largest = float(np.nanmax(rgb)) if rgb.size else 0.0
-        # Floats are usually in [0, 1]; 16-bit colours of laser scanners may use only 8 bits.
-        limit = 1 if rgb.dtype.kind == "f" and largest <= 1 else 255 if largest <= 255 else 65535
+        # Floats are usually in [0, 1], up to rounding; 16-bit colours of laser scanners may use only 8 bits.
+        limit = 1 if rgb.dtype.kind == "f" and largest < 2 else 255 if largest <= 255 else 65535
         rgb = np.nan_to_num(rgb.astype(np.float64) * (255 / limit), nan=128.0)
     return xyz, np.clip(np.rint(rgb), 0, 255).astype(np.uint8)

@@ -158,6 +158,16 @@ def test_llff_columns_are_down_right_and_back(bed):
     assert view.camera.calibration_matrix().tolist() == [[50, 0, 20], [0, 50, 12], [0, 0, 1]]  # 40 x 24 px
 
 
+def test_llff_rows_are_in_the_order_of_whole_file_names(bed):
+    """A space, a bracket or a hyphen sorts before the dot of the suffix."""
+    before = [view.cam_from_source for view in posed_images(bed, "3D-OVS").values()]
+    for old, new in (("00", "a"), ("01", "a (1)"), ("02", "a-1"), ("03", "a_1")):
+        (bed / f"images/{old}.jpg").rename(bed / f"images/{new}.jpg")
+    posed = posed_images(bed, "3D-OVS")
+    found = [posed[f"{stem}.png"].cam_from_source for stem in ("a (1)", "a-1", "a", "a_1")]
+    np.testing.assert_array_equal(found, before)
+
+
 ENTRY = np.arange(17)
 
 
