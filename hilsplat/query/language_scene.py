@@ -208,8 +208,8 @@ class LanguageScene(NodeQueries):
         Raises:
             SettingsError: the picture has another type or shape, or no pixel.
         """
-        if not isinstance(picture, UInt8[np.ndarray, "H W 3"]) or not picture.size:
-            is_array = isinstance(picture, np.ndarray)
+        is_array = isinstance(picture, np.ndarray)
+        if not is_array or picture.dtype != np.uint8 or picture.shape[2:] != (3,) or not picture.size:
             raise SettingsError(
                 "the picture is not an RGB image",
                 expected="a (height, width, 3) array of uint8",
