@@ -23,7 +23,13 @@ from hilsplat import settings as of
 from hilsplat import stages
 from hilsplat.base.artifacts import INDEX, read_memo
 from hilsplat.base.cache import ViewCache
-from hilsplat.base.errors import ArtifactError, SceneError, SettingsError
+from hilsplat.base.errors import (
+    ArtifactError,
+    MisalignedArtifactError,
+    SceneError,
+    SettingsError,
+    shorten_list,
+)
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import reporting, track
 from hilsplat.configuration import resolve_auto, validated
@@ -257,12 +263,20 @@ def link(
         settings: those of section `semantic_tree`, such as `min_views=2`.
 
     Raises:
-        ArtifactError: the masks are empty, or the folder has results of a run or another scene.
-        MisalignedArtifactError: the masks are not those of the scene's training views.
+        ArtifactError: the folder has results of a run or another scene.
+        MisalignedArtifactError: there are no masks, or some are not those of the scene's training views.
         ModelError: the model is missing or incomplete.
     """
     section, number = _section("semantic_tree", settings), _threads(threads)
     clip = resolve_auto(_section("clip", {"model": str(model), "crops": "nodes"}))
+    views = train_views(scene)
+    if not (isinstance(masks, SceneMasks) and masks and set(masks) <= set(views)):
+        raise MisalignedArtifactError(
+            f"the masks are not those of the training views of {scene.name}",
+            expected=f"SceneMasks of {shorten_list(views)}",
+            found=f"{type(masks).__name__} of {shorten_list([*masks]) or 'no views'}",
+            fix="pass the result of hilsplat.segment for this scene",
+        )
     _require_own(folder)
     if folder and scene.folder.resolve() != (Path(folder) / "scene").resolve():
         raise ArtifactError(

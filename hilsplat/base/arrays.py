@@ -11,7 +11,7 @@ import tempfile
 import threading
 import weakref
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
@@ -23,10 +23,43 @@ from safetensors import SafetensorError, safe_open
 
 from hilsplat.base.artifacts import parse_json, rebuild_command
 from hilsplat.base.atomic import atomic_path
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.errors import ArtifactError, SettingsError
 
 Built = TypeVar("Built")
 Limits = Mapping[str, tuple[int | float, int | float]]  # array name -> minimum and maximum
+
+
+def require_arrays(built: Any) -> None:
+    """Check the arrays of a dataclass instance against their jaxtyping annotations.
+
+    Dimensions with the same name must have the same size.
+
+    Raises:
+        SettingsError: an array has the wrong type or shape.
+    """
+    with jaxtyped("context"):
+        for name, declared, array in _declared(type(built), vars(built)):
+            if not _fits(array, declared):
+                is_array = isinstance(array, np.ndarray)
+                raise SettingsError(
+                    f"{type(built).__name__}: array {name} has the wrong type or shape",
+                    expected=described(declared),
+                    found=f"{array.dtype} of shape {array.shape}" if is_array else type(array).__name__,
+                    fix="convert it, such as by np.asarray(array, np.float32), or correct its size",
+                )
+
+
+def _declared(cls: type, arrays: Mapping[str, Any]) -> Iterator[tuple[str, type[AbstractArray], Any]]:
+    """Yield the arrays that have a jaxtyping annotation, by field name."""
+    hints = get_type_hints(cls)
+    for name, array in arrays.items():
+        declared = hints.get(name)
+        if isinstance(declared, type) and issubclass(declared, AbstractArray):
+            yield name, declared, array
+
+
+def _fits(array: Any, declared: Any) -> bool:
+    return isinstance(array, declared)
 
 
 def require_types(cls: type, arrays: Mapping[str, Any], path: Path, limits: Limits) -> None:
@@ -37,14 +70,9 @@ def require_types(cls: type, arrays: Mapping[str, Any], path: Path, limits: Limi
     Raises:
         ArtifactError: an array has the wrong type or shape, or contains a non-finite or out-of-range value.
     """
-    hints = get_type_hints(cls)
     with jaxtyped("context"):
-        for name, array in arrays.items():
-            declared: Any = hints.get(name)
-            if not (isinstance(declared, type) and issubclass(declared, AbstractArray)):
-                continue
-            fits: bool = isinstance(array, declared)
-            if not fits:
+        for name, declared, array in _declared(cls, arrays):
+            if not _fits(array, declared):
                 raise ArtifactError(
                     f"{path}: array {name} has the wrong type or shape",
                     expected=described(declared),

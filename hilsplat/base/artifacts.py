@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from hilsplat.base.atomic import atomic_path
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.base.files import regular
 
 ZIP64_BYTES = 2**30  # arrays above this size get an archive entry that may exceed 2 GiB
@@ -211,6 +211,14 @@ def read_index(folder: Path, *entries: str) -> dict[str, Any]:
             fix=rebuild_command(Path(folder)),
         )
     return index
+
+
+def is_artifact(folder: Path) -> bool:
+    """Return whether a folder has an index that hilsplat wrote."""
+    try:
+        return bool(_index(folder))
+    except HilsplatError:
+        return False
 
 
 def _index(folder: Path) -> dict[str, Any]:

@@ -49,6 +49,13 @@ def system_error(error: BaseException) -> HilsplatError | None:
     )
 
 
+def is_interruption(error: BaseException | None) -> bool:
+    """Return whether Ctrl-C caused an error: a library that is being imported raises its own instead."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
 KILLED = "probably because memory ran out"
 KILLED_FIX = "use fewer cores (hilsplat run --cores 1), smaller images (poses.max_side_px) or more memory"
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from hilsplat.base.artifacts import read_memo, write_json
+from hilsplat.base.artifacts import is_artifact, read_memo, write_json
 from hilsplat.base.atomic import was_interrupted
 from hilsplat.base.errors import ArtifactError, ImageError
 from hilsplat.base.images import opened_image
@@ -22,12 +22,13 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
     provenance of the first output, or if a process was killed while writing it.
 
     Raises:
-        ArtifactError: an output is or contains an input or the working, home or root folder, or exists and is
-            not an earlier output of the stage.
+        ArtifactError: an output is in an artifact, is or contains an input or the working, home or root
+            folder, or exists and is not an earlier output of the stage.
     """
     recorded = _recorded_outputs(outputs[0], stage)
     sources = [Path(path).resolve() for path in inputs]
     for out in outputs:
+        require_outside_artifacts(out)
         path = out.resolve()
         for source in sources:
             if source.is_relative_to(path):
@@ -42,8 +43,19 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
             raise _foreign(out, stage, f"a new path, or an earlier output of {stage} with its provenance")
 
 
+def require_outside_artifacts(out: Path) -> None:
+    """Raise ArtifactError if an output is in an artifact, whose digest another file would change."""
+    for folder in out.resolve().parents:
+        if is_artifact(folder):
+            raise ArtifactError(
+                f"output {out} is in the artifact {folder}, which would then be damaged",
+                fix="choose another output",
+            )
+
+
 def require_own_picture(path: Path, beside: Path | None = None) -> None:
-    """Raise ArtifactError if a path is not a .png, or if it or `beside` is a file of other programs."""
+    """Raise ArtifactError if a path is in an artifact or not a .png, or if it or `beside` is not ours."""
+    require_outside_artifacts(path)
     if path.suffix.lower() != ".png":
         raise ArtifactError(f"output {path} is not a PNG file", expected="a name that ends in .png")
     if _is_something(path) and not _is_own_picture(path):
@@ -81,7 +93,8 @@ def _stats(folder: Path) -> dict[str, list[int]]:
 
 
 def require_beginning(path: Path, line: str) -> None:
-    """Raise ArtifactError if a table would replace a file whose first line is not `line`."""
+    """Raise ArtifactError if a table is in an artifact, or replaces a file whose first line is not `line`."""
+    require_outside_artifacts(path)
     if not _is_something(path):
         return
     try:

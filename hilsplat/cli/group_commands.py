@@ -153,12 +153,13 @@ def datasets_fits(
 
     Writes label_fits.csv beside the tree.
     """
-    folder, tree = results / scene, results / scene / variant / "semantic_tree"
-    name, target = labels or f"annotated/{scene}", tree.with_name("label_fits.csv")
-    masks = folder / variant / "masks"
-    echo(
-        label_fits(folder / "scene", folder / "gaussians.ply", masks, tree, target, name, data_root, threads)
-    )
+    from hilsplat.scene.finished import FinishedScene
+    from hilsplat.scene.scene import Scene
+
+    parts = FinishedScene.locate(scene_folder(scene, results), variant).parts
+    posed, tree, target = parts.scene, parts.semantic_tree, parts.semantic_tree.with_name("label_fits.csv")
+    name = labels or f"annotated/{Scene.load(posed).name}"
+    echo(label_fits(posed, parts.gaussians, parts.masks, tree, target, name, data_root, threads))
 
 
 @blocks_app.command("split")

@@ -6,10 +6,15 @@ Commands import heavy libraries only when they run.
 import gc
 import logging
 import os
+import signal
 import sys
 import warnings
 from pathlib import Path
 from typing import Annotated
+
+_interrupt = signal.getsignal(signal.SIGINT)
+if _interrupt is signal.default_int_handler:  # until all is imported, Ctrl-C would print a traceback
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 # The summation order of linear algebra libraries depends on the number of threads. Stages therefore run on
 # several cores through numba or our own pools, where the number of cores does not affect results.
@@ -34,12 +39,19 @@ sys.stderr = sys.stderr or open(2, "w", closefd=False)  # noqa: SIM115
 import typer  # noqa: E402
 
 from hilsplat.base.cache import use_writable_cache  # noqa: E402
-from hilsplat.base.errors import HilsplatError, require_working_directory, system_error  # noqa: E402
+from hilsplat.base.errors import (  # noqa: E402
+    HilsplatError,
+    is_interruption,
+    require_working_directory,
+    system_error,
+)
 from hilsplat.base.processes import end_with_workflow, keep_freed_memory  # noqa: E402
 from hilsplat.cli import group_commands, scene_commands, stage_commands, user_commands  # noqa: E402, F401
 from hilsplat.cli.common import app, echo, sort_into_panels, start_logging  # noqa: E402
 
 sort_into_panels()
+if _interrupt is signal.default_int_handler:
+    signal.signal(signal.SIGINT, _interrupt)
 
 
 def main() -> None:
@@ -54,6 +66,8 @@ def main() -> None:
         app()
         sys.stdout.flush()
     except Exception as error:
+        if is_interruption(error):
+            sys.exit(130)
         message = error if isinstance(error, HilsplatError) else system_error(error)
         if message is None and sys.gettrace() is not None:  # for post-mortem debugging
             raise

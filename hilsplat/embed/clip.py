@@ -1,6 +1,7 @@
 """CLIP: unit vectors of mask crops and texts in a shared space."""
 
 import logging
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -10,7 +11,7 @@ from jaxtyping import Float16, Float32, Int64, UInt8
 from tokenizers import Tokenizer
 
 from hilsplat.base.artifacts import read_index, read_json
-from hilsplat.base.errors import MisalignedArtifactError, ModelError
+from hilsplat.base.errors import MisalignedArtifactError, ModelError, SettingsError
 from hilsplat.base.files import INSTALLED
 from hilsplat.models.card import CPU, Batches, in_turn, network_device
 from hilsplat.models.folder import WHOLE_COPY, ModelFolder, input_side_px, open_model_folder
@@ -203,12 +204,17 @@ class ClipModel:
         inside = masks.window(row, box)
         return crop_to_square(image[y0:y1, x0:x1], inside, settings.background, self.side_px, as_langsplat)
 
-    def embed_texts(self, texts: list[str]) -> Float32[np.ndarray, "T C"]:
+    def embed_texts(self, texts: Sequence[str]) -> Float32[np.ndarray, "T C"]:
         """Return the unit vectors of texts, each inserted into the template; vectors are cached.
 
-        Texts are embedded one by one, so a vector never depends on other queries. A text without tokens
-        raises a ModelError.
+        Texts are embedded one by one, so a vector never depends on other queries.
+
+        Raises:
+            SettingsError: there is no text, or `texts` is one text, whose letters would be embedded.
+            ModelError: a text has no tokens.
         """
+        if isinstance(texts, str) or not len(texts):
+            raise SettingsError(f"{texts!r} is not a list of texts", expected='such as ["mug", "book"]')
         for text in texts:
             if text not in self._text_vectors:
                 self._text_vectors[text] = self._embed_text(text)

@@ -168,13 +168,13 @@ def _are_masks(card: cards.ProtocolCard, answers: Mapping[str, Mapping[tuple[str
     for view, of_view in answers.items():
         for (level, text), answer in of_view.items():
             kind = answer.dtype.kind
-            is_map = kind == "f" and answer.ndim == 3 and not np.isnan(answer).any()
-            is_map &= is_argmax or len(answer) == len(LEVELS)
+            is_map = kind == "f" and answer.ndim == 3 and bool((answer < np.inf).all())  # False for NaN
+            is_map &= is_argmax or (len(answer) == len(LEVELS) and bool(np.isfinite(answer).all()))
             if not (is_map or (kind == "b" and answer.ndim == 2)) or bool(level) != _has_levels(card):
                 name = "'part/handle'" if _has_levels(card) else "'handle', without a level"
                 raise SettingsError(
                     f"{view}: {level}{'/' * bool(level)}{text} cannot be scored under {card.full_name}",
-                    expected=f"mask (H, W) bool, or relevancy (3, H, W) float without NaN, named like {name}",
+                    expected=f"mask (H, W) bool, or finite relevancy (3, H, W) float, named like {name}",
                     found=f"{answer.shape} {answer.dtype}",
                 )
             kinds.add(kind)
@@ -302,8 +302,11 @@ def _rows_of_points(card: cards.ProtocolCard, predictions: Any, labels: Any) -> 
     sizes = dict(zip("MP", given[0].shape, strict=False)) if is_scan else {"P": len(labels)}
     axes, ids = (("MP", "M", "M", "P", "P"), (1, 3, 4)) if is_scan else (("P", "P"), (0, 1))
     shapes = [tuple(sizes.get(axis) for axis in each) for each in axes]
-    if [array.shape for array in given] != shapes or any(given[row].dtype.kind not in "iu" for row in ids):
-        scan = "masks (M, P) bool, class ids (M,) and confidences (M,); class ids (P,) and instance ids (P,)"
+    fits = [array.shape for array in given] == shapes and all(given[row].dtype.kind in "iu" for row in ids)
+    if is_scan:  # masks of ids, such as -1 for none, would be read as masks of all points
+        fits &= given[0].dtype == bool and given[2].dtype.kind in "fiu" and bool(np.isfinite(given[2]).all())
+    if not fits:
+        scan = "masks (M, P) bool, class ids (M,), finite confidences (M,); class ids (P,), instance ids (P,)"
         raise MisalignedArtifactError(
             f"predictions and labels do not match under {card.full_name}",
             expected=scan if is_scan else "integer class ids of the same points, (P,) and (P,)",
@@ -315,5 +318,5 @@ def _rows_of_points(card: cards.ProtocolCard, predictions: Any, labels: Any) -> 
         return
     masks, class_ids, confidences, *truth_ids = given
     points = LabelledPoints(np.zeros((sizes["P"], 3)), *(array.astype(np.int32) for array in truth_ids))
-    matches = instance_scan(points, classes, masks.astype(bool), class_ids, confidences.astype(np.float64))
+    matches = instance_scan(points, classes, masks, class_ids, confidences.astype(np.float64))
     yield from measure_instances(METHOD, {"": matches}, METHOD)

@@ -41,7 +41,7 @@ class FieldAnswers:
         """
         height, width = self.views.size_hw(view)
         relevancy, levels = self._latent_relevancy, self.latents(view)
-        vectors, prepared = self.clip.embed_texts(list(texts)), None
+        vectors, prepared = self.clip.embed_texts(texts), None
         if isinstance(self.code, LinearCode) or not exact:
             prepared = self.views.cache.get(
                 ("prepared", view), lambda: [relevancy.prepare(latents) for _, latents in levels]
@@ -66,7 +66,7 @@ class FieldAnswers:
 
         Pixels (row * width + column) that show mostly Gaussians without a latent get -inf.
         """
-        vectors = self.clip.embed_texts(list(texts))
+        vectors, pixels = self.clip.embed_texts(texts), self.views.existing_pixels(view, pixels)
         cosines = np.full((len(texts), len(LEVELS), len(pixels)), -np.inf, np.float32)
         for index, (with_latent, latents) in enumerate(self.latents(view)):
             has_latent = np.flatnonzero(np.isin(pixels, with_latent))

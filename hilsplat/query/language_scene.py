@@ -203,25 +203,34 @@ class LanguageScene(NodeQueries):
         return self._nearest(self.tree.clip[node], same[same != node], limit)
 
     def like_picture(self, picture: UInt8[np.ndarray, "H W 3"], *, limit: int = 10) -> list[Hit]:
-        """Return the nodes of any level that look most like a picture, best first; scores are cosines."""
+        """Return the nodes of any level that look most like a picture, best first; scores are cosines.
+
+        Raises:
+            SettingsError: the picture has another type or shape, or no pixel.
+        """
+        is_array = isinstance(picture, np.ndarray)
+        if not is_array or picture.dtype != np.uint8 or picture.shape[2:] != (3,) or not picture.size:
+            raise SettingsError(
+                "the picture is not an RGB image",
+                expected="a (height, width, 3) array of uint8",
+                found=f"{picture.dtype} of shape {picture.shape}" if is_array else type(picture).__name__,
+            )
         return self._nearest(self.clip.embed_picture(picture), np.arange(len(self.tree)), limit)
 
     def existing_node(self, node: int) -> int:
         """Return the node; raise SettingsError if it does not exist."""
-        if not 0 <= node < len(self.tree):
-            raise SettingsError(f"node {node} does not exist", expected=f"0 to {len(self.tree) - 1}")
-        return node
+        return int(self.views.existing([node])[0])
 
     def _nearest(
         self, vector: Float32[np.ndarray, " C"], nodes: Int64[np.ndarray, " n"], limit: int
     ) -> list[Hit]:
         cosine = self.tree.clip[nodes] @ vector
-        order = np.lexsort((nodes, -cosine))[:limit]
+        order = np.lexsort((nodes, -cosine))[: _count(limit)]
         return [self._hit(int(nodes[row]), float(cosine[row]), "like", ()) for row in order]
 
     def hits_of(self, nodes: NodeHits, limit: int) -> list[Hit]:
         """Return up to `limit` of the best nodes as answers."""
-        doubts = doubts_of(nodes)
+        doubts, limit = doubts_of(nodes), _count(limit)
         scores = relevancy_of_margins(nodes.values[:limit], self.settings.relevancy_scale).tolist()
         return [
             self._hit(node, score, nodes.route, doubts)
@@ -281,7 +290,8 @@ class LanguageScene(NodeQueries):
         Uncovered pixels and levels without nodes get -inf. User-given names are ignored. A pixel's index is
         row * width + column.
         """
-        of_nodes = self.clip.embed_texts(list(texts)) @ self.tree.clip.T
+        of_nodes = self.clip.embed_texts(texts) @ self.tree.clip.T
+        pixels = self.views.existing_pixels(view, pixels)
         cosines = np.full((len(texts), len(LEVELS), len(pixels)), -np.inf, np.float32)
         for level in LEVELS:
             nodes = self.tree.nodes_of(level)
@@ -292,6 +302,12 @@ class LanguageScene(NodeQueries):
                 blended = in_view.blend(values, float(values[nodes].min()))
                 cosines[row, level.index] = np.where(in_view.covered, blended, -np.inf)[pixels]
         return cosines
+
+
+def _count(limit: int) -> int:
+    if limit < 0:  # a slice would leave out the last answers
+        raise SettingsError(f"limit is {limit}", expected="a number of answers, at least 0")
+    return limit
 
 
 def open_scene(folder: Path | str, variant: str = "default", *, threads: int = 1) -> LanguageScene:

@@ -140,7 +140,7 @@ class NodeQueries(ABC):
 
         A node's margin for the name that the user gave it is `NAMED`.
         """
-        of_texts = self._margins(self.clip.embed_texts(list(texts)), answerer)
+        of_texts = self._margins(self.clip.embed_texts(texts), answerer)
         for row, text in zip(of_texts, texts, strict=True):
             row[self.names.nodes_of(text)] = NAMED
         return of_texts

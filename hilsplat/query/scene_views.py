@@ -1,5 +1,6 @@
 """Nodes and pixels shown by a scene's views; artifacts are opened once, and results are cached per view."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -148,8 +149,16 @@ class SceneViews:
         return self._cached("visible", view, measure)
 
     def gaussians_of(self, ids: Nodes) -> Int64[np.ndarray, " g"]:
-        """Return the rows of `gaussians.ply` that belong to any of the nodes."""
-        return np.flatnonzero(np.isin(self.tree.node_of_gaussian, np.asarray(ids)).any(axis=1))
+        """Return the rows of `gaussians.ply` that belong to any of the nodes; errors as in `existing`."""
+        return np.flatnonzero(np.isin(self.tree.node_of_gaussian, self.existing(ids)).any(axis=1))
+
+    def existing(self, ids: Nodes) -> Int64[np.ndarray, " k"]:
+        """Return the nodes as an array; raise SettingsError if one does not exist."""
+        return _within(ids, len(self.tree), "node")
+
+    def existing_pixels(self, view: View, pixels: Any) -> Int64[np.ndarray, " P"]:
+        """Return pixels (row * width + column) as an array; raise SettingsError if one does not exist."""
+        return _within(pixels, math.prod(self.size_hw(view)), f"pixel of {view}:")
 
     @property
     def loose(self) -> Bool[np.ndarray, " N"]:
@@ -157,8 +166,11 @@ class SceneViews:
         return (self.tree.node_of_gaussian == NONE).all(axis=1)
 
     def node_masks(self, view: View, ids: Nodes) -> Bool[np.ndarray, "H W"]:
-        """Return the pixels in which the nodes' Gaussians have more than half of the total weight."""
-        ids = np.asarray(ids, np.int64)
+        """Return the pixels in which the nodes' Gaussians have more than half of the total weight.
+
+        Errors are those of `camera` and `existing`.
+        """
+        ids = self.existing(ids)
         size_hw = self.size_hw(view)
         if not len(ids):
             return np.zeros(size_hw, np.bool_)
@@ -186,6 +198,15 @@ class SceneViews:
             for row, values in enumerate(scores):
                 in_view.blend(values, float(values[nodes].min()), maps[row, level.index])
         return maps.reshape(len(scores), len(LEVELS), height, width)
+
+
+def _within(numbers: Any, count: int, what: str) -> Int64[np.ndarray, " k"]:
+    """Return integers as an array; raise SettingsError if one is not in 0 to `count` - 1."""
+    array = np.asarray(numbers)
+    if array.size and (array.dtype.kind not in "iu" or array.min() < 0 or array.max() >= count):
+        wrong = next(each for each in array.ravel().tolist() if each not in range(count))
+        raise SettingsError(f"{what} {wrong!r} does not exist", expected=f"0 to {count - 1}")
+    return array.astype(np.int64)
 
 
 def heaviest_node(

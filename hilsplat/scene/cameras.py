@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int32
 
-from hilsplat.base.arrays import require_types
+from hilsplat.base.arrays import require_arrays, require_types
 from hilsplat.base.artifacts import read_npz, rebuild_command, write_npz
 from hilsplat.base.errors import ArtifactError, SceneError, shorten_list
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
@@ -44,6 +44,10 @@ class Camera:
         size_hw: image height and width, px.
         photo: the photograph, if it was cropped or undistorted; else the view is the photograph, or a scaled
             copy.
+
+    Raises:
+        SettingsError: an array has the wrong type or shape.
+        SceneError: a value is impossible, such as a pose that is not rigid or a size of 0.
     """
 
     name: str
@@ -51,6 +55,18 @@ class Camera:
     K: Float[np.ndarray, "3 3"]
     size_hw: tuple[int, int]
     photo: Photo | None = None
+
+    def __post_init__(self) -> None:
+        require_arrays(self)
+        fault = _fault_of(self.cam_from_world[None], self.K[None])
+        if not all(isinstance(side, int) and 1 <= side <= MAX_SIDE_PX for side in self.size_hw):
+            fault = f"height and width in whole px, 1 to {MAX_SIDE_PX}"
+        if fault:
+            raise SceneError(
+                f"camera {self.name} is not valid",
+                expected=fault,
+                found=f"size {self.size_hw}, pose {self.cam_from_world.tolist()}, K {self.K.tolist()}",
+            )
 
     def __repr__(self) -> str:
         height, width = self.size_hw
@@ -134,15 +150,10 @@ class Cameras:
         numbers = {name: array for name, array in arrays.items() if name != "names"}
         require_types(Cameras, numbers, path, LIMITS)
         names, poses, K = arrays["names"], arrays["cam_from_world"], arrays["K"]
-        are_rigid = are_rotations(poses[:, :3, :3], RIGID_TOLERANCE)
         if names.dtype.kind != "U" or names.shape != (len(poses),) or len(set(names.tolist())) != len(names):
             fault = f"a distinct name for each of {len(poses)} cameras ({len(names)} names found)"
-        elif not are_rigid.all() or (poses[:, 3] != (0, 0, 0, 1)).any():
-            fault = "rigid poses"
-        elif not (K[:, [0, 1], [0, 1]] > 0).all() or (K[:, 2] != (0, 0, 1)).any():
-            fault = "focal lengths above 0"
         else:
-            fault = ""
+            fault = _fault_of(poses, K)
         if fault:
             raise ArtifactError(
                 f"{path} does not contain valid cameras", expected=fault, fix=rebuild_command(path)
@@ -155,3 +166,14 @@ class Cameras:
                 if model:
                     photos[name] = Photo(model, tuple(params), tuple(size_hw))
         return Cameras(order, poses, K, arrays["size_hw"], photos)
+
+
+def _fault_of(poses: Float[np.ndarray, "V 4 4"], K: Float[np.ndarray, "V 3 3"]) -> str:
+    """Return what cameras lack to be valid, or ""."""
+    if not (np.isfinite(poses).all() and np.isfinite(K).all()):
+        return "finite numbers"
+    if not are_rotations(poses[:, :3, :3], RIGID_TOLERANCE).all() or (poses[:, 3] != (0, 0, 0, 1)).any():
+        return "rigid poses"
+    if not (K[:, [0, 1], [0, 1]] > 0).all() or (K[:, 2] != (0, 0, 1)).any():
+        return "focal lengths above 0"
+    return ""

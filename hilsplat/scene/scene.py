@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from hilsplat.base.artifacts import read_index, read_npz, sealed, write_index, write_npz
+from hilsplat.base.errors import SettingsError
 from hilsplat.base.images import read_image
 from hilsplat.scene.cameras import Cameras
 
@@ -42,7 +43,13 @@ class Scene:
         return self.cameras.names
 
     def views(self, split: str | None = None) -> list[str]:
-        """Return the view names of a split ("train", "test") or all view names, in camera order."""
+        """Return the view names of a split ("train", "test") or all view names, in camera order.
+
+        Raises:
+            SettingsError: the split is unknown.
+        """
+        if split not in (None, "train", "test"):
+            raise SettingsError(f"split {split!r} is unknown", expected="train or test")
         return [name for name in self.cameras.names if split is None or self.split[name] == split]
 
     def image_path(self, view: str) -> Path:

@@ -5,16 +5,32 @@ from dataclasses import dataclass, fields
 import numpy as np
 from jaxtyping import Float, Float32, Int64, UInt64
 
+from hilsplat.base.arrays import require_arrays
+from hilsplat.base.errors import SettingsError
+
 
 @dataclass(frozen=True)
 class Gaussians:
-    """N anisotropic 3D Gaussians of one scene, as contiguous arrays."""
+    """N anisotropic 3D Gaussians of one scene, as contiguous arrays.
+
+    Raises:
+        SettingsError: arrays have the wrong type or shape, or differ in size.
+    """
 
     means: Float32[np.ndarray, "N 3"]  # centres, scene units
     log_scales: Float32[np.ndarray, "N 3"]  # natural log of the standard deviations, scene units
     quats: Float32[np.ndarray, "N 4"]  # world-from-Gaussian rotations (wxyz), of any non-zero length
     opacity_logits: Float32[np.ndarray, " N"]  # inverse sigmoid of the peak alpha
     sh: Float32[np.ndarray, "N K 3"]  # colour; K = (degree + 1)**2, and row 0 is the constant term
+
+    def __post_init__(self) -> None:
+        require_arrays(self)  # compiled loops would read beyond the end of an array that is too short
+        if self.sh.shape[1] not in (1, 4, 9, 16):
+            raise SettingsError(
+                "Gaussians: sh does not have the size of a degree",
+                expected="(N, K, 3) with K = 1, 4, 9 or 16",
+                found=self.sh.shape,
+            )
 
     def __len__(self) -> int:
         return len(self.means)

@@ -167,6 +167,22 @@ def until(page, holds: Callable[[], object]) -> None:
     raise AssertionError("the condition didn't become true")
 
 
+LATE = """
+(path) => {
+  const asked = window.fetch;
+  window.fetch = async (address, ...more) => {
+    if (`${address}`.includes(path)) await new Promise((done) => setTimeout(done, 700));
+    return asked(address, ...more);
+  };
+}
+"""
+
+
+def late(page, path: str) -> None:
+    """Delay the replies to requests whose address contains `path`."""
+    page.evaluate(LATE, path)
+
+
 def drawn(page, act: Callable[[], object]) -> None:
     """Run `act` and wait until the picture is redrawn."""
     view = page.locator("#view")

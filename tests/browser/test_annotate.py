@@ -11,7 +11,7 @@ from hilsplat.annotate.labels import Label, label_path, read_labels, write_label
 from hilsplat.base.tables import write_csv
 from hilsplat.datasets.registry import open_labelled
 from hilsplat.web.file_changes import version_of
-from tests.browser.conftest import phone_fits, serving
+from tests.browser.conftest import late, phone_fits, serving
 from tests.conftest import PROJECT
 from tests.unit.artifact_changes import change_index, write_again
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, WIDTH
@@ -43,11 +43,15 @@ def place(page, x: float, y: float) -> tuple[float, float]:
 
 
 def polygon(page, *corners: tuple[int, int]) -> None:
+    draw_polygon(page, *corners)
+    saved(page)
+
+
+def draw_polygon(page, *corners: tuple[int, int]) -> None:
     page.locator("#view").press("p")
     for corner in corners:
         page.mouse.click(*place(page, *corner))
     page.keyboard.press("Enter")
-    saved(page)
 
 
 def name(page, text: str) -> None:
@@ -364,3 +368,61 @@ def test_the_page_explains_the_first_steps_and_a_missing_sam(page):
     page.locator("#view").press("?")
     focused = page.evaluate("document.activeElement.id")
     assert focused == "help-title"
+
+
+def test_regions_go_to_the_objects_and_photographs_for_which_they_were_drawn(page, tmp_path):
+    late(page, "api/shape")
+    name(page, "mug")
+    draw_polygon(page, (1, 1), (15, 1), (15, 20), (1, 20))
+    page.locator("#view").press("n")
+    name(page, "book")
+    draw_polygon(page, (22, 2), (36, 2), (36, 20))
+    draw_polygon(page, (22, 4), (24, 20), (30, 20))  # more of the book
+    page.keyboard.press("]")
+    saved(page)
+    mug, book = kept(tmp_path)
+    assert (mug.text, book.text) == ("mug", "book")
+    assert mug.mask(SIZE)[:, :16].sum() == mug.mask(SIZE).sum() == 15 * 20
+    assert book.mask(SIZE)[4, 35] and book.mask(SIZE)[19, 25] and not book.mask(SIZE)[:, :20].any()
+    assert page.url.endswith("view=1") and things(page) == []
+
+
+def test_corners_moved_one_after_the_other_are_both_kept(page, tmp_path):
+    draw_mug(page)
+    late(page, "api/shape")
+    page.locator("#view").press("v")
+    drag(page, (15, 1), (20, 1))
+    drag(page, (15, 20), (20, 20))
+    page.keyboard.press("]")
+    saved(page)
+    (mug,) = kept(tmp_path)
+    assert mug.mask(SIZE)[1:20, 17:20].all()
+
+
+def test_late_proposals_are_not_those_of_the_next_photograph(page, tmp_path):
+    late(page, "api/at")
+    page.locator("#view").press("x")
+    page.mouse.click(*place(page, 8, 8))
+    page.keyboard.press("]")
+    saved(page)
+    assert not page.get_by_role("region", name="Proposals at this pixel").is_visible()
+    assert page.locator("#status").inner_text() == "001.png"
+
+
+def test_a_change_that_could_not_be_saved_is_shown_and_saved_with_the_next_one(page, opened, tmp_path):
+    opened.expected.append("507")
+    full = {"status": 507, "content_type": "application/json", "body": '{"error": "the disk is full"}'}
+    page.route("**/api/labels/0*", lambda route: route.fulfill(**full))
+    name(page, "mug")
+    draw_polygon(page, (1, 1), (15, 1), (15, 20), (1, 20))
+    page.get_by_text("Not saved: the next change is saved with this one.").wait_for(state="attached")
+    assert page.locator("body").get_attribute("data-saved") == "false"
+    page.unroute("**/api/labels/0*")
+    page.locator("#view").press("]")
+    page.locator("#view").press("n")
+    draw_book(page)
+    page.get_by_text("Saved in").wait_for(state="attached")
+    assert [label.text for view in ("000.png", "001.png") for label in kept(tmp_path, view)] == [
+        "mug",
+        "book",
+    ]

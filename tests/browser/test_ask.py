@@ -9,6 +9,7 @@ from PIL import Image
 
 from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.images import write_png
+from hilsplat.query.names import read_names
 from tests.browser.conftest import (
     HEIGHT,
     WIDTH,
@@ -19,6 +20,7 @@ from tests.browser.conftest import (
     choose_row,
     drawn,
     keep,
+    late,
     on_page,
     pixels,
     save,
@@ -341,3 +343,37 @@ def test_a_tree_of_70000_nodes_looks_like_a_small_one(opened, served, own_desk, 
     np.testing.assert_array_equal(many, few)
     assert (items, own_items) == (702, 5)  # parts of a folded whole are not made
     assert (node, below) == (own_node + 70_000, own_below + 70_000)
+
+
+def test_late_replies_do_not_undo_what_was_done_meanwhile(served, own_desk):
+    page = served(own_desk)
+    for path in ("api/pick", "api/names"):
+        late(page, path)
+    name = page.get_by_role("textbox", name="Name")
+    for node, text in ((0, "frog"), (1, "hat")):
+        choose_row(page, node)
+        name.fill(text)
+        page.keyboard.press("Enter")
+    ((x, y),) = on_page(page, (6, 6, 0))
+    page.mouse.click(x, y)
+    choose_row(page, 3)
+    page.get_by_text("Named “hat”").wait_for()
+    page.wait_for_timeout(900)
+    names = read_names(own_desk, own_desk / "default/semantic_tree").of_node
+    assert names == {0: "frog", 1: "hat"}
+    assert page.locator("[role=treeitem][aria-selected=true]").get_attribute("data-node") == "3"
+
+
+def test_the_field_of_an_earlier_query_is_not_painted(opened, desk_address):
+    page = opened(desk_address)
+    held = []
+    page.route("**/api/field**", lambda route: route.continue_() if held else held.append(route))
+    ask_and_wait(page, "mug")
+    page.locator("#colour").select_option("field")
+    until(page, lambda: held)
+    ask(page, "book")
+    field = "hilsplat.painted()[0].style.field?.text"
+    until(page, lambda: page.evaluate(field) == "book")
+    held[0].continue_()
+    page.wait_for_timeout(500)
+    assert page.evaluate(field) == "book"

@@ -12,19 +12,9 @@ from plyfile import PlyData
 from hilsplat.splat.ply import load_ply
 from hilsplat.viewer.frames import within
 from hilsplat.viewer.wire import WireCamera
-from tests.browser.conftest import ask_and_wait, keep, on_page, phone_fits, save, until, wire_camera
+from tests.browser.conftest import ask_and_wait, keep, late, on_page, phone_fits, save, until, wire_camera
 from tests.unit.artifact_changes import loosen
 from tests.unit.splat.spz_reader import decoded
-
-# What is found in a region arrives late.
-LATE = """
-const asked = window.fetch;
-window.fetch = async (address, ...more) => {
-  if (`${address}`.includes("api/within")) await new Promise((done) => setTimeout(done, 700));
-  return asked(address, ...more);
-};
-null  // not a function, which would be called
-"""
 
 
 def edit(page) -> None:
@@ -193,7 +183,7 @@ def test_loose_gaussians_are_selected_and_removed(own_desk, served):
 
 def test_what_is_done_while_a_selection_is_on_its_way_acts_on_it(opened, desk_address, tmp_path):
     page = opened(desk_address)
-    page.evaluate(LATE)
+    late(page, "api/within")
     edit(page)
     use(page, "box")
     drag(page, (21.5, 16.5), (29.5, 20.5))

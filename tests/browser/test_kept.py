@@ -8,7 +8,7 @@ import av
 import pytest
 from plyfile import PlyData
 
-from tests.browser.conftest import answers, ask, ask_and_wait, chips, drawn, keep, pixels, save, until
+from tests.browser.conftest import answers, ask, ask_and_wait, chips, drawn, keep, late, pixels, save, until
 
 
 def greenish(page) -> float:
@@ -31,6 +31,17 @@ def test_kept_queries_have_colours_and_can_be_hidden_and_dropped(opened, desk_ad
     assert page.get_by_role("button", name="Show book").get_attribute("aria-pressed") == "false"
     until(page, lambda: greenish(page) < 0.005)
     page.get_by_role("button", name="Remove book").click()
+    assert chips(page).count() == 1
+
+
+def test_kept_queries_can_be_used_while_they_are_sent_again(opened, desk_address):
+    page = opened(desk_address)
+    keep(page, "book")
+    late(page, "api/query")
+    page.get_by_label("Answers by").select_option("default|field")
+    page.get_by_role("button", name="Show book").click()
+    assert page.get_by_role("button", name="Show book").get_attribute("aria-pressed") == "false"
+    page.wait_for_timeout(900)
     assert chips(page).count() == 1
 
 

@@ -1,6 +1,6 @@
 """A language scene assembled from parts: functions return the weights of views and the vectors of texts."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,11 +29,11 @@ class GivenViews(SceneViews):
 
 
 class GivenClip(ClipModel):
-    def __init__(self, embed: Callable[[list[str]], np.ndarray], world_only: bool = False) -> None:
+    def __init__(self, embed: Callable[[Sequence[str]], np.ndarray], world_only: bool = False) -> None:
         self.embed = embed
         self.model: Any = SimpleNamespace(config={"world_only": world_only}, folder=Path("models/clip-tiny"))
 
-    def embed_texts(self, texts: list[str]) -> np.ndarray:
+    def embed_texts(self, texts: Sequence[str]) -> np.ndarray:
         return self.embed(texts)
 
     def unknown_words(self, text: str) -> list[str]:
@@ -45,7 +45,7 @@ def assembled(
     gaussians: Gaussians,
     tree: SemanticTree,
     weights: Callable[[str], sp.csr_matrix],
-    embed: Callable[[list[str]], np.ndarray],
+    embed: Callable[[Sequence[str]], np.ndarray],
     field: tuple[LanguageField, Code] | None = None,
     settings: EvaluateSettings | None = None,
     threads: int = 1,

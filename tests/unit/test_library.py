@@ -1,10 +1,12 @@
 """The pipeline from Python on the desk: the same bytes as the stages, no files left, errors that help."""
 
 import logging
+import math
 import os
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -265,3 +267,51 @@ def test_a_script_without_a_guard_is_not_run_again_by_child_processes(desk, tmp_
     # a remaining child would delay the end of a notebook's kernel, which is killed before it can clean up
     assert done.stdout == "once [1, 2] photos/kept\nchildren: \n", done.stderr
     assert read_provenance(tmp_path / "kept/scene").command == ()  # not that of the script
+
+
+def test_arrays_and_arguments_that_do_not_fit_are_refused(scene, masks, linked):
+    """Compiled loops would read beyond the end of a short array, and indices wrap around."""
+    gaussians, camera = linked.gaussians, linked.camera("000.png")
+    red = np.zeros((4, 6, 3), np.uint8)
+    count, pixels = len(gaussians), math.prod(camera.size_hw)
+    calls = {
+        r"array quats (.|\n)*of shape \(9, 4\)": lambda: replace(gaussians, quats=gaussians.quats[:9]),
+        "array means (.|\n)*float64": lambda: replace(gaussians, means=gaussians.means.astype(float)),
+        "K = 1, 4, 9 or 16": lambda: replace(gaussians, sh=np.zeros((count, 2, 3), np.float32)),
+        "focal lengths above 0": lambda: replace(camera, K=camera.K * [[-1], [1], [1]]),
+        "rigid poses": lambda: replace(camera, cam_from_world=camera.cam_from_world * 2),
+        "finite numbers": lambda: replace(camera, K=camera.K * np.nan),
+        "array cam_from_world": lambda: replace(camera, cam_from_world=camera.cam_from_world[:3]),
+        "size .0, 9.": lambda: camera.scaled((0, 9)),
+        "whole px": lambda: camera.scaled((24.0, 36.5)),
+        "is not a camera": lambda: hilsplat.render(gaussians, "000.png"),
+        f"features (.|\n)*{count}, D": lambda: hilsplat.render(gaussians, camera, np.ones((5, 2))),
+        "split 'tset' is unknown": lambda: scene.views("tset"),
+        "of no views": lambda: hilsplat.link(scene, gaussians, hilsplat.SceneMasks({}, masks.origin)),
+        "found +dict of 000.png": lambda: hilsplat.link(scene, gaussians, dict(masks)),
+        "node 99 does not exist": lambda: linked.views.node_masks("000.png", [0, 99]),
+        "node -1 does not": lambda: linked.views.gaussians_of([-1]),
+        "node 0.5 does not": lambda: linked.like_node(0.5),
+        "uint8(.|\n)*float64": lambda: linked.like_picture(red / 255),
+        r"\(4, 6, 4\)": lambda: linked.like_picture(np.dstack([red, red[..., 0]])),
+        r"\(0, 6, 3\)": lambda: linked.like_picture(red[:0]),
+        "'mug' is not a list": lambda: linked.node_cosine("mug", "000.png", np.array([0])),
+        "'mug' is": lambda: linked.node_relevancy_map("mug", "000.png"),
+        r"\[\] is not a list": lambda: linked.node_relevancy_map([], "000.png"),
+        "pixel of 000.png: -1": lambda: linked.node_cosine(["mug"], "000.png", np.array([0, -1])),
+        f"000.png: {pixels} does": lambda: linked.node_cosine(["mug"], "000.png", np.array([pixels])),
+        "limit is -2": lambda: linked.query("mug", limit=-2),
+        "limit is -1": lambda: linked.like_node(0, limit=-1),
+    }
+    for message, call in calls.items():
+        with pytest.raises(HilsplatError, match=message):
+            call()
+
+
+def test_the_field_refuses_pixels_outside_the_view_and_a_text_that_is_no_list(desk):
+    field = hilsplat.open_scene(desk).field
+    with pytest.raises(SettingsError, match="-1 does not exist"):
+        field.cosine(["mug"], "000.png", np.array([-1]))
+    for call in (field.relevancy, lambda text, view: field.cosine(text, view, np.array([0]))):
+        with pytest.raises(SettingsError, match="'mug' is not a list"):
+            call("mug", "000.png")

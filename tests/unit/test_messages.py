@@ -1,14 +1,18 @@
 """Commands in messages are commands of this version, with options that they have."""
 
 import ast
+import os
 import re
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 import typer
 
 import hilsplat
-from hilsplat.cli.main import app
+from hilsplat.cli.main import app, main
 
 PACKAGE = Path(hilsplat.__file__).parent
 PROSE = {
@@ -97,3 +101,41 @@ def test_a_command_in_a_message_can_be_parsed(module, text):
         assert not word.startswith("-") or word.partition("=")[0].rstrip(".") in known, text
     after = words[words.index("--") + 1 :] if "--" in words else []
     assert {word for word in after if word.startswith("-")} <= TO_SNAKEMAKE
+
+
+def test_ctrl_c_during_an_import_ends_the_command_without_an_error(monkeypatch, caplog):
+    """Compiled modules raise an ImportError from it, and their packages another error."""
+
+    def interrupted() -> None:
+        try:
+            raise ImportError("initialization failed") from KeyboardInterrupt()
+        except ImportError as error:
+            raise RuntimeError("cannot import the C++ backend") from error
+
+    monkeypatch.setattr("hilsplat.cli.main.app", interrupted)
+    monkeypatch.setattr("hilsplat.cli.main.start_logging", lambda: None)
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 130 and not caplog.records
+
+
+EARLY = """
+import os, signal, sys
+
+class Interrupting:
+    def find_spec(self, name, *_):
+        if name == sys.argv[1]:
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupting())
+import hilsplat.cli.main
+print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)
+"""
+
+
+def test_ctrl_c_while_a_command_starts_prints_no_traceback(project):
+    environment = {**os.environ, "PYTHONPATH": str(project)}
+    for name, expected in (("hilsplat.cli.group_commands", (-signal.SIGINT, "")), ("none", (0, "True\n"))):
+        command = [sys.executable, "-c", EARLY, name]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        assert (done.returncode, done.stdout, done.stderr) == (*expected, "")

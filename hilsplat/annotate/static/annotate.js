@@ -9,14 +9,18 @@ import { attachThings, fillForm, level, LEVEL, makeStrip, markStrip, setLevel, s
 
 const UNNAMED = "unnamed", NEAR_PX = 8;
 const sheet = new Sheet(), start = new URLSearchParams(location.hash.slice(1));
-let scene, number = 0, chosen = 0, next = { text: "", level: 1, parent: null };
+// The id of the chosen object, 0 for a new one, and the settings of a new one. A choice replaces this, so that a region
+// whose reply is late still goes to the object for which it was drawn.
+let aim = { id: 0, next: { text: "", level: 1, parent: null } };
+let scene, number = 0;
 let draft = [], stroke = null, cross = null, offer = null, working = Promise.resolve();
 let clicks = [], frame = null, found = [], corner = null;   // of the segment tool; `corner` is the corner that is being moved
 
 function tell(text, error = false) { $("status").textContent = text; $("status").classList.toggle("error", error); }
 const store = new Store({ told: tell, changed: refresh });
 const labels = () => store.labels(number);
-const own = () => labels().find((label) => label.id === chosen) ?? null;
+const labelOf = (view, id) => store.labels(view).find((label) => label.id === id) ?? null;
+const own = () => labelOf(number, aim.id);
 const tool = () => document.querySelector("[name=tool]:checked").value;
 const radius = () => Number($("radius").value);
 // Requests run one after the other, because each region depends on the previous one.
@@ -34,27 +38,29 @@ tellUnsaved(() => store.unsaved || waiting ? "Your last changes are not saved ye
 
 function draw() {
   const brushes = tool() === "brush" || tool() === "erase";
-  sheet.hand({ offer, draft, stroke, clicks, frame, corners: tool() === "choose" && own() ? corner?.rings ?? own().polygons : [], cross: tool() === "choose" ? null : cross, brush: brushes ? radius() : 0 });
+  sheet.hand({ offer, draft, stroke, clicks, frame, corners: tool() === "choose" ? ringsShown() : [], cross: tool() === "choose" ? null : cross, brush: brushes ? radius() : 0 });
 }
 
 function refresh() {
   if (!scene || !store.views) return;
-  if (!own()) chosen = 0;
-  fillForm(labels(), own(), next);
-  showThings(labels(), chosen, choose);
+  if (aim.id && !own()) aimAt(0);
+  fillForm(labels(), own(), aim.next);
+  showThings(labels(), aim.id, choose);
   showTexts(store.things);
   markStrip(scene.views, store, number);
   $("undo").disabled = !store.past.length;
   $("redo").disabled = !store.future.length;
   $("carry").disabled = !scene.carries;
-  $("saved").textContent = store.unsaved ? "Saving…" : `Saved in ${scene.folder}.`;
+  $("saved").textContent = store.refused.size ? "Not saved: the next change is saved with this one." : store.unsaved ? "Saving…" : `Saved in ${scene.folder}.`;
   markSaved();
-  sheet.things(labels(), chosen);
+  sheet.things(labels(), aim.id);
   draw();
 }
 
-function choose(id) {
-  chosen = id;
+function aimAt(id, next = {}) { aim = { id, next: { ...aim.next, ...next } }; }
+
+function choose(id, next = {}) {
+  aimAt(id, next);
   drop();
   refresh();
 }
@@ -68,6 +74,7 @@ function drop() {
 
 function stand(to) {
   number = (to + scene.views.length) % scene.views.length;
+  aimAt(aim.id);
   drop();
   sheet.show(number, scene.views[number].size_hw);
   $("picture").alt = scene.views[number].name;
@@ -87,38 +94,39 @@ function setTool(name) {
 // -- regions ---------------------------------------------------------------------------------------
 
 const edited = (label) => label.origin === "drawn" ? "drawn" : "edited";
-const ringsOf = (id) => labels().find((label) => label.id === id)?.polygons ?? null;
+const ringsOf = (view, id) => labelOf(view, id)?.polygons ?? null;
 
 // An object has the same id in all photographs.
-function idFor(thing) {
+function idFor(view, thing) {
   const same = (label) => label.text.toLowerCase() === thing.text.toLowerCase() && label.level === thing.level && label.parent === thing.parent;
-  for (const [id, label] of store.things) if (thing.text !== UNNAMED && same(label) && !store.has(number, id)) return id;
+  for (const [id, label] of store.things) if (thing.text !== UNNAMED && same(label) && !store.has(view, id)) return id;
   return Math.max(0, ...store.things.keys()) + 1;
 }
 
-function add(thing) {
-  const label = { ...thing, id: idFor(thing) };
-  chosen = label.id;
-  next = { ...next, text: "" };   // the next object has another text
-  store.change([[number, [...labels(), label]]]);
-  if (label.text === UNNAMED) { $("text").focus(); $("text").select(); }
+// `mine` is what `aim` was when the object was drawn.
+function add(view, thing, mine) {
+  const label = { ...thing, id: idFor(view, thing) }, isCurrent = mine === aim;
+  Object.assign(mine, { id: label.id, next: { ...mine.next, text: "" } });   // the next object has another text
+  store.change([[view, [...store.labels(view), label]]]);
+  if (isCurrent && label.text === UNNAMED) { $("text").focus(); $("text").select(); }
 }
 
-async function region(ring, brush) {
-  const label = own(), view = number, parent = label ? label.parent : next.parent;
+const reshaped = (view, id, polygons) => store.change([[view, store.labels(view).map((each) => each.id === id ? { ...each, polygons, origin: edited(each) } : each)]]);
+
+async function region(ring, brush, view, mine) {
+  const label = labelOf(view, mine.id), parent = label ? label.parent : mine.next.parent;
   if (!label && brush?.erase) { tell("Select the thing to erase from.", true); return; }
-  const made = await ask("/api/shape", { view, add: [...(label?.polygons ?? []), ...(ring ? [ring] : [])], stroke: brush, inside: parent ? ringsOf(parent) : null });
-  if (view !== number) return;
+  const made = await ask("/api/shape", { view, add: [...(label?.polygons ?? []), ...(ring ? [ring] : [])], stroke: brush, inside: parent ? ringsOf(view, parent) : null });
   if (!made.polygons.length) {
-    if (label) remove(); else tell("The shape has no pixel inside the photograph and its parent.", true);
-  } else if (label) store.change([[view, labels().map((each) => each.id === label.id ? { ...each, polygons: made.polygons, origin: edited(each) } : each)]]);
-  else add({ ...next, text: next.text || UNNAMED, polygons: made.polygons, origin: "drawn" });
+    if (label) remove(view, label.id); else tell("The shape has no pixel inside the photograph and its parent.", true);
+  } else if (label) reshaped(view, label.id, made.polygons);
+  else add(view, { ...mine.next, text: mine.next.text || UNNAMED, polygons: made.polygons, origin: "drawn" }, mine);
 }
 
 function closePolygon() {
-  const ring = draft.filter(([x, y], k) => !k || x !== draft[k - 1][0] || y !== draft[k - 1][1]);
+  const view = number, mine = aim, ring = draft.filter(([x, y], k) => !k || x !== draft[k - 1][0] || y !== draft[k - 1][1]);
   draft = [];
-  if (ring.length > 2) soon(() => region(ring, null));
+  if (ring.length > 2) soon(() => region(ring, null, view, mine));
   draw();
 }
 
@@ -129,9 +137,11 @@ function listOffers(found, rest = null) {
     each.text ? `${each.text}, ${LEVEL(each)} (${each.what})` : `${LEVEL(each)} (${each.what})`))));
 }
 
-async function propose([x, y]) {
+async function propose([x, y], view) {
+  if (view !== number) return;
   tell("Looking for outlines…");
-  const found = await ask("/api/at", { view: number, x, y });
+  const found = await ask("/api/at", { view, x, y });
+  if (view !== number) return;
   listOffers(found);
   tell(found.length ? "Choose an outline; it stays a proposal until you accept or correct it." : `There is no ${scene.proposes.slice(0, -1)} at this pixel.`);
   $("offers").querySelector("button")?.focus();
@@ -162,8 +172,11 @@ function clicked(at, inside) {
 
 // -- corners of the chosen outline -----------------------------------------------------------------
 
+// A corner moved before is part of the outline, although its reply may be late.
+const ringsShown = () => own() ? corner?.rings ?? own().polygons : [];
+
 function cornerAt(at) {
-  const rings = own()?.polygons ?? [];
+  const rings = ringsShown();
   let best = null, least = NEAR_PX;
   rings.forEach((ring, r) => ring.forEach(([x, y], k) => {
     const away = Math.hypot(x - at[0], y - at[1]) * sheet.scale;
@@ -174,18 +187,16 @@ function cornerAt(at) {
 
 // The server computes the new outline and cuts it to the parent.
 function reshape(rings) {
-  const label = own(), view = number;
+  const { id, parent } = own(), view = number, moved = corner;
   soon(async () => {
-    const made = await ask("/api/shape", { view, add: rings, stroke: null, inside: label.parent ? ringsOf(label.parent) : null });
-    if (view === number && made.polygons.length) store.change([[view, labels().map((each) => each.id === label.id ? { ...each, polygons: made.polygons, origin: edited(each) } : each)]]);
-    corner = null;
-    draw();
-  });
+    const made = await ask("/api/shape", { view, add: rings, stroke: null, inside: parent ? ringsOf(view, parent) : null });
+    if (made.polygons.length) reshaped(view, id, made.polygons);
+  }).then(() => { if (corner === moved) corner = null; draw(); });
 }
 
 // Pressing on a side of the outline adds a corner there.
 function sideAt(at) {
-  const rings = own()?.polygons ?? [];
+  const rings = ringsShown();
   let best = null, least = NEAR_PX;
   rings.forEach((ring, r) => ring.forEach(([x, y], k) => {
     const [u, v] = ring[(k + 1) % ring.length], length = Math.hypot(u - x, v - y) || 1, t = Math.max(0, Math.min(1, ((at[0] - x) * (u - x) + (at[1] - y) * (v - y)) / length ** 2));
@@ -198,27 +209,29 @@ function sideAt(at) {
 function take(each) {
   const above = own(), parent = above?.level === each.level - 1 ? above.id : null;
   drop();
-  add({ text: each.text || next.text || UNNAMED, level: each.level, parent, polygons: each.polygons, origin: "proposed" });
+  add(number, { text: each.text || aim.next.text || UNNAMED, level: each.level, parent, polygons: each.polygons, origin: "proposed" }, aim);
   const orphan = above && above.level < each.level && !parent;
   tell(orphan ? `Proposed without a parent: the parent of a ${LEVEL(each)} is a ${LEVELS[each.level - 2]}, but ${above.text} is a ${LEVEL(above)}.` : "Proposed: accept (A), correct or delete it.");
 }
 
-async function carry() {
+async function carry(view) {
   tell("Transferring things from other photographs…");
   await store.saving;
-  const view = number, ids = [...store.things.keys()].filter((id) => !store.has(view, id));
+  const ids = [...store.things.keys()].filter((id) => !store.has(view, id));
   if (!ids.length) { tell("All things from other photographs are already in this one.", true); return; }
-  const found = await ask("/api/carry", { ids, view });
+  const found = (await ask("/api/carry", { ids, view })).filter(({ id }) => !store.has(view, id));   // one may be drawn by now
   if (found.length) store.change([[view, [...store.labels(view), ...found]]]);
   tell(found.length ? `${found.length} proposed: accept (A), correct or delete each.` : "No accepted thing from another photograph is visible here.");
 }
+
+const transfer = (view = number) => soon(() => carry(view));
 
 // -- things ----------------------------------------------------------------------------------------
 
 // A change of an object's text, level or parent applies to all photographs.
 function edit(patch) {
-  if (!own()) { Object.assign(next, patch); refresh(); return; }
-  const id = chosen, after = [];
+  if (!own()) { Object.assign(aim.next, patch); refresh(); return; }
+  const { id } = aim, after = [];
   store.views.forEach((view, k) => {
     if (!store.has(k, id)) return;
     const mine = { ...patch };
@@ -243,17 +256,16 @@ function accept() {
 
 function step(way) { tell(""); store[way](); }   // the last message no longer applies
 
-function remove() {
-  const gone = new Set([chosen, ...under(labels(), chosen)]);
-  store.change([[number, labels().filter((label) => !gone.has(label.id))]]);
+function remove(view = number, id = aim.id) {
+  const gone = new Set([id, ...under(store.labels(view), id)]);
+  store.change([[view, store.labels(view).filter((label) => !gone.has(label.id))]]);
 }
 
 function fresh(child = false) {
   const above = own();
-  if (child && above && above.level < 3) next = { text: "", level: above.level + 1, parent: above.id };
-  else next = { ...next, text: "" };
-  if (!labels().some((label) => label.id === next.parent)) next.parent = null;
-  choose(0);
+  const next = { ...aim.next, text: "", ...(child && above && above.level < 3 ? { level: above.level + 1, parent: above.id } : {}) };
+  if (!labelOf(number, next.parent)) next.parent = null;
+  choose(0, next);
   $("text").focus();
 }
 
@@ -270,6 +282,7 @@ async function take_in(files) {
 
 function down(at, event) {
   $("view").focus({ preventScroll: true });
+  const view = number;
   cross = at;
   if (tool() === "choose" && corner) return;
   if (tool() === "choose") {
@@ -282,7 +295,7 @@ function down(at, event) {
     if (near) closePolygon(); else draft = [...draft, at];
   } else if (tool() === "segment") {
     if (event && !event.altKey) frame = [at, at]; else clicked(at, !event?.altKey);
-  } else if (tool() === "propose") soon(() => propose(at));
+  } else if (tool() === "propose") soon(() => propose(at, view));
   else stroke = { points: [at], radius: radius(), erase: tool() === "erase" };
   draw();
 }
@@ -305,8 +318,8 @@ function up() {
     soon(segment);
     return;
   }
-  const done = stroke;
-  if (done) soon(async () => { await region(null, done); if (stroke === done) stroke = null; draw(); });
+  const done = stroke, view = number, mine = aim;
+  if (done) soon(() => region(null, done, view, mine)).then(() => { if (stroke === done) stroke = null; draw(); });
 }
 
 // With the choosing tool, dragging the chosen outline moves a corner; dragging elsewhere moves the photograph.
@@ -322,7 +335,7 @@ attachThings(choose);
 
 function escape() {
   if (draft.length || stroke || clicks.length || frame || !$("offers-section").hidden) drop();
-  else if (chosen) choose(0);
+  else if (aim.id) choose(0);
   draw();
 }
 
@@ -331,7 +344,7 @@ document.addEventListener("keydown", (event) => {
   if (event.key === "Escape") { escape(); $("view").focus(); return; }
   const typing = event.target.closest("input:not([type=radio]):not([type=range]), select");
   const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
-  const isTyped = typing?.id === "text" && typing.value !== (own() ?? next).text;   // the browser undoes typing
+  const isTyped = typing?.id === "text" && typing.value !== (own() ?? aim.next).text;   // the browser undoes typing
   if ((event.ctrlKey || event.metaKey) && (key === "z" || key === "y") && !isTyped) { step(key === "y" || event.shiftKey ? "redo" : "undo"); event.preventDefault(); return; }
   if (typing) { if (event.key === "Enter" && event.target.id === "text") { event.target.blur(); $("view").focus(); event.preventDefault(); } return; }
   if (event.ctrlKey || event.metaKey || event.altKey) return;
@@ -340,7 +353,7 @@ document.addEventListener("keydown", (event) => {
   const keys = {
     v: () => setTool("choose"), p: () => setTool("polygon"), b: () => setTool("brush"), e: () => setTool("erase"), x: () => scene.proposes && setTool("propose"), s: () => scene.segments ? setTool("segment") : tell("Outlining clicked things needs masks of this scene made by a SAM that is installed here."),
     i: () => tool() === "segment" && cross && clicked(cross, true), o: () => tool() === "segment" && cross && clicked(cross, false),
-    n: () => fresh(), j: () => fresh(true), t: () => { $("text").focus(); $("text").select(); }, a: () => own()?.origin === "proposed" && accept(), c: () => scene.carries && soon(carry),
+    n: () => fresh(), j: () => fresh(true), t: () => { $("text").focus(); $("text").select(); }, a: () => own()?.origin === "proposed" && accept(), c: () => scene.carries && transfer(),
     Delete: () => own() && remove(), Backspace: () => { draft = draft.slice(0, -1); draw(); }, "[": () => stand(number - 1), "]": () => stand(number + 1),
     ",": () => resize(-1), ".": () => resize(1), "+": () => sheet.zoom(1.25), "=": () => sheet.zoom(1.25), "-": () => sheet.zoom(0.8), 0: () => sheet.fit(), "?": () => $("help").showModal(),
     1: () => pickLevel(1), 2: () => pickLevel(2), 3: () => pickLevel(3),
@@ -363,8 +376,8 @@ $("text").addEventListener("change", setText);
 for (const radio of document.querySelectorAll("[name=level]")) radio.addEventListener("change", levelChanged);
 $("parent").addEventListener("change", () => edit({ parent: Number($("parent").value) || null }));
 for (const radio of document.querySelectorAll("[name=tool]")) radio.addEventListener("change", () => setTool(tool()));
-for (const [id, work] of Object.entries({ new: () => fresh(), child: () => fresh(true), accept, delete: remove, undo: () => step("undo"), redo: () => step("redo"),
-  carry: () => soon(carry), reload: () => location.reload(), import: () => $("file").click(), "help-button": () => $("help").showModal() })) $(id).addEventListener("click", work);
+for (const [id, work] of Object.entries({ new: () => fresh(), child: () => fresh(true), accept, delete: () => remove(), undo: () => step("undo"), redo: () => step("redo"),
+  carry: () => transfer(), reload: () => location.reload(), import: () => $("file").click(), "help-button": () => $("help").showModal() })) $(id).addEventListener("click", work);
 $("file").addEventListener("change", () => { const files = [...$("file").files]; $("file").value = ""; $("save").open = false; soon(() => take_in(files)); });
 $("radius").addEventListener("input", draw);
 window.addEventListener("pagehide", () => { if (store.views) store.remember(scene.folder); });

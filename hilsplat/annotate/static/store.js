@@ -8,11 +8,13 @@ export class Store {
     this.past = [];
     this.future = [];
     this.saving = Promise.resolve();
-    this.unsaved = 0;
+    this.waiting = 0;
+    this.refused = new Set();   // photographs whose last change the server could not save
   }
 
   async load() {
     this.views = await api.labels();
+    this.refused.clear();
     this.past = [];
     this.future = [];
     this.handlers.changed();
@@ -40,6 +42,7 @@ export class Store {
     this.handlers.changed();
   }
 
+  get unsaved() { return this.waiting + this.refused.size; }
   labels(number) { return this.views[number].labels; }
   has(number, id) { return this.labels(number).some((label) => label.id === id); }
 
@@ -69,12 +72,15 @@ export class Store {
   }
 
   save(number) {
-    this.unsaved++;
-    this.saving = this.saving.then(() => this.put(number)).finally(() => { this.unsaved--; this.handlers.changed(); });
+    for (const each of new Set([number, ...this.refused])) {
+      this.waiting++;
+      this.saving = this.saving.then(() => this.put(each)).finally(() => { this.waiting--; this.handlers.changed(); });
+    }
   }
 
   async put(number) {
     await null;   // wait until the change to be saved is in the history
+    this.refused.delete(number);
     const view = this.views[number], sent = view.labels, entries = [...this.past, ...this.future];
     try {
       const kept = await api.save(number, sent, view.version);
@@ -85,6 +91,7 @@ export class Store {
       this.handlers.told(error.message, true);
       if (error.status === 422) this.takeBack(number);
       else if (error.status === 412) await this.load();
+      else this.refused.add(number);
     }
   }
 

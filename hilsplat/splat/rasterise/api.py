@@ -6,7 +6,6 @@ from scipy.sparse import csr_matrix
 
 from cpusplat import views
 from cpusplat.project import MOMENTS, pack_camera
-from hilsplat.base.errors import HilsplatError
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise.drawn import Drawn, Gradients, refuse_broken, weight_matrix
@@ -42,10 +41,8 @@ def draw(
         threads: CPU threads; the result is byte-identical for any number.
 
     Raises:
-        HilsplatError: if parameters are not finite, quaternions are zero, or the degree is above 3.
+        HilsplatError: if parameters are not finite, or quaternions are zero.
     """
-    if degree > 3:
-        raise HilsplatError(f"spherical harmonics of degree {degree} cannot be drawn", expected="at most 3")
     view = project_gaussians(gaussians, camera, degree, threads)
     channels = view.colours
     if features is not None:

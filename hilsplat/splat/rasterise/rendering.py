@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32
 
+from hilsplat.base.errors import SettingsError
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.rasterise.api import draw
@@ -48,8 +49,19 @@ def render(
         threads: does not affect the result.
 
     Raises:
+        SettingsError: `camera` is not a camera, or there are not as many features as Gaussians.
         HilsplatError: Gaussians have non-finite parameters.
     """
+    if not isinstance(camera, Camera):
+        raise SettingsError(
+            f"{camera!r} is not a camera", fix="pass scene.cameras[...], or use scene.render(view)"
+        )
+    if features is not None and len(features) != len(gaussians):
+        raise SettingsError(
+            "features do not match the Gaussians",
+            expected=f"({len(gaussians)}, D)",
+            found=np.shape(features),
+        )
     z = gaussians.means @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
     channels = z[:, None] if features is None else np.column_stack([z, features])
     channels = channels.astype(np.float32)

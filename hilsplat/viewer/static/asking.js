@@ -27,7 +27,7 @@ async function askAll(what, work) {
       else listAnswers();
     }
   } catch (error) { refused(error); return; }
-  await fillField(signal);
+  await fillField();
 }
 
 // Remove the previous answer, so that it isn't mistaken for the new query's answer.
@@ -52,7 +52,8 @@ export function listAnswers() {
   showAnswers(main(), panes[0].answer, acts, right && { outline: outlines.get(variantOf(right)), answer: right.answer, by: right.by.replace("|", ", ") });
 }
 
-export async function fillField(signal) {
+export async function fillField() {
+  const { signal } = aborting;   // of the last query, after which relevancy of an earlier text is of no use
   if ($("colour").value === "field" && page.asked?.text) {
     const field = { text: page.asked.text.split(">").at(-1).trim(), level: level() };
     try {

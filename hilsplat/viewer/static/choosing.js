@@ -12,7 +12,10 @@ import { failed, host, level, loadVariant, main, outlines, page, panes, tell, va
 // Actions of lists and cards of nodes; asking.js adds `like`.
 export const acts = { choose, hover: setHover, fly: () => flyTo(page.chosen), name: rename };
 
-export function choose(node) {
+let others = 0;   // choices made by other means than a click on the view
+export function choose(node) { others++; chooseNow(node); }
+
+function chooseNow(node) {
   page.chosen = node;
   page.hover = -1;
   markChosen(node);
@@ -53,7 +56,11 @@ export function tapped(x, y) {
   const at = paneAt(x);
   if (!main()) { tell("Nothing to select yet: the semantic tree is not loaded."); return; }
   if (variantOf(panes[at.k]) !== variantOf(panes[0])) { tell("This side shows a different tree. Select nodes on the left."); return; }
-  next(async () => choose(deeper(api.offline ? quickPick(at, y) : await exactPick(at, y))));
+  const before = others;
+  next(async () => {
+    const nodes = api.offline ? quickPick(at, y) : await exactPick(at, y);
+    if (others === before) chooseNow(deeper(nodes));   // a later choice stays
+  });
 }
 
 const hoverAt = latest(async (x, y) => {
@@ -69,8 +76,14 @@ const hoverAt = latest(async (x, y) => {
 let pointing = 0;
 export const pointed = (x, y) => { clearTimeout(pointing); pointing = setTimeout(() => hoverAt(x, y), page.painter?.kind === "gl" && !page.slow ? 16 : 60); };
 
-async function rename(node, name) {
-  const own = main(), names = {};
+const nextName = inOrder(failed);   // each name is sent with the version that the one before it made
+function rename(node, name) {
+  const variant = variantOf(panes[0]);
+  nextName(() => renameNow(variant, node, name));
+}
+
+async function renameNow(variant, node, name) {
+  const own = outlines.get(variant), names = {};
   own.nodes.forEach((each, row) => { if (each.name) names[row] = each.name; });
   names[node] = name;
   try {
@@ -82,9 +95,9 @@ async function rename(node, name) {
     for (const pane of panes) for (const hit of pane.answer?.hits ?? []) if (hit.node === node) hit.name = name;
     page.outline.renamed(node);
     tell(name ? `Named “${name}”. Queries match this name, here and with hilsplat query.` : "The name was removed.");
-    choose(node);   // after showing the message, because it makes the outline smaller
+    if (page.chosen === node) chooseNow(node);   // after showing the message, because it makes the outline smaller
     acts.list();
   } catch (error) {
-    if (error.status === 412) { await loadVariant(own.variant, true); page.outline.show(main()); choose(node); tell("The names were changed elsewhere and have been reloaded. Name the node again.", true); } else failed(error);
+    if (error.status === 412) { await loadVariant(own.variant, true); page.outline.show(main()); choose(page.chosen); tell("The names were changed elsewhere and have been reloaded. Name the node again.", true); } else failed(error);
   }
 }

@@ -14,9 +14,11 @@ const MOST = 12;
 export const asking = (text) => ({ text, level: level(), ...(threshold() === null ? {} : { threshold: threshold() }),
   ...($("here").checked && page.camera.view >= 0 ? { view: page.camera.view } : {}) });
 
+// Until all answers have arrived, the query keeps those that it had.
 async function answered(query) {
-  query.answers = [];
-  for (const pane of panes) query.answers.push(await api.query({ variant: variantOf(pane), answerer: answererOf(pane), ...query.asked }));
+  const answers = [];
+  for (const pane of panes) answers.push(await api.query({ variant: variantOf(pane), answerer: answererOf(pane), ...query.asked }));
+  query.answers = answers;
 }
 
 // Return the colour used by the fewest kept queries.
@@ -44,11 +46,11 @@ export async function keepFromStart() {
 }
 
 // Send all kept queries again after a change of answerer or tree.
-export async function askKeptAgain() {
+export const askKeptAgain = () => next(async () => {
   if (!page.kept.length) return;
   for (const query of page.kept) await answered(query);
   showKept();
-}
+});
 
 // Return the nodes of all shown queries with scores and doubts, for saved files.
 export function groups() {

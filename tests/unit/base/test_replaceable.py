@@ -5,11 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilsplat.base.artifacts import provenance_path
+from hilsplat.base.artifacts import provenance_path, write_index
 from hilsplat.base.atomic import lock_path
 from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.base.images import write_png
 from hilsplat.base.ownership import SOFTWARE, require_beginning, require_own_picture, require_replaceable
+from hilsplat.cli.common import require_new_folder
 from hilsplat.cli.main import app
 from hilsplat.stage import PathIn, PathOut, Registry
 from tests.unit.artifact_changes import write_record
@@ -170,3 +171,23 @@ def test_a_pdf_beside_a_picture_is_the_users_only_before_the_first_run(tmp_path)
     sweep(out)
     out.unlink()
     sweep(out)
+
+
+@pytest.mark.parametrize(
+    "check",
+    [
+        lambda out: require_replaceable([out], "masks", []),
+        require_own_picture,
+        lambda out: require_beginning(out, "a,b"),
+        require_new_folder,
+    ],
+)
+def test_no_output_is_in_an_artifact(tmp_path, check):
+    """Its digest would change, and the next run would compute it again."""
+    write_index(tmp_path / "masks", {})
+    (tmp_path / "users").mkdir()
+    (tmp_path / "users/index.json").write_text("{}")  # of another program
+    check(tmp_path / "users/new.png")
+    for out in (tmp_path / "masks/new.png", tmp_path / "masks/more/new.png"):
+        with pytest.raises(ArtifactError, match=r"is in the artifact .*masks, which would"):
+            check(out)

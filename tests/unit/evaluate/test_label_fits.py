@@ -1,11 +1,15 @@
 """Masks and nodes against annotated regions, counted by hand on the desk, where one Gaussian is one pixel."""
 
 import csv
+from pathlib import Path
 
 import numpy as np
+import pytest
 
 from hilsplat.annotate.labels import Label, label_path, traced, write_labels
+from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import Level
+from hilsplat.cli.main import app
 from hilsplat.evaluate.label_fits import Fits, add_view, masks_of_view, run_label_fits
 from hilsplat.query.names import NO_FILE
 from tests.unit.evaluate.builders import box, masks_of, region_of
@@ -63,3 +67,12 @@ def test_a_finished_scene_is_measured_by_level_and_split(desk_project, tmp_path)
     assert all(float(row["best_iou"]) > 0.7 and float(row["recall"]) == 1 for row in rows)
     assert all(float(row["any_level_iou"]) >= float(row["best_iou"]) for row in rows)
     assert all(float(row["containment"]) > 0.9 for row in rows if row["level"] == "part")
+
+
+def test_a_wrong_scene_or_variant_is_refused_and_makes_no_folder(own_desk, monkeypatch):
+    monkeypatch.chdir(own_desk.parents[2])
+    before = sorted(Path().rglob("*"))
+    for words in (["photos/dask"], ["../outside"], ["photos/desk", "--variant", "defalt"]):
+        with pytest.raises(ArtifactError):
+            app(["datasets", "fits", *words], standalone_mode=False)
+    assert sorted(Path().rglob("*")) == before and not Path("outside").exists()

@@ -166,7 +166,14 @@ CUP = box((0, 4), (0, 8), SIZE)
         ({"a": {"cpu": CUP}}, {"a": {"cup": CUP}}, "lerf/langsplat", "rename it to 'cup'"),
         ({"a": {"cup": CUP[1:]}}, {"a": {"cup": CUP}}, "lerf/langsplat", "expected  32 x 48"),
         ({"a": {"cup": CUP * 255}}, {"a": {"cup": CUP}}, "lerf/langsplat", r"a: cup cannot .*(.|\n)*int64"),
-        ({"a": {"cup": np.full((3, *SIZE), np.nan)}}, {"a": {"cup": CUP}}, "lerf/langsplat", "without NaN"),
+        (
+            {"a": {"cup": np.full((3, *SIZE), np.nan)}},
+            {"a": {"cup": CUP}},
+            "lerf/langsplat",
+            "finite relevancy",
+        ),
+        ({"a": {"cup": np.full((3, *SIZE), np.inf)}}, {"a": {"cup": CUP}}, "lerf/langsplat", "finite"),
+        ({"a": {"cup": np.full((1, *SIZE), np.inf)}}, {"a": {"cup": CUP}}, "3d-ovs/argmax", "finite"),
         (
             {"a": {"cup": CUP * np.ones((3, 1, 1))}},
             {"a": {"cup": CUP}},
@@ -182,6 +189,18 @@ CUP = box((0, 4), (0, 8), SIZE)
         ({"a": {}}, {"a": {"a > b > c > d": CUP}}, "hierarchy/level-given", "more than 3 levels"),
         (np.zeros(3, int), np.zeros(4, int), "replica/opennerf", r"same points(.|\n)*\(3,\) int64, \(4,\)"),
         ((np.ones((2, 4)), [1], [0.5]), ([1] * 4, [1] * 4), "scannet200/instances", r"masks \(M, P\) bool"),
+        (
+            (np.ones((2, 4), int), [1] * 2, [0.5] * 2),
+            ([1] * 4, [1] * 4),
+            "scannet200/instances",
+            "M, P. bool",
+        ),
+        (
+            (CUP[:2], [1] * 2, [0.5, np.nan]),
+            ([1] * 48, [1] * 48),
+            "scannet200/instances",
+            "finite confidences",
+        ),
         ({}, {}, "lerf/langplat", "is unknown"),
     ],
 )
