@@ -6,6 +6,7 @@ before the timing, because the time to embed a text depends on the model.
 """
 
 import time
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -100,7 +101,7 @@ def open_scene(code_name: str, threads: int = 1) -> LanguageScene:
     )
     weights = pixel_weights(gaussians, camera, min_weight=1 / 255)
 
-    def encode(texts: list[str]) -> np.ndarray:
+    def encode(texts: Sequence[str]) -> np.ndarray:
         return unit(np.stack([np.random.default_rng(len(t)).normal(size=CHANNELS) for t in texts]) + kinds[7])
 
     field = LanguageField(features, "", ""), code
