@@ -65,10 +65,15 @@ def draw_mug(page) -> None:
 
 
 def draw_book(page) -> None:
+    draw_book_unsaved(page)
+    saved(page)
+
+
+def draw_book_unsaved(page) -> None:
     page.locator("#view").press("Escape")
     page.locator("#view").press("n")
     name(page, "book")
-    polygon(page, (22, 2), (36, 2), (36, 20))
+    draw_polygon(page, (22, 2), (36, 2), (36, 20))
 
 
 def drag(page, start: tuple[int, int], *path: tuple[int, int]) -> None:
@@ -200,6 +205,28 @@ def test_concurrent_changes_are_not_overwritten(page, opened, tmp_path):
     page.get_by_text("have changed since they were read").wait_for()
     page.get_by_role("treeitem", name="cup, whole").wait_for()
     assert kept(tmp_path) == theirs and things(page) == ["cup, whole"]
+
+
+def test_unsaved_changes_stay_when_another_photograph_was_changed_elsewhere(page, opened, tmp_path):
+    opened.expected += ["412 (Precondition Failed)", "507"]
+    draw_mug(page)
+    full = {"status": 507, "content_type": "application/json", "body": '{"error": "the disk is full"}'}
+    page.route("**/api/labels/1*", lambda route: route.fulfill(**full))
+    page.locator("#view").press("]")
+    page.locator("#view").press("n")
+    name(page, "cup")
+    draw_polygon(page, (1, 1), (15, 1), (15, 20), (1, 20))
+    page.get_by_text("Not saved: the next change is saved with this one.").wait_for(state="attached")
+    path = label_path(tmp_path / "annotated/photos/desk", "000.png")
+    write_labels(path, "000.png", SIZE, [], version_of(path))
+    page.locator("#view").press("[")
+    draw_book_unsaved(page)
+    page.get_by_text("have changed since they were read").wait_for()
+    page.unroute("**/api/labels/1*")
+    page.locator("#view").press("]")
+    page.get_by_role("treeitem", name="cup, whole").wait_for()
+    draw_book(page)
+    assert sorted(label.text for label in kept(tmp_path, "001.png")) == ["book", "cup"]
 
 
 def test_files_are_exported_and_imported_again(page, tmp_path):

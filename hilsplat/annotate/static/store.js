@@ -9,12 +9,14 @@ export class Store {
     this.future = [];
     this.saving = Promise.resolve();
     this.waiting = 0;
+    this.queued = new Set();    // photographs with a change that has not been sent
     this.refused = new Set();   // photographs whose last change the server could not save
   }
 
-  async load() {
-    this.views = await api.labels();
-    this.refused.clear();
+  // Read the annotations of all photographs; unsaved ones stay, except those of a photograph that another program has changed.
+  async load(changed = -1) {
+    const before = this.views, unsaved = (number) => number !== changed && (this.refused.has(number) || this.queued.has(number));
+    this.views = (await api.labels()).map((view, number) => unsaved(number) ? before[number] : view);
     this.past = [];
     this.future = [];
     this.handlers.changed();
@@ -74,6 +76,7 @@ export class Store {
   save(number) {
     for (const each of new Set([number, ...this.refused])) {
       this.waiting++;
+      this.queued.add(each);
       this.saving = this.saving.then(() => this.put(each)).finally(() => { this.waiting--; this.handlers.changed(); });
     }
   }
@@ -81,6 +84,7 @@ export class Store {
   async put(number) {
     await null;   // wait until the change to be saved is in the history
     this.refused.delete(number);
+    this.queued.delete(number);
     const view = this.views[number], sent = view.labels, entries = [...this.past, ...this.future];
     try {
       const kept = await api.save(number, sent, view.version);
@@ -90,7 +94,7 @@ export class Store {
     } catch (error) {
       this.handlers.told(error.message, true);
       if (error.status === 422) this.takeBack(number);
-      else if (error.status === 412) await this.load();
+      else if (error.status === 412) await this.load(number);
       else this.refused.add(number);
     }
   }
@@ -98,7 +102,7 @@ export class Store {
   // The server refused a change: undo it and all later ones.
   takeBack(number) {
     const first = this.past.findIndex((entry) => entry.unsaved.has(number));
-    if (first < 0) return;
+    if (first < 0) { this.refused.add(number); return; }   // the history was lost since
     const refused = this.past.splice(first), touched = new Set();
     this.future = [];
     for (const { before } of refused.reverse()) for (const [other, labels] of before) { this.views[other].labels = labels; touched.add(other); }
