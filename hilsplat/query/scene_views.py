@@ -204,8 +204,9 @@ def _within(numbers: Any, count: int, what: str) -> Int64[np.ndarray, " k"]:
     """Return integers as an array; raise SettingsError if one is not in 0 to `count` - 1."""
     array = np.asarray(numbers)
     if array.size and (array.dtype.kind not in "iu" or array.min() < 0 or array.max() >= count):
-        wrong = next(each for each in array.ravel().tolist() if each not in range(count))
-        raise SettingsError(f"{what} {wrong!r} does not exist", expected=f"0 to {count - 1}")
+        listed = array.ravel().tolist()
+        wrong = next((each for each in listed if each not in range(count)), listed[0])
+        raise SettingsError(f"{what} {wrong!r} does not exist", expected=f"integers from 0 to {count - 1}")
     return array.astype(np.int64)
 
 

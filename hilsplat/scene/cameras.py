@@ -59,7 +59,7 @@ class Camera:
     def __post_init__(self) -> None:
         require_arrays(self)
         fault = _fault_of(self.cam_from_world[None], self.K[None])
-        if not all(isinstance(side, int) and 1 <= side <= MAX_SIDE_PX for side in self.size_hw):
+        if not all(isinstance(side, int | np.integer) and 1 <= side <= MAX_SIDE_PX for side in self.size_hw):
             fault = f"height and width in whole px, 1 to {MAX_SIDE_PX}"
         if fault:
             raise SceneError(

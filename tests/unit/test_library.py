@@ -300,6 +300,7 @@ def test_arrays_and_arguments_that_do_not_fit_are_refused(scene, masks, linked):
         r"\[\] is not a list": lambda: linked.node_relevancy_map([], "000.png"),
         "pixel of 000.png: -1": lambda: linked.node_cosine(["mug"], "000.png", np.array([0, -1])),
         f"000.png: {pixels} does": lambda: linked.node_cosine(["mug"], "000.png", np.array([pixels])),
+        "node True does not exist": lambda: linked.views.node_masks("000.png", [True]),
         "limit is -2": lambda: linked.query("mug", limit=-2),
         "limit is -1": lambda: linked.like_node(0, limit=-1),
     }
