@@ -132,7 +132,6 @@ def require_valid(view: KnownView) -> None:
     """Raise SceneError if the lens or pose of a view is not valid."""
     values = np.array([*view.camera.params, view.camera.width, view.camera.height], np.float64)
     focal = [view.camera.params[row] for row in view.camera.focal_length_idxs()]
-    centre = [view.camera.params[row] for row in view.camera.principal_point_idxs()]
     pose, sides = view.cam_from_source, values[-2:]
     is_size = (values[-2:] > 0).all() and (values[-2:] <= MAX_SIDE_PX).all()
     if not focal:
@@ -142,12 +141,10 @@ def require_valid(view: KnownView) -> None:
         fault, found = "lens", f"{view.camera.model_name} {values.tolist()}"
         expected = f"finite numbers, a focal length above 0, sides of 1 to {MAX_SIDE_PX} px"
     elif view.image is not None and (
-        min(focal) < MIN_FOCAL * min(sides)
-        or max(focal) > MAX_FOCAL * max(sides)
-        or np.max(np.abs(centre)) <= 1
+        min(focal) < MIN_FOCAL * min(sides) or max(focal) > MAX_FOCAL * max(sides)
     ):
         fault, found = "lens", f"{view.camera.model_name} {values.tolist()}"
-        expected = f"px: a focal length of {MIN_FOCAL} to {MAX_FOCAL} sides, and a centre that is not a share"
+        expected = f"a focal length of {MIN_FOCAL} to {MAX_FOCAL} sides, px"
     elif not np.isfinite(pose).all() or not are_rotations(pose[:3, :3], RIGID_TOLERANCE):
         fault, found = "rotation", np.array2string(pose[:3, :3], precision=4).replace("\n", "")
         expected = "a matrix that neither scales nor mirrors, or a quaternion of length 1"
