@@ -154,7 +154,6 @@ def test_what_cannot_be_applied_is_refused(head, tmp_path, imported):
         ({**SIZE, "y_fov": 400.0}, "y_fov is 400, not an angle in degrees"),
         ({**SIZE, "x_fov": 0.9}, "a focal length of 0.1 to 50 sides"),  # radians
         ({**NUMBERS, "fl_x": FX / WIDTH, "fl_y": FY / HEIGHT}, "a focal length of 0.1 to 50 sides"),
-        ({**NUMBERS, "cx": CX / WIDTH, "cy": CY / HEIGHT}, "cx and cy are shares"),
         (
             {**LENS, "cx": 4 * CX, "cy": 4 * CY},
             "another size of the image, and the size is missing",

@@ -127,6 +127,7 @@ class Interrupting:
         if name == sys.argv[1]:
             os.kill(os.getpid(), signal.SIGINT)
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores Ctrl-C
 sys.meta_path.insert(0, Interrupting())
 import hilsplat.cli.main
 print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)
