@@ -414,11 +414,10 @@ class FieldSettings(HierarchyLosses):
     """Language field: one latent per Gaussian and level."""
 
     weight_language: float = knob(1.0, "weight of the latent regression", ge=0, origin="paper: not stated")
-    start: Literal["average", "median", "random", "langsplat"] = knob(
+    start: Literal["average", "random", "langsplat"] = knob(
         "average",
-        "initial features; average, median: of the latents of masks that contain a Gaussian (the "
-        "geometric median is robust, like L1); random: in [-1, 1); langsplat: from a variant with "
-        "method.name langsplat and the same autoencoder",
+        "initial features; average: of the latents of masks that contain a Gaussian; random: in [-1, 1); "
+        "langsplat: from a variant with method.name langsplat and the same autoencoder",
     )
     ridge: float = knob(0.1, "weight of the pull towards the initial features, per visible mass", ge=0)
     min_labelled_share: float = knob(

@@ -14,9 +14,6 @@ AHEAD = 8
 PLACE = np.uint64(2**32 - 1)
 """Bits of a cell (see `transpose`) that contain its place; the higher bits contain its row."""
 
-MEDIAN_SOFTENING = 1e-4
-"""Minimum distance between a latent and the median, to avoid division by zero."""
-
 BLOCK = 2**15
 """Number of Gaussians per pass of a wide product with A: their features fit into the processor's cache."""
 
@@ -339,22 +336,6 @@ def columns_below(limit, begin, end, indices):
     while begin < end and indices[begin] < limit:
         begin += 1
     return begin
-
-
-@compiled
-def median_step(indptr, indices, data, level_index, pixels, latents, features, sums, weights):
-    for m in range(len(level_index)):
-        level = level_index[m]
-        for k in range(indptr[m], indptr[m + 1]):
-            g = indices[k]
-            square = 0.0
-            for c in range(latents.shape[1]):
-                apart = np.float64(latents[m, c]) - features[g, level, c]
-                square += apart * apart
-            weight = np.float64(pixels[m]) * data[k] / max(np.sqrt(square), MEDIAN_SOFTENING)
-            weights[g, level] += weight
-            for c in range(latents.shape[1]):
-                sums[g, level, c] += weight * latents[m, c]
 
 
 @compiled

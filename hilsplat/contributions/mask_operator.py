@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32, Int64, UInt8
 from cpusplat.lanes import WIDTH
 from cpusplat.threads import over_edges
 from hilsplat.contributions.compositing import padded
-from hilsplat.contributions.kernels import mask_means, median_step, spread_rows, wide_mask_means
+from hilsplat.contributions.kernels import mask_means, spread_rows, wide_mask_means
 
 SPREAD_PARTS = 4
 """Number of Gaussian ranges per thread; several balance the load, as the mask count per Gaussian varies."""
@@ -84,26 +84,3 @@ def lifted_average(
     sums /= np.maximum(mass, np.float32(1e-12))[:, :, None]
     sums[mass <= 0] = 0
     return sums
-
-
-def lifted_median(
-    masks: MaskOperator,
-    pixels: Float32[np.ndarray, " M"],
-    latents: Float32[np.ndarray, "M D"],
-    start: Float32[np.ndarray, "N 3 D"],
-    steps: int = 15,
-) -> Float32[np.ndarray, "N 3 D"]:
-    """Compute the geometric median of the latents averaged by `lifted_average`, with the same weights.
-
-    LangSplat's L1 loss converges to this median. Masks that merge or miss objects shift an average more. Each
-    Weiszfeld iteration, one pass over A, divides weights by the distance to the latest estimate. Fifteen
-    iterations give about three correct digits. Gaussians outside all masks keep `start`, the lifted average.
-    """
-    features = np.array(start, np.float32, order="C")
-    for _ in range(steps):
-        sums = np.zeros(features.shape, np.float64)
-        weights = np.zeros(features.shape[:2], np.float64)
-        median_step(*masks._arrays(), pixels, latents, features, sums, weights)
-        seen = weights > 0
-        features[seen] = sums[seen] / weights[seen][:, None]
-    return features

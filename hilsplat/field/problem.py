@@ -19,7 +19,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from hilsplat.contributions.mask_operator import MaskOperator, lifted_average, lifted_median
+from hilsplat.contributions.mask_operator import MaskOperator, lifted_average
 from hilsplat.contributions.quadratic import Blocks, Quadratic, form, level_mass
 from hilsplat.field.kernels import add_by_channel, add_scaled, channel_dots, pull, redirect, scaled_squares
 
@@ -46,7 +46,7 @@ class QuadraticProblem:
         pixels: Float32[np.ndarray, " M"],
         latents: Float32[np.ndarray, "M D"],
         weights: tuple[float, float, float],
-        start: str | Float32[np.ndarray, "N 3 D"] = "average",  # or "median", "random", or features
+        start: str | Float32[np.ndarray, "N 3 D"] = "average",  # or "random", or features
         seed: int = 0,
         block_gaussians: int = 2**20,
     ) -> "QuadraticProblem":
@@ -62,8 +62,6 @@ class QuadraticProblem:
             lifted = draws.uniform(-1, 1, (*mass.shape, latents.shape[1])).astype(np.float32)
         else:
             lifted = lifted_average(masks, mass, pixels, latents)
-            if start == "median":
-                lifted = lifted_median(masks, pixels, latents, lifted)
         return QuadraticProblem(masks, quadratic, mass, pixels, latents, lifted, weights, blocks)
 
     @property

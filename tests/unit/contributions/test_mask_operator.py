@@ -1,4 +1,4 @@
-"""A as an operator compared with plain loops, the two lifts by hand, and key views."""
+"""A as an operator compared with plain loops, and key views."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ import scipy.sparse as sp
 from hilsplat.contributions import key_views as module
 from hilsplat.contributions.kernels import BLOCK
 from hilsplat.contributions.key_views import key_views
-from hilsplat.contributions.mask_operator import MaskOperator, lifted_average, lifted_median
+from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.scene.scene import Scene
 from tests.unit.two_boxes_world import NUM_GAUSSIANS, two_boxes_weights
 
@@ -29,18 +29,6 @@ def test_products_have_the_bytes_of_plain_loops_on_any_number_of_threads(channel
     assert operator.means(features).tobytes() == means.tobytes()
     assert operator.means(features.astype(np.float64)) == pytest.approx(means, abs=1e-5)
     assert operator.spread(values).tobytes() == spread.tobytes()
-
-
-def test_the_median_of_a_triangle_is_its_fermat_point():
-    # an isosceles triangle: seen from (0, y), the two lower corners are 120 degrees apart, so y = 1 / sqrt(3)
-    latents = np.array([[-1, 0], [1, 0], [0, 3]], np.float32)
-    masks = MaskOperator.of(sp.csr_matrix(np.ones((3, 1), np.float32)), np.ones(3, np.uint8))
-    pixels, mass = np.ones(3, np.float32), np.array([[3, 0, 0]], np.float32)
-    average = lifted_average(masks, mass, pixels, latents)
-    assert average[0, 0] == pytest.approx([0, 1])
-    median = lifted_median(masks, pixels, latents, average, steps=200)
-    assert median[0, 0] == pytest.approx([0, 1 / np.sqrt(3)], abs=1e-4)
-    assert np.array_equal(median[0, 1:], average[0, 1:])  # levels that no mask shows keep the start
 
 
 def test_a_share_of_the_training_views_is_chosen_in_camera_order(two_boxes, monkeypatch):
