@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilsplat.scene.scene import Scene
-from tests.browser.conftest import drawn, until, wire_camera
+from tests.browser.conftest import drawn, late, until, wire_camera
 
 
 def steps(page):
@@ -103,6 +103,19 @@ def test_the_preview_shows_the_cameras_of_the_film_and_returns(opened, desk_addr
     assert 1.5 < lasted < 3 and len(moving) > 8
     xs = shown[moving[0] + 1 : moving[-1], 1]
     assert (np.diff(xs) <= 1e-9).all() and np.ptp(xs) > 3  # from view 0 to view 4, never back
+    assert wire_camera(page) == before
+
+
+def test_a_preview_is_stopped_before_it_has_begun(opened, desk_address):
+    page = opened(desk_address)
+    add(page, "000.png", "004.png")
+    before = wire_camera(page)
+    late(page, "api/path")
+    with page.expect_response("**/api/path*"):
+        page.get_by_role("button", name="Preview").click()
+        page.get_by_role("button", name="Stop").click()
+        page.get_by_role("button", name="Preview").wait_for()
+    page.wait_for_timeout(300)
     assert wire_camera(page) == before
 
 

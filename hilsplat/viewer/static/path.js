@@ -59,13 +59,20 @@ export function addToPath() {
   tell(page.path.length < 2 ? "The path begins here. Add another view to make saved films follow the path." : `${counted(page.path.length, "view")} in the path. Saved films follow it.`);
 }
 
+let previews = 0;
+
+function ended() { page.previewing = false; $("path-preview").textContent = "Preview"; }
+
 // Move the camera as a saved film would; a second click, or moving the camera, ends it.
 async function preview() {
-  if (page.previewing) { halt(); return; }
-  const ended = () => { page.previewing = false; $("path-preview").textContent = "Preview"; };
+  const mine = ++previews;
+  if (page.previewing) { ended(); halt(); return; }
   page.previewing = true;
   $("path-preview").textContent = "Stop";
-  try { play((await api.path(flown())).map((wire) => viewed((camera) => camera.standAt(wire, -1))), FRAMES_PER_S, ended); } catch (error) { ended(); failed(error); }
+  try {
+    const cameras = (await api.path(flown())).map((wire) => viewed((camera) => camera.standAt(wire, -1)));
+    if (mine === previews) play(cameras, FRAMES_PER_S, ended);
+  } catch (error) { if (mine === previews) ended(); failed(error); }
 }
 
 function saveJson() {
