@@ -114,7 +114,7 @@ def test_a_preview_is_stopped_before_it_has_begun(opened, desk_address):
     with page.expect_response("**/api/path*"):
         page.get_by_role("button", name="Preview").click()
         page.get_by_role("button", name="Stop").click()
-        page.get_by_role("button", name="Preview").wait_for()
+        assert page.get_by_role("button", name="Preview").is_visible()
     page.wait_for_timeout(300)
     assert wire_camera(page) == before
 

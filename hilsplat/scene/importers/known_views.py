@@ -133,7 +133,7 @@ def require_valid(view: KnownView) -> None:
     values = np.array([*view.camera.params, view.camera.width, view.camera.height], np.float64)
     focal = [view.camera.params[row] for row in view.camera.focal_length_idxs()]
     pose, sides = view.cam_from_source, values[-2:]
-    is_size = (values[-2:] > 0).all() and (values[-2:] <= MAX_SIDE_PX).all()
+    is_size = (sides > 0).all() and (sides <= MAX_SIDE_PX).all()
     if not focal:
         fault, found = "lens", view.camera.model_name
         expected = "a lens with a focal length: panoramas are not supported"
