@@ -39,6 +39,6 @@ def replacing(path: Path, version: str, what: str) -> Iterator[Path]:
     with changing(path) as path:
         if version_of(path) != version:
             raise StaleFileError(
-                f"{what} have changed since they were read", fix="reload the page, and repeat the change"
+                f"{what} have changed since they were read", fix="repeat the change on the new ones"
             )
         yield path

@@ -221,7 +221,7 @@ def test_unsaved_changes_stay_when_another_photograph_was_changed_elsewhere(page
     write_labels(path, "000.png", SIZE, [], version_of(path))
     page.locator("#view").press("[")
     draw_book_unsaved(page)
-    page.get_by_text("have changed since they were read").wait_for()
+    page.get_by_text(re.compile("have changed since they were read.*the disk is full", re.DOTALL)).wait_for()
     page.unroute("**/api/labels/1*")
     page.locator("#view").press("]")
     page.get_by_role("treeitem", name="cup, whole").wait_for()

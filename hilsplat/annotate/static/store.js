@@ -11,6 +11,7 @@ export class Store {
     this.waiting = 0;
     this.queued = new Set();    // photographs with a change that has not been sent
     this.refused = new Set();   // photographs whose last change the server could not save
+    this.errors = new Set();    // since the last time that nothing was waiting: the page shows them together
   }
 
   // Read the annotations of all photographs; unsaved ones stay, except those of a photograph that another program has changed.
@@ -74,6 +75,7 @@ export class Store {
   }
 
   save(number) {
+    if (!this.waiting) this.errors.clear();
     for (const each of new Set([number, ...this.refused])) {
       this.waiting++;
       this.queued.add(each);
@@ -92,7 +94,7 @@ export class Store {
       if (view.labels === sent) view.labels = kept.labels;   // the server cuts labels to their parents
       for (const entry of entries) entry.unsaved.delete(number);
     } catch (error) {
-      this.handlers.told(error.message, true);
+      this.handlers.told([...this.errors.add(error.message)].join(" "), true);
       if (error.status === 422) this.takeBack(number);
       else if (error.status === 412) await this.load(number);
       else this.refused.add(number);
