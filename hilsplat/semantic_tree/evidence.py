@@ -4,6 +4,7 @@ Everything is sparse: only masks of partner views that share Gaussians are compa
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -14,27 +15,43 @@ from hilsplat.semantic_tree.kernels import drop_small, seen_sizes, shared_pairs
 from hilsplat.semantic_tree.view_pairs import ViewPairs
 
 
+class MaskPairs(NamedTuple):
+    """Pairs of masks.
+
+    Attributes:
+        firsts: first mask of each pair.
+        seconds: second mask, which is greater.
+        sums: of each pair, the intersection, the union minus both visible sizes (`Evidence.sizes`), and the
+            IoU.
+    """
+
+    firsts: Int32[np.ndarray, " E"]
+    seconds: Int32[np.ndarray, " E"]
+    sums: Float64[np.ndarray, "E 3"]
+
+
 @dataclass(frozen=True)
 class Evidence:
     """Agreement of each pair of the M masks of a level on the Gaussians that both views see.
 
     Attributes:
-        indptr: where the pairs of each mask a begin.
-        indices: mask b > a of each pair, from a different view.
-        sums: of each pair, the intersection, the union minus both visible sizes in `sizes`, and the IoU.
+        pairs: pairs of masks from different views, in ascending order, in blocks.
         size_indptr: where the visible sizes of each mask begin.
         size_views: partners of the mask's view, in ascending order.
         sizes: visible size of the mask in that view, 0 if the view sees too little of the mask.
         view: view of each mask.
     """
 
-    indptr: Int64[np.ndarray, " M1"]
-    indices: Int32[np.ndarray, " E"]
-    sums: Float64[np.ndarray, "E 3"]
+    pairs: tuple[MaskPairs, ...]
     size_indptr: Int64[np.ndarray, " M1"]
     size_views: Int32[np.ndarray, " F"]
     sizes: Float64[np.ndarray, " F"]
     view: Int32[np.ndarray, " M"]
+
+    @property
+    def num_pairs(self) -> int:
+        """Number of pairs of masks."""
+        return sum(len(block.firsts) for block in self.pairs)
 
 
 def mask_evidence(
@@ -78,16 +95,6 @@ def mask_evidence(
     over_ranges(seen_sizes, num_views, threads, masks, shown, partners, sizes, size_views, full)
     least = min_covisible * full
     rest = partners, sizes, least, pairs.min_iou
-    parts = over_ranges(shared_pairs, num_views, threads, masks, *rest)
+    blocks = over_ranges(shared_pairs, num_views, threads, masks, *rest)
     drop_small(row_start, least, sizes)
-    of_pairs = [list(part) for part in zip(*parts, strict=True)]
-    parts.clear()
-
-    def joined(some: list[np.ndarray]) -> np.ndarray:
-        whole = np.concatenate(some)
-        some.clear()  # pairs take much memory
-        return whole
-
-    counts, indices, sums = map(joined, of_pairs)
-    indptr = np.concatenate([[0], np.cumsum(counts)])
-    return Evidence(indptr, indices, sums, row_start, size_views, sizes, view)
+    return Evidence(tuple(MaskPairs(*block) for block in blocks), row_start, size_views, sizes, view)

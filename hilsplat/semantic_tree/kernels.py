@@ -112,18 +112,25 @@ def drop_small(row_start, least, sizes):
 
 
 @compiled
+def _more_pairs(firsts, seconds, sums, kept, room):
+    """Return larger copies of three arrays with their first `kept` entries."""
+    more = np.empty(room, np.int32)
+    more[:kept] = firsts[:kept]
+    return more, *enlarged(seconds, sums, kept, room)
+
+
+@compiled
 def shared_pairs(begin, end, masks, pairs, seen, least, min_iou):
     """Return the pairs of masks a < b with an IoU of at least `min_iou`, for masks a of views begin..end.
 
     Returns:
-        number of pairs per mask a, masks b, and three numbers per pair: the intersection, the union minus the
-        sizes of both masks (0 if the other view shows less than `least` of the mask), and the IoU.
+        masks a and masks b, in ascending order, and three numbers per pair: the intersection, the union minus
+        the sizes of both masks (0 if the other view shows less than `least` of the mask), and the IoU.
     """
     starts, (indptr, indices, share), importance = masks
     (pair_indptr, partners, mirror), row_start = pairs
     number = np.full(len(importance), -1, np.int32)
-    counts = np.zeros(starts[end] - starts[begin], np.int64)
-    out, out_sums = np.empty(1024, np.int32), np.empty((1024, 3))
+    firsts, seconds, out_sums = np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty((1024, 3))
     done = 0
     for u in range(begin, end):
         first, last = indptr[starts[u]], indptr[starts[u + 1]]
@@ -154,8 +161,7 @@ def shared_pairs(begin, end, masks, pairs, seen, least, min_iou):
                             of_b[of[t]] += of_weighted[t] * share[k]
             if count + shared.size > len(to_b):
                 room = 2 * (count + shared.size)
-                from_a = np.concatenate((from_a, np.empty(room - len(from_a), np.int32)))
-                to_b, sums = enlarged(to_b, sums, count, room)
+                from_a, to_b, sums = _more_pairs(from_a, to_b, sums, count, room)
             for b in range(starts[v], starts[v + 1]):
                 for a in range(starts[u], starts[u + 1]):
                     both = shared[b - starts[v], a - starts[u]]
@@ -176,40 +182,37 @@ def shared_pairs(begin, end, masks, pairs, seen, least, min_iou):
                     count += 1
         for k in range(first, last):
             number[indices[k]] = -1
-        if done + count > len(out):
-            out, out_sums = enlarged(out, out_sums, done, 2 * (done + count))
+        if done + count > len(firsts):
+            firsts, seconds, out_sums = _more_pairs(firsts, seconds, out_sums, done, 2 * (done + count))
         places = np.zeros(starts[u + 1] - starts[u] + 1, np.int64)
         for k in range(count):
             places[from_a[k] - starts[u] + 1] += 1
-        counts[starts[u] - starts[begin] : starts[u + 1] - starts[begin]] = places[1:]
         places = done + np.cumsum(places)
         for k in range(count):  # by mask a; masks b stay in order
             at = places[from_a[k] - starts[u]]
-            out[at], out_sums[at] = to_b[k], sums[k]
+            firsts[at], seconds[at], out_sums[at] = from_a[k], to_b[k], sums[k]
             places[from_a[k] - starts[u]] += 1
         done += count
-    return counts, out[:done].copy(), out_sums[:done].copy()
+    return firsts[:done], seconds[:done], out_sums[:done]  # untouched pages beyond take no memory
 
 
 @compiled
-def neighbour_runs(indptr, indices, sums, ids, values):
-    """Write each mask's neighbours to `ids` and `values`, in ascending order; return their start and stop."""
-    num = len(indptr) - 1
-    start = np.zeros(num + 1, np.int64)
-    for a in range(num):
-        start[a + 1] += indptr[a + 1] - indptr[a]
-        for k in range(indptr[a], indptr[a + 1]):
-            start[indices[k] + 1] += 1
-    start = np.cumsum(start)
-    stop = start[:num].copy()
-    for a in range(num):
-        for k in range(indptr[a], indptr[a + 1]):
-            b = np.int64(indices[k])
-            for own, other in ((a, b), (b, a)):
-                ids[stop[own]] = other
-                values[stop[own], 0], values[stop[own], 1] = sums[k, 0], sums[k, 1]
-                stop[own] += 1
-    return start[:num].copy(), stop
+def count_neighbours(firsts, seconds, counts):
+    """Add each mask's number of neighbours among these pairs."""
+    for k in range(len(firsts)):
+        counts[firsts[k]] += 1
+        counts[seconds[k]] += 1
+
+
+@compiled
+def add_neighbours(firsts, seconds, sums, stop, ids, values):
+    """Add these pairs to the runs of neighbours of both masks, which end at `stop`."""
+    for k in range(len(firsts)):
+        a, b = np.int64(firsts[k]), np.int64(seconds[k])
+        for own, other in ((a, b), (b, a)):
+            ids[stop[own]] = other
+            values[stop[own], 0], values[stop[own], 1] = sums[k, 0], sums[k, 1]
+            stop[own] += 1
 
 
 @compiled
@@ -289,8 +292,8 @@ def _union(i, j, extra, sizes, members):
 
     Only views of `i` are read, because in others it has neither a size nor a mask.
     """
-    start, stop, size_views, size_values = sizes
-    member_start, member_stop, views, counts = members
+    start, stop, size_views, size_values = sizes[:4]
+    member_start, member_stop, views, counts = members[:4]
     at, end, member, member_end = start[i], stop[i], member_start[i], member_stop[i]
     other, other_member = start[j], member_start[j]
     union = extra
@@ -314,12 +317,16 @@ def _union(i, j, extra, sizes, members):
 
 @compiled
 def _with_room(needed, used, runs):
-    """Return runs with room for `needed` entries after position `used`, and that position."""
-    start, stop, ids, values = runs
+    """Return runs with room for `needed` entries after position `used`, and that position.
+
+    If there is none, the runs are copied to the spare arrays, without the gaps between them.
+    """
+    start, stop, ids, values, to_ids, to_values = runs
     if used + needed <= len(ids):
         return runs, used
     room = (np.sum(stop - start) + needed) * 5 // 4
-    to_ids, to_values = np.empty(room, np.int32), np.empty(room)
+    if room > len(to_ids):
+        to_ids, to_values = np.empty(room, np.int32), np.empty(room)
     used = 0
     for i in range(len(start)):
         begin, start[i] = start[i], used
@@ -327,13 +334,13 @@ def _with_room(needed, used, runs):
             to_ids[used], to_values[used] = ids[k], values[k]
             used += 1
         stop[i] = used
-    return (start, stop, to_ids, to_values), used
+    return (start, stop, to_ids, to_values, ids, values), used
 
 
 @compiled
 def _unite(i, j, used, runs):
     """Add the run of `i` to that of `j`, in place or after position `used`; return the runs and `used`."""
-    start, stop, ids, values = runs
+    start, stop, ids, values = runs[:4]
     more, most = (j, i) if stop[i] - start[i] > stop[j] - start[j] else (i, j)
     place, is_inside = start[most], True
     for k in range(start[more], stop[more]):
@@ -348,7 +355,7 @@ def _unite(i, j, used, runs):
         start[i], stop[i] = 0, 0
         return runs, used
     runs, used = _with_room(stop[i] - start[i] + stop[j] - start[j], used, runs)
-    start, stop, ids, values = runs
+    start, stop, ids, values = runs[:4]
     at_i, at_j, last = start[i], start[j], used
     while at_i < stop[i] or at_j < stop[j]:
         use_i = at_i < stop[i] and (at_j == stop[j] or ids[at_i] <= ids[at_j])

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from hilsplat.semantic_tree.evidence import Evidence
-from hilsplat.semantic_tree.kernels import link, neighbour_runs
+from hilsplat.semantic_tree.kernels import add_neighbours, count_neighbours, link
 
 Linkage = tuple[Int64[np.ndarray, " M"], Float[np.ndarray, " K"]]
 """Cluster of each mask, numbered by first appearance, and each cluster's pooled IoU over its own pairs (0 for
@@ -30,17 +30,25 @@ def pooled_linkage(evidence: Evidence, threshold: float) -> Linkage:
 def prepared_linkage(evidence: Evidence, threshold: float) -> Callable[[], Linkage]:
     """Return `pooled_linkage` as a function that can be called once and doesn't keep the evidence's pairs."""
     num, starts, first = len(evidence.view), evidence.size_indptr, np.arange(len(evidence.view))
-    iou = evidence.sums[:, 2]
-    chosen = np.flatnonzero(iou >= threshold)
-    chosen = chosen[np.argsort(-iou[chosen], kind="stable")]
-    masks = np.searchsorted(evidence.indptr, chosen, side="right") - 1
-    pairs = masks, evidence.indices[chosen], iou[chosen]
-    sizes = starts[:-1].copy(), starts[1:].copy(), evidence.size_views.copy(), evidence.sizes.copy()
-    members = first.copy(), first + 1, evidence.view.copy(), np.ones(num)
+    linked = [np.flatnonzero(block.sums[:, 2] >= threshold) for block in evidence.pairs]
+    of_linked = zip(evidence.pairs, linked, strict=True)
+    columns = [(block.firsts[at], block.seconds[at], block.sums[at, 2]) for block, at in of_linked]
+    firsts, seconds, iou = map(np.concatenate, zip(*columns, strict=True))
+    best = np.argsort(-iou, kind="stable")
+    pairs = firsts[best], seconds[best], iou[best]
+    spare = np.empty(0, np.int32), np.empty(0)
+    sizes = starts[:-1].copy(), starts[1:].copy(), evidence.size_views.copy(), evidence.sizes.copy(), *spare
+    members = first.copy(), first + 1, evidence.view.copy(), np.ones(num), *spare
+    counts = np.zeros(num, np.int64)
+    for block in evidence.pairs:
+        count_neighbours(block.firsts, block.seconds, counts)
+    stop = np.cumsum(counts) - counts
+    start = stop.copy()
     # NumPy's large arrays have huge pages, which compiled code's don't; short runs are read in random order.
-    ids, values = np.empty(2 * len(iou), np.int32), np.empty((2 * len(iou), 2))
-    runs = neighbour_runs(evidence.indptr, evidence.indices, evidence.sums, ids, values)
-    neighbours = [(*runs, ids, values)]
+    ids, values = np.empty(counts.sum(), np.int32), np.empty((counts.sum(), 2))
+    for block in evidence.pairs:
+        add_neighbours(*block, stop, ids, values)
+    neighbours = [(start, stop, ids, values)]
 
     def linkage() -> Linkage:
         root, within = np.arange(num), np.zeros((2, num))

@@ -148,7 +148,7 @@ def linked_nodes(
         if other_mib + _pairs_mib(counts, 2) > most_mib:
             sampled = pairs.of_views(np.linspace(0, num_views - 1, SAMPLED_VIEWS).astype(np.int64))
             scale = (len(pairs.partners) - num_views) / max(1, len(sampled.partners) - num_views)
-            counts = [scale * len(evidence(rows, sampled).indices) for rows in rows_of_levels]
+            counts = [scale * evidence(rows, sampled).num_pairs for rows in rows_of_levels]
         require_memory(
             other_mib + _pairs_mib(counts, 1),
             memory_mib,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from hilsplat.semantic_tree.evidence import Evidence, mask_evidence
+from hilsplat.semantic_tree.evidence import Evidence, MaskPairs, mask_evidence
 from hilsplat.semantic_tree.linkage import pooled_linkage
 from hilsplat.semantic_tree.view_pairs import view_pairs
 
@@ -18,9 +18,13 @@ def dense_evidence(intersection, union):
     row, view = np.nonzero(sizes)
     iou = intersection[a, b] / union[a, b]
     return Evidence(
-        indptr=np.searchsorted(a, np.arange(num + 1)),
-        indices=b.astype(np.int32),
-        sums=np.stack([intersection[a, b], np.zeros(len(a)), iou], axis=1),
+        pairs=(
+            MaskPairs(
+                a.astype(np.int32),
+                b.astype(np.int32),
+                np.stack([intersection[a, b], np.zeros(len(a)), iou], axis=1),
+            ),
+        ),
         size_indptr=np.searchsorted(row, np.arange(num + 1)),
         size_views=view.astype(np.int32),
         sizes=sizes[row, view],
@@ -37,8 +41,10 @@ def pair(evidence: Evidence, a: int, b: int) -> tuple[float, float]:
         return evidence.sizes[row][evidence.size_views[row] == view].sum()
 
     sizes = size(a, evidence.view[b]) + size(b, evidence.view[a])
-    row = slice(*evidence.indptr[a : a + 2])
-    intersection, extra, _ = evidence.sums[row][evidence.indices[row] == b].sum(axis=0)
+    stored = np.concatenate(
+        [block.sums[(block.firsts == a) & (block.seconds == b)] for block in evidence.pairs]
+    )
+    intersection, extra, _ = stored.sum(axis=0)
     return float(intersection), float(sizes + extra)
 
 

@@ -174,7 +174,7 @@ def test_a_few_views_tell_the_number_of_pairs():
     view, pairs = np.repeat(np.arange(num, dtype=np.int32), masks), view_pairs(visible)
 
     def count(of: ViewPairs) -> int:
-        return len(mask_evidence(shares, np.ones(30), visible, view, of, 0.2).indices)
+        return mask_evidence(shares, np.ones(30), visible, view, of, 0.2).num_pairs
 
     sampled = pairs.of_views(np.array([0, 13, 39]))
     assert len(sampled.partners) - num == 2 * (39 + 38 + 37)

@@ -69,10 +69,9 @@ def test_pairs_of_masks_from_partners_have_the_same_evidence(bounded, monkeypatc
     def stored() -> dict[tuple[int, int], tuple[float, float]]:
         pairs = view_pairs(visible)
         found = mask_evidence(shares, np.ones(visible.shape[1]), visible, view, pairs, 0.2)
-        row = np.repeat(np.arange(len(view)), np.diff(found.indptr))
-        return dict(
-            zip(zip(row.tolist(), found.indices.tolist(), strict=True), map(tuple, found.sums), strict=True)
-        )
+        (block,) = found.pairs
+        masks = zip(block.firsts.tolist(), block.seconds.tolist(), strict=True)
+        return dict(zip(masks, map(tuple, block.sums), strict=True))
 
     few = stored()
     monkeypatch.setattr(module, "MAX_ALL", VIEWS)
