@@ -234,8 +234,6 @@ def models_of(sections: Sequence[Section]) -> dict[str, Path]:
 @contextmanager
 def _recorded(stage: Stage[..., Any], arguments: Mapping[str, Any]) -> Iterator[None]:
     """Lock the output, check inputs and disk space, and write provenance when the call ends."""
-    from hilsplat.splat.rasterise.device import choose_device
-
     sections = {section: arguments[name] for name, section in stage.sections.items()}
     given = {name: arguments[name] for name in stage.inputs if arguments[name] is not None}
     extra = stage.reads(arguments)
@@ -275,8 +273,14 @@ def _recorded(stage: Stage[..., Any], arguments: Mapping[str, Any]) -> Iterator[
             inputs=before,
             beside=(*beside, *filter(Path.exists, side_files)),
             plugins=extra.plugins,
-            device=None if device is None else choose_device(device),
+            device=None if device is None else _chosen(device),
         )
+
+
+def _chosen(setting: Literal["auto", "cpu", "cuda"]) -> str:
+    from hilsplat.splat.rasterise.device import choose_device  # lazy: most stages don't rasterise
+
+    return choose_device(setting)
 
 
 def _command() -> list[str]:

@@ -1,4 +1,4 @@
-"""Small tables: CSV files with fixed columns, and Markdown."""
+"""Small tables: CSV files with fixed columns, Markdown, and text; numbers with their nouns."""
 
 import csv
 import re
@@ -66,3 +66,8 @@ def aligned_table(rows: Sequence[Sequence[object]], words: Collection[str]) -> l
         width, side = max(map(len, texts)), str.ljust if column[0] in words else str.rjust
         columns.append([side(text, width) for text in texts])
     return ["  ".join(row).rstrip() for row in zip(*columns, strict=True)]
+
+
+def counted(count: int, noun: str) -> str:
+    """Format a count with its noun: 1 node, 2 nodes."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

@@ -11,7 +11,8 @@ from hilsplat.base.levels import LEVELS, PATH_SEPARATOR, path_of
 from hilsplat.base.lineage import sha256_of_bytes
 from hilsplat.base.ownership import require_own_picture
 from hilsplat.base.progress import track
-from hilsplat.query.hits import Hit, NodeGroup, counted, doubts_of, label_comments
+from hilsplat.base.tables import counted
+from hilsplat.query.hits import Hit, NodeGroup, doubts_of, label_comments
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.mask_files import mask_files
 from hilsplat.query.node_search import NodeHits

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from hilsplat.base.errors import SettingsError
-from hilsplat.query.hits import counted
+from hilsplat.base.tables import counted
 from hilsplat.query.language_scene import LanguageScene
 
 

@@ -151,8 +151,3 @@ def doubts_of(hits: NodeHits) -> tuple[Doubt, ...]:
             level = text.level if text.anywhere > 0 else None
             doubts.append(Doubt(text.text, level, text.chance if is_likely else None, text.unknown))
     return tuple(doubts)
-
-
-def counted(count: int, noun: str) -> str:
-    """Format a count with its noun: 1 node, 2 nodes."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

@@ -11,7 +11,8 @@ from matplotlib.patches import Rectangle
 from matplotlib.transforms import IdentityTransform
 
 from hilsplat.base.levels import LEVELS, path_of
-from hilsplat.query.hits import counted, doubts_of
+from hilsplat.base.tables import counted
+from hilsplat.query.hits import doubts_of
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.node_search import NodeHits
 from hilsplat.query.pictures import (

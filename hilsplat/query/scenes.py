@@ -14,8 +14,9 @@ from jaxtyping import Float32
 from hilsplat.base.artifacts import read_index, run_command
 from hilsplat.base.errors import ArtifactError, HilsplatError, first_line, nearest
 from hilsplat.base.levels import Level
+from hilsplat.base.tables import counted
 from hilsplat.embed.clip import ClipModel, open_clip_of
-from hilsplat.query.hits import Doubt, counted, doubts_of
+from hilsplat.query.hits import Doubt, doubts_of
 from hilsplat.query.names import NodeNames, read_names
 from hilsplat.query.node_index import FILE, NodeIndex
 from hilsplat.query.node_names import NodeNaming

@@ -17,7 +17,8 @@ from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.initial import TrainingView
 from hilsplat.splat.kernels import noise_rows
 from hilsplat.splat.rasterise.api import draw
-from hilsplat.splat.rasterise.drawn import Device, Gradients
+from hilsplat.splat.rasterise.device import Device
+from hilsplat.splat.rasterise.drawn import Gradients
 
 OPACITY_RATE = 0.05  # 3DGS
 SH_REST_SHARE = 1 / 20

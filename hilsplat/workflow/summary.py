@@ -4,10 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hilsplat.base.artifacts import rebuild_command, run_command
-from hilsplat.base.tables import aligned_table, read_csv
+from hilsplat.base.tables import aligned_table, counted, read_csv
 from hilsplat.evaluate.scenes import scene_lines
 from hilsplat.evaluate.tables.means import TEXTS
-from hilsplat.query.hits import counted
 from hilsplat.query.scene_state import SceneState
 from hilsplat.scene.finished import command_name, scenes_in
 from hilsplat.scene.sheet import SceneRow

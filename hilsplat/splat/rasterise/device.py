@@ -15,8 +15,6 @@ from hilsplat.base.cache import forget, remembered
 from hilsplat.base.cards import has_driver, release_card
 from hilsplat.base.errors import DeviceError, first_line
 from hilsplat.models.card import MIB, free_mib
-from hilsplat.splat.rasterise.drawn import Device
-from hilsplat.splat.rasterise.parity import KIND, cuda_disagreement
 
 logger = logging.getLogger(__name__)
 
@@ -26,6 +24,10 @@ ABSENT = ("gsplat is not installed", "no NVIDIA driver is installed", "torch ")
 
 TOO_MUCH = "needs more memory than the card has free"
 
+KIND = "cuda"
+"""Kind of `remembered` results about CUDA."""
+
+Device = Literal["cpu", "cuda"]
 Requested = Literal["auto", "cpu", "cuda"]
 CHOSEN: dict[Requested, Device] = {}  # device of each setting in this process
 
@@ -103,6 +105,8 @@ def _examined(requested: Requested) -> Device:
             "device: auto or cpu; after a change, run `hilsplat doctor`",
         )
     if requested == "auto" and problem is None:
+        from hilsplat.splat.rasterise.parity import cuda_disagreement  # lazy: loads the CPU's kernels
+
         try:
             problem = cuda_disagreement()
         except Exception as error:  # drivers, torch and gsplat raise several types

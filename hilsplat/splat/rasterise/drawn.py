@@ -2,15 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float32
 from scipy.sparse import csr_matrix
 
 from hilsplat.base.errors import HilsplatError
-
-Device = Literal["cpu", "cuda"]
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,7 @@ from hilsplat.base.code import code_digest
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise import api
-from hilsplat.splat.rasterise.drawn import Device
-
-KIND = "cuda"
-"""Kind of `remembered` results about CUDA."""
+from hilsplat.splat.rasterise.device import KIND, Device
 
 MAX_DIFFERENCES = {"loss": 1e-4, "gradients": 1e-2, "step": 2e-2, "weights": 1e-3}
 """Maximum differences caused by rounding; those of gradients and step are relative to their length."""

@@ -87,7 +87,7 @@ def test_saved_labels_are_cut_to_their_parents_versioned_and_a_data_set(client, 
     assert again.status_code == 200
     for old in ("none", "", "another"):
         stale = put(client, 2, [], old)
-        assert stale.status_code == 412 and "reload" in stale.json()["error"]
+        assert stale.status_code == 412 and "repeat the change" in stale.json()["error"]
     assert client.put("/api/labels/2", json={"labels": []}).status_code == 412
     assert client.get("/api/labels").json()[2] == saved
     scene = open_labelled("annotated/photos/desk", tmp_path)
