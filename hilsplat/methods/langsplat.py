@@ -159,7 +159,9 @@ def train(
     wide = channels + -channels % WIDTH
 
     def padded(rows: np.ndarray) -> np.ndarray:
-        return np.pad(rows, ((0, 0), (0, wide - channels))).astype(np.float32).reshape(-1)
+        out = np.zeros((len(rows), wide), np.float32)
+        out[:, :channels] = rows
+        return out.reshape(-1)
 
     features = np.zeros((len(LEVELS), num_gaussians, wide), np.float32)
     gradient, levels = np.zeros(num_gaussians * wide, np.float32), []

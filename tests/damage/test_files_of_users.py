@@ -64,6 +64,7 @@ WORDS = {
 FAST = {
     "gaussians": ("--settings", '{"iterations": 10}'),
     "masks": ("--settings", '{"segmenter": "graph"}'),
+    "key-masks": ("--settings", '{"segmenter": "graph"}'),
     "clip": ("--settings", '{"model": "models/colours"}'),
     "names": ("--settings", '{"vocabulary": "words.txt"}'),
     "world make": ("--settings", '{"views": 3, "image_px": 32}'),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.workflow.conftest import SCENE, Project
+from tests.workflow.conftest import SCENE, Project, copy_project
 
 PRIVATE = re.compile(
     r"workflow\.(persistence|dag|is_main_process|executor_plugin|rerun_triggers|resource_settings|output_settings"
@@ -26,9 +26,9 @@ def test_only_documented_interfaces_of_snakemake_are_used(project: Path) -> None
 
 
 @pytest.fixture
-def clone(plain: Project) -> Project:
-    """A copy of the project in a folder with a space and a non-ASCII letter."""
-    return Project(plain.root.rename(plain.root.with_name("my scènes")))
+def clone(finished: Project, tmp_path: Path) -> Project:
+    """A copy of the project, without results, in a folder with a space and a non-ASCII letter."""
+    return copy_project(finished.root, tmp_path / "my scènes", results=False)
 
 
 def plan_of(project: Project, folder: Path, *words: str) -> str:
