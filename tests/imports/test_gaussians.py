@@ -235,6 +235,18 @@ def test_other_files_are_refused_by_name(tmp_path, content):
         import_ply(tmp_path / "g.ply", "fix")
 
 
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("comment", ["TextureFile Täxtur.png", "名前", "a" * 5000 + "é"])
+def test_comments_in_other_alphabets_are_read(text, comment, tmp_path):
+    table = columns()
+    path = write(tmp_path / "g.ply", table, text=text, comments=["by us"])
+    for encoding in ("utf-8", "utf-16", "latin-1"):
+        theirs = tmp_path / "theirs.ply"
+        written = comment.encode(encoding, "replace").replace(b"\n", b"")
+        theirs.write_bytes(path.read_bytes().replace(b"by us", written))
+        assert_rows(import_ply(theirs, "")[0], table)
+
+
 def test_notes_are_logged_and_recorded(tmp_path, caplog):
     table = {**columns(), "filter_3D": np.ones(8, np.float32), "gloss": np.ones(8, np.float32)}
     table["x"][0] = np.nan

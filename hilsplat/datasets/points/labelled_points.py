@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int32
-from plyfile import PlyData, PlyParseError
+from plyfile import PlyParseError
 
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.dataset import SceneReport, listing
 from hilsplat.scene import layouts
+from hilsplat.scene.importers.ply_file import read_ply
 from hilsplat.scene.posed_images import PosedImage, rigid_pose
 
 UNPACK_AGAIN = "unpack or download the file again; this copy is damaged or incomplete"
@@ -110,7 +111,7 @@ class PlyMesh:
     def __init__(self, path: Path, corners: int, fix: str = UNPACK_AGAIN) -> None:
         self.path, self.fix = require_file(path, fix), fix
         with decoding(path, f"a PLY mesh with {corners} corners per face", fix):
-            self._content = PlyData.read(path, known_list_len={"face": {"vertex_indices": corners}})
+            self._content = read_ply(path, corners)
             for element in ("vertex", "face"):
                 self._content[element]  # raises KeyError if the element is missing
 
