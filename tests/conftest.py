@@ -45,19 +45,6 @@ settings.register_profile("hilsplat", deadline=None, derandomize=True)
 settings.load_profile("hilsplat")
 settings.register_profile("chaos", deadline=None, max_examples=5000)
 
-EARLY = ("tests/unit/test_benchmarks.py", "tests/unit/training/test_recipe.py")
-"""The longest files whose tests don't need the finished run that those in `tests/workflow` share."""
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Give the second of two processes `EARLY`, which it runs while the first makes the finished run."""
-    files = list(dict.fromkeys(item.path for item in items))
-    for place, name in enumerate(EARLY):
-        if len(files) > len(EARLY) and (file := PROJECT / name) in files:
-            files.remove(file)
-            files.insert(2 * place + 1, file)
-    items.sort(key=lambda item: files.index(item.path))
-
 
 @pytest.fixture(scope="session")
 def project() -> Path:
