@@ -22,10 +22,13 @@ def edit(page) -> None:
     page.wait_for_timeout(300)  # the view is lower now
 
 
-def counts(page) -> tuple[int, int]:
-    """Numbers of selected and removed Gaussians."""
-    page.wait_for_timeout(400)
-    return tuple(int(number) for number in re.findall(r"\d+", page.locator("#edit-told").inner_text())[:2])
+def selected_after(page, act: Callable[[], object]) -> int:
+    """Run `act`, and return the number of selected Gaussians once it has changed."""
+    told = page.locator("#edit-told")
+    before = told.inner_text()
+    act()
+    until(page, lambda: told.inner_text() != before)
+    return int(re.search(r"\d+", told.inner_text()).group())
 
 
 def has(page, selected: int, removed: int) -> None:
@@ -105,19 +108,16 @@ def test_the_brush_adds_and_subtracts(opened, desk_address, desk):
     places = on_page(page, (6, 8, 0), (26, 14, 0)) - (view["x"], view["y"])
     points = [tuple(place) for place in places.tolist()]
     expected = int(within(gaussians.means, camera, points, 30.0).sum())
-    drag(page, (6, 8), (26, 14))
-    selected, _ = counts(page)
+    selected = selected_after(page, lambda: drag(page, (6, 8), (26, 14)))
     assert abs(selected - expected) <= 0.05 * expected and expected > 60
-    drag(page, (6, 20), (8, 20), held="Shift")
-    more, _ = counts(page)
-    assert more > selected
-    drag(page, (6, 20), (8, 20), held="Control")
-    assert counts(page)[0] == pytest.approx(selected, abs=2)
+    assert selected_after(page, lambda: drag(page, (6, 20), (8, 20), held="Shift")) > selected
+    fewer = selected_after(page, lambda: drag(page, (6, 20), (8, 20), held="Control"))
+    assert fewer == pytest.approx(selected, abs=2)
     size = float(page.get_by_label("Size").input_value())
     press(page, "]")
     assert float(page.get_by_label("Size").input_value()) > size
-    press(page, "i")
-    assert counts(page)[0] == pytest.approx(len(gaussians) - selected, abs=2)
+    inverted = selected_after(page, lambda: press(page, "i"))
+    assert inverted == pytest.approx(len(gaussians) - selected, abs=2)
     press(page, "Escape")  # dragging moves the camera again
     before = wire_camera(page)
     drag(page, (6, 8), (12, 8))

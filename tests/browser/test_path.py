@@ -102,7 +102,8 @@ def test_the_preview_shows_the_cameras_of_the_film_and_returns(opened, desk_addr
     lasted = (shown[moving[-1], 0] - shown[moving[0], 0]) / 1000
     assert 1.5 < lasted < 3 and len(moving) > 8
     xs = shown[moving[0] + 1 : moving[-1], 1]
-    assert (np.diff(xs) <= 1e-9).all() and np.ptp(xs) > 3  # from view 0 to view 4, never back
+    # from view 0 to view 4, never back; a slow machine shows few pictures of it
+    assert (np.diff(xs) <= 1e-9).all() and np.ptp(xs) > 2
     assert wire_camera(page) == before
 
 
