@@ -1,4 +1,4 @@
-"""Small tables: CSV files with fixed columns, Markdown, and text; numbers with their nouns."""
+"""Small tables as CSV files with fixed columns, Markdown and text; counts with their nouns."""
 
 import csv
 import re

@@ -30,12 +30,7 @@ from hilsplat.splat.initial import TrainingView, camera_extent, first_gaussians,
 from hilsplat.splat.model import Model, StepOptions, means_rate, model_on
 from hilsplat.splat.ply import save_ply
 from hilsplat.splat.rasterise.api import render
-from hilsplat.splat.rasterise.device import (
-    Device,
-    choose_device,
-    explained_memory,
-    require_card_memory,
-)
+from hilsplat.splat.rasterise.device import Device, choose_device, explained_memory, require_card_memory
 
 logger = logging.getLogger(__name__)
 

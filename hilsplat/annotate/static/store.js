@@ -94,7 +94,7 @@ export class Store {
       if (view.labels === sent) view.labels = kept.labels;   // the server cuts labels to their parents
       for (const entry of entries) entry.unsaved.delete(number);
     } catch (error) {
-      this.handlers.told([...this.errors.add(error.message)].join(" "), true);
+      this.handlers.told([...this.errors.add(error.message)].join("\n"), true);
       if (error.status === 422) this.takeBack(number);
       else if (error.status === 412) await this.load(number);
       else this.refused.add(number);

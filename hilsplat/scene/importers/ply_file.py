@@ -45,4 +45,4 @@ def _with_plain_header(file: BinaryIO) -> BinaryIO:
     if header.isascii() or not header.startswith(b"ply"):
         file.seek(0)
         return file
-    return io.BytesIO(bytes(byte if byte < 128 else ord("?") for byte in header) + file.read())
+    return io.BytesIO(header.decode("ascii", "replace").encode("ascii", "replace") + file.read())

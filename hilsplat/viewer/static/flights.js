@@ -30,13 +30,15 @@ export function goTo(target) {
   requestAnimationFrame(next);
 }
 
-// Show cameras in real time, then return to the present one; anything else that moves the camera ends it.
+// Show cameras in real time, the last one always, then return to the present one; anything else that moves the camera ends it.
 export function play(cameras, perSecond, ended) {
-  const mine = ++flight, before = page.camera, begin = performance.now();
+  const mine = ++flight, before = page.camera, begin = performance.now(), last = cameras.length - 1;
+  let shown = -1;
   setMoving(true);
   const next = (now) => {
-    const k = Math.max(0, Math.floor((now - begin) / 1000 * perSecond)), over = k >= cameras.length;
-    if (mine === flight) page.camera = over ? before : cameras[k];
+    const k = Math.max(0, Math.floor((now - begin) / 1000 * perSecond)), over = k > last && shown === last;
+    shown = Math.min(k, last);
+    if (mine === flight) page.camera = over ? before : cameras[shown];
     redraw();
     if (mine === flight && !over) { requestAnimationFrame(next); return; }
     setMoving(false);
