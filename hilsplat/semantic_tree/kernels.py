@@ -379,8 +379,8 @@ def link(pairs, neighbours, sizes, members, threshold, root, within):
     of intersections, and the sum of the differences between the unions of stored pairs and `sizes` (never
     positive, because sizes count the overlap of two masks twice). `sizes`: the view, and the cluster's size
     there. `members`: the view, and the number of the cluster's masks there. The last two end with spare
-    arrays for `_with_room`. The union of two clusters is the second sum plus, over views, the size of each cluster in the view times the number of the other cluster's
-    masks there.
+    arrays for `_with_room`. The union of two clusters is the second sum plus, over views, the size of each
+    cluster in the view times the number of the other cluster's masks there.
 
     Joining never creates a better pair. So two clusters need to be compared only when the best IoU of two of
     their parts becomes the best of all, and the smaller cluster's neighbours and views suffice for that.
