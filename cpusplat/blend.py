@@ -369,15 +369,30 @@ def add_slots(begin, end, tiles, base, tile_start, tile_end, gaussian, slots, co
 
 @compiled
 def sparse_rows(
-    begin, end, base, tiles_x, tile_start, tile_end, gaussian, reach, size_hw, geometry, least, counts, out
+    begin,
+    end,
+    base,
+    tiles_x,
+    tile_start,
+    tile_end,
+    gaussian,
+    reach,
+    size_hw,
+    step,
+    geometry,
+    least,
+    counts,
+    out,
 ):
     """Count the weights >= `least` of each pixel (row-major) of tiles begin..end; with `out`, write them.
+
+    Pixels outside every `step`-th row and column get none.
 
     `out` is None in the first pass. In the second pass, it contains the length of the longest row, the row
     starts of the sparse matrix, and arrays for its columns (ascending) and weights.
     """
     height, width = size_hw
-    transmittance, size_of = aligned(PIXELS), np.empty(PIXELS, np.int64)
+    transmittance, size_of, wanted = aligned(PIXELS), np.empty(PIXELS, np.int64), np.empty(PIXELS, np.bool_)
     records, by_lane = aligned(CHUNK * RECORD), aligned(CHUNK * LANES)
     entries, rows = np.empty(CHUNK, np.int64), np.empty(CHUNK, np.int32)
     if out is not None:
@@ -387,6 +402,11 @@ def sparse_rows(
         held_columns, rank = held.view(np.int32), np.empty(room, np.float32)
     for tile in range(begin, end):
         x0, y0 = start_tile(tile, tiles_x, height, width, transmittance)
+        for pixel in range(PIXELS):
+            x, y = x0 + np.int64(_X[pixel]), y0 + np.int64(_Y[pixel])
+            wanted[pixel] = x % step == 0 and y % step == 0
+            if not wanted[pixel]:
+                transmittance[pixel] = _ZERO
         size_of[:] = 0
         for chunk in range(tile_start[tile], tile_end[tile], CHUNK):
             if unfinished(transmittance) == 0:
@@ -407,6 +427,8 @@ def sparse_rows(
                     rows[n] = gaussian[chunk - base + entries[n]]
                 for lane in range(LANES if done else 0):
                     pixel = block * LANES + lane
+                    if not wanted[pixel]:
+                        continue
                     at = pixel * room + size_of[pixel]
                     for n in range(done):  # branch-free, because a branch would be unpredictable
                         weight = by_lane[n * LANES + lane]

@@ -159,9 +159,11 @@ def project_gradients(view: Projected, sums: np.ndarray, threads: int) -> tuple[
 
 
 def sparse_weights(
-    view: Projected, min_weight: float, threads: int
+    view: Projected, min_weight: float, threads: int, step: int = 1
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the blending weights >= min_weight of each Gaussian at each pixel.
+
+    Rows of pixels outside every `step`-th row and column of the image are empty.
 
     Returns:
         CSR arrays of a matrix (H W, N) with row-major pixels and sorted columns: data (float32), indices
@@ -171,7 +173,7 @@ def sparse_weights(
 
     def over_bands(out: tuple[Any, ...] | None) -> None:
         for band in tile_lists(view, threads):
-            arguments = (view.size_hw, view.geometry, np.float32(min_weight), counts, out)
+            arguments = (view.size_hw, step, view.geometry, np.float32(min_weight), counts, out)
             band.over_tiles(sparse_rows, threads, *arguments)
 
     over_bands(None)

@@ -317,7 +317,7 @@ class ContributionsSettings(Section):
     keep: Literal["auto", "gram", "weights", "none"] = knob(
         "auto",
         "gram: store pairs of Gaussians; weights: store pixel weights of all views; auto: the one with fewer "
-        "non-zeros; none: neither, which suffices for a semantic tree without a field",
+        "non-zeros; none: neither, which suffices for a semantic tree, and for fields of other methods",
     )
     device: Device = knob(
         "auto",

@@ -32,7 +32,7 @@ from hilsplat.baselines import HiLSplatSettings, TrainedSettings
 from hilsplat.contributions.view_matrices import painted_indicator, random_half
 from hilsplat.field.adam import Adam, in_random_order
 from hilsplat.field.contrast import ViewRelations, instance_term, part_term, read_parents, view_relations
-from hilsplat.methods.kernels import WIDTH, rendered_gradient
+from hilsplat.methods.kernels import WIDTH, rendered_gradient, rendered_rows
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 
 
@@ -41,7 +41,7 @@ class MaskHalves:
     """Masks of one view, each as two random halves of its pixels; row 2 r + h is half h of mask r."""
 
     labels: Int32[np.ndarray, "p 3"]  # row of the half painted at each pixel and level, -1 for none
-    sums: tuple[sp.csr_matrix, ...]  # per level: summed weights (halves x Gaussians) of that level's masks
+    sums: sp.csr_matrix  # summed weights: halves x 3 N, where a mask has entries at its own level
     pixels: Int64[np.ndarray, "m 2"]
     latents: Float32[np.ndarray, "m D"]
     relations: tuple[ViewRelations, ...]  # per level: masks compared by L_ins and, at this level, by L_part
@@ -68,7 +68,7 @@ class MaskHalves:
             replace(found, parts=tuple(part for part in found.parts if level[part[0][0]] == int(of)))
             for of in LEVELS
         )
-        sums = tuple(indicator @ view.weights for indicator in painted)
+        sums = sp.hstack([indicator @ view.weights for indicator in painted], format="csr")
         return MaskHalves(labels, sums, pixels, latents, tuple(relations))
 
 
@@ -114,11 +114,10 @@ class HierarchyTerms:
         """
         settings, view = self.settings, self.views[number]
         relations, latents = [view.relations[level.index]], view.latents
-        is_compared = settings.weight_instance or (settings.weight_part and relations[0].parts)
-        halves = np.zeros((len(view.pixels), 2, latents.shape[1]))
-        for of in LEVELS if is_compared else (level,):
-            product = view.sums[of.index] @ features[of.index]
-            halves += product[:, : latents.shape[1]].reshape(halves.shape)
+        rows, wide = view.sums, features.shape[2]
+        rendered = np.empty((rows.shape[0], wide), np.float32)
+        rendered_rows(rows.indptr, rows.indices, rows.data, features.reshape(-1), wide, rendered.reshape(-1))
+        halves = rendered[:, : latents.shape[1]].astype(np.float64).reshape(len(view.pixels), 2, -1)
         by_pixel = 1 / np.maximum(view.pixels, 1)[:, :, None]
         by_mask = 1 / np.maximum(view.pixels.sum(axis=1), 1)[:, None]
         means, halves = by_mask * halves.sum(axis=1), by_pixel * halves

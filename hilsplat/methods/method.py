@@ -56,11 +56,14 @@ class MethodInputs:
         """Code of each mask's CLIP vector, in the row order of the contributions."""
         return load_latents(self.autoencoder_folder, self.contributions)
 
-    def view_weights(self, view: str) -> sp.csr_matrix:
-        """Return a view's compositing weights (pixels x Gaussians); rows sum to 1, or 0 if uncovered."""
+    def view_weights(self, view: str, step: int = 1) -> sp.csr_matrix:
+        """Return a view's compositing weights (pixels x Gaussians); rows sum to 1, or 0 if uncovered.
+
+        Rows of pixels outside every `step`-th row and column are 0.
+        """
         gaussians, scene = self._loaded
-        min_weight = self.contributions.min_weight
-        weights = pixel_weights(gaussians, scene.cameras[view], min_weight=min_weight, threads=self.threads)
+        least, threads = self.contributions.min_weight, self.threads
+        weights = pixel_weights(gaussians, scene.cameras[view], min_weight=least, threads=threads, step=step)
         return normalised_weights(weights)
 
     def view_masks(self, view: str) -> HierarchicalMasks:
@@ -161,11 +164,10 @@ def labelled_views(inputs: MethodInputs, pixel_step: int) -> list[LabelledView]:
     views = []
     rows = inputs.contributions.rows_of_views()
     for number, name in enumerate(track(list(inputs.contributions.views), "weights of views")):
-        weights, labels = inputs.view_weights(name), inputs.view_labels(name)
-        height, width = inputs.view_camera(name).size_hw
-        grid = np.arange(height * width).reshape(height, width)[::pixel_step, ::pixel_step].ravel()
-        covered = np.diff(weights.indptr)[grid] > 0
-        pixels = grid[covered & (labels[grid] >= 0).any(axis=1)]
+        weights, labels = inputs.view_weights(name, pixel_step), inputs.view_labels(name)
+        width = inputs.view_camera(name).size_hw[1]
+        covered = np.flatnonzero(np.diff(weights.indptr))
+        pixels = covered[(labels[covered] >= 0).any(axis=1)]
         if len(pixels):
             xy = np.stack([pixels % width, pixels // width], axis=1)
             views.append(LabelledView(number, rows[number], weights[pixels], labels[pixels], xy))

@@ -1,8 +1,9 @@
 #!/usr/bin/env bash
 # The ci configuration on a Slurm of two nodes on this machine, beside a local run: same tables, a drained node,
 # a job killed for its memory, a GPU request. Needs root, control groups (v1 or v2), 4 GB of memory, and Debian's
-# slurmctld, slurmd, slurm-client and munge; on Debian:
+# slurmctld, slurmd, slurm-client and munge, and hilsplat with its extra `cluster`; on Debian:
 #   apt-get install --no-install-recommends slurmctld slurmd slurm-client munge
+#   pip install --constraint constraints.txt --editable '.[cluster]'
 #   tests/cluster/run.sh [FOLDER]        logs and both runs stay in FOLDER (default: a temporary one)
 set -euo pipefail
 project=$(cd "$(dirname "$0")/../.." && pwd)
@@ -16,6 +17,7 @@ fail() { echo "FAILED: $*" >&2; exit 1; }
 for program in slurmctld slurmd sbatch munged; do
     command -v $program > /dev/null || fail "$program is missing: see the first lines of $0"
 done
+python -c "import snakemake_executor_plugin_slurm" || fail "hilsplat's extra cluster is missing: see the first lines of $0"
 if [ -e $etc/slurm.conf ] && ! grep -q "^$mark" $etc/slurm.conf; then fail "this machine has a Slurm of its own: $etc/slurm.conf"; fi
 
 stop() {
@@ -126,7 +128,7 @@ echo "ok: $compared tables and the field have the same bytes as those of the loc
 : > "$folder/slurm/jobs.txt"
 half=$(grep -oE '"max_rss": [0-9]+' "$folder/local/results/synthetic/tiny/benchmarks/mask_truth.jsonl" | awk '{print int($2 / 2)}')
 on_slurm --forcerun mask_truth --set-resources "mask_truth:mem_mb=$half*attempt" mask_truth:gpu=1 \
-    --retries 4 -- results/figures/synthetic/tiny/masks.png > "$folder/memory.log" 2>&1 ||
+    --retries 4 -- results/figures/synthetic/tiny/masks.webp > "$folder/memory.log" 2>&1 ||
     fail "the job that ran out of memory did not finish: $folder/memory.log"
 grep -q "oom-kill event" "$folder"/slurm/slurmd-node?.log || fail "no job was killed for its memory"
 grep -q JobState=COMPLETED "$folder/slurm/jobs.txt" || fail "no attempt finished"

@@ -67,11 +67,13 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, degree: int, threads
     return view
 
 
-def pixel_weights(gaussians: Gaussians, camera: Camera, *, min_weight: float, threads: int = 1) -> csr_matrix:
+def pixel_weights(
+    gaussians: Gaussians, camera: Camera, *, min_weight: float, threads: int = 1, step: int = 1
+) -> csr_matrix:
     """Return the blending weight alpha_i T_i of each Gaussian at each pixel: a float32 matrix (H W, N).
 
     Rows are row-major pixels; columns are sorted. Weights below `min_weight` are omitted; if that is 0,
-    rows sum to the view's alpha.
+    rows sum to the view's alpha. Rows of pixels outside every `step`-th row and column are empty.
     """
     view = project_gaussians(gaussians, camera, 0, threads)
-    return weight_matrix(*views.sparse_weights(view, min_weight, threads), len(gaussians))
+    return weight_matrix(*views.sparse_weights(view, min_weight, threads, step), len(gaussians))

@@ -79,7 +79,7 @@ class BoxesInputs(MethodInputs):
     def linear_code(self, method):
         return LinearCode(np.full(len(REGIONS), 0.1, np.float32), np.eye(len(REGIONS), dtype=np.float32))
 
-    def view_weights(self, view):
+    def view_weights(self, view, step=1):
         return normalised_weights(two_boxes_weights(self.world.views.index(view)))
 
     def view_camera(self, view):

@@ -40,6 +40,17 @@ def test_threads_bands_of_tiles_and_memory_order_do_not_change_the_bytes(monkeyp
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.parametrize("step", [2, 3])
+def test_weights_on_a_pixel_grid_are_rows_of_all_weights(step):
+    gaussians, view = random_gaussians(300, seed=5), camera(70, 90)
+    every, some = (pixel_weights(gaussians, view, min_weight=1e-3, step=s) for s in (1, step))
+    row, column = np.divmod(np.arange(70 * 90), 90)
+    skipped = (row % step > 0) | (column % step > 0)
+    assert some.nnz > 0
+    assert not np.diff(some.indptr)[skipped].any()
+    assert (some[~skipped] != every[~skipped]).nnz == 0
+
+
 # ---- device ---------------------------------------------------------------------------------------
 
 
