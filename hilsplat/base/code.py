@@ -37,9 +37,9 @@ Code = str | Callable[..., Any]
 
 
 class Facts(NamedTuple):
-    """State of a module's files, digest of their content, and dotted names of modules or objects imported."""
+    """Digests of a module's files and of what counts in them, and names of modules or objects imported."""
 
-    state: str
+    files: str
     digest: str
     imports: list[str]
 
@@ -116,14 +116,15 @@ def _file(module: str) -> Path | None:
 
 def _facts(module: str, path: Path, known: Facts | None) -> Facts:
     files = [path, *filter(Path.is_file, (path.with_suffix(".json"), path.with_suffix(".tsv")))]
-    stats = [file.stat() for file in files]  # before the files are read: they may change after it
-    state = repr([(stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino) for stat in stats])
-    if known is not None and known.state == state:
-        return known
     text, *data = (file.read_bytes() for file in files)
+    contents = sha256_of_bytes(path.name.encode(), text, *data)  # relative imports depend on the name
+    if known is not None and known.files == contents:
+        return known
     tree = _Bare().visit(ast.parse(text, str(path)))
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-    return Facts(state, sha256_of_bytes(ast.dump(tree).encode(), *data), sorted({*_imported(tree, package)}))
+    return Facts(
+        contents, sha256_of_bytes(ast.dump(tree).encode(), *data), sorted({*_imported(tree, package)})
+    )
 
 
 def _imported(tree: ast.AST, package: str) -> Iterator[str]:

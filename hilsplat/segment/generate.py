@@ -26,7 +26,6 @@ from hilsplat.segment.sam import (
     Frame,
     Prompts,
     SamModel,
-    Thresholds,
     frame_taps,
     full_stability,
     point_grid,
@@ -34,6 +33,7 @@ from hilsplat.segment.sam import (
     read_logits,
 )
 from hilsplat.segment.suppression import distinct_boxes, last_inside, suppress_boxes, suppress_masks
+from hilsplat.segment.thresholds import Thresholds
 from hilsplat.settings import MasksSettings
 
 LOOSE = 0.1

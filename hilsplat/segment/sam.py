@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -38,6 +38,7 @@ from hilsplat.models.repeatable import random_pixels, require_repeatable_once
 from hilsplat.segment.decoder_network import DecoderNetwork
 from hilsplat.segment.factored_decoder import HEADS_PER_ATTENTION, PROMPTS, FactoredDecoder, ImageTerms
 from hilsplat.segment.kernels import areas_and_boxes, upscaled_runs
+from hilsplat.segment.thresholds import REAL_SAM, Thresholds, own_thresholds
 from hilsplat.settings import MasksSettings
 
 logger = logging.getLogger(__name__)
@@ -74,23 +75,9 @@ Prompts = Mapping[str, Array]
 prompts, the arrays that the factored decoder keeps."""
 
 
-@dataclass(frozen=True)
-class Thresholds:
-    """Resolved settings of `masks` whose best value depends on the model (`SamModel.thresholds`)."""
-
-    predicted_iou_min: float
-    stability_min: float
-    nms_score: float
-    points_per_batch: int
-
-
-REAL_SAM = Thresholds(predicted_iou_min=0.7, stability_min=0.85, nms_score=0.7, points_per_batch=8)
-"""LangSplat's thresholds for the released SAM models. A ViT-B call takes 60 MB per prompt, and calls of
-more than 8 prompts are no faster per prompt."""
 MOST_PROMPTS = 256  # per call on a card
 CHECKED_PROMPTS, AGREEMENT = 2, 1e-4
 """Number of prompts for checking the factored decoder against the network, and the maximum difference."""
-OWN = "mask_generation"  # key of `config.json` under which a model specifies its own `Thresholds`
 
 
 def point_grid(points_per_side: int) -> Float[np.ndarray, "P 2"]:
@@ -385,24 +372,6 @@ def largest_difference(
     fast_iou, fast_logits = map(on_host, decoded[:2])
     difference = np.abs(fast_logits - logits).max() / max(1, np.abs(logits).max())
     return float(max(difference, np.abs(fast_iou - iou).max()))
-
-
-def own_thresholds(model: ModelFolder) -> Thresholds:
-    """Return the thresholds in a model folder's `config.json`, or `REAL_SAM`.
-
-    A ModelError is raised for an unknown key or a value out of range.
-    """
-    own: Any = model.config.get(OWN, {})
-    names = vars(REAL_SAM)
-    try:
-        if not isinstance(own, dict) or not own.keys() <= names.keys():
-            raise ValueError(f"known keys are {', '.join(names)}")
-        settings = MasksSettings(**own)
-        return replace(REAL_SAM, **{name: getattr(settings, name) for name in own})
-    except ValueError as error:  # includes pydantic's ValidationError
-        raise ModelError(
-            f"{model.folder / 'config.json'}: {OWN} is invalid: {error}", fix="correct or remove it"
-        ) from error
 
 
 def read_logits(

@@ -1,6 +1,5 @@
 """Estimates for the user: the jobs of a dry run, and the time until photographs can be queried."""
 
-import os
 import subprocess
 import sys
 from collections import defaultdict
@@ -19,6 +18,7 @@ from hilsplat.workflow.progress import duration
 from hilsplat.workflow.resources import GPU, GUIDED, NODES, PICTURE_S, START_S, JobResources
 from hilsplat.workflow.scene_data import of_variant
 
+PROBE_S = 0.9  # CPU seconds of `start_probe` where the costs of stages were measured
 OTHERS = "tables"  # row for jobs without a scene
 
 NOTES = (
@@ -45,6 +45,7 @@ class RunEstimate:
 
     def __init__(self, resources: JobResources) -> None:
         self.resources = resources
+        self._probe = start_probe()
         self._jobs = defaultdict[str, list[JobEstimate]](list)
         self._candidates = set[tuple[object, ...]]()
 
@@ -71,19 +72,21 @@ class RunEstimate:
             return []
         cores = self.resources.cores or 1
         head = ("", "scenes", "jobs", "disk", "memory", f"hours, {cores} cores", "hours, GPU")
-        names, scale = sorted(self._jobs, key=lambda name: (name == OTHERS, name)), machine_scale()
+        names, scale = sorted(self._jobs, key=lambda name: (name == OTHERS, name)), machine_scale(self._probe)
         rows = [_row(name, self._jobs[name], cores, scale) for name in names]
         total = _row("all", [job for name in names for job in self._jobs[name]], cores, scale)
         return ["Estimate for this run:", *aligned_table([head, *rows, total], [head[0]]), *NOTES]
 
 
-def machine_scale() -> float:
-    """Return the CPU time that a stage's process takes to start on this machine, relative to `START_S`."""
-    before = os.times()
-    subprocess.run([sys.executable, "-c", "import hilsplat.cli.main, hilsplat.evaluate.stage"], check=True)
-    after = os.times()
-    both = [times.children_user + times.children_system for times in (before, after)]
-    return (both[1] - both[0]) / START_S
+def start_probe() -> subprocess.Popen[str]:
+    """Start a process that loads libraries and prints its CPU time, while Snakemake goes on planning."""
+    code = "import pandas, scipy.sparse, time; print(time.process_time())"
+    return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+
+
+def machine_scale(probe: subprocess.Popen[str]) -> float:
+    """Return the CPU time of a probe on this machine, relative to `PROBE_S`."""
+    return float(probe.communicate()[0]) / PROBE_S
 
 
 def _row(name: str, jobs: Sequence[JobEstimate], cores: int, scale: float) -> tuple[str, ...]:

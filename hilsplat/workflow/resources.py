@@ -353,7 +353,7 @@ def _model_memory_mb(folder: Path, variant: str, batch: int | str, threads: int)
     """
     from hilsplat.models.folder import open_model_folder
     from hilsplat.models.memory import needs_of  # onnxruntime is slow to import
-    from hilsplat.segment.sam import own_thresholds
+    from hilsplat.segment.thresholds import own_thresholds
 
     try:
         model = open_model_folder(folder, variant=variant)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from hilsplat.base.artifacts import write_json
 from hilsplat.base.atomic import atomic_path
 from hilsplat.models.layouts import DECODER, PREVIEW
-from hilsplat.segment.sam import OWN, Thresholds
+from hilsplat.segment.thresholds import OWN, Thresholds
 from models.training.clip import CROP_PX, DIMENSIONS, Clip
 from models.training.sam import (
     FRAME_PX,

@@ -3,6 +3,7 @@
 import ast
 import functools
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -121,6 +122,7 @@ def test_unchanged_modules_are_parsed_once_whatever_is_in_the_memo(tmp_path, for
     write(tmp_path, a="import plug.c", c="")
     digest = code_digest("plug.a")
     memo = code.MEMO.read_text()
+    os.utime(tmp_path / "plug/a.py", (1, 1))  # as in another checkout
     forget()
     with monkeypatch.context() as patch:
         patch.setattr(ast, "parse", None)

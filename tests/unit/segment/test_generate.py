@@ -17,7 +17,8 @@ from hilsplat.segment.generate import (
     keep_candidates,
     masks_from_candidates,
 )
-from hilsplat.segment.sam import Encoded, Frame, Prompts, SamModel, Thresholds, enlarged, point_grid
+from hilsplat.segment.sam import Encoded, Frame, Prompts, SamModel, enlarged, point_grid
+from hilsplat.segment.thresholds import Thresholds
 from hilsplat.settings import MasksSettings
 from tests.unit.segment import official
 from tests.unit.segment.handmade import assert_equal_masks, generate, pack, quantise, smooth_logits

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from hilsplat.embed.model_check import check_model
-from hilsplat.segment.sam import REAL_SAM, Frame, SamModel, Thresholds, read_logits
+from hilsplat.segment.sam import Frame, SamModel, read_logits
+from hilsplat.segment.thresholds import REAL_SAM, Thresholds
 from hilsplat.settings import MasksSettings
 from models.training.export import OWN_THRESHOLDS
 

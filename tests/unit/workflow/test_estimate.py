@@ -25,8 +25,8 @@ def resources(tmp_path, monkeypatch):
 
 
 def test_jobs_are_summed_by_data_set(resources, monkeypatch):
-    assert 0.05 < estimate.machine_scale() < 20
-    monkeypatch.setattr(estimate, "machine_scale", lambda: 0.5)
+    assert 0.05 < estimate.machine_scale(estimate.start_probe()) < 20
+    monkeypatch.setattr(estimate, "machine_scale", lambda probe: 0.5)
     run = RunEstimate(resources)
     assert run.lines() == []
     for scene in SCENES:
