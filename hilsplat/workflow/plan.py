@@ -483,16 +483,19 @@ class Plan:
     def first_code(self, job: VariantJob) -> list[str]:
         """Return the input of `autoencoder`: the code of the same masks with levels by head, if there is one.
 
-        Levels don't change masks and their vectors, so that variants which differ in levels share a code.
+        Variants that differ only in levels and contributions share a code, because neither changes masks and
+        their vectors.
         """
         stages, situation = self.stages(job), self.situation(self.row(job))
         if stages.masks.levels == "head" or stages.autoencoder.targets != "mask":
             return []
         own = self.identity("autoencoder", job.variant, *situation)
         masks = stages.masks.model_copy(update={"levels": "head", "theta": None})
-        by_head = own._replace(settings=tuple((dict(own.settings) | {"masks": masks}).items()))
+        by_head = dict(own.settings) | {"masks": masks, "contributions": None}
         for name in self.run.every_variant():
-            if self.identity("autoencoder", name, *situation) == by_head:
+            other = self.identity("autoencoder", name, *situation)
+            is_alike = dict(other.settings) | {"contributions": None} == by_head
+            if is_alike and other._replace(settings=own.settings) == own:
                 return [self.path(job, name, "autoencoder")]
         return []
 

@@ -119,7 +119,7 @@ def test_the_ablation_has_its_own_number_of_seeds(tmp_path):
 
 def test_levels_by_the_tree_share_the_code_of_levels_by_head_with_the_same_seed(tmp_path):
     own = {**NETWORK, "targets": "mask"}
-    by_tree = {"masks": {"levels": "tree"}}
+    by_tree = {"masks": {"levels": "tree"}, "contributions": {"keep": "none"}}
     variants = {
         "head": {"autoencoder": own, "method": {"name": "langsplat"}},
         "tree": {"autoencoder": own, **by_tree},
