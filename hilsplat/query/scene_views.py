@@ -185,8 +185,9 @@ class SceneViews:
     def blended(self, view: str, scores: Float32[np.ndarray, "T n"]) -> Float32[np.ndarray, "T 3 H W"]:
         """Average node scores over each pixel's Gaussians, weighted by W, at each level.
 
-        Gaussians without a node have the lowest node score of the level. Uncovered pixels get the covered
-        pixels' lowest value, so that they are never selected and do not extend the range.
+        Gaussians without a node have the lowest node score of the level, or 0 if it has one node. Uncovered
+        pixels get the covered pixels' lowest value, so that they are never selected and do not extend the
+        range.
         """
         height, width = self.size_hw(view)
         maps = np.zeros((len(scores), len(LEVELS), height * width), np.float32)
@@ -196,7 +197,8 @@ class SceneViews:
                 continue
             in_view = self.view_nodes(view, level)
             for row, values in enumerate(scores):
-                in_view.blend(values, float(values[nodes].min()), maps[row, level.index])
+                lowest = float(values[nodes].min()) if len(nodes) > 1 else 0.0
+                in_view.blend(values, lowest, maps[row, level.index])
         return maps.reshape(len(scores), len(LEVELS), height, width)
 
 

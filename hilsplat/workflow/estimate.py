@@ -18,7 +18,7 @@ from hilsplat.workflow.progress import duration
 from hilsplat.workflow.resources import GPU, GUIDED, NODES, PICTURE_S, START_S, JobResources
 from hilsplat.workflow.scene_data import of_variant
 
-PROBE_S = 0.9  # CPU seconds of `start_probe` where the costs of stages were measured
+PROBE_S = 1.0  # CPU seconds of `start_probe` where the costs of stages were measured
 OTHERS = "tables"  # row for jobs without a scene
 
 NOTES = (

@@ -14,8 +14,9 @@ from hilsplat.base.images import read_image, write_webp
 from hilsplat.base.levels import LEVELS, Level, path_of
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.registry import open_labelled
-from hilsplat.evaluate.metrics.masks import iou, peak_points
+from hilsplat.evaluate.metrics.masks import iou
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
+from hilsplat.evaluate.protocols.answers import peaks_of_answer
 from hilsplat.evaluate.protocols.view_truth import ViewTruth, truths_of
 from hilsplat.evaluate.protocols.views import rule_of
 from hilsplat.query.language_scene import LanguageScene
@@ -208,7 +209,7 @@ def draw_queries(
         level = row.level or hits.level
         smoothed = SmoothedRelevancy.of(relevancy, rule)
         field_mask = relevancy_mask(smoothed, level, rule)
-        points = peak_points(smoothed.filtered, level)
+        points = peaks_of_answer(relevancy, smoothed.filtered, level)
         pictures = [("tree", answers.views.node_masks(row.view, hits.ids))]
         if columns == 7:
             pictures.append(("tree, path", row.tree_mask(answers, by_path=True)))
@@ -218,7 +219,8 @@ def draw_queries(
         for place, (name, mask) in zip(axes[1:], pictures, strict=False):
             score = row.score(mask)
             show(place, paint_answer(image, mask, row.truth), f"{name}: {score}" if score else name)
-        axes[len(pictures)].plot(*points[0], "o", **RING)
+        if len(points):
+            axes[len(pictures)].plot(*points[0], "o", **RING)
         low, high = float(relevancy.min()), float(relevancy.max())
         for each in LEVELS:
             top = float(relevancy[each.index].max())

@@ -39,6 +39,18 @@ def relevancy_of(
     return found
 
 
+def peaks_of_answer(
+    relevancy: Float32[np.ndarray, "L H W"], filtered: Float32[np.ndarray, "L H W"], level: Level | None
+) -> Int[np.ndarray, "P 2"]:
+    """Return the peaks (x, y) of a level's filtered relevancy, or of the level with the highest one.
+
+    A level without an answer (no latent, no node in the view) has one value everywhere, and no peak.
+    """
+    searched = range(len(relevancy)) if level is None else (level.index,)
+    answered = [index for index in searched if relevancy[index].min() < relevancy[index].max()]
+    return masks.peak_points(filtered[answered], None) if answered else NO_POINTS
+
+
 class PackedMasks:
     """Predicted masks of one view at one bit per pixel."""
 

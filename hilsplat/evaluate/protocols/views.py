@@ -15,7 +15,7 @@ import numpy as np
 from hilsplat.base.levels import Level
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.metrics import hierarchy
-from hilsplat.evaluate.metrics.masks import best_threshold_iou, peak_points
+from hilsplat.evaluate.metrics.masks import best_threshold_iou
 from hilsplat.evaluate.metrics.relevancy_rule import (
     RelevancyRule,
     SmoothedRelevancy,
@@ -24,7 +24,14 @@ from hilsplat.evaluate.metrics.relevancy_rule import (
     relevancy_mask,
 )
 from hilsplat.evaluate.protocols import cards
-from hilsplat.evaluate.protocols.answers import NO_POINTS, PackedMasks, Selections, mask_rows, relevancy_of
+from hilsplat.evaluate.protocols.answers import (
+    NO_POINTS,
+    PackedMasks,
+    Selections,
+    mask_rows,
+    peaks_of_answer,
+    relevancy_of,
+)
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols
 from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
 from hilsplat.evaluate.scores import Measured
@@ -113,7 +120,7 @@ def measure_view(
                         flat, answer = cards.TREE_NODES, partial(answers.of_nodes, (category.text,))
                         yield from answers.scene_wide_rows(queries)
                         mask = answer(None)
-                    yield from answers.rows(method, flat, smoothed, answer, category, queries)
+                    yield from answers.rows(method, flat, found[row], smoothed, answer, category, queries)
                 yield from flat_views.add(method, found[row], mask, category, queries)
             if nodes is not None and "tree-path" in settings.methods:
                 yield from answers.path_rows(nodes[row], queries)
@@ -139,6 +146,7 @@ class _ViewAnswers:
         self,
         method: str,
         flat: cards.ProtocolCard,
+        relevancy: np.ndarray,
         smoothed: SmoothedRelevancy,
         answer: Callable[[Level | None], np.ndarray],
         category: Query,
@@ -152,13 +160,13 @@ class _ViewAnswers:
             label_of(card, method, self.settings) for card in (flat, cards.LEVEL_GIVEN, cards.LEVEL_AUTO)
         )
         auto_mask = answer(None)
-        auto_points = peak_points(smoothed.filtered, None)
+        auto_points = peaks_of_answer(relevancy, smoothed.filtered, None)
         yield from mask_rows(method, category, united, auto_mask, auto_points)
         self.masks.put((method, auto, category.text), auto_mask)
         for query in queries:
             assert query.level is not None
             given_mask = answer(query.level)
-            given_points = peak_points(smoothed.filtered, query.level)
+            given_points = peaks_of_answer(relevancy, smoothed.filtered, query.level)
             yield from mask_rows(method, query, given, given_mask, given_points)
             yield from mask_rows(method, query, auto, auto_mask, auto_points)
             best = best_threshold_iou(smoothed.mixed[query.level.index], query.truth)
@@ -191,7 +199,7 @@ class _ViewAnswers:
                     inside |= self.of_nodes(path[:-1], Level(len(path) - 1) if is_full else None)
             level_map = relevancy[query.level.index]
             filtered = mean_filter(np.where(inside, level_map, 0) if inside.any() else level_map, side_px)
-            points = peak_points(filtered[None], None)
+            points = peaks_of_answer(level_map[None], filtered[None], None)
             yield from mask_rows("tree-path", query, protocol, mask, points)
 
     def consistency_rows(self, truth: ViewTruth) -> Iterator[Measured]:

@@ -195,6 +195,16 @@ def test_a_relevancy_that_is_not_a_number_is_an_error():
         measured(HandMade([], {}, {"cup": relevancy}), truth, methods=("field",))
 
 
+@pytest.mark.parametrize("constant", [0.0, 0.3])
+def test_an_answer_with_nothing_in_it_localizes_nothing(tmp_path, constant):
+    truth = truth_of(tmp_path, [("bear", 1, -1), ("nose", 2, 0)], [((0, 10), (0, 5)), ((2, 4), (2, 4))])
+    scene = HandMade([], {}, dict.fromkeys(("bear", "nose"), np.full((3, *SIZE), constant, np.float32)))
+    values = measured(scene, truth, methods=("field", "tree", "tree-path"))
+    found = {key: value for key, value in values.items() if key[-1].startswith("localization")}
+    assert {key[0] for key in found} == {"field", "tree", "tree-path"}
+    assert set(found.values()) == {0.0}
+
+
 def test_a_repeated_text_nests_in_each_of_its_wholes(tmp_path):
     nodes = [("chair", 1, -1), ("table", 1, -1), ("leg", 2, 0), ("leg", 2, 1)]
     regions = [((0, 10), (0, 5)), ((0, 10), (5, 10)), ((8, 10), (0, 5)), ((8, 10), (5, 10))]
