@@ -1,6 +1,5 @@
 """The scenes of a results folder: what each can answer, its size, and the quality of its fit and tree."""
 
-import math
 from fnmatch import fnmatchcase
 from pathlib import Path
 
@@ -74,7 +73,8 @@ def scene_lines(
 
 
 def _tree_iou(scores: Path, protocol: str) -> str:
+    """Return the mean IoU of the tree under a protocol, for the data set with the most labelled queries."""
     table = read_scores([scores] if scores.is_file() else [])
     is_shown = (table["method"] == "tree") & (table["metric"] == "iou")
-    iou = table["value"][is_shown & table["protocol"].str.startswith(protocol)].mean()
-    return "" if math.isnan(iou) else f"{iou:.4f}"
+    values = table[is_shown & table["protocol"].str.startswith(protocol)].groupby("dataset")["value"]
+    return f"{values.mean()[values.count().idxmax()]:.4f}" if len(values) else ""

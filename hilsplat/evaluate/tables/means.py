@@ -26,16 +26,19 @@ METRICS = {
 """Column -> metrics; the first that a protocol has is shown."""
 
 COLUMNS = (
-    *("method", "mIoU", *(level.label for level in LEVELS), "localized", "accuracy", "AP"),
+    *("method", "labels", "mIoU", *(level.label for level in LEVELS), "localized", "accuracy", "AP"),
     *("queries", "protocol"),
 )
-"""Columns of a table of means; empty ones are omitted. All values but the number of queries are in %."""
+"""Columns of a table of means; empty ones are omitted. All values but the number of queries are in %.
 
-TEXTS = ("method", "protocol")  # columns that are not numbers
+`labels` is the data set of the labels, if a scene has those of several.
+"""
+
+TEXTS = ("method", "labels", "protocol")  # columns that are not numbers
 
 
 def mean_rows(scores: "pd.DataFrame", labels: Mapping[str, str]) -> list[list[str]]:
-    """Return a header and one row per method and protocol, averaged as the protocol's card says.
+    """Return a header and one row per method, data set and protocol, averaged as the protocol's card says.
 
     Protocols without an IoU or a precision, such as view consistency, have no row.
 
@@ -43,17 +46,18 @@ def mean_rows(scores: "pd.DataFrame", labels: Mapping[str, str]) -> list[list[st
         scores: rows of one scene (`read_scores`).
         labels: variant -> its name; a variant without one keeps its own.
     """
-    found = []
-    for (variant, method, protocol), part in scores.groupby(["variant", "method", "protocol"], sort=True):
+    found, of_several = [], scores["dataset"].nunique() > 1
+    keys = ["variant", "method", "dataset", "protocol"]
+    for (variant, method, dataset, protocol), part in scores.groupby(keys, sort=True):
         means = _means(protocol, part)
         if means["mIoU"].value is None and means["AP"].value is None:
             continue
         queries = int(part["metric"].isin(("iou", "class_iou")).sum())
         row = {column: "" if cell.value is None else cell.text for column, cell in means.items()}
         row |= {"method": row_name(variant, method, labels), "protocol": protocol}
-        row["queries"] = str(queries or "")
-        found.append((row_place(variant, method, labels), protocol, row))
-    rows = [row for *_, row in sorted(found, key=lambda each: each[:2])]
+        row |= {"queries": str(queries or ""), "labels": dataset if of_several else ""}
+        found.append((row_place(variant, method, labels), dataset, protocol, row))
+    rows = [row for *_, row in sorted(found, key=lambda each: each[:3])]
     columns = [column for column in COLUMNS if any(row.get(column) for row in rows)]
     return [columns, *([row.get(column, "") for column in columns] for row in rows)] if rows else []
 

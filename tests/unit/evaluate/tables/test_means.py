@@ -69,3 +69,12 @@ def test_the_means_of_a_scene_are_written_as_markdown_and_csv(tmp_path):
     write_scores(files[0], [])
     app([words[0], str(files[0]), *words[3:]], standalone_mode=False)
     assert read_csv(out.with_suffix(".csv"), None, "") == []
+
+
+def test_labels_of_several_data_sets_are_not_averaged_together():
+    theirs = [score("iou", 0.8, dataset="lerf_ovs", query=text, protocol="lerf/langsplat@2") for text in "ab"]
+    own = score("iou", 0.0, dataset="annotated", protocol="lerf/langsplat@2")
+    assert [(row["labels"], row["mIoU"]) for row in means(*theirs, own)] == [
+        ("annotated", "0.0"),
+        ("lerf_ovs", "80.0"),
+    ]
