@@ -44,6 +44,10 @@ Option = Callable[[Any], Any] | str
 """An option of a stage's command: its value, or a function of the wildcards."""
 
 
+LINKING = ("contributions", "coverage_tree", "semantic_tree")
+"""Artifacts that relate masks to each other and to Gaussians."""
+
+
 class Identity(NamedTuple):
     """What an artifact of a variant is made from; artifacts with equal identities are the same."""
 
@@ -483,21 +487,30 @@ class Plan:
     def first_code(self, job: VariantJob) -> list[str]:
         """Return the input of `autoencoder`: the code of the same masks with levels by head, if there is one.
 
-        Variants that differ only in levels and contributions share a code, because neither changes masks and
-        their vectors.
+        Variants share a code unless they differ in what changes masks and their vectors.
         """
         stages, situation = self.stages(job), self.situation(self.row(job))
         if stages.masks.levels == "head" or stages.autoencoder.targets != "mask":
             return []
-        own = self.identity("autoencoder", job.variant, *situation)
-        masks = stages.masks.model_copy(update={"levels": "head", "theta": None})
-        by_head = dict(own.settings) | {"masks": masks, "contributions": None}
+        own = self._code_identity(job.variant, *situation)
         for name in self.run.every_variant():
-            other = self.identity("autoencoder", name, *situation)
-            is_alike = dict(other.settings) | {"contributions": None} == by_head
-            if is_alike and other._replace(settings=own.settings) == own:
+            is_by_head = self.stages_of(name, situation[0]).masks.levels == "head"
+            if is_by_head and self._code_identity(name, *situation) == own:
                 return [self.path(job, name, "autoencoder")]
         return []
+
+    def _code_identity(self, variant: str, *situation: Any) -> Identity:
+        """Return what a code of the masks' own vectors depends on: neither levels nor, by default, trees."""
+        stages, settings, seed = self.identity("autoencoder", variant, *situation)
+        values = dict(settings)
+        values["masks"] = values["masks"].model_copy(update={"levels": "head", "theta": None})
+        if values["clip"].crops == "masks":  # else the semantic tree selects them
+            values["clip"] = values["clip"].model_copy(update={"crops_per_node": 0})
+            linking = [kind for artifact in LINKING for kind in kinds_of(artifact)]
+            stages = tuple(name for name in stages if name not in {kind.name for kind in linking})
+            sections = {name for kind in linking for name in kind.sections.values()} - {"masks"}
+            values = {name: value for name, value in values.items() if name not in sections}
+        return Identity(stages, tuple(values.items()), seed)
 
     def first_field(self, job: VariantJob) -> list[str]:
         """Return the input of `field`: LangSplat's initial field; SettingsError if no variant computes it."""

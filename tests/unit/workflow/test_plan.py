@@ -117,21 +117,24 @@ def test_the_ablation_has_its_own_number_of_seeds(tmp_path):
     assert found.run.all_seeds("omega") == ["omega"]
 
 
-def test_levels_by_the_tree_share_the_code_of_levels_by_head_with_the_same_seed(tmp_path):
+@pytest.mark.parametrize("run_wide", [{}, {"masks": {"theta": 0.85}}])  # levels by head have no theta
+def test_levels_by_the_tree_share_the_code_of_levels_by_head_with_the_same_seed(tmp_path, run_wide):
     own = {**NETWORK, "targets": "mask"}
     by_tree = {"masks": {"levels": "tree"}, "contributions": {"keep": "none"}}
     variants = {
         "head": {"autoencoder": own, "method": {"name": "langsplat"}},
         "tree": {"autoencoder": own, **by_tree},
         "theta": {"autoencoder": own, **by_tree, "coverage_tree": {"theta": 0.7}},
+        "linked": {"autoencoder": own, **by_tree, "semantic_tree": {"min_views": 2}},
+        "crops": {"autoencoder": own, **by_tree, "clip": {"crops": "nodes"}},
         "alone": {"autoencoder": {**own, "latent": 4}, **by_tree},
         "nodes": {"autoencoder": NETWORK, **by_tree},
     }
-    found = plan(tmp_path, variants=variants, main_variants=["default"], seeds=2)
+    found = plan(tmp_path, variants=variants, main_variants=["default"], seeds=2, **run_wide)
     codes = {name: found.first_code(Job(variant=name)) for name in (*variants, "tree.seed1")}
     assert {name: variants_in(paths) for name, paths in codes.items()} == {
-        **{name: [] for name in ("head", "alone", "nodes")},
-        **{name: ["head"] for name in ("tree", "theta")},
+        **{name: [] for name in ("head", "alone", "nodes", "crops")},
+        **{name: ["head"] for name in ("tree", "theta", "linked")},
         "tree.seed1": ["head.seed1"],
     }
 
