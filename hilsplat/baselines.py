@@ -99,27 +99,29 @@ class Method:
         fit: "module:function"; a function of type `hilsplat.methods.method.Fit`, imported when it runs.
         settings: class of its settings.
         is_random: whether the field depends on the seed.
+        averages: whether it averages codes as if they were vectors, so that the code must be linear.
     """
 
     fit: str
     settings: type[MethodSettings] = MethodSettings
     is_random: bool = True
+    averages: bool = False
 
 
 BASELINES = {
-    "dr_splat": Method("hilsplat.methods.dr_splat:fit"),
-    "gaussian_grouping": Method("hilsplat.methods.gaussian_grouping:fit", TrainedSettings),
+    "dr_splat": Method("hilsplat.methods.dr_splat:fit", averages=True),
+    "gaussian_grouping": Method("hilsplat.methods.gaussian_grouping:fit", TrainedSettings, averages=True),
     "hi_lsplat": Method("hilsplat.methods.langsplat:fit", HiLSplatSettings),
-    "laga": Method("hilsplat.methods.laga:fit", TrainedSettings),
+    "laga": Method("hilsplat.methods.laga:fit", TrainedSettings, averages=True),
     "langsplat": Method("hilsplat.methods.langsplat:fit", TrainedSettings),
-    "langsplat_v2": Method("hilsplat.methods.langsplat_v2:fit", TrainedSettings),
-    "legaussians": Method("hilsplat.methods.legaussians:fit", TrainedSettings),
-    "lifted": Method("hilsplat.methods.lifted:fit", is_random=False),
-    "occam": Method("hilsplat.methods.occam:fit", is_random=False),
-    "omniseg3d": Method("hilsplat.methods.omniseg3d:fit", OmniSeg3DSettings),
-    "opengaussian": Method("hilsplat.methods.opengaussian:fit", OpenGaussianSettings),
-    "saga": Method("hilsplat.methods.saga:fit", TrainedSettings),
-    "vch": Method("hilsplat.methods.vch:fit", VchSettings),
+    "langsplat_v2": Method("hilsplat.methods.langsplat_v2:fit", TrainedSettings, averages=True),
+    "legaussians": Method("hilsplat.methods.legaussians:fit", TrainedSettings, averages=True),
+    "lifted": Method("hilsplat.methods.lifted:fit", is_random=False, averages=True),
+    "occam": Method("hilsplat.methods.occam:fit", is_random=False, averages=True),
+    "omniseg3d": Method("hilsplat.methods.omniseg3d:fit", OmniSeg3DSettings, averages=True),
+    "opengaussian": Method("hilsplat.methods.opengaussian:fit", OpenGaussianSettings, averages=True),
+    "saga": Method("hilsplat.methods.saga:fit", TrainedSettings, averages=True),
+    "vch": Method("hilsplat.methods.vch:fit", VchSettings, averages=True),
 }
 
 

@@ -65,8 +65,8 @@ def nested_clusters(
             cluster_of_row = clusters(rows, (distance,), seed, "euclidean", count)[:, 0]
             nested[inside, level.index] = number + cluster_of_row
             number += int(cluster_of_row.max()) + 1
-        # Gaussians without a cluster remain grouped by their whole.
-        around = np.where(has, nested[:, level.index], -2 - around)
+        # Gaussians without a cluster remain grouped by their whole, with negative numbers.
+        around = np.where(has, nested[:, level.index], np.where(around < 0, around, -2 - around))
     return nested
 
 
@@ -89,7 +89,9 @@ def run_feature_tree(
     """
     contributions = Contributions.load(contributions_folder)
     parents = read_parents(coverage_folder, contributions)
-    alone = {"weight_language": 0.0, "ridge": RIDGE, "cg_steps": 0, "lbfgs_steps": STEPS, "prune_cosine": 1.0}
+    is_quadratic = not (field_settings.weight_instance or field_settings.weight_part)
+    alone = {"weight_language": 0.0, "ridge": RIDGE, "lbfgs_steps": STEPS, "prune_cosine": 1.0}
+    alone["cg_steps"] = STEPS if is_quadratic else 0
     losses = field_settings.model_copy(update=alone)
     no_latents = np.zeros((len(contributions), settings.feature_size), np.float32)
     problem, contrast = field_losses(contributions, parents, no_latents, losses, "random", seed, threads)

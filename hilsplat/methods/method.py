@@ -86,7 +86,7 @@ class MethodInputs:
         return masks.spread(np.ones((len(self.latents), 1), np.float32))[:, :, 0] > 0
 
     def linear_code(self, method: str) -> LinearCode:
-        """Return the scene's code, for methods whose training or averages need the CLIP vectors themselves.
+        """Return the scene's code, for methods that average codes (`Method.averages`).
 
         Raises:
             SettingsError: the code is a network, whose latents cannot be averaged like vectors.
@@ -117,10 +117,13 @@ def run_method(inputs: MethodInputs, out: Path, settings: MethodSettings, seed: 
     """Compute the field of a scene with a baseline, and write it to `out`, a `field.safetensors` file.
 
     Raises:
-        SettingsError: there is no such method.
+        SettingsError: there is no such method, or it averages codes and the scene's code is a network.
         ArtifactError: the method returned features of the wrong shape or non-finite values.
     """
-    method, contributions = method_of(settings.name), inputs.contributions
+    method = method_of(settings.name)
+    if method.averages:
+        inputs.linear_code(settings.name)
+    contributions = inputs.contributions
     fit: Fit = load(method.fit)
     with stage_log(f"method {settings.name}", Path(inputs.scene_folder).parent.name) as counts:
         features = np.asarray(fit(inputs, settings, seed), dtype=np.float32)

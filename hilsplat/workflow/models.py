@@ -3,8 +3,9 @@
 import functools
 from pathlib import Path
 
-from hilsplat.base.errors import HilsplatError
+from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.base.files import INSTALLED
+from hilsplat.baselines import OURS, method_of
 from hilsplat.configuration import CONFIG, StageSettings, parse_run, read_config
 from hilsplat.models.card import network_device
 from hilsplat.models.store import RELEASES, meaningless, read_model
@@ -21,6 +22,22 @@ def check_models(stages: StageSettings, where: str) -> None:
             _require_model(Path(folder), kind, variant)
         except HilsplatError as error:
             raise HilsplatError(f"{section}.model of {where}: {error}") from error
+
+
+def check_field(stages: StageSettings, where: str) -> None:
+    """Raise SettingsError if the field or the tree needs another code or other contributions."""
+    ours, evidence = stages.method.name == OURS, stages.semantic_tree.evidence
+    if not ours and method_of(stages.method.name).averages and stages.autoencoder.code == "network":
+        raise SettingsError(
+            f"{where}: method {stages.method.name} averages codes, which a network does not allow",
+            expected="autoencoder.code pca",
+            fix="set autoencoder: {code: pca, latent: 64, targets: mask} in the variant",
+        )
+    if stages.contributions.keep == "none" and (ours or evidence == "features"):
+        raise SettingsError(
+            f"{where}: contributions.keep is none, but the field or the tree needs pairs of Gaussians",
+            fix="remove contributions.keep, or set method.name to a baseline, and evidence to masks",
+        )
 
 
 def check_device(stages: StageSettings, where: str) -> None:

@@ -28,7 +28,13 @@ from hilsplat.scene.sheet import (
 )
 from hilsplat.stage import Facts, Stage
 from hilsplat.stages import all_stages, family_of, kinds_of, stage_of
-from hilsplat.workflow.models import check_device, check_models, describe_models, doubt_about_photographs
+from hilsplat.workflow.models import (
+    check_device,
+    check_field,
+    check_models,
+    describe_models,
+    doubt_about_photographs,
+)
 from hilsplat.workflow.scene_data import Job, SceneData, VariantJob, of_variant
 
 MIN_PHOTOGRAPHS = 16
@@ -183,6 +189,7 @@ class Plan:
                 where.setdefault(self.stages_of(variant, self.scopes(row)), f"{row.name}, variant {variant}")
         for stages, place in where.items():
             check_models(stages, place)
+            check_field(stages, place)
             if devices:
                 check_device(stages, place)
 

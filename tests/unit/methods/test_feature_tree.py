@@ -55,6 +55,23 @@ def test_finer_clusters_are_inside_coarser_ones_and_unseen_gaussians_have_none()
         assert len(np.unique(found[1:][found[1:, 1] == cluster, 0])) == 1
 
 
+def test_gaussians_in_no_coarser_cluster_share_none_of_its_finer_clusters():
+    features = np.full((4, 3, 2), np.nan, np.float32)
+    features[:, 2] = 0
+    features[:2, :2] = 0  # the others are in no whole and no part
+    assert nested_clusters(features, (0.5, 0.5, 0.5), 0).tolist() == [[0, 0, 1]] * 2 + [[-1, -1, 0]] * 2
+
+
+def test_l_h_alone_is_minimised(two_boxes_contributions):
+    world, contributions = two_boxes_contributions
+    settings = SemanticTreeSettings(evidence="features", feature_size=3)
+    alone = LOSSES.model_copy(update={"weight_instance": 0.0})
+    run_feature_tree(
+        contributions, world.masks, world.coverage_tree, world.folder / "alone", settings, alone, 0, 1
+    )
+    assert len(SemanticTree.load(world.folder / "alone").nodes_of(Level.WHOLE)) == 2
+
+
 def test_the_stage_finds_the_boxes_and_the_same_bytes_on_any_number_of_threads(two_boxes_contributions):
     world, contributions = two_boxes_contributions
     settings = SemanticTreeSettings(evidence="features", feature_size=3)

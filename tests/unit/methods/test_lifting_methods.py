@@ -9,13 +9,13 @@ import scipy.sparse as sp
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import Level
-from hilsplat.baselines import MethodSettings, TrainedSettings
+from hilsplat.baselines import BASELINES, MethodSettings, TrainedSettings
 from hilsplat.field.adam import Adam, in_random_order
 from hilsplat.field.code import Autoencoder, LinearCode
 from hilsplat.methods import dr_splat, langsplat_v2, lifted, occam
 from hilsplat.methods.langsplat import train
 from hilsplat.methods.langsplat_v2 import as_vectors, cosine_loss, largest_shares
-from hilsplat.methods.method import LabelledView, MethodInputs
+from hilsplat.methods.method import LabelledView, MethodInputs, run_method
 from hilsplat.scene.cameras import Camera
 
 
@@ -197,6 +197,9 @@ def test_occam_uses_the_mask_at_the_centre_of_a_gaussian_and_ignores_hidden_ones
 def test_methods_that_average_vectors_refuse_a_network_code(tmp_path, monkeypatch):
     network = Autoencoder.__new__(Autoencoder)
     monkeypatch.setattr("hilsplat.methods.method.load_code", lambda folder: network)
-    inputs = MethodInputs(*[tmp_path] * 6)
-    with pytest.raises(SettingsError, match="method dr_splat needs a linear code"):
-        inputs.linear_code("dr_splat")
+    world = (tmp_path, *[tmp_path / name for name in "abcde"])
+    averaging = [name for name, method in BASELINES.items() if method.averages]
+    assert set(BASELINES) - set(averaging) == {"langsplat", "hi_lsplat"}  # trained on codes, as published
+    for name in averaging:
+        with pytest.raises(SettingsError, match=f"method {name} needs a linear code"):
+            run_method(MethodInputs(*world), tmp_path / "field", MethodSettings(name=name), 0)

@@ -178,8 +178,8 @@ def test_a_method_that_returns_no_field_is_refused(tmp_path, monkeypatch, featur
         latents=np.zeros((3, 1), np.float32),
     )
     run_method = inspect.unwrap(method.run_method)  # the inputs here are no MethodInputs
-    with pytest.raises(ArtifactError, match="method lifted did not return a language field"):
-        run_method(inputs, tmp_path / "field.safetensors", MethodSettings(name="lifted"), 0)
+    with pytest.raises(ArtifactError, match="method langsplat did not return a language field"):
+        run_method(inputs, tmp_path / "field.safetensors", MethodSettings(name="langsplat"), 0)
 
 
 @pytest.fixture

@@ -1,11 +1,13 @@
 """Models and devices are checked before a job begins."""
 
+from contextlib import nullcontext
+
 import pytest
 
-from hilsplat.base.errors import HilsplatError
+from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.configuration import StageSettings
 from hilsplat.splat.rasterise.device import cuda_problem
-from hilsplat.workflow.models import check_device, check_models
+from hilsplat.workflow.models import check_device, check_field, check_models
 
 
 def stages(**sections: dict) -> StageSettings:
@@ -34,6 +36,28 @@ def test_a_missing_device_is_refused(section):
 def test_a_model_folder_that_cannot_be_used_is_refused(section, model, words):
     with pytest.raises(HilsplatError, match=rf"^{section}\.model of d/s: (.|\n)*{words}"):
         check_models(stages(**{section: {"model": model}}), "d/s")
+
+
+PAIRS = "contributions.keep is none"
+
+
+@pytest.mark.parametrize(
+    ("sections", "words"),
+    [
+        ({"method": {"name": "lifted"}, "autoencoder": {"code": "network"}}, "method lifted averages codes"),
+        ({"contributions": {"keep": "none"}}, PAIRS),
+        ({"contributions": {"keep": "none"}, "method": {"name": "langsplat"}}, ""),
+        ({"method": {"name": "langsplat"}, "autoencoder": {"code": "network"}}, ""),
+        (
+            {"contributions": {"keep": "none"}, "method": {"name": "lifted"}}
+            | {"semantic_tree": {"evidence": "features"}},
+            PAIRS,
+        ),
+    ],
+)
+def test_a_field_without_its_inputs_is_refused_before_the_run(sections, words):
+    with pytest.raises(SettingsError, match=words) if words else nullcontext():
+        check_field(stages(**sections), "d/s, variant v")
 
 
 def test_an_unused_model_and_device_auto_are_not_checked():
