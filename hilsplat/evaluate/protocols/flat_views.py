@@ -41,7 +41,7 @@ class FlatProtocols:
     """Scores one view under additional protocols, one text at a time.
 
     Only texts of `level` are queried, unless the data has no levels (None). The protocol names contain
-    `words`, the settings that change the relevancy.
+    `words`, the settings that change the relevancy, and `of_nodes`, those that change masks of nodes.
     """
 
     def __init__(
@@ -51,9 +51,11 @@ class FlatProtocols:
         cards: Sequence[ProtocolCard],
         level: Level | None,
         words: Sequence[str] = (),
+        of_nodes: Sequence[str] = (),
     ) -> None:
         self.scene, self.view, self.cards, self.level = scene, view, tuple(cards), level
         self.words = [*(["wholes"] if level is Level.WHOLE else []), *words]
+        self.words_of_nodes = [*self.words, *of_nodes]
         self._queries: dict[str, dict[str, Query]] = {}  # by method and text, for the argmax
 
     def add(
@@ -85,7 +87,7 @@ class FlatProtocols:
         for card in self.cards:
             is_of_nodes = nodes_mask is not None and card in (LERF_MASK, LERF_MASK_SKIPPING, OVS_NODES)
             if is_of_nodes:
-                yield from answer_rows(method, card, flat, nodes_mask, self.words, card.metrics)
+                yield from answer_rows(method, card, flat, nodes_mask, self.words_of_nodes, card.metrics)
             elif rule_of(card) is not None:  # other protocols need nodes, or all texts (`finish`)
                 other = dict(card.united).get(flat.text)
                 united = relevancy_of(self.scene, method, (other,), self.view)[0] if other else None

@@ -62,11 +62,18 @@ def label_of(card: cards.ProtocolCard, method: str, settings: EvaluateSettings) 
         words += rule.departures()
     else:  # nodes are selected without thresholds; localization and diagnostics still use smoothed maps
         words += RelevancyRule(rule.filter_px, rule.mix).departures()
-        if settings.node_select != cards.NODE_SELECT:
-            words.append(f"node share {settings.node_select:g}")
-        if method == "tree" and settings.ancestors != cards.ANCESTORS:
-            words.append(f"ancestors {settings.ancestors:g}")
+        words += node_departures(method, settings)
     return card.labelled([*words, *relevancy_departures(settings)])
+
+
+def node_departures(method: str, settings: EvaluateSettings) -> list[str]:
+    """Return descriptions of the settings that change which nodes answer a text, or a path."""
+    words = []
+    if settings.node_select != cards.NODE_SELECT:
+        words.append(f"node share {settings.node_select:g}")
+    if method == "tree" and settings.ancestors != cards.ANCESTORS:
+        words.append(f"ancestors {settings.ancestors:g}")
+    return words
 
 
 def given_key(method: str, query: Query, settings: EvaluateSettings) -> tuple[Any, ...]:
@@ -95,7 +102,8 @@ def measure_view(
 ) -> Iterator[Measured]:
     """Yield all rows of one view, in arbitrary order, and store the answers in `masks`."""
     answers, scene = _ViewAnswers(selections, view, settings, masks), selections.scene
-    flat_views = FlatProtocols(scene, view, extra.flat, extra.level, relevancy_departures(settings))
+    of_nodes = node_departures("tree", settings)
+    flat_views = FlatProtocols(scene, view, extra.flat, extra.level, relevancy_departures(settings), of_nodes)
     rule = rule_of(settings)
 
     needs_nodes = "tree" in settings.methods or "tree-path" in settings.methods

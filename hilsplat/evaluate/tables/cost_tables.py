@@ -3,6 +3,8 @@
 import statistics
 from dataclasses import replace
 
+import numpy as np
+
 from hilsplat.datasets.sources import LEVELLED
 from hilsplat.evaluate.costs import Cost
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN
@@ -64,10 +66,11 @@ def without_costs(block: Block) -> Block:
 
 def time_cells(costs: list[Cost], method: str) -> dict[str, Cell]:
     """Return the mean times and the maximum memory over scenes, for rows of `method`."""
+    peaks_mib = [cost.peak_mib for cost in costs]
     return {
         "Preparation (min)": Cell.number(statistics.fmean(cost.prepare_s for cost in costs) / 60),
         "Training (min)": Cell.number(statistics.fmean(cost.train_s for cost in costs) / 60),
-        "Memory (GB)": Cell.number(max(cost.peak_mib for cost in costs) / 1024),
+        "Memory (GB)": Cell.number(float(np.max(peaks_mib)) / 1024),  # nan if any is unknown
         "Query (s)": Cell.number(statistics.fmean(cost.query_s[method] for cost in costs)),
     }
 

@@ -67,7 +67,7 @@ def measured_blocks(
             rows: list[tuple[tuple[Any, ...], Row]] = []
             groups = selected.groupby(["variant", "masks", "method", "label"], sort=True)
             for (variant, masks, method, label), part in groups:
-                seeds = [cells_of(scores, of_seed) for _, of_seed in part.groupby("seed", sort=True)]
+                seeds = [cells_of(scores, of_seed) for of_seed in _comparable_seeds(part)]
                 seeds = seeds[:1] if method == "truth" else seeds  # annotations are the same under every seed
                 names = _row_names(variant, masks, method, label, sources.labels)
                 if len(seeds) > 1:
@@ -79,12 +79,22 @@ def measured_blocks(
                 protocol = list(PROTOCOLS).index(label) if label in PROTOCOLS else -1
                 order = row_place(variant, method, sources.labels)
                 place = made_from_truth(masks), protocol, *order, masks, label
-                rows.append((place, Row(names, cells, group if is_ranked else None)))
+                own = tuple(f"{scene} " for scene in part["scene"].unique())
+                averages = tuple(column for column in cells if not column.startswith(own))
+                unranked = averages if "Scenes" in names else ()
+                rows.append((place, Row(names, cells, group if is_ranked else None, unranked)))
             if rows:
                 distinct = without_repeats([row for _, row in sorted(rows, key=lambda pair: pair[0])])
                 columns = kind.columns_of(selected["scene"])
                 blocks.append(Block(*kind_and_title(str(data)), distinct, columns, kind.unranked))
     return blocks
+
+
+def _comparable_seeds(part: "pd.DataFrame") -> list["pd.DataFrame"]:
+    """Return a row's scores by seed, without seeds that lack scenes, whose means are of something else."""
+    seeds = [of_seed for _, of_seed in part.groupby("seed", sort=True)]
+    every = max(of_seed["scene"].nunique() for of_seed in seeds)
+    return [of_seed for of_seed in seeds if of_seed["scene"].nunique() == every]
 
 
 def _row_names(

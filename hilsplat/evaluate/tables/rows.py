@@ -52,6 +52,7 @@ class Row:
     names: Mapping[str, str]
     cells: Mapping[str, Cell]
     ranked_with: str | None = ""
+    unranked: tuple[str, ...] = ()  # columns in which it can't be compared with other rows
 
     def cell(self, column: str) -> Cell:
         """Return the cell of a column; a dash if the row has no value there."""
@@ -93,7 +94,7 @@ class Block:
             groups: dict[str, dict[int, float]] = {}
             for number, row in enumerate(self.rows):
                 cell = row.cell(column)
-                if row.ranked_with is not None and cell.value is not None:
+                if row.ranked_with is not None and cell.value is not None and column not in row.unranked:
                     # Displayed values are compared, so that equal texts get the same rank.
                     value = float(cell.text.partition(" ")[0])
                     groups.setdefault(row.ranked_with, {})[number] = value

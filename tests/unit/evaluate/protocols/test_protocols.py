@@ -205,6 +205,17 @@ def test_an_answer_with_nothing_in_it_localizes_nothing(tmp_path, constant):
     assert set(found.values()) == {0.0}
 
 
+def test_settings_of_nodes_are_in_the_names_of_all_protocols_of_nodes(block_world):
+    view, size_hw = "001.png", (64, 64)
+    settings = EvaluateSettings(node_select=0.5, methods=("tree",))
+    truth = ViewTruth.of(block_world.annotations, view, size_hw, settings.min_region_px)
+    flat = ExtraProtocols((card_of("3d-ovs/tree-nodes"), card_of("lerf-mask/gaussian-grouping")))
+    selections = Selections(block_world.answers)
+    rows = list(measure_view(selections, truth, view, PackedMasks(size_hw), settings, flat))
+    names = {row.protocol for row in rows if row.protocol.startswith(("3d-ovs", "lerf-mask"))}
+    assert len(names) == 2 and all("node share 0.5" in name for name in names)
+
+
 def test_a_repeated_text_nests_in_each_of_its_wholes(tmp_path):
     nodes = [("chair", 1, -1), ("table", 1, -1), ("leg", 2, 0), ("leg", 2, 1)]
     regions = [((0, 10), (0, 5)), ((0, 10), (5, 10)), ((8, 10), (0, 5)), ((8, 10), (5, 10))]

@@ -133,6 +133,15 @@ def test_a_scene_has_one_column_and_rows_over_part_of_the_scenes_say_so(tmp_path
     assert "waldo_kitchen mIoU" not in rows[0]
     assert (measured(rows)["scenes"], measured(rows, method="half")["scenes"]) == ("", "1 of 4")
     assert "not all of them" in forms[".md"] and '<td class="name">1 of 4</td>' in forms[".html"]
+    half = next(line for line in forms[".md"].splitlines() if line.startswith("| half"))
+    assert half.count("90.0") == 2 and half.count("**90.0**") == 1  # best in its scene, not on average
+
+
+def test_seeds_of_some_scenes_do_not_change_the_mean_over_all(tmp_path):
+    scores = [score("iou", 0.3, scene=scene, variant="v", method="field", **LERF) for scene in "abcd"]
+    scores.append(score("iou", 0.9, scene="a", variant="v.seed1", method="field", **LERF))
+    rows, _ = built(tmp_path, "lerf", scores)
+    assert measured(rows, method="v")["Average mIoU"] == "30.00"
 
 
 def test_the_average_of_3d_ovs_is_over_the_scenes_of_the_paper(tmp_path):
