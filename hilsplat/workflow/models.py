@@ -24,8 +24,13 @@ def check_models(stages: StageSettings, where: str) -> None:
             raise HilsplatError(f"{section}.model of {where}: {error}") from error
 
 
-def check_field(stages: StageSettings, where: str) -> None:
-    """Raise SettingsError if the field or the tree needs another code or other contributions."""
+def check_stages(stages: StageSettings, where: str, *, is_imported: bool = False) -> None:
+    """Raise SettingsError for settings that exclude each other; `is_imported` means masks of LangSplat."""
+    if stages.masks.levels == "tree" and (is_imported or stages.masks.segmenter == "truth-perturbed"):
+        raise SettingsError(
+            f"{where}: masks.levels is tree, but these masks come with their levels",
+            fix="remove masks.levels, or run this variant on scenes whose masks SAM or graph makes",
+        )
     ours, evidence = stages.method.name == OURS, stages.semantic_tree.evidence
     if not ours and method_of(stages.method.name).averages and stages.autoencoder.code == "network":
         raise SettingsError(

@@ -30,8 +30,8 @@ from hilsplat.stage import Facts, Stage
 from hilsplat.stages import all_stages, family_of, kinds_of, stage_of
 from hilsplat.workflow.models import (
     check_device,
-    check_field,
     check_models,
+    check_stages,
     describe_models,
     doubt_about_photographs,
 )
@@ -183,13 +183,14 @@ class Plan:
 
     def require_usable(self, *, devices: bool) -> None:
         """Check that the models exist and, with `devices`, that this machine has the configured devices."""
-        where: dict[StageSettings, str] = {}
+        where: dict[tuple[StageSettings, bool], str] = {}
         for row in self.scenes:
             for variant in self.run.variant_names():
-                where.setdefault(self.stages_of(variant, self.scopes(row)), f"{row.name}, variant {variant}")
-        for stages, place in where.items():
+                stages = self.stages_of(variant, self.scopes(row))
+                where.setdefault((stages, row.features is not None), f"{row.name}, variant {variant}")
+        for (stages, is_imported), place in where.items():
             check_models(stages, place)
-            check_field(stages, place)
+            check_stages(stages, place, is_imported=is_imported)
             if devices:
                 check_device(stages, place)
 

@@ -7,7 +7,7 @@ import pytest
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.configuration import StageSettings
 from hilsplat.splat.rasterise.device import cuda_problem
-from hilsplat.workflow.models import check_device, check_field, check_models
+from hilsplat.workflow.models import check_device, check_models, check_stages
 
 
 def stages(**sections: dict) -> StageSettings:
@@ -46,6 +46,8 @@ PAIRS = "contributions.keep is none"
     [
         ({"method": {"name": "lifted"}, "autoencoder": {"code": "network"}}, "method lifted averages codes"),
         ({"contributions": {"keep": "none"}}, PAIRS),
+        ({"masks": {"segmenter": "truth-perturbed", "levels": "tree"}}, "come with their levels"),
+        ({"masks": {"levels": "tree"}}, ""),
         ({"contributions": {"keep": "none"}, "method": {"name": "langsplat"}}, ""),
         ({"method": {"name": "langsplat"}, "autoencoder": {"code": "network"}}, ""),
         (
@@ -55,9 +57,14 @@ PAIRS = "contributions.keep is none"
         ),
     ],
 )
-def test_a_field_without_its_inputs_is_refused_before_the_run(sections, words):
+def test_settings_that_exclude_each_other_are_refused_before_the_run(sections, words):
     with pytest.raises(SettingsError, match=words) if words else nullcontext():
-        check_field(stages(**sections), "d/s, variant v")
+        check_stages(stages(**sections), "d/s, variant v")
+
+
+def test_masks_of_langsplat_keep_their_levels():
+    with pytest.raises(SettingsError, match="come with their levels"):
+        check_stages(stages(masks={"levels": "tree"}), "d/s, variant v", is_imported=True)
 
 
 def test_an_unused_model_and_device_auto_are_not_checked():
