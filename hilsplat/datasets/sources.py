@@ -7,7 +7,7 @@ import logging
 from collections.abc import Collection
 from pathlib import Path
 
-from hilsplat.base.errors import SceneError
+from hilsplat.base.errors import SceneError, SettingsError
 from hilsplat.base.lineage import files_of
 from hilsplat.datasets.registry import DATASETS, dataset_of, open_labels
 from hilsplat.scene.sheet import DATA_PREFIX
@@ -62,10 +62,19 @@ def unlisted(sources: Collection[str], groups: Collection[str], data_root: str) 
 def label_sets(source: str, data_root: str, row: str) -> tuple[str, ...]:
     """Return the label sets (`data set/scene`) of a row's scene (`dataset/scene`), those of its source first.
 
-    If `data_root` is empty, your own annotations are looked up in the working folder.
+    Your own annotations are in `data_root` or in the working folder.
+
+    Raises:
+        SettingsError: they are in the working folder, but `data_root` has those of other scenes.
     """
-    drawn = (Path(data_root).expanduser() / "annotated" / row).glob("*.json")
-    own = (f"annotated/{row}",) if any(drawn) else ()
+    own_name = f"annotated/{row}"
+    root = dataset_of("annotated").root(data_root).parent
+    own = (own_name,) if any((root / own_name).glob("*.json")) else ()
+    if not own and any(Path(own_name).glob("*.json")):
+        raise SettingsError(
+            f"the annotations in {own_name} are not scored, because {root} has a folder `annotated` too",
+            fix=f"move {own_name} to {root / own_name}",
+        )
     place = published(source)
     if place is None or absence(source, data_root) is not None:
         return own

@@ -204,6 +204,11 @@ HI_DATASETS: dict[str, Dataset] = {dataset.name: dataset for dataset in (HI_LERF
 class Annotated(Dataset):
     """A data set without published scenes: its scenes are those that have been annotated."""
 
+    def root(self, data_root: Path | str) -> Path:
+        """Return the folder in `data_root`, or that in the working folder if `data_root` has none."""
+        inside, here = super().root(data_root), Path(self.name)
+        return inside if inside.is_dir() or not here.is_dir() else here
+
     def found(self, root: Path) -> tuple[str, ...]:
         files = root.glob("*/*/*.json")
         return tuple(sorted({f"{path.parent.parent.name}/{path.parent.name}" for path in files}))

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hilsplat.base.errors import SceneError
+from hilsplat.base.errors import SceneError, SettingsError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import Level
 from hilsplat.datasets.images.hi import ANNOTATED, HI_LERF
@@ -313,6 +313,19 @@ def test_own_annotations_are_found_and_read_with_or_without_levels(tmp_path):
     with pytest.raises(SceneError, match=r"also photos/shelf"):
         open_labelled("annotated/photos/shelf", tmp_path)
     assert label_files("annotated/photos/desk", str(tmp_path)) == (path, folder / "DSC_2.json")
+
+
+def test_own_annotations_in_the_working_folder_are_found_beside_a_data_root(tmp_path, monkeypatch):
+    (tmp_path / "work/annotated/photos/desk").mkdir(parents=True)
+    (tmp_path / "work/annotated/photos/desk/001.json").write_text("{}")
+    monkeypatch.chdir(tmp_path / "work")
+    data = str(tmp_path / "data")
+    assert label_sets("photos/desk", data, "photos/desk") == ("annotated/photos/desk",)
+    (found,) = label_files("annotated/photos/desk", data)
+    assert found.samefile("annotated/photos/desk/001.json")
+    (tmp_path / "data/annotated/photos/shelf").mkdir(parents=True)
+    with pytest.raises(SettingsError, match=r"not scored(.|\n)*move annotated/photos/desk to"):
+        label_sets("photos/desk", data, "photos/desk")
 
 
 def test_the_annotation_of_the_bedroom_has_ten_objects_whose_children_are_inside_them():
