@@ -24,9 +24,9 @@ def check_models(stages: StageSettings, where: str) -> None:
             raise HilsplatError(f"{section}.model of {where}: {error}") from error
 
 
-def check_stages(stages: StageSettings, where: str, *, is_imported: bool = False) -> None:
-    """Raise SettingsError for settings that exclude each other; `is_imported` means masks of LangSplat."""
-    if stages.masks.levels == "tree" and (is_imported or stages.masks.segmenter == "truth-perturbed"):
+def check_stages(stages: StageSettings, where: str) -> None:
+    """Raise SettingsError for settings that exclude each other."""
+    if stages.masks.levels == "tree" and stages.masks.segmenter == "truth-perturbed":
         raise SettingsError(
             f"{where}: masks.levels is tree, but these masks come with their levels",
             fix="remove masks.levels, or run this variant on scenes whose masks SAM or graph makes",

@@ -183,14 +183,13 @@ class Plan:
 
     def require_usable(self, *, devices: bool) -> None:
         """Check that the models exist and, with `devices`, that this machine has the configured devices."""
-        where: dict[tuple[StageSettings, bool], str] = {}
+        where: dict[StageSettings, str] = {}
         for row in self.scenes:
             for variant in self.run.variant_names():
-                stages = self.stages_of(variant, self.scopes(row))
-                where.setdefault((stages, row.features is not None), f"{row.name}, variant {variant}")
-        for (stages, is_imported), place in where.items():
+                where.setdefault(self.stages_of(variant, self.scopes(row)), f"{row.name}, variant {variant}")
+        for stages, place in where.items():
             check_models(stages, place)
-            check_stages(stages, place, is_imported=is_imported)
+            check_stages(stages, place)
             if devices:
                 check_device(stages, place)
 

@@ -62,11 +62,6 @@ def test_settings_that_exclude_each_other_are_refused_before_the_run(sections, w
         check_stages(stages(**sections), "d/s, variant v")
 
 
-def test_masks_of_langsplat_keep_their_levels():
-    with pytest.raises(SettingsError, match="come with their levels"):
-        check_stages(stages(masks={"levels": "tree"}), "d/s, variant v", is_imported=True)
-
-
 def test_an_unused_model_and_device_auto_are_not_checked():
     check_device(stages(), "d/s")
     check_models(stages(masks={"segmenter": "graph", "model": "models/nope"}), "d/s")
