@@ -7,10 +7,12 @@ from pathlib import Path
 from hilsplat.base.errors import SceneError, foreign, in_one_line
 from hilsplat.base.files import list_images
 from hilsplat.scene.layouts import (
+    DATAPARSER,
     NO_POSES,
     dataparser_of,
     find_known_poses,
     has_known_poses,
+    is_from_nerfstudio,
     label_files,
     langsplat_features,
     langsplat_level,
@@ -110,6 +112,9 @@ def _gaussians(folder: Path, named: dict[str, Path | None], check_ply: CheckPly 
         parts.lines.append("  the three levels of LangSplat share their geometry, so one is enough")
     if dataparser := dataparser_of(ply, folder):
         parts.lines.append(f"  coordinates: nerfstudio's, from {dataparser}")
+    elif is_from_nerfstudio(ply):
+        problem = f"unknown, because the {DATAPARSER} of nerfstudio's run was not found"
+        parts.lines.append(f"  coordinates: {problem}; those of the poses are assumed")
 
 
 def _features(folder: Path, named: Path | None, views: list[str], parts: Parts) -> None:

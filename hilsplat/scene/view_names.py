@@ -10,6 +10,7 @@ from pathlib import Path
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES
+from hilsplat.scene.layouts import PHOTO_FOLDERS
 
 
 def view_name(stem: str) -> str:
@@ -38,11 +39,17 @@ ADDED = re.compile(r"^[0-9a-f]{8}-|_(?:jpe?g|png)\.rf\.[0-9a-f]{32}$")
 """What Label Studio puts before, and Roboflow behind, the name of an uploaded picture."""
 
 
+PLAIN = {(folder,) for folder in PHOTO_FOLDERS}
+"""Folders that don't distinguish photographs, so that they may be missing or have another name."""
+
+
 def match_names(names: Iterable[str], candidates: Iterable[str]) -> dict[str, str | None]:
     """Return for each name in another program's file the candidate that it means, or None if it isn't clear.
 
     Candidates are view names, or paths in a folder. Separators, case, suffix and Unicode form are ignored;
-    the rest of the last part must be equal. Of several candidates, the one with the most equal folders is
+    the rest of the last part must be equal. Folders, from the last one up, must be equal until either the
+    name or the candidate has no more, or only a `PLAIN` one: "cam1/a.jpg" may be "images/a.png" or
+    "rig/cam1/a.png", but not "cam2/a.png". Of several candidates, the one with the most equal folders is
     meant, then the one in the fewest folders, then the one with the same suffix and case. View names have
     their folders as a prefix: "cam1/a.jpg" may be "cam1_a.png". If nothing fits, what upload pages `ADDED` is
     ignored.
@@ -59,10 +66,14 @@ def match_names(names: Iterable[str], candidates: Iterable[str]) -> dict[str, st
             ranked = []
             for length in range(1, len(wanted) + 1):
                 for other, candidate in by_last.get("_".join(wanted[-length:]), ()):
-                    pairs = zip(reversed(wanted[:-length]), reversed(other[:-1]), strict=False)
-                    same = length + sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
+                    folders, places = wanted[:-length], other[:-1]
+                    pairs = zip(reversed(folders), reversed(places), strict=False)
+                    same = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
+                    rests = folders[: len(folders) - same], places[: len(places) - same]
+                    if all(rests) and PLAIN.isdisjoint(rests):
+                        continue
                     alike = (candidate.casefold().rpartition(".")[2] == suffix, candidate.endswith(last))
-                    ranked.append(((same, -len(other), *alike), candidate))
+                    ranked.append(((length + same, -len(other), *alike), candidate))
             best = [candidate for rank, candidate in ranked if rank == max(ranked)[0]]
             if best:
                 return best[0] if len(best) == 1 else None

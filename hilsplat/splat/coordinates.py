@@ -20,7 +20,10 @@ from hilsplat.splat.ply import import_ply, load_ply, save_ply
 
 logger = logging.getLogger(__name__)
 
-FIX = "export it again as an uncompressed 3DGS PLY, or correct the gaussians column of the scene sheet"
+FIX = (
+    "export it again as an uncompressed 3DGS PLY (SuperSplat converts other formats), or correct the "
+    "gaussians column of the scene sheet"
+)
 COPY_AGAIN = "copy it again from nerfstudio"
 TOLERANCE = 1e-5  # maximum deviation of a matrix from a scaled rotation, relative to the scale
 BEFORE_APPLIED_TRANSFORM = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]

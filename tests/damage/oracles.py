@@ -75,22 +75,28 @@ def name_parts(text: str) -> list[str]:
 
 
 def meant(name: str, candidates: list[str]) -> list[str]:
-    """Return the candidates that share the most last parts with a name; of these, those without others."""
+    """Return the candidates that share the most last parts with a name; of these, those without others.
+
+    Above the shared parts, one of the two has no folder, or only `images`.
+    """
     wanted, shared = name_parts(name), []
     for candidate in candidates:
-        pairs = zip(reversed(wanted), reversed(name_parts(candidate)), strict=False)
-        same = [one == other for one, other in pairs]
-        shared.append(same.index(False) if False in same else len(same))
+        parts = name_parts(candidate)
+        same = [one == other for one, other in zip(reversed(wanted), reversed(parts), strict=False)]
+        count = same.index(False) if False in same else len(same)
+        above = [each[: len(each) - count] for each in (wanted, parts)]
+        shared.append(count if [] in above or ["images"] in above else 0)
     best = [each for each, count in zip(candidates, shared, strict=True) if count == max(shared) > 0]
     exact = [each for each in best if len(name_parts(each)) == min(map(len, map(name_parts, best)))]
     return exact if len(exact) == 1 else best
 
 
 def image_files(root: Path, name: str) -> list[Path | None]:
-    """Return the image that a name means; several, and None, if it isn't clear."""
+    """Return the images that a name may mean, and None unless it states the place of the only one."""
     files = {path.relative_to(root).as_posix(): path for path in sorted(root.rglob("*.png"))}
     found: list[Path | None] = [files[each] for each in meant(name, list(files))]
-    return found if len(found) == 1 else [*found, None]
+    places = [root / folder / f"{name}{suffix}" for folder in ("", "images") for suffix in ("", ".png")]
+    return found if len(found) == 1 and found[0] in places else [*found, None]
 
 
 def colmap_name(model: int) -> str:
@@ -377,7 +383,8 @@ def transforms_lens(frame: dict[str, Any], image: Path | None) -> tuple[Any, ...
     is_fisheye = bool(fisheye) or model in FISHEYES
     require(not (is_fisheye and (value("p1") or value("p2"))), "tangential")
     require(is_fisheye or not value("k4"), "k4")
-    cx, cy = (float(frame.get(key, side / 2)) for key, side in zip(("cx", "cy"), size, strict=True))
+    centre = zip((frame.get("cx"), frame.get("cy")), size, strict=True)
+    cx, cy = (side / 2 if stated is None else float(stated) for stated, side in centre)
     params = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
     params |= {key: value(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
     return "fisheye" if is_fisheye else "perspective", params, tuple(size)

@@ -7,7 +7,7 @@ import pytest
 from hilsplat.base.errors import HilsplatError
 from hilsplat.scene.importers.colmap_model import read_model
 from hilsplat.scene.importers.reading import read_source
-from hilsplat.scene.layouts import find_known_poses
+from hilsplat.scene.layouts import find_known_poses, photo_files
 from tests.imports import analytic_world as world
 
 WIDTH, HEIGHT, LENS = 96, 72, "PINHOLE 80 78 47 37"
@@ -236,3 +236,51 @@ def test_rigs_whose_cameras_share_file_names_keep_every_view(tmp_path, imported)
     """COLMAP's rigs: rig0/0000.png, rig1/0000.png, ..."""
     views, *_ = imported(write(tmp_path / "in", "rig{}/0000.png"))
     world.require_right(views, {f"rig{number}_0000.png": pose for number, pose in enumerate(POSES)}, 45)
+
+
+RIG = {f"cam{1 + number // 3}/{number % 3}.png": number for number in range(6)}
+FLAT = {f"{number}.png": number for number in range(6)}
+
+
+@pytest.mark.parametrize(
+    ("names", "moved", "missing"),
+    [
+        # The picture of the same name in another camera's folder has no pose, or one of its own.
+        ([*RIG][1:], {"cam2/0.png": "images/cam1/0.png", "cam1/0.png": None}, {"cam2/0.png"}),
+        ([*RIG], {"cam2/0.png": None}, {"cam2/0.png"}),
+        ([*RIG], dict.fromkeys([*RIG][3:]), {*[*RIG][3:]}),
+        ([*RIG][3:], dict.fromkeys([*RIG][3:]), {*[*RIG][3:]}),
+        # The same names in another form, with other folders above, or without any.
+        ([*RIG], {"cam2/0.png": "images/CAM2/0.PNG"}, set()),
+        ([*RIG], {name: f"photos/rig/{name}" for name in RIG}, set()),
+        ([*RIG][3:], {name: f"images/{name[5:]}" for name in [*RIG][3:]} | {"cam1/0.png": None}, set()),
+        # The `convert.py` of 3DGS keeps distorted photographs in `input/`.
+        ([*FLAT], {"2.png": "input/2.png"}, {"2.png"}),
+        ([*FLAT], {"2.png": "images/2.JPEG", "3.png": "images/3.PNG"}, set()),
+        ([*FLAT], {name: f"input/{name}" for name in FLAT}, set()),
+        ([*FLAT], {name: f"DCIM/10{name[0]}/{name}" for name in FLAT}, set()),
+    ],
+)
+def test_a_missing_picture_is_not_replaced_by_one_in_another_folder(names, moved, missing, tmp_path):
+    """`moved` maps pictures to other files than `images/<name>`, or to None if they are deleted."""
+    pictures = FLAT if names[-1] in FLAT else RIG
+    files = {name: moved.get(name, f"images/{name}") for name in pictures}
+    world.save(tmp_path, {file: PICTURES[pictures[name]] for name, file in files.items() if file}, suffix="")
+    poses = dict(zip(names, POSES, strict=False))
+    world.write_colmap(tmp_path / "sparse/0", LENS, (WIDTH, HEIGHT), poses, POINTS)
+    views = {view.name: view.image for view in read_source(find_known_poses(tmp_path)).views}
+    expected = {name: None if name in missing else tmp_path / files[name] for name in poses}
+    assert views == expected
+
+
+def test_the_test_views_that_3dgs_lists_are_held_out(tmp_path, imported):
+    folder = write(tmp_path / "in")
+    listed = folder / "sparse/0/test.txt"
+    listed.write_text("\ufeff004.png\r\nimages\\001.JPG\r\n009.png\r\n\r\n", encoding="utf-8")
+    *_, split, report = imported(folder)
+    assert [view for view, part in split.items() if part == "test"] == ["001.png", "004.png"]
+    assert report["warnings"] == ["1 names in test.txt belong to no view"]
+    assert listed in photo_files(folder)
+    listed.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(HilsplatError, match=r"test\.txt cannot be read(.|\n)*the name of a test view"):
+        imported(folder)

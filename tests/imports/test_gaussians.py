@@ -1,5 +1,7 @@
 """Gaussians of other programs: filters, unknown properties, unusable rows, and what is refused."""
 
+import gzip
+
 import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
@@ -7,7 +9,7 @@ from plyfile import PlyData, PlyElement
 from hilsplat.base.errors import ArtifactError
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
-from hilsplat.splat.coordinates import import_gaussians
+from hilsplat.splat.coordinates import import_gaussians, read_gaussians
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import import_ply, load_ply
 
@@ -169,6 +171,13 @@ def test_forms_and_elements_that_mean_something_else_are_refused_by_name(tmp_pat
     path = write(tmp_path / "theirs.ply", change(columns()), elements=elements)
     with pytest.raises(ArtifactError, match=rf"theirs\.ply(.|\n)*{words}(.|\n)*export it plainly"):
         import_ply(path, "export it plainly")
+
+
+@pytest.mark.parametrize("content", [gzip.compress(b"NGSP"), b"PK\x03\x04", b"\0" * 320, b""])
+def test_files_of_other_formats_are_named_as_such(tmp_path, content):
+    (tmp_path / "desk.spz").write_bytes(content)
+    with pytest.raises(ArtifactError, match=r"desk\.spz cannot be read: it is not a PLY(.|\n)*SuperSplat"):
+        read_gaussians(tmp_path / "desk.spz")
 
 
 # ---- rows --------------------------------------------------------------------------------------------

@@ -195,9 +195,23 @@ def test_the_split_of_the_source_is_kept(lists, held_out, tmp_path):
     assert "".join(view.name[7] for view in source.views if view.is_test) == held_out
 
 
+def test_the_test_frames_of_scannetpp_are_held_out(tmp_path, imported):
+    """They are a second list of frames, not names."""
+    folder = write(tmp_path / "in", PLAIN, NUMBERS)
+    changed(
+        folder, lambda content: content.update(test_frames=[content["frames"].pop(row) for row in (4, 1)])
+    )
+    views, _, split, _ = imported(folder)
+    world.require_right(views, right("abcdef"), 45)
+    assert sorted(view for view, part in split.items() if part == "test") == ["b.png", "e.png"]
+    changed(folder, lambda content: content.update(test_frames=["images/b.png"]))
+    with pytest.raises(SceneError, match="`test_frames` is missing, or is not a list of objects"):
+        read_source(find_known_poses(folder))
+
+
 def test_names_of_a_split_without_a_frame_are_reported(tmp_path):
     folder = write(tmp_path, PLAIN, {**NUMBERS, "test_filenames": ["images/a.png", "images/zz.png"]})
-    assert read_source(find_known_poses(folder)).notes == ["1 names in test_filenames belong to no frame"]
+    assert read_source(find_known_poses(folder)).notes == ["1 names in test_filenames belong to no view"]
 
 
 @pytest.mark.parametrize(
@@ -297,11 +311,37 @@ def test_views_that_all_have_one_pose_are_refused(tmp_path):
 
 def test_two_frames_with_one_image_are_both_left_out(tmp_path):
     folder = changed(
-        write(tmp_path, PLAIN, NUMBERS), lambda content: content["frames"][0].update(file_path="other/b.png")
+        write(tmp_path, PLAIN, NUMBERS), lambda content: content["frames"][0].update(file_path="./images/b")
     )
     source = read_source(find_known_poses(folder))
     assert [view.name for view in source.views] == NAMES[2:]
-    assert set(source.left_out) == {"other/b.png", "images/b.png"}
+    assert set(source.left_out) == {"./images/b", "images/b.png"}
+
+
+@pytest.mark.parametrize("name", ["other/b.png", "b.jpg", "x/images/b", "images/sub/b"])
+def test_the_image_of_a_frame_is_not_that_of_a_frame_without_one(name, tmp_path):
+    folder = write(tmp_path, PLAIN, NUMBERS)
+    (folder / "images/a.png").unlink()
+    changed(folder, lambda content: content["frames"][0].update(file_path=name))
+    images = {view.name: view.image for view in read_source(find_known_poses(folder)).views}
+    assert images == {name: None} | {other: folder / other for other in NAMES[1:]}
+
+
+@pytest.mark.parametrize("splits", [("train",), ("train", "test")])
+def test_a_missing_picture_of_blender_is_not_replaced_by_one_of_another_set(splits, tmp_path):
+    """Both sets have pictures a, b, ...; one picture for training is missing, then all of them."""
+    for split in ("train", "test"):
+        world.save(tmp_path / split, {letter: shot(SQUARE, letter) for letter in POSES})
+        if split in splits:
+            poses = {f"./{split}/{letter}": POSES[letter] for letter in POSES}
+            world.write_transforms(tmp_path / f"transforms_{split}.json", {"camera_angle_x": 1.0}, poses)
+    for letters in ("c", "abdef"):
+        for letter in letters:
+            (tmp_path / f"train/{letter}.png").unlink()
+        images = {view.name: view.image for view in read_source(find_known_poses(tmp_path)).views}
+        paths = {name: tmp_path / f"{name}.png" for name in images}
+        assert images == {name: path if path.is_file() else None for name, path in paths.items()}
+        assert len(images) == 6 * len(splits)
 
 
 def cloud(folder, colours, kind, names=("red", "green", "blue"), xyz=((0, 1, 2), (3, 4, 5)), text=False):

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from hilsplat.base.errors import HilsplatError, SceneError, foreign, in_one_line
-from hilsplat.base.files import IMAGE_SUFFIXES, is_outside, list_images
+from hilsplat.base.files import IMAGE_SUFFIXES, is_outside, list_images, regular
 from hilsplat.base.images import image_size_hw
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.cameras import MAX_SIDE_PX
@@ -17,7 +17,7 @@ from hilsplat.scene.colmap import Points, pycolmap
 from hilsplat.scene.importers.colmap_model import ModelImage, read_model
 from hilsplat.scene.layouts import KnownPoses, used_images
 from hilsplat.scene.posed_images import rigid_pose
-from hilsplat.scene.view_names import match_names
+from hilsplat.scene.view_names import match_names, name_parts
 
 ASPECT_TOLERANCE = 0.01
 """Relative tolerance of an image's aspect ratio: a scaled copy is accepted, a different crop is not."""
@@ -84,6 +84,13 @@ class Source:
         while name in self.left_out:
             name += " (again)"
         self.left_out[name] = reason
+
+    def listed(self, listed: Iterable[str], names: Sequence[str], where: str) -> set[str]:
+        """Return the views that a list of names means, and note the number of names without a view."""
+        matches = match_names(listed, names).values()
+        if num_lost := sum(name is None for name in matches):
+            self.notes.append(f"{num_lost} names in {where} belong to no view")
+        return {name for name in matches if name is not None}
 
     def require_most(self, min_share: float, files: object) -> None:
         """Raise SceneError if fewer than this share of the views can be used, with the first reasons."""
@@ -167,10 +174,11 @@ def require_centred(centre: Sequence[float], size: tuple[int, int]) -> None:
 
 
 def find_images(root: Path, names: Sequence[str]) -> dict[str, Path | None]:
-    """Return the image of each name in a pose file, from `root`, its `images/` or folders below, or None.
+    """Return the image of each of a source's names, from `root`, its `images/` or folders below, or None.
 
-    Downloaded data cannot access other files: a path that leads outside the folder means the image in the
-    folder with the same name (`match_names`).
+    A name without such a file means the image that `match_names` finds, unless another name has that image,
+    or other names in the same folder have files, but elsewhere: the image is then missing. This includes
+    paths that lead outside `root`, so that downloaded data cannot access other files.
 
     Raises:
         SceneError: a path leads outside the folder, which has no such image.
@@ -182,11 +190,17 @@ def find_images(root: Path, names: Sequence[str]) -> dict[str, Path | None]:
         paths = [] if is_outside(name) else [base / f"{plain}{end}" for base in bases for end in ends]
         images[name] = next((path for path in paths if path.is_file()), None)
     if missing := [name for name, image in images.items() if image is None]:
-        below = {path.relative_to(root).as_posix(): path for path in used_images(root)}
+        found = {image: image.relative_to(root).as_posix() for image in images.values() if image is not None}
+        below = {path.relative_to(root).as_posix(): path for path in used_images(root) if path not in found}
+        homes: dict[tuple[str, ...], set[tuple[str, ...]]] = {}
+        for name, image in images.items():
+            if image is not None:
+                homes.setdefault(name_parts(name)[:-1], set()).add(name_parts(found[image])[:-1])
         for name, match in match_names(missing, below).items():
+            home = homes.get(name_parts(name)[:-1])
             if match is None:
                 require_inside(root, name)
-            else:
+            elif home is None or name_parts(match)[:-1] in home:
                 images[name] = below[match]
     return images
 
@@ -202,17 +216,23 @@ def require_inside(root: Path, name: str) -> None:
 
 
 def read_colmap(known: KnownPoses) -> Source:
-    """Read a COLMAP model."""
+    """Read a COLMAP model, and the names of its test views from the `test.txt` of 3DGS, if present."""
     folder = known.files[0]
     model, source = read_model(folder), Source()
     point_ids, xyz, rgb = model.points or (np.zeros(0, np.int64), np.zeros((0, 3)), None)
-    files = find_images(known.root, [image.name for image in model.images])
+    names = [image.name for image in model.images]
+    files, held_out = find_images(known.root, names), set[str]()
+    if (listed := folder / "test.txt").is_file():
+        with foreign(listed, expected="the name of a test view in each line"):
+            lines = regular(listed).read_text(encoding="utf-8-sig").splitlines()
+        held_out = source.listed([line.strip() for line in lines if line.strip()], names, listed.name)
 
     def described(image: ModelImage) -> KnownView:
         if image.camera_id not in model.lenses:
             raise SceneError(f"view {image.name} has camera {image.camera_id}, which the model lacks")
         camera = model.lenses[image.camera_id].camera()
-        return KnownView(image.name, files[image.name], camera, image.cam_from_world)
+        is_test = image.name in held_out
+        return KnownView(image.name, files[image.name], camera, image.cam_from_world, is_test)
 
     num_lost = 0
     for image in sorted(model.images, key=lambda image: image.name):

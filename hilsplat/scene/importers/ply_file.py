@@ -42,7 +42,9 @@ def _with_plain_header(file: BinaryIO) -> BinaryIO:
         header += line
         if line.strip() == b"end_header":
             break
-    if header.isascii() or not header.startswith(b"ply"):
+    if not header.startswith(b"ply"):
+        raise ValueError("it is not a PLY file")
+    if header.isascii():
         file.seek(0)
         return file
     return io.BytesIO(header.decode("ascii", "replace").encode("ascii", "replace") + file.read())

@@ -24,7 +24,6 @@ from hilsplat.scene.importers.known_views import (
 from hilsplat.scene.importers.ply_file import read_ply
 from hilsplat.scene.layouts import KnownPoses, read_json_object
 from hilsplat.scene.posed_images import OPENGL_TO_OPENCV, rigid_pose
-from hilsplat.scene.view_names import match_names
 
 FOCAL = {axis: (f"fl_{axis}", f"camera_angle_{axis}", f"{axis}_fov") for axis in "xy"}
 FOCAL_KEYS = frozenset((*FOCAL["x"], *FOCAL["y"]))
@@ -47,7 +46,7 @@ SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 
 # applied_transform and applied_scale are used for Gaussians, see `splat/coordinates.py`.
 USED = """frames file_path transform_matrix w h cx cy k1 k2 k3 k4 p1 p2 camera_model is_fisheye ply_file_path
-applied_transform applied_scale"""
+applied_transform applied_scale test_frames"""
 HARMLESS = """aabb_scale scale offset n_frames up sharpness rotation render_aabb orientation_override
 colmap_im_id depth_file_path depth_path depth_unit_scale_factor integer_depth_scale enable_depth_loading
 normal_file_path sharpen white_transparent black_transparent timestamp auto_scale_poses_override center_method
@@ -73,26 +72,33 @@ def read_transforms(known: KnownPoses) -> Source:
 
     A frame's keys override those of its file. Without a size, it is the image's. Lists of file names are the
     source's split: a view is held out unless it is in `train_filenames`, or else if it is in one of the
-    other lists. Points are read if `ply_file_path` names them.
+    other lists. The `test_frames` of ScanNet++ are held out. Points are read if `ply_file_path` names them.
     """
-    source = Source()
+    source, contents = Source(), []
     for file in known.files:
         content = read_json_object(file, "export it again")
-        frames = content.get("frames")
-        if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-            raise SceneError(
-                f"{file}: `frames` is missing, or is not a list of objects", fix="export it again"
-            )
+        frames: list[dict[str, Any]] = []
+        for key, rows in (
+            ("frames", content.get("frames")),
+            ("test_frames", content.get("test_frames") or []),
+        ):
+            if not isinstance(rows, list) or not all(isinstance(frame, dict) for frame in rows):
+                problem = f"{file}: `{key}` is missing, or is not a list of objects"
+                raise SceneError(problem, fix="export it again")
+            frames += rows
         source.notes += KEYS.check([content, *frames], file)
         names = [str(frame.get("file_path", f"frame {number}")) for number, frame in enumerate(frames)]
-        images, held_out = find_images(known.root, names), _held_out(content, names, source.notes)
+        contents.append((file, content, frames, names))
+    images = find_images(known.root, [name for *_, names in contents for name in names])
+    for file, content, frames, names in contents:
+        held_out = _held_out(content, names, source)
         source.has_split |= bool(content.get(SPLITS[0]))
-        is_test = file != known.files[0]
+        num_train = len(content["frames"]) if file == known.files[0] else 0
         for number, (name, frame) in enumerate(zip(names, frames, strict=True)):
             replaced = FOCAL_KEYS if FOCAL_KEYS & frame.keys() else frozenset()
             merged = {key: value for key, value in content.items() if key not in replaced} | frame
-            where, is_held_out = f"{file}, frame {number} ({name})", is_test or name in held_out
-            source.add(name, _view, where, merged, name, images[name], is_held_out, source.notes)
+            where, is_test = f"{file}, frame {number} ({name})", number >= num_train or name in held_out
+            source.add(name, _view, where, merged, name, images[name], is_test, source.notes)
         if source.points is None and content.get("ply_file_path") is not None:
             ply = str(content["ply_file_path"]).replace("\\", "/")
             require_inside(file.parent, ply)
@@ -101,18 +107,15 @@ def read_transforms(known: KnownPoses) -> Source:
     return source
 
 
-def _held_out(content: Mapping[str, Any], names: list[str], notes: list[str]) -> set[str]:
+def _held_out(content: Mapping[str, Any], names: list[str], source: Source) -> set[str]:
     """Return the frames that the file's lists of names keep from training."""
-    listed: dict[str, set[str]] = {}
+    listed: list[set[str]] = []
     for key in SPLITS:
         value = content.get(key)
         if value is not None and not isinstance(value, list):
-            notes.append(f"{key} is not a list of names, and is not used")
-        matches = match_names(map(str, value if isinstance(value, list) else []), names).values()
-        listed[key] = {name for name in matches if name is not None}
-        if num_lost := sum(name is None for name in matches):
-            notes.append(f"{num_lost} names in {key} belong to no frame")
-    train, *others = (listed[key] for key in SPLITS)
+            source.notes.append(f"{key} is not a list of names, and is not used")
+        listed.append(source.listed(map(str, value if isinstance(value, list) else []), names, key))
+    train, *others = listed
     return set(names) - train if train else set().union(*others)
 
 
