@@ -87,7 +87,7 @@ def test_prompts_may_have_any_image_format_and_other_files_are_refused(teatime):
     head = open_scene(teatime).views["frame_00002.png"][0]
     assert head.text == "head" and np.array_equal(head.mask(), expected)
     (folder / "tail.npy").write_bytes(b"")
-    with pytest.raises(ArtifactError, match="tail.npy is not a mask"):
+    with pytest.raises(ArtifactError, match=r"tail.npy is not a mask"):
         open_scene(teatime)
 
 
