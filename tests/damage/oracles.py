@@ -588,10 +588,9 @@ class Region:
 
 
 def size_of(content: Any, view_hw: tuple[int, int]) -> tuple[int, int]:
-    if content.get("height") is None and content.get("width") is None:
-        return view_hw
     size = content["height"], content["width"]
-    require(all(type(side) is int and 0 < side <= 20000 for side in size), "size")
+    require(all(type(side) in (int, float) and 0 < side <= 20000 and side % 1 == 0 for side in size), "size")
+    size = int(size[0]), int(size[1])
     require(abs(size[0] - size[1] * view_hw[0] / view_hw[1]) <= max(1, 0.01 * size[0]), "shape")
     return size
 
@@ -637,7 +636,7 @@ def isat(content: dict[str, Any], view_hw: tuple[int, int]) -> list[Region | Non
 
 def labelme(content: dict[str, Any], view_hw: tuple[int, int]) -> list[Region | None]:
     def region(entry: Any) -> Region:
-        size = size_of({"height": content.get("imageHeight"), "width": content.get("imageWidth")}, view_hw)
+        size = size_of({"height": content["imageHeight"], "width": content["imageWidth"]}, view_hw)
         kind = entry.get("shape_type") or "polygon"
         points = np.array(entry["points"], np.float64).reshape(-1, 2)
         require((np.abs(points) < 1e6).all() and isinstance(entry["label"], str), "points")

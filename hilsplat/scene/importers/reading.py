@@ -3,7 +3,7 @@
 import numpy as np
 
 from hilsplat.base.errors import SceneError
-from hilsplat.scene.importers.known_views import KnownView, Source, read_colmap, read_llff
+from hilsplat.scene.importers.known_views import KnownView, Source, check_centres, read_colmap, read_llff
 from hilsplat.scene.importers.phones import read_polycam, read_record3d
 from hilsplat.scene.importers.transforms import read_transforms
 from hilsplat.scene.layouts import KnownPoses
@@ -33,6 +33,7 @@ def read_source(known: KnownPoses) -> Source:
             f"all {len(poses)} views of {known.files[0]} have the same pose", fix="export it again"
         )
     _keep_one_view_per_image(source)
+    source.notes += check_centres({view.name: view.lens for view in source.views if view.image is not None})
     source.notes += [f"{other} also has poses, which are not used" for other in known.others]
     if source.points is not None:
         xyz, rgb = source.points

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.points.scannet import LABEL_TABLE, open_scan, read_label_table
@@ -158,6 +159,23 @@ NUMBERLESS = '{"segGroups": [{"label": "wall", "segments": [7]}]}'
 def test_unusable_scans_are_refused_with_a_fix(root, damage, message):
     damage(root / "scans" / SCAN)
     with pytest.raises(SceneError, match=f"(?s){message}"):
+        open_scan(root, SCAN)
+
+
+@pytest.mark.parametrize(
+    ("scale", "info"),
+    [
+        (0.5, ""),  # images made smaller than intrinsic_color.txt
+        (1.0, "colorHeight = 24\ncolorWidth = 32\n"),  # both made smaller than the .txt
+    ],
+)
+def test_a_lens_of_another_image_size_is_refused(root, scale, info):
+    folder = root / "scans" / SCAN
+    (folder / f"{SCAN}.txt").write_text(info)
+    for path in (folder / "color").iterdir():
+        with Image.open(path) as image:
+            image.resize((round(16 * scale), round(12 * scale))).save(path)
+    with pytest.raises(SceneError, match=r"cx and cy of \S*intrinsic_color.txt belong to another size"):
         open_scan(root, SCAN)
 
 
