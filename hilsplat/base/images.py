@@ -195,7 +195,7 @@ def read_mask(path: Path) -> UInt8[np.ndarray, "H W"]:
             if has_colour or image.mode == "P":
                 is_other = colours.any(axis=2)
                 if not is_other.all() and _num_colours(colours[is_other]) == 1:
-                    return is_other * np.uint8(255)
+                    return np.where(is_other, 255, 0).astype(np.uint8)
                 if has_colour:
                     raise _several_classes(path, f"{_num_colours(colours)} colours")
             grey = np.asarray(image.convert("RGB").convert("L"))
