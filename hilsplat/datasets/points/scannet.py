@@ -84,6 +84,7 @@ def read_images(folder: Path, scan: str) -> tuple[tuple[PosedImage, ...], tuple[
     Also return a warning for each reason that frames were skipped.
     """
     frames = sorted((_frame_number(path), path) for path in list_images(folder / "color"))
+    poses = {int(path.stem): path for path in (folder / "pose").glob("*.txt") if path.stem.isdecimal()}
     lens = folder / "intrinsic" / "intrinsic_color.txt"
     K = read_matrices(lens, 4)[0, :3, :3] + HALF_PIXEL
     lost, unposed, images = [], [], []
@@ -94,8 +95,7 @@ def read_images(folder: Path, scan: str) -> tuple[tuple[PosedImage, ...], tuple[
     else:
         size_hw = image_size_hw(frames[0][1]) if frames else (0, 0)
     for number, path in frames:
-        pose = folder / "pose" / f"{number}.txt"
-        if not pose.is_file():
+        if (pose := poses.get(number)) is None:
             unposed.append(number)
             continue
         world_from_cam = read_matrices(pose, 4)[0]

@@ -71,6 +71,16 @@ def test_frames_are_sorted_by_number_and_posed_with_centres_moved_by_half_a_pixe
     assert image.size_hw == (12, 16)
 
 
+def test_names_may_be_padded_with_zeros(root):
+    plain = open_scan(root, SCAN).images
+    for path in [*(root / "scans" / SCAN).glob("color/*"), *(root / "scans" / SCAN).glob("pose/*")]:
+        path.rename(path.with_name(f"{int(path.stem):06d}{path.suffix}"))
+    images = open_scan(root, SCAN).images
+    assert [image.name for image in images] == [f"{number:06d}.jpg" for number in range(12)]
+    for image, same in zip(images, plain, strict=True):
+        np.testing.assert_array_equal(image.cam_from_world, same.cam_from_world)
+
+
 def test_frames_without_a_pose_are_skipped_and_reported(tmp_path):
     root = make_scan(tmp_path / "scannet", frames=5, lost=(1, 3))
     poses = root / "scans" / SCAN / "pose"
