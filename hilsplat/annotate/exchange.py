@@ -296,6 +296,9 @@ def _isat_reader(name: str, content: Mapping[str, Any], cameras: Cameras) -> Rea
 def _labelme_reader(name: str, content: Mapping[str, Any], cameras: Cameras) -> Reader:
     view = _view(name, content.get("imagePath"), cameras)
     size = {side: content.get(f"image{side.title()}") for side in ("height", "width")}
+    if not any(size.values()) and content.get("imageData"):  # as in old versions
+        with open_image(io.BytesIO(base64.b64decode(content["imageData"]))) as image:
+            size = {"height": image.height, "width": image.width}
 
     def read(where: str, entry: Any) -> Piece | str:
         drawn_hw = _drawn_hw(where, size, cameras[view])
@@ -411,9 +414,7 @@ def _vertices(value: Any, size_hw: tuple[int, int]) -> Float[np.ndarray, "P 2"]:
 
 
 def _drawn_hw(where: str, image: Mapping[str, Any], camera: Camera) -> tuple[int, int]:
-    """Return the stated size of the image that was drawn on; without one, assume the view."""
-    if image.get("height") is None and image.get("width") is None:
-        return camera.size_hw
+    """Return the stated size of the image that was drawn on, which may be larger than the view."""
     size_hw = stated_size(where, image)
     placement(camera, size_hw, where)  # raises an error if the shape does not fit
     return size_hw

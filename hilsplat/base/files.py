@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path, PureWindowsPath
 
-from hilsplat.base.errors import HilsplatError
+from hilsplat.base.errors import ArtifactError, HilsplatError
 
 IMAGE_SUFFIXES = frozenset(
     {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".avif", ".heic", ".heif", ".hif"}
@@ -65,6 +65,27 @@ def list_files(folder: Path, suffixes: Collection[str]) -> list[Path]:
         and not path.name.startswith(".")
         and (path.is_file() or (path.is_symlink() and not path.exists()))  # reading a broken link fails later
     )
+
+
+def list_masks(folder: Path, pattern: str = "*") -> list[Path]:
+    """Return the images in a folder, one for each name without suffix, sorted; skip hidden files and folders.
+
+    Raises:
+        ArtifactError: a file has another format, or two files differ only in their suffix.
+    """
+    files = sorted(path for path in folder.glob(pattern) if not path.is_dir())
+    masks: dict[Path, Path] = {}
+    for path in files:
+        name = path.relative_to(folder)
+        if any(part.startswith(".") for part in name.parts):
+            continue
+        if path.suffix.lower() not in IMAGE_SUFFIXES:
+            expected = f"images: {' '.join(sorted(IMAGE_SUFFIXES))}"
+            raise ArtifactError(f"{path} is not a mask", expected=expected, fix="convert or remove it")
+        if other := masks.get(name.with_suffix("")):
+            raise ArtifactError(f"{other} and {path} are two masks with one name", fix="remove one of them")
+        masks[name.with_suffix("")] = path
+    return list(masks.values())
 
 
 def files_below(folder: Path) -> Iterator[Path]:

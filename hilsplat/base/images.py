@@ -30,6 +30,15 @@ PROFILE_MODES = {b"RGB ": "RGB", b"GRAY": "L", b"CMYK": "CMYK"}
 
 MIN_SIDE_PX, MAX_ASPECT = 16, 20  # limits on photographs; all stages were run on 16 x 16 and 320 x 16 px
 
+SLIVER = 0.01
+"""Share of transparent pixels up to which a mask counts as opaque, such as one with rounded corners."""
+
+MAX_CLASSES = 20
+"""Maximum number of values in a map of classes; compressed or smooth masks have more."""
+
+GREY_NOISE = 16
+"""Difference between the channels up to which a mask's pixel counts as grey, as after lossy compression."""
+
 DAMAGE = (EOFError, MemoryError, OSError, SyntaxError, ValueError)
 """Errors that Pillow raises on damaged files."""
 
@@ -161,31 +170,48 @@ def _eight_bits(values: np.ndarray) -> UInt8[np.ndarray, "H W"]:
 def read_mask(path: Path) -> UInt8[np.ndarray, "H W"]:
     """Read the grey values of a mask, 0 to 255, as stored.
 
-    They are the alpha channel, scaled to 255, if it isn't constant (cut-outs, brushes); else the colours as
-    grey. In a palette of black and one other colour, the other colour is 255. 16-bit values above 255 become
-    8-bit.
+    They are the alpha channel, scaled to 255, if it is 0 on more than `SLIVER` of the pixels (cut-outs,
+    brushes) or nothing else varies; else the colours as grey. A single colour on black is 255; grey counts
+    as a colour only in a palette. 16-bit values above 255 become 8-bit.
 
     Raises:
-        ImageError: the file is missing or not an image, or uses several colours of a palette.
+        ImageError: the file is missing or not an image, or has several classes, as colours or as ids.
     """
     with opened_image(path, "mask") as image:
-        if image.mode == "P" and "transparency" not in image.info:
-            colours = np.asarray(image.convert("RGB"))
-            brightest, num_colours = colours.max(axis=2), np.unique(np.asarray(image)).size
-            if num_colours == 2 and (brightest == 0).any():
-                return np.where(brightest > 0, 255, 0).astype(np.uint8)
-            if num_colours > 2 and (colours != brightest[..., None]).any():
-                raise ValueError(f"it has {num_colours} colours, such as one for each class")
-        if image.has_transparency_data:
-            alpha = np.asarray(image.convert("RGBA"))[..., 3]
-            if alpha.min() < alpha.max():
-                return (alpha.astype(np.float64) * 255 / alpha.max() + 0.5).astype(np.uint8)
         if image.mode.startswith("I"):
             values = np.asarray(image)
-            return _eight_bits(values) if values.max() > 255 else values.astype(np.uint8)
-        return np.asarray(
-            image.convert("RGB").convert("L") if image.mode in ("LA", "PA") else image.convert("L")
-        )
+            grey = _eight_bits(values) if values.max() > 255 else values.astype(np.uint8)
+        elif image.mode in ("1", "L", "F") and not image.has_transparency_data:
+            grey = np.asarray(image.convert("L"))
+        else:
+            rgba = np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB").convert("RGBA"))
+            colours, alpha = rgba[..., :3], rgba[..., 3]
+            is_plain, is_clear = (colours == colours[0, 0]).all(), (alpha == 0).mean()
+            if SLIVER < is_clear < 1 or (is_plain and alpha.min() < max(alpha.max(), 1)):
+                if 1 < (num_colours := _num_colours(colours[alpha == alpha.max()])) <= MAX_CLASSES:
+                    raise _several_classes(path, f"{num_colours} colours")
+                return (alpha.astype(np.float64) * 255 / max(alpha.max(), 1) + 0.5).astype(np.uint8)
+            has_colour = (np.ptp(colours, axis=2) > GREY_NOISE).any()
+            if has_colour or image.mode == "P":
+                is_other = colours.any(axis=2)
+                if not is_other.all() and _num_colours(colours[is_other]) == 1:
+                    return np.where(is_other, 255, 0).astype(np.uint8)
+                if has_colour:
+                    raise _several_classes(path, f"{_num_colours(colours)} colours")
+            grey = np.asarray(image.convert("RGB").convert("L"))
+    if 2 < len(values := np.unique(grey)) <= MAX_CLASSES and values[-1] < 255:
+        raise _several_classes(path, f"{len(values)} grey values up to {values[-1]}")
+    return grey
+
+
+def _num_colours(colours: UInt8[np.ndarray, "*N 3"]) -> int:
+    return len(np.unique(colours @ np.array([65536, 256, 1])))
+
+
+def _several_classes(path: Path, found: str) -> ImageError:
+    """Return the error about a mask that would be thresholded by the brightness of its classes."""
+    fix = "write one file per class, white on black"
+    return ImageError(f"mask {path} has {found}, such as one for each class", expected="one class", fix=fix)
 
 
 def require_usable_size(image: object, size_hw: tuple[int, ...], max_side_px: int = 2**16) -> None:

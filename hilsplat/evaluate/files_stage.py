@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from hilsplat.base.artifacts import read_npz
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, SettingsError
+from hilsplat.base.files import list_masks
 from hilsplat.base.images import image_size_hw, read_mask
 from hilsplat.base.progress import stage_log
 from hilsplat.base.tables import aligned_table
@@ -181,11 +182,11 @@ def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.nd
 
     Files are `<view>/<text>.png`, `<view>/<level>/<text>.png` (level whole, part or subpart), or `<view>.npz`
     with one array per text, named "<text>" or "<level>/<text>". `<view>` is the view's name without suffix.
-    A view without predictions has an empty folder.
+    A view without predictions has an empty folder. Masks may have another image format.
 
     Raises:
         ArtifactError: the view has neither a folder nor a file, or has both, or a file cannot be used.
-        ImageError: a PNG is damaged.
+        ImageError: an image is damaged, or has the colours of several classes.
     """
     stem = Path(view).stem
     images, packed = folder / stem, folder / f"{stem}.npz"
@@ -205,7 +206,7 @@ def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.nd
             expected=f"{images}/<text>.png, or {packed.name}",
             fix="write them, or create an empty folder if nothing was found",
         )
-    files = sorted(images.rglob("*.png"))
+    files = list_masks(images, "**/*")
     names = {path: key_of(path.relative_to(images).with_suffix("").as_posix()) for path in files}
     return {name: _as_mask(read_mask(path), str(path)) for path, name in names.items()}
 

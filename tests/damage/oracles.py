@@ -595,10 +595,9 @@ class Region:
 
 
 def size_of(content: Any, view_hw: tuple[int, int]) -> tuple[int, int]:
-    if content.get("height") is None and content.get("width") is None:
-        return view_hw
     size = content["height"], content["width"]
-    require(all(type(side) is int and 0 < side <= 20000 for side in size), "size")
+    require(all(type(side) in (int, float) and 0 < side <= 20000 and side % 1 == 0 for side in size), "size")
+    size = int(size[0]), int(size[1])
     require(abs(size[0] - size[1] * view_hw[0] / view_hw[1]) <= max(1, 0.01 * size[0]), "shape")
     return size
 
@@ -644,7 +643,7 @@ def isat(content: dict[str, Any], view_hw: tuple[int, int]) -> list[Region | Non
 
 def labelme(content: dict[str, Any], view_hw: tuple[int, int]) -> list[Region | None]:
     def region(entry: Any) -> Region:
-        size = size_of({"height": content.get("imageHeight"), "width": content.get("imageWidth")}, view_hw)
+        size = size_of({"height": content["imageHeight"], "width": content["imageWidth"]}, view_hw)
         kind = entry.get("shape_type") or "polygon"
         points = np.array(entry["points"], np.float64).reshape(-1, 2)
         require((np.abs(points) < 1e6).all() and isinstance(entry["label"], str), "points")
@@ -765,20 +764,27 @@ def picture(path: Path) -> np.ndarray:
 
 
 def mask(path: Path) -> np.ndarray:
-    """Return grey values: alpha if it varies, 0 and 255 for black and another colour, else the brightness."""
+    """Return grey values: alpha if parts are clear, 255 for one colour on black, else the brightness."""
     image = opened(path)
-    rgba = np.asarray(image.convert("RGBA"))
-    alpha = rgba[..., 3]
-    if image.mode == "P" and "transparency" not in image.info:
-        used = np.unique(rgba[..., :3].reshape(-1, 3), axis=0)
-        if np.unique(np.asarray(image)).size == 2 and (used.max(axis=1) == 0).any():
-            return np.where(rgba[..., :3].any(axis=2), 255, 0).astype(np.uint8)
-    if alpha.min() < alpha.max():
-        return np.floor(alpha * 255.0 / alpha.max() + 0.5).astype(np.uint8)
     if image.mode.startswith("I"):
         values = np.asarray(image).astype(np.int64)
-        return (np.rint(values / 257) if values.max() > 255 else values).astype(np.uint8)
-    return np.asarray(image.convert("L"))
+        grey = (np.rint(values / 257) if values.max() > 255 else values).astype(np.uint8)
+    else:
+        rgba = np.asarray(image.convert("RGBA")).astype(np.int64)
+        colours, alpha = rgba[..., :3], rgba[..., 3]
+        is_plain = np.ptp(colours.reshape(-1, 3), axis=0).max() == 0
+        if 0.01 < np.mean(alpha == 0) < 1 or (is_plain and (np.ptp(alpha) or not alpha.any())):
+            solid = np.unique(colours[alpha == alpha.max()], axis=0)
+            require(not 2 <= len(solid) <= 20, "classes")
+            return np.floor(alpha * 255.0 / max(1, alpha.max()) + 0.5).astype(np.uint8)
+        vivid = colours.max(axis=2) - colours.min(axis=2) > 16
+        used = np.unique(colours.reshape(-1, 3), axis=0).tolist()
+        if (vivid.any() or image.mode == "P") and len(used) == 2 and used[0] == [0, 0, 0]:
+            return np.where(colours.any(axis=2), 255, 0).astype(np.uint8)
+        require(not vivid.any(), "classes")
+        grey = np.asarray(image.convert("RGB").convert("L"))
+    require(not 3 <= np.unique(grey).size <= 20 or grey.max() == 255, "classes")
+    return grey
 
 
 def langsplat(

@@ -450,6 +450,8 @@ def pictures(
     def build(folder: Path) -> Case:
         random = np.random.default_rng(0)
         colours = cv2.resize(random.integers(0, 255, (5, 7, 4), np.uint8), SIZE_HW[::-1])
+        if read is read_mask:  # several colours would be refused as several classes
+            colours[..., 1:3], colours[..., 3] = colours[..., :1], colours[..., 3] // 128 * 255
         rgb, exif = Image.fromarray(colours[..., :3]), Image.Exif()
         exif[ExifTags.Base.Orientation], exif[ExifTags.Base.Model] = 6, "a camera"
         rgb.save(folder / "turned.jpg", exif=exif, quality=90)

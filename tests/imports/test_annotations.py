@@ -94,7 +94,7 @@ BLOB = np.random.default_rng(0).random(SIZE) < 0.3
         (coco({"size": list(SIZE), "counts": runs_of(~BLOB)}), ~BLOB),
         (coco([flat(200, 80, 280, 160)], image={"height": 240, "width": 320}), box(50, 20, 70, 40)),
         (coco([flat(25, 10, 35, 20)], image={"height": 30, "width": 40}), box(50, 20, 70, 40)),
-        (coco([flat(50, 20, 70, 40)], image={"height": None, "width": None}), box(50, 20, 70, 40)),
+        (coco([flat(50, 20, 70, 40)], image={"height": 60.0, "width": 80.0}), box(50, 20, 70, 40)),
         # The size of run lengths is that of the mask that a network made.
         (coco({"size": [120, 160], "counts": runs_of(BLOB.repeat(2, 0).repeat(2, 1))}), BLOB),
     ],
@@ -159,6 +159,14 @@ def test_labelme_shapes_of_a_group_are_one_object_and_drawings_may_have_another_
     pair = [{"points": [[x, 4], [x + 7, 11]], "shape_type": "rectangle", "group_id": 3} for x in (4, 40)]
     (mask,) = regions(labelme(*pair, imageHeight=2 * HEIGHT, imageWidth=2 * WIDTH))["IMG_0001.png"]
     np.testing.assert_array_equal(mask, box(2, 2, 6, 6) | box(20, 2, 24, 6))
+    stream = io.BytesIO()  # old versions store the photograph instead of its size
+    Image.new("RGB", (2 * WIDTH, 2 * HEIGHT)).save(stream, "JPEG")
+    photo = {
+        "imageData": base64.b64encode(stream.getvalue()).decode(),
+        "imageHeight": None,
+        "imageWidth": None,
+    }
+    np.testing.assert_array_equal(only(labelme(*pair, **photo)), mask)
 
 
 @pytest.mark.parametrize(
@@ -256,7 +264,8 @@ RUNS = {"size": list(SIZE), "counts": runs_of(BLOB)}
         (coco(GOOD, [[3, 3, 9]], [[3, 3, 9]]), "annotation 1(.|\n)*2 of 3 annotations in x.json"),
         (coco(GOOD, image={"height": 60, "width": 60}), "60 x 60 px"),
         (coco(GOOD, image={"height": "60"}), "valid image size"),
-        (coco([flat(200, 80, 280, 160)], image={"height": None, "width": None}), "outside the image"),
+        (coco([flat(50, 20, 70, 40)], image={"height": None, "width": None}), "valid image size"),
+        (labelme({"points": CORNERS}, imageHeight=None, imageWidth=None), "valid image size"),
         # These crashed pycocotools, or made it read random memory.
         (coco([[0, 0, 1e9, 0, 1e9, 1e9]]), "outside the image"),
         (coco([[0, 0, float("nan"), 0, 9, 9]]), "outside the image"),

@@ -215,6 +215,29 @@ def test_other_kinds_of_poses_in_the_folder_are_named(tmp_path):
     assert "transforms.json also has poses" in notes and "poses_bounds.npy also has poses" in notes
 
 
+@pytest.mark.parametrize(
+    ("size", "is_noted"),
+    [
+        ((960, 720), False),
+        ((480, 360), False),  # a scaled copy
+        ((641, 481), False),
+        ((1921, 1440), False),  # rounded
+        ((720, 960), False),  # turned
+        ((900, 676), True),  # undistorted by COLMAP, with a pincushion lens
+        ((961, 720), True),  # with a weak barrel lens
+        ((480, 363), True),  # stretched
+    ],
+)
+def test_images_of_nearly_the_camera_s_size_or_stretched_are_noted(size, is_noted, tmp_path):
+    world.save(tmp_path / "images", {"000": np.zeros((720, 960, 3), np.uint8)})
+    lens = f"PINHOLE {size[0]} {size[0]} {size[0] / 2} {size[1] / 2}"
+    world.write_colmap(tmp_path / "sparse/0", lens, size, {"000.png": POSES[0]}, POINTS)
+    notes = read_source(find_known_poses(tmp_path)).notes
+    assert len(notes) == is_noted
+    assert all(note.startswith("1 images, such as 000.png (") for note in notes)
+    assert all("are they the images that the poses were computed from?" in note for note in notes)
+
+
 def test_without_points_they_are_triangulated(tmp_path, imported):
     folder = write(tmp_path / "in")
     (folder / "sparse/0/points3D.txt").unlink()

@@ -117,6 +117,8 @@ def test_one_damaged_camera_of_polycam_leaves_out_its_view(content, tmp_path, im
         (record3d, {"K": [90, 0, 56, 0, 91, 42, 0, 0, 1]}),  # by rows
         (polycam, {"fx": 0.8, "fy": 0.8, "cx": 0.5, "cy": 0.5}),  # shares of the size
         (polycam, {"width": None, "cx": 112, "cy": 84}),  # those of another size
+        (polycam, {"width": None, "cx": 84, "cy": 63}),  # 1.5 times as large
+        (record3d, {"K": [90, 0, 0, 0, 91, 0, 84, 63, 1]}),
         (record3d, {"K": None}),
         (record3d, {"w": "wide"}),
         (polycam, {"k1": 0.1}),

@@ -154,15 +154,22 @@ def test_what_cannot_be_applied_is_refused(head, tmp_path, imported):
         ({**SIZE, "y_fov": 400.0}, "y_fov is 400, not an angle in degrees"),
         ({**SIZE, "x_fov": 0.9}, "a focal length of 0.1 to 50 sides"),  # radians
         ({**NUMBERS, "fl_x": FX / WIDTH, "fl_y": FY / HEIGHT}, "a focal length of 0.1 to 50 sides"),
-        (
-            {**LENS, "cx": 4 * CX, "cy": 4 * CY},
-            "another size of the image, and the size is missing",
-        ),  # images_4
+        ({**LENS, "cx": 4 * CX, "cy": 4 * CY}, "cx and cy of view .* another size of the image"),  # images_4
+        ({**NUMBERS, "cx": 0.75 * WIDTH, "cy": 0.75 * HEIGHT}, "another size of the image"),  # 1080p for 720p
     ],
 )
 def test_numbers_of_another_unit_or_size_are_refused(head, message, tmp_path, imported):
     with pytest.raises(HilsplatError, match=message):
         imported(write(tmp_path / "in", PLAIN, head, "a"))
+
+
+def test_crops_off_the_middle_are_imported_with_a_note(tmp_path, imported):
+    rays = world.pinhole(FX, FY, 0.26 * WIDTH, 0.7 * HEIGHT)
+    folder = write(tmp_path / "in", rays, {**NUMBERS, "cx": 0.26 * WIDTH, "cy": 0.7 * HEIGHT})
+    views, _, _, report = imported(folder)
+    world.require_right(views, right("abcdef"), 45)
+    (note,) = report["warnings"]
+    assert note.startswith("cx or cy of images/a.png and 5 others is more than 10% of a side off the middle")
 
 
 def test_unknown_keys_and_contradictions_are_reported_once(tmp_path):
@@ -269,7 +276,7 @@ def changed(folder, change):
         (lambda frame: frame.update(file_path=3), "file_path is not a text"),
         (lambda frame: frame.update(fl_x=-3), "lens of view"),
         (lambda frame: frame.update(fl_x=0), "has no focal length"),
-        (lambda frame: frame.update(w=10), "does not match the size of its camera"),
+        (lambda frame: frame.update(w=10, cx=5), "does not match the size of its camera"),
     ],
 )
 def test_one_frame_that_cannot_be_used_is_left_out_with_the_reason(change, reason, tmp_path, imported):

@@ -127,14 +127,14 @@ def stated_size(where: str, content: Any) -> tuple[int, int]:
     sides: list[Any] = [
         content.get(key) if isinstance(content, dict) else None for key in ("height", "width")
     ]
-    if not all(type(side) is int and 0 < side <= MAX_SIDE_PX for side in sides):
+    if not all(type(side) in (int, float) and 0 < side <= MAX_SIDE_PX and side % 1 == 0 for side in sides):
         raise SceneError(
             f"{where} does not state a valid image size",
             expected=f"height and width in pixels, at most {MAX_SIDE_PX}",
             found=f"height {sides[0]!r}, width {sides[1]!r}",
-            fix="export the labels again",
+            fix="export the labels again, with the size of the image",
         )
-    return sides[0], sides[1]
+    return int(sides[0]), int(sides[1])
 
 
 def read_object(where: str, entry: Any, size_hw: tuple[int, int], warnings: list[str]) -> IsatObject:

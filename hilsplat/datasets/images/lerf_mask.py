@@ -2,13 +2,15 @@
 
 Test views are the posed images missing from `images_train`, sorted by name. The folder `test_mask/0` contains
 the masks of the first view, `test_mask/1` those of the second, and so on. Mask files are named after prompts.
-Missing files or folders, and mask folders that don't match the test views, raise SceneError.
+Missing files or folders, and mask folders that don't match the test views, raise SceneError; files that are
+not images raise ArtifactError.
 """
 
 from dataclasses import replace
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
+from hilsplat.base.files import list_masks
 from hilsplat.base.images import image_size_hw
 from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.labelled import (
@@ -46,7 +48,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
     for view, place in masks.items():
         image_hw = image_size_hw(images[view])
         regions = []
-        for path in sorted(place.glob("*.png")):
+        for path in list_masks(place):
             if "." in path.stem:  # the published evaluation truncates names at a dot
                 raise SceneError(
                     f"the file name of mask {path} has a dot before the suffix",

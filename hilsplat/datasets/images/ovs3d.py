@@ -8,6 +8,7 @@ with ground truth `any grey`. A missing file or folder, or an unusable classes.t
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
+from hilsplat.base.files import list_files
 from hilsplat.base.images import image_size_hw
 from hilsplat.datasets.dataset import ABLATIONS, Dataset
 from hilsplat.datasets.labelled import (
@@ -76,7 +77,7 @@ def read_classes(path: Path) -> tuple[str, ...]:
 def _regions(
     place: Path, prompts: tuple[str, ...], image_hw: tuple[int, int], warnings: list[str]
 ) -> tuple[LabelledRegion, ...]:
-    files = {path.stem: path for path in place.glob("*.png") if not path.name.startswith(".")}
+    files = {path.stem: path for path in list_files(place, {".png"})}
     missing = [prompt for prompt in prompts if prompt not in files]
     extra = sorted(set(files) - set(prompts))
     if missing:

@@ -29,6 +29,7 @@ from hilsplat.datasets.points.labelled_points import (
     read_matrices,
     require_file,
 )
+from hilsplat.scene.importers.known_views import NOTED_OFFSET, check_centres
 from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage
 
 LABEL_TABLE = "scannetv2-labels.combined.tsv"
@@ -83,7 +84,9 @@ def read_images(folder: Path, scan: str) -> tuple[tuple[PosedImage, ...], tuple[
     Also return a warning for each reason that frames were skipped.
     """
     frames = sorted((_frame_number(path), path) for path in list_images(folder / "color"))
-    K = read_matrices(folder / "intrinsic" / "intrinsic_color.txt", 4)[0, :3, :3] + HALF_PIXEL
+    poses = {int(path.stem): path for path in (folder / "pose").glob("*.txt") if path.stem.isdecimal()}
+    lens = folder / "intrinsic" / "intrinsic_color.txt"
+    K = read_matrices(lens, 4)[0, :3, :3] + HALF_PIXEL
     lost, unposed, images = [], [], []
     described = folder / f"{scan}.txt"
     info = dict(re.findall("(.*) = (.*)", described.read_text("utf-8"))) if described.is_file() else {}
@@ -92,8 +95,7 @@ def read_images(folder: Path, scan: str) -> tuple[tuple[PosedImage, ...], tuple[
     else:
         size_hw = image_size_hw(frames[0][1]) if frames else (0, 0)
     for number, path in frames:
-        pose = folder / "pose" / f"{number}.txt"
-        if not pose.is_file():
+        if (pose := poses.get(number)) is None:
             unposed.append(number)
             continue
         world_from_cam = read_matrices(pose, 4)[0]
@@ -101,6 +103,8 @@ def read_images(folder: Path, scan: str) -> tuple[tuple[PosedImage, ...], tuple[
             lost.append(number)
             continue
         images.append(posed_frame(path, world_from_cam, str(pose), K, size_hw))
+    if frames:  # no scan was cropped
+        check_centres({str(lens): (K, size_hw)}, NOTED_OFFSET)
     if not images:
         raise SceneError(
             f"{scan} has no usable frames",

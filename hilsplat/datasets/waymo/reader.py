@@ -70,10 +70,7 @@ def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
             fix="use a segment with 3D semantic segmentation labels, from release 1.3.2 or later",
         )
     images = tuple(shot_image(shot, segment_from_world) for shot in shots)
-    warnings: tuple[str, ...] = ()
-    if any(image.distortion[4] for image in images):
-        warnings = ("lenses have k3 distortion, which the poses stage cannot import; undistort the images",)
-    return PointScene(segment, images, {"waymo": joined_points(points)}, warnings)
+    return PointScene(segment, images, {"waymo": joined_points(points)})
 
 
 class Segments(Dataset):

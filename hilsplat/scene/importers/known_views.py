@@ -25,6 +25,13 @@ ASPECT_TOLERANCE = 0.01
 MIN_FOCAL, MAX_FOCAL = 0.1, 50
 """Range of focal lengths, in sides of the image; other numbers aren't px."""
 
+NOTED_OFFSET, MAX_OFFSET = 0.1, 0.25
+"""Distances of the principal point from the middle of the image, in its sides, that are noted and refused:
+a centred lens has them if it belongs to an image 1.2 and 1.5 times as large."""
+
+Lens = tuple[Float64[np.ndarray, "3 3"], tuple[int, int]]
+"""Intrinsics K in px, and the height and width of the image that they belong to."""
+
 MAX_COORDINATE = 1e9
 """Maximum coordinate, in the source's units; beyond it, 32-bit numbers are too coarse."""
 
@@ -48,6 +55,10 @@ class KnownView:
     is_test: bool = False
     border_px: int = 0
     report: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def lens(self) -> Lens:
+        return self.camera.calibration_matrix(), (self.camera.height, self.camera.width)
 
 
 @dataclass
@@ -159,18 +170,33 @@ def require_valid(view: KnownView) -> None:
         fault, found = "position", str(pose[:3, 3].tolist())
         expected = f"coordinates up to {MAX_COORDINATE:g}"
     else:
+        if view.image is not None:
+            check_centres({f"view {view.name}": view.lens})
         return
     raise SceneError(f"the camera {fault} of view {view.name} is not valid", expected=expected, found=found)
 
 
-def require_centred(centre: Sequence[float], size: tuple[int, int]) -> None:
-    """Raise ValueError if cx, cy are far from the middle of an image whose source doesn't state its size.
+def check_centres(lenses: Mapping[str, Lens], max_offset: float = MAX_OFFSET) -> list[str]:
+    """Return a note if principal points are more than `NOTED_OFFSET` from the middle of their images.
 
-    They then belong to another size of the image, such as that of a full-size copy.
+    Raises:
+        SceneError: one is `max_offset` or more, so that the lens belongs to another size of the image.
     """
-    sides = np.array(size)
-    if (np.abs(centre - sides / 2) > sides / 4).any():
-        raise ValueError("cx and cy belong to another size of the image, and the size is missing")
+    noted = []
+    for where, (K, (height, width)) in lenses.items():
+        offset = float(np.abs(K[:2, 2] / (width, height) - 0.5).max())
+        if offset >= max_offset:
+            raise SceneError(
+                f"cx and cy of {where} belong to another size of the image",
+                expected=f"less than {max_offset:.0%} of a side off the middle of {width} x {height} px",
+                found=f"{K[0, 2]:g}, {K[1, 2]:g}",
+                fix="use the lens of these images, or the images that it was computed from",
+            )
+        if offset > NOTED_OFFSET:
+            noted.append(where)
+    more = f" and {len(noted) - 1} others" if len(noted) > 1 else ""
+    what = f"more than {NOTED_OFFSET:.0%} of a side off the middle: are their lenses of this image size?"
+    return [f"cx or cy of {noted[0]}{more} is {what}"] if noted else []
 
 
 def find_images(root: Path, names: Sequence[str]) -> dict[str, Path | None]:

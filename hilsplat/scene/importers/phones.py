@@ -13,7 +13,7 @@ from hilsplat.base.errors import SceneError, foreign
 from hilsplat.base.files import list_images
 from hilsplat.base.images import image_size_hw
 from hilsplat.scene.colmap import pycolmap, rotation_matrix
-from hilsplat.scene.importers.known_views import Keys, KnownView, Source, require_centred
+from hilsplat.scene.importers.known_views import Keys, KnownView, Source
 from hilsplat.scene.layouts import KnownPoses, read_json_object
 from hilsplat.scene.posed_images import OPENGL_TO_OPENCV, rigid_pose
 
@@ -68,7 +68,6 @@ def read_polycam(known: KnownPoses) -> Source:
             width, height = content.get("width"), content.get("height")
             if width is None or height is None:
                 height, width = image_size_hw(image)
-                require_centred(params[2:], (width, height))
             camera = pycolmap.Camera(model="PINHOLE", params=params, width=int(width), height=int(height))
         pose = _phone_pose(np.array(entries).reshape(3, 4), str(file))
         return KnownView(image.name, image, camera, pose, border_px=border_px)

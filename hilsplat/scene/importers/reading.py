@@ -1,9 +1,12 @@
 """Posed views of a folder in any supported format."""
 
+from contextlib import suppress
+
 import numpy as np
 
-from hilsplat.base.errors import SceneError
-from hilsplat.scene.importers.known_views import KnownView, Source, read_colmap, read_llff
+from hilsplat.base.errors import ImageError, SceneError
+from hilsplat.base.images import image_size_hw
+from hilsplat.scene.importers.known_views import KnownView, Source, check_centres, read_colmap, read_llff
 from hilsplat.scene.importers.phones import read_polycam, read_record3d
 from hilsplat.scene.importers.transforms import read_transforms
 from hilsplat.scene.layouts import KnownPoses
@@ -15,6 +18,9 @@ READERS = {
     "record3d": read_record3d,
     "llff": read_llff,
 }
+
+NEARLY = 0.1
+"""Relative difference from the camera's size up to which an image is no scaled copy made on purpose."""
 
 
 def read_source(known: KnownPoses) -> Source:
@@ -33,6 +39,8 @@ def read_source(known: KnownPoses) -> Source:
             f"all {len(poses)} views of {known.files[0]} have the same pose", fix="export it again"
         )
     _keep_one_view_per_image(source)
+    source.notes += check_centres({view.name: view.lens for view in source.views if view.image is not None})
+    source.notes += _size_notes(source)
     source.notes += [f"{other} also has poses, which are not used" for other in known.others]
     if source.points is not None:
         xyz, rgb = source.points
@@ -42,6 +50,28 @@ def read_source(known: KnownPoses) -> Source:
         # Without points, they are triangulated.
         source.points = (xyz[is_finite], rgb[is_finite]) if is_finite.any() else None
     return source
+
+
+def _size_notes(source: Source) -> list[str]:
+    """Return a note if images may not be those of the poses: nearly of the camera's size, or stretched.
+
+    Undistortion changes the size by a few percent, and may leave the shape within `ASPECT_TOLERANCE`.
+    """
+    noted = []
+    for view in source.views:
+        if view.image is None:
+            continue
+        with suppress(ImageError):  # its import gives the reason
+            image = np.sort(image_size_hw(view.image))  # EXIF may turn it
+            camera = np.sort(view.lens[1])
+            factors = image / camera
+            is_stretched = abs(factors[0] / factors[1] - 1) > (1 / np.minimum(image, camera)).sum()
+            if (factors != 1).any() and (is_stretched or (np.abs(factors - 1) < NEARLY).all()):
+                noted.append(f"{view.name} ({factors[0]:.3f} and {factors[1]:.3f} times)")
+    if not noted:
+        return []
+    why = "other sizes than their cameras: are they the images that the poses were computed from?"
+    return [f"{len(noted)} images, such as {noted[0]}, have {why}"]
 
 
 def _keep_one_view_per_image(source: Source) -> None:

@@ -18,7 +18,6 @@ from hilsplat.scene.importers.known_views import (
     KnownView,
     Source,
     find_images,
-    require_centred,
     require_inside,
 )
 from hilsplat.scene.importers.ply_file import read_ply
@@ -160,8 +159,6 @@ def _lens(where: str, frame: Mapping[str, Any], image: Path | None, notes: list[
             expected = "fl_x (px), camera_angle_x (radians) or x_fov (degrees), or the same for y"
             raise SceneError(f"{where} has no focal length", expected=expected, fix="export it again")
         params = [focal_x, focal_y, float(values.get("cx", width / 2)), float(values.get("cy", height / 2))]
-        if image is not None and not values.keys() >= {"w", "h"}:
-            require_centred(params[2:], (width, height))
         coefficients = [bends[key] for key in COEFFICIENTS[model]]
         if model == "OPENCV" and bends["k3"]:
             model, coefficients = "FULL_OPENCV", [*coefficients, 0.0, 0.0, 0.0]

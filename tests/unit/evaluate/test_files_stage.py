@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError
 from hilsplat.base.images import write_png
@@ -117,6 +118,23 @@ def test_a_view_without_predictions_or_with_two_is_refused_but_its_folder_may_be
 def test_masks_that_cannot_be_scored_are_refused(block_world, tmp_path, name, mask, message):
     write_png(tmp_path / "001" / f"{name}.png", mask.astype(np.uint8))
     assert re.search(message, refused(block_world, tmp_path, tmp_path, HilsplatError))
+
+
+def test_masks_may_have_any_image_format_and_other_files_are_refused(data_set, tmp_path):
+    cup, mug = box((2, 14), (0, 4), (16, 16)), box((2, 14), (9, 16), (16, 16))
+    data_set(LabelledScene("set", "s", {}, None, {"a.png": (region_of(cup, "cup"), region_of(mug, "mug"))}))
+    (tmp_path / "a").mkdir()
+    Image.fromarray(cup * np.uint8(255)).save(tmp_path / "a/cup.PNG", "PNG")
+    Image.fromarray(mug * np.uint8(255)).save(tmp_path / "a/mug.jpg", quality=95)
+    (tmp_path / "a/._cup.PNG").write_bytes(b"macOS")
+    frame, _ = scored(tmp_path)
+    assert (frame.loc[frame["metric"] == "iou", "value"] == 1).all()
+    np.save(tmp_path / "a/mug.npy", mug)
+    with pytest.raises(ArtifactError, match=r"a/mug.npy is not a mask"):
+        scored(tmp_path)
+    (tmp_path / "a/mug.npy").rename(tmp_path / "a/mug.bmp")
+    with pytest.raises(ArtifactError, match=r"a/mug.bmp and \S*a/mug.jpg are two masks"):
+        scored(tmp_path)
 
 
 def test_exactly_one_of_labels_and_truth_is_required(tmp_path):

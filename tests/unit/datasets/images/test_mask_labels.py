@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilsplat.base.errors import ImageError, SceneError
+from hilsplat.base.errors import ArtifactError, ImageError, SceneError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import Level
 from hilsplat.datasets.images import lerf_mask, ovs3d
@@ -76,6 +76,19 @@ def test_the_poses_stage_holds_the_test_views_out(teatime, tmp_path):
     run_poses(teatime, tmp_path / "scene", "lerf_mask/teatime", "arbitrary", False, settings, 0, 1)
     split = Scene.load(tmp_path / "scene").split
     assert [view for view in split if split[view] == "test"] == list(open_scene(teatime).views)
+
+
+def test_prompts_may_have_any_image_format_and_other_files_are_refused(teatime):
+    folder = teatime / "test_mask" / "0"
+    with Image.open(folder / "head.png") as mask:
+        mask.save(folder / "head.JPG", "JPEG", quality=95)
+        expected = np.asarray(mask) > 128
+    (folder / "head.png").unlink()
+    head = open_scene(teatime).views["frame_00002.png"][0]
+    assert head.text == "head" and np.array_equal(head.mask(), expected)
+    (folder / "tail.npy").write_bytes(b"")
+    with pytest.raises(ArtifactError, match=r"tail.npy is not a mask"):
+        open_scene(teatime)
 
 
 def test_foreground_is_above_128_and_a_truncated_mask_is_refused(teatime):

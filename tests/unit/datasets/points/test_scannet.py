@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.points.scannet import LABEL_TABLE, open_scan, read_label_table
@@ -68,6 +69,16 @@ def test_frames_are_sorted_by_number_and_posed_with_centres_moved_by_half_a_pixe
     assert stored[:2, 2].tolist() == [7.75, 6.0]
     assert image.K[:2, 2].tolist() == [8.25, 6.5]
     assert image.size_hw == (12, 16)
+
+
+def test_names_may_be_padded_with_zeros(root):
+    plain = open_scan(root, SCAN).images
+    for path in [*(root / "scans" / SCAN).glob("color/*"), *(root / "scans" / SCAN).glob("pose/*")]:
+        path.rename(path.with_name(f"{int(path.stem):06d}{path.suffix}"))
+    images = open_scan(root, SCAN).images
+    assert [image.name for image in images] == [f"{number:06d}.jpg" for number in range(12)]
+    for image, same in zip(images, plain, strict=True):
+        np.testing.assert_array_equal(image.cam_from_world, same.cam_from_world)
 
 
 def test_frames_without_a_pose_are_skipped_and_reported(tmp_path):
@@ -158,6 +169,23 @@ NUMBERLESS = '{"segGroups": [{"label": "wall", "segments": [7]}]}'
 def test_unusable_scans_are_refused_with_a_fix(root, damage, message):
     damage(root / "scans" / SCAN)
     with pytest.raises(SceneError, match=f"(?s){message}"):
+        open_scan(root, SCAN)
+
+
+@pytest.mark.parametrize(
+    ("scale", "info"),
+    [
+        (0.5, ""),  # images made smaller than intrinsic_color.txt
+        (1.0, "colorHeight = 24\ncolorWidth = 32\n"),  # both made smaller than the .txt
+    ],
+)
+def test_a_lens_of_another_image_size_is_refused(root, scale, info):
+    folder = root / "scans" / SCAN
+    (folder / f"{SCAN}.txt").write_text(info)
+    for path in (folder / "color").iterdir():
+        with Image.open(path) as image:
+            image.resize((round(16 * scale), round(12 * scale))).save(path)
+    with pytest.raises(SceneError, match=r"cx and cy of \S*intrinsic_color.txt belong to another size"):
         open_scan(root, SCAN)
 
 
