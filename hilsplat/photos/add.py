@@ -61,8 +61,9 @@ def add_scene(
         dry_run: only report; videos and archives are converted in a temporary folder.
 
     Raises:
-        SceneError: the name is invalid or taken, photographs cannot be read, or there are fewer than three
-            distinct photographs and no known poses. The sheet is then left unchanged.
+        SceneError: the name is invalid or taken, a path cannot be written to the sheet, the labels differ
+            from those of an earlier scene of that name, photographs cannot be read, or there are fewer than
+            three distinct photographs and no known poses. The sheet is then left unchanged.
     """
     sheet, photos = Path(sheet), Path(photos)
     photos = (photos if photos.exists() else Path(os.path.expanduser(photos))).resolve()  # noqa: PTH111

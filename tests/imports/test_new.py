@@ -204,6 +204,17 @@ def test_label_files_are_copied_under_the_names_of_their_views(tmp_path):
     assert [path.name for path in (tmp_path / "p/annotated/photos/a").iterdir()] == ["003.json"]
 
 
+def test_the_next_commands_name_the_setting_of_another_sheet(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    photographs(tmp_path / "a")
+    for sheet, setting in (
+        ("config/scenes.tsv", ""),
+        ("my.tsv", ", with `scenes: my.tsv` in config/config.yaml"),
+    ):
+        printed = CliRunner().invoke(app, ["new", "desk", "a", "--sheet", sheet]).output
+        assert f"added photos/desk to {sheet}. Next{setting}:\n  hilsplat run desk\n" in printed
+
+
 def labelled(folder, **labels):
     """Write photographs, and a label file for each name of a view."""
     photographs(folder)
