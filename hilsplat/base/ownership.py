@@ -6,13 +6,16 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from hilsplat.base.artifacts import is_artifact, read_memo, write_json
-from hilsplat.base.atomic import was_interrupted
+from hilsplat.base.atomic import changing, was_interrupted
 from hilsplat.base.errors import ArtifactError, ImageError
 from hilsplat.base.images import opened_image
-from hilsplat.base.lineage import files_of, read_provenance
+from hilsplat.base.lineage import read_provenance
 
 SOFTWARE = {"Software": "hilsplat"}
 """Metadata of the PNGs that commands draw for users; these files have no provenance record."""
+
+Stats = dict[str, list[int]]
+"""Size and time of each file; empty if its writer failed or was killed, so that the file may be replaced."""
 
 
 def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Path]) -> None:
@@ -53,15 +56,13 @@ def require_outside_artifacts(out: Path) -> None:
             )
 
 
-def require_own_picture(path: Path, beside: Path | None = None) -> None:
-    """Raise ArtifactError if a path is in an artifact or not a .png, or if it or `beside` is not ours."""
+def require_own_picture(path: Path) -> None:
+    """Raise ArtifactError if a path is in an artifact, is not a .png, or exists and is not our picture."""
     require_outside_artifacts(path)
     if path.suffix.lower() != ".png":
         raise ArtifactError(f"output {path} is not a PNG file", expected="a name that ends in .png")
     if _is_something(path) and not _is_own_picture(path):
         raise _foreign(path)
-    if beside is not None and _is_something(beside) and not _is_something(path):
-        raise _foreign(beside)
 
 
 def _is_own_picture(path: Path) -> bool:
@@ -75,20 +76,38 @@ def _is_own_picture(path: Path) -> bool:
 @contextmanager
 def replaced_folder(folder: Path) -> Iterator[None]:
     """Replace a folder in the block; raise ArtifactError if a file in it is not from the last such block."""
-    record = folder.with_name(f".{folder.name}.written.json")  # size and time of each file
-    written = read_memo(record, dict[str, list[int]])
-    if others := sorted(name for name, stat in _stats(folder).items() if written.get(name) != stat):
+    record = folder.with_name(f".{folder.name}.written.json")
+    _require_written(folder, _stats(folder, folder.rglob("*")), read_memo(record, Stats))
+    yield
+    write_json(record, _stats(folder, folder.rglob("*")))
+
+
+@contextmanager
+def replaced_files(folder: Path, names: Sequence[str]) -> Iterator[None]:
+    """Replace files of a folder in the block; raise ArtifactError if one is not from the last such block."""
+    paths = [folder / name for name in names]
+    require_outside_artifacts(paths[0])
+    with changing(folder / ".hilsplat.written.json") as record:
+        written = read_memo(record, Stats)
+        _require_written(folder, _stats(folder, paths), written)
+        others = {name: stat for name, stat in written.items() if name not in names}
+        write_json(record, others | {name: [] for name in names})
+        yield
+        write_json(record, others | _stats(folder, paths))
+
+
+def _require_written(folder: Path, stats: Stats, written: Stats) -> None:
+    if others := sorted(name for name, stat in stats.items() if written.get(name) not in (stat, [])):
         raise ArtifactError(
             f"{folder} contains files that hilsplat did not write, or that were changed later",
             found=", ".join(others[:3]),
             fix="move them elsewhere, or choose another folder (--out)",
         )
-    yield
-    write_json(record, _stats(folder))
 
 
-def _stats(folder: Path) -> dict[str, list[int]]:
-    stats = {file.relative_to(folder).as_posix(): file.stat() for file in files_of(folder)}
+def _stats(folder: Path, paths: Iterable[Path]) -> Stats:
+    files = [path for path in paths if path.is_symlink() or path.is_file()]
+    stats = {path.relative_to(folder).as_posix(): path.lstat() for path in files}
     return {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
 
 
@@ -126,20 +145,20 @@ def _recorded_outputs(artifact: Path, stage: str) -> set[Path]:
 
 
 def _is_something(path: Path) -> bool:
-    """Return whether a path exists and is not empty, ignoring hidden files such as Snakemake's markers."""
+    """Return whether a path exists and is not empty, ignoring Snakemake's marker of folders."""
     if not os.path.lexists(path):
         return False
     if path.is_dir():
-        return bool(_visible(path))
+        return bool(_entries(path))
     return not path.is_file() or path.stat().st_size > 0
 
 
-def _visible(folder: Path) -> list[str]:
-    return [path.name for path in folder.iterdir() if not path.name.startswith(".")]
+def _entries(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir() if path.name != ".snakemake_timestamp")
 
 
 def _described(path: Path) -> str:
     if path.is_dir():
-        names = sorted(_visible(path))
+        names = _entries(path)
         return f"a folder of {len(names)} entries: {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
     return f"a file of {path.stat().st_size} bytes" if path.is_file() else "neither a file nor a folder"

@@ -67,14 +67,14 @@ def start_logging(*, timestamps: bool = False) -> None:
         logging.getLogger(noisy).setLevel(logging.WARNING)
 
 
-def require_new_folder(out: Path) -> None:
-    """Raise ArtifactError if --out is in an artifact, exists and is not empty, or is a link to nothing."""
+def require_new_folder(out: Path, option: str = "--out") -> None:
+    """Raise ArtifactError if a folder is in an artifact, exists and is not empty, or is a link to nothing."""
     from hilsplat.base.ownership import require_outside_artifacts
 
     require_outside_artifacts(out)
     is_there = out.exists() or out.is_symlink()
     if is_there and not (out.is_dir() and not any(out.iterdir())):
-        raise ArtifactError(f"--out {out} exists", fix="choose a new folder, or remove this one first")
+        raise ArtifactError(f"{option} {out} exists", fix="choose a new folder, or remove this one first")
 
 
 def echo(text: object) -> None:

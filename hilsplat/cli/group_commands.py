@@ -1,5 +1,6 @@
 """Command groups: model folders, caches, published data sets, and blocks of a large scene."""
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -185,7 +186,7 @@ def blocks_split(
     require_new_folder(out)
     for name, block in split_scene(opened, out, blocks, share).blocks.items():
         echo(f"{name}: {len(block.owned)} views, {len(block.borrowed)} more of other blocks")
-        echo(f"  hilsplat new {name} {out / name}")
+        echo(f"  hilsplat new {name} {shlex.quote(str(out / name))}")
 
 
 @blocks_app.command("join")

@@ -83,6 +83,7 @@ def new(
     Reports what was found, what is used, and what is likely to fail.
     """
     from hilsplat.photos.add import add_scene
+    from hilsplat.scene.sheet import DEFAULT_SHEET
     from hilsplat.splat.coordinates import read_gaussians
     from hilsplat.workflow.models import models_of_photographs
 
@@ -99,7 +100,9 @@ def new(
     if dry_run:
         echo(f"{report}\n\nnothing was added (--dry-run)")
         return
+    is_default = sheet.resolve() == DEFAULT_SHEET.resolve()
+    setting = "" if is_default else f", with `scenes: {sheet}` in config/config.yaml"
     following = f"  hilsplat run {name}\n  hilsplat query {name} 'bear nose'"
-    echo(f"{report}\n\nadded photos/{name} to {sheet}. Next:\n{following}")
+    echo(f"{report}\n\nadded photos/{name} to {sheet}. Next{setting}:\n{following}")
     for line in models_of_photographs(sheet.with_name("config.yaml"), name, report.columns.get("features")):
         echo(line)

@@ -71,7 +71,7 @@ def query(
     if text is None:
         raise SettingsError(f"there is no text to search for in {scene}", fix="hilsplat query SCENE TEXT")
     if masks is not None:
-        require_new_folder(masks)
+        require_new_folder(masks, "--masks")
     gc.disable()  # garbage collection would take two seconds, a tenth of the query time
     try:
         from hilsplat.query.answer import answer

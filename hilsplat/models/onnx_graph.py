@@ -376,7 +376,8 @@ def split_clip(folder: Path) -> list[Path]:
     A network above 2 GiB has its weights in a separate file (`model.onnx_data`), to which both halves refer.
 
     Raises:
-        ModelError: `model.onnx` is missing, cannot be read, or lacks an input or output.
+        ModelError: `model.onnx` is missing, cannot be read, or lacks an input or output, or a half exists
+            that differs.
     """
     import onnx
 
@@ -400,10 +401,17 @@ def split_clip(folder: Path) -> list[Path]:
             found=f"{', '.join(sorted(inputs))} -> {', '.join(sorted(outputs))}",
             fix="export it with optimum's task feature-extraction",
         )
-    written = []
-    for name, (_, output) in HALVES.items():
-        path = whole.with_name(f"{name}.onnx")
+    halves = {
+        whole.with_name(f"{name}.onnx"): reduced(copy.deepcopy(model), [output]).SerializeToString()
+        for name, (_, output) in HALVES.items()
+    }
+    for path, content in halves.items():
+        if path.exists() and path.read_bytes() != content:
+            raise ModelError(
+                f"{path} exists, and is not the half of {whole.name} that would replace it",
+                fix="move it elsewhere, then split again",
+            )
+    for path, content in halves.items():
         with atomic_path(path) as temporary:
-            temporary.write_bytes(reduced(copy.deepcopy(model), [output]).SerializeToString())
-        written.append(path)
-    return written
+            temporary.write_bytes(content)
+    return list(halves)

@@ -1,7 +1,8 @@
 """Addition of a folder of photographs to the scene sheet."""
 
+import os
 import shutil
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,7 +12,7 @@ from hilsplat.base.atomic import atomic_folder, changing
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import NAME_RULE, name_problem
 from hilsplat.base.removal import undone_on_error
-from hilsplat.photos.findings import CheckPly, find_parts
+from hilsplat.photos.findings import CheckPly, Parts, find_parts
 from hilsplat.photos.inspection import PhotoReport, inspect_photos
 from hilsplat.photos.intake import prepared_photographs
 from hilsplat.scene.layouts import contents, has_known_poses
@@ -21,9 +22,9 @@ from hilsplat.scene.sheet import (
     NOTHING,
     PHOTOS,
     content_lines,
-    generated_of,
     project_root,
     read_sheet,
+    sheet_text,
 )
 from hilsplat.settings import PosesSettings
 
@@ -60,10 +61,12 @@ def add_scene(
         dry_run: only report; videos and archives are converted in a temporary folder.
 
     Raises:
-        SceneError: the name is invalid or taken, photographs cannot be read, or there are fewer than three
-            distinct photographs and no known poses. The sheet is then left unchanged.
+        SceneError: the name is invalid or taken, a path cannot be written to the sheet, the labels differ
+            from those of an earlier scene of that name, photographs cannot be read, or there are fewer than
+            three distinct photographs and no known poses. The sheet is then left unchanged.
     """
-    sheet, photos = Path(sheet), Path(photos).expanduser().resolve()
+    sheet, photos = Path(sheet), Path(photos)
+    photos = (photos if photos.exists() else Path(os.path.expanduser(photos))).resolve()  # noqa: PTH111
     if problem := name_problem(name):
         raise SceneError(
             f"{name!r} is not a valid scene name",
@@ -80,7 +83,7 @@ def add_scene(
             with prepared_photographs(photos, target, frames) as (folder, notes):
                 parts = find_parts(folder, named, check_ply)
                 annotated = root / "annotated" / PHOTOS / name
-                copied_labels = {} if annotated.exists() else parts.labels
+                copied_labels = _labels_to_copy(annotated, parts)
                 report = inspect_photos(folder, poses)
                 report = replace(report, notes=(*notes, *parts.lines), columns=parts.columns)
                 _check(report, has_known_poses(folder, poses))
@@ -93,6 +96,24 @@ def add_scene(
                 with undone_on_error(annotated) if copied_labels else nullcontext():
                     _append(sheet, name, folder, parts.columns)
         return report
+
+
+def _labels_to_copy(annotated: Path, parts: Parts) -> dict[Path, str]:
+    """Return the labels to copy to the scene's annotations; raise SceneError if others are there."""
+    present = [] if not annotated.exists() else sorted(annotated.iterdir())
+    files = {path.name: path.read_bytes() for path in present if path.suffix == ".json"}
+    if not parts.labels and files:
+        parts.lines.append(
+            f"labels: {len(files)} files of an earlier scene, used for evaluation: {annotated}\n"
+            "  move them if they are not of these photographs"
+        )
+    elif present and files != {copy: path.read_bytes() for path, copy in parts.labels.items()}:
+        raise SceneError(
+            f"{annotated} has files of an earlier scene, which differ from the labels to be used",
+            found=", ".join(path.name for path in present[:3]),
+            fix="move them, choose another name, or pass --labels none to keep them",
+        )
+    return {} if present else parts.labels
 
 
 def _require_new(sheet: Path, name: str) -> None:
@@ -126,26 +147,36 @@ def _check(report: PhotoReport, have_poses: bool) -> None:
 
 
 def _append(sheet: Path, name: str, photos: Path, columns: dict[str, Path]) -> None:
+    """Append a row whose paths the reader of the sheet resolves to the given ones.
+
+    The reader strips cells and expands "~", `data:` and generators, unless a path begins with "./".
+    """
     root = project_root(sheet)
-    paths = {
-        column: path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
-        for column, path in {"source": photos, **columns}.items()
-    }
-    for path in paths.values():
-        if not path.isprintable() or generated_of(path) is not None:
-            problem = f"the path {path!r} cannot be written to the scene sheet"
-            raise SceneError(problem, fix="rename the folder")
-    values = {"dataset": PHOTOS, "scene": name, "group": PHOTOS, "unit": "arbitrary", **paths}
-    if sheet.exists():
-        text = sheet.read_text(encoding="utf-8-sig")
-        first = content_lines(sheet)[0][1]
-        header = [cell.strip() for cell in first.split("\t")]
-        if new := [column for column in columns if column not in header]:
-            header += new  # existing rows may be shorter than the header
-            text = text.replace(first, "\t".join(header), 1)
-        if not text.endswith("\n"):
-            text += "\n"
-    else:
-        header = [*COLUMNS, *columns]
-        text = "\t".join(header) + "\n"
-    write_text(sheet, text + "\t".join(values.get(column, NOTHING[1]) for column in header) + "\n")
+    meant = {"folder": photos, **columns}
+    text = sheet_text(sheet) if sheet.exists() else "\t".join(COLUMNS) + "\n"
+    number, first = content_lines(text)[0]
+    header = [cell.strip() for cell in first.split("\t")]
+    lines = text.removesuffix("\n").split("\n")
+    if new := [column for column in columns if column not in header]:
+        header += new  # existing rows may be shorter than the header
+        lines[number - 1] = "\t".join(header)
+    for start in ("", "./"):
+        cells = {
+            column: start + path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
+            for column, path in meant.items()
+        }
+        values = {"dataset": PHOTOS, "scene": name, "group": PHOTOS, "unit": "arbitrary", **cells}
+        values["source"] = cells["folder"]
+        row = "\t".join(values.get(column, NOTHING[1]) for column in header)
+        text = "\n".join([*lines, row]) + "\n"
+        with suppress(SceneError):
+            read = read_sheet(sheet, (), text=text)[-1]
+            if "".join(cells.values()).isprintable() and all(
+                getattr(read, column) in (path, path.resolve()) for column, path in meant.items()
+            ):
+                return write_text(sheet, text)
+    raise SceneError(
+        f"a path of {name} cannot be written to the scene sheet",
+        found=", ".join(map(repr, cells.values())),
+        fix="rename the folder or file",
+    )

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from hilsplat.base.atomic import atomic_folder, atomic_path
 from hilsplat.base.levels import LEVELS, PATH_SEPARATOR, path_of
 from hilsplat.base.lineage import sha256_of_bytes
-from hilsplat.base.ownership import require_own_picture
+from hilsplat.base.ownership import replaced_files
 from hilsplat.base.progress import track
 from hilsplat.base.tables import counted
 from hilsplat.query.hits import Hit, NodeGroup, doubts_of, label_comments
@@ -67,23 +68,22 @@ def answer(
 
     folder = Path(out) if out is not None else finished.folder / "queries" / file_name(text)
     panel, selection, compressed = (folder / name for name in ("panel.png", "selection.ply", "selection.spz"))
-    if out is not None:
-        for beside in (selection, compressed) if spz else (selection,):
-            require_own_picture(panel, beside=beside)
     best = views_of(scene, scene.hits_of(nodes, LISTED), views)
     drawn = list(dict.fromkeys([*([view] if view else []), *best]))[:views]
     restriction = "" if view is None else f", in view {view}"
-    query_panel(scene, text, nodes, drawn, panel, note=restriction + note, answerer=answerer)
-    rows = scene.views.gaussians_of(nodes.ids)
-    group = NodeGroup.of(text, scene.hits_of(nodes, len(nodes.ids)))
-    comments = label_comments([group], scene.name_of)
-    write_selection_ply(finished.parts.gaussians, rows, selection, np.ones(len(rows), np.int32), comments)
-    yield f"wrote {panel} and {selection.name}"
-    if spz:
-        ordered = rows[morton_order(scene.gaussians.means[rows])]
-        with atomic_path(compressed) as temporary:
-            temporary.write_bytes(spz_bytes(scene.gaussians, ordered, fractional_bits(scene.gaussians)))
-        yield f"wrote {compressed}"
+    written = (panel, selection, compressed) if spz else (panel, selection)
+    with nullcontext() if out is None else replaced_files(folder, [path.name for path in written]):
+        query_panel(scene, text, nodes, drawn, panel, note=restriction + note, answerer=answerer)
+        rows = scene.views.gaussians_of(nodes.ids)
+        group = NodeGroup.of(text, scene.hits_of(nodes, len(nodes.ids)))
+        comments = label_comments([group], scene.name_of)
+        write_selection_ply(finished.parts.gaussians, rows, selection, np.ones(len(rows), np.int32), comments)
+        yield f"wrote {panel} and {selection.name}"
+        if spz:
+            ordered = rows[morton_order(scene.gaussians.means[rows])]
+            with atomic_path(compressed) as temporary:
+                temporary.write_bytes(spz_bytes(scene.gaussians, ordered, fractional_bits(scene.gaussians)))
+            yield f"wrote {compressed}"
     if masks is not None:
         of_views = mask_files(scene, [group])
         with atomic_folder(masks) as temporary:

@@ -5,6 +5,7 @@ The workflow imports this module at start-up, so it does not import slow modules
 
 import difflib
 import fnmatch
+import os
 import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
@@ -99,7 +100,11 @@ def project_root(sheet: Path) -> Path:
 
 
 def read_sheet(
-    path: Path, checked_groups: Collection[str] | None = None, data_root: str = ""
+    path: Path,
+    checked_groups: Collection[str] | None = None,
+    data_root: str = "",
+    *,
+    text: str | None = None,
 ) -> list[SceneRow]:
     """Read and check the scene sheet: tab-separated, with one header line and `#` for comment lines.
 
@@ -111,11 +116,12 @@ def read_sheet(
             only the groups it runs, so that a missing folder in a different group does not stop it.
         data_root: folder of the published data sets, to which `data:` sources are relative (they need not
             exist); empty if not set.
+        text: content that will be written to the sheet; None to read the sheet.
 
     Raises:
         SceneError: the sheet cannot be used; the message gives the line, column and fix.
     """
-    lines = content_lines(path)
+    lines = content_lines(sheet_text(path) if text is None else text)
     if not lines:
         raise SceneError(f"scene sheet {path} is empty", fix=f"begin it with the line: {' '.join(COLUMNS)}")
     header_line, header_text = lines[0]
@@ -194,10 +200,9 @@ def is_pattern(name: str) -> bool:
     return any(letter in name for letter in "*?[")
 
 
-def content_lines(path: Path) -> list[tuple[int, str]]:
-    """Return the sheet's lines with their line numbers, excluding comments and empty lines."""
+def sheet_text(path: Path) -> str:
     try:
-        text = regular(path).read_text(encoding="utf-8-sig")
+        return regular(path).read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
         raise SceneError(f"scene sheet {path} is missing", fix="create it, or correct its path") from error
     except IsADirectoryError as error:
@@ -205,9 +210,13 @@ def content_lines(path: Path) -> list[tuple[int, str]]:
     except UnicodeDecodeError as error:
         fix = "save it as tab-separated text in UTF-8"
         raise SceneError(f"scene sheet {path} is not UTF-8 text", fix=fix) from error
+
+
+def content_lines(text: str) -> list[tuple[int, str]]:
+    """Return the lines of a sheet with their line numbers, excluding comments and empty lines."""
     return [
         (number, line)
-        for number, line in enumerate(text.replace("\r\n", "\n").split("\n"), start=1)
+        for number, line in enumerate(text.split("\n"), start=1)
         if line.strip() and not line.lstrip().startswith("#")
     ]
 
@@ -300,7 +309,8 @@ def _resolved(sheet: Path, cell: str, data_root: str) -> Path | None:
         if not data_root:
             return None
         base = Path(data_root).expanduser()
-    return (base / Path(cell.removeprefix(DATA_PREFIX)).expanduser()).resolve()
+    # `Path` would drop the "./" of "./~desk", a folder whose name begins with a tilde.
+    return (base / os.path.expanduser(cell.removeprefix(DATA_PREFIX))).resolve()  # noqa: PTH111
 
 
 def _ply_problem(ply: Path) -> str:

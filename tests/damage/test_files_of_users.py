@@ -91,7 +91,7 @@ OPTIONS = [
 ]
 NAMES = (
     *("drawing.png", "film.mp4", "masks/a.png", "clip/b.mp4", "contributions/c.txt", "results/d.csv"),
-    *("images/1.jpg", "index.json", "scenes.tsv", ".run.json", "photos/chair/f.jpg"),
+    *("images/1.jpg", "index.json", "scenes.tsv", ".run.json", "photos/chair/f.jpg", "hidden/.git/HEAD"),
     *("new.pdf", "new.csv", "new.md", "new.json", "new.report.json", "new.tex", "new.html"),
     *("gaussians/0123456789abcdef.npz", f"masks/01/{'0' * 64}.npz", ".writing-01234567-01234567/e.png"),
 )
@@ -99,7 +99,9 @@ NAMES = (
 THEIRS = ("trained.ply", "deep/1.npz")
 LINKS = {"link.ply": "trained.ply", "folder": "deep", "lost.json": "nowhere"}
 """Links in the user's folder to files elsewhere."""
-PLACES = ("", "drawing.png", "masks", "link.ply", "folder", "lost.json", "new.png", "new.safetensors")
+PLACES = (
+    *("", "drawing.png", "masks", "hidden", "link.ply", "folder", "lost.json", "new.png", "new.safetensors"),
+)
 
 
 @pytest.fixture(scope="module")
@@ -186,10 +188,29 @@ def test_an_export_replaces_only_its_own_files(own_desk: Path, monkeypatch, form
     app(words, standalone_mode=False)
     app(words, standalone_mode=False)
     written = sorted(path for path in folder.rglob("*") if path.is_file() and path.name[0] != ".")
-    for name in (Path("mine/drawing.png"), written[0].relative_to(folder)):
+    for name in (Path("mine/drawing.png"), Path(".git/HEAD"), written[0].relative_to(folder)):
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text("of the user")
         with pytest.raises(HilsplatError, match=rf"did not write, or that were changed(.|\n)*{name.name}"):
             app(words, standalone_mode=False)
         assert (folder / name).read_text() == "of the user"
         (folder / name).unlink()
+
+
+def test_a_query_replaces_only_its_own_files(own_desk: Path, monkeypatch) -> None:
+    monkeypatch.chdir(own_desk.parents[2])
+    words, folder = ["query", "photos/desk", "mug", "--out", "answer", "--spz"], Path("answer")
+    folder.mkdir()
+    (folder / "notes.txt").write_text("of the user")
+    app(words, standalone_mode=False)
+    app(words, standalone_mode=False)
+    for name in ("panel.png", "selection.ply", "selection.spz"):
+        written = (folder / name).read_bytes()
+        (folder / name).write_text("of the user")
+        with pytest.raises(HilsplatError, match=rf"did not write, or that were changed(.|\n)*{name}"):
+            app(words, standalone_mode=False)
+        assert (folder / name).read_text() == "of the user"
+        (folder / name).unlink()
+        app(words, standalone_mode=False)
+        assert (folder / name).read_bytes() == written
+    assert (folder / "notes.txt").read_text() == "of the user"

@@ -222,6 +222,59 @@ def test_label_files_are_copied_under_the_names_of_their_views(tmp_path):
     assert [path.name for path in (tmp_path / "p/annotated/photos/a").iterdir()] == ["003.json"]
 
 
+def test_the_next_commands_name_the_setting_of_another_sheet(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    photographs(tmp_path / "a")
+    for sheet, setting in (
+        ("config/scenes.tsv", ""),
+        ("my.tsv", ", with `scenes: my.tsv` in config/config.yaml"),
+    ):
+        printed = CliRunner().invoke(app, ["new", "desk", "a", "--sheet", sheet]).output
+        assert f"added photos/desk to {sheet}. Next{setting}:\n  hilsplat run desk\n" in printed
+
+
+def labelled(folder, **labels):
+    """Write photographs, and a label file for each name of a view."""
+    photographs(folder)
+    (folder / "label").mkdir()
+    for view, label in labels.items():
+        objects = [{"category": label}]
+        content = {"info": {"width": WIDTH, "height": HEIGHT}, "objects": objects}
+        (folder / f"label/{view[1:]}.json").write_text(json.dumps(content))
+    return folder
+
+
+def test_labels_of_an_earlier_scene_are_never_used_unnoticed(tmp_path):
+    first, second = labelled(tmp_path / "a", v000="mug"), labelled(tmp_path / "b", v000="train")
+    bare = photographs(tmp_path / "c")
+    project, annotated = tmp_path / "p", tmp_path / "p/annotated/photos/desk"
+    sheet = project / "config/scenes.tsv"
+    annotated.mkdir(parents=True)  # empty
+
+    def remove_row():
+        sheet.write_text("".join(line for line in sheet.open() if "\tdesk\t" not in line))
+
+    for _ in range(2):
+        assert f"used for evaluation: {first}/label" in new(first, project).output
+        assert "mug" in (annotated / "000.json").read_text()
+        remove_row()
+    before = sheet.read_bytes()
+    for options in ((), ("--dry-run",), ("--labels", str(second / "label"))):
+        result = new(second, project, *options)
+        assert "differ from the labels to be used" in str(result.exception)
+        assert sheet.read_bytes() == before
+    for folder, options in ((bare, ()), (second, ("--labels", "none"))):
+        printed = new(folder, project, *options).output
+        assert f"labels: 1 files of an earlier scene, used for evaluation: {annotated}" in printed
+        assert "mug" in (annotated / "000.json").read_text()
+        remove_row()
+    (annotated / "000.json").rename(annotated / "notes.txt")
+    assert "differ from the labels to be used" in str(new(second, project).exception)
+    (annotated / "notes.txt").unlink()
+    assert f"used for evaluation: {second}/label" in new(second, project).output
+    assert "train" in (annotated / "000.json").read_text()
+
+
 def test_damaged_poses_are_refused_before_the_scene_is_added(tmp_path):
     folder = photographs(tmp_path / "theirs/images").parent
     model(folder)

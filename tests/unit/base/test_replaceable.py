@@ -9,7 +9,13 @@ from hilsplat.base.artifacts import provenance_path, write_index
 from hilsplat.base.atomic import lock_path
 from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.base.images import write_png
-from hilsplat.base.ownership import SOFTWARE, require_beginning, require_own_picture, require_replaceable
+from hilsplat.base.ownership import (
+    SOFTWARE,
+    replaced_files,
+    require_beginning,
+    require_own_picture,
+    require_replaceable,
+)
 from hilsplat.cli.common import require_new_folder
 from hilsplat.cli.main import app
 from hilsplat.stage import PathIn, PathOut, Registry
@@ -54,6 +60,12 @@ def test_missing_or_empty_outputs_may_be_written(tmp_path):
     (tmp_path / "folder/.snakemake_timestamp").touch()
     (tmp_path / "file").touch()
     require_replaceable([tmp_path / name for name in ("new", "folder", "file")], "masks", [])
+
+
+def test_a_folder_of_hidden_files_is_not_empty(tmp_path):
+    (tmp_path / ".todo").write_text("work")
+    with pytest.raises(ArtifactError, match=r"did not write it(.|\n)*a folder of 1 entries: \.todo"):
+        require_replaceable([tmp_path], "masks", [])
 
 
 def test_only_outputs_in_the_record_of_the_same_stage_may_be_replaced(photographs, tmp_path):
@@ -144,10 +156,19 @@ def test_pictures_replace_only_pictures_of_this_package(tmp_path):
             require_own_picture(path)
     with pytest.raises(ArtifactError, match="not a PNG file"):
         require_own_picture(text)
-    (tmp_path / "selection.ply").write_text("mine")
-    require_own_picture(picture, beside=tmp_path / "selection.ply")
-    with pytest.raises(ArtifactError, match=r"selection.ply exists"):
-        require_own_picture(tmp_path / "other.png", beside=tmp_path / "selection.ply")
+
+
+def test_files_of_a_writer_that_failed_may_be_replaced(tmp_path):
+    """A query takes seconds, so that users interrupt it."""
+    with pytest.raises(KeyboardInterrupt), replaced_files(tmp_path, ["panel.png", "selection.ply"]):
+        (tmp_path / "panel.png").write_text("half a picture")
+        raise KeyboardInterrupt
+    for _ in range(2):
+        with replaced_files(tmp_path, ["panel.png", "selection.ply"]):
+            (tmp_path / "panel.png").write_text("a picture")
+    (tmp_path / "selection.ply").symlink_to("nowhere")
+    with pytest.raises(ArtifactError, match=r"did not write(.|\n)*selection\.ply"):
+        replaced_files(tmp_path, ["panel.png", "selection.ply"]).__enter__()
 
 
 def test_tables_replace_only_tables_with_the_same_header(tmp_path):

@@ -46,6 +46,17 @@ def ours(clip_parts, tmp_path_factory) -> ClipModel:
     return ClipModel.load(copy)
 
 
+def test_splitting_replaces_only_the_same_halves(clip_parts, tmp_path: Path):
+    folder = Path(shutil.copytree(clip_parts[2], tmp_path / "clip"))
+    vision, text = split_clip(folder)
+    assert split_clip(folder) == [vision, text]
+    text.unlink()
+    vision.write_text("of the user")
+    with pytest.raises(ModelError, match=r"vision_model\.onnx exists, and is not the half"):
+        split_clip(folder)
+    assert vision.read_text() == "of the user" and not text.exists()
+
+
 def test_clip_gives_what_transformers_gives(ours, clip_parts):
     model, processor, _ = clip_parts
 

@@ -184,7 +184,7 @@ def test_query_saves_the_masks_and_the_compressed_gaussians_of_its_answer(desk, 
     header = PlyData.read(elsewhere / "answer/selection.ply").comments
     assert header == ["label 1: mug > handle", f"label 1, node {hit.node}: ?, score {hit.score:.4f}"]
     assert len(spz) == len(hit.gaussians)
-    with pytest.raises(ArtifactError, match="masks exists"):
+    with pytest.raises(ArtifactError, match="--masks masks exists"):
         run("query", str(desk), "mug", "--out", "answer", "--masks", "masks")
 
 

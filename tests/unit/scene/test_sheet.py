@@ -266,6 +266,43 @@ def test_adding_a_scene_appends_one_row_with_a_relative_source(tmp_path, columns
         add_scene(sheet, "Desk", tmp_path / "desk photos")
 
 
+@pytest.mark.parametrize("name", [" desk", "~desk", "data:desk", "world:desk", "world:tabletop:1", "-"])
+def test_the_added_row_names_the_given_folders(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    folder, sheet = write_noise(tmp_path / name, 3), write_sheet(tmp_path, WORLD)
+    write_files(tmp_path, f"masks/{name}/0_s.npy")
+    add_scene(sheet, "first", Path(name), features=Path("masks", name))
+    add_scene(sheet, "second", folder)
+    _, *rows = read_sheet(sheet)
+    assert [(row.folder, row.features) for row in rows] == [
+        (folder, tmp_path / "masks" / name),
+        (folder, None),
+    ]
+
+
+@pytest.mark.parametrize("path", ["desk ", "desk\t2", "desk\x1b[2J", "desk\r"])
+def test_a_path_that_the_sheet_cannot_hold_is_refused(tmp_path, path):
+    """The reader strips cells: the photographs of the folder "desk" would be used for "desk "."""
+    write_noise(tmp_path / "desk", 3)
+    write_files(tmp_path, f"{path}/masks/0_s.npy")
+    sheet = write_sheet(tmp_path, WORLD)
+    before = sheet.read_bytes()
+    for photos, features in ((write_noise(tmp_path / path, 3), None), (tmp_path / "desk", tmp_path / path)):
+        with pytest.raises(SceneError, match="cannot be written to the scene sheet"):
+            add_scene(sheet, "new", photos, features=features)
+    assert sheet.read_bytes() == before
+
+
+def test_new_columns_are_added_to_the_header_and_not_to_a_comment(tmp_path):
+    header = "\t".join(COLUMNS[:5])
+    sheet, folder = write_sheet(tmp_path), write_noise(tmp_path / "desk", 3)
+    write_files(folder, "masks/0_s.npy")
+    sheet.write_text(f"# columns: {header}\n{header}\n")
+    add_scene(sheet, "desk", folder, features=folder / "masks")
+    assert sheet.read_text().splitlines()[:2] == [f"# columns: {header}", f"{header}\tfeatures"]
+    assert [row.features for row in read_sheet(sheet)] == [folder / "masks"]
+
+
 def test_adding_unusable_photographs_leaves_the_sheet_alone(tmp_path):
     sheet, folder = tmp_path / "scenes.tsv", write_noise(tmp_path / "desk", 2)
     shutil.copy(folder / "1.png", folder / "copy.png")

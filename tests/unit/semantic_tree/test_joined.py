@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -170,6 +171,14 @@ def test_blocks_share_the_views_at_their_border_and_keep_the_split(project):
         scene = Scene.load(project / "photos" / name / "scene")
         assert scene.views() == sorted([*block.owned, *block.borrowed])
         assert scene.views("test") == [view for view in scene.views() if view == VIEWS[4]]
+
+
+def test_the_printed_commands_quote_the_folders_of_blocks(project, monkeypatch, capsys):
+    monkeypatch.chdir(project.parent)
+    app(["blocks", "split", "photos/shelf", "--blocks", "2", "--out", "my blocks"], standalone_mode=False)
+    commands = [line.split("hilsplat new ")[1] for line in capsys.readouterr().out.splitlines()[1::2]]
+    folders = {path.name: str(path) for path in Path("my blocks").iterdir() if path.is_dir()}
+    assert dict(map(shlex.split, commands)) == folders and len(folders) == 2
 
 
 def test_a_joined_scene_has_the_nodes_of_the_whole_scene(project):
