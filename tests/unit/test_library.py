@@ -279,6 +279,8 @@ def test_arrays_and_arguments_that_do_not_fit_are_refused(scene, masks, linked):
         "array means (.|\n)*float64": lambda: replace(gaussians, means=gaussians.means.astype(float)),
         "K = 1, 4, 9 or 16": lambda: replace(gaussians, sh=np.zeros((count, 2, 3), np.float32)),
         "focal lengths above 0": lambda: replace(camera, K=camera.K * [[-1], [1], [1]]),
+        "without skew": lambda: replace(camera, K=camera.K + np.eye(3, k=1) * [[1], [0], [0]]),
+        "K.1, 0. are": lambda: replace(camera, K=camera.K + np.eye(3, k=-1) * [[0], [1e-3], [0]]),
         "rigid poses": lambda: replace(camera, cam_from_world=camera.cam_from_world * 2),
         "finite numbers": lambda: replace(camera, K=camera.K * np.nan),
         "array cam_from_world": lambda: replace(camera, cam_from_world=camera.cam_from_world[:3]),
