@@ -195,8 +195,8 @@ def load_gaussians(path: Path | str, scene: Scene | None = None) -> Gaussians:
 
     Args:
         scene: scene to whose coordinates the Gaussians are moved: from those of its source, in which 3DGS
-            trained, or those that the JSON file beside the PLY describes. None for a PLY that hilsplat wrote,
-            such as results/photos/desk/gaussians.ply, which is read as it is.
+            trained, or those that the PLY's header or the JSON file beside it describes. None for a PLY that
+            hilsplat wrote, such as results/photos/desk/gaussians.ply, which is read as it is.
 
     Raises:
         ArtifactError: the file is missing, or is not a 3DGS PLY.
