@@ -33,7 +33,7 @@ Ring = Annotated[list[tuple[Place, Place]], Field(min_length=1, max_length=20_00
 Rings = Annotated[list[Ring], Field(max_length=2000)]
 
 REPLACED = {"id", "level", "parent", "category", "origin", "segmentation", "bbox", "area"}
-"""Keys of an object that a rewritten file has anew, or that a new outline makes wrong."""
+"""Keys of an object that are written by us, or that are wrong for a new outline."""
 
 
 def _plain_text(text: str) -> str:

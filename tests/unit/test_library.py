@@ -305,6 +305,12 @@ def test_arrays_and_arguments_that_do_not_fit_are_refused(scene, masks, linked):
         "node True does not exist": lambda: linked.views.node_masks("000.png", [True]),
         "limit is -2": lambda: linked.query("mug", limit=-2),
         "limit is -1": lambda: linked.like_node(0, limit=-1),
+        "limit is None": lambda: linked.query("mug", limit=None),
+        "seed is -1": lambda: hilsplat.fit(scene, 3, seed=-1),
+        "no Gaussians": lambda: hilsplat.link(
+            scene, hilsplat.Gaussians(*(array[:0] for array in vars(gaussians).values())), masks
+        ),
+        "not a colour": lambda: hilsplat.render(gaussians, camera, background=(0, 0, 0, 1)),
     }
     for message, call in calls.items():
         with pytest.raises(HilsplatError, match=message):
@@ -313,6 +319,9 @@ def test_arrays_and_arguments_that_do_not_fit_are_refused(scene, masks, linked):
 
 def test_the_field_refuses_pixels_outside_the_view_and_a_text_that_is_no_list(desk):
     field = hilsplat.open_scene(desk).field
+    np.testing.assert_array_equal(field.image("000.png", "part"), field.image("000.png", hilsplat.Level.PART))
+    with pytest.raises(SettingsError, match="level 'piece' is unknown"):
+        field.image("000.png", "piece")
     with pytest.raises(SettingsError, match="-1 does not exist"):
         field.cosine(["mug"], "000.png", np.array([-1]))
     for call in (field.relevancy, lambda text, view: field.cosine(text, view, np.array([0]))):
