@@ -181,9 +181,12 @@ def fit(
         settings: those of section `gaussians`, such as `max_gaussians=20000`.
 
     Raises:
+        SettingsError: a setting or the seed is invalid.
         SceneError: the scene has no training views, or all Gaussians became transparent.
         DeviceError: `device="cuda"` cannot be used.
     """
+    if seed < 0:
+        raise SettingsError(f"seed is {seed}", expected="a whole number, at least 0")
     steps = {} if iterations is None else {"iterations": iterations, "steps_per_view": iterations}
     section = _section("gaussians", steps | settings)
     with _running(progress):
@@ -195,8 +198,8 @@ def load_gaussians(path: Path | str, scene: Scene | None = None) -> Gaussians:
 
     Args:
         scene: scene to whose coordinates the Gaussians are moved: from those of its source, in which 3DGS
-            trained, or those that the JSON file beside the PLY describes. None for a PLY that hilsplat wrote,
-            such as results/photos/desk/gaussians.ply, which is read as it is.
+            trained, or those that the PLY's header or the JSON file beside it describes. None for a PLY that
+            hilsplat wrote, such as results/photos/desk/gaussians.ply, which is read as it is.
 
     Raises:
         ArtifactError: the file is missing, or is not a 3DGS PLY.
@@ -264,6 +267,7 @@ def link(
 
     Raises:
         ArtifactError: the folder has results of a run or another scene.
+        SceneError: there are no Gaussians.
         MisalignedArtifactError: there are no masks, or some are not those of the scene's training views.
         ModelError: the model is missing or incomplete.
     """
@@ -277,6 +281,8 @@ def link(
             found=f"{type(masks).__name__} of {shorten_list([*masks]) or 'no views'}",
             fix="pass the result of hilsplat.segment for this scene",
         )
+    if not len(gaussians):
+        raise SceneError("there are no Gaussians to link", fix="pass those of hilsplat.fit or load_gaussians")
     _require_own(folder)
     if folder and scene.folder.resolve() != (Path(folder) / "scene").resolve():
         raise ArtifactError(

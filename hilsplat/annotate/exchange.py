@@ -7,6 +7,7 @@ these keys are imported as wholes.
 import base64
 import io
 import json
+import logging
 import math
 import re
 import zipfile
@@ -28,6 +29,7 @@ from hilsplat.base.errors import HilsplatError, SceneError, first_line, foreign
 from hilsplat.base.images import open_image
 from hilsplat.datasets.generators import GENERATORS
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
+from hilsplat.datasets.images.hi import PROPOSED
 from hilsplat.datasets.images.isat import (
     BACKGROUND,
     IsatObject,
@@ -42,13 +44,20 @@ from hilsplat.scene.scene import Scene
 from hilsplat.scene.view_names import match_name, match_names
 from hilsplat.web.coco import coco_content, coco_region
 
+logger = logging.getLogger(__name__)
+
 Kind = Literal["hilsplat", "isat", "labelme", "coco"]
 OURS = {"level", "parent", "origin"}
 """Our extra keys in the other formats."""
 
 
 def exported(kind: Kind, known: Mapping[str, Sequence[Label]], cameras: Cameras) -> bytes:
-    """Return all annotations as a ZIP with one file per view or, for COCO, as one JSON file."""
+    """Return all annotations as a ZIP with one file per view or, for COCO, as one JSON file.
+
+    Only our own format contains unaccepted proposals.
+    """
+    if kind != "hilsplat":
+        known = _accepted(known)
     if kind == "coco":
         return json.dumps(_coco(known, cameras), ensure_ascii=False).encode()
     write = {"hilsplat": as_file, "isat": _isat, "labelme": _labelme}[kind]
@@ -57,6 +66,14 @@ def exported(kind: Kind, known: Mapping[str, Sequence[Label]], cameras: Cameras)
         for view, labels in known.items():
             archive.writestr(f"{Path(view).stem}.json", write(view, cameras[view].size_hw, labels))
     return content.getvalue()
+
+
+def _accepted(known: Mapping[str, Sequence[Label]]) -> dict[str, list[Label]]:
+    """Return the labels without proposals, which other programs would take as ground truth; log how many."""
+    kept = {view: [label for label in labels if label.origin != PROPOSED] for view, labels in known.items()}
+    if count := sum(len(labels) - len(kept[view]) for view, labels in known.items()):
+        logger.warning("%d unaccepted proposals are not exported; accept them with: hilsplat annotate", count)
+    return {view: labels for view, labels in kept.items() if labels}
 
 
 def export_labels(scene: Scene, folder: Path, data_root: Path, out: Path) -> int:
@@ -70,17 +87,19 @@ def export_labels(scene: Scene, folder: Path, data_root: Path, out: Path) -> int
     below `data_root`. Return the number of labelled views.
 
     Raises:
-        SceneError: the scene has no labels.
+        SceneError: the scene has no labels, or only unaccepted proposals.
     """
     annotated, views = data_root / "annotated" / scene.name, scene.views()
     truths = [folder / name / "truth" for name in GENERATORS]
     if truth := next(filter(Path.is_dir, truths), None):
         known = labels_of_truth(HierarchyAnnotations.load(truth), views)
     else:
-        known = known_labels(annotated, scene.cameras, views)
+        known = _accepted(known_labels(annotated, scene.cameras, views))
     if not known:
         raise SceneError(
-            f"{scene.name} has no labels", expected=f"files in {annotated}", fix=f"hilsplat annotate {folder}"
+            f"{scene.name} has no labels",
+            expected=f"drawn or accepted regions in files in {annotated}",
+            fix=f"hilsplat annotate {folder}",
         )
     with atomic_folder(out) as temporary:
         for view, labels in known.items():

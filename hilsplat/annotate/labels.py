@@ -6,9 +6,10 @@ vertices are whole pixels, so that evaluation fills exactly the drawn region.
 
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Bool
@@ -19,8 +20,9 @@ from hilsplat.base.errors import SceneError, SettingsError
 from hilsplat.base.levels import Level
 from hilsplat.base.removal import delete
 from hilsplat.datasets.images.hi import by_id, parents_of
-from hilsplat.datasets.images.isat import Polygon, fill_polygons, read_isat, trace_polygons
+from hilsplat.datasets.images.isat import IsatFile, Polygon, fill_polygons, read_isat, trace_polygons
 from hilsplat.scene.cameras import Camera, Cameras
+from hilsplat.scene.layouts import read_json_object
 from hilsplat.scene.placement import placed
 from hilsplat.web.file_changes import replacing, version_of
 from hilsplat.web.messages import MAX_SIDE_PX, Message, Text
@@ -29,6 +31,9 @@ Origin = Literal["drawn", "edited", "accepted", "proposed"]
 Place = Annotated[int, Field(ge=-MAX_SIDE_PX, le=2 * MAX_SIDE_PX)]
 Ring = Annotated[list[tuple[Place, Place]], Field(min_length=1, max_length=20_000)]
 Rings = Annotated[list[Ring], Field(max_length=2000)]
+
+REPLACED = {"id", "level", "parent", "category", "origin", "segmentation", "bbox", "area"}
+"""Keys of an object that are written by us, or that are wrong for a new outline."""
 
 
 def _plain_text(text: str) -> str:
@@ -136,25 +141,65 @@ def read_labels(path: Path, camera: Camera | None = None) -> list[Label]:
     """Read the annotations of a view; empty if there is no file.
 
     With the view's camera, labels drawn on its photograph or on a scaled copy are transferred to the view;
-    labels outside the view are left out.
+    labels outside the view are left out. Labels without levels (LERF-OVS) are wholes.
 
     Raises:
         SceneError: the file, an id or a level is invalid.
         MisalignedArtifactError: the file's image size fits neither the camera nor the photograph.
     """
-    if not path.is_file():
-        return []
-    stored = read_isat(path)
+    return _labels_of(_with_ids(read_isat(path), {}), camera) if path.is_file() else []
+
+
+def known_labels(folder: Path, cameras: Cameras, views: Sequence[str]) -> dict[str, list[Label]]:
+    """Return the annotations of all annotated views; for errors, see `read_labels`.
+
+    An object in a file without ids gets the id of an object with the same text in other views, if any.
+    """
+    files = {view: read_isat(path) for view in views if (path := label_path(folder, view)).is_file()}
+    texts: dict[int, str] = {}
+    labels: dict[str, list[Label]] = {}
+    for view in sorted(files, key=lambda view: not _has_ids(files[view])):
+        stored = _with_ids(files[view], texts)
+        labels[view] = _labels_of(stored, cameras[view])
+        for number, thing in by_id(stored).items():
+            texts[number] = thing.category.casefold() if thing.keys["level"] == Level.WHOLE else ""
+    return {view: labels[view] for view in views if labels.get(view)}
+
+
+def _has_ids(stored: IsatFile) -> bool:
+    return any("id" in thing.keys or "level" in thing.keys for thing in stored.objects)
+
+
+def _with_ids(stored: IsatFile, texts: Mapping[int, str]) -> IsatFile:
+    """Return a file with ids and levels; `texts` has the casefolded texts of known wholes by id."""
+    if any("level" in thing.keys for thing in stored.objects):
+        return stored
+    has_ids, unused = _has_ids(stored), dict(texts)
+    free, objects = 1 + max(texts, default=0), []
+    for thing in stored.objects:
+        if has_ids:
+            keys = {**thing.keys, "level": 1}
+        else:
+            alike = [number for number, text in unused.items() if text == thing.category.casefold()]
+            number = min(alike, default=free)
+            free += number == free
+            unused.pop(number, None)
+            keys = {**thing.keys, "level": 1, "id": number}
+        objects.append(replace(thing, keys=keys))
+    return replace(stored, objects=tuple(objects))
+
+
+def _labels_of(stored: IsatFile, camera: Camera | None) -> list[Label]:
     objects = by_id(stored)
     parents = parents_of(stored, objects, [])
     labels = []
     for number, thing in objects.items():
         polygons = [whole_pixels(polygon) for polygon in thing.polygons]
         if camera is not None:
-            polygons = placed_rings(polygons, stored.size_hw, camera, f"label file {path}")
+            polygons = placed_rings(polygons, stored.size_hw, camera, f"label file {stored.path}")
         if polygons:
             label = Label.read(
-                str(path),
+                str(stored.path),
                 id=number,
                 level=thing.keys["level"],
                 parent=parents[number],
@@ -164,12 +209,6 @@ def read_labels(path: Path, camera: Camera | None = None) -> list[Label]:
             )
             labels.append(label)
     return labels
-
-
-def known_labels(folder: Path, cameras: Cameras, views: Sequence[str]) -> dict[str, list[Label]]:
-    """Return the annotations of all annotated views; for errors, see `read_labels`."""
-    labels = {view: read_labels(label_path(folder, view), cameras[view]) for view in views}
-    return {view: of_view for view, of_view in labels.items() if of_view}
 
 
 def whole_pixels(points: Polygon) -> list[tuple[int, int]]:
@@ -182,20 +221,50 @@ def write_labels(
 ) -> str:
     """Replace the annotations of a view and return the new version; without annotations, delete the file.
 
+    Keys that we do not use are kept. A file that was drawn at another size or has no ids is kept as a whole
+    under the key `original`, because it may contain regions outside the view.
+
     Raises:
+        SceneError: the present file is invalid.
         StaleFileError: the file changed since `version` was read.
     """
     with replacing(path, version, f"the annotations of {view}") as path:
-        if labels:
-            write_text(path, as_file(view, size_hw, labels))
+        content, keys = _kept(path, size_hw) if path.is_file() else ({}, {})
+        if labels or content.keys() - {"info"}:
+            write_text(path, as_file(view, size_hw, labels, content, keys))
         else:
             delete(path, r".+\.json")
         return version_of(path)
 
 
-def as_file(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
-    """Format a view's annotations in our format: one object per line, for short files and readable diffs."""
-    info = {"name": view, "width": size_hw[1], "height": size_hw[0]}
+def _kept(path: Path, size_hw: tuple[int, int]) -> tuple[dict[str, Any], dict[int, dict[str, Any]]]:
+    """Return what stays of a file that is rewritten: keys of the file, and keys of its objects by id."""
+    stored, content = read_isat(path), read_json_object(path, "restore the file")
+    kept = {key: value for key, value in content.items() if key != "objects"}
+    if stored.objects and (stored.size_hw != size_hw or not _has_ids(stored)):
+        return {**kept, "original": content}, {}
+    objects = by_id(_with_ids(stored, {})).items()
+    return kept, {
+        number: {key: value for key, value in thing.keys.items() if key not in REPLACED}
+        for number, thing in objects
+    }
+
+
+def as_file(
+    view: str,
+    size_hw: tuple[int, int],
+    labels: Sequence[Label],
+    content: Mapping[str, Any] | None = None,
+    keys: Mapping[int, Mapping[str, Any]] | None = None,
+) -> str:
+    """Format a view's annotations in our format: one object per line, for short files and readable diffs.
+
+    Args:
+        content: more keys of the file, except `objects`; values of `info` are replaced.
+        keys: more keys of objects, by id.
+    """
+    more = dict(content or {})
+    info = {**more.pop("info", {}), "name": view, "width": size_hw[1], "height": size_hw[0]}
     objects = [
         {
             "id": label.id,
@@ -204,10 +273,13 @@ def as_file(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str
             "category": label.text,
             "origin": label.origin,
             "segmentation": label.polygons,
+            **(keys or {}).get(label.id, {}),
         }
         for label in sorted(labels, key=lambda label: label.id)
     ]
-    return f'{{"info":{_compact(info)},\n"objects":[\n' + ",\n".join(map(_compact, objects)) + "\n]}\n"
+    parts = [f'"info":{_compact(info)}', '"objects":[\n' + ",\n".join(map(_compact, objects)) + "\n]"]
+    parts += [f"{_compact(key)}:{_compact(value)}" for key, value in more.items()]
+    return "{" + ",\n".join(parts) + "}\n"
 
 
 def _compact(value: object) -> str:

@@ -1,5 +1,6 @@
 """The three semantic levels, coarse to fine, and queries with a text for each of several levels."""
 
+import unicodedata
 from enum import IntEnum
 
 from hilsplat.base.errors import SettingsError
@@ -34,8 +35,8 @@ MAX_TEXT = 500  # maximum number of characters in a query; CLIP reads 77 tokens
 
 
 def plain_text(text: str) -> str:
-    """Return a text in lower case with single spaces, to compare it with others."""
-    return " ".join(text.split()).casefold()
+    """Return a text in composed Unicode and lower case with single spaces, to compare it with others."""
+    return " ".join(unicodedata.normalize("NFC", text).split()).casefold()
 
 
 def path_of(text: str) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from hilsplat.base.errors import MisalignedArtifactError, SettingsError
 from hilsplat.base.levels import LEVELS, Level, path_of
 from hilsplat.datasets.labelled import LabelledRegion
 from hilsplat.datasets.points.labelled_points import LabelledPoints
+from hilsplat.evaluate.metrics.instances import CLASS_STRIDE
 from hilsplat.evaluate.protocols import cards
 from hilsplat.evaluate.protocols.flat_views import Answer, answer_rows, argmax_rows, mask_of, rule_of
 from hilsplat.evaluate.protocols.points import class_set, instance_scan, measure_instances, measure_points
@@ -303,10 +304,14 @@ def _rows_of_points(card: cards.ProtocolCard, predictions: Any, labels: Any) -> 
     axes, ids = (("MP", "M", "M", "P", "P"), (1, 3, 4)) if is_scan else (("P", "P"), (0, 1))
     shapes = [tuple(sizes.get(axis) for axis in each) for each in axes]
     fits = [array.shape for array in given] == shapes and all(given[row].dtype.kind in "iu" for row in ids)
-    if is_scan:  # masks of ids, such as -1 for none, would be read as masks of all points
-        fits &= given[0].dtype == bool and given[2].dtype.kind in "fiu" and bool(np.isfinite(given[2]).all())
+    if is_scan and fits:  # masks of ids, such as -1 for none, would be read as masks of all points
+        fits = given[0].dtype == bool and given[2].dtype.kind in "fiu" and bool(np.isfinite(given[2]).all())
+        fits = fits and not (given[4] < 0).any() and len(np.unique(given[4])) < CLASS_STRIDE
     if not fits:
-        scan = "masks (M, P) bool, class ids (M,), finite confidences (M,); class ids (P,), instance ids (P,)"
+        scan = (
+            "masks (M, P) bool, class ids (M,), finite confidences (M,); class ids (P,), instance ids (P,), "
+            f"0 for none, of fewer than {CLASS_STRIDE} instances"
+        )
         raise MisalignedArtifactError(
             f"predictions and labels do not match under {card.full_name}",
             expected=scan if is_scan else "integer class ids of the same points, (P,) and (P,)",
@@ -316,7 +321,10 @@ def _rows_of_points(card: cards.ProtocolCard, predictions: Any, labels: Any) -> 
         predicted, truth = map(classes.labels, given)
         yield from measure_points(card, METHOD, truth, predicted, classes, METHOD)
         return
-    masks, class_ids, confidences, *truth_ids = given
-    points = LabelledPoints(np.zeros((sizes["P"], 3)), *(array.astype(np.int32) for array in truth_ids))
+    masks, class_ids, confidences, class_id, instance_id = given
+    class_id = np.where(classes.labels(class_id) > 0, class_id, 0).astype(np.int32)
+    # Renumbered: any integer identifies an instance, but a scan's ids are below CLASS_STRIDE. 0 stays 0.
+    number = np.unique(np.append(instance_id.dtype.type(0), instance_id), return_inverse=True)[1][1:]
+    points = LabelledPoints(np.zeros((sizes["P"], 3)), class_id, number.astype(np.int32))
     matches = instance_scan(points, classes, masks, class_ids, confidences.astype(np.float64))
     yield from measure_instances(METHOD, {"": matches}, METHOD)

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float32, Int64, UInt8
 
+from hilsplat.base.errors import SettingsError
 from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import LEVELS, Level, path_of
 from hilsplat.contributions.compositing import rendered_latents
@@ -88,9 +89,13 @@ class FieldAnswers:
                 out[has_latent] = np.maximum(out[has_latent], relevancy)
         return out
 
-    def image(self, view: str, level: Level) -> UInt8[np.ndarray, "H W 3"]:
+    def image(self, view: str, level: Level | str) -> UInt8[np.ndarray, "H W 3"]:
         """Render the field of a level as colours (see `field_colours`); uncovered pixels are black."""
-        colours = field_colours(self.language.features[:, level.index])
+        known = {name: each.index for each in LEVELS for name in (each, each.label)}
+        if level not in known:
+            labels = ", ".join(each.label for each in LEVELS)
+            raise SettingsError(f"level {level!r} is unknown", expected=labels)
+        colours = field_colours(self.language.features[:, known[level]])
         return to_uint8((self.views.view_weights(view) @ colours).reshape(*self.views.size_hw(view), 3))
 
     @cached_property

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Int64
 
+from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import Level
 from hilsplat.query.node_search import NodeHits
 from hilsplat.query.scene_views import SceneViews, View
@@ -13,6 +14,13 @@ from hilsplat.semantic_tree.tree import OrientedBox
 
 LIKELY_CHANCE = 0.05
 """An answer is doubtful if more than this share of the words for absent objects score at least as high."""
+
+
+def checked_count(count: int, name: str = "limit") -> int:
+    """Return a number of answers; raise SettingsError if it is negative or not a whole number."""
+    if not isinstance(count, int | np.integer) or count < 0:  # a slice would leave out the last answers
+        raise SettingsError(f"{name} is {count!r}", expected="a number of answers, at least 0")
+    return int(count)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from hilsplat.base.lineage import require_made_from, sha256_of_file
 from hilsplat.embed.clip import ClipModel, open_clip_of
 from hilsplat.field.code import LanguageField, autoencoder_file, load_code
 from hilsplat.query.field_answers import FieldAnswers
-from hilsplat.query.hits import Doubt, Hit, Node, doubts_of
+from hilsplat.query.hits import Doubt, Hit, Node, checked_count, doubts_of
 from hilsplat.query.names import NodeNames, read_names
 from hilsplat.query.node_names import NodeNaming
 from hilsplat.query.node_queries import NodeQueries, caution_of
@@ -225,12 +225,12 @@ class LanguageScene(NodeQueries):
         self, vector: Float32[np.ndarray, " C"], nodes: Int64[np.ndarray, " n"], limit: int
     ) -> list[Hit]:
         cosine = self.tree.clip[nodes] @ vector
-        order = np.lexsort((nodes, -cosine))[: _count(limit)]
+        order = np.lexsort((nodes, -cosine))[: checked_count(limit)]
         return [self._hit(int(nodes[row]), float(cosine[row]), "like", ()) for row in order]
 
     def hits_of(self, nodes: NodeHits, limit: int) -> list[Hit]:
         """Return up to `limit` of the best nodes as answers."""
-        doubts, limit = doubts_of(nodes), _count(limit)
+        doubts, limit = doubts_of(nodes), checked_count(limit)
         scores = relevancy_of_margins(nodes.values[:limit], self.settings.relevancy_scale).tolist()
         return [
             self._hit(node, score, nodes.route, doubts)
@@ -302,12 +302,6 @@ class LanguageScene(NodeQueries):
                 blended = in_view.blend(values, float(values[nodes].min()))
                 cosines[row, level.index] = np.where(in_view.covered, blended, -np.inf)[pixels]
         return cosines
-
-
-def _count(limit: int) -> int:
-    if limit < 0:  # a slice would leave out the last answers
-        raise SettingsError(f"limit is {limit}", expected="a number of answers, at least 0")
-    return limit
 
 
 def open_scene(folder: Path | str, variant: str = "default", *, threads: int = 1) -> LanguageScene:

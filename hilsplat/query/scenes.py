@@ -16,7 +16,7 @@ from hilsplat.base.errors import ArtifactError, HilsplatError, first_line, neare
 from hilsplat.base.levels import Level
 from hilsplat.base.tables import counted
 from hilsplat.embed.clip import ClipModel, open_clip_of
-from hilsplat.query.hits import Doubt, doubts_of
+from hilsplat.query.hits import Doubt, checked_count, doubts_of
 from hilsplat.query.names import NodeNames, read_names
 from hilsplat.query.node_index import FILE, NodeIndex
 from hilsplat.query.node_names import NodeNaming
@@ -150,6 +150,7 @@ class Scenes:
         Raises:
             SettingsError: as in `LanguageScene.query`.
         """
+        limit, each = checked_count(limit), checked_count(each, "each")
 
         def answers(scene: IndexedScene) -> NodeHits:
             return scene.find(text, level=level, threshold=threshold)

@@ -176,4 +176,6 @@ def _fault_of(poses: Float[np.ndarray, "V 4 4"], K: Float[np.ndarray, "V 3 3"]) 
         return "rigid poses"
     if not (K[:, [0, 1], [0, 1]] > 0).all() or (K[:, 2] != (0, 0, 1)).any():
         return "focal lengths above 0"
+    if (K[:, [0, 1], [1, 0]] != 0).any():
+        return "pixels without skew (K[0, 1] and K[1, 0] are 0), as after undistortion"
     return ""

@@ -11,6 +11,7 @@ from hilsplat.base.atomic import atomic_path
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.lineage import require_made_from, sha256_of_file
 from hilsplat.semantic_tree.tree import SemanticTree
+from hilsplat.splat.coordinates import source_comments
 
 
 def readable_nodes(tree: SemanticTree) -> list[dict[str, Any]]:
@@ -72,7 +73,7 @@ def _write(
     out: Path,
     comments: Sequence[str] = (),
 ) -> None:
-    """Copy rows of a PLY, with additional int32 columns."""
+    """Copy rows of a PLY, with additional int32 columns, and a comment that states the coordinates."""
     from plyfile import PlyData, PlyElement
 
     vertex = PlyData.read(str(ply))["vertex"].data[rows]
@@ -81,4 +82,4 @@ def _write(
         table[name] = columns[name] if name in columns else vertex[name]
     with atomic_path(out) as temporary:
         element = PlyElement.describe(table, "vertex")
-        PlyData([element], byte_order="<", comments=list(comments)).write(str(temporary))
+        PlyData([element], byte_order="<", comments=[*source_comments(ply), *comments]).write(str(temporary))

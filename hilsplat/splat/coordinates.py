@@ -1,6 +1,7 @@
 """Coordinates of Gaussians: similarity transforms, and import and export in a source's coordinates."""
 
 import logging
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,10 @@ from scipy.special import sph_harm_y
 
 from hilsplat.base.artifacts import read_json, run_command, write_json
 from hilsplat.base.errors import ArtifactError, HilsplatError, SceneError, foreign
+from hilsplat.base.files import regular
 from hilsplat.base.lineage import require_as_written, require_made_from, sha256_of_file
 from hilsplat.base.rotations import are_rotations, multiply, quaternion_of
-from hilsplat.scene.layouts import read_json_object
+from hilsplat.scene.layouts import HEADER_BYTES, read_json_object
 from hilsplat.scene.posed_images import rigid_pose
 from hilsplat.scene.scene import Scene
 from hilsplat.splat.gaussians import FIELDS, Gaussians
@@ -25,6 +27,7 @@ FIX = (
     "gaussians column of the scene sheet"
 )
 COPY_AGAIN = "copy it again from nerfstudio"
+KEY = "source_from_scene"
 TOLERANCE = 1e-5  # maximum deviation of a matrix from a scaled rotation, relative to the scale
 BEFORE_APPLIED_TRANSFORM = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
 """Transform of COLMAP coordinates by `ns-process-data` versions that do not record `applied_transform`."""
@@ -127,7 +130,7 @@ def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dic
             "source": read_json(scene.folder / "registration.json")["poses"],
             "convention": "x_scene = scene_from_source @ [x_source, 1]",
             "scene_from_source": scene.scene_from_source.tolist(),
-            "source_from_scene": np.linalg.inv(scene.scene_from_source).tolist(),
+            KEY: np.linalg.inv(scene.scene_from_source).tolist(),
             "scale": scale,
             "rotation": rotation.tolist(),
             "translation": translation.tolist(),
@@ -137,20 +140,40 @@ def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dic
 
 
 def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
-    """Return the transform from a PLY's coordinates to its source's, or None if no JSON file contains it."""
+    """Return the transform from a PLY's coordinates to its source's.
+
+    It is in the JSON file beside the PLY, or in a comment of its header (`source_comments`). None if neither
+    has it.
+    """
     path = ply.with_suffix(".json")
-    if not path.is_file():
-        return None
-    content = read_json(path)
-    if not isinstance(content, dict) or "source_from_scene" not in content:
-        return None
+    content = read_json(path) if path.is_file() else None
+    if not isinstance(content, dict) or KEY not in content:
+        return _commented(ply)
     require_as_written(path, sha256_of_file(path))
     fix = "move it next to its PLY, or remove it if this PLY is in the coordinates of the scene's source"
     require_made_from(path, ply, str(content.get("ply_sha256")), sha256_of_file(ply), fix)
-    matrix = np.array(content["source_from_scene"], dtype=np.float64)
+    matrix = np.array(content[KEY], dtype=np.float64)
     if matrix.shape != (4, 4):
-        raise ArtifactError(f"{path}: source_from_scene is not a 4 x 4 matrix", found=f"shape {matrix.shape}")
+        raise ArtifactError(f"{path}: {KEY} is not a 4 x 4 matrix", found=f"shape {matrix.shape}")
     return matrix
+
+
+def source_comments(ply: Path) -> list[str]:
+    """Return the comment that states the coordinates of copies of a scene's PLY; none if they are unknown."""
+    matrix = read_source_from_scene(ply)
+    return [] if matrix is None else [" ".join([KEY, *map(repr, matrix.ravel().tolist())])]
+
+
+def _commented(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
+    if not ply.is_file():
+        return None
+    with regular(ply).open("rb") as stream:
+        header = stream.read(HEADER_BYTES).partition(b"end_header")[0]
+    match = re.search(rf"^comment {KEY} (.*)$".encode(), header, re.MULTILINE)
+    if match is None:
+        return None
+    with foreign(f"{ply}, comment {KEY}", ArtifactError, expected="16 numbers", fix=FIX):
+        return np.array(match[1].split(), dtype=np.float64).reshape(4, 4)
 
 
 def source_from_dataparser(dataparser: Path, transforms: Path | None) -> Float64[np.ndarray, "4 4"]:
@@ -202,9 +225,9 @@ def import_gaussians(
 ) -> tuple[Gaussians, dict[str, Any]]:
     """Read a 3DGS PLY, which by default uses the coordinates of the scene's source poses.
 
-    A PLY written by this package is transformed to the source's coordinates with the JSON file beside it. A
-    PLY in nerfstudio's training coordinates needs its `dataparser_transforms.json`, and the `transforms.json`
-    that contains the source's poses.
+    A PLY written by this package is transformed to the source's coordinates with the JSON file beside it, or
+    with the comment in its header. A PLY in nerfstudio's training coordinates needs its
+    `dataparser_transforms.json`, and the `transforms.json` that contains the source's poses.
 
     Returns:
         The Gaussians in the scene's coordinates, and their origin for the report.
@@ -218,7 +241,7 @@ def import_gaussians(
     transform = scene.scene_from_source
     if source_from_ply is not None:
         transform = transform @ source_from_ply
-        moved = "in the coordinates that the JSON file beside it describes"
+        moved = "in the coordinates that its header or the JSON file beside it describes"
     elif dataparser is not None:
         transform = transform @ source_from_dataparser(dataparser, transforms)
         moved = f"in nerfstudio's training coordinates, from {dataparser.name}"

@@ -13,7 +13,7 @@ from pycocotools import mask as coco_masks
 
 from hilsplat.annotate.exchange import export_labels, imported, merged
 from hilsplat.annotate.labels import Label, label_path, write_labels
-from hilsplat.base.errors import HilsplatError
+from hilsplat.base.errors import HilsplatError, SceneError
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.web.file_changes import NO_FILE
@@ -324,7 +324,12 @@ def test_langsplats_evaluation_finds_exported_labels_images_and_numbers(tmp_path
     view = names[1]
     rings = [[(4, 4), (35, 4), (35, 12), (4, 12)], [(50, 13), (60, 13), (60, 25)]]
     label = Label(id=3, level=1, text="mug", polygons=rings)
-    write_labels(label_path(tmp_path / "annotated/set/scene", view), view, SIZE, [label], NO_FILE)
+    proposed = Label(id=4, level=1, text="unchecked", polygons=rings, origin="proposed")
+    path = label_path(tmp_path / "annotated/set/scene", view)
+    version = write_labels(path, view, SIZE, [proposed], NO_FILE)
+    with pytest.raises(SceneError, match="has no labels"):
+        export_labels(scene, tmp_path, tmp_path, tmp_path / "label")
+    write_labels(path, view, SIZE, [label, proposed], version)
     out = tmp_path / "label"
     assert export_labels(scene, tmp_path, tmp_path, out) == 1
     # What eval_openclip_lerf does with a label folder, in its order.

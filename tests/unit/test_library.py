@@ -279,6 +279,8 @@ def test_arrays_and_arguments_that_do_not_fit_are_refused(scene, masks, linked):
         "array means (.|\n)*float64": lambda: replace(gaussians, means=gaussians.means.astype(float)),
         "K = 1, 4, 9 or 16": lambda: replace(gaussians, sh=np.zeros((count, 2, 3), np.float32)),
         "focal lengths above 0": lambda: replace(camera, K=camera.K * [[-1], [1], [1]]),
+        "without skew": lambda: replace(camera, K=camera.K + np.eye(3, k=1) * [[1], [0], [0]]),
+        "K.1, 0. are": lambda: replace(camera, K=camera.K + np.eye(3, k=-1) * [[0], [1e-3], [0]]),
         "rigid poses": lambda: replace(camera, cam_from_world=camera.cam_from_world * 2),
         "finite numbers": lambda: replace(camera, K=camera.K * np.nan),
         "array cam_from_world": lambda: replace(camera, cam_from_world=camera.cam_from_world[:3]),
@@ -303,6 +305,12 @@ def test_arrays_and_arguments_that_do_not_fit_are_refused(scene, masks, linked):
         "node True does not exist": lambda: linked.views.node_masks("000.png", [True]),
         "limit is -2": lambda: linked.query("mug", limit=-2),
         "limit is -1": lambda: linked.like_node(0, limit=-1),
+        "limit is None": lambda: linked.query("mug", limit=None),
+        "seed is -1": lambda: hilsplat.fit(scene, 3, seed=-1),
+        "no Gaussians": lambda: hilsplat.link(
+            scene, hilsplat.Gaussians(*(array[:0] for array in vars(gaussians).values())), masks
+        ),
+        "not a colour": lambda: hilsplat.render(gaussians, camera, background=(0, 0, 0, 1)),
     }
     for message, call in calls.items():
         with pytest.raises(HilsplatError, match=message):
@@ -311,6 +319,9 @@ def test_arrays_and_arguments_that_do_not_fit_are_refused(scene, masks, linked):
 
 def test_the_field_refuses_pixels_outside_the_view_and_a_text_that_is_no_list(desk):
     field = hilsplat.open_scene(desk).field
+    np.testing.assert_array_equal(field.image("000.png", "part"), field.image("000.png", hilsplat.Level.PART))
+    with pytest.raises(SettingsError, match="level 'piece' is unknown"):
+        field.image("000.png", "piece")
     with pytest.raises(SettingsError, match="-1 does not exist"):
         field.cosine(["mug"], "000.png", np.array([-1]))
     for call in (field.relevancy, lambda text, view: field.cosine(text, view, np.array([0]))):

@@ -49,13 +49,16 @@ def render(
         threads: does not affect the result.
 
     Raises:
-        SettingsError: `camera` is not a camera, or there are not as many features as Gaussians.
+        SettingsError: `camera` is not a camera, the background is not a colour, or there are not as many
+            features as Gaussians.
         HilsplatError: Gaussians have non-finite parameters.
     """
     if not isinstance(camera, Camera):
         raise SettingsError(
             f"{camera!r} is not a camera", fix="pass scene.cameras[...], or use scene.render(view)"
         )
+    if np.shape(background) != (3,):
+        raise SettingsError("the background is not a colour", expected="3 numbers", found=repr(background))
     if features is not None and len(features) != len(gaussians):
         raise SettingsError(
             "features do not match the Gaussians",

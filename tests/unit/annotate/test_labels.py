@@ -1,12 +1,23 @@
 """Annotations of a view: children are cut to their parents, and only the last version is replaced."""
 
+import json
+
 import numpy as np
 import pytest
 
-from hilsplat.annotate.labels import Label, cut_to_parents, read_labels, traced, write_labels
+from hilsplat.annotate.labels import (
+    Label,
+    cut_to_parents,
+    known_labels,
+    label_path,
+    read_labels,
+    traced,
+    write_labels,
+)
 from hilsplat.base.errors import SettingsError
 from hilsplat.datasets.images.hi import regions_of
 from hilsplat.datasets.images.isat import read_isat
+from hilsplat.scene.cameras import Cameras, Photo
 from hilsplat.web.file_changes import NO_FILE, version_of
 
 SIZE = (30, 40)
@@ -86,3 +97,75 @@ def test_a_written_file_is_read_back_and_scored_without_proposals(tmp_path):
     path.symlink_to(shared)
     write_labels(path, "DSC_1.png", SIZE, given, NO_FILE)
     assert path.is_symlink() and shared.is_file()
+
+
+def views_of(*names: str, photos: dict[str, Photo] | None = None) -> Cameras:
+    n = len(names)
+    K = np.array([[30.0, 0, SIZE[1] / 2], [0, 30, SIZE[0] / 2], [0, 0, 1]])
+    sizes = np.full((n, 2), SIZE, np.int32)
+    return Cameras(names, np.tile(np.eye(4), (n, 1, 1)), np.tile(K, (n, 1, 1)), sizes, photos or {})
+
+
+def isat(name: str, size_hw: tuple[int, int], things: list[dict], **more) -> str:
+    info = {"name": name, "width": size_hw[1], "height": size_hw[0], "note": "desk"}
+    return json.dumps({"info": info, "objects": things, **more})
+
+
+def test_regions_outside_the_view_survive_a_change_and_the_removal_of_all_others(tmp_path):
+    photo = Photo("PINHOLE", (30, 30, 40, 20), (40, 80))  # the view is its middle
+    camera = views_of("a.png", photos={"a.png": photo})["a.png"]
+    keys = {"level": 1, "parent": None}
+    lamp = {"id": 1, **keys, "category": "corner lamp", "segmentation": [[0, 0], [4, 0], [4, 4]]}
+    table = {"id": 2, **keys, "category": "table", "segmentation": [[0, 20], [50, 20], [50, 39], [0, 39]]}
+    path = tmp_path / "a.json"
+    path.write_text(before := isat("a.png", photo.size_hw, [lamp, table]))
+    (shown,) = read_labels(path, camera)
+    assert shown.text == "table"
+    new = label(3, 1, None, box(1, 1, 5, 5))
+    version = write_labels(path, "a.png", SIZE, [shown, new], version_of(path))
+    assert read_labels(path, camera) == [shown, new]
+    assert json.loads(path.read_text())["original"] == json.loads(before)
+    version = write_labels(path, "a.png", SIZE, [new], version)
+    write_labels(path, "a.png", SIZE, [], version)
+    assert json.loads(path.read_text())["original"] == json.loads(before)
+    assert regions_of(read_isat(path), []) == ()
+
+
+def test_keys_of_other_programs_survive_a_change(tmp_path):
+    path = tmp_path / "a.json"
+    keys = {"level": 1, "parent": None, "segmentation": box(2, 2, 9, 9), "bbox": [2, 2, 9, 9]}
+    things = [{"id": n, "category": "mug", **keys, "note": f"by hand {n}"} for n in (1, 2)]
+    path.write_text(isat("a.png", SIZE, things, author="me"))
+    second = read_labels(path)[1]
+    moved = second.model_copy(update={"polygons": box(20, 20, 29, 29)})
+    write_labels(path, "a.png", SIZE, [moved], version_of(path))
+    content = json.loads(path.read_text())
+    assert (content["author"], content["info"]["note"]) == ("me", "desk")
+    assert [(thing["id"], thing["note"]) for thing in content["objects"]] == [(2, "by hand 2")]
+    assert read_isat(path).warnings == ()  # such as about a box of the old outline
+    assert read_labels(path) == [moved]
+
+
+def test_labels_without_levels_are_wholes_with_the_ids_of_the_same_objects(tmp_path):
+    def things(*texts: str) -> list[dict]:
+        shape = {"group": 1, "segmentation": box(2, 2, 9, 9)[0]}
+        return [{"category": text, **shape} for text in texts]
+
+    (tmp_path / "a.json").write_text(isat("a.jpg", SIZE, things("mug", "cup", "mug")))
+    (tmp_path / "b.json").write_text(isat("b.jpg", SIZE, things("Cup", "lamp")))
+    cameras = views_of("a.jpg", "b.jpg", "c.jpg")
+    lamp = label(1, 1, None, box(0, 0, 5, 5), "lamp")
+    write_labels(
+        label_path(tmp_path, "c.jpg"), "c.jpg", SIZE, [lamp, label(2, 2, 1, box(1, 1, 3, 3))], NO_FILE
+    )
+    known = known_labels(tmp_path, cameras, cameras.names)
+    found = {view: [(each.text, each.id, each.level) for each in labels] for view, labels in known.items()}
+    assert found == {
+        "a.jpg": [("mug", 3, 1), ("cup", 4, 1), ("mug", 5, 1)],
+        "b.jpg": [("Cup", 4, 1), ("lamp", 1, 1)],
+        "c.jpg": [("lamp", 1, 1), ("thing 2", 2, 2)],
+    }
+    before = json.loads((tmp_path / "a.json").read_text())
+    write_labels(tmp_path / "a.json", "a.jpg", SIZE, known["a.jpg"], version_of(tmp_path / "a.json"))
+    assert json.loads((tmp_path / "a.json").read_text())["original"] == before
+    assert known_labels(tmp_path, cameras, cameras.names) == known

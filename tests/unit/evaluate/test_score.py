@@ -144,6 +144,14 @@ def test_classes_of_points_are_pooled_and_instances_matched():
     masks = np.stack([instances == 1, instances == 2])
     perfect = hilsplat.score((masks, [chair] * 2, [0.9, 0.8]), (of_points, instances), "scannet200/instances")
     assert perfect.means["ap"] == perfect.means["ap25"] == 1.0
+    # the last one is far enough to be taken as an instance of the next class
+    for number, kind in ((2**32 + 2, "i8"), (2**63 + 2, "u8"), (1002, "i2")):
+        ids = np.repeat(np.array([2, number], kind), 200)
+        again = hilsplat.score((masks, [chair] * 2, [0.9, 0.8]), (of_points, ids), "scannet200/instances")
+        assert again.means["ap"] == again.means["ap25"] == 1.0
+    absent = (masks, [chair] * 2, [0.9, 0.8]), (of_points + 2**32, instances)
+    with pytest.raises(HilsplatError, match="contain nothing that scannet200/instances"):
+        hilsplat.score(*absent, "scannet200/instances")
     half = hilsplat.score((masks[:1], [chair], [0.9]), (of_points, instances), "scannet200/instances")
     assert 0 < half.means["ap50"] < 1
 
@@ -200,6 +208,13 @@ CUP = box((0, 4), (0, 8), SIZE)
             ([1] * 48, [1] * 48),
             "scannet200/instances",
             "finite confidences",
+        ),
+        ((CUP[:2], [1] * 2, [0.5] * 2), ([1] * 48, [-1] * 48), "scannet200/instances", "0 for none"),
+        (
+            (np.ones((1, 1000), bool), [1], [0.5]),
+            ([1] * 1000, range(1000)),
+            "scannet200/instances",
+            "fewer than",
         ),
         ({}, {}, "lerf/langplat", "is unknown"),
     ],

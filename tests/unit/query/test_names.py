@@ -37,10 +37,13 @@ def test_a_named_node_is_the_only_answer_with_the_highest_score_and_no_doubt(des
     (unknown, *_) = before.query("kanji guide")
     assert unknown.doubts and unknown.name == ""
     book = nodes_by_text(before)["book"]
-    name_nodes(desk, {book: "Kanji  guide"})
+    first = name_nodes(desk, {book: "Kanji  guide"})
     (hit,) = hilsplat.open_scene(desk).query(" kanji GUIDE ")
     assert (hit.node, hit.name, hit.doubts) == (book, "Kanji guide", ())
     assert hit.score > 0.9999
+    name_nodes(desk, {book: "T\u00fcr"}, first.version)
+    (hit,) = hilsplat.open_scene(desk).query("tu\u0308r")  # the same letters in decomposed Unicode
+    assert (hit.node, hit.doubts) == (book, ())
 
 
 def test_all_nodes_with_the_name_are_answers_and_a_path_looks_inside_them(desk):

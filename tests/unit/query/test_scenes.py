@@ -72,6 +72,9 @@ def test_a_pattern_a_limit_and_a_threshold_restrict_the_answers(results):
     assert high and len(high) < SCENES // 2 and min(hit.score for hit in high) >= 0.99
     with pytest.raises(SettingsError, match="level 'piece' is unknown"):
         rooms.query("mug", "piece")
+    for name in ("limit", "each"):
+        with pytest.raises(SettingsError, match=f"{name} is -1"):
+            rooms.query("mug", **{name: -1})
     with pytest.raises(ArtifactError, match="has no finished scene that matches 'cellar'"):
         hilsplat.open_scenes(results, "cellar")
 

@@ -13,6 +13,7 @@ from hilsplat.base.artifacts import read_json, write_json
 from hilsplat.base.errors import ArtifactError, HilsplatError, SceneError
 from hilsplat.scene.assemble import move_cameras
 from hilsplat.scene.scene import Scene
+from hilsplat.semantic_tree.export import write_selection_ply
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.coordinates import decompose, import_gaussians, move_gaussians, write_source_ply
 from hilsplat.splat.fit import run_gaussians
@@ -164,6 +165,19 @@ def test_exported_gaussians_are_in_the_sources_coordinates(source_ply, out, tmp_
     (out / "g.json").unlink()
     with pytest.raises(ArtifactError, match=r"g\.json is missing"):
         write_source_ply(out / "g.ply", tmp_path / "again.ply")
+
+
+def test_an_exported_selection_returns_to_its_place_without_the_json(turned_scene, out, tmp_path):
+    selection, chosen = tmp_path / "selection.ply", np.array([0, 2])
+    write_selection_ply(out / "g.ply", chosen, selection, comments=["label 1: mug", *["long " * 99] * 99])
+    again, origin = import_gaussians(selection, turned_scene)
+    assert "header" in origin["taken_as"]
+    ours = load_ply(out / "g.ply")
+    for name in COMPARED:
+        np.testing.assert_allclose(getattr(again, name), getattr(ours, name)[chosen], atol=1e-5)
+    selection.write_bytes(selection.read_bytes().replace(b"source_from_scene ", b"source_from_scene 1 ", 1))
+    with pytest.raises(ArtifactError, match="comment source_from_scene"):
+        import_gaussians(selection, turned_scene)
 
 
 def test_a_ply_without_gaussians_is_refused_with_the_column_to_correct(turned_scene, tmp_path):
