@@ -296,6 +296,14 @@ def test_a_missing_picture_is_not_replaced_by_one_in_another_folder(names, moved
     assert views == expected
 
 
+def test_missing_pictures_are_named(tmp_path, imported):
+    folder = write(tmp_path / "in")
+    (folder / "images/002.png").rename(folder / "002 (copy).png")
+    views, _, _, report = imported(folder)
+    assert [view.view for view in views] == [f"{number:03d}.png" for number in (0, 1, 3, 4, 5)]
+    assert report["warnings"] == ["1 of 6 posed views have no image file: 002.png"]
+
+
 def test_the_test_views_that_3dgs_lists_are_held_out(tmp_path, imported):
     folder = write(tmp_path / "in")
     listed = folder / "sparse/0/test.txt"

@@ -54,9 +54,10 @@ def import_poses(
             posed.append((view, undistort(distorted, work / "pinhole", settings.max_side_px)))
         except ImageError as error:
             source.leave_out(view.name, in_one_line(error))
+    more = [f"and {len(missing) - 20} more"] if len(missing) > 20 else []
+    named = ", ".join([*missing[:20], *more])
     if not posed or len(posed) < min_share * total:
-        more = [f"and {len(missing) - 20} more"] if len(missing) > 20 else []
-        found = f"{len(posed)}; missing: {', '.join([*missing[:20], *more]) or 'none'}"
+        found = f"{len(posed)}; missing: {named or 'none'}"
         found += "".join(f"\n            left out: {reason}" for reason in [*source.left_out.values()][:3])
         raise RegistrationError(
             f"too few posed views of {name} have an image in {known.root}",
@@ -76,7 +77,7 @@ def import_poses(
             "turns or mirrors them: poses, labels and maps of the upright images don't fit"
         )
     if missing:
-        warnings.append(f"{len(missing)} of {total} posed views have no image file")
+        warnings.append(f"{len(missing)} of {total} posed views have no image file: {named}")
     if unposed:
         warnings.append(f"{len(unposed)} images have no pose and are skipped")
     origin = ", ".join(
