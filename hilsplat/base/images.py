@@ -198,7 +198,7 @@ def read_mask(path: Path) -> UInt8[np.ndarray, "H W"]:
                     return np.where(is_other, 255, 0).astype(np.uint8)
                 if has_colour:
                     raise _several_classes(path, f"{_num_colours(colours)} colours")
-            grey = np.asarray(image.convert("RGB").convert("L"))
+            grey = np.asarray(Image.fromarray(colours).convert("L"))
     if 2 < len(values := np.unique(grey)) <= MAX_CLASSES and values[-1] < 255:
         raise _several_classes(path, f"{len(values)} grey values up to {values[-1]}")
     return grey

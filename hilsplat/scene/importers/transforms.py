@@ -13,13 +13,7 @@ import numpy as np
 from hilsplat.base.errors import SceneError, foreign
 from hilsplat.base.images import image_size_hw
 from hilsplat.scene.colmap import Points, pycolmap
-from hilsplat.scene.importers.known_views import (
-    Keys,
-    KnownView,
-    Source,
-    find_images,
-    require_inside,
-)
+from hilsplat.scene.importers.known_views import Keys, KnownView, Source, find_images, require_inside
 from hilsplat.scene.importers.ply_file import read_ply
 from hilsplat.scene.layouts import KnownPoses, read_json_object
 from hilsplat.scene.posed_images import OPENGL_TO_OPENCV, rigid_pose
