@@ -134,6 +134,7 @@ class OpenedScene(ShownScene):
         self.scene, self.photographs = Scene.load(scene), (scene,)
         self.proposals = Proposals(self.scene, folder, variant, threads)
         self.clicks = Clicks(self.scene, folder / variant / "masks")
+        self.texts: dict[int, str] = {}  # of ids that the page has (`known_labels`)
 
     def opened_again(self) -> "OpenedScene":
         return OpenedScene(self.folder, self.labels, self.variant, self.threads)
@@ -174,7 +175,7 @@ class OpenedScene(ShownScene):
 
     def known(self) -> dict[str, list[Label]]:
         """Return the annotations of all annotated views."""
-        return known_labels(self.labels, self.scene.cameras, self.scene.cameras.names)
+        return known_labels(self.labels, self.scene.cameras, self.scene.cameras.names, self.texts)
 
 
 class Annotator:

@@ -150,13 +150,19 @@ def read_labels(path: Path, camera: Camera | None = None) -> list[Label]:
     return _labels_of(_with_ids(read_isat(path), {}), camera) if path.is_file() else []
 
 
-def known_labels(folder: Path, cameras: Cameras, views: Sequence[str]) -> dict[str, list[Label]]:
+def known_labels(
+    folder: Path, cameras: Cameras, views: Sequence[str], texts: dict[int, str] | None = None
+) -> dict[str, list[Label]]:
     """Return the annotations of all annotated views; for errors, see `read_labels`.
 
     An object in a file without ids gets the id of an object with the same text in other views, if any.
+
+    Args:
+        texts: the ids of wholes that an earlier call gave, with their casefolded texts, so that later calls
+            give the same; updated.
     """
+    texts = {} if texts is None else texts
     files = {view: read_isat(path) for view in views if (path := label_path(folder, view)).is_file()}
-    texts: dict[int, str] = {}
     labels: dict[str, list[Label]] = {}
     for view in sorted(files, key=lambda view: not _has_ids(files[view])):
         stored = _with_ids(files[view], texts)

@@ -158,13 +158,19 @@ def test_labels_without_levels_are_wholes_with_the_ids_of_the_same_objects(tmp_p
     write_labels(
         label_path(tmp_path, "c.jpg"), "c.jpg", SIZE, [lamp, label(2, 2, 1, box(1, 1, 3, 3))], NO_FILE
     )
-    known = known_labels(tmp_path, cameras, cameras.names)
+    texts: dict[int, str] = {}
+    known = known_labels(tmp_path, cameras, cameras.names, texts)
     found = {view: [(each.text, each.id, each.level) for each in labels] for view, labels in known.items()}
     assert found == {
         "a.jpg": [("mug", 3, 1), ("cup", 4, 1), ("mug", 5, 1)],
         "b.jpg": [("Cup", 4, 1), ("lamp", 1, 1)],
         "c.jpg": [("lamp", 1, 1), ("thing 2", 2, 2)],
     }
+    # the page draws a new object, and keeps the ids of the others
+    new = [*known["c.jpg"], label(6, 1, None, box(9, 9, 20, 20), "plate")]
+    write_labels(tmp_path / "c.json", "c.jpg", SIZE, new, version_of(tmp_path / "c.json"))
+    known["c.jpg"] = new
+    assert known_labels(tmp_path, cameras, cameras.names, texts) == known
     before = json.loads((tmp_path / "a.json").read_text())
     write_labels(tmp_path / "a.json", "a.jpg", SIZE, known["a.jpg"], version_of(tmp_path / "a.json"))
     assert json.loads((tmp_path / "a.json").read_text())["original"] == before
