@@ -67,6 +67,10 @@ def list_files(folder: Path, suffixes: Collection[str]) -> list[Path]:
     )
 
 
+FILES_OF_DESKTOPS = (".DS_Store", "Thumbs.db", "desktop.ini")
+"""Names of files that desktops write into any folder that a user looks at."""
+
+
 def list_masks(folder: Path, pattern: str = "*") -> list[Path]:
     """Return the images in a folder, one for each name without suffix, sorted; skip hidden files and folders.
 
@@ -77,7 +81,7 @@ def list_masks(folder: Path, pattern: str = "*") -> list[Path]:
     masks: dict[Path, Path] = {}
     for path in files:
         name = path.relative_to(folder)
-        if any(part.startswith(".") for part in name.parts):
+        if any(part.startswith(".") for part in name.parts) or path.name in FILES_OF_DESKTOPS:
             continue
         if path.suffix.lower() not in IMAGE_SUFFIXES:
             expected = f"images: {' '.join(sorted(IMAGE_SUFFIXES))}"

@@ -8,11 +8,15 @@ from pathlib import Path
 from hilsplat.base.artifacts import is_artifact, read_memo, write_json
 from hilsplat.base.atomic import changing, was_interrupted
 from hilsplat.base.errors import ArtifactError, ImageError
+from hilsplat.base.files import FILES_OF_DESKTOPS
 from hilsplat.base.images import opened_image
 from hilsplat.base.lineage import read_provenance
 
 SOFTWARE = {"Software": "hilsplat"}
 """Metadata of the PNGs that commands draw for users; these files have no provenance record."""
+
+NOBODYS = (".snakemake_timestamp", *FILES_OF_DESKTOPS)
+"""Files that a folder may lose: Snakemake and desktops write them."""
 
 Stats = dict[str, list[int]]
 """Size and time of each file; empty if its writer failed or was killed, so that the file may be replaced."""
@@ -106,7 +110,7 @@ def _require_written(folder: Path, stats: Stats, written: Stats) -> None:
 
 
 def _stats(folder: Path, paths: Iterable[Path]) -> Stats:
-    files = [path for path in paths if path.is_symlink() or path.is_file()]
+    files = [path for path in paths if path.name not in NOBODYS and (path.is_symlink() or path.is_file())]
     stats = {path.relative_to(folder).as_posix(): path.lstat() for path in files}
     return {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
 
@@ -154,7 +158,7 @@ def _is_something(path: Path) -> bool:
 
 
 def _entries(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir() if path.name != ".snakemake_timestamp")
+    return sorted(path.name for path in folder.iterdir() if path.name not in NOBODYS)
 
 
 def _described(path: Path) -> str:
