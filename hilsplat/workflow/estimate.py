@@ -79,7 +79,7 @@ class RunEstimate:
 
 
 def start_probe() -> subprocess.Popen[str]:
-    """Start a process that loads libraries and prints its CPU time; Snakemake plans meanwhile."""
+    """Start a process that loads libraries and prints its CPU time, beside the planning."""
     code = "import pandas, scipy.sparse, time; print(time.process_time())"
     return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
 
