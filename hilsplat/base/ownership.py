@@ -91,6 +91,7 @@ def replaced_files(folder: Path, names: Sequence[str]) -> Iterator[None]:
     """Replace files of a folder in the block; raise ArtifactError if one is not from the last such block."""
     paths = [folder / name for name in names]
     require_outside_artifacts(paths[0])
+    folder.mkdir(parents=True, exist_ok=True)  # an error then names the folder, not the record
     with changing(folder / ".hilsplat.written.json") as record:
         written = read_memo(record, Stats)
         _require_written(folder, _stats(folder, paths), written)

@@ -91,8 +91,9 @@ def shelf_gaussians() -> Gaussians:
 def write_whole_scene(folder: Path) -> None:
     poses = np.tile(np.eye(4), (len(VIEWS), 1, 1))
     poses[:, 2, 3] = DISTANCE
-    poses[:, 0, 3] = -STEP * np.arange(len(VIEWS))
-    K = np.array([[DISTANCE, 0, 0.5], [0, DISTANCE, 0.5], [0, 0, 1]])
+    poses[:, 0, 3] = 0.5 - WINDOW / 2 - STEP * np.arange(len(VIEWS))
+    poses[:, 1, 3] = 0.5 - HEIGHT / 2
+    K = np.array([[DISTANCE, 0, WINDOW / 2], [0, DISTANCE, HEIGHT / 2], [0, 0, 1]])
     for view in VIEWS:
         write_png(folder / "images" / view, np.ascontiguousarray(window(picture(), view)))
     points = shelf_gaussians().means[::7]
