@@ -18,7 +18,9 @@ from hilsplat.workflow.progress import duration
 from hilsplat.workflow.resources import GPU, GUIDED, NODES, PICTURE_S, START_S, JobResources
 from hilsplat.workflow.scene_data import of_variant
 
-PROBE_S = 1.0  # CPU seconds of `start_probe` where the costs of stages were measured
+PROBE_S = 1.0
+"""CPU seconds of `start_probe` at which costs need no scaling, chosen by a run of two scenes (620 s)."""
+
 OTHERS = "tables"  # row for jobs without a scene
 
 NOTES = (
