@@ -29,6 +29,7 @@ def executed(path: Path, folder: Path) -> nbformat.NotebookNode:
         kernel_name="python3",
         resources={"metadata": {"path": str(folder)}},
         record_timing=False,
+        coalesce_streams=True,  # the kernel sends what is printed in pieces, cut by time
     )
     client.execute(env=environment)
     notebook.metadata = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
