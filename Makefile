@@ -20,7 +20,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: run demo test lint docs bench gpu gpu-build chaos published report setup
+.PHONY: run demo test lint style types docs bench gpu gpu-build chaos published report setup
 
 run: $(STAMP)
 	hilsplat run --cores $(CORES)
@@ -37,12 +37,17 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $(STAMP)
 
 lint: $(STAMP)
+	$(MAKE) --jobs=2 --output-sync --no-print-directory style types
+
+style: $(STAMP)
 	ruff check cpusplat hilsplat hilsplat_world models snakemake_logger_plugin_hilsplat tests benchmarks docs/*.py
 	ruff format --check cpusplat hilsplat hilsplat_world models snakemake_logger_plugin_hilsplat tests benchmarks docs/*.py
 	lint-imports
-	mypy
 	snakefmt --check Snakefile workflow/Snakefile rules
 	snakemake --lint --configfile config/ci.yaml
+
+types: $(STAMP)
+	mypy
 
 test: lint
 	python -m pytest --numprocesses $(CORES) --dist loadfile --no-loadscope-reorder tests/workflow tests/browser tests/bad_inputs tests/damage tests/published_models tests/imports tests/unit tests/cpusplat

@@ -150,7 +150,9 @@ def lathe(profile: Sequence[tuple[Number, Number]], segments: int = 28) -> Mesh:
         normal_low, normal_high = _unit(normal + below), _unit(normal + above)
 
         def around(value: np.ndarray) -> np.ndarray:
-            return np.column_stack([ring * value[0], np.full(len(ring), value[1])])  # (segments + 1, 3)
+            out = np.full((len(ring), 3), value[1])
+            out[:, :2] = ring * value[0]
+            return out
 
         p0, p1, n0, n1 = around(low), around(high), around(normal_low), around(normal_high)
         extended = (low[0] > 1e-9, high[0] > 1e-9)  # a ring of radius 0 is a point
@@ -169,10 +171,15 @@ def cylinder(radius: Number, bottom: Number, top: Number, segments: int = 28, be
 
 def ellipsoid(radii: Point, centre: Point = (0.0, 0.0, 0.0), segments: int = 24, rings: int = 12) -> Mesh:
     """Return an ellipsoid with the given semi-axes."""
+    return _unit_sphere(segments, rings).scaled(*radii).moved(*centre)
+
+
+@cache
+def _unit_sphere(segments: int, rings: int) -> Mesh:
     angle = np.linspace(-np.pi / 2, np.pi / 2, rings + 1)
     profile = [(float(np.cos(a)), float(np.sin(a))) for a in angle]
     profile[0], profile[-1] = (0.0, -1.0), (0.0, 1.0)
-    return lathe(profile, segments).scaled(*radii).moved(*centre)
+    return lathe(profile, segments)
 
 
 def sphere(radius: Number, centre: Point = (0.0, 0.0, 0.0), segments: int = 24) -> Mesh:

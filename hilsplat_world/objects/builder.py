@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import chain
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -112,12 +113,13 @@ class Builder:
     def build(self) -> ObjectModel:
         """Return the object, with its lowest point at z = 0 and contrast between touching parts."""
         node_ids = np.array([node.ids for node in self.nodes], np.int32)
-        pieces = self._contrasted()
+        surfaces = [_surface(mesh) for _, mesh, _ in self.pieces]
+        pieces = self._contrasted(surfaces)
         paints = list(dict.fromkeys(paint for _, _, paint in pieces))
         areas: dict[int, dict[Paint, float]] = defaultdict(lambda: defaultdict(float))
-        for row, mesh, paint in pieces:
+        for (row, _, paint), surface in zip(pieces, surfaces, strict=True):
             for ancestor in self.nodes[row].ids:
-                areas[ancestor][paint] += _surface(mesh)
+                areas[ancestor][paint] += surface
         triangles = np.concatenate([mesh.triangles for _, mesh, _ in pieces])
         triangles[..., 2] -= triangles[..., 2].min()
         return ObjectModel(
@@ -130,7 +132,7 @@ class Builder:
             np.stack([paint.row() for paint in paints]),
         )
 
-    def _contrasted(self) -> list[tuple[int, Mesh, Paint]]:
+    def _contrasted(self, surfaces: list[float]) -> list[tuple[int, Mesh, Paint]]:
         """Return the pieces; parts and subparts that look too similar to a neighbour are repainted.
 
         Nodes with the same name (four legs) form a group with a common look. Groups are processed in order of
@@ -139,8 +141,8 @@ class Builder:
         """
         areas: dict[int, dict[Paint, float]] = defaultdict(lambda: defaultdict(float))
         corners: dict[int, list[np.ndarray]] = defaultdict(list)
-        for row, mesh, paint in self.pieces:
-            areas[row][paint] += _surface(mesh)
+        for (row, mesh, paint), surface in zip(self.pieces, surfaces, strict=True):
+            areas[row][paint] += surface
             corners[row].append(mesh.triangles.reshape(-1, 3))
         boxes = {}
         for row, meshes in corners.items():
@@ -202,16 +204,24 @@ def _touch(first: np.ndarray, second: np.ndarray, reach: float) -> bool:
 
 
 def _distinct(paint: Paint, rivals: list[tuple[Paint, float]]) -> Paint:
-    """Return the least changed version of a paint that keeps the minimum distance to every rival."""
+    """Return the least changed version of a paint that keeps the minimum distance to every rival.
+
+    If none does, it is the one that lacks least.
+    """
 
     def short(candidate: Paint) -> float:
         return max([0.0, *(minimum - difference(candidate, rival) for rival, minimum in rivals)])
 
-    shades = [paint if factor == 1 else paint.shaded(factor) for factor in _SHADES]
     allowed = paint.choices or tuple(COLOURS)
-    tried = [shade for shade in shades if shade.colour in allowed]
-    tried += [paint.recoloured(word) for word in allowed if word != paint.colour]
-    return min(tried or [paint], key=short)  # the first, which is the smallest change, wins ties
+    shades = (paint if factor == 1 else paint.shaded(factor) for factor in _SHADES)
+    others = (paint.recoloured(word) for word in allowed if word != paint.colour)
+    best, least = paint, np.inf
+    for candidate in chain((shade for shade in shades if shade.colour in allowed), others):
+        if (lack := short(candidate)) < least:
+            best, least = candidate, lack
+        if least == 0:
+            break
+    return best
 
 
 def _totals(sizes: Iterable[tuple[Word, float]]) -> dict[Word, float]:
