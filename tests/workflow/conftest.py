@@ -15,13 +15,15 @@ from typing import IO
 
 import pytest
 
+from hilsplat.base.atomic import atomic_path
+
 MODELS = ("models/sam-tiny", "models/clip-tiny")
 """The only models of the checkout that tests use."""
 PACKAGES = ("cpusplat", "hilsplat", "hilsplat_world", "snakemake_logger_plugin_hilsplat")
 PARTS = ("Snakefile", "rules", "workflow", "profiles", "config", *PACKAGES, *MODELS)
 SCENE = Path("results/synthetic/tiny")
-UNFINISHED = shutil.ignore_patterns("*.pyc.*", "*.tmp.*")
-"""Files of Python and numba that other tests may be writing; they are renamed once complete."""
+SKIPPED = shutil.ignore_patterns("*.pyc.*", "kernels-*")
+"""Bytecode that other tests may be writing, renamed once complete, and what `copy_kernels` copies."""
 BY_CONTENTS = py_compile.PycInvalidationMode.CHECKED_HASH
 
 
@@ -113,20 +115,16 @@ class Project:
 
 
 def copy_project(source: Path, target: Path, *, results: bool) -> Project:
-    """Copy the project's own files and, on request, results with Snakemake's records.
-
-    Copied kernels of numba remain valid: modification times are kept, and folders in caches are renamed.
-    """
+    """Copy the project's own files and, on request, results with Snakemake's records."""
     target.mkdir(parents=True)
     parts = [*PARTS, *(["results", ".snakemake"] if results else [])]
     for part in parts:
         origin = source / part
         if origin.is_dir():
-            shutil.copytree(origin, target / part, symlinks=True, ignore=UNFINISHED)
+            shutil.copytree(origin, target / part, symlinks=True, ignore=SKIPPED)
         elif origin.exists():
             shutil.copy2(origin, target / part)
-    for cache in target.glob("*/__pycache__/kernels-*"):
-        _rename_folders_of_kernels(cache, source, target)
+    copy_kernels(source, target)
     if not results:  # rows that a user added to the sheet do not belong in tests
         sheet = target / "config/scenes.tsv"
         rows = sheet.read_text().splitlines(keepends=True)
@@ -134,13 +132,29 @@ def copy_project(source: Path, target: Path, *, results: bool) -> Project:
     return Project(target)
 
 
-def _rename_folders_of_kernels(cache: Path, source: Path, target: Path) -> None:
-    """Give the folders in a copied cache, named after the paths of modules, the names for the copy."""
-    for folder in {path.parent for path in cache.parents[1].rglob("*.py")}:
-        paths = (source / folder.relative_to(target), folder)
-        before, after = (f"{folder.name}_{hashlib.sha1(str(path).encode()).hexdigest()}" for path in paths)
-        if (cache / before).exists():
-            (cache / before).rename(cache / after)
+def copy_kernels(source: Path, target: Path) -> None:
+    """Copy the compiled kernels of numba that a copy of the same modules lacks.
+
+    They remain valid: files keep their times, and numba names folders after the paths of modules.
+    """
+    for package in PACKAGES:
+        caches = (source / package / "__pycache__").glob("kernels-*")
+        for cache in sorted(caches, key=lambda folder: folder.stat().st_mtime)[-1:]:
+            for folder in {path.parent for path in (source / package).rglob("*.py")}:
+                there = (
+                    target
+                    / cache.relative_to(source)
+                    / _folder_of_kernels(target / folder.relative_to(source))
+                )
+                for file in (cache / _folder_of_kernels(folder)).glob("*.nb[ci]"):
+                    if not (there / file.name).exists():
+                        there.mkdir(parents=True, exist_ok=True)
+                        with atomic_path(there / file.name, durable=False) as temporary:
+                            shutil.copy2(file, temporary)
+
+
+def _folder_of_kernels(modules: Path) -> str:
+    return f"{modules.name}_{hashlib.sha1(str(modules).encode()).hexdigest()}"
 
 
 DECOY = "open(__file__ + '.ran', 'w')\nraise SystemExit('a file of the user ran')\n"
@@ -189,6 +203,7 @@ def finished(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Project
             for package in PACKAGES:  # so that no process compiles the package again; edited files still are
                 compileall.compile_dir(copy.root / package, quiet=1, invalidation_mode=BY_CONTENTS)
             copy.snakemake()
+            copy_kernels(copy.root, project)
             (folder / "finished.done").touch()
     return copy
 
