@@ -117,6 +117,40 @@ def test_tensors_and_arrays_give_the_same_bytes():
     assert by_tensor[2].keys() == by_array[2].keys()
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_no_gradient_is_computed_from_parameters_that_changed_in_place(name):
+    gaussians, cameras = tensors(random_gaussians(30)), two_cameras()
+    colors, _, _ = rasterization(**gaussians, **cameras)
+    with torch.no_grad():
+        gaussians[name].mul_(0.5)
+    if name == "colors":  # drawn from a copy
+        gaussians["means"].grad = None
+        colors.sum().backward()
+        expected = tensors(random_gaussians(30))
+        rasterization(**expected, **cameras)[0].sum().backward()
+        assert torch.equal(gaussians["means"].grad, expected["means"].grad)
+    else:
+        with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+            colors.sum().backward()
+
+
+def test_second_order_gradients_are_refused():
+    gaussians = tensors(random_gaussians(30))
+    colors, _, meta = rasterization(**gaussians, **two_cameras())
+    for of in (gaussians["means"], meta["means2d"]):
+        with pytest.raises(NotImplementedError, match="second-order"):
+            torch.autograd.grad(colors.sum(), of, create_graph=True)
+
+
+@pytest.mark.parametrize("name", [*NAMES, "backgrounds"])
+def test_tensors_among_arrays_are_refused(name):
+    arrays = {**random_gaussians(30), "backgrounds": np.ones((2, 3), np.float32)}
+    every = {key: torch.tensor(values) for key, values in arrays.items()}
+    for mixed in (arrays | {name: every[name]}, every | {name: arrays[name]}):
+        with pytest.raises(TypeError, match="arrays and tensors"):
+            rasterization(**mixed, **two_cameras())
+
+
 def test_gradients_of_cameras_are_refused():
     cameras = two_cameras()
     cameras["viewmats"] = torch.tensor(cameras["viewmats"]).requires_grad_()
