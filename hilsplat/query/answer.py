@@ -112,11 +112,7 @@ def views_of(scene: LanguageScene, hits: Sequence[Hit], count: int) -> list[str]
 
 
 def report(
-    scene: LanguageScene,
-    text: str,
-    nodes: NodeHits,
-    view: str | None = None,
-    threshold: float | None = None,
+    scene: LanguageScene, text: str, nodes: NodeHits, view: str | None = None, threshold: float | None = None
 ) -> str:
     """Return answers and doubts as text; the query was restricted to `view` and scores of `threshold`."""
     searched = scene.scene.name if view is None else f"view {view} of {scene.scene.name}"

@@ -56,12 +56,10 @@ class ViewStore:
             value = compute()
             found = value, _nbytes(value)
         self._values[key] = found
-        kept = list(self._values.items())
-        total = sum(nbytes for _, (_, nbytes) in kept)
-        for old, (_, nbytes) in kept[:-1]:
-            if total > self._max_bytes:
-                self._values.pop(old, None)
-                total -= nbytes
+        while (
+            len(kept := list(self._values.items())) > 1 and sum(item[1][1] for item in kept) > self._max_bytes
+        ):
+            self._values.pop(kept[0][0], None)
         return found[0]
 
     def forget(self, view: str) -> None:
