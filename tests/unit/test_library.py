@@ -3,6 +3,7 @@
 import logging
 import math
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -17,6 +18,7 @@ import pytest
 import hilsplat
 from hilsplat import stages
 from hilsplat.base.errors import ArtifactError, HilsplatError, ModelError, SceneError, SettingsError
+from hilsplat.base.images import write_png
 from hilsplat.base.lineage import read_provenance, sha256_of_path
 from hilsplat.query.scene_views import ViewStore
 from hilsplat.scene.exporting import write_colmap
@@ -26,6 +28,7 @@ from hilsplat.settings import GaussiansSettings, MasksSettings
 from hilsplat.splat.ply import save_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 from hilsplat.splat.rasterise.api import render as render_rgb
+from tests.unit.finished_desk import SCENE
 
 
 @pytest.fixture
@@ -362,6 +365,19 @@ def test_a_changed_camera_changes_no_other(scene):
         == scene.cameras["001.png"].cam_from_world[0, 3]
         != camera.cam_from_world[0, 3]
     )
+
+
+def test_a_scene_keeps_its_photographs_if_the_working_folder_changes(desk_project, tmp_path, monkeypatch):
+    """Another project may have a scene of the same name."""
+    shutil.copytree(desk_project / SCENE, other := tmp_path / SCENE)
+    for image in (other / "scene/images").glob("*.png"):
+        write_png(image, np.zeros((24, 42, 3), np.uint8))
+    monkeypatch.chdir(desk_project)
+    posed, opened = hilsplat.load_scene(SCENE), hilsplat.open_scene(SCENE)
+    before = posed.image("000.png")
+    monkeypatch.chdir(tmp_path)
+    for after in (posed.image("000.png"), opened.views.image("000.png")):
+        np.testing.assert_array_equal(after, before)
 
 
 def test_levels_are_found_by_number_and_label(masks, linked):
