@@ -215,14 +215,6 @@ class Annotated(Dataset):
             raise SceneError(f"there are no annotations in {root}", fix="draw them: hilsplat annotate SCENE")
         return root
 
-    def require(self, root: Path, scene: str) -> None:
-        if self.missing(root, scene):
-            raise SceneError(
-                f"{scene} has no annotations in {root}",
-                found=", ".join(self.found(root)) or None,
-                fix=f"correct the name, or draw them: hilsplat annotate {scene}",
-            )
-
     def found(self, root: Path) -> tuple[str, ...]:
         files = root.glob("*/*/*.json")
         return tuple(sorted({f"{path.parent.parent.name}/{path.parent.name}" for path in files}))
