@@ -18,7 +18,7 @@ from hilsplat.cli.common import (
 )
 from hilsplat.cli.user_commands import scene_folder
 from hilsplat.stage import DEFAULT_CACHE, DataRoot, Threads
-from hilsplat.stages import all_stages, family_of, joined, label_fits, names
+from hilsplat.stages import joined, label_fits, names
 
 
 @models_app.command("get")
@@ -114,9 +114,7 @@ def cache_prune(
 
     if days is None and max_mib is None:
         refuse_options(context, ("stage",), "entries beyond a limit, with --days or --max-mib")
-    cached = [family_of(each) for each in all_stages().values() if "cache" in each.hints]
-    prunable = list(dict.fromkeys(cached))
-    number, freed_mib = prune_cache(context.obj, prunable, stage or [], days=days, max_mib=max_mib)
+    number, freed_mib = prune_cache(context.obj, stage or [], days=days, max_mib=max_mib)
     echo(f"deleted {number} files, {freed_mib:.1f} MiB\n{size_table(context.obj)}")
 
 
