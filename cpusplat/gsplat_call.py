@@ -91,7 +91,8 @@ def rasterization(
     Returns:
         colors [C, H, W, X], premultiplied by alpha; alphas [C, H, W, 1]; and a dictionary with `means2d`
         [C, N, 2] (px), `radii` [C, N, 2] (int32, px: half-widths of the box in which a Gaussian is visible;
-        0 if it is not drawn), `depths` [C, N], `opacities` [C, N], `width`, `height`, and `n_cameras`.
+        0 if it is not drawn), `depths` [C, N], `opacities` [C, N], `width`, `height`, `n_cameras`, and, as
+        without `packed` in gsplat, `gaussian_ids` and `camera_ids`, which are None.
 
     Raises:
         NotImplementedError: an argument has a value that only gsplat supports.
@@ -143,6 +144,8 @@ def rasterization(
         "width": width,
         "height": height,
         "n_cameras": len(cameras),
+        "gaussian_ids": None,
+        "camera_ids": None,
     }
     return images, alphas, meta
 

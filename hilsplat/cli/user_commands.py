@@ -135,7 +135,10 @@ def scenes(
         str, typer.Option(help="protocol of the IoU of the tree's answers; default: lerf/tree-nodes")
     ] = "",
 ) -> None:
-    """Print a table of all scenes: views, Gaussians, PSNR, nodes at three levels, and IoU if labelled."""
+    """Print a table of all scenes: state, views, PSNR, IoU if labelled, size, date and models.
+
+    The CSV also has Gaussians and nodes at three levels.
+    """
     from hilsplat.evaluate.scenes import PROTOCOL, run_scenes
 
     echo(run_scenes(results, pattern, out, protocol or PROTOCOL))
@@ -145,7 +148,7 @@ def scenes(
 def verify(
     results: Annotated[Path, typer.Argument(help="results folder, or a copy of it")] = Path("results"),
 ) -> None:
-    """Check all digests in a results folder, and print the Snakemake command that repairs it."""
+    """Check all digests in a results folder, and print the command that repairs it."""
     from hilsplat.workflow.records import verify
 
     report, is_whole = verify(results)
