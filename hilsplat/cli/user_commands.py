@@ -135,10 +135,7 @@ def scenes(
         str, typer.Option(help="protocol of the IoU of the tree's answers; default: lerf/tree-nodes")
     ] = "",
 ) -> None:
-    """Print a table of all scenes: state, views, PSNR, IoU if labelled, size, date and models.
-
-    The CSV also has Gaussians and nodes at three levels.
-    """
+    """Print a table of all scenes: state, views, PSNR, IoU, size, date, models; the CSV has more columns."""
     from hilsplat.evaluate.scenes import PROTOCOL, run_scenes
 
     echo(run_scenes(results, pattern, out, protocol or PROTOCOL))
@@ -240,8 +237,9 @@ def export(
         echo(_export(folder, form, variant, data_root, out, crop, threads))
         return
     out = folder / "export" / (form if variant == "default" else f"{form}-{variant}")
-    with replaced_folder(out):
-        echo(_export(folder, form, variant, data_root, out, crop, threads))
+    with replaced_folder(out) as temporary:
+        text = _export(folder, form, variant, data_root, temporary, crop, threads)
+    echo(text.replace(str(temporary), str(out)))
 
 
 def _export(
