@@ -79,15 +79,12 @@ def _is_own_picture(path: Path) -> bool:
 
 @contextmanager
 def replaced_folder(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder that replaces `folder`; raise ArtifactError if other files are in that one.
-
-    The record has the files of both, because the command may be killed before the folder is replaced.
-    """
+    """Yield a temporary folder that replaces `folder`; raise ArtifactError if other files are in that one."""
     record, former = folder.with_name(f".{folder.name}.written.json"), _stats(folder, folder.rglob("*"))
     _require_written(folder, former, read_memo(record, Stats))
     with atomic_folder(folder) as temporary:
         yield temporary
-        new = _stats(temporary, temporary.rglob("*"))
+        new = _stats(temporary, temporary.rglob("*"))  # recorded with the former files, in case of a kill now
         write_json(record, {name: new.get(name, []) + former.get(name, []) for name in new | former})
 
 
