@@ -55,7 +55,7 @@ def answer(
         views: number of views in the panel; `view`, if given, is the first.
         out: output folder for both files; by default `queries/<text>` in the scene's folder.
         masks: new folder for the masks of the answer's nodes in all views (`mask_files`).
-        spz: whether to write the answer's Gaussians as `selection.spz`, too, as if there is one already.
+        spz: whether to write the answer's Gaussians as `selection.spz`, too; an existing one is replaced anyway.
 
     Raises:
         SettingsError: `masks`, which is written last, is or contains another output.
@@ -114,7 +114,7 @@ def views_of(scene: LanguageScene, hits: Sequence[Hit], count: int) -> list[str]
 def report(
     scene: LanguageScene, text: str, nodes: NodeHits, view: str | None = None, threshold: float | None = None
 ) -> str:
-    """Return answers and doubts as text; the query was restricted to `view` and scores of `threshold`."""
+    """Return answers and doubts as text; `view` and `threshold` are those of the query."""
     searched = scene.scene.name if view is None else f"view {view} of {scene.scene.name}"
     hits = scene.hits_of(nodes, LISTED)
     if not hits:
