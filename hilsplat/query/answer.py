@@ -55,7 +55,7 @@ def answer(
         views: number of views in the panel; `view`, if given, is the first.
         out: output folder for both files; by default `queries/<text>` in the scene's folder.
         masks: new folder for the masks of the answer's nodes in all views (`mask_files`).
-        spz: whether to write the answer's Gaussians as `selection.spz`, too; an existing one is replaced anyway.
+        spz: whether to write `selection.spz`, too; if there is one, it is replaced in any case.
 
     Raises:
         SettingsError: `masks`, which is written last, is or contains another output.
