@@ -34,7 +34,7 @@ def adam_step(
     gradients: np.ndarray,
     first: np.ndarray,
     second: np.ndarray,
-    rates: list[float],
+    rates: list[float] | np.ndarray,
     t: int,
     threads: int = 1,
 ) -> None:
@@ -44,9 +44,17 @@ def adam_step(
         first, second: running moments of the gradients; zeros before the first step.
         rates: step sizes, repeated cyclically over the values.
         threads: CPU threads; the result is byte-identical for any number.
+
+    Raises:
+        ValueError: the arrays are not flat, contiguous float32 arrays of one length, or `t` is below 1.
     """
     arrays = values, gradients, first, second
-    repeated = np.array(WIDTH * rates, np.float32) / np.float32(1 - BETA1**t)
+    # the loops check neither types nor bounds
+    are_flat = all(array.dtype == np.float32 and array.flags.c_contiguous for array in arrays)
+    if not are_flat or {array.shape for array in arrays} != {(len(values),)} or t < 1:
+        found = ", ".join(f"{array.dtype} {list(array.shape)}" for array in arrays)
+        raise ValueError(f"expected contiguous float32 arrays [N] and t >= 1; found {found}, t = {t}")
+    repeated = np.tile(np.asarray(rates, np.float32), WIDTH) / np.float32(1 - BETA1**t)
     root_of_rest2 = float(np.sqrt(1 - BETA2**t))
     whole, rest = divmod(len(values), WIDTH)
     over_ranges(_adam_chunks, whole, threads, *arrays, repeated, root_of_rest2)

@@ -1,5 +1,6 @@
 """gsplat's `rasterization` on the CPU: NumPy arrays, or torch tensors with gradients."""
 
+import operator
 import os
 from importlib import import_module
 from typing import Any
@@ -90,13 +91,15 @@ def rasterization(
     Returns:
         colors [C, H, W, X], premultiplied by alpha; alphas [C, H, W, 1]; and a dictionary with `means2d`
         [C, N, 2] (px), `radii` [C, N, 2] (int32, px: half-widths of the box in which a Gaussian is visible;
-        0 if it is not drawn), `depths` [C, N], `opacities` [C, N], `width`, `height`, and `n_cameras`.
+        0 if it is not drawn), `depths` [C, N], `opacities` [C, N], `width`, `height`, `n_cameras`, and, as
+        without `packed` in gsplat, `gaussian_ids` and `camera_ids`, which are None.
 
     Raises:
         NotImplementedError: an argument has a value that only gsplat supports.
-        ValueError: a shape, the degree or the render mode is wrong; Gaussians are not finite, quaternions are
-            zero, or scales or opacities are out of range.
-        TypeError: an argument is unknown, or a tensor is not on the CPU.
+        ValueError: a shape, the degree or the render mode is wrong; Gaussians or cameras are not finite,
+            quaternions are zero, or scales, opacities, focal lengths or the size are out of range.
+        TypeError: an argument is unknown, a tensor is not on the CPU, tensors are mixed with arrays, or the
+            size or degree is not a whole number.
     """
     others |= {"radius_clip": radius_clip, "packed": packed, "sparse_grad": sparse_grad, "absgrad": absgrad}
     _refuse_unsupported(others | {"rasterize_mode": rasterize_mode})
@@ -104,11 +107,23 @@ def rasterization(
         raise ValueError(f"render_mode is {render_mode!r}; expected one of {', '.join(RENDER_MODES)}")
     viewmats = as_array("viewmats", _constant("viewmats", viewmats), None, 4, 4, dtype=np.float64)
     Ks = as_array("Ks", _constant("Ks", Ks), len(viewmats), 3, 3, dtype=np.float64)
+    width, height = operator.index(width), operator.index(height)
+    focal_lengths = Ks[:, (0, 1), (0, 1)]
+    if not np.isfinite(viewmats).all() or not np.isfinite(Ks).all() or not (focal_lengths > 0).all():
+        raise ValueError("viewmats and Ks must be finite, and focal lengths above 0")
+    if not (len(viewmats) and min(width, height) > 0 and eps2d >= 0):
+        raise ValueError(
+            "expected at least one view, width and height of at least 1, and eps2d of at least 0"
+        )
     sizes = (height, width), near_plane, far_plane, eps2d
     cameras = [pack_camera(viewmat, K, *sizes) for viewmat, K in zip(viewmats, Ks, strict=True)]
     gaussians = means, quats, scales, opacities, colors if "RGB" in render_mode else None
-    views = ActivatedViews(*gaussians, cameras, sh_degree, "D" in render_mode, threads or os.cpu_count() or 1)
-    is_torch = hasattr(means, "detach")
+    are_torch = {hasattr(values, "detach") for values in (*gaussians, backgrounds) if values is not None}
+    if len(are_torch) > 1:  # tensors among arrays would get no gradients
+        raise TypeError("Gaussians and backgrounds are arrays and tensors; expected only one of them")
+    degree = None if sh_degree is None else operator.index(sh_degree)
+    views = ActivatedViews(*gaussians, cameras, degree, "D" in render_mode, threads or os.cpu_count() or 1)
+    (is_torch,) = are_torch
     library: Any = import_module("torch" if is_torch else "numpy")
     draw = import_module("cpusplat.torch_call").draw if is_torch else _draw_arrays
     images, alphas, means2d, depths = draw(views, *gaussians)
@@ -125,10 +140,12 @@ def rasterization(
         "means2d": means2d,
         "depths": depths,
         "radii": library.asarray(views.radii()),
-        "opacities": library.concatenate([opacities[None]] * len(cameras)),
+        "opacities": library.stack([opacities] * len(cameras)),
         "width": width,
         "height": height,
         "n_cameras": len(cameras),
+        "gaussian_ids": None,
+        "camera_ids": None,
     }
     return images, alphas, meta
 

@@ -123,6 +123,16 @@ def _gradient_rows(begin, end, num, stride, image, target, slopes, l1_weight, ss
                 gradient[y, group * _LANES + lane] = sign - ssim_weight * out[lane]
 
 
+def _require_alike(image: np.ndarray, target: np.ndarray) -> None:
+    """Raise ValueError unless both are images of one size; the loops do not check bounds."""
+    are_images = all(
+        each.ndim == 3 and each.shape[2] == 3 and each.dtype.kind == "f" for each in (image, target)
+    )
+    if not are_images or image.shape != target.shape or not image.size:
+        found = " and ".join(f"{each.dtype} {list(each.shape)}" for each in (image, target))
+        raise ValueError(f"expected two float images [H, W, 3] of one size, in [0, 1]; found {found}")
+
+
 def _padded(image: np.ndarray) -> tuple[np.ndarray, int]:
     """Return the image padded with zeros, as a flat array, and the padded length of a row."""
     height, width, _ = image.shape
@@ -142,7 +152,9 @@ def photometric_loss(
     """Return L = (1 - w) mean |image - target| + w (1 - SSIM), and dL/dimage (3DGS, Eq. 7: w = 0.2).
 
     Images are float32 [H, W, 3], RGB in [0, 1]. The result is byte-identical for any number of threads.
+    ValueError is raised if they have another type or shape.
     """
+    _require_alike(image, target)
     height, width, _ = image.shape
     num = 3 * width
     x, stride = _padded(image)
@@ -159,7 +171,11 @@ def photometric_loss(
 
 
 def ssim(image: np.ndarray, target: np.ndarray) -> float:
-    """Return the mean structural similarity of two RGB images in [0, 1], as computed by 3DGS."""
+    """Return the mean structural similarity of two RGB images in [0, 1], as computed by 3DGS.
+
+    Errors as in `photometric_loss`.
+    """
+    _require_alike(image, target)
     height, width, _ = image.shape
     x, stride = _padded(image)
     t, _ = _padded(target)
@@ -169,6 +185,10 @@ def ssim(image: np.ndarray, target: np.ndarray) -> float:
 
 
 def psnr(image: np.ndarray, target: np.ndarray) -> float:
-    """Return the peak signal-to-noise ratio in dB of two RGB images in [0, 1]; infinite if they are equal."""
+    """Return the peak signal-to-noise ratio in dB of two RGB images in [0, 1]; infinite if they are equal.
+
+    Errors as in `photometric_loss`.
+    """
+    _require_alike(image, target)
     error = np.square(image.astype(np.float64) - target).mean()
     return float("inf") if error == 0 else float(-10 * np.log10(error))

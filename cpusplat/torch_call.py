@@ -28,14 +28,22 @@ def draw(
     return images, alphas, means2d, depths
 
 
+def _require_first_order() -> None:
+    if torch.is_grad_enabled():  # the result would silently count as a constant
+        raise NotImplementedError("second-order gradients (create_graph=True) are not supported")
+
+
 class _Projection(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, views: ActivatedViews, *parameters: Tensor | None) -> tuple[Tensor, ...]:
         ctx.views = views
+        ctx.save_for_backward(*parameters)  # torch refuses the way back if one was modified in place
         return *map(torch.from_numpy, views.project()), torch.zeros(1)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        _require_first_order()
+        _ = ctx.saved_tensors
         by_mean_px, by_depth, by_link = (grad.numpy() for grad in grads)
         found = ctx.views.project_backward(by_mean_px, by_depth, bool(by_link[0]))
         *by_parameter, by_sh = map(torch.from_numpy, found)
@@ -52,6 +60,7 @@ class _Blending(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        _require_first_order()
         found = ctx.views.blend_backward(*(grad.contiguous().numpy() for grad in grads))
         by_mean_px, by_depth, by_colour = map(torch.from_numpy, found)
         by_colour = by_colour.sum(dim=0) if ctx.has_shared_colours else by_colour

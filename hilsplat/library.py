@@ -17,6 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from hilsplat import settings as of
@@ -146,6 +147,7 @@ def _posed(
 ) -> Scene:
     """Run the stage `poses`; without a folder, the scene's files are deleted with the returned object."""
     source, section = source.resolve(), _section("poses", settings)
+    _require_seed(seed)
     _require_own(folder)
     with ExitStack() as files:
         base = files.enter_context(_folder(folder))
@@ -185,8 +187,7 @@ def fit(
         SceneError: the scene has no training views, or all Gaussians became transparent.
         DeviceError: `device="cuda"` cannot be used.
     """
-    if seed < 0:
-        raise SettingsError(f"seed is {seed}", expected="a whole number, at least 0")
+    _require_seed(seed)
     steps = {} if iterations is None else {"iterations": iterations, "steps_per_view": iterations}
     section = _section("gaussians", steps | settings)
     with _running(progress):
@@ -337,6 +338,11 @@ def _folder(path: Path | str | None) -> Iterator[Path]:
 
 def _section(name: str, values: Mapping[str, Any]) -> Any:
     return validated(name, values, name)
+
+
+def _require_seed(seed: int) -> None:
+    if not isinstance(seed, int | np.integer) or seed < 0:
+        raise SettingsError(f"seed is {seed!r}", expected="a whole number, at least 0")
 
 
 def _threads(number: int | None) -> int:

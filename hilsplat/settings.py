@@ -445,8 +445,11 @@ class FieldSettings(HierarchyLosses):
 class EvaluateSettings(Section):
     """Queries and evaluation protocols."""
 
-    canonical: tuple[str, ...] = knob(
-        ("object", "things", "stuff", "texture"), "canonical phrases for relevancy", origin="LERF, LangSplat"
+    canonical: tuple[Annotated[str, Field(pattern=r"\S")], ...] = knob(
+        ("object", "things", "stuff", "texture"),
+        "canonical phrases for relevancy",
+        origin="LERF, LangSplat",
+        min_length=1,
     )
     template: str = knob(
         "{}",

@@ -23,7 +23,10 @@ from hilsplat.base.removal import DIGEST, ENTRY, delete, is_tagged, tag
 logger = logging.getLogger(__name__)
 
 CHECKPOINTS = "gaussians"
-"""Cache of fit checkpoints; in the others, of finished views, a missing entry costs only time."""
+"""Cache of fit checkpoints; in the others, a missing entry costs only time."""
+
+CACHES = (CHECKPOINTS, "masks", "contributions", "clip", "texts", "int8")
+"""Folders of entries that may be deleted."""
 
 FIT_DAYS = 1.0
 """Checkpoints younger than this are kept, because fits save more often and may still be running."""
@@ -46,28 +49,22 @@ def size_table(folder: Path) -> str:
 
 
 def prune_cache(
-    folder: Path,
-    prunable: Sequence[str],
-    chosen: Sequence[str] = (),
-    *,
-    days: float | None = None,
-    max_mib: float | None = None,
+    folder: Path, chosen: Sequence[str] = (), *, days: float | None = None, max_mib: float | None = None
 ) -> tuple[int, float]:
     """Delete unfinished files and old cache entries; return the number of entries and their size in MiB.
 
     Only files named like an entry (`ENTRY`), in a cache with our tag, are deleted.
 
     Args:
-        prunable: names of the caches that may be pruned.
-        chosen: caches to prune; if empty, all of finished views, and also the checkpoints if `days` is set.
+        chosen: caches to prune; if empty, all, but the checkpoints only if `days` is set.
         days: delete entries not used for this many days.
         max_mib: then delete the least recently used until the rest is at most this size.
     """
-    if unknown := sorted(set(chosen) - set(prunable)):
-        raise HilsplatError(f"unknown cache: {', '.join(unknown)}", expected=f"one of {', '.join(prunable)}")
+    if unknown := sorted(set(chosen) - set(CACHES)):
+        raise HilsplatError(f"unknown cache: {', '.join(unknown)}", expected=f"one of {', '.join(CACHES)}")
     # The cache is in the results folder, where killed jobs leave unfinished files beside their outputs.
     remove_leftovers(folder.parent if Path(folder).name == ".cache" else folder)
-    names = set(chosen or prunable) - ({CHECKPOINTS} if days is None and not chosen else set())
+    names = set(chosen or CACHES) - ({CHECKPOINTS} if days is None and not chosen else set())
     now, freed, deleted = time.time(), 0, 0
     used = stats_of(
         path

@@ -17,6 +17,14 @@ class Level(IntEnum):
     PART = 2
     SUBPART = 3
 
+    @staticmethod
+    def of(level: "Level | int | str") -> "Level":
+        """Return a level by number or label; raise SettingsError if there is none."""
+        for known in Level:
+            if level in (known, known.label):
+                return known
+        raise SettingsError(f"level {level!r} is unknown", expected="whole, part or subpart")
+
     @property
     def label(self) -> str:
         """Name in files and tables."""

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from hilsplat.base.artifacts import is_artifact, read_memo, write_json
-from hilsplat.base.atomic import changing, was_interrupted
+from hilsplat.base.atomic import atomic_folder, changing, was_interrupted
 from hilsplat.base.errors import ArtifactError, ImageError
 from hilsplat.base.files import FILES_OF_DESKTOPS
 from hilsplat.base.images import opened_image
@@ -19,7 +19,7 @@ NOBODYS = (".snakemake_timestamp", *FILES_OF_DESKTOPS)
 """Files that a folder may lose: Snakemake and desktops write them."""
 
 Stats = dict[str, list[int]]
-"""Size and time of each file; empty if its writer failed or was killed, so that the file may be replaced."""
+"""Size and time of each file, or of two versions; empty if its writer ended early: it may be replaced."""
 
 
 def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Path]) -> None:
@@ -78,12 +78,14 @@ def _is_own_picture(path: Path) -> bool:
 
 
 @contextmanager
-def replaced_folder(folder: Path) -> Iterator[None]:
-    """Replace a folder in the block; raise ArtifactError if a file in it is not from the last such block."""
-    record = folder.with_name(f".{folder.name}.written.json")
-    _require_written(folder, _stats(folder, folder.rglob("*")), read_memo(record, Stats))
-    yield
-    write_json(record, _stats(folder, folder.rglob("*")))
+def replaced_folder(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder that replaces `folder`; raise ArtifactError if other files are in that one."""
+    record, former = folder.with_name(f".{folder.name}.written.json"), _stats(folder, folder.rglob("*"))
+    _require_written(folder, former, read_memo(record, Stats))
+    with atomic_folder(folder) as temporary:
+        yield temporary
+        new = _stats(temporary, temporary.rglob("*"))  # recorded with the former files, in case of a kill now
+        write_json(record, {name: new.get(name, []) + former.get(name, []) for name in new | former})
 
 
 @contextmanager
@@ -102,12 +104,16 @@ def replaced_files(folder: Path, names: Sequence[str]) -> Iterator[None]:
 
 
 def _require_written(folder: Path, stats: Stats, written: Stats) -> None:
-    if others := sorted(name for name, stat in stats.items() if written.get(name) not in (stat, [])):
+    if others := sorted(name for name, stat in stats.items() if not _is_in(written.get(name), stat)):
         raise ArtifactError(
             f"{folder} contains files that hilsplat did not write, or that were changed later",
             found=", ".join(others[:3]),
             fix="move them elsewhere, or choose another folder (--out)",
         )
+
+
+def _is_in(record: list[int] | None, stat: list[int]) -> bool:
+    return record is not None and (not record or stat in (record[:2], record[2:]))
 
 
 def _stats(folder: Path, paths: Iterable[Path]) -> Stats:

@@ -2,12 +2,13 @@
 
 import logging
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from hilsplat.base.errors import ArtifactError, visible
+from hilsplat.base.errors import ArtifactError, SettingsError, visible
 from hilsplat.base.progress import LOG_FORMAT, LogFormatter
 
 PANELS = {
@@ -75,6 +76,14 @@ def require_new_folder(out: Path, option: str = "--out") -> None:
     is_there = out.exists() or out.is_symlink()
     if is_there and not (out.is_dir() and not any(out.iterdir())):
         raise ArtifactError(f"{option} {out} exists", fix="choose a new folder, or remove this one first")
+
+
+def refuse_options(context: typer.Context, names: Iterable[str], purpose: str) -> None:
+    """Raise SettingsError if one of these options was given, because it would be ignored."""
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name or "")
+        if parameter.name in names and source and source.name == "COMMANDLINE":
+            raise SettingsError(f"{parameter.opts[0]} is for {purpose}", fix=f"leave out {parameter.opts[0]}")
 
 
 def echo(text: object) -> None:

@@ -13,11 +13,12 @@ from hilsplat.cli.common import (
     datasets_app,
     echo,
     models_app,
+    refuse_options,
     require_new_folder,
 )
 from hilsplat.cli.user_commands import scene_folder
 from hilsplat.stage import DEFAULT_CACHE, DataRoot, Threads
-from hilsplat.stages import all_stages, family_of, joined, label_fits, names
+from hilsplat.stages import joined, label_fits, names
 
 
 @models_app.command("get")
@@ -57,12 +58,15 @@ def models_list() -> None:
 
 @models_app.command("check")
 def models_check(
+    context: typer.Context,
     folder: Annotated[Path | None, typer.Argument(help="model folder; default: all installed models")] = None,
     variant: Annotated[str, typer.Option(help="suffix of the network files, such as fp16")] = "",
 ) -> None:
     """Describe one model or all installed models, and measure the time per image."""
     from hilsplat.embed.model_check import check_model, check_models
 
+    if folder is None:
+        refuse_options(context, ("variant",), "the check of one folder")
     text, num_failed = (check_model(folder, variant), 0) if folder is not None else check_models()
     echo(text)
     if num_failed:
@@ -108,9 +112,9 @@ def cache_prune(
     """Delete unfinished files of killed jobs and, if a limit is given, cache entries (recomputed on use)."""
     from hilsplat.base.cache import prune_cache, size_table
 
-    cached = [family_of(each) for each in all_stages().values() if "cache" in each.hints]
-    prunable = list(dict.fromkeys(cached))
-    number, freed_mib = prune_cache(context.obj, prunable, stage or [], days=days, max_mib=max_mib)
+    if days is None and max_mib is None:
+        refuse_options(context, ("stage",), "entries beyond a limit, with --days or --max-mib")
+    number, freed_mib = prune_cache(context.obj, stage or [], days=days, max_mib=max_mib)
     echo(f"deleted {number} files, {freed_mib:.1f} MiB\n{size_table(context.obj)}")
 
 

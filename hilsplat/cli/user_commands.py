@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from hilsplat.base.errors import SettingsError
-from hilsplat.cli.common import Results, app, echo, require_new_folder
+from hilsplat.cli.common import Results, app, echo, refuse_options, require_new_folder
 from hilsplat.stage import DataRoot, Threads
 
 SceneName = Annotated[str, typer.Argument(help="scene in results/, such as desk or photos/desk, or its path")]
@@ -17,6 +17,7 @@ SceneName = Annotated[str, typer.Argument(help="scene in results/, such as desk 
 
 @app.command()
 def query(
+    context: typer.Context,
     scene: SceneName,
     text: Annotated[
         str | None, typer.Argument(help="what to look for; 'bear > nose' finds the noses of bears")
@@ -53,13 +54,9 @@ def query(
     Prints the score, level, position, size and best views of each answer. Writes a picture (panel.png) and
     the answers' Gaussians (selection.ply). With --all, prints the best answer of each of the best scenes.
     """
-    of_one = {"--out": out, "--masks": masks, "--spz": spz, "--view": view, "--answerer": answerer != "tree"}
-    given = [option for option, value in of_one.items() if value]
-    if all_scenes and given:
-        raise SettingsError(f"{given[0]} is for queries of one scene", fix=f"leave out {given[0]} or --all")
-    if as_json and not all_scenes:
-        raise SettingsError("--json is for queries of all scenes", fix="leave out --json, or add --all")
     if all_scenes:
+        of_one = ("out", "masks", "spz", "view", "views", "answerer", "threads")
+        refuse_options(context, of_one, "queries of one scene, without --all")
         from hilsplat.query.scenes import open_scenes, report_of
 
         pattern, wanted = ("*", scene) if text is None else (scene, text)
@@ -68,6 +65,7 @@ def query(
         rows = [hit.as_json() for hit in hits]
         echo(json.dumps(rows, indent=1) if as_json else report_of(scenes, wanted, hits))
         return
+    refuse_options(context, ("limit", "as_json"), "queries of all scenes, with --all")
     if text is None:
         raise SettingsError(f"there is no text to search for in {scene}", fix="hilsplat query SCENE TEXT")
     if masks is not None:
@@ -137,7 +135,7 @@ def scenes(
         str, typer.Option(help="protocol of the IoU of the tree's answers; default: lerf/tree-nodes")
     ] = "",
 ) -> None:
-    """Print a table of all scenes: views, Gaussians, PSNR, nodes at three levels, and IoU if labelled."""
+    """Print a table of all scenes: state, views, PSNR, IoU, size, date, models; the CSV has more columns."""
     from hilsplat.evaluate.scenes import PROTOCOL, run_scenes
 
     echo(run_scenes(results, pattern, out, protocol or PROTOCOL))
@@ -147,7 +145,7 @@ def scenes(
 def verify(
     results: Annotated[Path, typer.Argument(help="results folder, or a copy of it")] = Path("results"),
 ) -> None:
-    """Check all digests in a results folder, and print the Snakemake command that repairs it."""
+    """Check all digests in a results folder, and print the command that repairs it."""
     from hilsplat.workflow.records import verify
 
     report, is_whole = verify(results)
@@ -188,6 +186,7 @@ def settings(
 
 @app.command()
 def export(
+    context: typer.Context,
     scene: SceneName,
     form: Annotated[
         Literal["tree", "ply", "colmap", "nerfstudio", "langsplat", "labels"],
@@ -198,7 +197,9 @@ def export(
             "labels: the scene's annotations in LERF-OVS format",
         ),
     ] = "tree",
-    variant: Annotated[str, typer.Option(help="variant, for tree, langsplat, --only, --without")] = "default",
+    variant: Annotated[
+        str, typer.Option(help="variant, for tree, langsplat, --only, --without, --clean")
+    ] = "default",
     results: Results = Path("results"),
     data_root: DataRoot = Path(),
     out: Annotated[
@@ -224,16 +225,21 @@ def export(
     from hilsplat.base.ownership import replaced_folder
 
     crop = {"only": only or [], "without": without or [], "clean": clean}
-    if any(crop.values()) and form != "ply":
-        raise SettingsError("--only, --without and --clean are for --as ply", fix="add --as ply")
+    if form != "ply":
+        refuse_options(context, crop, "--as ply")
+    if form != "labels":
+        refuse_options(context, ("data_root",), "--as labels")
+    if form not in ("tree", "langsplat") and not any(crop.values()):
+        refuse_options(context, ("variant",), "--as tree, --as langsplat, --only, --without and --clean")
     folder = scene_folder(scene, results)
     if out is not None:
         require_new_folder(out)
         echo(_export(folder, form, variant, data_root, out, crop, threads))
         return
     out = folder / "export" / (form if variant == "default" else f"{form}-{variant}")
-    with replaced_folder(out):
-        echo(_export(folder, form, variant, data_root, out, crop, threads))
+    with replaced_folder(out) as temporary:
+        text = _export(folder, form, variant, data_root, temporary, crop, threads)
+    echo(text.replace(str(temporary), str(out)))
 
 
 def _export(

@@ -25,6 +25,9 @@ from hilsplat.settings import ClipSettings
 
 logger = logging.getLogger(__name__)
 
+CLIP_STATISTICS = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
+SIGLIP_STATISTICS = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
+"""Mean and deviation of pixels if `preprocessor_config.json` lacks them, as in transformers."""
 SIGLIP_TOKENS = 64
 """Text length (tokens) of a SigLIP model whose configuration does not specify it."""
 CARD_CROPS, MOST_CROPS = 64, 256
@@ -46,10 +49,10 @@ class ClipModel:
         self.text = model.network("text_model")
         self.ids, (self.words,) = next(iter(self.text.spec.inputs)), self.text.spec.outputs
         self.side_px = input_side_px(model)
-        # default: CLIP's statistics, as in transformers
-        preprocessing = model.preprocessing
-        self.mean = np.array(preprocessing.get("image_mean", (0.48145466, 0.4578275, 0.40821073)), np.float32)
-        self.std = np.array(preprocessing.get("image_std", (0.26862954, 0.26130258, 0.27577711)), np.float32)
+        self.siglip, preprocessing = model.layout == "siglip", model.preprocessing
+        mean, std = SIGLIP_STATISTICS if self.siglip else CLIP_STATISTICS
+        self.mean = np.array(preprocessing.get("image_mean", mean), np.float32)
+        self.std = np.array(preprocessing.get("image_std", std), np.float32)
         self.rescale = np.float32(preprocessing.get("rescale_factor", 1 / 255))
         path = model.tokenizer
         try:
@@ -60,7 +63,6 @@ class ClipModel:
             raise ModelError(f"{path} contains no words", fix=WHOLE_COPY)
         fixed = self.text.fixed_axis(self.ids, 1)
         text_config = model.config.get("text_config", {})
-        self.siglip = model.layout == "siglip"
         declared = text_config.get("max_position_embeddings", SIGLIP_TOKENS if self.siglip else None)
         truncation = self.tokenizer.truncation or {}
         self.max_tokens: int | None = fixed or declared or truncation.get("max_length")

@@ -3,10 +3,11 @@
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from hilsplat.base.errors import ArtifactError, nearest
+from hilsplat.base.errors import ArtifactError, SettingsError, nearest
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.ownership import require_beginning
 from hilsplat.base.tables import aligned_table, write_csv
+from hilsplat.evaluate.protocols.cards import BY_NAME
 from hilsplat.evaluate.scores import read_scores
 from hilsplat.query.scene_state import SceneState
 from hilsplat.scene.finished import scenes_in
@@ -33,11 +34,14 @@ def run_scenes(results: Path, pattern: str, out: Path | None, protocol: str = PR
     Cells of what a scene's run has not computed, such as scores without labels, are empty.
 
     Args:
-        protocol: beginning of the name of the protocol whose mean IoU of the tree's answers is shown.
+        protocol: name of the protocol whose mean IoU of the tree's answers is shown.
 
     Raises:
         ArtifactError: no scene matches, an artifact is damaged, or `out` is another file.
+        SettingsError: the protocol is unknown.
     """
+    if protocol not in BY_NAME:
+        raise SettingsError(f"protocol {protocol!r} is unknown", expected=nearest(protocol, list(BY_NAME)))
     names = scenes_in(results)
     chosen = [name for name in names if any(fnmatchcase(each, pattern) for each in (name, Path(name).name))]
     if not chosen:
@@ -76,5 +80,6 @@ def _tree_iou(scores: Path, protocol: str) -> str:
     """Return the mean IoU of the tree under a protocol, for the data set with the most labelled queries."""
     table = read_scores([scores] if scores.is_file() else [])
     is_shown = (table["method"] == "tree") & (table["metric"] == "iou")
-    values = table[is_shown & table["protocol"].str.startswith(protocol)].groupby("dataset")["value"]
+    is_of_protocol = table["protocol"].str.split("@").str[0] == BY_NAME[protocol].name
+    values = table[is_shown & is_of_protocol].groupby("dataset")["value"]
     return f"{values.mean()[values.count().idxmax()]:.4f}" if len(values) else ""

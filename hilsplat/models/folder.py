@@ -177,7 +177,8 @@ def _incomplete(folder: Path, name: str, missing: list[str], alternative: str) -
     variants = _variants(folder, layout)
     if any(file.endswith(".onnx") for file in missing) and variants:
         listed = ", ".join(map(repr, variants))
-        fix = f"its networks have suffixes: set {SECTIONS[layout.kind]}.variant to one of {listed}"
+        what = "suffixes" if any(variants) else "no suffix"
+        fix = f"its networks have {what}: set {SECTIONS[layout.kind]}.variant to one of {listed}"
     elif layout.kind == "clip" and whole_clip(folder):
         fix = f"split its single network into the required two: hilsplat models split {folder}"
     elif any(file.endswith(TORCH_SUFFIXES) for file in files) and not any(folder.rglob("*.onnx")):

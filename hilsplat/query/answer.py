@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hilsplat.base.atomic import atomic_folder, atomic_path
+from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, PATH_SEPARATOR, path_of
 from hilsplat.base.lineage import sha256_of_bytes
 from hilsplat.base.ownership import replaced_files
@@ -48,30 +49,36 @@ def answer(
     """Query a scene: yield the report, then write `panel.png` and `selection.ply` and yield their names.
 
     The query takes milliseconds; the picture takes one to two seconds, including imports and rendering.
-    For other arguments and for errors, see `LanguageScene.open` and `LanguageScene.query`.
+    For other arguments and errors, see `open_scene` and `LanguageScene.query`.
 
     Args:
         views: number of views in the panel; `view`, if given, is the first.
         out: output folder for both files; by default `queries/<text>` in the scene's folder.
         masks: new folder for the masks of the answer's nodes in all views (`mask_files`).
-        spz: whether to write the answer's Gaussians as `selection.spz`, too.
+        spz: whether to write `selection.spz`, too; if there is one, it is replaced in any case.
+
+    Raises:
+        SettingsError: `masks`, which is written last, is or contains another output.
     """
     finished = FinishedScene.locate(Path(folder), variant)
+    folder = Path(out) if out is not None else finished.folder / "queries" / file_name(text)
+    panel, selection, compressed = (folder / name for name in ("panel.png", "selection.ply", "selection.spz"))
+    spz = spz or compressed.is_file()  # that of an earlier answer would remain
+    written = (panel, selection, compressed) if spz else (panel, selection)
+    if masks is not None and any(path.resolve().is_relative_to(Path(masks).resolve()) for path in written):
+        raise SettingsError(f"--masks {masks} would replace {panel}", fix="choose a folder of its own")
     scene = LanguageScene.of(finished, threads=threads)
     nodes = scene.select(text, level=level, answerer=answerer, view=view, threshold=threshold)
     label = masks_label(finished.parts.masks)
     note = f"; diagnostic only, with masks made from true labels: {label}" if made_from_truth(label) else ""
     caution = scene.caution_about(text)
-    yield report(scene, text, nodes, view) + note + (f"\n{caution}" if caution else "")
+    yield report(scene, text, nodes, view, threshold) + note + (f"\n{caution}" if caution else "")
 
     from hilsplat.query.query_panel import query_panel
 
-    folder = Path(out) if out is not None else finished.folder / "queries" / file_name(text)
-    panel, selection, compressed = (folder / name for name in ("panel.png", "selection.ply", "selection.spz"))
     best = views_of(scene, scene.hits_of(nodes, LISTED), views)
     drawn = list(dict.fromkeys([*([view] if view else []), *best]))[:views]
     restriction = "" if view is None else f", in view {view}"
-    written = (panel, selection, compressed) if spz else (panel, selection)
     with nullcontext() if out is None else replaced_files(folder, [path.name for path in written]):
         query_panel(scene, text, nodes, drawn, panel, note=restriction + note, answerer=answerer)
         rows = scene.views.gaussians_of(nodes.ids)
@@ -104,13 +111,16 @@ def views_of(scene: LanguageScene, hits: Sequence[Hit], count: int) -> list[str]
     return list(dict.fromkeys([*best, *others, *spread, *every]))[:count]
 
 
-def report(scene: LanguageScene, text: str, nodes: NodeHits, view: str | None = None) -> str:
-    """Return answers and doubts as text; `view` is the view that the query was restricted to."""
+def report(
+    scene: LanguageScene, text: str, nodes: NodeHits, view: str | None = None, threshold: float | None = None
+) -> str:
+    """Return answers and doubts as text; `view` and `threshold` are those of the query."""
     searched = scene.scene.name if view is None else f"view {view} of {scene.scene.name}"
     hits = scene.hits_of(nodes, LISTED)
     if not hits:
         levels = ", ".join(f"--level {level.label}" for level in LEVELS if level is not nodes.level)
-        other = "" if view is None else ", or omit --view"
+        given = {"--view": view, "--threshold": threshold}
+        other = "".join(f", or omit {name}" for name, value in given.items() if value is not None)
         return f"nothing in {searched} matches {text!r} at level {nodes.level.label}; try {levels}{other}"
     lengths = "metres" if scene.scene.unit == "metre" else "scene units"
     width = max(len(hit.name or "?") for hit in hits)

@@ -7,14 +7,13 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float32, Int64, UInt8
 
-from hilsplat.base.errors import SettingsError
 from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import LEVELS, Level, path_of
 from hilsplat.contributions.compositing import rendered_latents
 from hilsplat.embed.clip import ClipModel
 from hilsplat.field.code import Code, LanguageField, LinearCode
 from hilsplat.query.relevancy import LatentRelevancy
-from hilsplat.query.scene_views import SceneViews
+from hilsplat.query.scene_views import SceneViews, View
 from hilsplat.semantic_tree.nodes import node_means
 from hilsplat.settings import EvaluateSettings
 
@@ -30,7 +29,7 @@ class FieldAnswers:
     settings: EvaluateSettings
 
     def relevancy(
-        self, texts: Sequence[str], view: str, *, exact: bool = True
+        self, texts: Sequence[str], view: View, *, exact: bool = True
     ) -> Float32[np.ndarray, "T 3 H W"]:
         """Compute relevancy from decoded rendered latents at every pixel and level.
 
@@ -44,8 +43,8 @@ class FieldAnswers:
         relevancy, levels = self._latent_relevancy, self.latents(view)
         vectors, prepared = self.clip.embed_texts(texts), None
         if isinstance(self.code, LinearCode) or not exact:
-            prepared = self.views.cache.get(
-                ("prepared", view), lambda: [relevancy.prepare(latents) for _, latents in levels]
+            prepared = self.views.cached(
+                "prepared", view, lambda: [relevancy.prepare(latents) for _, latents in levels]
             )
         maps = np.zeros((len(texts), len(LEVELS), height * width), np.float32)
         for index, (pixels, latents) in enumerate(levels):
@@ -61,7 +60,7 @@ class FieldAnswers:
         return maps.reshape(len(texts), len(LEVELS), height, width)
 
     def cosine(
-        self, texts: Sequence[str], view: str, pixels: Int64[np.ndarray, " P"]
+        self, texts: Sequence[str], view: View, pixels: Int64[np.ndarray, " P"]
     ) -> Float32[np.ndarray, "T 3 P"]:
         """Return the cosines of texts with pixels' rendered and decoded latents, at each level.
 
@@ -81,21 +80,16 @@ class FieldAnswers:
         """Return each Gaussian's field relevancy at a level or its maximum over levels; 0 without latents."""
         features, vector = self.language.features, self.clip.embed_texts(list(path_of(text)[-1:]))
         out = np.zeros(len(features), np.float32)
-        for searched in LEVELS:
-            if level in ("auto", searched.label):
-                latents = features[:, searched.index]
-                has_latent = (latents != 0).any(axis=1)
-                relevancy = self._latent_relevancy.exact(latents[has_latent], vector)[0]
-                out[has_latent] = np.maximum(out[has_latent], relevancy)
+        for searched in LEVELS if level == "auto" else [Level.of(level)]:
+            latents = features[:, searched.index]
+            has_latent = (latents != 0).any(axis=1)
+            relevancy = self._latent_relevancy.exact(latents[has_latent], vector)[0]
+            out[has_latent] = np.maximum(out[has_latent], relevancy)
         return out
 
-    def image(self, view: str, level: Level | str) -> UInt8[np.ndarray, "H W 3"]:
+    def image(self, view: View, level: Level | str) -> UInt8[np.ndarray, "H W 3"]:
         """Render the field of a level as colours (see `field_colours`); uncovered pixels are black."""
-        known = {name: each.index for each in LEVELS for name in (each, each.label)}
-        if level not in known:
-            labels = ", ".join(each.label for each in LEVELS)
-            raise SettingsError(f"level {level!r} is unknown", expected=labels)
-        colours = field_colours(self.language.features[:, known[level]])
+        colours = field_colours(self.language.features[:, Level.of(level).index])
         return to_uint8((self.views.view_weights(view) @ colours).reshape(*self.views.size_hw(view), 3))
 
     @cached_property
@@ -104,10 +98,10 @@ class FieldAnswers:
         tree = self.views.tree
         return self.code.decode_array(node_means(tree.node_of_gaussian, tree.level, self.language.features))
 
-    def latents(self, view: str) -> list[tuple[np.ndarray, Float32[np.ndarray, "P D"]]]:
+    def latents(self, view: View) -> list[tuple[np.ndarray, Float32[np.ndarray, "P D"]]]:
         """Return, for each level, the pixels that show mostly Gaussians with a latent, and their latents."""
-        return self.views.cache.get(
-            ("latents", view), lambda: rendered_latents(self.views.view_weights(view), self.language.features)
+        return self.views.cached(
+            "latents", view, lambda: rendered_latents(self.views.view_weights(view), self.language.features)
         )
 
     @cached_property

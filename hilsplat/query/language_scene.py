@@ -278,12 +278,12 @@ class LanguageScene(NodeQueries):
         """Return the nodes' unit vectors: those of the tree, or those decoded from their Gaussians' field."""
         return self.tree.clip if answerer == "tree" else self.field.node_vectors
 
-    def node_relevancy_map(self, texts: Sequence[str], view: str) -> Float32[np.ndarray, "T 3 H W"]:
+    def node_relevancy_map(self, texts: Sequence[str], view: View) -> Float32[np.ndarray, "T 3 H W"]:
         """Average the nodes' relevancy in each pixel (see `SceneViews.blended`)."""
         return self.views.blended(view, self.node_relevancy(texts))
 
     def node_cosine(
-        self, texts: Sequence[str], view: str, pixels: Int64[np.ndarray, " P"]
+        self, texts: Sequence[str], view: View, pixels: Int64[np.ndarray, " P"]
     ) -> Float32[np.ndarray, "T 3 P"]:
         """Average the text-node cosines in each pixel, as `SceneViews.blended` does, at each level.
 

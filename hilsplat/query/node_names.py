@@ -70,7 +70,7 @@ class Vocabulary:
             SettingsError: the file cannot be read or contains no text, or a section or name is invalid.
         """
         try:
-            lines = regular(Path(path)).read_text(encoding="utf-8").splitlines()
+            lines = regular(Path(path)).read_text(encoding="utf-8-sig").splitlines()
         except (OSError, UnicodeDecodeError) as error:
             raise SettingsError(
                 f"the vocabulary {path} cannot be read: {error}", expected="a UTF-8 text file"

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from hilsplat.base.errors import SettingsError
-from hilsplat.base.levels import LEVELS, NONE, Level, path_of
+from hilsplat.base.levels import NONE, Level, path_of
 from hilsplat.embed.clip import ClipModel
 from hilsplat.models.store import is_embedded, meaningless
 from hilsplat.query.names import NodeNames
@@ -78,11 +78,6 @@ class NodeQueries(ABC):
             raise SettingsError(
                 f"answerer {answerer!r} is unknown", expected=" or ".join(ANSWERERS), found=answerer
             )
-        if isinstance(level, str):
-            levels = {"auto": None} | {known.label: known for known in LEVELS}
-            if level not in levels:
-                raise SettingsError(f"level {level!r} is unknown", expected=", ".join(levels), found=level)
-            level = levels[level]
         visible = np.ones(len(self.tree), np.bool_) if visible is None else visible
         nodes = search(
             self.tree,
@@ -92,7 +87,7 @@ class NodeQueries(ABC):
             threshold=self.settings.node_select if threshold is None else 0.0,  # 0 selects the whole level
             ancestors=self.settings.ancestors,
             visible=visible,
-            level=level,
+            level=None if level in (None, "auto") else Level.of(level),
         )
         if threshold is not None:
             is_above = nodes.values >= margin_of_relevancy(threshold, self.settings.relevancy_scale)

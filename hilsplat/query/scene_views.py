@@ -50,19 +50,22 @@ class ViewStore:
 
     def get(self, key: tuple[Any, ...], compute: Callable[[], Any]) -> Any:
         """Return the cached value, or compute and cache it; the second item of a key is the view."""
-        if key in self._values:
-            self._values[key] = self._values.pop(key)
-            return self._values[key][0]
-        value = compute()
-        self._values[key] = (value, _nbytes(value))
-        while len(self._values) > 1 and sum(nbytes for _, nbytes in self._values.values()) > self._max_bytes:
-            self._values.pop(next(iter(self._values)))
-        return value
+        # Single operations on a dict are atomic, so several threads may read a scene.
+        found = self._values.pop(key, None)
+        if found is None:
+            value = compute()
+            found = value, _nbytes(value)
+        self._values[key] = found
+        while (
+            len(kept := list(self._values.items())) > 1 and sum(item[1][1] for item in kept) > self._max_bytes
+        ):
+            self._values.pop(kept[0][0], None)
+        return found[0]
 
     def forget(self, view: str) -> None:
         """Drop the results of a view."""
-        for key in [key for key in self._values if key[1] == view]:
-            del self._values[key]
+        for key in [key for key in list(self._values) if key[1] == view]:
+            self._values.pop(key, None)
 
 
 def _nbytes(value: Any) -> int:
@@ -105,7 +108,7 @@ class SceneViews:
         """Return the image size of a view; errors as in `camera`."""
         return self.camera(view).size_hw
 
-    def _cached(self, kind: str, view: View, compute: Callable[[], Any], *more: Any) -> Any:
+    def cached(self, kind: str, view: View, compute: Callable[[], Any], *more: Any) -> Any:
         """Return the cached result for a view of the scene; those of other cameras aren't cached."""
         return self.cache.get((kind, view, *more), compute) if isinstance(view, str) else compute()
 
@@ -118,7 +121,7 @@ class SceneViews:
             pixels.setflags(write=False)
             return pixels
 
-        return self._cached("image", view, read)
+        return self.cached("image", view, read)
 
     def pixel_weights(self, view: View) -> sp.csr_matrix:
         """Render a view's weight matrix W (pixels x Gaussians)."""
@@ -127,7 +130,7 @@ class SceneViews:
 
     def view_weights(self, view: View) -> sp.csr_matrix:
         """Return W with rows divided by alpha; rows with an alpha below 0.5 are empty."""
-        return self._cached("weights", view, lambda: normalised_weights(self.pixel_weights(view)))
+        return self.cached("weights", view, lambda: normalised_weights(self.pixel_weights(view)))
 
     def view_nodes(self, view: View, level: Level) -> ViewNodes:
         """Return the nodes of a level in each pixel of a view."""
@@ -135,7 +138,7 @@ class SceneViews:
         def summed() -> ViewNodes:
             return ViewNodes.of(self.view_weights(view), self.tree.node_of_gaussian[:, level.index])
 
-        return self._cached("nodes", view, summed, level)
+        return self.cached("nodes", view, summed, level)
 
     def visible_nodes(self, view: str) -> Bool[np.ndarray, " n"]:
         """Return whether each node's mask covers at least `MIN_VISIBLE_SHARE` of a view."""
@@ -146,7 +149,7 @@ class SceneViews:
             area_px = np.sum([self.view_nodes(view, level).area_px(num) for level in LEVELS], axis=0)
             return np.asarray(area_px >= MIN_VISIBLE_SHARE * height * width)
 
-        return self._cached("visible", view, measure)
+        return self.cached("visible", view, measure)
 
     def gaussians_of(self, ids: Nodes) -> Int64[np.ndarray, " g"]:
         """Return the rows of `gaussians.ply` that belong to any of the nodes; errors as in `existing`."""
@@ -182,7 +185,7 @@ class SceneViews:
         member[self.gaussians_of(ids)] = 1
         return (self.view_weights(view) @ member > 0.5).reshape(size_hw)
 
-    def blended(self, view: str, scores: Float32[np.ndarray, "T n"]) -> Float32[np.ndarray, "T 3 H W"]:
+    def blended(self, view: View, scores: Float32[np.ndarray, "T n"]) -> Float32[np.ndarray, "T 3 H W"]:
         """Average node scores over each pixel's Gaussians, weighted by W, at each level.
 
         Gaussians without a node have the lowest node score of the level, or 0 if it has one node. Uncovered
@@ -204,9 +207,10 @@ class SceneViews:
 
 def _within(numbers: Any, count: int, what: str) -> Int64[np.ndarray, " k"]:
     """Return integers as an array; raise SettingsError if one is not in 0 to `count` - 1."""
-    array = np.asarray(numbers)
-    if array.size and (array.dtype.kind not in "iu" or array.min() < 0 or array.max() >= count):
-        listed = array.ravel().tolist()
+    array = np.atleast_1d(np.asarray(numbers))
+    are_right = array.ndim == 1 and (array.dtype.kind in "iu" or not array.size)
+    if not are_right or not ((array >= 0) & (array < count)).all():
+        listed = array.tolist()
         wrong = next((each for each in listed if each not in range(count)), listed[0])
         raise SettingsError(f"{what} {wrong!r} does not exist", expected=f"integers from 0 to {count - 1}")
     return array.astype(np.int64)

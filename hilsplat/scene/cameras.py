@@ -58,6 +58,8 @@ class Camera:
 
     def __post_init__(self) -> None:
         require_arrays(self)
+        for name in ("cam_from_world", "K"):  # not shared: a change would also change the scene
+            object.__setattr__(self, name, getattr(self, name).copy())
         fault = _fault_of(self.cam_from_world[None], self.K[None])
         if not all(isinstance(side, int | np.integer) and 1 <= side <= MAX_SIDE_PX for side in self.size_hw):
             fault = f"height and width in whole px, 1 to {MAX_SIDE_PX}"

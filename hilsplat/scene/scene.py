@@ -82,7 +82,7 @@ class Scene:
         index = read_index(folder, "name", "unit")
         points = read_npz(sealed(folder, "points.npz"), "xyz", "rgb", "scene_from_source")
         return Scene(
-            folder=folder,
+            folder=Path(folder).absolute(),  # images are read later, perhaps in another working folder
             name=index["name"],
             unit=index["unit"],
             cameras=Cameras.load(sealed(folder, "cameras.npz")),

@@ -177,11 +177,11 @@ class HierarchicalMasks:
 
         return np.array(sorted(range(len(self)), key=key), dtype=np.int64)
 
-    def rows_of(self, level: Level) -> Int64[np.ndarray, " m"]:
-        """Return the rows of a level, in order."""
-        return np.flatnonzero(self.level == int(level))
+    def rows_of(self, level: Level | str) -> Int64[np.ndarray, " m"]:
+        """Return the rows of a level, in order; raise SettingsError if there is no such level."""
+        return np.flatnonzero(self.level == Level.of(level))
 
-    def label_map(self, level: Level | None) -> Int32[np.ndarray, "H W"]:
+    def label_map(self, level: Level | str | None) -> Int32[np.ndarray, "H W"]:
         """Return the row of the mask visible at each pixel (-1: none), for one level or all levels (None).
 
         Large masks are painted first, so small masks stay visible. For the same area, the lower row wins.

@@ -123,12 +123,45 @@ def test_no_gaussians_render_the_background():
         ({"viewmats": np.eye(4)}, ValueError, r"viewmats has the shape \[4, 4\]; expected \[any, 4, 4\]"),
         ({"sh_degree": 1, "colors": np.zeros((1, 1, 3))}, ValueError, "sh_degree is 1 with 1 harmonics"),
         ({"sh_degree": 4, "colors": np.zeros((1, 25, 3))}, ValueError, "sh_degree is 4"),
+        ({"sh_degree": 0.5, "colors": np.zeros((1, 1, 3))}, TypeError, "float"),
+        ({"viewmats": np.full((1, 4, 4), np.nan)}, ValueError, "viewmats and Ks must be finite"),
+        ({"Ks": np.diag([0.0, 30, 1])[None]}, ValueError, "focal lengths above 0"),
+        ({"viewmats": np.eye(4)[:0].reshape(0, 4, 4), "Ks": np.zeros((0, 3, 3))}, ValueError, "one view"),
+        ({"width": 32.5}, TypeError, "float"),
+        ({"height": 0}, ValueError, "height of at least 1"),
+        ({"eps2d": -0.3}, ValueError, "eps2d of at least 0"),
     ],
     ids=lambda value: "" if not isinstance(value, dict) else next(iter(value)),
 )
 def test_what_is_not_supported_is_refused(arguments, error, message):
     with pytest.raises(error, match=message):
         rasterization(**one_gaussian() | arguments)
+
+
+def test_lists_of_numbers_are_arrays():
+    arrays = one_gaussian()
+    lists = {name: values.tolist() for name, values in arrays.items() if isinstance(values, np.ndarray)}
+    for by_list, by_array in zip(rasterization(**arrays | lists), rasterization(**arrays), strict=True):
+        np.testing.assert_equal(by_list, by_array)
+
+
+RENDER_AFTER_FORK = """
+import os, sys, threading
+from tests.cpusplat.scenes import random_gaussians, two_cameras
+from cpusplat import rasterization
+scene = {**random_gaussians(60), **two_cameras(), "threads": 2}
+image = rasterization(**scene)[0]
+child = os.fork()
+if not child:
+    threading.Timer(60, os._exit, [1]).start()
+    os._exit(0 if (rasterization(**scene)[0] == image).all() else 2)
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+def test_a_process_forked_after_rendering_renders_too():
+    root = Path(cpusplat.__file__).parents[1]
+    subprocess.run([sys.executable, "-c", RENDER_AFTER_FORK], cwd=root, check=True, timeout=120)
 
 
 def test_arguments_that_affect_only_speed_are_accepted():

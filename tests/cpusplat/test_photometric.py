@@ -44,6 +44,18 @@ def test_loss_and_gradient_agree_with_torch(size):
     assert ssim(image, target) == pytest.approx(torch_ssim(torch, x, t).item(), rel=1e-5)
 
 
+@pytest.mark.parametrize("compare", [lambda *pair: photometric_loss(*pair, ssim_weight=0.2), ssim, psnr])
+def test_images_of_different_sizes_or_with_whole_numbers_are_refused(compare):
+    image, target = pair(8, 9)
+    for other in (target[:4], target[:, :4], target[:1], target[..., :1], (255 * target).astype(np.uint8)):
+        with pytest.raises(ValueError, match=r"two float images \[H, W, 3\] of one size"):
+            compare(image, other)
+        with pytest.raises(ValueError, match="two float images"):
+            compare(other, image)
+    with pytest.raises(ValueError, match="two float images"):
+        compare(image[:0], target[:0])
+
+
 def test_psnr_of_a_constant_offset():
     # mean square 0.01, so -10 log10(0.01) = 20 dB
     black = np.zeros((4, 4, 3), np.float32)

@@ -117,6 +117,40 @@ def test_tensors_and_arrays_give_the_same_bytes():
     assert by_tensor[2].keys() == by_array[2].keys()
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_no_gradient_is_computed_from_parameters_that_changed_in_place(name):
+    gaussians, cameras = tensors(random_gaussians(30)), two_cameras()
+    colors, _, _ = rasterization(**gaussians, **cameras)
+    with torch.no_grad():
+        gaussians[name].mul_(0.5)
+    if name == "colors":  # drawn from a copy
+        gaussians["means"].grad = None
+        colors.sum().backward()
+        expected = tensors(random_gaussians(30))
+        rasterization(**expected, **cameras)[0].sum().backward()
+        assert torch.equal(gaussians["means"].grad, expected["means"].grad)
+    else:
+        with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+            colors.sum().backward()
+
+
+def test_second_order_gradients_are_refused():
+    gaussians = tensors(random_gaussians(30))
+    colors, _, meta = rasterization(**gaussians, **two_cameras())
+    for of in (gaussians["means"], meta["means2d"]):
+        with pytest.raises(NotImplementedError, match="second-order"):
+            torch.autograd.grad(colors.sum(), of, create_graph=True)
+
+
+@pytest.mark.parametrize("name", [*NAMES, "backgrounds"])
+def test_tensors_among_arrays_are_refused(name):
+    arrays = {**random_gaussians(30), "backgrounds": np.ones((2, 3), np.float32)}
+    every = {key: torch.tensor(values) for key, values in arrays.items()}
+    for mixed in (arrays | {name: every[name]}, every | {name: arrays[name]}):
+        with pytest.raises(TypeError, match="arrays and tensors"):
+            rasterization(**mixed, **two_cameras())
+
+
 def test_gradients_of_cameras_are_refused():
     cameras = two_cameras()
     cameras["viewmats"] = torch.tensor(cameras["viewmats"]).requires_grad_()
@@ -178,3 +212,31 @@ def test_a_training_loop_in_the_style_of_gsplats_examples_reaches_30_db():
     with torch.no_grad():
         fitted = render(slice(None))[0].numpy()
     assert np.mean([psnr(*pair) for pair in zip(fitted, targets, strict=True)]) > 30
+
+
+def test_gsplats_default_strategy_densifies_by_the_gradients_of_projected_means():
+    strategy_of = pytest.importorskip("gsplat.strategy", reason="gsplat is not installed").DefaultStrategy
+    torch.manual_seed(0)
+    arrays, cameras, n = random_gaussians(60), two_cameras(), 60
+    params = {name: torch.nn.Parameter(torch.tensor(arrays[name])) for name in NAMES}
+    for name, inverse in (("scales", torch.log), ("opacities", torch.logit)):
+        params[name] = torch.nn.Parameter(inverse(params[name].detach()))
+    optimizers = {name: torch.optim.Adam([values], lr=1e-3) for name, values in params.items()}
+    strategy = strategy_of(
+        refine_start_iter=0, refine_every=2, grow_grad2d=1e-9, prune_opa=0.0, reset_every=100
+    )
+    strategy.check_sanity(params, optimizers)
+    state = strategy.initialize_state(scene_scale=1.0)
+    for step in (1, 2):
+        drawn = params | {"scales": params["scales"].exp(), "opacities": params["opacities"].sigmoid()}
+        colors, _, info = rasterization(**drawn, **cameras)
+        strategy.step_pre_backward(params, optimizers, state, step, info)
+        colors.square().mean().backward()
+        if step == 2:
+            gathered = state["grad2d"].clone()
+        strategy.step_post_backward(params, optimizers, state, step, info, packed=False)
+        if step == 1:
+            scale = torch.tensor([info["width"], info["height"]]) / 2 * info["n_cameras"]
+            expected = (info["means2d"].grad * scale).norm(dim=-1).sum(dim=0)
+            torch.testing.assert_close(state["grad2d"], expected)
+    assert gathered.gt(0).any() and len(params["means"]) == n + int(gathered.gt(0).sum())

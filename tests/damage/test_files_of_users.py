@@ -197,6 +197,40 @@ def test_an_export_replaces_only_its_own_files(own_desk: Path, monkeypatch, form
         (folder / name).unlink()
 
 
+KILLED = """
+import os, sys, hilsplat.base.ownership
+hilsplat.base.{} = lambda *_: os._exit(9)
+from hilsplat.cli.main import app
+app(sys.argv[1:])
+"""
+
+
+@pytest.mark.parametrize(
+    ("form", "moment"),
+    [
+        ("tree", "ownership.write_json"),
+        ("colmap", "ownership.write_json"),
+        ("ply", "atomic.replace_folder"),
+        ("ply", "ownership.write_json"),
+    ],
+)
+def test_an_export_can_be_repeated_after_a_kill_and_until_then_the_former_one_is_kept(
+    own_desk: Path, monkeypatch, form: str, moment: str
+) -> None:
+    """It is killed after all files are written: before or after their sizes and times are recorded."""
+    monkeypatch.chdir(own_desk.parents[2])
+    words, folder = ["export", "photos/desk", "--as", form], SCENE / "export" / form
+    killed = [sys.executable, "-c", KILLED.format(moment), *words]
+    environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
+    assert subprocess.run(killed, env=environment).returncode == 9
+    app(words, standalone_mode=False)
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    assert before and not any(".writing" in str(path) for path in before)
+    assert subprocess.run(killed, env=environment).returncode == 9
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+    app(words, standalone_mode=False)
+
+
 def test_a_query_replaces_only_its_own_files(own_desk: Path, monkeypatch) -> None:
     monkeypatch.chdir(own_desk.parents[2])
     words, folder = ["query", "photos/desk", "mug", "--out", "answer", "--spz"], Path("answer")

@@ -3,10 +3,13 @@
 import logging
 import math
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +18,9 @@ import pytest
 import hilsplat
 from hilsplat import stages
 from hilsplat.base.errors import ArtifactError, HilsplatError, ModelError, SceneError, SettingsError
+from hilsplat.base.images import write_png
 from hilsplat.base.lineage import read_provenance, sha256_of_path
+from hilsplat.query.scene_views import ViewStore
 from hilsplat.scene.exporting import write_colmap
 from hilsplat.segment.digests import digest_of, digests_in, load_masks
 from hilsplat.semantic_tree.tree import SemanticTree
@@ -23,6 +28,7 @@ from hilsplat.settings import GaussiansSettings, MasksSettings
 from hilsplat.splat.ply import save_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 from hilsplat.splat.rasterise.api import render as render_rgb
+from tests.unit.finished_desk import SCENE
 
 
 @pytest.fixture
@@ -315,6 +321,11 @@ def test_arrays_and_arguments_that_do_not_fit_are_refused(scene, masks, linked):
         "limit is -1": lambda: linked.like_node(0, limit=-1),
         "limit is None": lambda: linked.query("mug", limit=None),
         "seed is -1": lambda: hilsplat.fit(scene, 3, seed=-1),
+        "seed is 1.5": lambda: hilsplat.fit(scene, 3, seed=1.5),
+        "seed is '1'": lambda: hilsplat.reconstruct("x.zip", seed="1"),
+        "level 7 is unknown": lambda: linked.query("mug", level=7),
+        "level 'hole' is unknown": lambda: masks["000.png"].label_map("hole"),
+        r"node \[0, 1\] does not exist": lambda: linked.views.gaussians_of([[0, 1]]),
         "no Gaussians": lambda: hilsplat.link(
             scene, hilsplat.Gaussians(*(array[:0] for array in vars(gaussians).values())), masks
         ),
@@ -326,7 +337,13 @@ def test_arrays_and_arguments_that_do_not_fit_are_refused(scene, masks, linked):
 
 
 def test_the_field_refuses_pixels_outside_the_view_and_a_text_that_is_no_list(desk):
-    field = hilsplat.open_scene(desk).field
+    scene = hilsplat.open_scene(desk)
+    field, camera = scene.field, scene.camera("000.png")
+    np.testing.assert_array_equal(field.relevancy(["mug"], camera), field.relevancy(["mug"], "000.png"))
+    with pytest.raises(SettingsError, match="level 'piece' is unknown"):
+        field.gaussian_relevancy("mug", "piece")
+    with pytest.raises(SettingsError, match=r"\[3, 1\] does not exist"):
+        field.cosine(["mug"], camera, np.array([[3, 1]]))
     np.testing.assert_array_equal(field.image("000.png", "part"), field.image("000.png", hilsplat.Level.PART))
     with pytest.raises(SettingsError, match="level 'piece' is unknown"):
         field.image("000.png", "piece")
@@ -335,3 +352,57 @@ def test_the_field_refuses_pixels_outside_the_view_and_a_text_that_is_no_list(de
     for call in (field.relevancy, lambda text, view: field.cosine(text, view, np.array([0]))):
         with pytest.raises(SettingsError, match="'mug' is not a list"):
             call("mug", "000.png")
+
+
+def test_a_changed_camera_changes_no_other(scene):
+    camera = scene.cameras["001.png"]
+    smaller, before = camera.scaled((12, 21)), scene.cameras.K.copy()
+    camera.K[0, 0] *= 2
+    camera.cam_from_world[0, 3] += 1
+    np.testing.assert_array_equal(scene.cameras.K, before)
+    assert (
+        smaller.cam_from_world[0, 3]
+        == scene.cameras["001.png"].cam_from_world[0, 3]
+        != camera.cam_from_world[0, 3]
+    )
+
+
+def test_a_scene_keeps_its_photographs_if_the_working_folder_changes(desk_project, tmp_path, monkeypatch):
+    """Another project may have a scene of the same name."""
+    shutil.copytree(desk_project / SCENE, other := tmp_path / SCENE)
+    for image in (other / "scene/images").glob("*.png"):
+        write_png(image, np.zeros((24, 42, 3), np.uint8))
+    monkeypatch.chdir(desk_project)
+    posed, opened = hilsplat.load_scene(SCENE), hilsplat.open_scene(SCENE)
+    before = posed.image("000.png")
+    monkeypatch.chdir(tmp_path)
+    for after in (posed.image("000.png"), opened.views.image("000.png")):
+        np.testing.assert_array_equal(after, before)
+
+
+def test_levels_are_found_by_number_and_label(masks, linked):
+    for level in hilsplat.Level:
+        expected = masks["000.png"].label_map(level)
+        for same in (int(level), level.label):
+            np.testing.assert_array_equal(masks["000.png"].label_map(same), expected)
+            assert linked.query("mug", level=same) == linked.query("mug", level=level)
+
+
+def test_threads_may_read_one_scene():
+    """Each thread drops results that others are about to read."""
+    store = ViewStore(max_mib=400 / 2**20)  # five of twenty results
+
+    def read(first: int) -> bool:
+        views = [7 * number + first for number in range(5000)]
+        return all(
+            (store.get(("k", view % 20), partial(np.full, 10, view % 20)) == view % 20).all()
+            for view in views
+        )
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(8) as pool:
+            assert all(pool.map(read, range(8)))
+    finally:
+        sys.setswitchinterval(interval)

@@ -47,6 +47,8 @@ def test_shipped_configurations_are_valid(project: Path, name: str) -> None:
             {"variants": {"x": {"method": {"name": "opengaussian", "codebok": [1, 1]}}}},
             r"variants\.x\.method\.codebok: unknown key; did you mean 'codebook'\?",
         ),
+        ({"evaluate": {"canonical": []}}, r"evaluate\.canonical"),
+        ({"evaluate": {"canonical": ["object", " "]}}, r"evaluate\.canonical"),
         ({"seed": 2**31}, "less than or equal to 2000000000"),
         ({"poses": {"single_camera": True}}, "YAML reads yes, no, on and off"),
         ({"masks": {"points_per_batch": True}}, "YAML reads yes, no, on and off"),

@@ -209,6 +209,12 @@ class Annotated(Dataset):
         inside, here = super().root(data_root), Path(self.name)
         return inside if inside.is_dir() or not here.is_dir() else here
 
+    def locate(self, data_root: Path) -> Path:
+        root = self.root(data_root)  # not searched elsewhere: any results look like annotations
+        if not self.found(root):
+            raise SceneError(f"there are no annotations in {root}", fix="draw them: hilsplat annotate SCENE")
+        return root
+
     def found(self, root: Path) -> tuple[str, ...]:
         files = root.glob("*/*/*.json")
         return tuple(sorted({f"{path.parent.parent.name}/{path.parent.name}" for path in files}))

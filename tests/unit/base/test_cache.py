@@ -1,6 +1,7 @@
 """The caches: finished views, their size, the entries that are deleted, and files of users, which are not."""
 
 import os
+import re
 import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -12,13 +13,13 @@ import pytest
 
 from hilsplat.base.artifacts import read_npz, write_arrays
 from hilsplat.base.atomic import atomic_path
-from hilsplat.base.cache import ViewCache, prune_cache, size_table
+from hilsplat.base.cache import CACHES, ViewCache, prune_cache, size_table
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.lineage import sha256_of_json
 from hilsplat.base.processes import host_token
 from hilsplat.base.removal import tag
+from tests.conftest import PROJECT
 
-CACHES = ("masks", "clip", "contributions", "gaussians")
 MIB = 2**20
 
 
@@ -55,8 +56,8 @@ def test_the_table_names_each_cache(cache):
 
 
 def test_only_old_view_entries_are_deleted(cache, tmp_path):
-    assert prune_cache(tmp_path / "nowhere", CACHES, [], days=0.0) == (0, 0)
-    assert prune_cache(cache, CACHES, [], days=2.0) == (3, 3.0)
+    assert prune_cache(tmp_path / "nowhere", [], days=0.0) == (0, 0)
+    assert prune_cache(cache, [], days=2.0) == (3, 3.0)
     assert left(cache) == [
         "masks/.writing-00000000-01234567/new.npz",
         f"masks/00/{0:064}.npz",
@@ -65,9 +66,18 @@ def test_only_old_view_entries_are_deleted(cache, tmp_path):
     ]
 
 
+def test_every_cache_can_be_pruned(tmp_path):
+    sources = [path.read_text() for path in (PROJECT / "hilsplat").rglob("*.py")]
+    names = {name for text in sources for name in re.findall(r'ViewCache\(.*? / "(\w+)"', text)}
+    assert names | {"gaussians"} == {*CACHES}
+    for name in names:
+        ViewCache(tmp_path / name).put("0" * 64, {"x": np.zeros(1)})
+    assert prune_cache(tmp_path, days=0.0)[0] == len(names)
+
+
 def test_an_unknown_cache_is_refused(cache):
-    with pytest.raises(HilsplatError, match=r"models\n.*masks, clip, contributions, gaussians"):
-        prune_cache(cache, CACHES, ["masks", "models"], days=0.0)
+    with pytest.raises(HilsplatError, match=r"models\n.*gaussians, masks, contributions, clip, texts, int8"):
+        prune_cache(cache, ["masks", "models"], days=0.0)
 
 
 @pytest.mark.parametrize(
@@ -89,7 +99,7 @@ def test_checkpoints_are_pruned_unless_their_fit_may_still_run(cache, options, e
         path.write_bytes(b"x" * MIB)
         written = time.time() - hours * 3600
         os.utime(path, (written, written))
-    prune_cache(cache, CACHES, options.pop("stages"), **options)
+    prune_cache(cache, options.pop("stages"), **options)
     assert {names[path.stem] for path in (cache / "gaussians").glob("*.npz")} == expected
 
 
@@ -98,7 +108,7 @@ def test_without_a_limit_only_unfinished_files_of_dead_jobs_are_deleted(tmp_path
     leftover = results / f"photos/desk/.writing-{host_token()}-01234567"
     leftover.mkdir(parents=True)
     shutil.copytree(cache, results / ".cache")
-    assert prune_cache(results / ".cache", CACHES, []) == (0, 0)
+    assert prune_cache(results / ".cache", []) == (0, 0)
     assert not leftover.exists()
     assert left(results / ".cache") == left(cache)
 
@@ -116,9 +126,9 @@ def test_files_in_folders_named_like_a_cache_are_kept(cache, tmp_path_factory):
         (cache / "masks" / name).parent.mkdir(exist_ok=True)
         (cache / "masks" / name).touch()
     before = sorted(folder.rglob("*"))
-    assert prune_cache(folder, CACHES, [], days=0.0, max_mib=0.0) == (0, 0)
+    assert prune_cache(folder, [], days=0.0, max_mib=0.0) == (0, 0)
     assert sorted(folder.rglob("*")) == before
-    assert prune_cache(cache, CACHES, [], days=0.0, max_mib=0.0) == (5, 5.0)
+    assert prune_cache(cache, [], days=0.0, max_mib=0.0) == (5, 5.0)
     assert all((cache / "masks" / name).exists() for name in own)
 
 
@@ -130,7 +140,7 @@ def test_commands_that_prune_at_once_do_not_disturb_each_other(tmp_path: Path) -
         path.touch()
 
     def prune(_: int) -> str:
-        prune_cache(tmp_path, CACHES, [], days=0.0)
+        prune_cache(tmp_path, [], days=0.0)
         return size_table(tmp_path)
 
     with ThreadPoolExecutor(8) as pool:
@@ -142,7 +152,7 @@ def test_a_link_in_a_cache_is_deleted_without_its_target(cache, tmp_path_factory
     drawing = tmp_path_factory.mktemp("mine") / "drawing.npz"
     drawing.touch()
     (cache / f"masks/00/{5:064}.npz").symlink_to(drawing)
-    prune_cache(cache, CACHES, ["masks"], days=0.0, max_mib=0.0)
+    prune_cache(cache, ["masks"], days=0.0, max_mib=0.0)
     assert drawing.exists()
 
 

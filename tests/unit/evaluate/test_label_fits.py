@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hilsplat.annotate.labels import Label, label_path, traced, write_labels
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.base.levels import Level
 from hilsplat.cli.main import app
 from hilsplat.evaluate.label_fits import Fits, add_view, masks_of_view, run_label_fits
@@ -76,3 +76,5 @@ def test_a_wrong_scene_or_variant_is_refused_and_makes_no_folder(own_desk, monke
         with pytest.raises(ArtifactError):
             app(["datasets", "fits", *words], standalone_mode=False)
     assert sorted(Path().rglob("*")) == before and not Path("outside").exists()
+    with pytest.raises(SceneError, match=r"there are no annotations in annotated(.|\n)*hilsplat annotate"):
+        app(["datasets", "fits", "desk"], standalone_mode=False)

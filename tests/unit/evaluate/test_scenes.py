@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hilsplat.base.artifacts import write_json
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.cli.main import app
 from hilsplat.evaluate.scenes import COLUMNS
 from hilsplat.evaluate.scores import Score, write_scores
@@ -28,6 +28,10 @@ def results(desk, tmp_path) -> Path:
     one = tmp_path / "rooms/one"
     write_json(one / "gaussians/report.json", {"psnr_db": 21.456, "gaussians": 864})
     of_tree = [score("tree", "lerf/tree-nodes@5", value) for value in (0.5, 0.8)]
+    of_tree += [
+        score("tree", f"lerf/langsplat{version}", value)
+        for version, value in (("@2 (wholes)", 0.2), ("-v2@2", 0.6))
+    ]
     others = [score("field", "lerf/langsplat@2", 0.1), score("tree", "hierarchy/level-auto@6", 0.3)]
     write_scores(one / "default/scores.csv", [*of_tree, *others])
     for part in ("clip", "semantic_tree", "masks"):
@@ -57,9 +61,12 @@ def test_each_scene_has_a_row_with_what_its_run_has_computed(results, capsys):
     assert printed[0].split() == ["scene", "state", "views", "PSNR", "mIoU", "MB", "date", "models"]
     assert printed[3].split()[:6] == ["rooms/one", "tree,", "field", "6", "21.46", "0.6500"]
     assert printed[3].endswith(f"{date}  graph, colours")
-    options = ("--results", str(results), "--protocol", "hierarchy/level-auto")
-    app(["scenes", "rooms/o*", *options], standalone_mode=False)
-    assert "0.3000" in capsys.readouterr().out.splitlines()[1]
+    for protocol, iou in {"hierarchy/level-auto": "0.3000", "lerf/langsplat": "0.2000"}.items():
+        options = ("--results", str(results), "--protocol", protocol)
+        app(["scenes", "rooms/o*", *options], standalone_mode=False)
+        assert iou in capsys.readouterr().out.splitlines()[1]
+    with pytest.raises(SettingsError, match=r"'lerf/tree' is unknown(.|\n)*did you mean 'lerf/tree-nodes'"):
+        app(["scenes", "--results", str(results), "--protocol", "lerf/tree"], standalone_mode=False)
 
 
 def test_the_size_of_a_scene_is_that_of_its_files(results):

@@ -1,5 +1,6 @@
 """Exports of CLIP, SigLIP and open_clip give through our code what transformers gives."""
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -79,6 +80,8 @@ def test_siglip_gives_what_transformers_gives(siglip_parts, tmp_path, split):
     shutil.copytree(folder / ("optimum" if split else "js"), tmp_path / "siglip")
     if split:
         split_clip(tmp_path / "siglip")
+        minimal = {"size": {"height": 32, "width": 32}}  # the rest has the defaults of SigLIP's processor
+        (tmp_path / "siglip/preprocessor_config.json").write_text(json.dumps(minimal))
 
     def inputs_of(text: str) -> dict:
         ids = [{"red": 1, "mug": 2, "on": 3}.get(word, 0) for word in text.lower().split()]

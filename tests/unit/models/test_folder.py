@@ -103,6 +103,8 @@ def test_external_weights_of_packed_and_other_types_are_read(tmp_path):
 
 def test_a_variant_is_chosen_by_its_ending_which_all_networks_must_have(sam):
     plain, encoder = open_model_folder(sam).digest, sam / "onnx/vision_encoder.onnx"
+    with pytest.raises(ModelError, match=r"have no suffix: set masks.variant to one of ''"):
+        open_model_folder(sam, variant="fp16")
     shutil.copy(encoder, encoder.with_name("vision_encoder_q4.onnx"))
     for path in (encoder, sam / "onnx/prompt_encoder_mask_decoder.onnx"):
         shutil.copy(path, path.with_name(f"{path.stem}_fp16.onnx"))

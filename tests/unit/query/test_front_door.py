@@ -208,8 +208,8 @@ def test_export_leaves_out_or_keeps_what_matches_a_query_or_a_node(desk, elsewhe
     exported("--without", "unicorn > rim", "doubtful")
     assert "doubtful: 'unicorn' may not be in the scene" in capsys.readouterr().out
     for words, message in (
-        (("--as", "tree", "--without", "book"), "--only, --without and --clean are for --as ply"),
-        (("--as", "tree", "--clean"), "--only, --without and --clean are for --as ply"),
+        (("--as", "tree", "--without", "book"), "--without is for --as ply"),
+        (("--as", "tree", "--clean"), "--clean is for --as ply"),
         (("--as", "ply", "--without", "99"), "node 99 does not exist"),
         (("--as", "ply", "--only", "book", "--without", "book"), "no Gaussian remains"),
     ):
@@ -235,13 +235,53 @@ def test_a_clean_export_leaves_out_gaussians_of_no_node(copied, elsewhere, capsy
         ("--all", "--spz"),
         ("--all", "--out", "o"),
         ("--all", "--view", "0"),
+        ("--all", "--views", "2"),
+        ("--all", "--answerer", "tree"),
         ("--json",),
+        ("--limit", "3"),
     ],
 )
 def test_options_that_a_query_would_ignore_are_refused(desk, elsewhere, words):
-    with pytest.raises(SettingsError, match=f"{words[min(1, len(words) - 1)]} is for queries of"):
+    with pytest.raises(SettingsError, match=f"{words[words[0] == '--all']} is for queries of"):
         run("query", str(desk), "mug", *words)
     assert not list(elsewhere.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "purpose"),
+    [
+        (("export", "DESK", "--as", "colmap", "--variant", "nope"), "--variant", "--as tree, --as langsplat"),
+        (("export", "DESK", "--as", "ply", "--variant", "nope"), "--variant", "--as tree, --as langsplat"),
+        (("export", "DESK", "--as", "tree", "--data-root", "."), "--data-root", "--as labels"),
+        (("models", "check", "--variant", "fp16"), "--variant", "the check of one folder"),
+        (("cache", "prune", "--stage", "masks"), "--stage", "entries beyond a limit"),
+    ],
+)
+def test_options_without_effect_are_refused(desk, elsewhere, command, option, purpose):
+    with pytest.raises(SettingsError, match=f"{option} is for {purpose}"):
+        run(*(str(desk) if word == "DESK" else word for word in command))
+    assert not list(elsewhere.iterdir()) and not (desk / "export").exists()
+
+
+@pytest.mark.parametrize(("out", "masks"), [("a", "a"), ("a/b", "a"), ("a", "a/panel.png"), ("a/../c", "c")])
+def test_masks_do_not_replace_the_picture_of_their_answer(desk, elsewhere, out, masks):
+    with pytest.raises(SettingsError, match="would replace"):
+        run("query", str(desk), "mug", "--out", out, "--masks", masks)
+    assert not list(elsewhere.iterdir())
+    run("query", str(desk), "mug", "--out", "a", "--masks", "a/masks")
+    assert {path.name for path in Path("a").iterdir()} >= {"panel.png", "selection.ply", "masks"}
+
+
+def test_compressed_gaussians_are_those_of_the_last_answer(desk, elsewhere):
+    for words in (("--spz",), ("--level", "part")):
+        run("query", str(desk), "mug > handle" if "--spz" in words else "book", "--out", "a", *words)
+    saved = decoded(Path("a/selection.spz").read_bytes())
+    assert len(saved) == len(PlyData.read("a/selection.ply")["vertex"].data)
+
+
+def test_an_empty_answer_names_the_options_that_made_it_empty(desk, elsewhere, capsys):
+    run("query", str(desk), "mug", "--threshold", "0.99", "--view", "000.png", "--out", "a")
+    assert "or omit --view, or omit --threshold" in capsys.readouterr().out
 
 
 def test_a_scene_is_found_by_its_name_alone(desk_project, tmp_path):

@@ -29,7 +29,7 @@ def desk(named_desk) -> Path:
 def test_sections_comments_and_repeated_texts_of_a_file(tmp_path):
     path = tmp_path / "words.txt"
     path.write_text(
-        "mug, red  mug # two\n\n[Parts]\nhandle\nhandle, lid\n[surfaces]\nfloor\n[absent]\nmoon\n"
+        "\ufeffmug, red  mug # two\n\n[Parts]\nhandle\nhandle, lid\n[surfaces]\nfloor\n[absent]\nmoon\n"
     )
     assert Vocabulary.read(path) == Vocabulary(("mug", "red mug"), ("handle", "lid"), ("floor",), ("moon",))
 
