@@ -25,9 +25,8 @@ from scipy.sparse.csgraph import connected_components
 
 from hilsplat.base.artifacts import read_index, read_json, write_index
 from hilsplat.base.atomic import atomic_folder
-from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, NONE, Level
-from hilsplat.base.lineage import sha256_of_json
+from hilsplat.base.lineage import require_size, sha256_of_json
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.hierarchy import AnnotatedNode, HierarchyAnnotations
@@ -79,14 +78,9 @@ def run_truth_masks(
 
         def segment(view: str) -> tuple[HierarchicalMasks, dict[str, int]]:
             labels = true_labels(annotations, view)
-            expected = scene.cameras[view].size_hw
-            if labels.shape[1:] != expected:
-                raise MisalignedArtifactError(
-                    f"the label image of view {view} does not match its camera",
-                    expected=f"{expected[0]} x {expected[1]} (height x width)",
-                    found=f"{labels.shape[1]} x {labels.shape[2]}",
-                    fix="rerun poses without shrinking the images (poses.max_side_px)",
-                )
+            problem = f"the label image of view {view} does not match its camera"
+            fix = "rerun poses without shrinking the images (poses.max_side_px)"
+            require_size(problem, labels.shape[1:], scene.cameras[view].size_hw, fix)
             return faulty_masks(labels, nodes, view, draws, settings, min_area_px)
 
         index: dict[str, Any] = {}

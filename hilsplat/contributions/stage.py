@@ -27,8 +27,8 @@ from hilsplat.base.artifacts import read_index, write_index, write_npz
 from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.cache import ViewCache
 from hilsplat.base.code import code_digest
-from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
-from hilsplat.base.lineage import sha256_of_bytes, sha256_of_file, sha256_of_json
+from hilsplat.base.errors import ArtifactError
+from hilsplat.base.lineage import require_size, sha256_of_bytes, sha256_of_file, sha256_of_json
 from hilsplat.base.memory import MIB, limit_mib, require_memory
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
@@ -148,13 +148,8 @@ def view_key(camera: Camera, masks_sha256: str | None, inputs: dict[str, Any]) -
 def view_masks(masks_folder: Path, camera: Camera, digests: dict[str, str]) -> HierarchicalMasks:
     """Read the masks of a view; raise MisalignedArtifactError if their size or digest differs."""
     masks = load_masks(masks_folder, camera.name, digests)
-    if masks.size_hw != camera.size_hw:
-        raise MisalignedArtifactError(
-            f"the masks of view {camera.name} do not match the size of its camera",
-            expected=f"{camera.size_hw[0]} x {camera.size_hw[1]} (height x width)",
-            found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
-            fix="rerun the masks stage",
-        )
+    problem = f"the masks of view {camera.name} do not match the size of its camera"
+    require_size(problem, masks.size_hw, camera.size_hw, fix="rerun the masks stage")
     return masks
 
 

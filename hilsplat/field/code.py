@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from hilsplat.base.arrays import build_checked, read_tensors, require_types, write_tensors
-from hilsplat.base.artifacts import read_npz, rebuild_command, sealed
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.artifacts import damaged, read_npz, sealed
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.decoder import PackedLayers
 from hilsplat.segment.digests import require_same_masks
@@ -177,9 +176,7 @@ def load_code(folder: Path) -> Code:
             model.arrays[name] = state[name]
         return model
     except (KeyError, ValueError) as error:
-        raise ArtifactError(
-            f"{path} is from a different version: {error}", fix=rebuild_command(path)
-        ) from error
+        raise damaged(path, f" is from a different version: {error}") from error
 
 
 def autoencoder_file(folder: Path) -> Path:
