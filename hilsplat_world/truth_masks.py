@@ -30,6 +30,7 @@ from hilsplat.base.lineage import require_size, sha256_of_json
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.hierarchy import AnnotatedNode, HierarchyAnnotations
+from hilsplat.evaluate.metrics.masks import iou
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import index_entry
 from hilsplat.segment.masks import HierarchicalMasks
@@ -342,7 +343,7 @@ def faulty_masks(
                 if draws.chance("wrong level", *name) < settings.wrong_level:
                     mask_level = beside(level, up=draws.chance("which level", *name) < 0.5)
                     counts["wrong_level"] += 1
-                quality = max(_iou(mask, of_level == node) for node in group)
+                quality = max(iou(mask, of_level == node) for node in group)
                 rows.append((mask, mask_level, *_scores(quality, draws, settings, name)))
     masks = HierarchicalMasks.from_dense(
         np.array([mask for mask, *_ in rows], bool).reshape(len(rows), *labels.shape[1:]),
@@ -360,7 +361,3 @@ def _scores(
     noise = settings.score_noise * draws.generator("scores", *name).standard_normal(2)
     predicted, stability = np.clip(np.array([quality, (1 + quality) / 2]) + noise, 0, 1).tolist()
     return predicted, stability
-
-
-def _iou(mask: Bool[np.ndarray, "H W"], region: Bool[np.ndarray, "H W"]) -> float:
-    return np.count_nonzero(mask & region) / np.count_nonzero(mask | region)
