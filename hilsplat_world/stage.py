@@ -14,12 +14,11 @@ from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.processes import in_processes
 from hilsplat.base.progress import stage_log, track
-from hilsplat.datasets.generators import generator_of
 from hilsplat.datasets.hierarchy import write_hierarchy
 from hilsplat_world.lidar import scan_street
 from hilsplat_world.objects.catalogue import GENERATOR_VERSION
 from hilsplat_world.render import render_and_label
-from hilsplat_world.scenes.kinds import build_scene, scene_cameras
+from hilsplat_world.scenes.kinds import KINDS, build_scene, scene_cameras
 from hilsplat_world.seeds import TRAINING_SEEDS, split_of_seed
 from hilsplat_world.settings import WorldSettings
 from hilsplat_world.truth import MIN_SUBPART_AREA, annotated_nodes, write_mesh
@@ -34,16 +33,23 @@ def parse_source(source: str) -> tuple[str, int]:
     """Return the kind of scene and the seed in a source such as "world:tabletop:201".
 
     Raises:
-        SceneError: if it is not such a source, or the seed is reserved for training.
+        SceneError: if the format is wrong, the kind is unknown, or the seed is reserved for training.
     """
-    _, scene = generator_of(source)
-    if scene.seed in TRAINING_SEEDS:
+    words = source.split(":")
+    if len(words) != 3 or words[0] != "world" or words[1] not in KINDS or not words[2].isdecimal():
+        raise SceneError(
+            f"source {source!r} does not name a synthetic scene",
+            expected=f"world:<kind>:<seed>, where kind is one of: {', '.join(KINDS)}",
+            fix="correct the source in the scene sheet, as in world:tabletop:201",
+        )
+    seed = int(words[2])
+    if seed in TRAINING_SEEDS:
         raise SceneError(
             f"source {source!r} is a scene that the small models were trained on",
             expected=f"a seed outside {TRAINING_SEEDS.start} to {TRAINING_SEEDS.stop - 1}",
             fix="use a seed from 200 to 299 for reported results, or from 100 to 199 for development",
         )
-    return scene.kind, scene.seed
+    return words[1], seed
 
 
 def run_world(source: str, settings: WorldSettings, images: Path, truth: Path, threads: int) -> None:

@@ -80,7 +80,7 @@ def test_instances_of_a_text_are_annotated_together_or_not_at_all():
 def test_malformed_sources_and_training_seeds_are_refused():
     assert parse_source("world:tabletop:201") == ("tabletop", 201)
     for source in ("tabletop:100", "world:forest:1", "world:tabletop:-1", "world:tabletop"):
-        with pytest.raises(SceneError, match="expected  one of world:tabletop:<seed>, "):
+        with pytest.raises(SceneError, match=r"expected  world:<kind>:<seed>, where kind is one of: table"):
             parse_source(source)
     with pytest.raises(SceneError, match="that the small models were trained on"):
         parse_source("world:tabletop:1000003")
