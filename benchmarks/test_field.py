@@ -185,7 +185,7 @@ def test_linkage_of_a_synthetic_scene(benchmark):
         found = 0
         for _ in LEVELS:
             evidence = mask_evidence(shares, np.ones(60_000), visible, view, view_pairs(visible), 0.2)
-            found += pooled_linkage(evidence, 0.3)[0].max() + 1
+            found += pooled_linkage(evidence, 0.3)()[0].max() + 1
         return found
 
     benchmark.extra_info |= {"case": LINKAGE, "count": 3000, "of": "masks"}

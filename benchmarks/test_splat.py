@@ -20,7 +20,7 @@ from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.fit import FitState, fit_step
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.initial import TrainingView
-from hilsplat.splat.model import CpuModel
+from hilsplat.splat.model import Model
 from hilsplat.splat.rasterise.api import pixel_weights, project_gaussians
 
 LARGE = "100k 800x600"
@@ -114,7 +114,7 @@ def test_fit_iteration(benchmark, scene, threads):
     rng = np.random.default_rng(3)
     start = {field: getattr(gaussians, field).copy() for field in FIELDS}
     start["sh"] += 0.1 * rng.normal(size=start["sh"].shape).astype(np.float32)
-    state = FitState(CpuModel(start, threads), rng)
+    state = FitState(Model(start, threads), rng)
 
     def reset():
         # Every round starts from the same Gaussians, so that the number of hits stays valid.

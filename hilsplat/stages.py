@@ -150,9 +150,12 @@ def key_masks(
     memory: Memory = None,
 ) -> None:
     """Segment the key views, which together see every Gaussian often enough."""
-    from hilsplat.contributions.key_views import run_key_masks
+    from hilsplat.contributions.key_views import key_views
+    from hilsplat.scene.scene import Scene
+    from hilsplat.segment.stage import run_masks
 
-    run_key_masks(scene, gaussians, out, cache, settings, threads, memory)
+    views = key_views(Scene.load(scene), gaussians, settings.key_views, threads)
+    run_masks(scene, out, cache, settings, threads, memory, views)
 
 
 @stage(

@@ -2,20 +2,18 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from hilsplat.datasets.dataset import ABLATIONS
-from hilsplat.datasets.generators import Generator, Kind
+from hilsplat.datasets.generators import Generator, Kind, Truth
 from hilsplat.datasets.points.labelled_points import LabelledPoints
 from hilsplat.scene.cameras import Cameras
 
 
 @dataclass(frozen=True)
-class WorldTruth:
+class WorldTruth(Truth):
     """Ground truth that the stage `world` wrote."""
 
-    folder: Path
     kind: str
 
     def points(self) -> dict[str, LabelledPoints]:

@@ -86,24 +86,6 @@ def blocked_rays(scene, origins, directions, reach, found):
 
 
 @compiled
-def ray_directions(x_cam, y_cam, rotation, samples, directions):
-    """Compute the unit directions of the rays through a grid of points at depth 1, pixel by pixel."""
-    i = 0
-    for row in range(0, len(y_cam), samples):
-        for column in range(0, len(x_cam), samples):
-            for y in y_cam[row : row + samples]:
-                for x in x_cam[column : column + samples]:
-                    dx = x * rotation[0, 0] + y * rotation[1, 0] + rotation[2, 0]
-                    dy = x * rotation[0, 1] + y * rotation[1, 1] + rotation[2, 1]
-                    dz = x * rotation[0, 2] + y * rotation[1, 2] + rotation[2, 2]
-                    length = math.sqrt(dx * dx + dy * dy + dz * dz)
-                    directions[i, 0] = dx / length
-                    directions[i, 1] = dy / length
-                    directions[i, 2] = dz / length
-                    i += 1
-
-
-@compiled
 def surfaces(prim, u, v, directions, mesh, surface):
     """Compute the surface at each hit: position, facet normal, shading normal, colour and highlight."""
     triangles, normals, coords, material_ids, materials = mesh

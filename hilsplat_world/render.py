@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 
 from hilsplat.scene.cameras import Camera
-from hilsplat_world.kernels import light_rays, ray_directions, receivers, shade, sky_rays, surfaces
+from hilsplat_world.kernels import light_rays, receivers, shade, sky_rays, surfaces
 from hilsplat_world.paints import srgb_from_linear
 from hilsplat_world.rays import Hits
 from hilsplat_world.scenes.scene import WorldScene
@@ -117,14 +117,11 @@ def _rays(camera: Camera, samples: int, rows: range | None = None) -> tuple[np.n
     height, width = camera.size_hw
     rows = rows or range(height)
     step = (np.arange(samples) + 0.5) / samples
-    x = (np.arange(width)[:, None] + step).reshape(-1)
-    y = (np.arange(rows.start, rows.stop)[:, None] + step).reshape(-1)
-    directions = np.empty((len(rows) * width * samples**2, 3), np.float32)
-    ray_directions(
-        (x - camera.K[0, 2]) / camera.K[0, 0],
-        (y - camera.K[1, 2]) / camera.K[1, 1],
-        np.ascontiguousarray(camera.cam_from_world[:3, :3]),
-        samples,
-        directions,
-    )
-    return camera.centre.astype(np.float32)[None], directions
+    x = (np.arange(width)[:, None] + step - camera.K[0, 2]) / camera.K[0, 0]
+    y = (np.arange(rows.start, rows.stop)[:, None] + step - camera.K[1, 2]) / camera.K[1, 1]
+    directions = np.empty((len(rows), width, samples, samples, 3), np.float32)
+    dx, dy, dz = (x[:, None] * a + y[:, None, :, None] * b + c for a, b, c in camera.cam_from_world[:3, :3].T)
+    length = np.sqrt(dx * dx + dy * dy + dz * dz)
+    for axis, along in enumerate((dx, dy, dz)):
+        directions[..., axis] = along / length
+    return camera.centre.astype(np.float32)[None], directions.reshape(-1, 3)

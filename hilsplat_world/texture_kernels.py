@@ -35,9 +35,9 @@ def hash01(x: int, y: int, z: int, salt: int) -> float:
     return _mixed(_key(x, y, z, salt))
 
 
-@compiled(forceinline=True)
-def _value_noise(x, y, z, salt):
-    """Compute `value_noise` inline, because a loop that calls a function is not vectorised."""
+@compiled(forceinline=True)  # a loop that calls a function is not vectorised
+def value_noise(x: float, y: float, z: float, salt: int) -> float:
+    """Return smoothly interpolated lattice noise in [0, 1)."""
     i, j, k = math.floor(x), math.floor(y), math.floor(z)
     u, v, w = x - i, y - j, z - k
     u, v, w = u * u * (3 - 2 * u), v * v * (3 - 2 * v), w * w * (3 - 2 * w)
@@ -47,12 +47,6 @@ def _value_noise(x, y, z, salt):
     c = _mixed(np.uint32(h + _Z)) * (1 - u) + _mixed(np.uint32(h + _X + _Z)) * u
     d = _mixed(np.uint32(h + _Y + _Z)) * (1 - u) + _mixed(np.uint32(h + _X + _Y + _Z)) * u
     return (a * (1 - v) + b * v) * (1 - w) + (c * (1 - v) + d * v) * w
-
-
-@compiled
-def value_noise(x: float, y: float, z: float, salt: int) -> float:
-    """Return smoothly interpolated lattice noise in [0, 1)."""
-    return _value_noise(x, y, z, salt)
 
 
 @compiled
@@ -176,7 +170,7 @@ def grains(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
     a, b, c = size * x, size * y, size * z
     for salt in range(201, 205):
         for n in range(len(out)):
-            out[n] += amplitude * _value_noise(a[n], b[n], c[n], salt)
+            out[n] += amplitude * value_noise(a[n], b[n], c[n], salt)
         reach += amplitude
         amplitude *= 0.5
         a, b, c = 2.03 * a, 2.03 * b, 2.03 * c

@@ -25,12 +25,12 @@ from scipy.sparse.csgraph import connected_components
 
 from hilsplat.base.artifacts import read_index, read_json, write_index
 from hilsplat.base.atomic import atomic_folder
-from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, NONE, Level
-from hilsplat.base.lineage import sha256_of_json
+from hilsplat.base.lineage import require_size, sha256_of_json
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.hierarchy import AnnotatedNode, HierarchyAnnotations
+from hilsplat.evaluate.metrics.masks import iou
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import index_entry
 from hilsplat.segment.masks import HierarchicalMasks
@@ -79,14 +79,9 @@ def run_truth_masks(
 
         def segment(view: str) -> tuple[HierarchicalMasks, dict[str, int]]:
             labels = true_labels(annotations, view)
-            expected = scene.cameras[view].size_hw
-            if labels.shape[1:] != expected:
-                raise MisalignedArtifactError(
-                    f"the label image of view {view} does not match its camera",
-                    expected=f"{expected[0]} x {expected[1]} (height x width)",
-                    found=f"{labels.shape[1]} x {labels.shape[2]}",
-                    fix="rerun poses without shrinking the images (poses.max_side_px)",
-                )
+            problem = f"the label image of view {view} does not match its camera"
+            fix = "rerun poses without shrinking the images (poses.max_side_px)"
+            require_size(problem, labels.shape[1:], scene.cameras[view].size_hw, fix)
             return faulty_masks(labels, nodes, view, draws, settings, min_area_px)
 
         index: dict[str, Any] = {}
@@ -348,7 +343,7 @@ def faulty_masks(
                 if draws.chance("wrong level", *name) < settings.wrong_level:
                     mask_level = beside(level, up=draws.chance("which level", *name) < 0.5)
                     counts["wrong_level"] += 1
-                quality = max(_iou(mask, of_level == node) for node in group)
+                quality = max(iou(mask, of_level == node) for node in group)
                 rows.append((mask, mask_level, *_scores(quality, draws, settings, name)))
     masks = HierarchicalMasks.from_dense(
         np.array([mask for mask, *_ in rows], bool).reshape(len(rows), *labels.shape[1:]),
@@ -366,7 +361,3 @@ def _scores(
     noise = settings.score_noise * draws.generator("scores", *name).standard_normal(2)
     predicted, stability = np.clip(np.array([quality, (1 + quality) / 2]) + noise, 0, 1).tolist()
     return predicted, stability
-
-
-def _iou(mask: Bool[np.ndarray, "H W"], region: Bool[np.ndarray, "H W"]) -> float:
-    return np.count_nonzero(mask & region) / np.count_nonzero(mask | region)

@@ -21,7 +21,7 @@ import safetensors.numpy
 from jaxtyping import AbstractArray, jaxtyped
 from safetensors import SafetensorError, safe_open
 
-from hilsplat.base.artifacts import parse_json, rebuild_command
+from hilsplat.base.artifacts import OTHER_VERSION, damaged, parse_json
 from hilsplat.base.atomic import atomic_path
 from hilsplat.base.errors import ArtifactError, SettingsError
 
@@ -73,23 +73,20 @@ def require_types(cls: type, arrays: Mapping[str, Any], path: Path, limits: Limi
     with jaxtyped("context"):
         for name, declared, array in _declared(cls, arrays):
             if not _fits(array, declared):
-                raise ArtifactError(
-                    f"{path}: array {name} has the wrong type or shape",
-                    expected=described(declared),
-                    found=f"{array.dtype} of shape {array.shape}",
-                    fix=rebuild_command(path),
-                )
+                found = f"{array.dtype} of shape {array.shape}"
+                raise damaged(path, f": array {name} has the wrong type or shape", described(declared), found)
             low, high = limits.get(name, (-np.inf, np.inf))
             if array.dtype.kind not in "biuf" or not array.size:
                 continue
             lowest, highest = array.min(), array.max()  # NaN if any value is NaN
             if not (low <= lowest and highest <= high and np.isfinite([lowest, highest]).all()):
-                raise ArtifactError(
-                    f"{path}: array {name} contains an impossible value",
-                    expected=f"{low:g} to {high:g}" if name in limits else "finite numbers",
-                    found=f"{lowest} to {highest}",
-                    fix=rebuild_command(path),
-                )
+                expected = f"{low:g} to {high:g}" if name in limits else "finite numbers"
+                raise impossible(path, name, expected, f"{lowest} to {highest}")
+
+
+def impossible(path: Path, name: str, expected: str, found: str | None = None) -> ArtifactError:
+    """Return an error about a value in an artifact's array."""
+    return damaged(path, f": array {name} contains an impossible value", expected, found)
 
 
 def described(declared: type[AbstractArray]) -> str:
@@ -107,12 +104,8 @@ def build_checked(
     """Create a dataclass instance from a file's arrays and other fields; raise ArtifactError on mismatch."""
     names = {field.name for field in fields(cls) if field.init}  # type: ignore[arg-type]
     if {*arrays, *others} != names:
-        raise ArtifactError(
-            f"{path} was written by a different version of hilsplat",
-            expected=", ".join(sorted(names - set(others))),
-            found=", ".join(sorted(arrays)) or "no arrays",
-            fix=rebuild_command(path),
-        )
+        expected = ", ".join(sorted(names - set(others)))
+        raise damaged(path, OTHER_VERSION, expected, ", ".join(sorted(arrays)) or "no arrays")
     require_types(cls, arrays, path, limits or {})
     return cls(**arrays, **others)
 
@@ -138,7 +131,7 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         if about.pop("crc32") != _checksum(arrays, about):
             raise ValueError("its content was changed after it was written")
     except (OSError, SafetensorError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ArtifactError(f"{path} cannot be read: {error}", fix=rebuild_command(path)) from error
+        raise damaged(path, f" cannot be read: {error}") from error
     return arrays, about
 
 

@@ -34,6 +34,8 @@ DAMAGE = (
 )
 """Errors that numpy and zipfile raise on damaged files."""
 
+OTHER_VERSION = " was written by a different version of hilsplat"
+
 RECORD = ".provenance.json"
 """Ending of the name of a provenance record, which begins with the artifact's name."""
 
@@ -76,6 +78,11 @@ def rebuild_command(path: Path) -> str:
             if isinstance(outputs, dict) and output.name in outputs:
                 return run_command(record.with_name(record.name.removesuffix(RECORD)), "--verify")
     return "rerun the stage that writes it"
+
+
+def damaged(path: Path, problem: str, expected: object = None, found: object = None) -> ArtifactError:
+    """Return an error about a file or folder that hilsplat writes, with the command that rebuilds it."""
+    return ArtifactError(f"{path}{problem}", expected=expected, found=found, fix=rebuild_command(path))
 
 
 def write_text(path: Path, text: str) -> None:
@@ -126,9 +133,9 @@ def _readable(path: Path, problem: str = "cannot be read") -> Iterator[None]:
     try:
         yield
     except FileNotFoundError as error:
-        raise ArtifactError(f"{path} is missing", fix=rebuild_command(path)) from error
+        raise damaged(path, " is missing") from error
     except DAMAGE as error:
-        raise ArtifactError(f"{path} {problem}: {error}", fix=rebuild_command(path)) from error
+        raise damaged(path, f" {problem}: {error}") from error
 
 
 def write_npz(path: Path, **arrays: np.ndarray) -> None:
@@ -166,11 +173,8 @@ def read_npz(path: Path, *needed: str, max_gib: float = math.inf) -> dict[str, n
         if any(isinstance(array, bytes) for array in arrays.values()):  # numpy found no header
             raise ValueError("it contains data other than arrays")
     if lacking := [name for name in needed if name not in arrays]:
-        raise ArtifactError(
-            f"{path} lacks {', '.join(lacking)}",
-            found=", ".join(sorted(arrays)) or "no arrays",
-            fix=rebuild_command(path),
-        )
+        found = ", ".join(sorted(arrays)) or "no arrays"
+        raise damaged(path, f" lacks {', '.join(lacking)}", found=found)
     return arrays
 
 
@@ -205,11 +209,7 @@ def read_index(folder: Path, *entries: str) -> dict[str, Any]:
     """Read a folder's index; raise ArtifactError if it is missing, changed or lacks one of the entries."""
     index = copy.deepcopy(_index(Path(folder)))
     if missing := [entry for entry in entries if entry not in index]:
-        raise ArtifactError(
-            f"{folder} was written by a different version of hilsplat",
-            expected=f"{', '.join(missing)} in {INDEX}",
-            fix=rebuild_command(Path(folder)),
-        )
+        raise damaged(folder, OTHER_VERSION, expected=f"{', '.join(missing)} in {INDEX}")
     return index
 
 
@@ -225,9 +225,7 @@ def _index(folder: Path) -> dict[str, Any]:
     try:
         stat = (folder / INDEX).stat()
     except OSError as error:
-        raise ArtifactError(
-            f"{folder} is missing or incomplete: it has no {INDEX}", fix=rebuild_command(folder)
-        ) from error
+        raise damaged(folder, f" is missing or incomplete: it has no {INDEX}") from error
     return _unsealed(folder / INDEX, stat.st_mtime_ns, stat.st_size, stat.st_ino)
 
 
@@ -236,9 +234,7 @@ def _unsealed(path: Path, *_: int) -> dict[str, Any]:
     """Read an index and compare it with its seal; the result is cached until the file changes."""
     index = read_json(path)
     if not isinstance(index, dict) or not isinstance(index.get("views"), dict) or "seal" not in index:
-        raise ArtifactError(
-            f"{path} is not an artifact index of this version of hilsplat", fix=rebuild_command(path)
-        )
+        raise damaged(path, " is not an artifact index of this version of hilsplat")
     if index.pop("seal") != seal_of(index):
         raise _changed(path)
     return index
@@ -249,18 +245,14 @@ def sealed(folder: Path, name: str) -> Path:
     path = Path(folder) / name
     sums = _index(Path(folder))["crc32"]
     if not path.is_file():
-        raise ArtifactError(f"{path} is missing", fix=rebuild_command(path))
+        raise damaged(path, " is missing")
     if sums.get(name) != _crc32_of_file(path):
         raise _changed(path)
     return path
 
 
 def _changed(path: Path) -> ArtifactError:
-    return ArtifactError(
-        f"{path} was changed after it was written",
-        expected=f"a file that matches its checksum in {INDEX}",
-        fix=rebuild_command(path),
-    )
+    return damaged(path, " was changed after it was written", f"a file that matches its checksum in {INDEX}")
 
 
 def seal_of(index: Mapping[str, Any]) -> int:

@@ -311,6 +311,13 @@ def require_made_from(
         )
 
 
+def require_size(what: str, size_hw: tuple[int, ...], expected_hw: tuple[int, ...], fix: str) -> None:
+    """Raise MisalignedArtifactError unless a size (height, width) is as expected; `what` is the problem."""
+    expected, found = (f"{height} x {width} (height x width)" for height, width in (expected_hw, size_hw))
+    if expected != found:
+        raise MisalignedArtifactError(what, expected=expected, found=found, fix=fix)
+
+
 @functools.cache
 def version_of(distribution: str) -> str | None:
     """Return the version of an installed distribution, or None."""

@@ -9,8 +9,7 @@ import numpy as np
 from hilsplat.base.processes import in_order
 from hilsplat.contributions.compositing import visible_mass
 from hilsplat.scene.scene import Scene
-from hilsplat.segment.stage import run_masks, train_views
-from hilsplat.settings import MasksSettings
+from hilsplat.segment.stage import train_views
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 
@@ -20,20 +19,6 @@ MIN_WEIGHT = 1 / 255  # smaller weights of a Gaussian at a pixel are ignored
 
 MIN_VISIBLE_PX = 0.02
 """A Gaussian is visible in a view if its mass there exceeds this (0.3 px if the longer side is 800 px)."""
-
-
-def run_key_masks(
-    scene_folder: Path,
-    gaussians_ply: Path,
-    out: Path,
-    cache: Path,
-    settings: MasksSettings,
-    threads: int,
-    memory_mib: float | None = None,
-) -> None:
-    """Segment only the key views; arguments as in `segment.stage.run_masks`."""
-    views = key_views(Scene.load(scene_folder), gaussians_ply, settings.key_views, threads)
-    run_masks(scene_folder, out, cache, settings, threads, memory_mib, views)
 
 
 def key_views(scene: Scene, gaussians_ply: Path, share: float, threads: int = 1) -> list[str]:

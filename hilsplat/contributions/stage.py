@@ -27,8 +27,8 @@ from hilsplat.base.artifacts import read_index, write_index, write_npz
 from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.cache import ViewCache
 from hilsplat.base.code import code_digest
-from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
-from hilsplat.base.lineage import sha256_of_bytes, sha256_of_file, sha256_of_json
+from hilsplat.base.errors import ArtifactError
+from hilsplat.base.lineage import require_size, sha256_of_bytes, sha256_of_file, sha256_of_json
 from hilsplat.base.memory import MIB, limit_mib, require_memory
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
@@ -145,19 +145,6 @@ def view_key(camera: Camera, masks_sha256: str | None, inputs: dict[str, Any]) -
     return sha256_of_json({**inputs, "masks": masks_sha256, "camera": pose, "view": camera.name})
 
 
-def view_masks(masks_folder: Path, camera: Camera, digests: dict[str, str]) -> HierarchicalMasks:
-    """Read the masks of a view; raise MisalignedArtifactError if their size or digest differs."""
-    masks = load_masks(masks_folder, camera.name, digests)
-    if masks.size_hw != camera.size_hw:
-        raise MisalignedArtifactError(
-            f"the masks of view {camera.name} do not match the size of its camera",
-            expected=f"{camera.size_hw[0]} x {camera.size_hw[1]} (height x width)",
-            found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
-            fix="rerun the masks stage",
-        )
-    return masks
-
-
 def views_at_once(cameras: list[Camera], threads: int) -> int:
     """Return 2 if W of two views fits in memory, because half the work on a view uses one thread, else 1."""
     return min(2, max(1, threads)) if weights_of_view(cameras) <= MAX_WEIGHTS_TOGETHER else 1
@@ -243,7 +230,9 @@ def run_contributions(
     def prepare(number: int) -> tuple[HierarchicalMasks, dict[str, np.ndarray], StackedWeights | None]:
         """Return the masks and matrices of a view, and its rows of W if they are not yet in G."""
         camera = cameras[number]
-        masks = view_masks(masks_folder, camera, digests)
+        masks = load_masks(masks_folder, camera.name, digests)
+        problem = f"the masks of view {camera.name} do not match the size of its camera"
+        require_size(problem, masks.size_hw, camera.size_hw, fix="rerun the masks stage")
 
         @cache_calls
         def weights() -> Any:  # on the device

@@ -7,7 +7,7 @@ stages read, and `<generator>/truth`, which only evaluation and figures read.
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.plugins import Plugins, entry_points
@@ -18,38 +18,22 @@ from hilsplat.scene.sheet import Generated, generated_of
 GENERATORS: Plugins["Generator"] = entry_points("hilsplat.generators")
 
 
-@runtime_checkable  # for the type checker of the tests
-class Truth(Protocol):
-    """Ground truth of a generated scene; the folder has annotations in the format of `datasets.hierarchy`."""
-
-    @property
-    def folder(self) -> Path: ...
-
-    def points(self) -> dict[str, LabelledPoints]:
-        """Return the labelled points for each labelling, in the frame of `cameras`; SceneError if none."""
-
-    def cameras(self) -> Cameras:
-        """Return the true cameras."""
-
-    def consistency(
-        self, selections: Any, truths: Any, masks: Any, settings: Any
-    ) -> Iterator[tuple[str, Any]]:
-        """Yield pairs of a view's name and a row of scores: how well answers agree between views."""
-
-
 @dataclass(frozen=True)
-class Annotations:
-    """Annotations without exact geometry, in the format of `datasets.hierarchy`."""
+class Truth:
+    """Ground truth of a generated scene, in the format of `datasets.hierarchy`, without exact geometry."""
 
     folder: Path
 
     def points(self) -> dict[str, LabelledPoints]:
+        """Return the labelled points for each labelling, in the frame of `cameras`."""
         return {}
 
     def cameras(self) -> Cameras:
+        """Return the true cameras; raise SceneError if they are unknown."""
         raise SceneError(f"{self.folder} has no true cameras", fix="name the scene's source")
 
     def consistency(self, selections: Any, truths: Any, masks: Any, settings: Any) -> Iterator[Any]:
+        """Yield pairs of a view's name and a row of scores: how well answers agree between views."""
         return iter(())
 
 

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Collection
 from pathlib import Path
 
-from hilsplat.base.errors import SceneError, SettingsError
+from hilsplat.base.errors import SceneError, SettingsError, in_one_line
 from hilsplat.base.lineage import files_of
 from hilsplat.datasets.registry import DATASETS, dataset_of, open_labels
 from hilsplat.scene.sheet import DATA_PREFIX
@@ -41,7 +41,7 @@ def absence(source: str, data_root: str) -> str | None:
     try:
         dataset.require(dataset.locate(root), place[1])
     except SceneError as error:
-        return "; ".join(" ".join(line.split()) for line in str(error).splitlines())
+        return in_one_line(error)
     return None
 
 

@@ -12,7 +12,7 @@ from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.cache import ViewCache
 from hilsplat.base.code import code_digest
 from hilsplat.base.errors import MisalignedArtifactError, ModelError
-from hilsplat.base.lineage import sha256_of_bytes, sha256_of_file, sha256_of_json
+from hilsplat.base.lineage import require_size, sha256_of_bytes, sha256_of_file, sha256_of_json
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel, unit
@@ -94,13 +94,8 @@ def run_clip(
                 "code": code_digest(ClipModel),
             }
         )
-        if masks.size_hw != scene.cameras[view].size_hw:
-            raise MisalignedArtifactError(
-                f"masks of view {view} of {scene.name} do not match the size of its camera",
-                expected=f"{scene.cameras[view].size_hw} (height, width)",
-                found=f"{masks.size_hw}",
-                fix=RERUN_MASKS,
-            )
+        problem = f"masks of view {view} of {scene.name} do not match the size of its camera"
+        require_size(problem, masks.size_hw, scene.cameras[view].size_hw, RERUN_MASKS)
         rows = np.arange(len(masks)) if chosen is None else chosen[view]
         entry = view_cache.find(key)
         cached = np.zeros((len(masks), model.width), np.float16)

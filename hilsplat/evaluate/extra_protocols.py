@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hilsplat.base.levels import Level
-from hilsplat.datasets.generators import Annotations, Truth, generator_of
+from hilsplat.datasets.generators import Truth, generator_of
 from hilsplat.datasets.labelled import LabelledScene
 from hilsplat.datasets.points.labelled_points import PointScene
 from hilsplat.datasets.registry import dataset_of, open_labels
@@ -36,7 +36,7 @@ class ExtraProtocols:
         Without a source, only annotated images are scored.
         """
         if not source:
-            return Annotations(truth), ExtraProtocols(level=Level.WHOLE)
+            return Truth(truth), ExtraProtocols(level=Level.WHOLE)
         generator, generated = generator_of(source)
         protocols = generator.kinds[generated.kind].protocols
         return generator.open(truth, generated.kind), ExtraProtocols.of(protocols, Level.WHOLE)

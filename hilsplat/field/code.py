@@ -1,6 +1,6 @@
 """The scene's code, which maps CLIP vectors to a few numbers and back, and the language field of codes."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int64
 
 from hilsplat.base.arrays import build_checked, read_tensors, require_types, write_tensors
-from hilsplat.base.artifacts import read_npz, rebuild_command, sealed
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.artifacts import damaged, read_npz, sealed
 from hilsplat.contributions.rows import Contributions
-from hilsplat.field.decoder import PackedLayers
+from hilsplat.field.decoder_kernels import UNITS, through_layers
 from hilsplat.segment.digests import require_same_masks
 
 CHUNK_ROWS = 4096  # rows decoded at once: 4096 vectors of 128 numbers (2 MiB) fit in the processor's cache
@@ -103,6 +102,41 @@ def unit_rows(rows: Float[np.ndarray, "B C"]) -> Float[np.ndarray, "B C"]:
     return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
 
 
+class PackedLayers(NamedTuple):
+    """Dense layers with ReLUs between them, in the memory layout that the compiled loops need.
+
+    Such a network is affine where no ReLU changes sign. Pixels of an object have similar latents, so most
+    pixels of a view share a few hundred of these affine pieces. A piece is given by the network's value and
+    derivatives at one latent, its anchor. It contains all latents for which every hidden unit has the sign
+    that it has at the anchor, and decodes them exactly in a tenth of the network's time.
+
+    The values of `ROWS` rows fit in the L2 cache. Rows are SIMD lanes, and as many outputs are summed
+    together as fit in the registers.
+    """
+
+    widths: Int64[np.ndarray, " L_plus_1"]  # number of inputs, then number of each layer's outputs
+    weights: Float32[np.ndarray, " W"]
+    biases: Float32[np.ndarray, " V"]
+
+    @staticmethod
+    def of(layers: Sequence[tuple[np.ndarray, np.ndarray]]) -> "PackedLayers":
+        """Pack weights (outputs, inputs) and biases (outputs) of each layer."""
+        widths = [layers[0][0].shape[1], *(len(bias) for _, bias in layers)]
+        weights, biases = [], []
+        for weight, bias in layers:
+            missing = -len(bias) % UNITS
+            weights.append(np.pad(weight, ((0, missing), (0, 0))).reshape(-1))
+            biases.append(np.pad(bias, (0, missing)))
+        flat_weights, flat_biases = (np.concatenate(parts).astype(np.float32) for parts in (weights, biases))
+        return PackedLayers(np.array(widths), flat_weights, flat_biases)
+
+    def through(self, rows: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B C"]:
+        """Return the last layer's outputs, scaled to unit length; other rows affect only the rounding."""
+        out = np.empty((len(rows), self.widths[-1]), np.float32)
+        through_layers(np.ascontiguousarray(rows, np.float32), *self, out)
+        return out
+
+
 class Autoencoder:
     """LangSplat's scene autoencoder, C -> 256 -> 128 -> 64 -> 32 -> d and back, unit length at both ends.
 
@@ -177,9 +211,7 @@ def load_code(folder: Path) -> Code:
             model.arrays[name] = state[name]
         return model
     except (KeyError, ValueError) as error:
-        raise ArtifactError(
-            f"{path} is from a different version: {error}", fix=rebuild_command(path)
-        ) from error
+        raise damaged(path, f" is from a different version: {error}") from error
 
 
 def autoencoder_file(folder: Path) -> Path:

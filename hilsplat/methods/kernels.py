@@ -11,23 +11,6 @@ from cpusplat.lanes import load_quad, plus, quad, signs_of_difference, store
 WIDTH = 4
 
 
-@compiled(inline="always")
-def _row_sum(begin, end, indices, data, features, wide, channel):
-    total = quad(np.float32(0))
-    for k in range(begin, end):
-        total = plus(total, quad(data[k]), load_quad(features, np.int64(indices[k]) * wide + channel))
-    return total
-
-
-@compiled
-def rendered_rows(indptr, indices, data, features, wide, out):
-    """Write the product of a CSR matrix and features; arguments are as in `rendered_gradient`."""
-    for row in range(len(indptr) - 1):
-        begin, end = np.uint64(indptr[row]), np.uint64(indptr[row + 1])
-        for c in range(0, wide, WIDTH):
-            store(out, row * wide + c, _row_sum(begin, end, indices, data, features, wide, c))
-
-
 @compiled
 def rendered_gradient(
     indptr, indices, data, labels, codes, share, attraction, offsets, wide, features, gradient
@@ -54,7 +37,9 @@ def rendered_gradient(
             continue
         begin, end = np.uint64(indptr[p]), np.uint64(indptr[p + 1])  # unsigned: skips negative-index checks
         for c in range(0, wide, WIDTH):
-            total = _row_sum(begin, end, indices, data, features, wide, c)
+            total = quad(np.float32(0))
+            for k in range(begin, end):
+                total = plus(total, quad(data[k]), load_quad(features, np.int64(indices[k]) * wide + c))
             row = np.int64(labels[p]) * wide + c
             pull = signs_of_difference(total, load_quad(codes, row), share)
             if len(offsets):

@@ -32,7 +32,7 @@ from hilsplat.baselines import HiLSplatSettings, TrainedSettings
 from hilsplat.contributions.view_matrices import painted_indicator, random_half
 from hilsplat.field.adam import Adam, in_random_order
 from hilsplat.field.contrast import ViewRelations, instance_term, part_term, read_parents, view_relations
-from hilsplat.methods.kernels import WIDTH, rendered_gradient, rendered_rows
+from hilsplat.methods.kernels import WIDTH, rendered_gradient
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 
 
@@ -114,9 +114,7 @@ class HierarchyTerms:
         """
         settings, view = self.settings, self.views[number]
         relations, latents = [view.relations[level.index]], view.latents
-        rows, wide = view.sums, features.shape[2]
-        rendered = np.empty((rows.shape[0], wide), np.float32)
-        rendered_rows(rows.indptr, rows.indices, rows.data, features.reshape(-1), wide, rendered.reshape(-1))
+        rendered = view.sums @ features.reshape(-1, features.shape[2])
         halves = rendered[:, : latents.shape[1]].astype(np.float64).reshape(len(view.pixels), 2, -1)
         by_pixel = 1 / np.maximum(view.pixels, 1)[:, :, None]
         by_mask = 1 / np.maximum(view.pixels.sum(axis=1), 1)[:, None]

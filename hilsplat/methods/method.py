@@ -28,7 +28,6 @@ from hilsplat.field.code import LanguageField, LinearCode, autoencoder_file, loa
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import digests_in, load_masks
-from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
@@ -66,13 +65,12 @@ class MethodInputs:
         weights = pixel_weights(gaussians, scene.cameras[view], min_weight=least, threads=threads, step=step)
         return normalised_weights(weights)
 
-    def view_masks(self, view: str) -> HierarchicalMasks:
-        """Return the masks of a view, checked to match the contributions."""
-        return load_masks(self.masks_folder, view, digests_in(self.contributions_folder))
-
     def view_labels(self, view: str) -> Int32[np.ndarray, "P 3"]:
-        """Return the row of the view's painted mask at each pixel and level, -1 for none."""
-        return label_maps(self.view_masks(view))
+        """Return the row of the view's painted mask at each pixel and level, -1 for none.
+
+        The masks are checked to match the contributions.
+        """
+        return label_maps(load_masks(self.masks_folder, view, digests_in(self.contributions_folder)))
 
     def view_camera(self, view: str) -> Camera:
         return self._loaded[1].cameras[view]

@@ -8,8 +8,7 @@ import itertools
 from collections.abc import Mapping
 from pathlib import Path
 
-from hilsplat.base.artifacts import INDEX, read_index, rebuild_command
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.artifacts import INDEX, OTHER_VERSION, damaged, read_index, rebuild_command
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.lineage import require_made_from, sha256_of_bytes
 from hilsplat.segment.masks import HierarchicalMasks
@@ -46,12 +45,8 @@ def digests_in(folder: Path) -> dict[str, str]:
     for view, entry in read_index(folder, "views")["views"].items():
         digest = entry.get(MASKS_SHA256) if isinstance(entry, dict) else None
         if not isinstance(digest, str):
-            raise ArtifactError(
-                f"{folder} was written by a different version of hilsplat",
-                expected=f"{MASKS_SHA256} of every view in {INDEX}",
-                found=f"none for view {view}",
-                fix=rebuild_command(folder),
-            )
+            expected = f"{MASKS_SHA256} of every view in {INDEX}"
+            raise damaged(folder, OTHER_VERSION, expected, found=f"none for view {view}")
         digests[view] = digest
     return digests
 

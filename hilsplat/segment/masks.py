@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32, Int64, UInt8, UInt32
 
-from hilsplat.base.arrays import build_checked, require_types
-from hilsplat.base.artifacts import read_npz, rebuild_command, write_npz
-from hilsplat.base.errors import ArtifactError, EmptyMaskError
+from hilsplat.base.arrays import build_checked, impossible, require_types
+from hilsplat.base.artifacts import read_npz, write_npz
+from hilsplat.base.errors import EmptyMaskError
 from hilsplat.base.levels import NONE, Level
 from hilsplat.segment.kernels import areas_and_boxes, paint_runs, shared_pixels
 
@@ -216,7 +216,7 @@ class HierarchicalMasks:
         size = arrays.pop("size_hw")
         is_size = size.shape == (2,) and size.dtype.kind in "iu"
         if not is_size or size.min() < 1 or size.max() > MAX_SIDE_PX:
-            raise _damaged(path, "size_hw", f"two sides from 1 to {MAX_SIDE_PX} px", str(size.tolist()))
+            raise impossible(path, "size_hw", f"two sides from 1 to {MAX_SIDE_PX} px", str(size.tolist()))
         masks = build_checked(HierarchicalMasks, arrays, {"size_hw": tuple(size.tolist())}, path, LIMITS)
         masks._require_whole(path)
         return masks
@@ -226,23 +226,20 @@ class HierarchicalMasks:
         lengths, ends = np.diff(self.offsets), self.offsets[[0, -1]].tolist() if len(self.offsets) else []
         if len(self.offsets) != len(self) + 1 or ends != [0, len(self.runs)] or (lengths <= 0).any():
             offsets = f"{len(self.offsets)} from {ends}, smallest step {lengths.min(initial=0)}"
-            raise _damaged(path, "offsets", f"{len(self) + 1} ascending from 0 to {len(self.runs)}", offsets)
+            raise impossible(
+                path, "offsets", f"{len(self) + 1} ascending from 0 to {len(self.runs)}", offsets
+            )
         height, width = self.size_hw
         if len(self):
             pixels = np.add.reduceat(self.runs.astype(np.int64), self.offsets[:-1])
             if (pixels != height * width).any():
                 wrong = f"{pixels[pixels != height * width][0]} in one mask"
-                raise _damaged(path, "runs", f"{height * width} pixels per mask", wrong)
+                raise impossible(path, "runs", f"{height * width} pixels per mask", wrong)
         area_px, boxes = areas_and_boxes(self.runs, self.offsets, width)
         if not (area_px > 0).all() or not np.array_equal(area_px, self.area_px):
-            raise _damaged(path, "area_px", "the areas of the masks")
+            raise impossible(path, "area_px", "the areas of the masks")
         if not np.array_equal(boxes, self.box_xyxy):
-            raise _damaged(path, "box_xyxy", "the boxes of the masks")
-
-
-def _damaged(path: Path, name: str, expected: str, found: str | None = None) -> ArtifactError:
-    problem = f"{path}: array {name} contains an impossible value"
-    return ArtifactError(problem, expected=expected, found=found, fix=rebuild_command(path))
+            raise impossible(path, "box_xyxy", "the boxes of the masks")
 
 
 def region_ious(

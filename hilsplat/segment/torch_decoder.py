@@ -22,31 +22,16 @@ from hilsplat.segment.decoder_weights import Attention, Linear, Norm
 from hilsplat.segment.factored_decoder import HEADS_PER_ATTENTION, FactoredDecoder, ImageTerms, single
 
 
-class TorchLinear(Linear):
-    """A `Linear` of tensors."""
-
-    def __call__(self, x: Any) -> Any:
-        return F.linear(x, self.weight, self.bias)
-
-
-class TorchNorm(Norm):
-    """A `Norm` of tensors."""
-
-    def __call__(self, x: Any) -> Any:
-        return F.layer_norm(x, self.scale.shape, self.scale, self.shift, self.eps)
-
-
 def on_device(value: Any, device: torch.device) -> Any:
     """Return a copy of weights with tensors in place of arrays; other values are returned unchanged."""
     if isinstance(value, np.ndarray):
         return torch.from_numpy(np.array(value)).to(device)
     if isinstance(value, list):
         return [on_device(each, device) for each in value]
-    kind = {Linear: TorchLinear, Norm: TorchNorm, Attention: Attention, Upscaling: Upscaling}.get(type(value))
-    if kind is None:
+    if not isinstance(value, Linear | Norm | Attention | Upscaling):
         return value
-    names = kind._fields if kind is Upscaling else [each.name for each in fields(kind)]
-    return kind(*(on_device(getattr(value, name), device) for name in names))
+    names = value._fields if isinstance(value, Upscaling) else [each.name for each in fields(value)]
+    return type(value)(*(on_device(getattr(value, name), device) for name in names))
 
 
 class TorchDecoder(FactoredDecoder):

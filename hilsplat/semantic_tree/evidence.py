@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from jaxtyping import Float, Float64, Int32, Int64
 
 from cpusplat.threads import over_ranges
-from hilsplat.semantic_tree.kernels import drop_small, seen_sizes, shared_pairs
+from hilsplat.semantic_tree.kernels import seen_sizes, shared_pairs
 from hilsplat.semantic_tree.view_pairs import ViewPairs
 
 
@@ -96,5 +96,5 @@ def mask_evidence(
     least = min_covisible * full
     rest = partners, sizes, least, pairs.min_iou
     blocks = over_ranges(shared_pairs, num_views, threads, masks, *rest)
-    drop_small(row_start, least, sizes)
+    sizes[sizes < np.repeat(least, np.diff(row_start))] = 0.0
     return Evidence(tuple(MaskPairs(*block) for block in blocks), row_start, size_views, sizes, view)

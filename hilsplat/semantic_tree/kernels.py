@@ -103,15 +103,6 @@ def seen_sizes(begin, end, masks, visible, pairs, out, out_views, full):
 
 
 @compiled
-def drop_small(row_start, least, sizes):
-    """Set sizes below each mask's least to zero."""
-    for a in range(len(least)):
-        for k in range(row_start[a], row_start[a + 1]):
-            if sizes[k] < least[a]:
-                sizes[k] = 0.0
-
-
-@compiled
 def _more_pairs(firsts, seconds, sums, kept, room):
     """Return larger copies of three arrays with their first `kept` entries."""
     more = np.empty(room, np.int32)
@@ -194,14 +185,6 @@ def shared_pairs(begin, end, masks, pairs, seen, least, min_iou):
             places[from_a[k] - starts[u]] += 1
         done += count
     return firsts[:done], seconds[:done], out_sums[:done]  # untouched pages beyond take no memory
-
-
-@compiled
-def count_neighbours(firsts, seconds, counts):
-    """Add each mask's number of neighbours among these pairs."""
-    for k in range(len(firsts)):
-        counts[firsts[k]] += 1
-        counts[seconds[k]] += 1
 
 
 @compiled

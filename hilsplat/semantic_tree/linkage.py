@@ -10,25 +10,22 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from hilsplat.semantic_tree.evidence import Evidence
-from hilsplat.semantic_tree.kernels import add_neighbours, count_neighbours, link
+from hilsplat.semantic_tree.kernels import add_neighbours, link
 
 Linkage = tuple[Int64[np.ndarray, " M"], Float[np.ndarray, " K"]]
 """Cluster of each mask, numbered by first appearance, and each cluster's pooled IoU over its own pairs (0 for
 one mask)."""
 
 
-def pooled_linkage(evidence: Evidence, threshold: float) -> Linkage:
-    """Join clusters while the best pair's pooled IoU is at least the threshold.
+def pooled_linkage(evidence: Evidence, threshold: float) -> Callable[[], Linkage]:
+    """Return a function that joins clusters while the best pair's pooled IoU is at least the threshold.
+
+    The function can be called once, and doesn't keep the evidence's pairs.
 
     The IoU of two clusters is the sum of intersections divided by the sum of unions, over all pairs of a mask
     of one and a mask of the other. Pooling is reducible (joining never creates a better pair). On a tie, the
     pair with the lowest rows is joined.
     """
-    return prepared_linkage(evidence, threshold)()
-
-
-def prepared_linkage(evidence: Evidence, threshold: float) -> Callable[[], Linkage]:
-    """Return `pooled_linkage` as a function that can be called once and doesn't keep the evidence's pairs."""
     num, starts, first = len(evidence.view), evidence.size_indptr, np.arange(len(evidence.view))
     linked = [np.flatnonzero(block.sums[:, 2] >= threshold) for block in evidence.pairs]
     of_linked = zip(evidence.pairs, linked, strict=True)
@@ -41,7 +38,7 @@ def prepared_linkage(evidence: Evidence, threshold: float) -> Callable[[], Linka
     members = first.copy(), first + 1, evidence.view.copy(), np.ones(num), *spare
     counts = np.zeros(num, np.int64)
     for block in evidence.pairs:
-        count_neighbours(block.firsts, block.seconds, counts)
+        counts += np.bincount(block.firsts, minlength=num) + np.bincount(block.seconds, minlength=num)
     stop = np.cumsum(counts) - counts
     start = stop.copy()
     # NumPy's large arrays have huge pages, which compiled code's don't; short runs are read in random order.

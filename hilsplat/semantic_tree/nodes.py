@@ -14,7 +14,7 @@ from hilsplat.base.memory import MIB, limit_mib, require_memory
 from hilsplat.contributions.compositing import column_sums
 from hilsplat.semantic_tree.evidence import Evidence, mask_evidence
 from hilsplat.semantic_tree.kernels import add_views, divide_by_unions
-from hilsplat.semantic_tree.linkage import prepared_linkage
+from hilsplat.semantic_tree.linkage import pooled_linkage
 from hilsplat.semantic_tree.view_pairs import ViewPairs, view_pairs
 from hilsplat.settings import SemanticTreeSettings
 
@@ -164,7 +164,7 @@ def linked_nodes(
             wait(() if meanwhile else linked)
             found = evidence(rows)
             wait(linked)
-            linked.append(linker.submit(prepared_linkage(found, settings.link_threshold)))
+            linked.append(linker.submit(pooled_linkage(found, settings.link_threshold)))
             del found
         wait(linked if threads == 1 else ())
         for rows, clusters in zip(rows_of_levels, linked, strict=True):

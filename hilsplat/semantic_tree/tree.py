@@ -8,8 +8,8 @@ import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float32, Int32, Int64, UInt8
 
 from hilsplat.base.arrays import build_checked
-from hilsplat.base.artifacts import read_index, read_npz, rebuild_command, sealed
-from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
+from hilsplat.base.artifacts import damaged, read_index, read_npz, rebuild_command, sealed
+from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.embed.vectors import mask_embeddings
 from hilsplat.semantic_tree.kernels import blend_nodes, mask_of_nodes, summed_by_node
@@ -105,17 +105,11 @@ class SemanticTree:
         rows |= {"node_of_mask": self.node_of_mask, "linked_node": self.linked_node}
         for name, values in rows.items():
             if values.size and (values.min() < NONE or values.max() > last):
-                raise ArtifactError(
-                    f"{path}: array {name} refers to nodes that do not exist",
-                    expected=f"-1 to {last}",
-                    found=f"{values.min()} to {values.max()}",
-                    fix=rebuild_command(path),
-                )
+                problem, found = "refers to nodes that do not exist", f"{values.min()} to {values.max()}"
+                raise damaged(path, f": array {name} {problem}", expected=f"-1 to {last}", found=found)
         child = self.parent != NONE
         if (self.level[self.parent[child]] >= self.level[child]).any():
-            raise ArtifactError(
-                f"{path}: a node's parent is not at a coarser level", fix=rebuild_command(path)
-            )
+            raise damaged(path, ": a node's parent is not at a coarser level")
 
     def nodes_of(self, level: Level) -> Int64[np.ndarray, " t"]:
         return np.flatnonzero(self.level == int(level))

@@ -1,6 +1,5 @@
 """State that a fit changes, and one optimiser step: on the CPU here, and on a card in `torch_model`."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -59,10 +58,11 @@ class StepOptions(NamedTuple):
     is_watched: bool  # whether to sum screen-space gradients
 
 
-class Model(ABC):
+class Model:
     """Gaussians under optimisation: their parameters, Adam's moments, and sums of screen-space gradients.
 
-    Arrays are on the model's device. Methods take and return NumPy arrays; `read` without rows and
+    Arrays are NumPy arrays, updated in place; results are byte-identical for any number of threads.
+    `TorchModel` keeps them on a card. Methods take and return NumPy arrays; `read` without rows and
     `as_gaussians` may share memory with the model.
     """
 
@@ -77,34 +77,13 @@ class Model(ABC):
     def __len__(self) -> int:
         return len(self.parameters["means"])
 
-    @abstractmethod
     def array(self, values: np.ndarray) -> Any:
         """Return an array on the model's device."""
+        return values
 
-    @abstractmethod
     def host(self, array: Any) -> np.ndarray:
         """Return an array of the model's device in NumPy."""
-
-    @abstractmethod
-    def step(
-        self, view: TrainingView, settings: GaussiansSettings, extent: float, options: StepOptions
-    ) -> Scores:
-        """Take one step of Adam on one view; `extent` is the radius of the cameras, in scene units.
-
-        Raises:
-            HilsplatError: if some Gaussians cannot be drawn; a card may report them when scores are read.
-        """
-
-    @abstractmethod
-    def add_noise(
-        self, settings: GaussiansSettings, rate: float, extent: float, generator: np.random.Generator
-    ) -> None:
-        """Move the means of transparent Gaussians randomly along their own axes (SGLD; MCMC's paper, Eq. 8).
-
-        The step is noise weight x rate of the means x gate x covariance x normal numbers, limited to the
-        extent. The paper assumes scenes of extent 1; here the covariance and `rate` are in units of the
-        extent, so that the result does not depend on the scene's unit.
-        """
+        return np.asarray(array)
 
     def read(self, name: str, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
         """Return some rows (indices) of a parameter."""
@@ -170,19 +149,14 @@ class Model(ABC):
     def _on_device(self, rows: np.ndarray | slice) -> Any:
         return rows if isinstance(rows, slice) else self.array(rows)
 
-
-class CpuModel(Model):
-    """Model in NumPy, updated in place; results are byte-identical for any number of threads."""
-
-    def array(self, values: np.ndarray) -> np.ndarray:
-        return values
-
-    def host(self, array: np.ndarray) -> np.ndarray:
-        return array
-
     def step(
         self, view: TrainingView, settings: GaussiansSettings, extent: float, options: StepOptions
     ) -> Scores:
+        """Take one step of Adam on one view; `extent` is the radius of the cameras, in scene units.
+
+        Raises:
+            HilsplatError: if some Gaussians cannot be drawn; a card may report them when scores are read.
+        """
         degree, background, rate, is_watched = options
         drawing = draw(self.as_gaussians(), view.camera, degree, threads=self.threads)
         image, grad_alpha = drawing.image, np.zeros_like(drawing.alpha)
@@ -233,6 +207,12 @@ class CpuModel(Model):
     def add_noise(
         self, settings: GaussiansSettings, rate: float, extent: float, generator: np.random.Generator
     ) -> None:
+        """Move the means of transparent Gaussians randomly along their own axes (SGLD; MCMC's paper, Eq. 8).
+
+        The step is noise weight x rate of the means x gate x covariance x normal numbers, limited to the
+        extent. The paper assumes scenes of extent 1; here the covariance and `rate` are in units of the
+        extent, so that the result does not depend on the scene's unit.
+        """
         p = self.parameters
         normal = generator.standard_normal(p["means"].shape, dtype=np.float32)
         arrays = (p["means"], p["log_scales"], p["quats"], p["opacity_logits"], normal)
@@ -243,7 +223,7 @@ class CpuModel(Model):
 def model_on(device: Device) -> type[Model]:
     """Return the class of models on a device; only that for `cuda` imports torch."""
     if device == "cpu":
-        return CpuModel
+        return Model
     from hilsplat.splat.torch_model import TorchModel
 
     return TorchModel

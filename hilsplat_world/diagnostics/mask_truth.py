@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Int, Int64
 from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
@@ -22,7 +22,7 @@ from hilsplat.segment.origin import masks_label
 from hilsplat.segment.pictures import paint_level
 from hilsplat_world.diagnostics.world_consistency import load_masks
 
-MIN_PX = 100  # smaller ground-truth regions are not scored
+MIN_PX = 100  # smaller ground-truth regions are not scored, because their IoU is not informative
 FIT_IOU = 0.5
 COLUMNS = ("scene", "masks", "level", "views", "regions", "best_iou", "recall", "masks_a_view", "precision")
 COLOURS = "RdYlGn"
@@ -38,17 +38,14 @@ class ViewFit:
     fitting: int  # number of masks with an IoU of at least 0.5 with a region of any size
 
 
-def fit_of_view(masks: HierarchicalMasks, truth: HierarchyAnnotations, view: str) -> dict[Level, ViewFit]:
-    """Compare masks with the ground-truth regions, level by level."""
-    fits = {}
-    for level in LEVELS:
-        labels, rows = truth.label_image(view, level), masks.rows_of(level)
-        ids, areas, ious = region_ious(labels, masks.dense(rows))
-        scored = areas >= MIN_PX
-        best = ious[scored].max(axis=1, initial=0)
-        fitting = int((ious.max(axis=0, initial=0) >= FIT_IOU).sum())
-        fits[level] = ViewFit(ids[scored], best, len(rows), fitting)
-    return fits
+def fit_of_level(masks: HierarchicalMasks, level: Level, labels: Int[np.ndarray, "H W"]) -> ViewFit:
+    """Compare a view's masks of a level with the ground-truth regions, the node of each pixel."""
+    rows = masks.rows_of(level)
+    ids, areas, ious = region_ious(labels, masks.dense(rows))
+    scored = areas >= MIN_PX
+    best = ious[scored].max(axis=1, initial=0)
+    fitting = int((ious.max(axis=0, initial=0) >= FIT_IOU).sum())
+    return ViewFit(ids[scored], best, len(rows), fitting)
 
 
 def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, out: Path) -> str:
@@ -63,8 +60,9 @@ def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, o
     with stage_log("mask_truth", scene.name) as counts:
         fits = {}
         for view in track(list(read_index(masks_folder)["views"]), "views compared"):
-            masks = load_masks(masks_folder, view, truth.label_image(view, Level.WHOLE).shape)
-            fits[view] = fit_of_view(masks, truth, view)
+            labels = {level: truth.label_image(view, level) for level in LEVELS}
+            masks = load_masks(masks_folder, view, labels[Level.WHOLE].shape)
+            fits[view] = {level: fit_of_level(masks, level, labels[level]) for level in LEVELS}
         counts["views"] = len(fits)
         rows = []
         for level in LEVELS:  # means are over regions, not over views

@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
 
 from hilsplat.base.artifacts import read_index
-from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
+from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS, NONE, Level
+from hilsplat.base.lineage import require_size
 from hilsplat.base.tables import markdown_table, write_csv
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
 from hilsplat.evaluate.metrics.masks import iou, iou_matrix
@@ -194,13 +195,9 @@ def neighbours(cameras: Cameras, views: Sequence[str], count: int) -> list[tuple
 def load_masks(folder: Path, view: str, size_hw: tuple[int, int]) -> HierarchicalMasks:
     """Load the masks of a view; raise MisalignedArtifactError if its labels have a different size."""
     masks = HierarchicalMasks.load(Path(folder) / f"{view}.npz")
-    if masks.size_hw != tuple(size_hw):
-        raise MisalignedArtifactError(
-            f"the masks of view {view} do not match the size of its ground truth",
-            expected=f"{size_hw[0]} x {size_hw[1]} (height x width)",
-            found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
-            fix="rerun poses without shrinking the images (poses.max_side_px), then rerun masks",
-        )
+    problem = f"the masks of view {view} do not match the size of its ground truth"
+    fix = "rerun poses without shrinking the images (poses.max_side_px), then rerun masks"
+    require_size(problem, masks.size_hw, size_hw, fix)
     return masks
 
 

@@ -11,11 +11,12 @@ from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.lineage import sha256_of_file
 from hilsplat.base.tables import markdown_table
+from hilsplat_world.diagnostics.mask_truth import MIN_PX
 from models.training.clip import CROP_PX, DIMENSIONS
 from models.training.data import LabelledViews, nested_targets
 from models.training.loop import Curve
 from models.training.measure_clip import COMMON
-from models.training.measure_sam import MIN_PX, SIZES, predict_masks
+from models.training.measure_sam import SIZES, predict_masks
 from models.training.sam import FRAME_PX, MASK_STRIDE, SamDecoder, SamEncoder
 
 RECORD = "training.json"

@@ -10,11 +10,12 @@ from torch import Tensor
 
 from hilsplat.base.levels import LEVELS
 from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat_world.diagnostics.mask_truth import MIN_PX
 from hilsplat_world.paints import COLOURS
 from models.training.clip import CANONICAL, Clip
 from models.training.crops import CropTable, list_segmented
 from models.training.data import LabelledViews, normalised
-from models.training.measure_sam import MIN_PX, mean_or_zero
+from models.training.measure_sam import mean_or_zero
 
 CHUNK = 256  # crops embedded at once
 COMMON = 20  # number of most common texts of each level in the smaller set of competing texts

@@ -14,13 +14,13 @@ from hilsplat.base.lineage import sha256_of_bytes
 from hilsplat.base.processes import in_processes
 from hilsplat.base.progress import track
 from hilsplat.segment.generate import decode_candidates, masks_from_candidates
-from hilsplat.segment.masks import HierarchicalMasks, region_ious
+from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.sam import SamModel
 from hilsplat.settings import MasksSettings
+from hilsplat_world.diagnostics.mask_truth import FIT_IOU, MIN_PX, fit_of_level
 from models.training.data import LabelledViews, normalised
 from models.training.sam import HEADS, MASK_STRIDE, STRIDE, SamDecoder, SamEncoder, positional_embeddings
 
-MIN_PX = 100  # minimum area of a scored region, because the IoU of a few pixels is not informative
 # area classes of regions, px: inclusive minimum, exclusive maximum
 SIZES = {"small": (0, 400), "medium": (400, 1600), "large": (1600, np.inf)}
 PER_LEVEL = 8  # maximum number of regions scored per view and level
@@ -160,22 +160,15 @@ def measure_everything(masks: list[HierarchicalMasks], views: LabelledViews) -> 
     """
     report = {}
     for level in LEVELS:
-        best: list[float] = []
-        fits = count = 0
-        for view, of_view in enumerate(masks):
-            rows = of_view.rows_of(level)
-            _, areas, iou = region_ious(views.labels[view][level.index], of_view.dense(rows))
-            scored = areas >= MIN_PX
-            best += (iou[scored].max(axis=1) if len(rows) else np.zeros(int(scored.sum()))).tolist()
-            if len(iou):
-                fits += int((iou.max(axis=0) >= 0.5).sum())
-            count += len(rows)
-        values = np.array(best)
+        labels = views.labels[:, level.index]
+        fits = [fit_of_level(of_view, level, labels[view]) for view, of_view in enumerate(masks)]
+        best = np.concatenate([np.zeros(0), *(fit.best for fit in fits)])
+        count = sum(fit.masks for fit in fits)
         report[level.label] = {
-            "recall": mean_or_zero(values >= 0.5),
-            "iou": mean_or_zero(values),
+            "recall": mean_or_zero(best >= FIT_IOU),
+            "iou": mean_or_zero(best),
             "masks": count / max(1, len(masks)),
-            "precision": fits / max(1, count),
-            "n": len(values),
+            "precision": sum(fit.fitting for fit in fits) / max(1, count),
+            "n": len(best),
         }
     return report

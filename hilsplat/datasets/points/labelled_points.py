@@ -3,24 +3,24 @@
 Each reader raises SceneError if its file is missing or damaged.
 """
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int32
-from plyfile import PlyParseError
 
-from hilsplat.base.errors import SceneError
+from hilsplat.base.errors import SceneError, foreign
 from hilsplat.datasets.dataset import SceneReport, listing
 from hilsplat.scene import layouts
 from hilsplat.scene.importers.ply_file import read_ply
 from hilsplat.scene.posed_images import PosedImage, rigid_pose
 
 UNPACK_AGAIN = "unpack or download the file again; this copy is damaged or incomplete"
+
+decoding = partial(foreign, fix=UNPACK_AGAIN)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,16 +54,6 @@ class PointScene:
         return SceneReport(facts, self.warnings)
 
 
-@contextmanager
-def decoding(where: object, expected: str | None = None, fix: str = UNPACK_AGAIN) -> Iterator[None]:
-    """Raise SceneError with the reason if the block cannot decode the data described by `where`."""
-    try:
-        yield
-    except (ValueError, KeyError, IndexError, TypeError, OSError, PlyParseError) as error:
-        reason = repr(error) if isinstance(error, KeyError) else error
-        raise SceneError(f"{where} cannot be read: {reason}", expected=expected, fix=fix) from error
-
-
 def require_file(path: Path, fix: str = UNPACK_AGAIN) -> Path:
     """Return the path of a file that must exist; the error lists what its folder contains."""
     if not path.is_file():
@@ -87,7 +77,7 @@ def read_json_object(path: Path, keys: tuple[str, ...]) -> dict[str, Any]:
 def read_matrices(path: Path, columns: int) -> Float64[np.ndarray, "M 4 4"]:
     """Read a text file: lines of 16 numbers, or one matrix as 4 lines of 4 (inf and nan are allowed)."""
     expected = f"{columns} numbers per line" + (", 4 lines" if columns == 4 else "")
-    with decoding(require_file(path), expected):
+    with decoding(require_file(path), expected=expected):
         rows = np.loadtxt(path, comments=None, encoding="utf-8", ndmin=2)
         if rows.shape[1] != columns or (columns == 4 and len(rows) != 4):
             raise ValueError(f"{rows.shape[0]} lines of {rows.shape[1]} numbers")
@@ -110,7 +100,7 @@ class PlyMesh:
 
     def __init__(self, path: Path, corners: int, fix: str = UNPACK_AGAIN) -> None:
         self.path, self.fix = require_file(path, fix), fix
-        with decoding(path, f"a PLY mesh with {corners} corners per face", fix):
+        with foreign(path, expected=f"a PLY mesh with {corners} corners per face", fix=fix):
             self._content = read_ply(path, corners)
             for element in ("vertex", "face"):
                 self._content[element]  # raises KeyError if the element is missing

@@ -63,7 +63,7 @@ def find_sequence(root: Path, scene: str) -> tuple[Path, tuple[str, str, str]]:
 def read_lens(path: Path) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
     """Return K and the image size from `cam_params.json`, which is beside a NICE-SLAM sequence."""
     camera = read_json_object(path, ("camera",))["camera"]
-    with decoding(path, "numbers w, h, fx, fy, cx, cy under the key camera"):
+    with decoding(path, expected="numbers w, h, fx, fy, cx, cy under the key camera"):
         fx, fy, cx, cy = (float(camera[key]) for key in ("fx", "fy", "cx", "cy"))
         size_hw = int(camera["h"]), int(camera["w"])
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]) + HALF_PIXEL, size_hw
@@ -112,7 +112,7 @@ def class_of_objects(path: Path) -> Int32[np.ndarray, " O"]:
     Names and ids must be those of the release.
     """
     content = read_json_object(path, ("classes", "id_to_label"))
-    with decoding(path, "id_to_label: a list of class ids; classes: objects with id and name"):
+    with decoding(path, expected="id_to_label: a list of class ids; classes: objects with id and name"):
         classes = np.asarray(content["id_to_label"], dtype=np.int32).reshape(-1)
         names = {int(entry["id"]): str(entry["name"]) for entry in content["classes"]}
     other = [f"{number} {name}" for number, name in names.items() if REPLICA_NAMES.get(number) != name]

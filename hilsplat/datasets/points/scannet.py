@@ -181,7 +181,7 @@ def _from_aggregation(
     fine, instance = np.zeros((2, num_points), dtype=np.int32)
     unknown = Counter[str]()
     for row, group in enumerate(read_json_object(path, ("segGroups",))["segGroups"]):
-        with decoding(f"{path}, group {row}", "objectId, label and a list of segments"):
+        with decoding(f"{path}, group {row}", expected="objectId, label and a list of segments"):
             category, number = str(group["label"]), int(group["objectId"]) + 1
             members = np.asarray(group["segments"], dtype=np.int64)
         rows = np.isin(segments, members)

@@ -134,7 +134,7 @@ def _range_images(
             images.append(None)
             continue
         shape = tuple(int(size) for size in sizes)
-        with decoding(f"segment {segment}, frame {time}: {name}", f"height x width x {depth}"):
+        with decoding(f"segment {segment}, frame {time}: {name}", expected=f"height x width x {depth}"):
             height, width, _ = shape
             images.append(values.reshape(height, width, depth))
     return images

@@ -8,13 +8,11 @@ SceneError if the file is missing, damaged or truncated.
 import struct
 import zlib
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-from google.protobuf.message import DecodeError
 from jaxtyping import Float
 
 from hilsplat.base.errors import SceneError
@@ -116,24 +114,15 @@ def frames(path: Path) -> Iterator[tuple[str, Any]]:
     """Yield the location of each frame, for messages, and the frame itself."""
     for number, record in enumerate(records(path)):
         where = f"{path}, frame {number}"
-        with _readable(where):
+        with decoding(where):
             frame = MESSAGES["Frame"].FromString(record)
         yield where, frame
-
-
-@contextmanager
-def _readable(where: str) -> Iterator[None]:
-    with decoding(where):
-        try:
-            yield
-        except (DecodeError, zlib.error) as error:
-            raise ValueError(error) from error
 
 
 def first_pose(path: Path) -> Float[np.ndarray, "4 4"]:
     """Return the vehicle's pose in the world in the first frame."""
     for where, frame in frames(path):
-        with _readable(where):
+        with decoding(where):
             return _matrix4(frame.pose)
     raise SceneError(f"{path} contains no frames", fix=UNPACK_AGAIN)
 
@@ -145,7 +134,7 @@ def _matrix4(transform: Any) -> np.ndarray:
 def lidar_frames(path: Path) -> Iterator[LidarFrame]:
     """Yield a file's frames that have labels for the top lidar."""
     for where, frame in frames(path):
-        with _readable(where):
+        with decoding(where):
             laser = _named(frame.lasers, TOP)
             calibration = _named(frame.context.laser_calibrations, TOP)
             returns = tuple(
@@ -185,7 +174,7 @@ def camera_shots(path: Path, every: int = 1) -> Iterator[CameraShot]:
         if number % every:
             continue
         for image in sorted(frame.images, key=lambda image: image.name):
-            with _readable(where):
+            with decoding(where):
                 lens = _named(frame.context.camera_calibrations, image.name)
                 name, size_hw = CAMERAS[image.name - 1], (lens.height, lens.width)
                 camera = WaymoCamera(name, np.array(lens.intrinsic), _matrix4(lens.extrinsic), size_hw)

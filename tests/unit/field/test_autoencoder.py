@@ -19,12 +19,12 @@ from hilsplat.field.autoencoder import (
 )
 from hilsplat.field.code import (
     Autoencoder,
+    PackedLayers,
     autoencoder_file,
     load_code,
     load_latents,
     unit_rows,
 )
-from hilsplat.field.decoder import PackedLayers
 from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import AutoencoderSettings, SemanticTreeSettings

@@ -84,10 +84,10 @@ def test_linkage_pools_intersections_over_unions():
     # 0 and 1 agree by 0.8; together they agree with 2 by (3 + 0) / (10 + 5) = 0.2
     intersection = np.array([[0, 8, 3], [8, 0, 0], [3, 0, 0]], float)
     union = np.array([[0, 10, 10], [10, 0, 5], [10, 5, 0]], float)
-    cluster, quality = pooled_linkage(dense_evidence(intersection, union), 0.21)
+    cluster, quality = pooled_linkage(dense_evidence(intersection, union), 0.21)()
     assert cluster.tolist() == [0, 0, 1]
     assert quality.tolist() == pytest.approx([0.8, 0.0])
-    cluster, quality = pooled_linkage(dense_evidence(intersection, union), 0.19)
+    cluster, quality = pooled_linkage(dense_evidence(intersection, union), 0.19)()
     assert cluster.tolist() == [0, 0, 0]
     assert quality.tolist() == pytest.approx([11 / 25])
 
@@ -96,7 +96,7 @@ def test_linkage_of_equal_pairs_takes_the_lowest_rows():
     # 0-1 and 1-2 are equally good; joining 0-1 leaves 2 at 1 / 4 with the pair
     intersection = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], float)
     union = np.array([[0, 2, 2], [2, 0, 2], [2, 2, 0]], float)
-    assert pooled_linkage(dense_evidence(intersection, union), 0.3)[0].tolist() == [0, 0, 1]
+    assert pooled_linkage(dense_evidence(intersection, union), 0.3)()[0].tolist() == [0, 0, 1]
 
 
 def brute_linkage(intersection, union, threshold):
@@ -122,7 +122,7 @@ def test_linkage_equals_a_search_over_all_pairs(seed):
     union = np.triu(union, 1) + np.triu(union, 1).T
     intersection = np.triu(union * rng.random((14, 14)) ** 2, 1)
     intersection = intersection + intersection.T
-    cluster, _ = pooled_linkage(dense_evidence(intersection, union), 0.3)
+    cluster, _ = pooled_linkage(dense_evidence(intersection, union), 0.3)()
     found = sorted(sorted(np.flatnonzero(cluster == c).tolist()) for c in range(cluster.max() + 1))
     assert found == brute_linkage(intersection, union, 0.3)
 
@@ -174,7 +174,7 @@ def test_linkage_of_many_masks_equals_that_of_dense_sums(num):
     union = np.triu(rng.uniform(1, 2, (num, num)), 1)
     intersection = union * np.where(same, rng.uniform(0.5, 0.9, (num, num)), 0.05)
     union, intersection = union + union.T, np.triu(intersection, 1) + np.triu(intersection, 1).T
-    cluster, quality = pooled_linkage(dense_evidence(intersection, union), 0.4)
+    cluster, quality = pooled_linkage(dense_evidence(intersection, union), 0.4)()
     assert len(quality) == 12
     assert all(len(np.unique(cluster[thing == each])) == 1 for each in range(12))
     members = np.flatnonzero(cluster == 0)

@@ -24,7 +24,7 @@ from hilsplat.splat.densify import (
 )
 from hilsplat.splat.gaussians import morton_order
 from hilsplat.splat.initial import RANDOM_POINTS, first_gaussians
-from hilsplat.splat.model import CpuModel, means_rate, step_sizes
+from hilsplat.splat.model import Model, means_rate, step_sizes
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.drawn import Gradients
 from tests.unit.round_gaussians import round_gaussians
@@ -94,7 +94,7 @@ def test_threads_and_interruptions_do_not_change_the_bytes(stage, tmp_path, monk
     assert len(list((tmp_path / "cache").rglob("*.npz"))) == 1
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(fit, "fit_device", lambda *arguments: "cuda")
-        patch.setattr(fit, "model_on", lambda device: CpuModel)
+        patch.setattr(fit, "model_on", lambda device: Model)
         run("another device", settings, stop=0)  # a fit doesn't resume on it
     assert run("resumed", settings) == undisturbed
     assert steps[0] == 25
@@ -121,14 +121,14 @@ def test_threads_and_interruptions_do_not_change_the_bytes(stage, tmp_path, monk
 )
 def test_a_checkpoint_with_other_content_is_ignored(scene, tmp_path, change):
     generator, cameras = np.random.default_rng(0), [scene.cameras[view] for view in scene.views("train")]
-    model = CpuModel(first_gaussians(scene, cameras, SETTINGS, generator))
+    model = Model(first_gaussians(scene, cameras, SETTINGS, generator))
     path = tmp_path / f"{'0' * 16}.npz"
     fit.FitState(model, generator).save(path)
-    assert fit.FitState.load(path, CpuModel, 1) is not None
+    assert fit.FitState.load(path, Model, 1) is not None
     arrays = read_npz(path)
     change(arrays)
     write_arrays(path, arrays, compressed=False)
-    assert fit.FitState.load(path, CpuModel, 1) is None
+    assert fit.FitState.load(path, Model, 1) is None
 
 
 def test_random_points_are_in_view_of_cameras(scene):
@@ -196,7 +196,7 @@ def two_gaussians() -> dict[str, np.ndarray]:
     return two | {"log_scales": np.log(np.float32([[0.001] * 3, [0.1, 0.05, 0.05]]))}
 
 
-def gradients_of(model: CpuModel, value: float) -> Gradients:
+def gradients_of(model: Model, value: float) -> Gradients:
     """Gradients that have one value everywhere."""
     by_name = {name: np.full_like(values, value) for name, values in model.parameters.items()}
     features, means_px = (np.zeros((len(model), width), np.float32) for width in (0, 2))
@@ -207,7 +207,7 @@ def gradients_of(model: CpuModel, value: float) -> Gradients:
     ("most", "widths"), [(1000, [0.001, 0.001, 0.0625, 0.0625]), (3, [0.001, 0.0625, 0.0625])]
 )
 def test_small_gaussians_are_cloned_and_large_ones_split_by_gradient_up_to_the_cap(most, widths):
-    model = CpuModel(two_gaussians())
+    model = Model(two_gaussians())
     settings = GaussiansSettings(densify_gradient=0.5).model_copy(update={"max_gaussians": most})
     model.total, model.seen = np.array([1.0, 2.0]), np.ones(2, np.int32)
     densify(model, settings, 1.0, np.random.default_rng(0))
@@ -218,7 +218,7 @@ def test_small_gaussians_are_cloned_and_large_ones_split_by_gradient_up_to_the_c
 
 
 def test_transparent_and_huge_gaussians_are_pruned_and_opacity_is_reset():
-    model = CpuModel(two_gaussians())
+    model = Model(two_gaussians())
     model.parameters["opacity_logits"][0] = -6  # opacity 0.0025 < 0.005
     prune(model, GaussiansSettings(), extent=1.0)
     assert len(model) == 1
@@ -229,7 +229,7 @@ def test_transparent_and_huge_gaussians_are_pruned_and_opacity_is_reset():
 
 
 def test_screen_gradient_is_in_units_of_half_the_image():
-    model = CpuModel(two_gaussians())
+    model = Model(two_gaussians())
     for drawn in ([True, True], [True, False]):
         model.add_screen_gradients(np.float32([[3e-3, 2e-3], [0, 0]]), np.array(drawn), (40, 20))
     # x times 10, y times 20: (0.03, 0.04) has length 0.05 in both steps
@@ -238,7 +238,7 @@ def test_screen_gradient_is_in_units_of_half_the_image():
 
 
 def test_first_adam_step_moves_by_the_rate_against_the_sign():
-    model = CpuModel(two_gaussians())
+    model = Model(two_gaussians())
     before = {name: values.copy() for name, values in model.parameters.items()}
     settings = GaussiansSettings(scales_rate=0.01, sh_rate=2.5e-3)
     model.descend(gradients_of(model, 1.0), step_sizes(settings, 3.2e-4))
@@ -271,7 +271,7 @@ def test_coincident_gaussians_cover_what_one_covered(opacity, number):
 
 
 def test_dead_gaussians_move_onto_live_ones_and_moments_are_reset():
-    model = CpuModel(row_of_gaussians([0.9, 0.004, 0.5, 0.001]))
+    model = Model(row_of_gaussians([0.9, 0.004, 0.5, 0.001]))
     for table in (model.first, model.second):
         for values in table.values():
             values[:] = 1
@@ -293,7 +293,7 @@ def test_dead_gaussians_move_onto_live_ones_and_moments_are_reset():
 @pytest.mark.parametrize(("min_opacity", "opacity"), [(0.005, 0.1), (0.003, 0.1), (0.1, 0.6), (0.5, 0.9)])
 def test_gaussians_that_share_a_place_stay_alive(min_opacity, opacity):
     # an equal share for 51 would be 0.002, 0.002, 0.018 or 0.044: below each threshold
-    model = CpuModel(row_of_gaussians([opacity] + [min_opacity / 2] * 200))
+    model = Model(row_of_gaussians([opacity] + [min_opacity / 2] * 200))
     settings = NO_GROWTH.model_copy(update={"min_opacity": min_opacity})
     relocate_and_grow(model, settings, np.random.default_rng(0))
     assert (opacities(model) > min_opacity).all()
@@ -305,7 +305,7 @@ def test_gaussians_that_share_a_place_stay_alive(min_opacity, opacity):
 
 
 def test_growth_is_a_share_and_stops_at_the_cap():
-    model = CpuModel(row_of_gaussians([0.5] * 40))
+    model = Model(row_of_gaussians([0.5] * 40))
     settings = MCMC.model_copy(update={"mcmc_growth": 0.05, "max_gaussians": 43})
     relocate_and_grow(model, settings, np.random.default_rng(0))
     assert len(model) == 42  # 5 % of 40
@@ -319,7 +319,7 @@ def test_growth_is_a_share_and_stops_at_the_cap():
 
 
 def test_places_are_drawn_by_their_opacity():
-    model = CpuModel(row_of_gaussians([0.8, 0.2] + [0.0001] * 4000))
+    model = Model(row_of_gaussians([0.8, 0.2] + [0.0001] * 4000))
     relocate_and_grow(model, NO_GROWTH, np.random.default_rng(0))
     share = (model.parameters["means"][2:, 0] == 0).mean()
     assert share == pytest.approx(0.8, abs=0.02)  # standard error 0.006
@@ -331,7 +331,7 @@ def test_noise_is_normal_numbers_times_the_covariance_and_spares_opaque_gaussian
     generator = np.random.default_rng(2)
     parameters["log_scales"] = np.log(generator.uniform(0.001, 0.02, (32, 3))).astype(np.float32)
     parameters["quats"] = (3 * generator.normal(size=(32, 4))).astype(np.float32)
-    model = CpuModel(parameters | {"means": parameters["means"].copy()})
+    model = Model(parameters | {"means": parameters["means"].copy()})
     model.add_noise(MCMC, 1e-4, 2.0, np.random.default_rng(0))
     normal = np.random.default_rng(0).standard_normal((32, 3), dtype=np.float32)
     turns = Rotation.from_quat(np.roll(parameters["quats"], -1, axis=1)).as_matrix()
@@ -345,7 +345,7 @@ def test_noise_is_normal_numbers_times_the_covariance_and_spares_opaque_gaussian
 
 
 def test_regularisers_add_the_gradient_of_mean_opacity_and_mean_scale():
-    model = CpuModel(row_of_gaussians([0.5, 0.2], scale=0.3))
+    model = Model(row_of_gaussians([0.5, 0.2], scale=0.3))
     gradients = gradients_of(model, 0.0)
     settings = MCMC.model_copy(update={"mcmc_opacity_weight": 0.1, "mcmc_scale_weight": 0.6})
     model.add_regularisers(gradients, settings, extent=2.0)

@@ -17,7 +17,7 @@ from hilsplat.settings import GaussiansSettings
 from hilsplat.splat import fit, torch_model
 from hilsplat.splat.gaussians import FIELDS
 from hilsplat.splat.initial import camera_extent, first_gaussians, load_views
-from hilsplat.splat.model import TABLES, CpuModel, StepOptions, step_sizes
+from hilsplat.splat.model import TABLES, Model, StepOptions, step_sizes
 from hilsplat.splat.rasterise import cuda, device, parity
 from hilsplat.splat.rasterise.drawn import Gradients
 from hilsplat.splat.torch_model import TorchModel, bytes_needed
@@ -57,7 +57,7 @@ def _card_on_the_cpu(monkeypatch, request):
 
 @pytest.fixture
 def same_noise(monkeypatch):
-    """Let the torch model draw its noise as `CpuModel` does."""
+    """Let the torch model draw its noise as `Model` does."""
 
     def drawn(like: torch.Tensor, generator: np.random.Generator) -> torch.Tensor:
         return torch.from_numpy(generator.standard_normal(tuple(like.shape), dtype=np.float32))
@@ -74,7 +74,7 @@ def relative(found: np.ndarray, expected: np.ndarray) -> float:
 def test_sixty_steps_equal_those_of_the_cpu(scene, strategy):
     settings, views = SETTINGS.model_copy(update={"strategy": strategy}), load_views(scene, "train", 0.5)
     cameras, states = [view.camera for view in views], []
-    for kind in (CpuModel, TorchModel):
+    for kind in (Model, TorchModel):
         generator = np.random.default_rng(3)
         start = first_gaussians(scene, cameras, settings, generator)
         states.append(fit.FitState(kind(start), generator))
@@ -197,7 +197,7 @@ def test_the_loss_and_its_gradient_equal_those_of_cpusplat(monkeypatch, size_hw,
 
 def test_steps_of_adam_equal_those_of_cpusplat():
     start, rng = vars(random_gaussians(20, degree=2)), np.random.default_rng(0)
-    one, other = (kind({name: start[name].copy() for name in FIELDS}) for kind in (CpuModel, TorchModel))
+    one, other = (kind({name: start[name].copy() for name in FIELDS}) for kind in (Model, TorchModel))
     for _ in range(4):
         gradients = {name: rng.normal(size=start[name].shape).astype(np.float32) for name in FIELDS}
         rates = step_sizes(SETTINGS, 1e-3)
@@ -214,7 +214,7 @@ def test_noise_equals_that_of_the_cpu(width):
     start, moved = vars(random_gaussians(50, degree=0)), []
     start["log_scales"][:, 0] += width  # limited to the extent
     start["opacity_logits"][:] -= 4
-    for kind in (CpuModel, TorchModel):
+    for kind in (Model, TorchModel):
         model = kind({name: start[name].copy() for name in FIELDS})
         model.add_noise(SETTINGS, 1e-4, 2.0, np.random.default_rng(0))
         moved.append(model.read("means") - start["means"])
@@ -244,7 +244,7 @@ def test_gaussians_that_cannot_be_drawn_are_reported_with_the_scores(scene):
 
 def test_row_operations_equal_those_of_the_cpu():
     start, rng = vars(random_gaussians(8, degree=1)), np.random.default_rng(0)
-    one, other = (kind({name: start[name].copy() for name in FIELDS}) for kind in (CpuModel, TorchModel))
+    one, other = (kind({name: start[name].copy() for name in FIELDS}) for kind in (Model, TorchModel))
     moments = {name: rng.normal(size=start[name].shape).astype(np.float32) for name in FIELDS}
     for model in (one, other):
         for table in TABLES[1:]:

@@ -6,8 +6,9 @@ import numpy as np
 
 from hilsplat.base.artifacts import write_index
 from hilsplat.base.images import read_image
+from hilsplat.base.levels import LEVELS, Level
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat_world.diagnostics.mask_truth import fit_of_view, median_and_worst, run_mask_truth
+from hilsplat_world.diagnostics.mask_truth import ViewFit, fit_of_level, median_and_worst, run_mask_truth
 from tests.unit.evaluate.builders import box, masks_of
 
 VIEW = "001.png"
@@ -40,7 +41,10 @@ def test_table_and_picture(block_world, tmp_path):
 
 def test_the_median_and_the_worst_view_are_drawn(block_world):
     perfect = block_world.annotations
-    good = fit_of_view(found_masks(), perfect, VIEW)
-    bad = fit_of_view(masks_of([part((0, 4), (0, 4))], [1]), perfect, VIEW)
+
+    def fits(masks: HierarchicalMasks) -> dict[Level, ViewFit]:
+        return {level: fit_of_level(masks, level, perfect.label_image(VIEW, level)) for level in LEVELS}
+
+    good, bad = fits(found_masks()), fits(masks_of([part((0, 4), (0, 4))], [1]))
     assert median_and_worst({"a": good, "b": bad, "c": good}) == ["a", "b"]
     assert median_and_worst({"a": good}) == ["a"]

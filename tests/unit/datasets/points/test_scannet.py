@@ -159,7 +159,7 @@ NUMBERLESS = '{"segGroups": [{"label": "wall", "segments": [7]}]}'
         (moved("", f"../../{SCAN}"), "wrong place.*fix       move .*scannet/scene0000_00 to .*scans"),
         (keep_frames_in_archive, r"still inside scene0000_00\.sens.*SensReader"),
         (text_in(GROUPS, STRANGER), r"group 0 \(wall\): none of its segments.*fix "),
-        (text_in(GROUPS, NUMBERLESS), r"group 0 cannot be read: KeyError\('objectId'\)"),
+        (text_in(GROUPS, NUMBERLESS), r"group 0 cannot be read: 'objectId' is missing"),
         (text_in(SEGMENTS, '{"segIndices": [1]}'), r"segs\.json does not match.*each of 5 .*found     1 val"),
         (text_in("pose/0.txt", "2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"), "the pose is not a rotation"),
         (text_in("pose/0.txt", "1 0 0\n"), r"0\.txt cannot be read: 1 lines of 3 numbers\n.*4 lines"),
