@@ -13,8 +13,7 @@ from hilsplat.base.errors import SettingsError, shorten_list
 from hilsplat.base.files import INSTALLED, project_path
 from hilsplat.baselines import method_of
 from hilsplat.configuration import SECTIONS, RunSettings, StageSettings, parse_run, require_known
-from hilsplat.datasets.registry import DATASETS
-from hilsplat.datasets.sources import unlisted
+from hilsplat.datasets.sources import is_open_ended, unlisted
 from hilsplat.models.store import AUTO, model_digest, model_path, planned_model
 from hilsplat.scene.finished import KEY_VIEWS
 from hilsplat.scene.sheet import (
@@ -580,17 +579,23 @@ def require_variant_sections(run: RunSettings) -> None:
 def without_scene(run: RunSettings, rows: Iterable[SceneRow]) -> list[str]:
     """Return a line for each scene in `overrides`, `queries` and `sweep_scenes` that is not in the rows.
 
-    SettingsError is raised if a name is probably misspelt, or is not that of a known group or data set.
+    SettingsError is raised if a name is probably misspelt, or has no effect: `overrides` take the names of
+    groups, `queries` those of data sets.
     """
-    groups = list(dict.fromkeys((*GROUPS, *(row.group for row in rows), *DATASETS)))
+    open_ended = {name for name in (*run.groups, *run.overrides, *run.queries) if is_open_ended(name)}
+    groups = list(dict.fromkeys((*GROUPS, *(row.group for row in rows), *open_ended)))
     require_known("groups", run.groups, groups)
-    datasets = {row.dataset for row in rows} | {PHOTOS}
+    datasets = {row.dataset for row in rows} | {PHOTOS} | open_ended
     scenes = [row.name for row in rows]
     # Settings of a scene that was removed from the sheet may stay in the configuration.
     named = [key for key in (*run.overrides, *run.queries) if "/" in key]
     gone = [key for key in named if key.partition("/")[0] in datasets]
-    require_known("overrides", run.overrides, [*groups, *scenes, *gone])
-    require_known("queries", run.queries, [*sorted({*datasets, *groups}), *scenes, *gone])
+    for where, keys, names in (
+        ("overrides", run.overrides, groups),
+        ("queries", run.queries, sorted(datasets)),
+    ):
+        for key in keys:
+            require_known(where, [key], [*scenes, *gone] if "/" in key else names)
     known = {
         **dict.fromkeys(gone, ("overrides or queries", scenes)),
         **dict.fromkeys(run.sweep_scenes, ("sweep_scenes", [row.scene for row in rows])),

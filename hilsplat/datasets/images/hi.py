@@ -227,4 +227,5 @@ ANNOTATED = Annotated(
     required=lambda scene: (scene,),
     open=open_annotated,
     label_places=lambda scene: (f"{scene}/*.json",),
+    images_of="photos",
 )

@@ -359,6 +359,20 @@ def test_names_that_match_no_scene_are_reported(tmp_path):
     ]
 
 
+@pytest.mark.parametrize("name", ["lerf_ovs", "hi_lerf", "scannet200", "annotated"])
+@pytest.mark.parametrize("where", ["groups", "overrides", "queries"])
+def test_label_sets_that_are_no_group_are_refused(where, name, tmp_path):
+    config = {"groups": ["benchmark", name], "overrides": {name: {}}, "queries": {name: ["mug"]}}
+    with pytest.raises(SettingsError, match=rf"{where}\.{name}: unknown name(.|\n)*(one of|did you mean)"):
+        plan(tmp_path, **{where: config[where]})
+
+
+def test_queries_of_a_group_are_refused_because_panels_take_those_of_data_sets(tmp_path):
+    with pytest.raises(SettingsError, match=r"queries\.benchmark: unknown name(.|\n)*synthetic"):
+        plan(tmp_path, queries={"benchmark": ["mug"]})
+    plan(tmp_path, queries={"waymo": ["car"]}, overrides={"waymo": {}})  # its scenes are those on the disk
+
+
 @pytest.mark.parametrize("path", sorted((PROJECT / "config").glob("*.yaml")), ids=lambda path: path.name)
 def test_every_name_in_a_shipped_configuration_matches_a_scene(path):
     run = parse_run(merged_config([path]))
