@@ -22,6 +22,7 @@ from hilsplat.embed.clip import ClipModel, unit
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.placement import placed
 from hilsplat.scene.scene import Scene
+from hilsplat.segment.coverage import with_tree_levels
 from hilsplat.segment.digests import MASKS_SHA256, digest_of
 from hilsplat.segment.masks import HierarchicalMasks, runs_of_labels
 from hilsplat.segment.stage import train_views, write_masks
@@ -52,10 +53,13 @@ def stems_of(views: list[str]) -> dict[str, str]:
     return stems
 
 
-def read_view(folder: Path, camera: Camera) -> tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]:
+def read_view(
+    folder: Path, camera: Camera, theta: float | None = None
+) -> tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]:
     """Read the masks and vectors of one view, with rows in `content_order`.
 
-    The mixed-level map is ignored. Where masks of one level overlap, the files contain only the mask
+    The mixed-level map is ignored. Levels are those of the other maps or, with `theta`, the depths in the
+    view's coverage tree. Where masks of one level overlap, the files contain only the mask
     painted last. The files contain no scores, so predicted IoU and stability are set to 1. Maps of the
     photograph or of a scaled copy, such as LangSplat's 1080 rows, are transferred to the view (nearest
     pixel).
@@ -94,12 +98,16 @@ def read_view(folder: Path, camera: Camera) -> tuple[HierarchicalMasks, Float16[
         parts.append(HierarchicalMasks.from_runs(*runs, level, ones, ones, camera.size_hw))
         vector_rows.append(rows)
     masks = HierarchicalMasks.concatenate(parts)
+    if theta is not None:
+        masks = with_tree_levels(masks, theta)
     order = masks.content_order()
     vectors = vectors[np.concatenate(vector_rows)[order]].astype(np.float32)
     return masks.take(order), unit(vectors).astype(np.float16)
 
 
-def _read_all(scene: Scene, folder: Path) -> dict[str, tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]]:
+def _read_all(
+    scene: Scene, folder: Path, theta: float | None
+) -> dict[str, tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]]:
     """Read the training views that have files; raise an ArtifactError if fewer than half do."""
     maps = {view: f"{stem}_s.npy" for view, stem in stems_of(train_views(scene)).items()}
     views = [view for view, name in maps.items() if (folder / name).is_file()]
@@ -114,18 +122,20 @@ def _read_all(scene: Scene, folder: Path) -> dict[str, tuple[HierarchicalMasks, 
         )
     if missing:
         logger.warning("%s: %s", problem, ", ".join(missing[:5]))
-    return {view: read_view(folder, scene.cameras[view]) for view in track(views, "LangSplat's files")}
+    return {view: read_view(folder, scene.cameras[view], theta) for view in track(views, "LangSplat's files")}
 
 
-def run_imported_masks(scene_folder: Path, files: Path, out: Path) -> None:
+def run_imported_masks(scene_folder: Path, files: Path, out: Path, theta: float | None = None) -> None:
     """Write LangSplat's masks in the format of `segment.stage.write_masks`."""
     scene = Scene.load(scene_folder)
     with stage_log("langsplat masks", scene.name) as counts:
-        masks = {view: masks for view, (masks, _) in _read_all(scene, files).items()}
+        masks = {view: masks for view, (masks, _) in _read_all(scene, files, theta).items()}
         counts.update(write_masks(out, scene, masks.items(), len(masks), "langsplat"))
 
 
-def run_imported_clip(scene_folder: Path, files: Path, out: Path, settings: ClipSettings) -> None:
+def run_imported_clip(
+    scene_folder: Path, files: Path, out: Path, settings: ClipSettings, theta: float | None = None
+) -> None:
     """Write LangSplat's vectors in the format of the clip stage, with rows as in `run_imported_masks`.
 
     A MisalignedArtifactError is raised unless the vectors are those of `settings.model`, which embeds texts.
@@ -134,7 +144,7 @@ def run_imported_clip(scene_folder: Path, files: Path, out: Path, settings: Clip
     model = ClipModel.load(Path(settings.model), variant=settings.variant)
     with stage_log("langsplat clip", scene.name) as counts, atomic_folder(out) as folder:
         index = {}
-        views = _read_all(scene, files)
+        views = _read_all(scene, files, theta)
         _require_model(model, scene, files, views)
         for view, (masks, vectors) in views.items():
             write_npy(folder / f"{view}.npy", vectors)

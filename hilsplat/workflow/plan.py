@@ -25,6 +25,7 @@ from hilsplat.scene.sheet import (
     read_sheet,
     row_of_data,
 )
+from hilsplat.settings import MasksSettings
 from hilsplat.stage import Facts, Stage
 from hilsplat.stages import all_stages, family_of, kinds_of, stage_of
 from hilsplat.workflow.models import (
@@ -308,6 +309,11 @@ class Plan:
             elif name in stage.outputs[1:]:
                 values[name] = getattr(output, name)
         return values
+
+    def levels(self, job: Job) -> str:
+        """Return the settings of imported masks, as JSON: those of the levels; no others apply."""
+        masks = self.stages(job).masks
+        return MasksSettings(segmenter="graph", levels=masks.levels, theta=masks.theta).model_dump_json()
 
     def vocabulary(self, job: Job) -> list[str]:
         """Return the input of `names`: the user's own vocabulary, if any."""

@@ -96,6 +96,19 @@ def test_exported_files_are_read_back(ours, files, scene, model, tmp_path):
     np.testing.assert_allclose(again, read_npy(ours[1] / "a.png.npy").astype(float), atol=1e-3)
 
 
+def test_levels_by_the_tree_replace_those_of_the_maps(ours, files, scene, model, tmp_path):
+    for path in files.glob("*_s.npy"):
+        np.save(path, np.load(path)[[0, 3, 2, 1]])  # subparts in the map of wholes
+    run_imported_masks(scene, files, tmp_path / "masks again", theta=0.9)
+    found = HierarchicalMasks.load(tmp_path / "masks again" / "a.png.npz")
+    assert_equal_masks(found, nested())
+    settings = ClipSettings(model=str(model.model.folder))
+    run_imported_clip(scene, files, tmp_path / "clip again", settings, theta=0.9)
+    assert read_index(tmp_path / "clip again")["views"]["a.png"]["masks_sha256"] == digest_of(found)
+    again = read_npy(tmp_path / "clip again" / "a.png.npy").astype(float)
+    np.testing.assert_allclose(again, read_npy(ours[1] / "a.png.npy").astype(float), atol=1e-3)
+
+
 def test_a_view_may_have_no_masks(tmp_path):
     np.save(tmp_path / "x_s.npy", np.full((4, 2, 4), -1, np.float32))
     np.save(tmp_path / "x_f.npy", np.zeros((0, 5), np.float32))

@@ -12,6 +12,7 @@ import pytest
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.configuration import merged_config, parse_run
 from hilsplat.scene.sheet import read_sheet
+from hilsplat.settings import MasksSettings
 from hilsplat.stages import stage_of
 from hilsplat.workflow import targets
 from hilsplat.workflow.models import models_of_photographs
@@ -137,6 +138,15 @@ def test_levels_by_the_tree_share_the_code_of_levels_by_head_with_the_same_seed(
         **{name: ["head"] for name in ("tree", "theta", "linked")},
         "tree.seed1": ["head.seed1"],
     }
+
+
+def test_imported_masks_get_the_levels_of_the_variant_and_need_no_model(tmp_path):
+    variants = {"main_variants": ["default"], "variants": {"tree": {"masks": {"levels": "tree"}}}}
+    found = plan(tmp_path, **variants, coverage_tree={"theta": 0.7})
+    levels = [MasksSettings.model_validate_json(found.levels(Job(variant=v))) for v in ("default", "tree")]
+    assert [(each.tree_theta, each.uses_model) for each in levels] == [(None, False), (0.7, False)]
+    first, other = (found.identity("clip", variant, (), True) for variant in ("default", "tree"))
+    assert first != other and first.stages == other.stages == ("imported_clip", "imported_masks")
 
 
 def test_photographs_that_you_annotated_are_scored_without_replacing_the_tables(tmp_path):
