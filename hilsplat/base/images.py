@@ -95,10 +95,17 @@ def opened_image(path: Path, what: str = "image") -> Iterator[Image.Image]:
         raise ImageError(f"{what} {path} cannot be read: {error}", fix=fix) from error
 
 
-def image_size_hw(path: Path) -> tuple[int, int]:
-    """Read an image's height and width, as stored, from its header; raise ImageError if it is unreadable."""
+def image_size_hw(path: Path, *, upright: bool = False) -> tuple[int, int]:
+    """Read an image's height and width from its header, as stored or as EXIF turns it upright.
+
+    Raises:
+        ImageError: the image is unreadable.
+    """
     with opened_image(path) as image:
-        return image.height, image.width
+        is_other = orientation(image) > 4 and upright != (
+            image.format == "TIFF"
+        )  # Pillow's TIFFs are upright
+        return (image.width, image.height) if is_other else (image.height, image.width)
 
 
 def exif_tags(image: Image.Image, ifd: ExifTags.IFD | None = None) -> Mapping[int, Any]:

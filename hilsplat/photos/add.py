@@ -12,7 +12,7 @@ from hilsplat.base.atomic import atomic_folder, changing
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import NAME_RULE, name_problem
 from hilsplat.base.removal import undone_on_error
-from hilsplat.photos.findings import CheckPly, Parts, find_parts
+from hilsplat.photos.findings import TRUSTED, Checks, Parts, find_parts
 from hilsplat.photos.inspection import PhotoReport, inspect_photos
 from hilsplat.photos.intake import prepared_photographs
 from hilsplat.scene.layouts import contents, has_known_poses
@@ -26,7 +26,6 @@ from hilsplat.scene.sheet import (
     read_sheet,
     sheet_text,
 )
-from hilsplat.settings import PosesSettings
 
 
 def add_scene(
@@ -39,7 +38,7 @@ def add_scene(
     features: Path | None = None,
     labels: Path | None = None,
     *,
-    check_ply: CheckPly | None = None,
+    checks: Checks = TRUSTED,
     dry_run: bool = False,
 ) -> PhotoReport:
     """Append your own photographs to the sheet as scene `photos/<name>`, creating the sheet if it is missing.
@@ -57,7 +56,7 @@ def add_scene(
         features: folder of LangSplat's masks and CLIP vectors, used instead of SAM and CLIP.
         labels: folder of label files from LERF-OVS or `hilsplat annotate`, used only for evaluation and
             copied to `annotated/photos/<name>/` in the project.
-        check_ply: reads the Gaussians and returns notes on them; None trusts them.
+        checks: readers of Gaussians, features and labels, and settings; by default, files are trusted.
         dry_run: only report; videos and archives are converted in a temporary folder.
 
     Raises:
@@ -81,12 +80,12 @@ def add_scene(
         with TemporaryDirectory() if dry_run else nullcontext(root) as base:
             target = Path(base) / PHOTOS / name
             with prepared_photographs(photos, target, frames) as (folder, notes):
-                parts = find_parts(folder, named, check_ply)
+                parts = find_parts(folder, named, checks)
                 annotated = root / "annotated" / PHOTOS / name
                 copied_labels = _labels_to_copy(annotated, parts)
                 report = inspect_photos(folder, poses)
                 report = replace(report, notes=(*notes, *parts.lines), columns=parts.columns)
-                _check(report, has_known_poses(folder, poses))
+                _check(report, has_known_poses(folder, poses), checks.settings.min_registered_share)
                 if dry_run:
                     return report
                 if copied_labels:
@@ -126,10 +125,10 @@ def _require_new(sheet: Path, name: str) -> None:
             )
 
 
-def _check(report: PhotoReport, have_poses: bool) -> None:
+def _check(report: PhotoReport, have_poses: bool, min_share: float) -> None:
     total = report.num_readable + len(report.unreadable)
     unreadable = [f"{file}: {reason}" for file, reason in report.unreadable]
-    if report.num_readable < PosesSettings().min_registered_share * total:
+    if report.num_readable < min_share * total:
         raise SceneError(
             f"{len(report.unreadable)} of {total} photographs in {report.folder} cannot be read",
             found="; ".join(unreadable),

@@ -1,13 +1,15 @@
 """What a scene's folder offers besides photographs: what will be used, what is left out, and why."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from hilsplat.base.errors import SceneError, foreign, in_one_line
+from hilsplat.base.errors import HilsplatError, ImageError, SceneError, in_one_line
 from hilsplat.base.files import list_images
+from hilsplat.scene.cameras import Camera
 from hilsplat.scene.layouts import (
     DATAPARSER,
+    LABELS,
     NO_POSES,
     dataparser_of,
     find_known_poses,
@@ -17,7 +19,6 @@ from hilsplat.scene.layouts import (
     langsplat_features,
     langsplat_level,
     photo_folder,
-    read_json_object,
     trained_gaussians,
     vertex_count,
 )
@@ -43,11 +44,31 @@ class Parts:
     lines: list[str] = field(default_factory=list)
 
 
-CheckPly = Callable[[Path], list[str]]
-"""Function that reads a PLY and returns notes on what cannot be used."""
+Views = Mapping[str, Camera | None]
+"""The views to be expected, and their cameras if their poses are known."""
 
 
-def find_parts(folder: Path, named: dict[str, Path | None], check_ply: CheckPly | None) -> Parts:
+@dataclass(frozen=True)
+class Checks:
+    """Functions that read what a run will use, and raise HilsplatError if it is of no use.
+
+    Attributes:
+        gaussians: returns notes on what a PLY has that cannot be used.
+        features: returns why LangSplat's files of training views are left out.
+        labels: returns the number of regions of a file in its view, and appends warnings to a list.
+        settings: how the run will import poses.
+    """
+
+    gaussians: Callable[[Path], list[str]] = lambda ply: []
+    features: Callable[[Path, Views], list[str]] = lambda folder, cameras: []
+    labels: Callable[[Path, Camera | None, list[str]], int] = lambda path, camera, warnings: 0
+    settings: PosesSettings = field(default_factory=PosesSettings)
+
+
+TRUSTED = Checks()
+
+
+def find_parts(folder: Path, named: dict[str, Path | None], checks: Checks) -> Parts:
     """Find poses, Gaussians, features and labels: those that the user named, or else those in the folder.
 
     Without known poses, the coordinates of another program's Gaussians are unknown, so these are ignored.
@@ -59,31 +80,43 @@ def find_parts(folder: Path, named: dict[str, Path | None], check_ply: CheckPly 
         if path is not None and path != NO_POSES and not path.exists():
             raise SceneError(f"--{what} {path} is missing", fix="correct the path, or pass `none`")
     parts = Parts()
-    views = _poses(folder, named["poses"], parts)
-    _gaussians(folder, named, check_ply, parts)
-    _features(folder, named["features"], views, parts)
-    _labels(folder, named["labels"], views, parts)
+    views, split = _poses(folder, named["poses"], checks.settings, parts)
+    train = {view: camera for view, camera in views.items() if split[view] == "train"}
+    _gaussians(folder, named, checks, parts)
+    _features(folder, named["features"], train, checks, parts)
+    _labels(folder, named["labels"], views, checks, parts)
     if skipped := [path.name for path in sorted(folder.rglob("*.pth"))[:3]]:
         parts.lines.append(f"skipped, because pickle files can run code: {', '.join(skipped)}")
     return parts
 
 
-def _poses(folder: Path, named: Path | None, parts: Parts) -> list[str]:
-    """Read the poses; return the names of the views to be expected."""
+def _poses(
+    folder: Path, named: Path | None, settings: PosesSettings, parts: Parts
+) -> tuple[Views, dict[str, str]]:
+    """Read the poses; return the views to be expected, and their split."""
+    from hilsplat.scene.assemble import split_views  # pycolmap is slow to import
+    from hilsplat.scene.importers.importing import planned_camera, split_of
+    from hilsplat.scene.importers.reading import read_source
+
     known = find_known_poses(folder, named)
     if named is not None and (named != NO_POSES or has_known_poses(folder)):
         parts.columns["poses"] = named if named == NO_POSES else named.resolve()
     if known is None:
         parts.lines.append("poses: structure from motion")
-        return view_names(list_images(photo_folder(folder)))
-    from hilsplat.scene.importers.reading import read_source  # pycolmap is slow to import
-
+        names = view_names(list_images(photo_folder(folder)))
+        return dict.fromkeys(names), split_views(names, settings.test_every)
     source = read_source(known)
-    source.require_most(PosesSettings().min_registered_share, known.files[0])
-    files = [view.image for view in source.views if view.image is not None]
-    missing = [view.name for view in source.views if view.image is None]
-    parts.lines.append(f"poses: {', '.join(map(str, known.files))}: {len(files)} views with an image")
-    if missing:
+    with_image = [view for view in source.views if view.image is not None]
+    names = view_names([view.image for view in with_image if view.image is not None])
+    cameras: dict[str, Camera | None] = {}
+    for view, name in zip(with_image, names, strict=True):
+        try:
+            cameras[name] = planned_camera(view, name, settings.max_side_px)
+        except ImageError as error:
+            source.drop(view, error)
+    source.require_most(settings.min_registered_share, known.files[0], images=True)
+    parts.lines.append(f"poses: {', '.join(map(str, known.files))}: {len(cameras)} views with an image")
+    if missing := source.without_image:
         parts.lines.append(f"  left out: {len(missing)} views without an image: {_listed(missing)}")
     if source.left_out:
         reasons = _listed(list(source.left_out.values()), "; ")
@@ -92,10 +125,11 @@ def _poses(folder: Path, named: Path | None, parts: Parts) -> list[str]:
         parts.lines.append(f"  {held_out} views are held out for tests by the source's own split")
     count = "none; they are triangulated" if source.points is None else f"{len(source.points[0])}"
     parts.lines += [f"  points: {count}", *(f"  {note}" for note in source.notes)]
-    return view_names(files)
+    known_views = {name: view for view, name in zip(with_image, names, strict=True) if name in cameras}
+    return cameras, split_of(source, known_views, known.root, settings.test_every)
 
 
-def _gaussians(folder: Path, named: dict[str, Path | None], check_ply: CheckPly | None, parts: Parts) -> None:
+def _gaussians(folder: Path, named: dict[str, Path | None], checks: Checks, parts: Parts) -> None:
     plys = [named["gaussians"]] if named["gaussians"] is not None else trained_gaussians(folder)
     if not plys or plys[0] == NO_POSES:
         return
@@ -105,7 +139,7 @@ def _gaussians(folder: Path, named: dict[str, Path | None], check_ply: CheckPly 
         return
     parts.columns["gaussians"] = ply.resolve()
     parts.lines.append(f"Gaussians: {vertex_count(ply) or 'unknown number'} from {ply}")
-    parts.lines += [f"  {note}" for note in (check_ply(ply) if check_ply else [])]
+    parts.lines += [f"  {note}" for note in checks.gaussians(ply)]
     if names := [str(path.relative_to(folder)) for path in others]:
         parts.lines.append(f"  not used: {_listed(names)}")
     if langsplat_level(ply):
@@ -117,47 +151,53 @@ def _gaussians(folder: Path, named: dict[str, Path | None], check_ply: CheckPly 
         parts.lines.append(f"  coordinates: {problem}; those of the poses are assumed")
 
 
-def _features(folder: Path, named: Path | None, views: list[str], parts: Parts) -> None:
+def _features(folder: Path, named: Path | None, views: Views, checks: Checks, parts: Parts) -> None:
     features = langsplat_features(folder) if named is None else named
     if features is None or features == NO_POSES:
         return
-    stems = {path.name.removesuffix("_s.npy") for path in features.glob("*_s.npy")}
-    count = sum(view.partition(".")[0] in stems for view in views)
+    lost = checks.features(features, views)
     parts.columns["features"] = features.resolve()
-    parts.lines.append(f"features: {features}: masks and vectors of {count} of {len(views)} views")
+    count = f"{len(views) - len(lost)} of {len(views)} training views"
+    parts.lines.append(f"features: {features}: masks and vectors of {count}")
+    if lost:
+        parts.lines.append(f"  left out: {_listed(lost, '; ')}")
 
 
-def _labels(folder: Path, named: Path | None, views: list[str], parts: Parts) -> None:
-    """Choose the label files that can be read."""
+def _labels(folder: Path, named: Path | None, views: Views, checks: Checks, parts: Parts) -> None:
+    """Choose the label files that can be used."""
     if named == NO_POSES:
         return
-    files = label_files(folder) if named is None else sorted(named.glob("*.json"))
+    files = label_files(folder) if named is None else sorted(named.glob(LABELS))
     if not files and named is not None:
         expected = "a .json file for each labelled photograph"
         raise SceneError(f"--labels {named} contains no label file", expected=expected)
     if not files:
         return
-    lost: dict[str, str] = {}
-    num_objects = 0
+    lost: list[str] = []
+    warnings: list[str] = []
+    num_regions = 0
     matched = match_names([path.stem for path in files], views)
     for path in files:
-        try:
-            with foreign(path, expected="an ISAT file, as in LERF-OVS"):
-                num_objects += len(list(read_json_object(path, "export it again")["objects"]))
-            parts.labels[path] = f"{Path(matched[path.stem] or path.name).stem}.json"
-        except SceneError as error:
-            lost[path.name] = in_one_line(error)
-    if len(lost) > len(files) / 2:
+        if (view := matched[path.stem]) is None:
+            lost.append(f"{path.name}: no view with an image and a pose has this name")
+        elif (copy := f"{Path(view).stem}.json") in parts.labels.values():
+            lost.append(f"{path.name}: another file has the labels of {view}")
+        else:
+            try:
+                num_regions += checks.labels(path, views[view], warnings)
+                parts.labels[path] = copy
+            except HilsplatError as error:
+                lost.append(in_one_line(error))
+    if len(parts.labels) < len(files) / 2:
         raise SceneError(
-            f"{len(lost)} of {len(files)} label files in {files[0].parent} cannot be used",
-            found=_listed(list(lost.values()), "; "),
+            f"only {len(parts.labels)} of {len(files)} label files in {files[0].parent} can be used",
+            found=_listed(lost, "; "),
             fix="export the labels again, or pass --labels none",
         )
-    count = f"{num_objects} in {len(parts.labels)} photographs"
+    count = f"{num_regions} regions in {len(parts.labels)} photographs"
     parts.lines.append(f"labels: {count}, used for evaluation: {files[0].parent}")
-    parts.lines += [f"  left out: {reason}" for reason in lost.values()]
-    if unposed := [path.name for path in parts.labels if matched[path.stem] is None]:
-        parts.lines.append(f"  not scored, because their views have no pose: {_listed(unposed)}")
+    parts.lines += [f"  left out: {_listed(lost, '; ')}"] if lost else []
+    parts.lines += [f"  {_listed(warnings, '; ')}"] if warnings else []
 
 
 def _listed(items: list[str], separator: str = ", ") -> str:

@@ -25,6 +25,9 @@ UNUSED = (*TRAINED, *MAPS)
 PHOTO_FOLDERS = ("images", "input")
 """Folders of photographs: COLMAP's and nerfstudio's, then that of 3DGS's `convert.py`."""
 
+LABELS = "[!.]*.json"
+"""Pattern of the names of label files; archives from macOS have more, which are hidden."""
+
 POSES_BOUNDS = "poses_bounds.npy"
 """Pose file of LLFF."""
 
@@ -146,7 +149,7 @@ def label_files(folder: Path) -> list[Path]:
     """Return the label files of a LERF-OVS scene, from its `label/` folder or the one beside the scene."""
     folder = folder.resolve()
     beside = folder.parent / "label" / folder.name
-    return sorted((folder / "label").glob("*.json")) or sorted(beside.glob("*.json"))
+    return sorted((folder / "label").glob(LABELS)) or sorted(beside.glob(LABELS))
 
 
 def photo_folder(folder: Path) -> Path:

@@ -22,6 +22,8 @@ from hilsplat.datasets.images.isat import IsatFile, IsatObject, fill_polygons, r
 from hilsplat.datasets.images.lerf_ovs import label_files, merged_regions
 from hilsplat.datasets.labelled import LabelledRegion, LabelledScene, images_by_view
 from hilsplat.datasets.published import FRAMES, differences
+from hilsplat.scene.cameras import Camera
+from hilsplat.scene.placement import placement
 
 IMAGES_OF = {"hi_lerf": "lerf_ovs", "hi_3dovs": "3d_ovs"}
 """Data set -> folder with its images, next to the data set's own folder."""
@@ -65,11 +67,31 @@ def open_annotated(root: Path, scene: str) -> LabelledScene:
     warnings: list[str] = []
     views: dict[str, tuple[LabelledRegion, ...]] = {}
     for view, path in label_files(root / scene).items():
-        labels = read_isat(path)
-        warnings += labels.warnings
-        has_levels = any("level" in thing.keys for thing in labels.objects)
-        views[view] = regions_of(labels, warnings) if has_levels else merged_regions(labels)
+        views[view] = annotated_regions(path, warnings)
     return LabelledScene("annotated", scene, {}, None, views, tuple(warnings), MIN_POSED)
+
+
+def annotated_regions(path: Path, warnings: list[str]) -> tuple[LabelledRegion, ...]:
+    """Read the regions of one file as `open_annotated` does; append to `warnings`."""
+    labels = read_isat(path)
+    warnings += labels.warnings
+    has_levels = any("level" in thing.keys for thing in labels.objects)
+    return regions_of(labels, warnings) if has_levels else merged_regions(labels)
+
+
+def count_regions(path: Path, camera: Camera | None, warnings: list[str]) -> int:
+    """Return the number of regions of one file that a view shows, or of all if its camera is unknown.
+
+    Raises:
+        SceneError: the file cannot be read.
+        MisalignedArtifactError: the regions were drawn on an image of another shape.
+    """
+    regions = annotated_regions(path, warnings)
+    place = placement(camera, regions[0].size_hw, f"label file {path}") if camera and regions else None
+    num_seen = sum(bool((place(mask) if place else mask).any()) for mask in (each.mask() for each in regions))
+    if num_seen < len(regions):
+        warnings.append(f"{path.name}: {len(regions) - num_seen} regions have no pixels in the view")
+    return num_seen
 
 
 def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, ...]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilsplat.base.errors import ImageError, RegistrationError, SceneError
+from hilsplat.base.errors import ImageError, SceneError
 from hilsplat.photos.add import add_scene
 from hilsplat.photos.inspection import inspect_photos
 from hilsplat.scene.assemble import PosedView, undistort
@@ -44,7 +44,7 @@ def test_they_are_refused_if_shrinking_makes_them_too_small(tmp_path):
 def test_they_are_refused_with_known_poses(tmp_path):
     write_colmap(tmp_path / "in")
     write_images(tmp_path / "in/images", ["a.jpg", "b.jpg", "c.jpg"], (12, 16))
-    with pytest.raises(RegistrationError, match=r"a.jpg is too small or too narrow: 16 x 12 px"):
+    with pytest.raises(SceneError, match=r"a.jpg is too small or too narrow: 16 x 12 px"):
         import_scene(tmp_path / "in", tmp_path / "scene")
 
 

@@ -138,7 +138,7 @@ def write_files(folder: Path, *paths: str) -> None:
 
 def langsplat_scene(folder: Path) -> Path:
     """Photographs, and beside them what COLMAP, 3DGS and LangSplat write."""
-    write_noise(folder / "images", 3)
+    write_noise(folder / "images", 3, (30, 40))
     poses = [np.eye(4) for _ in range(3)]
     for number, pose in enumerate(poses):
         pose[0, 3] = number
