@@ -82,13 +82,9 @@ def new(
 
     Reports what was found, what is used, and what is likely to fail.
     """
-    from hilsplat.datasets.images.hi import count_regions
-    from hilsplat.embed.langsplat_files import read_views
-    from hilsplat.photos.add import add_scene
-    from hilsplat.photos.findings import Checks
     from hilsplat.scene.sheet import DEFAULT_SHEET
-    from hilsplat.splat.coordinates import read_gaussians
     from hilsplat.workflow.models import models_of_photographs, settings_of_photographs
+    from hilsplat.workflow.new_scene import add_scene
 
     settings = settings_of_photographs(sheet.with_name("config.yaml"), name)
     parts = {"poses": poses, "gaussians": gaussians, "features": features, "labels": labels}
@@ -98,12 +94,7 @@ def new(
         photos,
         frames=frames,
         **parts,
-        checks=Checks(
-            gaussians=lambda ply: read_gaussians(ply)[1],
-            features=lambda files, views: read_views(files, views)[1],
-            labels=count_regions,
-            settings=settings.poses,
-        ),
+        settings=settings.poses,
         dry_run=dry_run,
     )
     if dry_run:

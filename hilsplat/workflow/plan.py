@@ -13,7 +13,7 @@ from hilsplat.base.errors import SettingsError, shorten_list
 from hilsplat.base.files import INSTALLED, project_path
 from hilsplat.baselines import method_of
 from hilsplat.configuration import SECTIONS, RunSettings, StageSettings, parse_run, require_known
-from hilsplat.datasets.sources import is_open_ended, unlisted
+from hilsplat.datasets.sources import is_open_ended, published, unlisted
 from hilsplat.models.store import AUTO, model_digest, model_path, planned_model
 from hilsplat.scene.finished import KEY_VIEWS
 from hilsplat.scene.sheet import (
@@ -146,6 +146,13 @@ class Plan:
                 ),
                 fix="select a scene (hilsplat run photos/desk) or other groups, or set data_root",
             )
+        rows_of: dict[Path | None, SceneRow] = {}
+        for row in filter(lambda row: published(row.source), self.scenes):
+            if (other := rows_of.setdefault(row.folder, row)) is not row:
+                raise SettingsError(
+                    f"{other.name} and {row.name} are the same scene of a data set, with the same scores",
+                    fix="remove one of their rows, or run them one at a time into separate results folders",
+                )
         # A thousand scenes have tens of thousands of jobs, so settings are resolved and folders read once.
         self.stages_of = functools.cache(lambda *which: run.stages(*which).resolve_auto())
         self.defaults = {name: getattr(self.stages_of("default", ()), name) for name in SECTIONS}

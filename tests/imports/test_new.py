@@ -12,12 +12,12 @@ from typer.testing import CliRunner
 
 from hilsplat.base.errors import SceneError
 from hilsplat.cli.main import app
-from hilsplat.photos.add import add_scene
 from hilsplat.scene.importers.reading import read_source
 from hilsplat.scene.layouts import find_known_poses, photo_folder
 from hilsplat.scene.sheet import read_sheet
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import save_ply
+from hilsplat.workflow.new_scene import add_scene
 from tests.imports import analytic_world as world
 
 WIDTH, HEIGHT = 64, 48

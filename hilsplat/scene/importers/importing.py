@@ -1,7 +1,7 @@
 """Creation of a scene from images with known poses."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,8 @@ from hilsplat.base.images import (
 )
 from hilsplat.base.processes import in_own_process
 from hilsplat.base.progress import track
-from hilsplat.scene.assemble import Posed, PosedView, photo_of, pinhole_of, split_views, undistort
-from hilsplat.scene.cameras import Camera, Photo
+from hilsplat.scene.assemble import Posed, PosedView, photo_of, split_views, undistort
+from hilsplat.scene.cameras import Photo
 from hilsplat.scene.colmap import Points, pycolmap, sparse_points
 from hilsplat.scene.features import find_matches, incremental_options
 from hilsplat.scene.importers.known_views import ASPECT_TOLERANCE, KnownView, Source
@@ -88,33 +88,14 @@ def import_poses(
         "warnings": warnings,
         "views": _view_entries(posed, source, missing, unposed),
     }
-    split = split_of(source, {view.view: known for known, view in posed}, known.root, settings.test_every)
+    names = [view.view for view in views]
+    train = {path.stem for path in (known.root / "images_train").glob("*")}  # of Gaussian Grouping's data
+    held_out = [view.is_test or (bool(train) and Path(view.name).stem not in train) for view, _ in posed]
+    if any(held_out) or source.has_split:
+        split = {view: "test" if is_test else "train" for view, is_test in zip(names, held_out, strict=True)}
+    else:
+        split = split_views(names, settings.test_every)
     return views, points, split, report
-
-
-def split_of(source: Source, views: Mapping[str, KnownView], root: Path, test_every: int) -> dict[str, str]:
-    """Return the split of a source ("train" or "test" by view name), or else that of `split_views`."""
-    train = {path.stem for path in (root / "images_train").glob("*")}  # of Gaussian Grouping's data
-    held_out = {
-        name: view.is_test or (bool(train) and Path(view.name).stem not in train)
-        for name, view in views.items()
-    }
-    if any(held_out.values()) or source.has_split:
-        return {name: "test" if is_test else "train" for name, is_test in held_out.items()}
-    return split_views([*views], test_every)
-
-
-def planned_camera(view: KnownView, view_name: str, max_side_px: int) -> Camera:
-    """Return the camera that a view will have, at the identity pose, from the header of its image.
-
-    Raises:
-        ImageError: as in `_fitted`, or the lens distortion cannot be undone.
-    """
-    lens, photo, _ = _fitted(view, max_side_px)
-    lens.rescale(min(1.0, max_side_px / max(lens.width, lens.height)))
-    pinhole = pinhole_of(lens, view_name, max_side_px)
-    size_hw, K = (pinhole.height, pinhole.width), pinhole.calibration_matrix()
-    return Camera(view_name, np.eye(4), K, size_hw, photo or photo_of(lens))
 
 
 def _mean_error_px(source: Source) -> float | None:
@@ -146,7 +127,7 @@ def _with_pixels(
     Append the name to `turned` if it is used as stored against its EXIF orientation.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    camera, cropped, as_stored = _fitted(view, max_side_px)
+    camera, cropped, as_stored = fitted_camera(view, max_side_px)
     assert view.image is not None  # the caller leaves out views without one
     pixels = read_image(view.image, as_stored=as_stored)
     if cropped:
@@ -164,7 +145,7 @@ def _border_px(view: KnownView, width: int) -> int:
     return math.ceil(view.border_px * width / view.camera.width)
 
 
-def _fitted(view: KnownView, max_side_px: int) -> tuple[pycolmap.Camera, Photo | None, bool]:
+def fitted_camera(view: KnownView, max_side_px: int) -> tuple[pycolmap.Camera, Photo | None, bool]:
     """Return the camera of a view's image without its border, from the header of the image.
 
     The image is used as stored if both of its orientations have the camera's shape. Also return the

@@ -5,11 +5,11 @@ import pytest
 from PIL import Image
 
 from hilsplat.base.errors import ImageError, SceneError
-from hilsplat.photos.add import add_scene
 from hilsplat.photos.inspection import inspect_photos
 from hilsplat.scene.assemble import PosedView, undistort
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.features import prepare_images
+from hilsplat.workflow.new_scene import add_scene
 from tests.unit.scene.test_importers import import_scene, write_colmap, write_images
 
 SMALL_OR_NARROW = [(1, 64), (15, 64), (20, 30_000), (30_000, 20)]

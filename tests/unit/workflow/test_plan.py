@@ -15,7 +15,7 @@ from hilsplat.scene.sheet import read_sheet
 from hilsplat.settings import MasksSettings
 from hilsplat.stages import stage_of
 from hilsplat.workflow import targets
-from hilsplat.workflow.models import models_of_photographs
+from hilsplat.workflow.models import models_of_photographs, settings_of_photographs
 from hilsplat.workflow.plan import Plan, any_of, without_scene
 from tests.conftest import PROJECT
 from tests.unit.models.test_store import write_model
@@ -138,6 +138,16 @@ def test_levels_by_the_tree_share_the_code_of_levels_by_head_with_the_same_seed(
         **{name: ["head"] for name in ("tree", "theta", "linked")},
         "tree.seed1": ["head.seed1"],
     }
+
+
+def test_two_rows_of_one_published_scene_are_refused_because_their_scores_would_be_merged(tmp_path):
+    for part in ("figurines/images", "figurines/sparse", "label/figurines"):
+        (tmp_path / "data/lerf_ovs" / part).mkdir(parents=True)
+    rows = [f"{row} lerf data:lerf_ovs/figurines arbitrary" for row in ("lerf figurines", "mine figurines")]
+    of_data = {"groups": ["lerf"], "data_root": str(tmp_path / "data")}
+    plan_of(tmp_path, rows=(*rows,), only=["mine/figurines"], **of_data)
+    with pytest.raises(SettingsError, match=r"lerf/figurines and mine/figurines are the same scene"):
+        plan_of(tmp_path, rows=(*rows,), **of_data)
 
 
 def test_imported_masks_get_the_levels_of_the_variant_and_need_no_model(tmp_path):
@@ -410,13 +420,13 @@ def test_a_run_names_its_models_and_warns_if_answers_are_meaningless(tmp_path, m
     assert "answers about photographs are meaningless" in doubt and "hilsplat models get" in doubt
     own = tmp_path / "config/config.yaml"
     own.write_text(json.dumps({"overrides": OF_PHOTOGRAPHS}))
-    assert models_of_photographs(own, "desk") == [photo.removeprefix("photos/desk: "), doubt]
+    assert models_of_photographs(settings_of_photographs(own, "desk")) == [photo.removeprefix("photos/desk: "), doubt]
     write_model(Path("models/clip-vit-base-patch16"), "clip")
     write_model(Path("models/sam-vit-base"), "sam")
     line = "masks by sam-vit-base; text queries by clip-vit-base-patch16"
     assert plan(tmp_path, **config).model_lines()[1:] == [f"photos/desk: {line}"]
     for file in (own, tmp_path / "nowhere.yaml"):  # the installed one
-        assert models_of_photographs(file, "desk") == [line]
+        assert models_of_photographs(settings_of_photographs(file, "desk")) == [line]
 
 
 def test_commands_quote_what_they_contain(tmp_path):

@@ -1,12 +1,19 @@
 """What a scene's folder offers besides photographs: what will be used, what is left out, and why."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from hilsplat.base.errors import HilsplatError, ImageError, SceneError, in_one_line
 from hilsplat.base.files import list_images
+from hilsplat.datasets.images.hi import count_regions
+from hilsplat.embed.langsplat_files import read_views
 from hilsplat.scene.cameras import Camera
+from hilsplat.scene.colmap import is_pinhole
+from hilsplat.scene.importers.importing import fitted_camera
+from hilsplat.scene.importers.reading import read_source
 from hilsplat.scene.layouts import (
     DATAPARSER,
     LABELS,
@@ -24,6 +31,7 @@ from hilsplat.scene.layouts import (
 )
 from hilsplat.scene.view_names import match_names, view_names
 from hilsplat.settings import PosesSettings
+from hilsplat.splat.coordinates import read_gaussians
 
 MAX_NAMED = 5
 """Maximum number of items of one kind that a line names."""
@@ -45,30 +53,10 @@ class Parts:
 
 
 Views = Mapping[str, Camera | None]
-"""The views to be expected, and their cameras if their poses are known."""
+"""The views to be expected, and their cameras if these are known and have no distortion."""
 
 
-@dataclass(frozen=True)
-class Checks:
-    """Functions that read what a run will use, and raise HilsplatError if it is of no use.
-
-    Attributes:
-        gaussians: returns notes on what a PLY has that cannot be used.
-        features: returns why LangSplat's files of training views are left out.
-        labels: returns the number of regions of a file in its view, and appends warnings to a list.
-        settings: how the run will import poses.
-    """
-
-    gaussians: Callable[[Path], list[str]] = lambda ply: []
-    features: Callable[[Path, Views], list[str]] = lambda folder, cameras: []
-    labels: Callable[[Path, Camera | None, list[str]], int] = lambda path, camera, warnings: 0
-    settings: PosesSettings = field(default_factory=PosesSettings)
-
-
-TRUSTED = Checks()
-
-
-def find_parts(folder: Path, named: dict[str, Path | None], checks: Checks) -> Parts:
+def find_parts(folder: Path, named: dict[str, Path | None], settings: PosesSettings) -> Parts:
     """Find poses, Gaussians, features and labels: those that the user named, or else those in the folder.
 
     Without known poses, the coordinates of another program's Gaussians are unknown, so these are ignored.
@@ -80,40 +68,36 @@ def find_parts(folder: Path, named: dict[str, Path | None], checks: Checks) -> P
         if path is not None and path != NO_POSES and not path.exists():
             raise SceneError(f"--{what} {path} is missing", fix="correct the path, or pass `none`")
     parts = Parts()
-    views, split = _poses(folder, named["poses"], checks.settings, parts)
-    train = {view: camera for view, camera in views.items() if split[view] == "train"}
-    _gaussians(folder, named, checks, parts)
-    _features(folder, named["features"], train, checks, parts)
-    _labels(folder, named["labels"], views, checks, parts)
+    views, held_out = _poses(folder, named["poses"], settings, parts)
+    _gaussians(folder, named, parts)
+    _features(folder, named["features"], {view: views[view] for view in views.keys() - held_out}, parts)
+    _labels(folder, named["labels"], views, parts)
     if skipped := [path.name for path in sorted(folder.rglob("*.pth"))[:3]]:
         parts.lines.append(f"skipped, because pickle files can run code: {', '.join(skipped)}")
     return parts
 
 
-def _poses(
-    folder: Path, named: Path | None, settings: PosesSettings, parts: Parts
-) -> tuple[Views, dict[str, str]]:
-    """Read the poses; return the views to be expected, and their split."""
-    from hilsplat.scene.assemble import split_views  # pycolmap is slow to import
-    from hilsplat.scene.importers.importing import planned_camera, split_of
-    from hilsplat.scene.importers.reading import read_source
-
+def _poses(folder: Path, named: Path | None, settings: PosesSettings, parts: Parts) -> tuple[Views, set[str]]:
+    """Read the poses; return the views to be expected, and which of them the source holds out."""
     known = find_known_poses(folder, named)
     if named is not None and (named != NO_POSES or has_known_poses(folder)):
         parts.columns["poses"] = named if named == NO_POSES else named.resolve()
     if known is None:
         parts.lines.append("poses: structure from motion")
-        names = view_names(list_images(photo_folder(folder)))
-        return dict.fromkeys(names), split_views(names, settings.test_every)
+        return dict.fromkeys(view_names(list_images(photo_folder(folder)))), set()
     source = read_source(known)
     with_image = [view for view in source.views if view.image is not None]
     names = view_names([view.image for view in with_image if view.image is not None])
     cameras: dict[str, Camera | None] = {}
+    held_out = {name for view, name in zip(with_image, names, strict=True) if view.is_test}
     for view, name in zip(with_image, names, strict=True):
         try:
-            cameras[name] = planned_camera(view, name, settings.max_side_px)
+            lens, *_ = fitted_camera(view, settings.max_side_px)
         except ImageError as error:
             source.drop(view, error)
+            continue
+        K, size_hw = lens.calibration_matrix(), (lens.height, lens.width)
+        cameras[name] = Camera(name, np.eye(4), K, size_hw) if is_pinhole(lens) else None
     source.require_most(settings.min_registered_share, known.files[0], images=True)
     parts.lines.append(f"poses: {', '.join(map(str, known.files))}: {len(cameras)} views with an image")
     if missing := source.without_image:
@@ -121,15 +105,14 @@ def _poses(
     if source.left_out:
         reasons = _listed(list(source.left_out.values()), "; ")
         parts.lines.append(f"  left out: {len(source.left_out)} views: {reasons}")
-    if held_out := sum(view.is_test for view in source.views):
-        parts.lines.append(f"  {held_out} views are held out for tests by the source's own split")
+    if held_out:
+        parts.lines.append(f"  {len(held_out)} views are held out for tests by the source's own split")
     count = "none; they are triangulated" if source.points is None else f"{len(source.points[0])}"
     parts.lines += [f"  points: {count}", *(f"  {note}" for note in source.notes)]
-    known_views = {name: view for view, name in zip(with_image, names, strict=True) if name in cameras}
-    return cameras, split_of(source, known_views, known.root, settings.test_every)
+    return cameras, held_out
 
 
-def _gaussians(folder: Path, named: dict[str, Path | None], checks: Checks, parts: Parts) -> None:
+def _gaussians(folder: Path, named: dict[str, Path | None], parts: Parts) -> None:
     plys = [named["gaussians"]] if named["gaussians"] is not None else trained_gaussians(folder)
     if not plys or plys[0] == NO_POSES:
         return
@@ -139,7 +122,7 @@ def _gaussians(folder: Path, named: dict[str, Path | None], checks: Checks, part
         return
     parts.columns["gaussians"] = ply.resolve()
     parts.lines.append(f"Gaussians: {vertex_count(ply) or 'unknown number'} from {ply}")
-    parts.lines += [f"  {note}" for note in checks.gaussians(ply)]
+    parts.lines += [f"  {note}" for note in read_gaussians(ply)[1]]
     if names := [str(path.relative_to(folder)) for path in others]:
         parts.lines.append(f"  not used: {_listed(names)}")
     if langsplat_level(ply):
@@ -151,11 +134,11 @@ def _gaussians(folder: Path, named: dict[str, Path | None], checks: Checks, part
         parts.lines.append(f"  coordinates: {problem}; those of the poses are assumed")
 
 
-def _features(folder: Path, named: Path | None, views: Views, checks: Checks, parts: Parts) -> None:
+def _features(folder: Path, named: Path | None, views: Views, parts: Parts) -> None:
     features = langsplat_features(folder) if named is None else named
     if features is None or features == NO_POSES:
         return
-    lost = checks.features(features, views)
+    _, lost = read_views(features, views)
     parts.columns["features"] = features.resolve()
     count = f"{len(views) - len(lost)} of {len(views)} training views"
     parts.lines.append(f"features: {features}: masks and vectors of {count}")
@@ -163,7 +146,7 @@ def _features(folder: Path, named: Path | None, views: Views, checks: Checks, pa
         parts.lines.append(f"  left out: {_listed(lost, '; ')}")
 
 
-def _labels(folder: Path, named: Path | None, views: Views, checks: Checks, parts: Parts) -> None:
+def _labels(folder: Path, named: Path | None, views: Views, parts: Parts) -> None:
     """Choose the label files that can be used."""
     if named == NO_POSES:
         return
@@ -184,7 +167,7 @@ def _labels(folder: Path, named: Path | None, views: Views, checks: Checks, part
             lost.append(f"{path.name}: another file has the labels of {view}")
         else:
             try:
-                num_regions += checks.labels(path, views[view], warnings)
+                num_regions += count_regions(path, views[view], warnings)
                 parts.labels[path] = copy
             except HilsplatError as error:
                 lost.append(in_one_line(error))

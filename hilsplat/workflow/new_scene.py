@@ -12,7 +12,6 @@ from hilsplat.base.atomic import atomic_folder, changing
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import NAME_RULE, name_problem
 from hilsplat.base.removal import undone_on_error
-from hilsplat.photos.findings import TRUSTED, Checks, Parts, find_parts
 from hilsplat.photos.inspection import PhotoReport, inspect_photos
 from hilsplat.photos.intake import prepared_photographs
 from hilsplat.scene.layouts import contents, has_known_poses
@@ -26,6 +25,8 @@ from hilsplat.scene.sheet import (
     read_sheet,
     sheet_text,
 )
+from hilsplat.settings import PosesSettings
+from hilsplat.workflow.findings import Parts, find_parts
 
 
 def add_scene(
@@ -38,7 +39,7 @@ def add_scene(
     features: Path | None = None,
     labels: Path | None = None,
     *,
-    checks: Checks = TRUSTED,
+    settings: PosesSettings | None = None,
     dry_run: bool = False,
 ) -> PhotoReport:
     """Append your own photographs to the sheet as scene `photos/<name>`, creating the sheet if it is missing.
@@ -56,7 +57,7 @@ def add_scene(
         features: folder of LangSplat's masks and CLIP vectors, used instead of SAM and CLIP.
         labels: folder of label files from LERF-OVS or `hilsplat annotate`, used only for evaluation and
             copied to `annotated/photos/<name>/` in the project.
-        checks: readers of Gaussians, features and labels, and settings; by default, files are trusted.
+        settings: how the run will import poses; None: the defaults.
         dry_run: only report; videos and archives are converted in a temporary folder.
 
     Raises:
@@ -73,6 +74,7 @@ def add_scene(
             found=problem,
             fix="choose another name, such as my-desk_2",
         )
+    settings = settings or PosesSettings()
     named = {"poses": poses, "gaussians": gaussians, "features": features, "labels": labels}
     with nullcontext(sheet) if dry_run else changing(sheet) as sheet:  # `sheet` may be a link
         _require_new(sheet, name)
@@ -80,12 +82,12 @@ def add_scene(
         with TemporaryDirectory() if dry_run else nullcontext(root) as base:
             target = Path(base) / PHOTOS / name
             with prepared_photographs(photos, target, frames) as (folder, notes):
-                parts = find_parts(folder, named, checks)
+                parts = find_parts(folder, named, settings)
                 annotated = root / "annotated" / PHOTOS / name
                 copied_labels = _labels_to_copy(annotated, parts)
                 report = inspect_photos(folder, poses)
                 report = replace(report, notes=(*notes, *parts.lines), columns=parts.columns)
-                _check(report, has_known_poses(folder, poses), checks.settings.min_registered_share)
+                _check(report, has_known_poses(folder, poses), settings.min_registered_share)
                 if dry_run:
                     return report
                 if copied_labels:
