@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hilsplat.base.errors import ImageError, shorten_list
-from hilsplat.base.files import list_images
+from hilsplat.base.files import is_outside, list_images
 from hilsplat.base.images import (
     image_size_hw,
     opened_image,
@@ -111,7 +111,8 @@ def _view_entries(
     """Return the report on each view; `missing` views have no image, and `unposed` images no view."""
     entries: dict[str, dict[str, Any]] = {}
     for described, view in posed:
-        entries[view.view] = {"file": Path(described.name).name, "registered": True, **described.report}
+        name = Path(described.name).name if is_outside(described.name) else described.name
+        entries[view.view] = {"file": name, "registered": True, **described.report}
     reasons = source.left_out | dict.fromkeys(missing, "its image file is missing")
     reasons |= {file: "the source has no pose for it" for file in unposed if file not in reasons}
     for file, reason in reasons.items():
@@ -133,7 +134,10 @@ def _with_pixels(
     if cropped:
         border_px = _border_px(view, pixels.shape[1])
         pixels = np.ascontiguousarray(pixels[border_px:-border_px, border_px:-border_px])
-    turned += [view.name] * as_stored
+    if as_stored:  # programs that label photographs turn them
+        turned.append(view.name)
+    else:
+        view.report["photo_hw_px"] = list(pixels.shape[:2])
     pixels = resize_to_fit(pixels, max_side_px)
     camera.rescale(pixels.shape[1], pixels.shape[0])
     write_png(folder / view_name, pixels)

@@ -420,7 +420,10 @@ def test_a_run_names_its_models_and_warns_if_answers_are_meaningless(tmp_path, m
     assert "answers about photographs are meaningless" in doubt and "hilsplat models get" in doubt
     own = tmp_path / "config/config.yaml"
     own.write_text(json.dumps({"overrides": OF_PHOTOGRAPHS}))
-    assert models_of_photographs(settings_of_photographs(own, "desk")) == [photo.removeprefix("photos/desk: "), doubt]
+    assert models_of_photographs(settings_of_photographs(own, "desk")) == [
+        photo.removeprefix("photos/desk: "),
+        doubt,
+    ]
     write_model(Path("models/clip-vit-base-patch16"), "clip")
     write_model(Path("models/sam-vit-base"), "sam")
     line = "masks by sam-vit-base; text queries by clip-vit-base-patch16"
