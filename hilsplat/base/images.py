@@ -28,6 +28,8 @@ UPRIGHT = dict(zip(range(2, 9), (Image.Transpose(move) for move in (0, 3, 1, 5, 
 PROFILE_MODES = {b"RGB ": "RGB", b"GRAY": "L", b"CMYK": "CMYK"}
 """Pillow's mode of a colour profile, by the colour space in its header."""
 
+SRGB_GAMMA = 0.45455  # of PNGs whose pixels are nearly sRGB
+
 MIN_SIDE_PX, MAX_ASPECT = 16, 20  # limits on photographs; all stages were run on 16 x 16 and 320 x 16 px
 
 SLIVER = 0.01
@@ -154,7 +156,7 @@ def read_image(
                 pixels = Image.fromarray(_eight_bits(np.asarray(pixels)))
             if image.mode == "F":
                 raise ValueError("its pixels are floating-point numbers of unknown range")
-            return np.asarray(_to_srgb(pixels, image.info.get("icc_profile"), file))
+            return np.asarray(_to_srgb(pixels, image.info, file))
     except FileNotFoundError as error:
         raise ImageError(f"image {file} is missing") from error
     except DAMAGE as error:
@@ -244,8 +246,12 @@ def _frames(image: Image.Image) -> int:
     return num_frames if same else 1
 
 
-def _to_srgb(image: Image.Image, profile: bytes | None, file: object) -> Image.Image:
-    """Convert to sRGB with the embedded profile; if it is missing or damaged, assume sRGB pixels."""
+def _to_srgb(image: Image.Image, info: Mapping[str, Any], file: object) -> Image.Image:
+    """Convert to sRGB with the embedded profile or, without one, PNG's gamma; if both are missing, it is sRGB.
+
+    Pixels with a damaged profile are taken as sRGB.
+    """
+    profile = info.get("icc_profile")
     base = {"RGBA": "RGB", "P": "RGB", "LA": "L", "1": "L"}.get(image.mode, image.mode)
     if profile and PROFILE_MODES.get(profile[16:20], base) == base:  # grey images may carry a profile of RGB
         colours = image if base == image.mode else image.convert(base)
@@ -258,7 +264,12 @@ def _to_srgb(image: Image.Image, profile: bytes | None, file: object) -> Image.I
         else:
             assert converted is not None  # only in-place conversion returns None
             return converted
-    return image.convert("RGB")
+    colours, gamma = image.convert("RGB"), info.get("gamma", SRGB_GAMMA)
+    if profile or "srgb" in info or abs(gamma - SRGB_GAMMA) < 0.01:
+        return colours
+    light = np.linspace(0, 1, 256) ** (1 / gamma)
+    levels = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return colours.point(np.rint(255 * levels).astype(int).tolist() * 3)
 
 
 @functools.cache
