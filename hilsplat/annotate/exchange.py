@@ -322,13 +322,15 @@ def _isat_reader(name: str, content: Mapping[str, Any], cameras: Cameras, photos
 
 def _labelme_reader(name: str, content: Mapping[str, Any], cameras: Cameras, photos: Photos) -> Reader:
     view = _view(name, content.get("imagePath"), cameras, photos)
-    size = {side: content.get(f"image{side.title()}") for side in ("height", "width")}
+    size: Mapping[str, Any] = {side: content.get(f"image{side.title()}") for side in ("height", "width")}
     if not any(size.values()) and content.get("imageData"):  # as in old versions
         with open_image(io.BytesIO(base64.b64decode(content["imageData"]))) as image:
             size = {"height": image.height, "width": image.width}
+    elif not any(size.values()):
+        size = _photo_size(photos, view)
 
     def read(where: str, entry: Any) -> Piece | str:
-        drawn_hw = _drawn_hw(where, size, cameras[view], photos)
+        drawn_hw = _drawn_hw(where, size, cameras[view])
         kind, text = entry.get("shape_type") or "polygon", entry["label"]
         if kind in NO_AREA:
             return "without an area (points, lines)"
@@ -389,7 +391,9 @@ def _coco_reader(name: str, content: Mapping[str, Any], cameras: Cameras, photos
             return "of unknown categories"
         if not region:
             return "without a region (boxes, keypoints)"
-        mask = _coco_mask(where, region, image, cameras[view], photos)
+        if image.get("height") is image.get("width") is None:
+            image = _photo_size(photos, view)
+        mask = _coco_mask(where, region, image, cameras[view])
         return Piece(view, str(text), entry.get("thing"), traced(placed(mask, cameras[view], where)), entry)
 
     return read
@@ -403,22 +407,20 @@ def _by_id(rows: Sequence[Any]) -> dict[str, dict[str, Any]]:
     return {number: row for number, row in by_id.items() if number not in twice}
 
 
-def _coco_mask(
-    where: str, region: Any, image: Mapping[str, Any], camera: Camera, photos: Photos
-) -> Bool[np.ndarray, "H W"]:
+def _coco_mask(where: str, region: Any, image: Mapping[str, Any], camera: Camera) -> Bool[np.ndarray, "H W"]:
     """Fill polygons (flat lists x1, y1, x2, ...) or run lengths, plain or compressed, as pycocotools does.
 
     The values are checked here, because pycocotools crashes or reads random memory if they are invalid.
     """
     if isinstance(region, list):
-        size_hw = _drawn_hw(where, image, camera, photos)
+        size_hw = _drawn_hw(where, image, camera)
         nested = region if isinstance(region[0], list) and len(region[0]) > 2 else [region]
         polygons = [_vertices(flat, size_hw) for flat in nested]
         flat = [points.ravel().tolist() for points in polygons if len(points) > 2]  # 2 points would be a box
         if not flat:
             return np.zeros(size_hw, bool)
         return coco_masks.decode(coco_masks.merge(coco_masks.frPyObjects(flat, *size_hw))).astype(bool)
-    height, width = _drawn_hw(where, dict(zip(("height", "width"), region["size"], strict=True)), camera, {})
+    height, width = _drawn_hw(where, dict(zip(("height", "width"), region["size"], strict=True)), camera)
     runs = {"size": [height, width], "counts": region["counts"]}
     if not isinstance(runs["counts"], str):
         if {*map(type, runs["counts"])} - {int}:
@@ -442,11 +444,13 @@ def _vertices(value: Any, size_hw: tuple[int, int]) -> Float[np.ndarray, "P 2"]:
     return points
 
 
-def _drawn_hw(where: str, image: Mapping[str, Any], camera: Camera, photos: Photos) -> tuple[int, int]:
-    """Return the stated size of the image that was drawn on, or else the size of the photograph."""
-    if image.get("height") is image.get("width") is None:
-        sides = photos.get(camera.name, {}).get("photo_hw_px") or (None, None)
-        image = dict(zip(("height", "width"), sides, strict=True))
+def _photo_size(photos: Photos, view: str) -> dict[str, int]:
+    """Return the size of a view's photograph, for a file that states none; empty if it is unknown."""
+    return dict(zip(("height", "width"), photos.get(view, {}).get("photo_hw_px", ()), strict=False))
+
+
+def _drawn_hw(where: str, image: Mapping[str, Any], camera: Camera) -> tuple[int, int]:
+    """Return the stated size of the image that was drawn on, which may be larger than the view."""
     size_hw = stated_size(where, image)
     placement(camera, size_hw, where)  # raises an error if the shape does not fit
     return size_hw

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float64, UInt8
 from PIL import ExifTags, Image, ImageCms, PngImagePlugin
 
 from hilsplat.base.atomic import atomic_path
@@ -246,11 +246,8 @@ def _frames(image: Image.Image) -> int:
     return num_frames if same else 1
 
 
-def _to_srgb(image: Image.Image, info: Mapping[str, Any], file: object) -> Image.Image:
-    """Convert to sRGB with the embedded profile or, without one, PNG's gamma; if both are missing, it is sRGB.
-
-    Pixels with a damaged profile are taken as sRGB.
-    """
+def _to_srgb(image: Image.Image, info: Mapping[Any, Any], file: object) -> Image.Image:
+    """Convert to sRGB with the embedded profile, or else PNG's gamma; without valid ones, assume sRGB."""
     profile = info.get("icc_profile")
     base = {"RGBA": "RGB", "P": "RGB", "LA": "L", "1": "L"}.get(image.mode, image.mode)
     if profile and PROFILE_MODES.get(profile[16:20], base) == base:  # grey images may carry a profile of RGB
@@ -267,9 +264,12 @@ def _to_srgb(image: Image.Image, info: Mapping[str, Any], file: object) -> Image
     colours, gamma = image.convert("RGB"), info.get("gamma", SRGB_GAMMA)
     if profile or "srgb" in info or abs(gamma - SRGB_GAMMA) < 0.01:
         return colours
-    light = np.linspace(0, 1, 256) ** (1 / gamma)
-    levels = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-    return colours.point(np.rint(255 * levels).astype(int).tolist() * 3)
+    return colours.point(srgb_codes(np.linspace(0, 1, 256) ** (1 / gamma)).tolist() * 3)
+
+
+def srgb_codes(light: Float64[np.ndarray, " N"]) -> UInt8[np.ndarray, " N"]:
+    """Return the 8-bit sRGB values of linear light in [0, 1] (IEC 61966-2-1)."""
+    return to_uint8(np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055))
 
 
 @functools.cache

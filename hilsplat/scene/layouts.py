@@ -59,16 +59,16 @@ def read_json_object(path: Path, fix: str) -> dict[str, Any]:
 
 def vertex_count(path: Path) -> int | None:
     """Return the number of Gaussians in a PLY's header; None if unreadable (its reader says so)."""
-    match = re.search(rb"^element vertex ([0-9]+)\s*$", _header(path), re.MULTILINE)
+    match = re.search(rb"^element vertex ([0-9]+)\s*$", ply_header(path), re.MULTILINE)
     return int(match[1]) if match else None
 
 
 def is_from_nerfstudio(ply: Path) -> bool:
     """Return whether nerfstudio exported a PLY, according to its header."""
-    return NERFSTUDIO.search(_header(ply)) is not None
+    return NERFSTUDIO.search(ply_header(ply)) is not None
 
 
-def _header(ply: Path) -> bytes:
+def ply_header(ply: Path) -> bytes:
     """Return the start of a PLY's header; empty if unreadable."""
     try:
         with regular(Path(ply)).open("rb") as stream:

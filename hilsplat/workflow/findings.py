@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilsplat.base.errors import HilsplatError, ImageError, SceneError, in_one_line
+from hilsplat.base.errors import HilsplatError, ImageError, SceneError, in_one_line, shorten_list
 from hilsplat.base.files import list_images
 from hilsplat.datasets.images.hi import count_regions
 from hilsplat.embed.langsplat_files import read_views
@@ -27,14 +27,10 @@ from hilsplat.scene.layouts import (
     langsplat_level,
     photo_folder,
     trained_gaussians,
-    vertex_count,
 )
 from hilsplat.scene.view_names import match_names, view_names
 from hilsplat.settings import PosesSettings
 from hilsplat.splat.coordinates import read_gaussians
-
-MAX_NAMED = 5
-"""Maximum number of items of one kind that a line names."""
 
 
 @dataclass
@@ -101,9 +97,9 @@ def _poses(folder: Path, named: Path | None, settings: PosesSettings, parts: Par
     source.require_most(settings.min_registered_share, known.files[0], images=True)
     parts.lines.append(f"poses: {', '.join(map(str, known.files))}: {len(cameras)} views with an image")
     if missing := source.without_image:
-        parts.lines.append(f"  left out: {len(missing)} views without an image: {_listed(missing)}")
+        parts.lines.append(f"  left out: {len(missing)} views without an image: {shorten_list(missing, 5)}")
     if source.left_out:
-        reasons = _listed(list(source.left_out.values()), "; ")
+        reasons = shorten_list([*source.left_out.values()], 5)
         parts.lines.append(f"  left out: {len(source.left_out)} views: {reasons}")
     if held_out:
         parts.lines.append(f"  {len(held_out)} views are held out for tests by the source's own split")
@@ -121,10 +117,10 @@ def _gaussians(folder: Path, named: dict[str, Path | None], parts: Parts) -> Non
         parts.lines.append(f"Gaussians: not used, because they need the poses they were made with: {ply}")
         return
     parts.columns["gaussians"] = ply.resolve()
-    parts.lines.append(f"Gaussians: {vertex_count(ply) or 'unknown number'} from {ply}")
-    parts.lines += [f"  {note}" for note in read_gaussians(ply)[1]]
+    gaussians, notes = read_gaussians(ply)
+    parts.lines += [f"Gaussians: {len(gaussians)} from {ply}", *(f"  {note}" for note in notes)]
     if names := [str(path.relative_to(folder)) for path in others]:
-        parts.lines.append(f"  not used: {_listed(names)}")
+        parts.lines.append(f"  not used: {shorten_list(names, 5)}")
     if langsplat_level(ply):
         parts.lines.append("  the three levels of LangSplat share their geometry, so one is enough")
     if dataparser := dataparser_of(ply, folder):
@@ -143,7 +139,7 @@ def _features(folder: Path, named: Path | None, views: Views, parts: Parts) -> N
     count = f"{len(views) - len(lost)} of {len(views)} training views"
     parts.lines.append(f"features: {features}: masks and vectors of {count}")
     if lost:
-        parts.lines.append(f"  left out: {_listed(lost, '; ')}")
+        parts.lines.append(f"  left out: {shorten_list(lost, 5)}")
 
 
 def _labels(folder: Path, named: Path | None, views: Views, parts: Parts) -> None:
@@ -174,16 +170,10 @@ def _labels(folder: Path, named: Path | None, views: Views, parts: Parts) -> Non
     if len(parts.labels) < len(files) / 2:
         raise SceneError(
             f"only {len(parts.labels)} of {len(files)} label files in {files[0].parent} can be used",
-            found=_listed(lost, "; "),
+            found=shorten_list(lost, 5),
             fix="export the labels again, or pass --labels none",
         )
     count = f"{num_regions} regions in {len(parts.labels)} photographs"
     parts.lines.append(f"labels: {count}, used for evaluation: {files[0].parent}")
-    parts.lines += [f"  left out: {_listed(lost, '; ')}"] if lost else []
-    parts.lines += [f"  {_listed(warnings, '; ')}"] if warnings else []
-
-
-def _listed(items: list[str], separator: str = ", ") -> str:
-    """Return the first items, and the number of the others."""
-    more = [f"and {len(items) - MAX_NAMED} more"] if len(items) > MAX_NAMED else []
-    return separator.join([*items[:MAX_NAMED], *more])
+    parts.lines += [f"  left out: {shorten_list(lost, 5)}"] if lost else []
+    parts.lines += [f"  {shorten_list(warnings, 5)}"] if warnings else []

@@ -603,12 +603,8 @@ def without_scene(run: RunSettings, rows: Iterable[SceneRow]) -> list[str]:
     # Settings of a scene that was removed from the sheet may stay in the configuration.
     named = [key for key in (*run.overrides, *run.queries) if "/" in key]
     gone = [key for key in named if key.partition("/")[0] in datasets]
-    for where, keys, names in (
-        ("overrides", run.overrides, groups),
-        ("queries", run.queries, sorted(datasets)),
-    ):
-        for key in keys:
-            require_known(where, [key], [*scenes, *gone] if "/" in key else names)
+    require_known("overrides", run.overrides, [*groups, *scenes, *gone])
+    require_known("queries", run.queries, [*sorted(datasets), *scenes, *gone])
     known = {
         **dict.fromkeys(gone, ("overrides or queries", scenes)),
         **dict.fromkeys(run.sweep_scenes, ("sweep_scenes", [row.scene for row in rows])),

@@ -103,7 +103,7 @@ def test_every_part_is_counted_and_what_is_left_out_is_named(options, tmp_path):
         "  left out: 1 views without an image: 004.jpg",
         "  points: 7",
         f"  {folder}/sparse/1 also has poses, which are not used",
-        f"Gaussians: 11 from {folder}/output/a/point_cloud/iteration_30000/point_cloud.ply",
+        f"Gaussians: 9 from {folder}/output/a/point_cloud/iteration_30000/point_cloud.ply",
         "  left out: 2 of 11 Gaussians",
         "  not used: output/a/point_cloud/iteration_best/point_cloud.ply",
         f"features: {folder}/language_features: masks and vectors of 3 of 5 training views",

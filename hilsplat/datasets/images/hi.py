@@ -80,18 +80,16 @@ def annotated_regions(path: Path, warnings: list[str]) -> tuple[LabelledRegion, 
 
 
 def count_regions(path: Path, camera: Camera | None, warnings: list[str]) -> int:
-    """Return the number of regions of one file that a view shows, or of all if its camera is unknown.
+    """Return the number of regions of one file.
 
     Raises:
         SceneError: the file cannot be read.
         MisalignedArtifactError: the regions were drawn on an image of another shape.
     """
     regions = annotated_regions(path, warnings)
-    place = placement(camera, regions[0].size_hw, f"label file {path}") if camera and regions else None
-    num_seen = sum(bool((place(mask) if place else mask).any()) for mask in (each.mask() for each in regions))
-    if num_seen < len(regions):
-        warnings.append(f"{path.name}: {len(regions) - num_seen} regions have no pixels in the view")
-    return num_seen
+    if camera is not None and regions:
+        placement(camera, regions[0].size_hw, f"label file {path}")
+    return len(regions)
 
 
 def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, ...]:

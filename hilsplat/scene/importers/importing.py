@@ -131,22 +131,16 @@ def _with_pixels(
     camera, cropped, as_stored = fitted_camera(view, max_side_px)
     assert view.image is not None  # the caller leaves out views without one
     pixels = read_image(view.image, as_stored=as_stored)
-    if cropped:
-        border_px = _border_px(view, pixels.shape[1])
-        pixels = np.ascontiguousarray(pixels[border_px:-border_px, border_px:-border_px])
+    border_px = (pixels.shape[1] - camera.width) // 2
+    inside = pixels[border_px:, border_px:][: camera.height, : camera.width]
     if as_stored:  # programs that label photographs turn them
         turned.append(view.name)
     else:
         view.report["photo_hw_px"] = list(pixels.shape[:2])
-    pixels = resize_to_fit(pixels, max_side_px)
+    pixels = resize_to_fit(np.ascontiguousarray(inside), max_side_px)
     camera.rescale(pixels.shape[1], pixels.shape[0])
     write_png(folder / view_name, pixels)
     return PosedView(view_name, folder / view_name, camera, view.cam_from_source, cropped)
-
-
-def _border_px(view: KnownView, width: int) -> int:
-    """Return the width of the border of an image that is a scaled copy."""
-    return math.ceil(view.border_px * width / view.camera.width)
 
 
 def fitted_camera(view: KnownView, max_side_px: int) -> tuple[pycolmap.Camera, Photo | None, bool]:
@@ -175,7 +169,7 @@ def fitted_camera(view: KnownView, max_side_px: int) -> tuple[pycolmap.Camera, P
         )
     camera = pycolmap.Camera(view.camera.todict())
     camera.rescale(width, height)
-    photo, border_px = photo_of(camera), _border_px(view, width)
+    photo, border_px = photo_of(camera), math.ceil(view.border_px * width / view.camera.width)
     camera.width -= 2 * border_px
     camera.height -= 2 * border_px
     camera.principal_point_x -= border_px

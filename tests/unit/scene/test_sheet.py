@@ -261,7 +261,8 @@ def test_inspection_finds_damaged_turned_and_copied_photographs(tmp_path):
     assert report.duplicates == (("1.jpg", "copy.jpg"),)
     unreadable = dict(report.unreadable)
     assert list(unreadable) == ["empty.jpg", "text.png", "truncated.jpg"]
-    assert unreadable["empty.jpg"] == "the file is empty" and "truncated" in unreadable["truncated.jpg"]
+    assert unreadable["empty.jpg"] == "cannot identify image file 'empty.jpg' (0 bytes)"
+    assert "truncated" in unreadable["truncated.jpg"]
     assert report.passed_over == {".nef": 1}
     assert "5 photographs in" in str(report) and "4  of 40 x 30 px" in str(report)
 
@@ -322,7 +323,7 @@ def test_adding_unusable_photographs_leaves_the_sheet_alone(tmp_path):
     with pytest.raises(SceneError, match=r"too few photographs(.|\n)*2 distinct"):
         add_scene(sheet, "desk", folder)
     (folder / "empty.jpg").touch()
-    with pytest.raises(SceneError, match=r"empty\.jpg: the file is empty"):
+    with pytest.raises(SceneError, match=r"empty\.jpg: cannot identify image file 'empty\.jpg' \(0 bytes\)"):
         add_scene(sheet, "desk", folder)
     with pytest.raises(SceneError, match=r"gone is missing(.|\n)*a folder of photographs, a video, or a zip"):
         add_scene(sheet, "desk", tmp_path / "gone")
