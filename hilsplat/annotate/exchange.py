@@ -191,6 +191,10 @@ POLYGONS = {"polygon", "oriented_rectangle", "rotation", "quadrilateral"}
 """Shape types of labelme, and of X-AnyLabeling, which has the same format."""
 
 
+Photos = Mapping[str, Mapping[str, Any]]
+"""Entries of `registration.json`, by view."""
+
+
 class Piece(NamedTuple):
     """A region in a file; pieces of a view with the same text and number are one object."""
 
@@ -206,7 +210,7 @@ def imported(
     text: str,
     cameras: Cameras,
     notes: list[str] | None = None,
-    photos: "Photos | None" = None,
+    photos: Photos | None = None,
 ) -> dict[str, list[Label]]:
     """Return the annotations in a file, which may have any of the four formats, by view.
 
@@ -216,8 +220,8 @@ def imported(
 
     Args:
         notes: if annotations are left out, a sentence with their number and the reasons is appended.
-        photos: entries of `registration.json` by view. Their folders distinguish photographs with equal
-            names, and their sizes are used for drawings whose file states none.
+        photos: their folders distinguish photographs with equal names, and drawings whose file states no
+            size have theirs.
 
     Raises:
         HilsplatError: the format is unknown, the photograph is not in the scene, more than `MAX_INVALID` of
@@ -293,8 +297,6 @@ def _joined(name: str, pieces: Sequence[Piece], errors: list[HilsplatError]) -> 
             errors.append(error)
     return labels
 
-
-Photos = Mapping[str, Mapping[str, Any]]
 
 Reader = Callable[[str, Any], Piece | str]
 """Converts an annotation, quoting its place in errors, or returns the reason why it is left out."""

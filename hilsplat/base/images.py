@@ -98,15 +98,10 @@ def opened_image(path: Path, what: str = "image") -> Iterator[Image.Image]:
 
 
 def image_size_hw(path: Path, *, upright: bool = False) -> tuple[int, int]:
-    """Read an image's height and width from its header, as stored or as EXIF turns it upright.
-
-    Raises:
-        ImageError: the image is unreadable.
-    """
+    """Read an image's height and width, as stored or upright, from its header; ImageError if unreadable."""
     with opened_image(path) as image:
-        is_other = orientation(image) > 4 and upright != (
-            image.format == "TIFF"
-        )  # Pillow's TIFFs are upright
+        # Pillow states the upright size of a TIFF.
+        is_other = orientation(image) > 4 and upright != (image.format == "TIFF")
         return (image.width, image.height) if is_other else (image.height, image.width)
 
 

@@ -87,10 +87,9 @@ def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
             pixels = read_image(path)
             require_usable_size(path, pixels.shape[:2])
         except ImageError as error:
+            reason = first_line(error.__cause__ or error).replace(str(path), path.name)
             size = f" ({path.stat().st_size} bytes)" if path.exists() else ""
-            unreadable.append(
-                (path.name, first_line(error.__cause__ or error).replace(str(path), path.name) + size)
-            )
+            unreadable.append((path.name, reason + size))
             continue
         size_hw = (pixels.shape[0], pixels.shape[1])
         sizes[size_hw] += 1

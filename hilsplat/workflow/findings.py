@@ -66,7 +66,7 @@ def find_parts(folder: Path, named: dict[str, Path | None], settings: PosesSetti
     parts = Parts()
     views, held_out = _poses(folder, named["poses"], settings, parts)
     _gaussians(folder, named, parts)
-    _features(folder, named["features"], {view: views[view] for view in views.keys() - held_out}, parts)
+    _features(folder, named["features"], {view: views[view] for view in views if view not in held_out}, parts)
     _labels(folder, named["labels"], views, parts)
     if skipped := [path.name for path in sorted(folder.rglob("*.pth"))[:3]]:
         parts.lines.append(f"skipped, because pickle files can run code: {', '.join(skipped)}")
@@ -85,13 +85,14 @@ def _poses(folder: Path, named: Path | None, settings: PosesSettings, parts: Par
     with_image = [view for view in source.views if view.image is not None]
     names = view_names([view.image for view in with_image if view.image is not None])
     cameras: dict[str, Camera | None] = {}
-    held_out = {name for view, name in zip(with_image, names, strict=True) if view.is_test}
+    held_out: set[str] = set()
     for view, name in zip(with_image, names, strict=True):
         try:
             lens, *_ = fitted_camera(view, settings.max_side_px)
         except ImageError as error:
             source.drop(view, error)
             continue
+        held_out |= {name} if view.is_test else set()
         K, size_hw = lens.calibration_matrix(), (lens.height, lens.width)
         cameras[name] = Camera(name, np.eye(4), K, size_hw) if is_pinhole(lens) else None
     source.require_most(settings.min_registered_share, known.files[0], images=True)
@@ -136,7 +137,7 @@ def _features(folder: Path, named: Path | None, views: Views, parts: Parts) -> N
         return
     _, lost = read_views(features, views)
     parts.columns["features"] = features.resolve()
-    count = f"{len(views) - len(lost)} of {len(views)} training views"
+    count = f"{len(views) - len(lost)} of {len(views)} views"
     parts.lines.append(f"features: {features}: masks and vectors of {count}")
     if lost:
         parts.lines.append(f"  left out: {shorten_list(lost, 5)}")

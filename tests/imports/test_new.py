@@ -106,7 +106,7 @@ def test_every_part_is_counted_and_what_is_left_out_is_named(options, tmp_path):
         f"Gaussians: 9 from {folder}/output/a/point_cloud/iteration_30000/point_cloud.ply",
         "  left out: 2 of 11 Gaussians",
         "  not used: output/a/point_cloud/iteration_best/point_cloud.ply",
-        f"features: {folder}/language_features: masks and vectors of 3 of 5 training views",
+        f"features: {folder}/language_features: masks and vectors of 3 of 5 views",
         "003_s.npy does not match the size of its image",
         "005_s.npy is missing",
         f"labels: 3 regions in 3 photographs, used for evaluation: {folder}/label",

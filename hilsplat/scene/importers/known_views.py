@@ -302,17 +302,13 @@ def read_llff(known: KnownPoses) -> Source:
     image size on disk; an image of another shape than stated is noted.
     """
     path, folder = known.files[0], known.root / "images"
-    with foreign(path, fix="unpack it again"), path.open("rb") as stream:
+    expected = "finite numbers of shape (images, 17)"
+    with foreign(path, expected=expected, fix="unpack it again"), path.open("rb") as stream:
         rows = np.load(stream, allow_pickle=False)
         if stream.read(1):
             raise ValueError("bytes follow its array")
-    if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "fiu" or not np.isfinite(rows).any():
-        raise SceneError(
-            f"{path} does not contain LLFF poses",
-            expected="finite numbers of shape (images, 17)",
-            found=f"{rows.dtype} of shape {rows.shape}",
-            fix="unpack it again",
-        )
+        if rows.shape[1:] != (17,) or rows.dtype.kind not in "fiu" or not np.isfinite(rows).any():
+            raise ValueError(f"it does not contain LLFF poses, but {rows.dtype} of shape {rows.shape}")
     images = list_images(folder if folder.is_dir() else known.root)
     if len(images) != len(rows):
         raise SceneError(
