@@ -206,11 +206,7 @@ class Piece(NamedTuple):
 
 
 def imported(
-    name: str,
-    text: str,
-    cameras: Cameras,
-    notes: list[str] | None = None,
-    photos: Photos | None = None,
+    name: str, text: str, cameras: Cameras, notes: list[str] | None = None, photos: Photos | None = None
 ) -> dict[str, list[Label]]:
     """Return the annotations in a file, which may have any of the four formats, by view.
 

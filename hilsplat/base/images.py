@@ -28,8 +28,6 @@ UPRIGHT = dict(zip(range(2, 9), (Image.Transpose(move) for move in (0, 3, 1, 5, 
 PROFILE_MODES = {b"RGB ": "RGB", b"GRAY": "L", b"CMYK": "CMYK"}
 """Pillow's mode of a colour profile, by the colour space in its header."""
 
-SRGB_GAMMA = 0.45455  # of PNGs whose pixels are nearly sRGB
-
 MIN_SIDE_PX, MAX_ASPECT = 16, 20  # limits on photographs; all stages were run on 16 x 16 and 320 x 16 px
 
 SLIVER = 0.01
@@ -256,8 +254,8 @@ def _to_srgb(image: Image.Image, info: Mapping[Any, Any], file: object) -> Image
         else:
             assert converted is not None  # only in-place conversion returns None
             return converted
-    colours, gamma = image.convert("RGB"), info.get("gamma", SRGB_GAMMA)
-    if profile or "srgb" in info or abs(gamma - SRGB_GAMMA) < 0.01:
+    colours, gamma = image.convert("RGB"), info.get("gamma", 1 / 2.2)
+    if profile or "srgb" in info or abs(gamma - 1 / 2.2) < 0.01:  # 1 / 2.2 is nearly sRGB
         return colours
     return colours.point(srgb_codes(np.linspace(0, 1, 256) ** (1 / gamma)).tolist() * 3)
 

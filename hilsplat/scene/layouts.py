@@ -25,9 +25,6 @@ UNUSED = (*TRAINED, *MAPS)
 PHOTO_FOLDERS = ("images", "input")
 """Folders of photographs: COLMAP's and nerfstudio's, then that of 3DGS's `convert.py`."""
 
-LABELS = "[!.]*.json"
-"""Pattern of the names of label files; archives from macOS have more, which are hidden."""
-
 POSES_BOUNDS = "poses_bounds.npy"
 """Pose file of LLFF."""
 
@@ -145,11 +142,12 @@ def langsplat_features(folder: Path) -> Path | None:
     return features if any(features.glob("*_s.npy")) else None
 
 
-def label_files(folder: Path) -> list[Path]:
-    """Return the label files of a LERF-OVS scene, from its `label/` folder or the one beside the scene."""
+def label_files(folder: Path, named: Path | None = None) -> list[Path]:
+    """Return the label files in a named folder, or else those in or beside a LERF-OVS scene."""
     folder = folder.resolve()
-    beside = folder.parent / "label" / folder.name
-    return sorted((folder / "label").glob(LABELS)) or sorted(beside.glob(LABELS))
+    places = (folder / "label", folder.parent / "label" / folder.name) if named is None else (named,)
+    found = (sorted(place.glob("[!.]*.json")) for place in places)  # archives of macOS have hidden ones
+    return next(filter(None, found), [])
 
 
 def photo_folder(folder: Path) -> Path:

@@ -8,7 +8,7 @@ import numpy as np
 
 from hilsplat.base.errors import HilsplatError, ImageError, SceneError, in_one_line, shorten_list
 from hilsplat.base.files import list_images
-from hilsplat.datasets.images.hi import count_regions
+from hilsplat.datasets.images.hi import annotated_regions
 from hilsplat.embed.langsplat_files import read_views
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.colmap import is_pinhole
@@ -16,7 +16,6 @@ from hilsplat.scene.importers.importing import fitted_camera
 from hilsplat.scene.importers.reading import read_source
 from hilsplat.scene.layouts import (
     DATAPARSER,
-    LABELS,
     NO_POSES,
     dataparser_of,
     find_known_poses,
@@ -28,6 +27,7 @@ from hilsplat.scene.layouts import (
     photo_folder,
     trained_gaussians,
 )
+from hilsplat.scene.placement import placement
 from hilsplat.scene.view_names import match_names, view_names
 from hilsplat.settings import PosesSettings
 from hilsplat.splat.coordinates import read_gaussians
@@ -147,7 +147,7 @@ def _labels(folder: Path, named: Path | None, views: Views, parts: Parts) -> Non
     """Choose the label files that can be used."""
     if named == NO_POSES:
         return
-    files = label_files(folder) if named is None else sorted(named.glob(LABELS))
+    files = label_files(folder, named)
     if not files and named is not None:
         expected = "a .json file for each labelled photograph"
         raise SceneError(f"--labels {named} contains no label file", expected=expected)
@@ -164,8 +164,10 @@ def _labels(folder: Path, named: Path | None, views: Views, parts: Parts) -> Non
             lost.append(f"{path.name}: another file has the labels of {view}")
         else:
             try:
-                num_regions += count_regions(path, views[view], warnings)
-                parts.labels[path] = copy
+                regions, camera = annotated_regions(path, warnings), views[view]
+                if camera is not None and regions:
+                    placement(camera, regions[0].size_hw, f"label file {path}")
+                num_regions, parts.labels[path] = num_regions + len(regions), copy
             except HilsplatError as error:
                 lost.append(in_one_line(error))
     if len(parts.labels) < len(files) / 2:

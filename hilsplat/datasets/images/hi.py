@@ -22,8 +22,6 @@ from hilsplat.datasets.images.isat import IsatFile, IsatObject, fill_polygons, r
 from hilsplat.datasets.images.lerf_ovs import label_files, merged_regions
 from hilsplat.datasets.labelled import LabelledRegion, LabelledScene, images_by_view
 from hilsplat.datasets.published import FRAMES, differences
-from hilsplat.scene.cameras import Camera
-from hilsplat.scene.placement import placement
 
 IMAGES_OF = {"hi_lerf": "lerf_ovs", "hi_3dovs": "3d_ovs"}
 """Data set -> folder with its images, next to the data set's own folder."""
@@ -77,19 +75,6 @@ def annotated_regions(path: Path, warnings: list[str]) -> tuple[LabelledRegion, 
     warnings += labels.warnings
     has_levels = any("level" in thing.keys for thing in labels.objects)
     return regions_of(labels, warnings) if has_levels else merged_regions(labels)
-
-
-def count_regions(path: Path, camera: Camera | None, warnings: list[str]) -> int:
-    """Return the number of regions of one file.
-
-    Raises:
-        SceneError: the file cannot be read.
-        MisalignedArtifactError: the regions were drawn on an image of another shape.
-    """
-    regions = annotated_regions(path, warnings)
-    if camera is not None and regions:
-        placement(camera, regions[0].size_hw, f"label file {path}")
-    return len(regions)
 
 
 def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, ...]:
