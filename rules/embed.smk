@@ -27,7 +27,7 @@ use rule clip as imported_clip with:
     wildcard_constraints:
         dataset=PLAN.jobs_of("imported_clip"),
     params:
-        **PLAN.params("imported_clip", **FEATURES, levels=PLAN.levels),
+        **PLAN.params("imported_clip", **FEATURES),
 
 
 use rule stage as names with:

@@ -46,7 +46,7 @@ use rule masks as imported_masks with:
     wildcard_constraints:
         dataset=PLAN.jobs_of("imported_masks"),
     params:
-        **PLAN.params("imported_masks", **FEATURES, settings=PLAN.levels),
+        **PLAN.params("imported_masks", **FEATURES),
 
 
 use rule stage as coverage_tree with:

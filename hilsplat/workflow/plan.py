@@ -218,7 +218,10 @@ class Plan:
         return getattr(self.stages_of(variant, scopes), section)
 
     def settings(self, section: str, job: Job) -> str:
-        """Return a section's settings for a job, as JSON."""
+        """Return a section's settings for a job, as JSON; only levels apply to imported masks."""
+        if section == "masks" and self.row(job).features is not None:
+            masks = self.stages(job).masks
+            return MasksSettings(segmenter="graph", levels=masks.levels, theta=masks.theta).model_dump_json()
         return escape_json_for_report(self._json(section, *self.which(job)))
 
     def seeded(self, variant: str, row: SceneRow, table: str) -> list[str]:
@@ -316,11 +319,6 @@ class Plan:
             elif name in stage.outputs[1:]:
                 values[name] = getattr(output, name)
         return values
-
-    def levels(self, job: Job) -> str:
-        """Return the settings of imported masks, as JSON: those of the levels; no others apply."""
-        masks = self.stages(job).masks
-        return MasksSettings(segmenter="graph", levels=masks.levels, theta=masks.theta).model_dump_json()
 
     def vocabulary(self, job: Job) -> list[str]:
         """Return the input of `names`: the user's own vocabulary, if any."""

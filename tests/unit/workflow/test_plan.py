@@ -19,7 +19,7 @@ from hilsplat.workflow.models import models_of_photographs, settings_of_photogra
 from hilsplat.workflow.plan import Plan, any_of, without_scene
 from tests.conftest import PROJECT
 from tests.unit.models.test_store import write_model
-from tests.unit.workflow.plans import BENCHMARK, Job, plan_of
+from tests.unit.workflow.plans import BENCHMARK, Job, plan_of, write_sheet
 
 ROWS = (
     *BENCHMARK,
@@ -152,9 +152,16 @@ def test_two_rows_of_one_published_scene_are_refused_because_their_scores_would_
 
 def test_imported_masks_get_the_levels_of_the_variant_and_need_no_model(tmp_path):
     variants = {"main_variants": ["default"], "variants": {"tree": {"masks": {"levels": "tree"}}}}
-    found = plan(tmp_path, **variants, coverage_tree={"theta": 0.7})
-    levels = [MasksSettings.model_validate_json(found.levels(Job(variant=v))) for v in ("default", "tree")]
+    sheet = write_sheet(
+        tmp_path / "config/scenes.tsv", (*BENCHMARK, f"photos desk photos x arbitrary {tmp_path}")
+    )
+    sheet.write_text(sheet.read_text().replace("\tunit\n", "\tunit\tfeatures\n"))
+    found = Plan({"scenes": str(sheet), **variants, "coverage_tree": {"theta": 0.7}})
+    jobs = [Job("photos", "desk", variant) for variant in ("default", "tree")]
+    levels = [MasksSettings.model_validate_json(found.settings("masks", job)) for job in jobs]
     assert [(each.tree_theta, each.uses_model) for each in levels] == [(None, False), (0.7, False)]
+    values = found.params("imported_masks")["settings"](jobs[1])
+    assert found.settings("masks", jobs[1]) in values  # as `workflow.records` expects
     first, other = (found.identity("clip", variant, (), True) for variant in ("default", "tree"))
     assert first != other and first.stages == other.stages == ("imported_clip", "imported_masks")
 
