@@ -122,7 +122,7 @@ def load_scene(
         ArtifactError: the path does not exist; the message lists the scenes of its results folder.
         SceneError: the folder has no poses, or they cannot be used.
     """
-    path = Path(path)
+    path = Path(path).absolute()  # files are read later, perhaps from another working folder
     for posed in (path / "scene", path):
         if (posed / INDEX).is_file() and (posed / "cameras.npz").is_file():
             if settings or poses or folder:
@@ -333,7 +333,7 @@ def _running(progress: bool) -> Iterator[None]:
 def _folder(path: Path | str | None) -> Iterator[Path]:
     """Yield the folder, or a temporary one."""
     with nullcontext(path) if path else TemporaryDirectory(prefix="hilsplat-") as folder:
-        yield Path(folder)
+        yield Path(folder).absolute()
 
 
 def _section(name: str, values: Mapping[str, Any]) -> Any:

@@ -30,7 +30,7 @@ from hilsplat.base.ownership import require_replaceable
 from hilsplat.base.removal import delete
 from hilsplat.configuration import SECTIONS, StageSettings
 from hilsplat.models.store import model_path
-from hilsplat.settings import Section
+from hilsplat.settings import LARGEST, Section
 
 
 class Role(Enum):
@@ -59,7 +59,7 @@ Threads = Annotated[
 Memory = Annotated[
     float | None, typer.Option(min=1, help="memory that the stage may use, in MiB; default: all free memory")
 ]
-Seed = Annotated[int, typer.Option(min=0, max=2_000_000_000, help="random seed")]
+Seed = Annotated[int, typer.Option(min=0, max=LARGEST + 10, help="random seed")]
 Cache = Annotated[Path, typer.Option(callback=writable, help="cache folder of finished views, for resuming")]
 DataRoot = Annotated[Path, typer.Option(help="folder of the data sets")]
 

@@ -132,11 +132,11 @@ def gaussians(
 
 
 @stage(artifact="masks", when=lambda scene: scene.is_imported)
-def imported_masks(scene: PathIn, features: PathIn, out: PathOut) -> None:
-    """Import LangSplat's masks, a folder of _s.npy and _f.npy files."""
+def imported_masks(scene: PathIn, features: PathIn, out: PathOut, settings: of.MasksSettings) -> None:
+    """Import LangSplat's masks, a folder of _s.npy and _f.npy files; only levels and theta apply."""
     from hilsplat.embed.langsplat_files import run_imported_masks
 
-    run_imported_masks(scene, features, out)
+    run_imported_masks(scene, features, out, settings.tree_theta)
 
 
 @stage(artifact="masks", loop="masks of views", when=lambda scene: scene.settings.masks.key_views < 1)
@@ -257,12 +257,17 @@ def semantic_tree(
 
 @stage(artifact="clip", when=lambda scene: scene.is_imported)
 def imported_clip(
-    scene: PathIn, masks: PathIn, features: PathIn, out: PathOut, settings: of.ClipSettings
+    scene: PathIn,
+    masks: PathIn,
+    features: PathIn,
+    out: PathOut,
+    settings: of.ClipSettings,
+    levels: of.MasksSettings,
 ) -> None:
     """Import LangSplat's CLIP vectors, a folder of _s.npy and _f.npy files."""
     from hilsplat.embed.langsplat_files import run_imported_clip
 
-    run_imported_clip(scene, features, out, settings)
+    run_imported_clip(scene, features, out, settings, levels.tree_theta)
 
 
 @stage(loop="CLIP of views")

@@ -28,7 +28,7 @@ from hilsplat.annotate.labels import (
     write_labels,
 )
 from hilsplat.annotate.proposals import Clicks, Proposals
-from hilsplat.base.artifacts import rebuild_command
+from hilsplat.base.artifacts import read_json, rebuild_command
 from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError, first_line
 from hilsplat.base.tables import read_csv
 from hilsplat.datasets.images.isat import fill_polygons
@@ -274,9 +274,10 @@ def _import(opened: OpenedScene, asked: Files) -> dict[str, Any]:
     A file that cannot be used is noted; a single one is refused.
     """
     cameras, files, notes = opened.scene.cameras, [], list[str]()
+    photos = read_json(opened.scene.folder / "registration.json")["views"]
     for file in asked.files:
         try:
-            files.append(imported(file.name, file.text, cameras, notes))
+            files.append(imported(file.name, file.text, cameras, notes, photos))
         except HilsplatError as error:
             if len(asked.files) == 1:
                 raise

@@ -12,7 +12,7 @@ import math
 import re
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -191,6 +191,10 @@ POLYGONS = {"polygon", "oriented_rectangle", "rotation", "quadrilateral"}
 """Shape types of labelme, and of X-AnyLabeling, which has the same format."""
 
 
+Photos = Mapping[str, Mapping[str, Any]]
+"""Entries of `registration.json`, by view."""
+
+
 class Piece(NamedTuple):
     """A region in a file; pieces of a view with the same text and number are one object."""
 
@@ -202,7 +206,7 @@ class Piece(NamedTuple):
 
 
 def imported(
-    name: str, text: str, cameras: Cameras, notes: list[str] | None = None
+    name: str, text: str, cameras: Cameras, notes: list[str] | None = None, photos: Photos | None = None
 ) -> dict[str, list[Label]]:
     """Return the annotations in a file, which may have any of the four formats, by view.
 
@@ -212,6 +216,8 @@ def imported(
 
     Args:
         notes: if annotations are left out, a sentence with their number and the reasons is appended.
+        photos: their folders distinguish photographs with equal names, and drawings whose file states no
+            size have theirs.
 
     Raises:
         HilsplatError: the format is unknown, the photograph is not in the scene, more than `MAX_INVALID` of
@@ -229,7 +235,7 @@ def imported(
                 found=f"keys {', '.join(keys)}" if keys else type(content).__name__,
                 fix="export the annotations as COCO",
             )
-        read = readers[kind](name, content, cameras)
+        read = readers[kind](name, content, cameras, photos or {})
     pieces: dict[str, list[Piece]] = {}
     left: Counter[str] = Counter()
     errors: list[HilsplatError] = []  # of invalid annotations
@@ -292,9 +298,9 @@ Reader = Callable[[str, Any], Piece | str]
 """Converts an annotation, quoting its place in errors, or returns the reason why it is left out."""
 
 
-def _isat_reader(name: str, content: Mapping[str, Any], cameras: Cameras) -> Reader:
+def _isat_reader(name: str, content: Mapping[str, Any], cameras: Cameras, photos: Photos) -> Reader:
     drawn_hw = stated_size(name, content.get("info"))
-    view = _view(name, content["info"].get("name"), cameras)
+    view = _view(name, content["info"].get("name"), cameras, photos)
     things: list[IsatObject] = []
     for entry in content["objects"]:
         with suppress(HilsplatError), foreign(name):  # `read` reports it
@@ -312,12 +318,14 @@ def _isat_reader(name: str, content: Mapping[str, Any], cameras: Cameras) -> Rea
     return read
 
 
-def _labelme_reader(name: str, content: Mapping[str, Any], cameras: Cameras) -> Reader:
-    view = _view(name, content.get("imagePath"), cameras)
-    size = {side: content.get(f"image{side.title()}") for side in ("height", "width")}
+def _labelme_reader(name: str, content: Mapping[str, Any], cameras: Cameras, photos: Photos) -> Reader:
+    view = _view(name, content.get("imagePath"), cameras, photos)
+    size: Mapping[str, Any] = {side: content.get(f"image{side.title()}") for side in ("height", "width")}
     if not any(size.values()) and content.get("imageData"):  # as in old versions
         with open_image(io.BytesIO(base64.b64decode(content["imageData"]))) as image:
             size = {"height": image.height, "width": image.width}
+    elif not any(size.values()):
+        size = _photo_size(photos, view)
 
     def read(where: str, entry: Any) -> Piece | str:
         drawn_hw = _drawn_hw(where, size, cameras[view])
@@ -361,11 +369,11 @@ def _labelme_mask(
     return np.asarray(canvas)
 
 
-def _coco_reader(name: str, content: Mapping[str, Any], cameras: Cameras) -> Reader:
+def _coco_reader(name: str, content: Mapping[str, Any], cameras: Cameras, photos: Photos) -> Reader:
     images, categories = _by_id(content["images"]), _by_id(content["categories"])
     used = {repr(entry.get("image_id")) for entry in content["annotations"] if isinstance(entry, dict)}
     files = {str(image.get("file_name")) for number, image in images.items() if number in used}
-    views = match_names(files, cameras.names)
+    views = _matched(files, cameras, photos)
     num_files = Counter(views.values())
     foreign_names = ", ".join(sorted(file for file in files if views[file] is None)[:3])
 
@@ -381,6 +389,8 @@ def _coco_reader(name: str, content: Mapping[str, Any], cameras: Cameras) -> Rea
             return "of unknown categories"
         if not region:
             return "without a region (boxes, keypoints)"
+        if image.get("height") is image.get("width") is None:
+            image = _photo_size(photos, view)
         mask = _coco_mask(where, region, image, cameras[view])
         return Piece(view, str(text), entry.get("thing"), traced(placed(mask, cameras[view], where)), entry)
 
@@ -432,6 +442,11 @@ def _vertices(value: Any, size_hw: tuple[int, int]) -> Float[np.ndarray, "P 2"]:
     return points
 
 
+def _photo_size(photos: Photos, view: str) -> dict[str, int]:
+    """Return the size of a view's photograph, for a file that states none; empty if it is unknown."""
+    return dict(zip(("height", "width"), photos.get(view, {}).get("photo_hw_px", ()), strict=False))
+
+
 def _drawn_hw(where: str, image: Mapping[str, Any], camera: Camera) -> tuple[int, int]:
     """Return the stated size of the image that was drawn on, which may be larger than the view."""
     size_hw = stated_size(where, image)
@@ -439,9 +454,19 @@ def _drawn_hw(where: str, image: Mapping[str, Any], camera: Camera) -> tuple[int
     return size_hw
 
 
-def _view(name: str, image: Any, cameras: Cameras) -> str:
+def _matched(files: Iterable[str], cameras: Cameras, photos: Photos) -> dict[str, str | None]:
+    """Return the view of each photograph, or None; the folders that its pose file states must be the same."""
+    views = match_names(files, cameras.names)
+    for file, view in views.items():
+        photo = str(photos.get(view or "", {}).get("file", view))
+        if view and Path(photo).stem == Path(view).stem and match_name(file, [photo]) is None:
+            views[file] = None
+    return views
+
+
+def _view(name: str, image: Any, cameras: Cameras, photos: Photos) -> str:
     """Return the view of a photograph, or else of the file; raise SceneError if there is none."""
-    view = match_name(image := str(image or name), cameras.names)
+    view = _matched([image := str(image or name)], cameras, photos)[image]
     if view is None:
         expected = f"a name such as {cameras.names[0]}"
         raise SceneError(f"{name} does not match a photograph in this scene", expected=expected, found=image)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float64, UInt8
 from PIL import ExifTags, Image, ImageCms, PngImagePlugin
 
 from hilsplat.base.atomic import atomic_path
@@ -95,10 +95,12 @@ def opened_image(path: Path, what: str = "image") -> Iterator[Image.Image]:
         raise ImageError(f"{what} {path} cannot be read: {error}", fix=fix) from error
 
 
-def image_size_hw(path: Path) -> tuple[int, int]:
-    """Read an image's height and width, as stored, from its header; raise ImageError if it is unreadable."""
+def image_size_hw(path: Path, *, upright: bool = False) -> tuple[int, int]:
+    """Read an image's height and width, as stored or upright, from its header; ImageError if unreadable."""
     with opened_image(path) as image:
-        return image.height, image.width
+        # Pillow states the upright size of a TIFF.
+        is_other = orientation(image) > 4 and upright != (image.format == "TIFF")
+        return (image.width, image.height) if is_other else (image.height, image.width)
 
 
 def exif_tags(image: Image.Image, ifd: ExifTags.IFD | None = None) -> Mapping[int, Any]:
@@ -147,7 +149,7 @@ def read_image(
                 pixels = Image.fromarray(_eight_bits(np.asarray(pixels)))
             if image.mode == "F":
                 raise ValueError("its pixels are floating-point numbers of unknown range")
-            return np.asarray(_to_srgb(pixels, image.info.get("icc_profile"), file))
+            return np.asarray(_to_srgb(pixels, image.info, file))
     except FileNotFoundError as error:
         raise ImageError(f"image {file} is missing") from error
     except DAMAGE as error:
@@ -237,8 +239,9 @@ def _frames(image: Image.Image) -> int:
     return num_frames if same else 1
 
 
-def _to_srgb(image: Image.Image, profile: bytes | None, file: object) -> Image.Image:
-    """Convert to sRGB with the embedded profile; if it is missing or damaged, assume sRGB pixels."""
+def _to_srgb(image: Image.Image, info: Mapping[Any, Any], file: object) -> Image.Image:
+    """Convert to sRGB with the embedded profile, or else PNG's gamma; without valid ones, assume sRGB."""
+    profile = info.get("icc_profile")
     base = {"RGBA": "RGB", "P": "RGB", "LA": "L", "1": "L"}.get(image.mode, image.mode)
     if profile and PROFILE_MODES.get(profile[16:20], base) == base:  # grey images may carry a profile of RGB
         colours = image if base == image.mode else image.convert(base)
@@ -251,7 +254,15 @@ def _to_srgb(image: Image.Image, profile: bytes | None, file: object) -> Image.I
         else:
             assert converted is not None  # only in-place conversion returns None
             return converted
-    return image.convert("RGB")
+    colours, gamma = image.convert("RGB"), info.get("gamma", 1 / 2.2)
+    if profile or "srgb" in info or abs(gamma - 1 / 2.2) < 0.01:  # 1 / 2.2 is nearly sRGB
+        return colours
+    return colours.point(srgb_codes(np.linspace(0, 1, 256) ** (1 / gamma)).tolist() * 3)
+
+
+def srgb_codes(light: Float64[np.ndarray, " N"]) -> UInt8[np.ndarray, " N"]:
+    """Return the 8-bit sRGB values of linear light in [0, 1] (IEC 61966-2-1)."""
+    return to_uint8(np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055))
 
 
 @functools.cache

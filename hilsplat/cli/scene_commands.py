@@ -82,11 +82,11 @@ def new(
 
     Reports what was found, what is used, and what is likely to fail.
     """
-    from hilsplat.photos.add import add_scene
     from hilsplat.scene.sheet import DEFAULT_SHEET
-    from hilsplat.splat.coordinates import read_gaussians
-    from hilsplat.workflow.models import models_of_photographs
+    from hilsplat.workflow.models import models_of_photographs, settings_of_photographs
+    from hilsplat.workflow.new_scene import add_scene
 
+    settings = settings_of_photographs(sheet.with_name("config.yaml"), name)
     parts = {"poses": poses, "gaussians": gaussians, "features": features, "labels": labels}
     report = add_scene(
         sheet,
@@ -94,7 +94,7 @@ def new(
         photos,
         frames=frames,
         **parts,
-        check_ply=lambda ply: read_gaussians(ply)[1],
+        settings=settings.poses,
         dry_run=dry_run,
     )
     if dry_run:
@@ -104,5 +104,5 @@ def new(
     setting = "" if is_default else f", with `scenes: {sheet}` in config/config.yaml"
     following = f"  hilsplat run {name}\n  hilsplat query {name} 'bear nose'"
     echo(f"{report}\n\nadded photos/{name} to {sheet}. Next{setting}:\n{following}")
-    for line in models_of_photographs(sheet.with_name("config.yaml"), name, report.columns.get("features")):
+    for line in models_of_photographs(settings, report.columns.get("features")):
         echo(line)

@@ -45,12 +45,17 @@ def absence(source: str, data_root: str) -> str | None:
     return None
 
 
-def unlisted(sources: Collection[str], groups: Collection[str], data_root: str) -> list[str]:
-    """Return scenes on disk that are not the source of any row, for data sets without a scene list (Waymo).
+def is_open_ended(name: str) -> bool:
+    """Return whether a data set has images but no scene list (Waymo); its group has the same name."""
+    return name in DATASETS and not DATASETS[name].scenes and not DATASETS[name].images_of
 
-    Such a data set has the same name as its group; `data_root` is empty if not set.
+
+def unlisted(sources: Collection[str], groups: Collection[str], data_root: str) -> list[str]:
+    """Return scenes on disk that are not the source of any row, for data sets that are open-ended.
+
+    `data_root` is empty if not set.
     """
-    open_ended = [DATASETS[name] for name in groups if name in DATASETS and not DATASETS[name].scenes]
+    open_ended = [DATASETS[name] for name in groups if is_open_ended(name)]
     found = [
         f"{dataset.name}/{scene}"
         for dataset in (open_ended if data_root else ())

@@ -8,6 +8,7 @@ numbered across all four maps. File names are truncated at their first dot.
 """
 
 import logging
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +16,14 @@ from jaxtyping import Float16
 
 from hilsplat.base.artifacts import read_npy, write_index, write_npy
 from hilsplat.base.atomic import atomic_folder
-from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
+from hilsplat.base.errors import ArtifactError, HilsplatError, MisalignedArtifactError, in_one_line
 from hilsplat.base.levels import Level
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel, unit
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.placement import placed
 from hilsplat.scene.scene import Scene
+from hilsplat.segment.coverage import with_tree_levels
 from hilsplat.segment.digests import MASKS_SHA256, digest_of
 from hilsplat.segment.masks import HierarchicalMasks, runs_of_labels
 from hilsplat.segment.stage import train_views, write_masks
@@ -52,19 +54,24 @@ def stems_of(views: list[str]) -> dict[str, str]:
     return stems
 
 
-def read_view(folder: Path, camera: Camera) -> tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]:
+def read_view(
+    folder: Path, view: str, camera: Camera | None = None, theta: float | None = None
+) -> tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]:
     """Read the masks and vectors of one view, with rows in `content_order`.
 
-    The mixed-level map is ignored. Where masks of one level overlap, the files contain only the mask
+    The mixed-level map is ignored. Levels are those of the other maps or, with `theta`, the depths in the
+    view's coverage tree. Where masks of one level overlap, the files contain only the mask
     painted last. The files contain no scores, so predicted IoU and stability are set to 1. Maps of the
     photograph or of a scaled copy, such as LangSplat's 1080 rows, are transferred to the view (nearest
-    pixel).
+    pixel); without a camera, they stay as they are.
 
     Raises:
         ArtifactError: a file is missing, damaged, pickled, or in a different format.
         MisalignedArtifactError: the maps fit neither view nor photograph.
     """
-    maps_path, vectors_path = (folder / f"{stem_of(camera.name)}_{kind}.npy" for kind in "sf")
+    maps_path, vectors_path = (folder / f"{stem_of(view)}_{kind}.npy" for kind in "sf")
+    if missing := [path for path in (maps_path, vectors_path) if not path.is_file()]:
+        raise ArtifactError(f"{missing[0]} is missing")
     maps, vectors = read_npy(maps_path), read_npy(vectors_path)
     if maps.ndim != 3 or len(maps) != len(MAPS) or not maps.size:
         shape = "an array of shape (4, height, width): default, s, m, l"
@@ -87,45 +94,57 @@ def read_view(folder: Path, camera: Camera) -> tuple[HierarchicalMasks, Float16[
     for level, drawn in zip(MAPS, labels, strict=True):
         if level is None:
             continue
-        label_map = placed(drawn + 1, camera, str(maps_path)) - 1  # 0 is outside the photograph
+        label_map = drawn if camera is None else placed(drawn + 1, camera, str(maps_path)) - 1  # 0: outside
         rows = np.unique(label_map[label_map >= 0])
         ones = np.ones(len(rows), np.float32)
         runs = runs_of_labels(label_map, rows)
-        parts.append(HierarchicalMasks.from_runs(*runs, level, ones, ones, camera.size_hw))
+        parts.append(HierarchicalMasks.from_runs(*runs, level, ones, ones, label_map.shape))
         vector_rows.append(rows)
     masks = HierarchicalMasks.concatenate(parts)
+    if theta is not None:
+        masks = with_tree_levels(masks, theta)
     order = masks.content_order()
     vectors = vectors[np.concatenate(vector_rows)[order]].astype(np.float32)
     return masks.take(order), unit(vectors).astype(np.float16)
 
 
-def _read_all(scene: Scene, folder: Path) -> dict[str, tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]]:
-    """Read the training views that have files; raise an ArtifactError if fewer than half do."""
-    maps = {view: f"{stem}_s.npy" for view, stem in stems_of(train_views(scene)).items()}
-    views = [view for view, name in maps.items() if (folder / name).is_file()]
-    missing = [name for view, name in maps.items() if view not in views]
-    problem = f"{folder} lacks the maps of {len(missing)} of {len(maps)} training views of {scene.name}"
-    if len(views) < MIN_SHARE * len(maps):
+def read_views(
+    folder: Path, cameras: Mapping[str, Camera | None], theta: float | None = None
+) -> tuple[dict[str, tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]], list[str]]:
+    """Read training views (`read_view`); also return why others, whose files cannot be used, are left out.
+
+    Raises:
+        ArtifactError: less than `MIN_SHARE` of the views can be used, or two views share their files.
+    """
+    found, lost = {}, []
+    for view in track(stems_of([*cameras]), "LangSplat's files"):
+        try:
+            found[view] = read_view(folder, view, cameras[view], theta)
+        except HilsplatError as error:
+            lost.append(in_one_line(error))
+    if len(found) < MIN_SHARE * len(cameras):
         raise ArtifactError(
-            problem,
-            expected=", ".join(missing[:5]),
-            found=", ".join(sorted(path.name for path in folder.glob("*_s.npy"))[:5]) or "none",
+            f"{folder} has usable maps of only {len(found)} of {len(cameras)} training views",
+            found="; ".join(lost[:3]),
             fix="pass the language_features folder that LangSplat wrote for the same images",
         )
-    if missing:
-        logger.warning("%s: %s", problem, ", ".join(missing[:5]))
-    return {view: read_view(folder, scene.cameras[view]) for view in track(views, "LangSplat's files")}
+    return found, lost
 
 
-def run_imported_masks(scene_folder: Path, files: Path, out: Path) -> None:
+def run_imported_masks(scene_folder: Path, files: Path, out: Path, theta: float | None = None) -> None:
     """Write LangSplat's masks in the format of `segment.stage.write_masks`."""
     scene = Scene.load(scene_folder)
     with stage_log("langsplat masks", scene.name) as counts:
-        masks = {view: masks for view, (masks, _) in _read_all(scene, files).items()}
+        views, lost = read_views(files, {view: scene.cameras[view] for view in train_views(scene)}, theta)
+        if lost:
+            logger.warning("%s: %d views are left out: %s", files, len(lost), "; ".join(lost[:5]))
+        masks = {view: masks for view, (masks, _) in views.items()}
         counts.update(write_masks(out, scene, masks.items(), len(masks), "langsplat"))
 
 
-def run_imported_clip(scene_folder: Path, files: Path, out: Path, settings: ClipSettings) -> None:
+def run_imported_clip(
+    scene_folder: Path, files: Path, out: Path, settings: ClipSettings, theta: float | None = None
+) -> None:
     """Write LangSplat's vectors in the format of the clip stage, with rows as in `run_imported_masks`.
 
     A MisalignedArtifactError is raised unless the vectors are those of `settings.model`, which embeds texts.
@@ -134,7 +153,7 @@ def run_imported_clip(scene_folder: Path, files: Path, out: Path, settings: Clip
     model = ClipModel.load(Path(settings.model), variant=settings.variant)
     with stage_log("langsplat clip", scene.name) as counts, atomic_folder(out) as folder:
         index = {}
-        views = _read_all(scene, files)
+        views, _ = read_views(files, {view: scene.cameras[view] for view in train_views(scene)}, theta)
         _require_model(model, scene, files, views)
         for view, (masks, vectors) in views.items():
             write_npy(folder / f"{view}.npy", vectors)

@@ -83,18 +83,13 @@ def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
     num_rotated = 0
     checked: list[CheckedPhoto] = []
     for path in track(photos, "photographs checked"):
-        if not path.exists():
-            unreadable.append((path.name, "it is a link to a file that does not exist"))
-            continue
-        if path.stat().st_size == 0:
-            unreadable.append((path.name, "the file is empty"))
-            continue
         try:
             pixels = read_image(path)
             require_usable_size(path, pixels.shape[:2])
         except ImageError as error:
             reason = first_line(error.__cause__ or error).replace(str(path), path.name)
-            unreadable.append((path.name, f"{reason} ({path.stat().st_size} bytes)"))
+            size = f" ({path.stat().st_size} bytes)" if path.exists() else ""
+            unreadable.append((path.name, reason + size))
             continue
         size_hw = (pixels.shape[0], pixels.shape[1])
         sizes[size_hw] += 1

@@ -7,6 +7,8 @@ from av import VideoFrame
 from av.video.reformatter import Interpolation
 from jaxtyping import Float32, Float64, UInt8, UInt16
 
+from hilsplat.base.images import srgb_codes
+
 PQ, HLG = 16, 18
 """Transfer characteristics of HDR video (ITU-T H.273): SMPTE ST 2084 and ARIB STD-B67."""
 
@@ -95,7 +97,5 @@ def _hlg_light() -> Float32[np.ndarray, "65536"]:
 
 @functools.cache
 def _srgb_codes() -> UInt8[np.ndarray, "65536"]:
-    """Return the lookup table from linear light (65536 steps) to 8-bit sRGB (IEC 61966-2-1)."""
-    light = np.arange(65536) / 65535
-    encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-    return (encoded * 255 + 0.5).astype(np.uint8)
+    """Return the lookup table from linear light (65536 steps) to 8-bit sRGB."""
+    return srgb_codes(np.arange(65536) / 65535)

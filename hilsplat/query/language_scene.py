@@ -315,7 +315,7 @@ def open_scene(folder: Path | str, variant: str = "default", *, threads: int = 1
         MisalignedArtifactError: the scene's parts do not belong together.
         ModelError: the CLIP that embedded the scene's masks is not found.
     """
-    scene = LanguageScene.of(FinishedScene.locate(Path(folder), variant), threads=threads)
+    scene = LanguageScene.of(FinishedScene.locate(Path(folder).absolute(), variant), threads=threads)
     if scene.caution:
         logger.warning("%s: %s", scene.scene.name, scene.caution)
     return scene

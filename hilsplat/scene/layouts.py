@@ -56,16 +56,16 @@ def read_json_object(path: Path, fix: str) -> dict[str, Any]:
 
 def vertex_count(path: Path) -> int | None:
     """Return the number of Gaussians in a PLY's header; None if unreadable (its reader says so)."""
-    match = re.search(rb"^element vertex ([0-9]+)\s*$", _header(path), re.MULTILINE)
+    match = re.search(rb"^element vertex ([0-9]+)\s*$", ply_header(path), re.MULTILINE)
     return int(match[1]) if match else None
 
 
 def is_from_nerfstudio(ply: Path) -> bool:
     """Return whether nerfstudio exported a PLY, according to its header."""
-    return NERFSTUDIO.search(_header(ply)) is not None
+    return NERFSTUDIO.search(ply_header(ply)) is not None
 
 
-def _header(ply: Path) -> bytes:
+def ply_header(ply: Path) -> bytes:
     """Return the start of a PLY's header; empty if unreadable."""
     try:
         with regular(Path(ply)).open("rb") as stream:
@@ -142,11 +142,12 @@ def langsplat_features(folder: Path) -> Path | None:
     return features if any(features.glob("*_s.npy")) else None
 
 
-def label_files(folder: Path) -> list[Path]:
-    """Return the label files of a LERF-OVS scene, from its `label/` folder or the one beside the scene."""
+def label_files(folder: Path, named: Path | None = None) -> list[Path]:
+    """Return the label files in a named folder, or else those in or beside a LERF-OVS scene."""
     folder = folder.resolve()
-    beside = folder.parent / "label" / folder.name
-    return sorted((folder / "label").glob("*.json")) or sorted(beside.glob("*.json"))
+    places = (folder / "label", folder.parent / "label" / folder.name) if named is None else (named,)
+    found = (sorted(place.glob("[!.]*.json")) for place in places)  # archives of macOS have hidden ones
+    return next(filter(None, found), [])
 
 
 def photo_folder(folder: Path) -> Path:

@@ -14,7 +14,7 @@ from hilsplat.base.artifacts import run_command
 from hilsplat.base.atomic import work_folder
 from hilsplat.base.errors import RegistrationError, SceneError, shorten_list
 from hilsplat.base.files import list_images
-from hilsplat.base.images import read_image, resize_to_fit
+from hilsplat.base.images import image_size_hw, read_image, resize_to_fit
 from hilsplat.base.ownership import SOFTWARE, require_own_picture
 from hilsplat.base.processes import in_own_process
 from hilsplat.base.progress import stage_log
@@ -164,6 +164,8 @@ def _reconstruct(
     report = {"scene": name, "poses": how, "seed": seed, **report}
     plot_lost(work / LOST_PICTURE, work / "images", report)
     report["images"] += len(unreadable)
+    for photo in work_images:
+        report["views"][photo.view]["photo_hw_px"] = image_size_hw(photo.source, upright=True)
     for source, reason in unreadable.items():
         lost = {"file": source.name, "registered": False, "why_not": reason.splitlines()[0]}
         report["views"].setdefault(source.name, lost)

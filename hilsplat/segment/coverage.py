@@ -74,14 +74,13 @@ def coverage_tree(
 
 
 def with_tree_levels(masks: HierarchicalMasks, theta: float) -> HierarchicalMasks:
-    """Return the masks with levels set to their depths in the view's tree, in `content_order`.
+    """Return the masks, in the same order, with levels set to their depths in the view's tree.
 
     Roots become wholes, their children parts, and all other descendants subparts, regardless of the head
     that predicted them. This rule is from a comment in the source of the paper (Sec. III-B).
     """
     depth = depths(coverage_parents(masks.overlaps_px(), None, theta))
-    levelled = replace(masks, level=np.minimum(depth, len(LEVELS)).astype(np.uint8))
-    return levelled.take(levelled.content_order())
+    return replace(masks, level=np.minimum(depth, len(LEVELS)).astype(np.uint8))
 
 
 def run_coverage_tree(masks_folder: Path, out: Path, settings: CoverageTreeSettings) -> None:

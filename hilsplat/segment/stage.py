@@ -27,7 +27,7 @@ from hilsplat.segment.generate import Candidates, candidates_key, decode_candida
 from hilsplat.segment.graph import segment_graph
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.sam import SamModel
-from hilsplat.settings import CoverageTreeSettings, MasksSettings
+from hilsplat.settings import MasksSettings
 
 logger = logging.getLogger(__name__)
 
@@ -114,9 +114,10 @@ def segment_views(
         if finished and view in finished_digests:
             return load_masks(finished, view, finished_digests)
         masks = segment_view(view)
-        if settings.levels == "head":
+        if settings.tree_theta is None:
             return masks
-        return with_tree_levels(masks, settings.theta or CoverageTreeSettings().theta)
+        masks = with_tree_levels(masks, settings.tree_theta)
+        return masks.take(masks.content_order())
 
     return zip(views, in_order(segment, views, threads), strict=True), origin
 

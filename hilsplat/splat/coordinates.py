@@ -11,10 +11,9 @@ from scipy.special import sph_harm_y
 
 from hilsplat.base.artifacts import read_json, run_command, write_json
 from hilsplat.base.errors import ArtifactError, HilsplatError, SceneError, foreign
-from hilsplat.base.files import regular
 from hilsplat.base.lineage import require_as_written, require_made_from, sha256_of_file
 from hilsplat.base.rotations import are_rotations, multiply, quaternion_of
-from hilsplat.scene.layouts import HEADER_BYTES, read_json_object
+from hilsplat.scene.layouts import ply_header, read_json_object
 from hilsplat.scene.posed_images import rigid_pose
 from hilsplat.scene.scene import Scene
 from hilsplat.splat.gaussians import FIELDS, Gaussians
@@ -165,11 +164,7 @@ def source_comments(ply: Path) -> list[str]:
 
 
 def _commented(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
-    if not ply.is_file():
-        return None
-    with regular(ply).open("rb") as stream:
-        header = stream.read(HEADER_BYTES).partition(b"end_header")[0]
-    match = re.search(rf"^comment {KEY} (.*)$".encode(), header, re.MULTILINE)
+    match = re.search(rf"^comment {KEY} (.*)$".encode(), ply_header(ply), re.MULTILINE)
     if match is None:
         return None
     with foreign(f"{ply}, comment {KEY}", ArtifactError, expected="16 numbers", fix=FIX):

@@ -87,11 +87,12 @@ def doubt_about_photographs(stages: StageSettings) -> str:
     return meaningless(clip.folder.name) if clip is not None and clip.embedded else ""
 
 
-def models_of_photographs(config: Path, scene: str, features: Path | None = None) -> list[str]:
-    """Return lines about the models that a scene of photographs will use.
-
-    If `config` does not exist, the installed configuration is read.
-    """
+def settings_of_photographs(config: Path, scene: str) -> StageSettings:
+    """Return the settings of a scene of photographs; without `config`, those of the installed one."""
     run = parse_run(read_config(config if config.is_file() else INSTALLED / CONFIG))
-    stages = run.stages("default", (PHOTOS, f"{PHOTOS}/{scene}")).resolve_auto()
+    return run.stages("default", (PHOTOS, f"{PHOTOS}/{scene}")).resolve_auto()
+
+
+def models_of_photographs(stages: StageSettings, features: Path | None = None) -> list[str]:
+    """Return lines about the models that a scene of photographs will use."""
     return [line for line in (describe_models(stages, features), doubt_about_photographs(stages)) if line]

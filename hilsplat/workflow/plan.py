@@ -13,8 +13,7 @@ from hilsplat.base.errors import SettingsError, shorten_list
 from hilsplat.base.files import INSTALLED, project_path
 from hilsplat.baselines import method_of
 from hilsplat.configuration import SECTIONS, RunSettings, StageSettings, parse_run, require_known
-from hilsplat.datasets.registry import DATASETS
-from hilsplat.datasets.sources import unlisted
+from hilsplat.datasets.sources import is_open_ended, published, unlisted
 from hilsplat.models.store import AUTO, model_digest, model_path, planned_model
 from hilsplat.scene.finished import KEY_VIEWS
 from hilsplat.scene.sheet import (
@@ -26,6 +25,7 @@ from hilsplat.scene.sheet import (
     read_sheet,
     row_of_data,
 )
+from hilsplat.settings import MasksSettings
 from hilsplat.stage import Facts, Stage
 from hilsplat.stages import all_stages, family_of, kinds_of, stage_of
 from hilsplat.workflow.models import (
@@ -146,6 +146,13 @@ class Plan:
                 ),
                 fix="select a scene (hilsplat run photos/desk) or other groups, or set data_root",
             )
+        rows_of: dict[Path | None, SceneRow] = {}
+        for row in filter(lambda row: published(row.source), self.scenes):
+            if (other := rows_of.setdefault(row.folder, row)) is not row:
+                raise SettingsError(
+                    f"{other.name} and {row.name} are the same scene of a data set, with the same scores",
+                    fix="remove one of their rows, or run them one at a time into separate results folders",
+                )
         # A thousand scenes have tens of thousands of jobs, so settings are resolved and folders read once.
         self.stages_of = functools.cache(lambda *which: run.stages(*which).resolve_auto())
         self.defaults = {name: getattr(self.stages_of("default", ()), name) for name in SECTIONS}
@@ -211,7 +218,10 @@ class Plan:
         return getattr(self.stages_of(variant, scopes), section)
 
     def settings(self, section: str, job: Job) -> str:
-        """Return a section's settings for a job, as JSON."""
+        """Return a section's settings for a job, as JSON; only levels apply to imported masks."""
+        if section == "masks" and self.row(job).features is not None:
+            masks = self.stages(job).masks
+            return MasksSettings(segmenter="graph", levels=masks.levels, theta=masks.theta).model_dump_json()
         return escape_json_for_report(self._json(section, *self.which(job)))
 
     def seeded(self, variant: str, row: SceneRow, table: str) -> list[str]:
@@ -580,17 +590,19 @@ def require_variant_sections(run: RunSettings) -> None:
 def without_scene(run: RunSettings, rows: Iterable[SceneRow]) -> list[str]:
     """Return a line for each scene in `overrides`, `queries` and `sweep_scenes` that is not in the rows.
 
-    SettingsError is raised if a name is probably misspelt, or is not that of a known group or data set.
+    SettingsError is raised if a name is probably misspelt, or has no effect: `overrides` take the names of
+    groups, `queries` those of data sets.
     """
-    groups = list(dict.fromkeys((*GROUPS, *(row.group for row in rows), *DATASETS)))
+    open_ended = {name for name in (*run.groups, *run.overrides, *run.queries) if is_open_ended(name)}
+    groups = list(dict.fromkeys((*GROUPS, *(row.group for row in rows), *open_ended)))
     require_known("groups", run.groups, groups)
-    datasets = {row.dataset for row in rows} | {PHOTOS}
+    datasets = {row.dataset for row in rows} | {PHOTOS} | open_ended
     scenes = [row.name for row in rows]
     # Settings of a scene that was removed from the sheet may stay in the configuration.
     named = [key for key in (*run.overrides, *run.queries) if "/" in key]
     gone = [key for key in named if key.partition("/")[0] in datasets]
     require_known("overrides", run.overrides, [*groups, *scenes, *gone])
-    require_known("queries", run.queries, [*sorted({*datasets, *groups}), *scenes, *gone])
+    require_known("queries", run.queries, [*sorted(datasets), *scenes, *gone])
     known = {
         **dict.fromkeys(gone, ("overrides or queries", scenes)),
         **dict.fromkeys(run.sweep_scenes, ("sweep_scenes", [row.scene for row in rows])),

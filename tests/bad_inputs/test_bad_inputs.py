@@ -281,7 +281,7 @@ ROWS = {
     "LLFF poses that are text": row(
         lambda: [photographs()(), np.save("photos/poses_bounds.npy", np.array([["a"] * 17] * 3))],
         POSES,
-        "poses_bounds.npy does not contain LLFF poses",
+        "poses_bounds.npy cannot be read: it does not contain LLFF poses",
         "<U1",
     ),
     # ---- output paths

@@ -439,7 +439,9 @@ def langsplat(folder: Path) -> Case:
                 for known_level, mask, vector in expected
             ), f"level {level}: {direction}"
 
-    return Case(paths, lambda: read_view(folder, Camera("000.png", np.eye(4), np.eye(3), SIZE_HW)), check)
+    return Case(
+        paths, lambda: read_view(folder, "000.png", Camera("000.png", np.eye(4), np.eye(3), SIZE_HW)), check
+    )
 
 
 def pictures(

@@ -37,8 +37,8 @@ def flat(left, top, right, bottom):
     return [left, top, right, top, right, bottom, left, bottom]
 
 
-def regions(content, name: str = "x.json", notes=None) -> dict[str, list[np.ndarray]]:
-    found = imported(name, json.dumps(content), CAMERAS, notes)
+def regions(content, name: str = "x.json", notes=None, photos=None) -> dict[str, list[np.ndarray]]:
+    found = imported(name, json.dumps(content), CAMERAS, notes, photos)
     return {view: [label.mask(SIZE) for label in labels] for view, labels in found.items()}
 
 
@@ -186,6 +186,32 @@ def test_labelme_shapes_of_a_group_are_one_object_and_drawings_may_have_another_
 def test_names_of_photographs_in_files_of_other_programs(name, view):
     assert list(regions(coco([flat(5, 5, 9, 9)], image={"file_name": name}))) == [VIEWS[view]]
     assert list(regions(labelme({"points": [[1, 1], [9, 1], [5, 9]]}, imagePath=name))) == [VIEWS[view]]
+
+
+@pytest.mark.parametrize("name", ["cam2/IMG_0001.jpg", "rig\\cam2\\IMG_0001.jpg"])
+def test_a_namesake_in_another_folder_is_not_the_photograph(name):
+    photos = {VIEWS[0]: {"file": "cam1/IMG_0001.jpg"}, VIEWS[1]: {"file": "cam1/IMG_0002.jpg"}}
+    square = {"points": [[1, 1], [9, 1], [5, 9]]}
+    for content in (coco([flat(5, 5, 9, 9)], image={"file_name": name}), labelme(square, imagePath=name)):
+        with pytest.raises(SceneError, match=r"not in the scene|does not match a photograph"):
+            regions(content, photos=photos)
+        text = json.dumps(content).replace("cam2", "cam1")
+        assert list(regions(json.loads(text), photos=photos)) == [VIEWS[0]]
+
+
+@pytest.mark.parametrize("write", [coco, labelme])
+def test_the_size_is_that_of_the_photograph_if_a_file_states_none(write):
+    photos = {VIEWS[0]: {"file": "IMG_0001.jpg", "photo_hw_px": [2 * HEIGHT, 2 * WIDTH]}}
+    drawn = [[10, 10], [41, 10], [41, 31], [10, 31]]
+    if write is coco:
+        content = coco([np.ravel(drawn).tolist()], image={"height": None, "width": None})
+    else:
+        content = labelme({"points": drawn}, imageHeight=None, imageWidth=None)
+    content["imageData"] = None
+    ((mask,),) = regions(content, photos=photos).values()
+    np.testing.assert_array_equal(mask, box(5, 5, *((20, 15) if write is coco else (21, 16))))
+    with pytest.raises(SceneError, match="does not state a valid image size"):
+        regions(content)
 
 
 GOOD = [flat(5, 5, 9, 9)]

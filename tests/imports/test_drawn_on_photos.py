@@ -173,7 +173,7 @@ def test_langsplats_maps_of_the_photograph(kind, scale, tmp_path):
     maps[1:, mask] = 0
     np.save(tmp_path / "000_s.npy", maps)
     np.save(tmp_path / "000_f.npy", np.eye(1, 8, dtype=np.float32))
-    masks, vectors = read_view(tmp_path, cameras_of(kind)[VIEW])
+    masks, vectors = read_view(tmp_path, VIEW, cameras_of(kind)[VIEW])
     assert len(masks) == len(vectors) == 3
     assert min(iou(dense) for dense in masks.dense()) > least(scale)
 

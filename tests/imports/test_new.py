@@ -12,12 +12,12 @@ from typer.testing import CliRunner
 
 from hilsplat.base.errors import SceneError
 from hilsplat.cli.main import app
-from hilsplat.photos.add import add_scene
 from hilsplat.scene.importers.reading import read_source
 from hilsplat.scene.layouts import find_known_poses, photo_folder
 from hilsplat.scene.sheet import read_sheet
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import save_ply
+from hilsplat.workflow.new_scene import add_scene
 from tests.imports import analytic_world as world
 
 WIDTH, HEIGHT = 64, 48
@@ -53,6 +53,25 @@ def without_some(path, bad):
     ply.write(path)
 
 
+def langsplat_files(folder, name, size_hw=(HEIGHT, WIDTH)):
+    """Write LangSplat's maps and vectors of an image: one mask, which covers the image at every level."""
+    folder.mkdir(exist_ok=True)
+    np.save(folder / f"{name}_s.npy", np.zeros((4, *size_hw), np.float32))
+    np.save(folder / f"{name}_f.npy", np.ones((1, 8), np.float32))
+
+
+def thing(text, **keys):
+    """Return an object of a label file: a square of 20 px."""
+    number = 1 + len(text) % 2
+    square = [[10, 10], [30, 10], [30, 30], [10, 30]]
+    return {"category": text, "id": number, "level": 1, "segmentation": square, **keys}
+
+
+def label_file(path, objects, width=WIDTH, height=HEIGHT):
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(json.dumps({"info": {"width": width, "height": height}, "objects": objects}))
+
+
 def new(folder, project, *options):
     project.mkdir(exist_ok=True)
     words = ["new", "desk", str(folder), "--sheet", str(project / "config/scenes.tsv"), *options]
@@ -67,14 +86,15 @@ def test_every_part_is_counted_and_what_is_left_out_is_named(options, tmp_path):
     gaussians(folder / "output/a/point_cloud/iteration_30000/point_cloud.ply", 11)
     gaussians(folder / "output/a/point_cloud/iteration_best/point_cloud.ply", 12)
     without_some(folder / "output/a/point_cloud/iteration_30000/point_cloud.ply", 2)
-    (folder / "language_features").mkdir()
-    for name in ("000", "001"):
-        np.save(folder / f"language_features/{name}_s.npy", np.zeros(1))
-    (folder / "label").mkdir()
-    for name in ("001", "002", "004", "zzz"):
-        labels = {"info": {"name": f"{name}.jpg", "width": WIDTH, "height": HEIGHT}, "objects": [{}, {}]}
-        (folder / f"label/{name}.json").write_text(json.dumps(labels))
+    for name in ("000", "001", "002"):
+        langsplat_files(folder / "language_features", name)
+    langsplat_files(folder / "language_features", "003", (HEIGHT, HEIGHT))
+    for name in ("001", "002", "004"):
+        label_file(folder / f"label/{name}.json", [thing("mug"), thing("cup", origin="proposed")])
+    label_file(folder / "label/005.json", [thing("mug")])
+    label_file(folder / "label/003.json", [thing("mug")], WIDTH, WIDTH)
     (folder / "label/000.json").write_text("{")
+    (folder / "label/._001.json").write_bytes(b"of macOS")
     (folder / "output/a/chkpnt30000.pth").touch()
     result = new(folder, tmp_path / "project", *options)
     assert result.exit_code == 0, result.output
@@ -83,17 +103,21 @@ def test_every_part_is_counted_and_what_is_left_out_is_named(options, tmp_path):
         "  left out: 1 views without an image: 004.jpg",
         "  points: 7",
         f"  {folder}/sparse/1 also has poses, which are not used",
-        f"Gaussians: 11 from {folder}/output/a/point_cloud/iteration_30000/point_cloud.ply",
+        f"Gaussians: 9 from {folder}/output/a/point_cloud/iteration_30000/point_cloud.ply",
         "  left out: 2 of 11 Gaussians",
         "  not used: output/a/point_cloud/iteration_best/point_cloud.ply",
-        f"features: {folder}/language_features: masks and vectors of 2 of 5 views",
-        f"labels: 8 in 4 photographs, used for evaluation: {folder}/label",
-        "  not scored, because their views have no pose: 004.json, zzz.json",
+        f"features: {folder}/language_features: masks and vectors of 3 of 5 views",
+        "003_s.npy does not match the size of its image",
+        "005_s.npy is missing",
+        f"labels: 3 regions in 3 photographs, used for evaluation: {folder}/label",
+        "004.json: no view with an image and a pose has this name",
+        "003.json does not match the size of its image",
+        "001.json: ignored 1 unaccepted proposal(s)",
         "skipped, because pickle files can run code: chkpnt30000.pth",
         "5 photographs in",
     ):
         assert line in result.output, result.output
-    assert "left out: " in result.output and "000.json is not valid JSON" in result.output
+    assert "000.json is not valid JSON" in result.output and "._001" not in result.output
     sheet = tmp_path / "project/config/scenes.tsv"
     assert sheet.exists() == (not options)
     for row in read_sheet(sheet) if not options else []:
@@ -101,6 +125,42 @@ def test_every_part_is_counted_and_what_is_left_out_is_named(options, tmp_path):
         assert (row.folder, row.features) == (folder, folder / "language_features")
     assert (tmp_path / "project/annotated/photos/desk/001.json").exists() == (not options)
     assert not (tmp_path / "project/annotated/photos/desk/000.json").exists()
+
+
+def test_poses_that_the_run_would_refuse_are_refused(tmp_path):
+    folder = photographs(tmp_path / "a/images", 4).parent
+    model(folder)
+    assert "2 of 6 views of" in str(new(folder, tmp_path / "p").exception)
+    Image.new("RGB", (HEIGHT, HEIGHT)).save(folder / "images/004.jpg")
+    photographs(folder / "images", 3)
+    error = str(new(folder, tmp_path / "p").exception)
+    assert (
+        "004.jpg does not match the size of its camera" in error and "005.jpg: its image is missing" in error
+    )
+    (tmp_path / "p/config").mkdir(exist_ok=True)
+    (tmp_path / "p/config/config.yaml").write_text(
+        "overrides: {photos: {poses: {min_registered_share: 0.6}}}"
+    )
+    assert "4 views with an image" in new(folder, tmp_path / "p").output
+
+
+@pytest.mark.parametrize(
+    ("files", "reason"),
+    [
+        ({"001": [thing("mug")], "0badcafe-001": [thing("cup")]}, "another file has the labels of 001.png"),
+        ({"001": [thing("mug")], "zzz": [thing("cup")]}, "zzz.json: no view with an image and a pose"),
+        ({"001": [thing("mug")], "002": [{"category": "mug"}]}, "segmentation is not a polygon"),
+        ({"001": [thing("mug")], "002": [thing("mug", level=4)]}, "invalid level"),
+        ({"001": [thing("mug")], "002": [thing("mug", segmentation=[[99, 9], [98, 9], [98, 8]])]}, "outside"),
+    ],
+)
+def test_labels_that_evaluation_would_refuse_are_left_out_or_refused(files, reason, tmp_path):
+    folder = photographs(tmp_path / "a")
+    for name, objects in files.items():
+        label_file(folder / f"label/{name}.json", objects)
+    output = new(folder, tmp_path / "p").output
+    assert "labels: 1 regions in 1 photographs" in output and reason in output, output
+    assert [path.stem for path in (tmp_path / "p/annotated/photos/desk").iterdir()] == ["001"]
 
 
 @pytest.mark.parametrize("kind", ["zip", "r3d"])
@@ -238,9 +298,7 @@ def labelled(folder, **labels):
     photographs(folder)
     (folder / "label").mkdir()
     for view, label in labels.items():
-        objects = [{"category": label}]
-        content = {"info": {"width": WIDTH, "height": HEIGHT}, "objects": objects}
-        (folder / f"label/{view[1:]}.json").write_text(json.dumps(content))
+        label_file(folder / f"label/{view[1:]}.json", [thing(label)])
     return folder
 
 

@@ -10,10 +10,10 @@ import pytest
 from PIL import Image
 
 from hilsplat.base.errors import HilsplatError
-from hilsplat.photos.add import add_scene
 from hilsplat.scene.importers import phones
 from hilsplat.scene.importers.reading import read_source
 from hilsplat.scene.layouts import find_known_poses
+from hilsplat.workflow.new_scene import add_scene
 from tests.imports import analytic_world as world
 
 WIDTH, HEIGHT = 112, 84

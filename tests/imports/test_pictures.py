@@ -6,8 +6,9 @@ import struct
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
-from hilsplat.base.images import read_image, read_mask
+from hilsplat.base.images import image_size_hw, read_image, read_mask
 from tests.conftest import PROJECT
 from tests.imports import analytic_world as world
 from tests.unit.base.test_image_formats import red_and_green_swapped
@@ -146,6 +147,35 @@ def test_unknown_orientations_do_not_turn(value, tmp_path):
     tags = tiff((0x0112, 8, 1, struct.pack("<hh", value, 0)))
     Image.fromarray(PICTURES[0]).save(tmp_path / "a.png", exif=b"Exif\0\0" + tags)
     np.testing.assert_array_equal(read_image(tmp_path / "a.png"), PICTURES[0])
+
+
+@pytest.mark.parametrize(
+    ("chunks", "exponent"),
+    [
+        ({b"gAMA": 100_000}, 1.0),  # linear light
+        ({b"gAMA": 55_556}, 100_000 / 55_556),  # 1.8, as on old Macs
+        ({b"gAMA": 45_455}, None),  # sRGB's own
+        ({b"sRGB": 0, b"gAMA": 100_000}, None),
+    ],
+)
+def test_gamma_of_png_is_applied_unless_it_is_that_of_srgb(chunks, exponent, tmp_path):
+    stored, info = np.arange(256, dtype=np.uint8).reshape(16, 16), PngInfo()
+    for name, value in chunks.items():
+        info.add(name, struct.pack(">I" if name == b"gAMA" else ">B", value))
+    Image.fromarray(stored).save(tmp_path / "a.png", pnginfo=info)
+    light = (stored / 255) ** (exponent or 1)
+    srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)  # IEC 61966-2-1
+    expected = stored if exponent is None else np.rint(255 * srgb).astype(np.uint8)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), grey(expected))
+
+
+@pytest.mark.parametrize("turn", [1, 6])
+def test_sizes_in_headers_are_those_of_the_pixels_as_stored_and_upright(turn, tmp_path):
+    for suffix in (".jpg", ".png", ".tif", ".webp"):
+        path = tmp_path / f"a{suffix}"
+        Image.fromarray(PICTURES[0]).save(path, exif=exif(turn))
+        for upright in (False, True):
+            assert image_size_hw(path, upright=upright) == read_image(path, as_stored=not upright).shape[:2]
 
 
 def test_pictures_are_opened_in_one_place():

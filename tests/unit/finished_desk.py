@@ -108,7 +108,7 @@ def _write_scene() -> None:
     colours = points.astype(np.uint8)
     scene = Scene(SCENE / "scene", "photos/desk", "arbitrary", cameras, split, points, colours, np.eye(4))
     scene.save()
-    write_json(SCENE / "scene/registration.json", {"poses": "given"})
+    write_json(SCENE / "scene/registration.json", {"poses": "given", "views": {}})
     rows, columns = np.divmod(np.arange(HEIGHT * WIDTH), WIDTH)
     count = len(rows)
     colours = (canvas.reshape(-1, 3) / 255 - 0.5) / 0.28209479177387814

@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 from jsonschema import Draft202012Validator
@@ -18,6 +18,8 @@ from hilsplat.configuration import (
     parse_section,
     read_config,
 )
+from hilsplat.settings import LARGEST
+from hilsplat.stage import Seed
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "paper.yaml", "ci.yaml", "comparison.yaml"])
@@ -152,6 +154,12 @@ def test_only_our_solver_and_plain_averages_are_independent_of_the_seed() -> Non
     variants = {name: {"method": {"name": name}} for name in (OURS, *BASELINES)}
     run = parse_run({"variants": variants})
     assert {name for name in variants if not run.stages(name).method.is_random} == {OURS, "lifted", "occam"}
+
+
+def test_stages_accept_the_seeds_of_all_repetitions() -> None:
+    run = parse_run({"seed": LARGEST, "seeds": 10})
+    option = get_args(Seed)[1]
+    assert LARGEST < run.seed_of(run.all_seeds("default")[-1]) <= option.max < 2**31 - 1
 
 
 def test_a_method_has_its_own_settings() -> None:

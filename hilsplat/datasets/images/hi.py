@@ -65,11 +65,16 @@ def open_annotated(root: Path, scene: str) -> LabelledScene:
     warnings: list[str] = []
     views: dict[str, tuple[LabelledRegion, ...]] = {}
     for view, path in label_files(root / scene).items():
-        labels = read_isat(path)
-        warnings += labels.warnings
-        has_levels = any("level" in thing.keys for thing in labels.objects)
-        views[view] = regions_of(labels, warnings) if has_levels else merged_regions(labels)
+        views[view] = annotated_regions(path, warnings)
     return LabelledScene("annotated", scene, {}, None, views, tuple(warnings), MIN_POSED)
+
+
+def annotated_regions(path: Path, warnings: list[str]) -> tuple[LabelledRegion, ...]:
+    """Read the regions of one file as `open_annotated` does; append to `warnings`."""
+    labels = read_isat(path)
+    warnings += labels.warnings
+    has_levels = any("level" in thing.keys for thing in labels.objects)
+    return regions_of(labels, warnings) if has_levels else merged_regions(labels)
 
 
 def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, ...]:
@@ -233,4 +238,5 @@ ANNOTATED = Annotated(
     required=lambda scene: (scene,),
     open=open_annotated,
     label_places=lambda scene: (f"{scene}/*.json",),
+    images_of="photos",
 )

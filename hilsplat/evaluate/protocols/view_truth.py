@@ -14,8 +14,7 @@ from PIL import Image
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
-from hilsplat.datasets.labelled import LabelledRegion, LabelledScene, check_label_size
-from hilsplat.scene.placement import SHAPE_TOLERANCE
+from hilsplat.datasets.labelled import LabelledRegion, LabelledScene
 from hilsplat.scene.scene import Scene
 
 logger = logging.getLogger(__name__)
@@ -193,8 +192,5 @@ def truths_of(
     for view in known.check_posed(posed.cameras.names):
         camera, where = posed.cameras[view], f"a label of view {view}"
         regions = [region.on(camera, where) for region in known.views[view]]
-        for label_hw in sorted({region.size_hw for region in regions}):
-            for sentence in check_label_size(where, label_hw, camera.size_hw, SHAPE_TOLERANCE):
-                logger.warning("%s: %s", name, sentence)
         truths[view] = partial(ViewTruth.of_regions, regions, camera.size_hw)
     return truths

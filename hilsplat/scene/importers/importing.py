@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
 
-from hilsplat.base.errors import ImageError, RegistrationError, SceneError, in_one_line
-from hilsplat.base.files import list_images
+from hilsplat.base.errors import ImageError, shorten_list
+from hilsplat.base.files import is_outside, list_images
 from hilsplat.base.images import (
+    image_size_hw,
     opened_image,
     orientation,
     read_image,
@@ -21,6 +21,7 @@ from hilsplat.base.images import (
 from hilsplat.base.processes import in_own_process
 from hilsplat.base.progress import track
 from hilsplat.scene.assemble import Posed, PosedView, photo_of, split_views, undistort
+from hilsplat.scene.cameras import Photo
 from hilsplat.scene.colmap import Points, pycolmap, sparse_points
 from hilsplat.scene.features import find_matches, incremental_options
 from hilsplat.scene.importers.known_views import ASPECT_TOLERANCE, KnownView, Source
@@ -41,9 +42,6 @@ def import_poses(
     source, min_share = read_source(known), settings.min_registered_share
     source.require_most(min_share, known.files[0])
     total = len(source.views) + len(source.left_out)
-    if total == 0:
-        raise SceneError(f"{known.files[0]} of {name} contains no posed views", fix="export it again")
-    missing = sorted(view.name for view in source.views if view.image is None)
     with_image = [view for view in source.views if view.image is not None]
     files = [view.image for view in source.views if view.image is not None]
     posed: list[tuple[KnownView, PosedView]] = []
@@ -53,18 +51,9 @@ def import_poses(
             distorted = _with_pixels(view, view_name, work / "images", settings.max_side_px, turned)
             posed.append((view, undistort(distorted, work / "pinhole", settings.max_side_px)))
         except ImageError as error:
-            source.leave_out(view.name, in_one_line(error))
-    more = [f"and {len(missing) - 20} more"] if len(missing) > 20 else []
-    named = ", ".join([*missing[:20], *more])
-    if not posed or len(posed) < min_share * total:
-        found = f"{len(posed)}; missing: {named or 'none'}"
-        found += "".join(f"\n            left out: {reason}" for reason in [*source.left_out.values()][:3])
-        raise RegistrationError(
-            f"too few posed views of {name} have an image in {known.root}",
-            expected=f"at least {min_share:.0%} of {total} (poses.min_registered_share)",
-            found=found,
-            fix="put the images where the pose file expects them: in this folder or its images/ folder",
-        )
+            source.drop(view, error)
+    source.require_most(min_share, known.files[0], images=True)
+    missing = source.without_image
     views = [view for _, view in posed]
     points = source.points or triangulate(views, work, settings, seed, threads)
     beside = known.root / "images"
@@ -77,6 +66,7 @@ def import_poses(
             "turns or mirrors them: poses, labels and maps of the upright images don't fit"
         )
     if missing:
+        named = shorten_list(missing, 20)
         warnings.append(f"{len(missing)} of {total} posed views have no image file: {named}")
     if unposed:
         warnings.append(f"{len(unposed)} images have no pose and are skipped")
@@ -121,7 +111,8 @@ def _view_entries(
     """Return the report on each view; `missing` views have no image, and `unposed` images no view."""
     entries: dict[str, dict[str, Any]] = {}
     for described, view in posed:
-        entries[view.view] = {"file": Path(described.name).name, "registered": True, **described.report}
+        name = Path(described.name).name if is_outside(described.name) else described.name
+        entries[view.view] = {"file": name, "registered": True, **described.report}
     reasons = source.left_out | dict.fromkeys(missing, "its image file is missing")
     reasons |= {file: "the source has no pose for it" for file in unposed if file not in reasons}
     for file, reason in reasons.items():
@@ -137,46 +128,54 @@ def _with_pixels(
     Append the name to `turned` if it is used as stored against its EXIF orientation.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    camera, cropped, as_stored = fitted_camera(view, max_side_px)
     assert view.image is not None  # the caller leaves out views without one
-    pixels, as_stored = _read_as_described(view.image, view.camera)
-    turned += [view.name] * as_stored
-    camera = pycolmap.Camera(view.camera.todict())
-    camera.rescale(pixels.shape[1], pixels.shape[0])
-    photo = photo_of(camera)
-    if view.border_px:
-        border_px = math.ceil(view.border_px * camera.width / view.camera.width)
-        camera.width -= 2 * border_px
-        camera.height -= 2 * border_px
-        camera.principal_point_x -= border_px
-        camera.principal_point_y -= border_px
-        pixels = np.ascontiguousarray(pixels[border_px:-border_px, border_px:-border_px])
-    require_usable_size(view.image, pixels.shape[:2], max_side_px)
-    pixels = resize_to_fit(pixels, max_side_px)
+    pixels = read_image(view.image, as_stored=as_stored)
+    border_px = (pixels.shape[1] - camera.width) // 2
+    inside = pixels[border_px:, border_px:][: camera.height, : camera.width]
+    if as_stored:  # programs that label photographs turn them
+        turned.append(view.name)
+    else:
+        view.report["photo_hw_px"] = list(pixels.shape[:2])
+    pixels = resize_to_fit(np.ascontiguousarray(inside), max_side_px)
     camera.rescale(pixels.shape[1], pixels.shape[0])
     write_png(folder / view_name, pixels)
-    cropped = photo if view.border_px else None
     return PosedView(view_name, folder / view_name, camera, view.cam_from_source, cropped)
 
 
-def _read_as_described(path: Path, camera: pycolmap.Camera) -> tuple[UInt8[np.ndarray, "H W 3"], bool]:
-    """Read an image in the orientation whose shape fits the camera, or as stored if both orientations fit.
+def fitted_camera(view: KnownView, max_side_px: int) -> tuple[pycolmap.Camera, Photo | None, bool]:
+    """Return the camera of a view's image without its border, from the header of the image.
 
-    Also return whether its EXIF orientation was ignored.
+    The image is used as stored if both of its orientations have the camera's shape. Also return the
+    photograph if it has a border, and whether the EXIF orientation is ignored.
+
+    Raises:
+        ImageError: the image is unreadable or too small, or doesn't have the camera's shape.
     """
-    with opened_image(path) as image:
+    assert view.image is not None
+    with opened_image(view.image) as image:
         is_turned = orientation(image) > 1
-        width, height = image.size
     for as_stored in (True, False) if is_turned else (False,):
-        pixels = read_image(path, as_stored=as_stored)
-        ratio = (pixels.shape[1] / pixels.shape[0]) / (camera.width / camera.height)
+        height, width = image_size_hw(view.image, upright=not as_stored)
+        ratio = (width / height) / (view.camera.width / view.camera.height)
         if abs(ratio - 1) <= ASPECT_TOLERANCE:
-            return pixels, as_stored
-    raise ImageError(
-        f"image {path} does not match the size of its camera",
-        expected=f"{camera.width} x {camera.height} px (width x height), or a scaled copy",
-        found=f"{width} x {height} px",
-        fix="use the images that the poses were computed from",
-    )
+            break
+    else:
+        raise ImageError(
+            f"image {view.image} does not match the size of its camera",
+            expected=f"{view.camera.width} x {view.camera.height} px (width x height), or a scaled copy",
+            found=f"{width} x {height} px",
+            fix="use the images that the poses were computed from",
+        )
+    camera = pycolmap.Camera(view.camera.todict())
+    camera.rescale(width, height)
+    photo, border_px = photo_of(camera), math.ceil(view.border_px * width / view.camera.width)
+    camera.width -= 2 * border_px
+    camera.height -= 2 * border_px
+    camera.principal_point_x -= border_px
+    camera.principal_point_y -= border_px
+    require_usable_size(view.image, (camera.height, camera.width), max_side_px)
+    return camera, photo if border_px else None, as_stored
 
 
 def triangulate(

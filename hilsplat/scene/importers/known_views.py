@@ -96,6 +96,16 @@ class Source:
             name += " (again)"
         self.left_out[name] = reason
 
+    def drop(self, view: KnownView, error: HilsplatError) -> None:
+        """Leave out a view whose image cannot be used."""
+        self.views = [other for other in self.views if other is not view]
+        self.leave_out(view.name, in_one_line(error))
+
+    @property
+    def without_image(self) -> list[str]:
+        """Names of the views whose image is missing, sorted."""
+        return sorted(view.name for view in self.views if view.image is None)
+
     def listed(self, listed: Iterable[str], names: Sequence[str], where: str) -> set[str]:
         """Return the views that a list of names means, and note the number of names without a view."""
         matches = match_names(listed, names).values()
@@ -103,17 +113,17 @@ class Source:
             self.notes.append(f"{num_lost} names in {where} belong to no view")
         return {name for name in matches if name is not None}
 
-    def require_most(self, min_share: float, files: object) -> None:
-        """Raise SceneError if fewer than this share of the views can be used, with the first reasons."""
-        total = len(self.views) + len(self.left_out)
-        if self.left_out and len(self.views) < max(1, min_share * total):
-            reasons = list(self.left_out.values())
+    def require_most(self, min_share: float, files: object, *, images: bool = False) -> None:
+        """Raise SceneError if fewer than this share of the views can be used; `images`: and have an image."""
+        total, missing = len(self.views) + len(self.left_out), self.without_image if images else []
+        reasons = [*self.left_out.values(), *(f"{name}: its image is missing" for name in missing)]
+        if total - len(reasons) < max(1 if reasons or images else 0, min_share * total):
             more = f"\n            and {len(reasons) - 3} more" if len(reasons) > 3 else ""
             raise SceneError(
                 f"{len(reasons)} of {total} views of {files} cannot be used",
                 expected=f"at least {min_share:.0%} of the views (poses.min_registered_share)",
                 found="\n            ".join(reasons[:3]) + more,
-                fix="export the poses again",
+                fix="export the poses again, with their images in the same folder or its images/ folder",
             )
 
 
@@ -292,17 +302,13 @@ def read_llff(known: KnownPoses) -> Source:
     image size on disk; an image of another shape than stated is noted.
     """
     path, folder = known.files[0], known.root / "images"
-    with foreign(path, fix="unpack it again"), path.open("rb") as stream:
+    expected = "finite numbers of shape (images, 17)"
+    with foreign(path, expected=expected, fix="unpack it again"), path.open("rb") as stream:
         rows = np.load(stream, allow_pickle=False)
         if stream.read(1):
             raise ValueError("bytes follow its array")
-    if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "fiu" or not np.isfinite(rows).any():
-        raise SceneError(
-            f"{path} does not contain LLFF poses",
-            expected="finite numbers of shape (images, 17)",
-            found=f"{rows.dtype} of shape {rows.shape}",
-            fix="unpack it again",
-        )
+        if rows.shape[1:] != (17,) or rows.dtype.kind not in "fiu" or not np.isfinite(rows).any():
+            raise ValueError(f"it does not contain LLFF poses, but {rows.dtype} of shape {rows.shape}")
     images = list_images(folder if folder.is_dir() else known.root)
     if len(images) != len(rows):
         raise SceneError(

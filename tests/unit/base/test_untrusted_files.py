@@ -20,7 +20,6 @@ from hilsplat.datasets.hierarchy import HierarchyAnnotations, label_path
 from hilsplat.embed.langsplat_files import read_view
 from hilsplat.evaluate.files_stage import read_view_masks
 from hilsplat.photos.inspection import inspect_photos
-from hilsplat.scene.cameras import Camera
 from hilsplat.scene.poses import run_poses
 from hilsplat.settings import PosesSettings
 from hilsplat.workflow.resources import UNKNOWN_MP, _first_mp
@@ -208,4 +207,4 @@ def test_langsplat_maps_without_pixels_are_refused(tmp_path):
     np.save(tmp_path / "a_s.npy", np.zeros((4, 0, 9), np.float32))
     np.save(tmp_path / "a_f.npy", np.zeros((1, 3), np.float32))
     with pytest.raises(ArtifactError, match=r"a_s.npy is not a LangSplat map"):
-        read_view(tmp_path, Camera("a.png", np.eye(4), np.eye(3), (9, 9)))
+        read_view(tmp_path, "a.png")

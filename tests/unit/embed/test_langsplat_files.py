@@ -96,17 +96,30 @@ def test_exported_files_are_read_back(ours, files, scene, model, tmp_path):
     np.testing.assert_allclose(again, read_npy(ours[1] / "a.png.npy").astype(float), atol=1e-3)
 
 
+def test_levels_by_the_tree_replace_those_of_the_maps(ours, files, scene, model, tmp_path):
+    for path in files.glob("*_s.npy"):
+        np.save(path, np.load(path)[[0, 3, 2, 1]])  # subparts in the map of wholes
+    run_imported_masks(scene, files, tmp_path / "masks again", theta=0.9)
+    found = HierarchicalMasks.load(tmp_path / "masks again" / "a.png.npz")
+    assert_equal_masks(found, nested())
+    settings = ClipSettings(model=str(model.model.folder))
+    run_imported_clip(scene, files, tmp_path / "clip again", settings, theta=0.9)
+    assert read_index(tmp_path / "clip again")["views"]["a.png"]["masks_sha256"] == digest_of(found)
+    again = read_npy(tmp_path / "clip again" / "a.png.npy").astype(float)
+    np.testing.assert_allclose(again, read_npy(ours[1] / "a.png.npy").astype(float), atol=1e-3)
+
+
 def test_a_view_may_have_no_masks(tmp_path):
     np.save(tmp_path / "x_s.npy", np.full((4, 2, 4), -1, np.float32))
     np.save(tmp_path / "x_f.npy", np.zeros((0, 5), np.float32))
-    masks, vectors = read_view(tmp_path, camera((2, 4), "x.y.jpg"))
+    masks, vectors = read_view(tmp_path, "x.y.jpg", camera((2, 4), "x.y.jpg"))
     assert (len(masks), vectors.shape) == (0, (0, 5))
 
 
 def test_maps_of_another_size_are_resized_and_of_another_shape_refused(files):
     with pytest.raises(MisalignedArtifactError, match=r"12 x 12 px(.|\n)*8 x 6 px"):
-        read_view(files, camera((12, 12)))
-    masks, _ = read_view(files, camera((12, 16)))
+        read_view(files, "a.png", camera((12, 12)))
+    masks, _ = read_view(files, "a.png", camera((12, 16)))
     np.testing.assert_array_equal(masks.area_px, 4 * nested().area_px)
 
 
@@ -126,16 +139,16 @@ def test_invalid_files_are_refused_and_nothing_is_unpickled(tmp_path, maps, vect
     np.save(tmp_path / "a_s.npy", maps, allow_pickle=True)
     np.save(tmp_path / "a_f.npy", vectors)
     with pytest.raises(ArtifactError, match=words):
-        read_view(tmp_path, camera(SIZE))
+        read_view(tmp_path, "a.png", camera(SIZE))
 
 
 def test_missing_files_are_reported_and_half_of_the_views_need_them(files, scene, tmp_path, caplog):
     (files / "b_s.npy").unlink()
     run_imported_masks(scene, files, tmp_path / "out")
-    assert "lacks the maps of 1 of 2 training views of set/scene: b_s.npy" in caplog.text
+    assert "1 views are left out: " in caplog.text and "b_s.npy is missing" in caplog.text
     assert list(read_index(tmp_path / "out")["views"]) == ["a.png"]
     (files / "a_s.npy").unlink()
-    with pytest.raises(ArtifactError, match=r"lacks the maps of 2 of 2 training views(.|\n)*b_s.npy"):
+    with pytest.raises(ArtifactError, match=r"only 0 of 2 training views(.|\n)*b_s.npy is missing"):
         run_imported_masks(scene, files, tmp_path / "other")
     assert not (tmp_path / "other").exists()
 

@@ -14,11 +14,11 @@ from PIL import Image
 
 from hilsplat.base.errors import SceneError
 from hilsplat.photos import intake
-from hilsplat.photos.add import add_scene
 from hilsplat.photos.intake import prepared_photographs
 from hilsplat.photos.video import MIN_STEP, displacement, extract_frames
 from hilsplat.photos.video_colours import _pq_light, rgb_pixels, srgb_from_hdr
 from hilsplat.scene.sheet import read_sheet
+from hilsplat.workflow.new_scene import add_scene
 from tests.unit.scene.test_poses import write_noise
 
 
@@ -339,7 +339,7 @@ def test_an_interrupted_command_leaves_nothing_of_its_own(tmp_path, photos_in_zi
         (folder / "mine.txt").touch()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("hilsplat.photos.add.inspect_photos", interrupt)
+    monkeypatch.setattr("hilsplat.workflow.new_scene.inspect_photos", interrupt)
     with pytest.raises(KeyboardInterrupt):
         add_scene(sheet, "desk", zipped(tmp_path / "desk.zip", photos_in_zip))
     assert [path.name for path in folder.rglob("*")] == ["mine.txt"]

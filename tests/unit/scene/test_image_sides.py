@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilsplat.base.errors import ImageError, RegistrationError, SceneError
-from hilsplat.photos.add import add_scene
+from hilsplat.base.errors import ImageError, SceneError
 from hilsplat.photos.inspection import inspect_photos
 from hilsplat.scene.assemble import PosedView, undistort
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.features import prepare_images
+from hilsplat.workflow.new_scene import add_scene
 from tests.unit.scene.test_importers import import_scene, write_colmap, write_images
 
 SMALL_OR_NARROW = [(1, 64), (15, 64), (20, 30_000), (30_000, 20)]
@@ -44,7 +44,7 @@ def test_they_are_refused_if_shrinking_makes_them_too_small(tmp_path):
 def test_they_are_refused_with_known_poses(tmp_path):
     write_colmap(tmp_path / "in")
     write_images(tmp_path / "in/images", ["a.jpg", "b.jpg", "c.jpg"], (12, 16))
-    with pytest.raises(RegistrationError, match=r"a.jpg is too small or too narrow: 16 x 12 px"):
+    with pytest.raises(SceneError, match=r"a.jpg is too small or too narrow: 16 x 12 px"):
         import_scene(tmp_path / "in", tmp_path / "scene")
 
 

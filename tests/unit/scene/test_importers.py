@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilsplat.base.errors import RegistrationError, SceneError
+from hilsplat.base.errors import SceneError
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.exporting import write_colmap as export_colmap
 from hilsplat.scene.exporting import write_nerfstudio
@@ -75,7 +75,9 @@ def test_images_and_poses_without_a_partner_are_named(tmp_path):
     write_colmap(tmp_path / "in")
     (tmp_path / "in" / "images" / "c.jpg").unlink()
     write_images(tmp_path / "in" / "images", ["new.jpg"])
-    with pytest.raises(RegistrationError, match=r"at least 70% of 3(.|\n)*missing: c\.jpg"):
+    with pytest.raises(
+        SceneError, match=r"1 of 3 views(.|\n)*at least 70%(.|\n)*c\.jpg: its image is missing"
+    ):
         import_scene(tmp_path / "in", tmp_path / "scene")
     import_scene(tmp_path / "in", tmp_path / "scene", min_registered_share=0.5)
     report = json.loads((tmp_path / "scene" / "registration.json").read_text())

@@ -9,13 +9,15 @@ import pytest
 from PIL import Image
 
 from hilsplat.base.errors import SceneError
-from hilsplat.photos.add import add_scene
 from hilsplat.photos.inspection import inspect_photos
 from hilsplat.scene.exporting import pinhole_model
 from hilsplat.scene.layouts import NO_POSES
 from hilsplat.scene.posed_images import PosedImage
 from hilsplat.scene.sheet import choose_scenes, read_sheet
+from hilsplat.splat.ply import save_ply
+from hilsplat.workflow.new_scene import add_scene
 from hilsplat.workflow.scene_data import SceneData
+from tests.unit.round_gaussians import round_gaussians
 from tests.unit.scene.test_poses import write_noise
 
 COLUMNS = ("dataset", "scene", "group", "source", "unit", "gaussians", "features", "poses")
@@ -133,12 +135,23 @@ def test_data_sources_are_below_the_data_root(tmp_path, monkeypatch):
 def write_files(folder: Path, *paths: str) -> None:
     for path in paths:
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        (folder / path).write_bytes(b"ply\n")
+        if path.endswith(".ply"):
+            save_ply(folder / path, round_gaussians(np.ones((1, 3))))
+        else:
+            (folder / path).write_bytes(b"")
+
+
+def write_features(folder: Path) -> None:
+    """Write LangSplat's maps of three photographs: one mask, which covers each of them at every level."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in range(3):
+        np.save(folder / f"{name}_s.npy", np.zeros((4, 30, 40), np.float32))
+        np.save(folder / f"{name}_f.npy", np.ones((1, 8), np.float32))
 
 
 def langsplat_scene(folder: Path) -> Path:
     """Photographs, and beside them what COLMAP, 3DGS and LangSplat write."""
-    write_noise(folder / "images", 3)
+    write_noise(folder / "images", 3, (30, 40))
     poses = [np.eye(4) for _ in range(3)]
     for number, pose in enumerate(poses):
         pose[0, 3] = number
@@ -150,8 +163,8 @@ def langsplat_scene(folder: Path) -> Path:
         folder,
         *(f"output/a/point_cloud/iteration_{steps}/point_cloud.ply" for steps in (7000, 30000)),
         "output/a/chkpnt30000.pth",
-        "language_features/000_s.npy",
     )
+    write_features(folder / "language_features")
     labels = {"info": {"width": 40, "height": 30}, "objects": []}
     (folder / "label").mkdir()
     (folder / "label/0.json").write_text(json.dumps(labels))
@@ -248,7 +261,8 @@ def test_inspection_finds_damaged_turned_and_copied_photographs(tmp_path):
     assert report.duplicates == (("1.jpg", "copy.jpg"),)
     unreadable = dict(report.unreadable)
     assert list(unreadable) == ["empty.jpg", "text.png", "truncated.jpg"]
-    assert unreadable["empty.jpg"] == "the file is empty" and "truncated" in unreadable["truncated.jpg"]
+    assert unreadable["empty.jpg"] == "cannot identify image file 'empty.jpg' (0 bytes)"
+    assert "truncated" in unreadable["truncated.jpg"]
     assert report.passed_over == {".nef": 1}
     assert "5 photographs in" in str(report) and "4  of 40 x 30 px" in str(report)
 
@@ -270,7 +284,7 @@ def test_adding_a_scene_appends_one_row_with_a_relative_source(tmp_path, columns
 def test_the_added_row_names_the_given_folders(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     folder, sheet = write_noise(tmp_path / name, 3), write_sheet(tmp_path, WORLD)
-    write_files(tmp_path, f"masks/{name}/0_s.npy")
+    write_features(tmp_path / "masks" / name)
     add_scene(sheet, "first", Path(name), features=Path("masks", name))
     add_scene(sheet, "second", folder)
     _, *rows = read_sheet(sheet)
@@ -284,7 +298,7 @@ def test_the_added_row_names_the_given_folders(tmp_path, monkeypatch, name):
 def test_a_path_that_the_sheet_cannot_hold_is_refused(tmp_path, path):
     """The reader strips cells: the photographs of the folder "desk" would be used for "desk "."""
     write_noise(tmp_path / "desk", 3)
-    write_files(tmp_path, f"{path}/masks/0_s.npy")
+    write_features(tmp_path / path)
     sheet = write_sheet(tmp_path, WORLD)
     before = sheet.read_bytes()
     for photos, features in ((write_noise(tmp_path / path, 3), None), (tmp_path / "desk", tmp_path / path)):
@@ -296,7 +310,7 @@ def test_a_path_that_the_sheet_cannot_hold_is_refused(tmp_path, path):
 def test_new_columns_are_added_to_the_header_and_not_to_a_comment(tmp_path):
     header = "\t".join(COLUMNS[:5])
     sheet, folder = write_sheet(tmp_path), write_noise(tmp_path / "desk", 3)
-    write_files(folder, "masks/0_s.npy")
+    write_features(folder / "masks")
     sheet.write_text(f"# columns: {header}\n{header}\n")
     add_scene(sheet, "desk", folder, features=folder / "masks")
     assert sheet.read_text().splitlines()[:2] == [f"# columns: {header}", f"{header}\tfeatures"]
@@ -309,7 +323,7 @@ def test_adding_unusable_photographs_leaves_the_sheet_alone(tmp_path):
     with pytest.raises(SceneError, match=r"too few photographs(.|\n)*2 distinct"):
         add_scene(sheet, "desk", folder)
     (folder / "empty.jpg").touch()
-    with pytest.raises(SceneError, match=r"empty\.jpg: the file is empty"):
+    with pytest.raises(SceneError, match=r"empty\.jpg: cannot identify image file 'empty\.jpg' \(0 bytes\)"):
         add_scene(sheet, "desk", folder)
     with pytest.raises(SceneError, match=r"gone is missing(.|\n)*a folder of photographs, a video, or a zip"):
         add_scene(sheet, "desk", tmp_path / "gone")

@@ -90,7 +90,6 @@ def test_levels_by_the_tree_are_depths_for_masks_of_any_head_and_depend_on_theta
         (6, 2),
         (10, 1),
     ]
-    assert (by_tree.content_order() == np.arange(5)).all()
     overlapping = pack(rows("########..", ".....####."))  # 3 of the second mask's 4 px are in the first
     assert with_tree_levels(overlapping, 0.9).level.tolist() == [1, 1]
     assert with_tree_levels(overlapping, 0.7).level.tolist() == [1, 2]

@@ -12,13 +12,14 @@ import pytest
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.configuration import merged_config, parse_run
 from hilsplat.scene.sheet import read_sheet
+from hilsplat.settings import MasksSettings
 from hilsplat.stages import stage_of
 from hilsplat.workflow import targets
-from hilsplat.workflow.models import models_of_photographs
+from hilsplat.workflow.models import models_of_photographs, settings_of_photographs
 from hilsplat.workflow.plan import Plan, any_of, without_scene
 from tests.conftest import PROJECT
 from tests.unit.models.test_store import write_model
-from tests.unit.workflow.plans import BENCHMARK, Job, plan_of
+from tests.unit.workflow.plans import BENCHMARK, Job, plan_of, write_sheet
 
 ROWS = (
     *BENCHMARK,
@@ -137,6 +138,32 @@ def test_levels_by_the_tree_share_the_code_of_levels_by_head_with_the_same_seed(
         **{name: ["head"] for name in ("tree", "theta", "linked")},
         "tree.seed1": ["head.seed1"],
     }
+
+
+def test_two_rows_of_one_published_scene_are_refused_because_their_scores_would_be_merged(tmp_path):
+    for part in ("figurines/images", "figurines/sparse", "label/figurines"):
+        (tmp_path / "data/lerf_ovs" / part).mkdir(parents=True)
+    rows = [f"{row} lerf data:lerf_ovs/figurines arbitrary" for row in ("lerf figurines", "mine figurines")]
+    of_data = {"groups": ["lerf"], "data_root": str(tmp_path / "data")}
+    plan_of(tmp_path, rows=(*rows,), only=["mine/figurines"], **of_data)
+    with pytest.raises(SettingsError, match=r"lerf/figurines and mine/figurines are the same scene"):
+        plan_of(tmp_path, rows=(*rows,), **of_data)
+
+
+def test_imported_masks_get_the_levels_of_the_variant_and_need_no_model(tmp_path):
+    variants = {"main_variants": ["default"], "variants": {"tree": {"masks": {"levels": "tree"}}}}
+    sheet = write_sheet(
+        tmp_path / "config/scenes.tsv", (*BENCHMARK, f"photos desk photos x arbitrary {tmp_path}")
+    )
+    sheet.write_text(sheet.read_text().replace("\tunit\n", "\tunit\tfeatures\n"))
+    found = Plan({"scenes": str(sheet), **variants, "coverage_tree": {"theta": 0.7}})
+    jobs = [Job("photos", "desk", variant) for variant in ("default", "tree")]
+    levels = [MasksSettings.model_validate_json(found.settings("masks", job)) for job in jobs]
+    assert [(each.tree_theta, each.uses_model) for each in levels] == [(None, False), (0.7, False)]
+    values = found.params("imported_masks")["settings"](jobs[1])
+    assert found.settings("masks", jobs[1]) in values  # as `workflow.records` expects
+    first, other = (found.identity("clip", variant, (), True) for variant in ("default", "tree"))
+    assert first != other and first.stages == other.stages == ("imported_clip", "imported_masks")
 
 
 def test_photographs_that_you_annotated_are_scored_without_replacing_the_tables(tmp_path):
@@ -359,6 +386,20 @@ def test_names_that_match_no_scene_are_reported(tmp_path):
     ]
 
 
+@pytest.mark.parametrize("name", ["lerf_ovs", "hi_lerf", "scannet200", "annotated"])
+@pytest.mark.parametrize("where", ["groups", "overrides", "queries"])
+def test_label_sets_that_are_no_group_are_refused(where, name, tmp_path):
+    config = {"groups": ["benchmark", name], "overrides": {name: {}}, "queries": {name: ["mug"]}}
+    with pytest.raises(SettingsError, match=rf"{where}\.{name}: unknown name(.|\n)*(one of|did you mean)"):
+        plan(tmp_path, **{where: config[where]})
+
+
+def test_queries_of_a_group_are_refused_because_panels_take_those_of_data_sets(tmp_path):
+    with pytest.raises(SettingsError, match=r"queries\.benchmark: unknown name"):
+        plan(tmp_path, queries={"benchmark": ["mug"]})
+    plan(tmp_path, queries={"waymo": ["car"]}, overrides={"waymo": {}})  # its scenes are those on the disk
+
+
 @pytest.mark.parametrize("path", sorted((PROJECT / "config").glob("*.yaml")), ids=lambda path: path.name)
 def test_every_name_in_a_shipped_configuration_matches_a_scene(path):
     run = parse_run(merged_config([path]))
@@ -386,13 +427,16 @@ def test_a_run_names_its_models_and_warns_if_answers_are_meaningless(tmp_path, m
     assert "answers about photographs are meaningless" in doubt and "hilsplat models get" in doubt
     own = tmp_path / "config/config.yaml"
     own.write_text(json.dumps({"overrides": OF_PHOTOGRAPHS}))
-    assert models_of_photographs(own, "desk") == [photo.removeprefix("photos/desk: "), doubt]
+    assert models_of_photographs(settings_of_photographs(own, "desk")) == [
+        photo.removeprefix("photos/desk: "),
+        doubt,
+    ]
     write_model(Path("models/clip-vit-base-patch16"), "clip")
     write_model(Path("models/sam-vit-base"), "sam")
     line = "masks by sam-vit-base; text queries by clip-vit-base-patch16"
     assert plan(tmp_path, **config).model_lines()[1:] == [f"photos/desk: {line}"]
     for file in (own, tmp_path / "nowhere.yaml"):  # the installed one
-        assert models_of_photographs(file, "desk") == [line]
+        assert models_of_photographs(settings_of_photographs(file, "desk")) == [line]
 
 
 def test_commands_quote_what_they_contain(tmp_path):

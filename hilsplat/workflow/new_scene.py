@@ -12,7 +12,6 @@ from hilsplat.base.atomic import atomic_folder, changing
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import NAME_RULE, name_problem
 from hilsplat.base.removal import undone_on_error
-from hilsplat.photos.findings import CheckPly, Parts, find_parts
 from hilsplat.photos.inspection import PhotoReport, inspect_photos
 from hilsplat.photos.intake import prepared_photographs
 from hilsplat.scene.layouts import contents, has_known_poses
@@ -27,6 +26,7 @@ from hilsplat.scene.sheet import (
     sheet_text,
 )
 from hilsplat.settings import PosesSettings
+from hilsplat.workflow.findings import Parts, find_parts
 
 
 def add_scene(
@@ -39,7 +39,7 @@ def add_scene(
     features: Path | None = None,
     labels: Path | None = None,
     *,
-    check_ply: CheckPly | None = None,
+    settings: PosesSettings | None = None,
     dry_run: bool = False,
 ) -> PhotoReport:
     """Append your own photographs to the sheet as scene `photos/<name>`, creating the sheet if it is missing.
@@ -57,7 +57,7 @@ def add_scene(
         features: folder of LangSplat's masks and CLIP vectors, used instead of SAM and CLIP.
         labels: folder of label files from LERF-OVS or `hilsplat annotate`, used only for evaluation and
             copied to `annotated/photos/<name>/` in the project.
-        check_ply: reads the Gaussians and returns notes on them; None trusts them.
+        settings: how the run will import poses; None: the defaults.
         dry_run: only report; videos and archives are converted in a temporary folder.
 
     Raises:
@@ -74,6 +74,7 @@ def add_scene(
             found=problem,
             fix="choose another name, such as my-desk_2",
         )
+    settings = settings or PosesSettings()
     named = {"poses": poses, "gaussians": gaussians, "features": features, "labels": labels}
     with nullcontext(sheet) if dry_run else changing(sheet) as sheet:  # `sheet` may be a link
         _require_new(sheet, name)
@@ -81,12 +82,12 @@ def add_scene(
         with TemporaryDirectory() if dry_run else nullcontext(root) as base:
             target = Path(base) / PHOTOS / name
             with prepared_photographs(photos, target, frames) as (folder, notes):
-                parts = find_parts(folder, named, check_ply)
+                parts = find_parts(folder, named, settings)
                 annotated = root / "annotated" / PHOTOS / name
                 copied_labels = _labels_to_copy(annotated, parts)
                 report = inspect_photos(folder, poses)
                 report = replace(report, notes=(*notes, *parts.lines), columns=parts.columns)
-                _check(report, has_known_poses(folder, poses))
+                _check(report, has_known_poses(folder, poses), settings.min_registered_share)
                 if dry_run:
                     return report
                 if copied_labels:
@@ -126,10 +127,10 @@ def _require_new(sheet: Path, name: str) -> None:
             )
 
 
-def _check(report: PhotoReport, have_poses: bool) -> None:
+def _check(report: PhotoReport, have_poses: bool, min_share: float) -> None:
     total = report.num_readable + len(report.unreadable)
     unreadable = [f"{file}: {reason}" for file, reason in report.unreadable]
-    if report.num_readable < PosesSettings().min_registered_share * total:
+    if report.num_readable < min_share * total:
         raise SceneError(
             f"{len(report.unreadable)} of {total} photographs in {report.folder} cannot be read",
             found="; ".join(unreadable),
