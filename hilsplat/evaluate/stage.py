@@ -21,7 +21,7 @@ from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevanc
 from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
 from hilsplat.evaluate.protocols.points import measure_scene_points
 from hilsplat.evaluate.protocols.view_truth import truths_of
-from hilsplat.evaluate.protocols.views import measure_view, rule_of
+from hilsplat.evaluate.protocols.views import measure_view, rule_of, text_departures
 from hilsplat.evaluate.scores import Measured, Score, write_instances, write_scores
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Cameras
@@ -145,8 +145,8 @@ def point_rows(
         if error > MAX_CAMERA_ERROR_M:
             sentence = "%s: the median camera error is %.2f m, so point scores are meaningless"
             logger.warning(sentence, answers.scene.name, error)
-    methods, mode = settings.methods, settings.points
-    yield from measure_scene_points(answers, points, transform, extra.points, methods, mode, threads)
+    how = settings.methods, settings.points, text_departures(settings)
+    yield from measure_scene_points(answers, points, transform, extra.points, *how, threads)
 
 
 def scene_from_true(true: Cameras, found: Cameras) -> tuple[Float64[np.ndarray, "4 4"], float]:

@@ -107,15 +107,16 @@ def measure_points(
     prediction: Int[np.ndarray, " P"],
     classes: ClassSet,
     carried: str,
+    words: Sequence[str] = (),
 ) -> Iterator[Measured]:
     """Yield the rows of one scene: IoU and accuracy per class, and the scene's means if the card has them.
 
     In a class row, `n` is the number of points in the denominator, so that `pooled_points` can pool scenes.
     Classes absent from ground truth and prediction have no row; a scene without ground truth has no rows.
-    `carried` names the mode that transferred predictions to the points.
+    `carried` names the mode that transferred predictions to the points, and `words` other departures.
     """
     counts = ClassCounts.of(truth, prediction, len(classes))
-    protocol = card.labelled([f"points: {carried}"])
+    protocol = card.labelled([f"points: {carried}", *words])
     for metric, values, points in (
         ("class_iou", class_iou(counts), counts.union),
         ("class_accuracy", class_accuracy(counts), counts.truth),
@@ -228,12 +229,13 @@ def measure_scene_points(
     cards: Sequence[ProtocolCard],
     methods: Sequence[str],
     mode: Mode,
+    words: Sequence[str] = (),
     threads: int = 1,
 ) -> Iterator[Measured | instances.InstanceMatches]:
     """Yield the rows of one scene under point protocols, and the instance matches of the tree.
 
     Labelled points are keyed by labelling, in metres; `scene_from_points` is a similarity transform.
-    Protocols whose labelling is absent are skipped.
+    Protocols whose labelling is absent are skipped. Protocol names contain `words`, besides the mode.
     """
     carried: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # labellings of the same mesh share its vertices
     labels_of: dict[tuple[str, str], np.ndarray] = {}  # several protocols have the same classes
@@ -256,4 +258,4 @@ def measure_scene_points(
                 key = method, classes.name
                 if key not in labels_of:
                     labels_of[key] = classes_of_points(scene, gaussian, method, classes.texts)
-                yield from measure_points(card, method, labels, labels_of[key], classes, mode)
+                yield from measure_points(card, method, labels, labels_of[key], classes, mode, words)

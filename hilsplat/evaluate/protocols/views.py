@@ -85,11 +85,15 @@ def relevancy_departures(settings: EvaluateSettings) -> list[str]:
     words = []
     if settings.canonical != cards.CANONICAL:
         words.append(f"canonical {'+'.join(settings.canonical)}")
-    if settings.template != "{}":
-        words.append(f"texts as {settings.template.replace('{}', '...')}")
+    words += text_departures(settings)
     if settings.relevancy_scale != cards.RELEVANCY_SCALE:
         words.append(f"relevancy scale {settings.relevancy_scale:g}")
     return words
+
+
+def text_departures(settings: EvaluateSettings) -> list[str]:
+    """Return a description of the prompt template, which changes every cosine, unless it is the default."""
+    return [] if settings.template == "{}" else [f"texts as {settings.template.replace('{}', '...')}"]
 
 
 def measure_view(
