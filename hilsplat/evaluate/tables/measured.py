@@ -67,7 +67,8 @@ def measured_blocks(
             rows: list[tuple[tuple[Any, ...], Row]] = []
             groups = selected.groupby(["variant", "masks", "method", "label"], sort=True)
             for (variant, masks, method, label), part in groups:
-                seeds = [cells_of(scores, of_seed) for of_seed in _comparable_seeds(part)]
+                part = _of_comparable_seeds(part)
+                seeds = [cells_of(scores, of_seed) for _, of_seed in part.groupby("seed", sort=True)]
                 seeds = seeds[:1] if method == "truth" else seeds  # annotations are the same under every seed
                 names = _row_names(variant, masks, method, label, sources.labels)
                 if len(seeds) > 1:
@@ -90,11 +91,11 @@ def measured_blocks(
     return blocks
 
 
-def _comparable_seeds(part: "pd.DataFrame") -> list["pd.DataFrame"]:
-    """Return a row's scores by seed, without seeds that lack scenes, whose means are of something else."""
-    seeds = [of_seed for _, of_seed in part.groupby("seed", sort=True)]
-    every = max(of_seed["scene"].nunique() for of_seed in seeds)
-    return [of_seed for of_seed in seeds if of_seed["scene"].nunique() == every]
+def _of_comparable_seeds(part: "pd.DataFrame") -> "pd.DataFrame":
+    """Return a row's scores without seeds that lack scenes, whose means are of something else."""
+    scenes = {seed: set(of_seed["scene"]) for seed, of_seed in part.groupby("seed", sort=True)}
+    most = max(scenes.values(), key=len)
+    return part[part["seed"].isin([seed for seed, found in scenes.items() if found == most])]
 
 
 def _row_names(
@@ -133,14 +134,16 @@ def with_seeds(scores: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def mean_over_seeds(seeds: Sequence[Mapping[str, Cell]]) -> dict[str, Cell]:
-    """Return mean and standard deviation (n - 1) of each cell over seeds; a single seed is unchanged."""
+    """Return mean and standard deviation (n - 1) of the cells that every seed has; one seed is unchanged."""
     if len(seeds) == 1:
         return dict(seeds[0])
     cells = {}
     for column, first in seeds[0].items():
-        values = [value for cells in seeds if (value := cells.get(column, Cell()).value) is not None]
-        if len(values) < 2 or first.text.isdigit():  # counts do not depend on the seed
+        if first.text.isdigit():  # counts do not depend on the seed
             cells[column] = first
+            continue
+        values = [value for of_seed in seeds if (value := of_seed.get(column, Cell()).value) is not None]
+        if len(values) < len(seeds):  # a mean over some of the seeds is of something else
             continue
         mean, spread = statistics.fmean(values), statistics.stdev(values)
         cells[column] = Cell(f"{mean:.1f} ± {spread:.1f}", mean, first.note, spread)
