@@ -60,7 +60,7 @@ def scannet_cells(sources: Sources, _: "pd.DataFrame", part: "pd.DataFrame") -> 
         for mean, metric in (("mIoU", "miou_present"), ("mAcc", "macc_present")):
             cells[f"{name} {mean}"] = percent(of_protocol, metric)
     first = part.iloc[0]
-    variant = first["variant"] if first["seed"] == "0" else f"{first['variant']}.seed{first['seed']}"
+    variant = first["variant"] if first["seed"] == 0 else f"{first['variant']}.seed{first['seed']}"
     key = (first["dataset"], variant, first["masks"], first["method"])
     scans = {
         scene: matches
@@ -83,7 +83,7 @@ def scannet_cells(sources: Sources, _: "pd.DataFrame", part: "pd.DataFrame") -> 
 
 
 def scannet_intervals(scores: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
-    cells = {}
+    cells: dict[str, Cell] = {}
     for protocol, name in SCANNET_COLUMNS.items():
         cells |= interval_cells(name, False, scores, part[part["protocol"].str.startswith(protocol)])
     return cells
@@ -126,7 +126,8 @@ def bootstrap_mean(
         scenes = draws.integers(len(present), size=len(present))
         if pooled:
             names = present[scenes].any(axis=0)
-            return mean_over_names(hits[:, scenes].sum(axis=1)[:, names] / union[:, scenes].sum(axis=1)[:, names])
+            of_names = (counts[:, scenes].sum(axis=1)[:, names] for counts in (hits, union))
+            return mean_over_names(np.divide(*of_names))
         named = [scene for scene in scenes if present[scene].any()]
         means = [mean_over_names(hits[:, s, present[s]] / union[:, s, present[s]]) for s in named]
         return float(np.mean(means)) if means else 0.0

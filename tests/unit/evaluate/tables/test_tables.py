@@ -345,10 +345,9 @@ def test_waymo_pools_the_counts_of_all_scenes(tmp_path):
 )
 def test_intervals_are_of_the_mean_over_seeds(tmp_path, name, protocol, column):
     # One name: its IoU is the mean in each resample. With 0.2 and 0.6, the mean over seeds is 0.4.
+    query, values = "car" if name == "waymo" else "chair", {"v": 0.2, "v.seed1": 0.6}.items()
     scores = [
-        row
-        for variant, value in {"v": 0.2, "v.seed1": 0.6}.items()
-        for row in class_scores(protocol, value, 10, variant=variant, query="car" if name == "waymo" else "chair")
+        row for variant, v in values for row in class_scores(protocol, v, 10, variant=variant, query=query)
     ]
     row = measured(built(tmp_path, name, scores)[0], method="v, tree")
     assert cells(row, column, "seeds") == ["40 to 40", "2"]
