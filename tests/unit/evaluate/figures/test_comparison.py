@@ -18,7 +18,7 @@ from hilsplat.evaluate.figures.comparison import (
     run_comparison,
 )
 from hilsplat.evaluate.figures.panel import annotated_rows, shown_truths
-from hilsplat.evaluate.figures.sweep_plot import read_lines, run_sweep_plot
+from hilsplat.evaluate.figures.sweep_plot import read_curves, run_sweep_plot
 from hilsplat.settings import EvaluateSettings, FiguresSettings
 
 EVALUATE = EvaluateSettings()
@@ -99,20 +99,35 @@ def test_comparing_no_variants_is_refused(compare):
         compare("none", [], {})
 
 
-SWEEP = """kind,data,method,Hi-LERF mIoU,Hi-LERF HC,notes
-reported,LERF,theta = 0.6,38.4,56.3,
-reported,LERF,theta = 0.9,39.1,56.9,
-synthetic stand-in,synthetic,hilsplat (field),42.10,50.00,
-synthetic stand-in,synthetic,theta = 0.6,41.00 ± 0.50,,
+SWEEP = """kind,data,method,masks,Hi-LERF mIoU,Hi-LERF HC,notes
+reported,LERF,theta = 0.6,,38.4,56.3,
+reported,LERF,theta = 0.9,,39.1,56.9,
+measured,hi_lerf,theta = 0.6,sam,31.00 ± 0.50,,
+measured,hi_lerf,theta = 0.9,sam,32.00,,
+measured,hi_3dovs,theta = 0.6,sam,51.00,,
+measured,hi_3dovs,theta = 0.9,sam,52.00,,
+synthetic stand-in,synthetic,hilsplat (field),a,42.10,50.00,
+synthetic stand-in,synthetic,theta = 0.9,a,42.00,,
+synthetic stand-in,synthetic,theta = 0.6,a,41.00,,
+synthetic stand-in,synthetic,"theta = 0.6, by head",a,61.00,,
+synthetic stand-in,synthetic,"theta = 0.9, by head",a,62.00,,
+synthetic stand-in,synthetic,"theta = 0.9, by head",b,72.00,,
 """
 
 
-def test_curves_take_the_value_from_the_rows_name_and_kinds_stay_apart(tmp_path):
+def test_a_curve_joins_rows_of_one_data_set_and_reading(tmp_path):
     (tmp_path / "theta.csv").write_text(SWEEP)
-    assert read_lines(tmp_path / "theta.csv", 0.9) == {
-        ("reported", "Hi-LERF mIoU"): [(0.6, 38.4), (0.9, 39.1)],
-        ("reported", "Hi-LERF HC"): [(0.6, 56.3), (0.9, 56.9)],
-        ("synthetic stand-in", "Hi-LERF mIoU"): [(0.6, 41.0), (0.9, 42.1)],
+    assert read_curves(tmp_path / "theta.csv") == {
+        "reported: LERF": {
+            "Hi-LERF mIoU": [(0.6, 38.4), (0.9, 39.1)],
+            "Hi-LERF HC": [(0.6, 56.3), (0.9, 56.9)],
+        },
+        "measured: hi_lerf": {"Hi-LERF mIoU": [(0.6, 31.0), (0.9, 32.0)]},
+        "measured: hi_3dovs": {"Hi-LERF mIoU": [(0.6, 51.0), (0.9, 52.0)]},
+        "synthetic stand-in: synthetic": {
+            "Hi-LERF mIoU, a": [(0.6, 41.0), (0.9, 42.0)],
+            "Hi-LERF mIoU, by head, a": [(0.6, 61.0), (0.9, 62.0)],
+        },
     }
     run_sweep_plot("theta", tmp_path / "theta.csv", tmp_path / "theta.png")
     assert (tmp_path / "theta.pdf").is_file()
