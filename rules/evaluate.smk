@@ -19,7 +19,12 @@ use rule stage as evaluate with:
     resources:
         **RESOURCES.of("evaluate"),
     params:
-        **PLAN.params("evaluate", **LABELS, name=PLAN.data.scene_name),
+        **PLAN.params(
+            "evaluate",
+            files=PLAN.data.label_files,
+            plugins=PLAN.data.scorers,
+            name=PLAN.data.scene_name,
+        ),
 
 
 use rule stage as score_means with:
@@ -63,6 +68,7 @@ use rule stage as table with:
     params:
         **PLAN.params(
             "table",
+            plugins=targets.readers,
             name=targets.table_name,
             labels=PLAN.names,
             absent=targets.absent_of(PLAN),

@@ -23,6 +23,7 @@ from hilsplat.settings import GaussiansSettings, MasksSettings
 from hilsplat.splat.ply import save_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 from hilsplat.splat.rasterise.api import render as render_rgb
+from hilsplat.splat.steps import fit_steps
 
 
 @pytest.fixture
@@ -70,13 +71,13 @@ def test_objects_are_one_line_each_and_cameras_are_found_by_name_and_row(desk, s
 
 @pytest.mark.parametrize("iterations", [40, None])
 def test_a_fit_equals_that_of_the_stage(scene, tmp_path, monkeypatch, iterations):
-    monkeypatch.setattr("hilsplat.settings.LEAST_FIT_STEPS", 20)
+    monkeypatch.setattr("hilsplat.splat.steps.LEAST_FIT_STEPS", 20)
     settings = {"max_gaussians": 500, "densify_every": 10, "device": "cpu"}
     settings |= {} if iterations else {"steps_per_view": 5}
     found = hilsplat.fit(scene, iterations, seed=3, threads=2, **settings)
     steps = {"iterations": iterations, "steps_per_view": iterations} if iterations else {}
     out, section = tmp_path / "gaussians.ply", GaussiansSettings(**settings, **steps)
-    assert section.steps(5) == (iterations or 25)
+    assert fit_steps(section, 5) == (iterations or 25)
     stages.gaussians(scene.folder, out, tmp_path / "report", section, cache=tmp_path / "cache", seed=3)
     save_ply(tmp_path / "ours.ply", found)
     assert (tmp_path / "ours.ply").read_bytes() == out.read_bytes()

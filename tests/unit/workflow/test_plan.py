@@ -203,14 +203,19 @@ def test_levels_by_the_tree_take_the_theta_of_the_tree(tmp_path):
 
 
 def test_inputs_of_a_field_that_continues_langsplats(tmp_path):
-    shared = {"autoencoder": NETWORK}
+    shared, own = {"autoencoder": NETWORK}, {"autoencoder": {**NETWORK, "targets": "mask"}}
+    by_tree = {"masks": {"levels": "tree"}}
     variants = {
         "paper": {**shared, "method": {"name": "hi_lsplat"}},
         "langsplat": {**shared, "method": {"name": "langsplat"}},
         "on": {**shared, "field": {"start": "langsplat"}},
         "alone": {"field": {"start": "langsplat"}},
+        "tree": {**by_tree, **own, "contributions": {"keep": "none"}, "method": {"name": "langsplat"}},
+        "on-tree": {**by_tree, **own, "field": {"start": "langsplat"}},
     }
     found = plan(tmp_path, variants=variants, main_variants=["default"], seeds=2)
+    # LangSplat needs no pairs of Gaussians, which don't change the code of the masks' own vectors.
+    assert variants_in(found.first_field(Job(variant="on-tree.seed1"))) == ["tree.seed1"]
     on = Job(variant="on.seed1")
     assert found.first_field(on) == ["results/synthetic/one/langsplat.seed1/field.safetensors"]
     assert found.first_field(Job()) == []
