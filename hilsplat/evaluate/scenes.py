@@ -1,15 +1,18 @@
 """The scenes of a results folder: what each can answer, its size, and the quality of its fit and tree."""
 
+import logging
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from hilsplat.base.errors import ArtifactError, nearest
+from hilsplat.base.errors import ArtifactError, HilsplatError, nearest
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.ownership import require_beginning
 from hilsplat.base.tables import aligned_table, write_csv
 from hilsplat.evaluate.scores import read_scores
 from hilsplat.query.scene_state import SceneState
 from hilsplat.scene.finished import scenes_in
+
+logger = logging.getLogger(__name__)
 
 COLUMNS = (
     *("scene", "state", "train_views", "test_views", "gaussians", "psnr_db"),
@@ -23,6 +26,9 @@ SHOWN = ("scene", "state", "views", "PSNR", "mIoU", "MB", "date", "models")
 
 WORDS = ("scene", "state", "date", "models")
 
+DAMAGED = "damaged"
+"""State of a scene with an artifact that cannot be read."""
+
 PROTOCOL = "lerf/tree-nodes"
 """Default protocol of the scores: the tree's answers in views, against regions annotated with a text."""
 
@@ -30,13 +36,14 @@ PROTOCOL = "lerf/tree-nodes"
 def run_scenes(results: Path, pattern: str, out: Path | None, protocol: str = PROTOCOL) -> str:
     """Return a table of the scenes that match a pattern, and write all columns to `out` as CSV, if given.
 
-    Cells of what a scene's run has not computed, such as scores without labels, are empty.
+    Cells of what a scene's run has not computed, such as scores without labels, are empty. A scene with a
+    damaged artifact has the state `damaged`, and a warning names the artifact.
 
     Args:
         protocol: beginning of the name of the protocol whose mean IoU of the tree's answers is shown.
 
     Raises:
-        ArtifactError: no scene matches, an artifact is damaged, or `out` is another file.
+        ArtifactError: no scene matches, or `out` is another file.
     """
     names = scenes_in(results)
     chosen = [name for name in names if any(fnmatchcase(each, pattern) for each in (name, Path(name).name))]
@@ -60,9 +67,16 @@ def scene_lines(
     rows: list[list[object]] = []
     shown: list[tuple[object, ...]] = [SHOWN]
     for name in names:
-        scene = SceneState.read(results / name)
+        try:
+            scene = SceneState.read(results / name)
+            iou = _tree_iou(results / name / "default/scores.csv", protocol)
+        except HilsplatError as error:
+            logger.warning("%s: %s", name, error)
+            rows.append([name, DAMAGED, *[""] * (len(COLUMNS) - 2)])
+            shown.append((name, DAMAGED, *[""] * (len(SHOWN) - 2)))
+            continue
         train, test = (scene.views[split] or "" for split in ("train", "test"))
-        psnr, iou = scene.fit.get("psnr_db"), _tree_iou(results / name / "default/scores.csv", protocol)
+        psnr = scene.fit.get("psnr_db")
         psnr_db, megabytes = "" if psnr is None else f"{psnr:.2f}", round(scene.num_bytes / 1e6)
         nodes = [scene.nodes.get(level.label, "") for level in LEVELS]
         known = [name, scene.state, train, test, scene.fit.get("gaussians", ""), psnr_db, *nodes]

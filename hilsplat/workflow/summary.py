@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hilsplat.base.artifacts import rebuild_command, run_command
+from hilsplat.base.errors import HilsplatError
 from hilsplat.base.tables import aligned_table, counted, read_csv
 from hilsplat.evaluate.scenes import scene_lines
 from hilsplat.evaluate.tables.means import TEXTS
@@ -24,11 +25,7 @@ Gaussian Splatting has 23 to 29 dB on its photographs (Kerbl et al. 2023, Tab. 1
 
 
 def summary(plan: Plan, files: Sequence[str] = ()) -> list[str]:
-    """Return the summary of a plan's scenes that have poses; if files were made, only of theirs.
-
-    Raises:
-        ArtifactError: an artifact is damaged.
-    """
+    """Return the summary of a plan's scenes that have poses; if files were made, only of theirs."""
     found = set(scenes_in(plan.results))
     rows = [row for row in plan.scenes if row.name in found]
     if files:
@@ -46,7 +43,14 @@ def summary(plan: Plan, files: Sequence[str] = ()) -> list[str]:
 
 
 def _scene(plan: Plan, row: SceneRow) -> list[str]:
-    """Return a heading and the facts about one scene."""
+    """Return a heading and the facts about one scene, or what is wrong with an artifact."""
+    try:
+        return _facts(plan, row)
+    except HilsplatError as error:  # the run has succeeded, but an earlier artifact is damaged
+        return [f"{row.name}:", *(f"  {line}" for line in str(error).splitlines())]
+
+
+def _facts(plan: Plan, row: SceneRow) -> list[str]:
     folder, figures = Path(plan.path(row)), plan.results / "figures" / row.name
     scene, name, means = SceneState.read(folder), command_name(folder), folder / "scores.csv"
     counts = ", ".join(f"{number} {level}" for level, number in scene.nodes.items())

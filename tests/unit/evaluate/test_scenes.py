@@ -62,6 +62,18 @@ def test_each_scene_has_a_row_with_what_its_run_has_computed(results, capsys):
     assert "0.3000" in capsys.readouterr().out.splitlines()[1]
 
 
+@pytest.mark.parametrize("file", ["gaussians/report.json", "default/scores.csv", "scene/index.json"])
+def test_a_damaged_scene_is_named_and_the_others_are_listed(results, capsys, file):
+    path, out = results / "rooms/one" / file, results / "scenes.csv"
+    path.write_bytes(path.read_bytes()[:20])
+    app(["scenes", "--results", str(results), "--out", str(out)], standalone_mode=False)
+    states = [line.split(",")[:2] for line in out.read_text().splitlines()[1:]]
+    assert states[2] == ["rooms/one", "damaged"] and states[3] == ["rooms/posed", "poses"]
+    printed = capsys.readouterr()
+    assert printed.out.splitlines()[3].split() == ["rooms/one", "damaged"]
+    assert printed.err.startswith(f"rooms/one: {path}") and "fix  " in printed.err
+
+
 def test_the_size_of_a_scene_is_that_of_its_files(results):
     (results / "rooms/posed/scene/large.bin").write_bytes(b"x" * 2_600_000)
     assert (
