@@ -63,6 +63,7 @@ estimates.resources = RESOURCES
 for line in PLAN.absent_lines():
     logger.warning(line)
 LABELS = {"files": PLAN.data.label_files, "plugins": PLAN.data.label_readers}
+SCORED = {**LABELS, "plugins": PLAN.data.scorers}
 FEATURES = {"files": PLAN.data.features, "features": PLAN.data.features_folder}
 
 

@@ -402,14 +402,13 @@ def field(
 
 
 def _labels(arguments: Mapping[str, Any]) -> Reads:
-    from hilsplat.datasets.generators import generator_places
     from hilsplat.datasets.registry import readers_of
     from hilsplat.datasets.sources import label_files
 
     labels = arguments["labels"] or ()
     named = [labels] if isinstance(labels, str) else list(labels)
     files = {f"labels {name}": label_files(name, str(arguments["data_root"])) for name in named}
-    return Reads(files, (*readers_of(named), *generator_places(arguments.get("source", ""))))
+    return Reads(files, readers_of([*named, arguments.get("source", "")]))
 
 
 @stage(
@@ -526,17 +525,13 @@ def label_fits(
 # ---- tables and pictures -------------------------------------------------------------------------
 
 
-def _listed_scenes(arguments: Mapping[str, Any]) -> Reads:
+def _readers(arguments: Mapping[str, Any]) -> Reads:
     from hilsplat.datasets.registry import DATASETS, readers_of
 
     return Reads(plugins=readers_of(DATASETS))
 
 
-@stage(
-    scope="run",
-    reads=_listed_scenes,
-    beside=lambda out: tuple(out.with_suffix(end) for end in (".md", ".tex", ".html")),
-)
+@stage(scope="run", reads=_readers, beside=lambda out: tuple(map(out.with_suffix, (".md", ".tex", ".html"))))
 def table(
     name: Annotated[str, typer.Argument(help="table: hierarchy, lerf, ablation, ... (docs/tables.md)")],
     published: PathIn,

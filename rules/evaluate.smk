@@ -19,12 +19,7 @@ use rule stage as evaluate with:
     resources:
         **RESOURCES.of("evaluate"),
     params:
-        **PLAN.params(
-            "evaluate",
-            files=PLAN.data.label_files,
-            plugins=PLAN.data.scorers,
-            name=PLAN.data.scene_name,
-        ),
+        **PLAN.params("evaluate", **SCORED, name=PLAN.data.scene_name),
 
 
 use rule stage as score_means with:

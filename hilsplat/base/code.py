@@ -29,9 +29,6 @@ PACKAGES = ("hilsplat", "cpusplat")
 NEUTRAL = ("hilsplat.settings", "hilsplat.baselines", __name__)
 """Modules that don't count: settings, whose values are parameters of the rules, and this one."""
 
-DATA = (".json", ".tsv", ".txt")
-"""Suffixes of the data of a module, which have its name, so that they count."""
-
 MEMO = Path(__file__).parent / "__pycache__" / f"code.{sys.implementation.cache_tag}.json"
 """Facts of each module; parsing all modules takes seconds."""
 
@@ -127,7 +124,7 @@ def _file(module: str) -> Path | None:
 
 
 def _facts(module: str, path: Path, known: Facts | None) -> Facts:
-    files = [path, *filter(Path.is_file, map(path.with_suffix, DATA))]
+    files = [path, *filter(Path.is_file, map(path.with_suffix, (".json", ".tsv", ".txt")))]
     text, *data = (file.read_bytes() for file in files)
     contents = sha256_of_bytes(path.name.encode(), text, *data)  # relative imports depend on the name
     if known is not None and known.files == contents:

@@ -78,12 +78,6 @@ class Generator:
     pictures: tuple[str, ...] = ()
 
 
-def generator_places(source: str) -> tuple[str, ...]:
-    """Return the import path of the generator named in a source, if any (`base.plugins`)."""
-    name = source.partition(":")[0]
-    return (GENERATORS.places[name],) if name in GENERATORS else ()
-
-
 def generator_of(source: str) -> tuple[Generator, Generated]:
     """Return the generator named in a source, and the source's parts; raise SceneError if it is unknown."""
     generated = generated_of(source)

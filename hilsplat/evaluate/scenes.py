@@ -8,7 +8,9 @@ from hilsplat.base.errors import ArtifactError, HilsplatError, nearest
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.ownership import require_beginning
 from hilsplat.base.tables import aligned_table, write_csv
+from hilsplat.evaluate.protocols.cards import card_of
 from hilsplat.evaluate.scores import read_scores
+from hilsplat.evaluate.tables.means import metric_means
 from hilsplat.query.scene_state import SceneState
 from hilsplat.scene.finished import scenes_in
 
@@ -26,9 +28,6 @@ SHOWN = ("scene", "state", "views", "PSNR", "mIoU", "MB", "date", "models")
 
 WORDS = ("scene", "state", "date", "models")
 
-DAMAGED = "damaged"
-"""State of a scene with an artifact that cannot be read."""
-
 PROTOCOL = "lerf/tree-nodes"
 """Default protocol of the scores: the tree's answers in views, against regions annotated with a text."""
 
@@ -36,8 +35,8 @@ PROTOCOL = "lerf/tree-nodes"
 def run_scenes(results: Path, pattern: str, out: Path | None, protocol: str = PROTOCOL) -> str:
     """Return a table of the scenes that match a pattern, and write all columns to `out` as CSV, if given.
 
-    Cells of what a scene's run has not computed, such as scores without labels, are empty. A scene with a
-    damaged artifact has the state `damaged`, and a warning names the artifact.
+    Cells of what a scene's run has not computed, such as scores without labels, are empty, as are those of
+    a scene with a damaged artifact, which a warning names.
 
     Args:
         protocol: beginning of the name of the protocol whose mean IoU of the tree's answers is shown.
@@ -72,8 +71,8 @@ def scene_lines(
             iou = _tree_iou(results / name / "default/scores.csv", protocol)
         except HilsplatError as error:
             logger.warning("%s: %s", name, error)
-            rows.append([name, DAMAGED, *[""] * (len(COLUMNS) - 2)])
-            shown.append((name, DAMAGED, *[""] * (len(SHOWN) - 2)))
+            rows.append([name, "damaged", *[""] * (len(COLUMNS) - 2)])
+            shown.append((name, "damaged", *[""] * (len(SHOWN) - 2)))
             continue
         train, test = (scene.views[split] or "" for split in ("train", "test"))
         psnr = scene.fit.get("psnr_db")
@@ -87,8 +86,10 @@ def scene_lines(
 
 
 def _tree_iou(scores: Path, protocol: str) -> str:
-    """Return the mean IoU of the tree under a protocol, for the data set with the most labelled queries."""
+    """Return the mean IoU of the tree under the protocol and data set with the most labelled queries."""
     table = read_scores([scores] if scores.is_file() else [])
     is_shown = (table["method"] == "tree") & (table["metric"] == "iou")
-    values = table[is_shown & table["protocol"].str.startswith(protocol)].groupby("dataset")["value"]
-    return f"{values.mean()[values.count().idxmax()]:.4f}" if len(values) else ""
+    shown = table[is_shown & table["protocol"].str.startswith(protocol)]
+    parts = [(name, part) for (_, name), part in shown.groupby(["dataset", "protocol"])]
+    name, most = max(parts, key=lambda named: len(named[1]), default=("", shown))
+    return f"{metric_means(card_of(name), most)['iou']:.4f}" if name else ""

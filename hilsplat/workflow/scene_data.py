@@ -14,7 +14,6 @@ from typing import Any, Protocol, runtime_checkable
 from hilsplat.base.errors import SettingsError, nearest
 from hilsplat.base.files import IMAGE_SUFFIXES
 from hilsplat.base.lineage import digests_of, sha256_of_json
-from hilsplat.datasets.generators import generator_places
 from hilsplat.datasets.registry import readers_of
 from hilsplat.datasets.sources import absence, image_files, is_exported, label_files, label_sets
 from hilsplat.scene.layouts import dataparser_of, photo_files, transforms_of
@@ -176,7 +175,7 @@ class SceneData:
 
     def scorers(self, job: Job) -> tuple[str, ...]:
         """Return the readers of a scene's labels, or the generator that has its ground truth."""
-        return (*self.label_readers(job), *generator_places(self.generated_source(job)))
+        return readers_of([*self.labels(self.row(job)), self.generated_source(job)])
 
     def label_files(self, job: Job) -> list[str]:
         """Return the label files, which only evaluation reads, so that editing one reruns no other stage."""

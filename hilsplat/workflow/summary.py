@@ -44,18 +44,15 @@ def summary(plan: Plan, files: Sequence[str] = ()) -> list[str]:
 
 def _scene(plan: Plan, row: SceneRow) -> list[str]:
     """Return a heading and the facts about one scene, or what is wrong with an artifact."""
+    folder, figures = Path(plan.path(row)), plan.results / "figures" / row.name
+    name, means = command_name(folder), folder / "scores.csv"
     try:
-        return _facts(plan, row)
+        scene = SceneState.read(folder)
+        scores = read_csv(means, None, rebuild_command(means)) if means.is_file() else []
     except HilsplatError as error:  # the run has succeeded, but an earlier artifact is damaged
         return [f"{row.name}:", *(f"  {line}" for line in str(error).splitlines())]
-
-
-def _facts(plan: Plan, row: SceneRow) -> list[str]:
-    folder, figures = Path(plan.path(row)), plan.results / "figures" / row.name
-    scene, name, means = SceneState.read(folder), command_name(folder), folder / "scores.csv"
     counts = ", ".join(f"{number} {level}" for level, number in scene.nodes.items())
     pictures = ", ".join(sorted(path.name for path in figures.glob("*.webp")))
-    scores = read_csv(means, None, rebuild_command(means)) if means.is_file() else []
     table = aligned_table([[*scores[0]], *([*each.values()] for each in scores)], TEXTS) if scores else []
     uses = f'hilsplat query {name} "..."  or  hilsplat view {name}'
     facts = {

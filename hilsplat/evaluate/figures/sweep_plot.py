@@ -22,45 +22,39 @@ def run_sweep_plot(name: str, table: Path, out: Path) -> None:
     """Draw a sweep as PNG and PDF, from the finished CSV of the table called `name`.
 
     Raises:
-        ArtifactError: the sweep is unknown, or the table is missing.
+        ArtifactError: the sweep is unknown, or the table is missing or another.
     """
     if name not in SWEEPS:
         raise ArtifactError(f"there is no sweep {name!r}", expected=f"one of {', '.join(SWEEPS)}")
-    save_with_pdf(draw_sweep(name, read_curves(table)), out)
+    if not (curves := read_curves(table)):
+        raise ArtifactError(f"{table} is not the table of a sweep", expected="rows named like 'theta = 0.9'")
+    save_with_pdf(draw_sweep(name, curves), out)
 
 
 def read_curves(table: Path) -> Curves:
-    """Map each panel (kind of rows and data set) to its curves, by name: sorted (setting, percentage) pairs.
+    """Map each panel (kind of rows and data set) to its curves, by name: (setting, percentage) pairs.
 
-    A curve has at least two points. Its rows have the same masks and protocol, and names that differ only in
-    the setting, such as "theta = 0.6, by head"; what distinguishes the curves of a panel is in their names.
+    Rows of a curve have the same masks and protocol, and names that differ only in the setting, such as
+    "theta = 0.6, by head".
     """
-    found: dict[str, dict[tuple[str, ...], list[tuple[float, float]]]] = {}
+    panels: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for row in read_csv(table, None, "build the table first"):
         named = re.fullmatch(r"\w+ = ([0-9.]+)(?:, )?(.*)", row["method"])
         for column in COLUMNS if named else ():
             if shown := re.match(r"[-0-9.]+", row.get(column) or ""):
-                key = column, named[2], row.get("masks", ""), row.get("protocol", "")
-                panel = found.setdefault(f"{row['kind']}: {row['data']}", {})
-                panel.setdefault(key, []).append((float(named[1]), float(shown[0])))
-    curves: dict[str, dict[str, list[tuple[float, float]]]] = {}
-    for panel, points_of in found.items():
-        same = [len(set(names)) == 1 for names in zip(*points_of, strict=True)]
-        for (column, *names), points in points_of.items():
-            own = [name for name, is_same in zip(names, same[1:], strict=True) if name and not is_same]
-            if len(points) > 1:
-                curves.setdefault(panel, {})[", ".join([column, *own])] = sorted(points)
-    return curves
+                curve = ", ".join(filter(None, (column, named[2], row.get("masks"), row.get("protocol"))))
+                curves = panels.setdefault(f"{row['kind']}: {row['data']}", {})
+                curves.setdefault(curve, []).append((float(named[1]), float(shown[0])))
+    return panels
 
 
 def draw_sweep(name: str, curves: Curves) -> Figure:
     """Draw one panel per kind of rows and data set; axes are not shared because these are not comparable."""
-    num = max(1, len(curves))
-    figure = Figure(figsize=(4.6 * num, 3.4), layout="constrained")
-    panels = figure.subplots(1, num, squeeze=False)[0]
-    for axes, (panel, points_of) in zip(panels, curves.items(), strict=False):
+    figure = Figure(figsize=(4.6 * len(curves), 3.4), layout="constrained")
+    all_axes = figure.subplots(1, len(curves), squeeze=False)[0]
+    for axes, (panel, points_of) in zip(all_axes, curves.items(), strict=True):
         for label, points in points_of.items():
-            values, shares = zip(*points, strict=True)
+            values, shares = zip(*sorted(points), strict=True)
             axes.plot(values, shares, marker="o", label=label)
         if name == "omega":
             axes.set_xscale("log")

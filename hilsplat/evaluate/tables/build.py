@@ -26,13 +26,9 @@ logger = logging.getLogger(__name__)
 BLOCKS: dict[str, Callable[[TableKind, Sources], list[Block]]] = {
     "lerf": partial(measured_blocks, cells_of=lerf_cells),
     "3dovs": partial(measured_blocks, cells_of=ovs_cells),
-    "replica": partial(
-        measured_blocks, cells_of=replica_cells, over_seeds=partial(interval_cells, "Mean", False)
-    ),
+    "replica": partial(measured_blocks, cells_of=replica_cells, over_seeds=interval_cells),
     "scannet": scannet_blocks,
-    "waymo": partial(
-        measured_blocks, cells_of=waymo_cells, over_seeds=partial(interval_cells, "Present classes", True)
-    ),
+    "waymo": partial(measured_blocks, cells_of=waymo_cells, over_seeds=interval_cells),
     "hierarchy": partial(measured_blocks, cells_of=hierarchy_cells),
     **dict.fromkeys(("ablation", "components", "theta", "omega"), ablation_blocks),
     "cost": cost_blocks,

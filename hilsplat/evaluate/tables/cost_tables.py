@@ -2,26 +2,20 @@
 
 import statistics
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hilsplat.configuration import seed_parts
 from hilsplat.datasets.sources import LEVELLED
 from hilsplat.evaluate.costs import Cost
-from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN
 from hilsplat.evaluate.tables.ablation import component_cells
 from hilsplat.evaluate.tables.kinds import TableKind
-from hilsplat.evaluate.tables.measured import (
-    kind_and_title,
-    mean_over_seeds,
-    of_comparable_seeds,
-    row_name,
-    row_of_scenes,
-    row_place,
-    seeds_of_row,
-    with_seeds,
-)
+from hilsplat.evaluate.tables.measured import kind_and_title, measured_blocks, row_name, row_of, row_place
 from hilsplat.evaluate.tables.rows import Block, Cell, Sources
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def cost_blocks(kind: TableKind, sources: Sources) -> list[Block]:
@@ -31,12 +25,10 @@ def cost_blocks(kind: TableKind, sources: Sources) -> list[Block]:
         rows, scenes = [], scenes_of(answers)
         for variant, method, costs in answers:
             of_scenes = {cost.scene: [each for each in costs if each.scene == cost.scene] for cost in costs}
-            queries = {
-                f"{scene} query (s)": time_cells(of_scene, method)["Query (s)"]
-                for scene, of_scene in of_scenes.items()
-            }
+            times = {scene: time_cells(of_scene, method) for scene, of_scene in of_scenes.items()}
+            queries = {f"{scene} query (s)": cells["Query (s)"] for scene, cells in times.items()}
             names = {"Method": row_name(variant, method, sources.labels)}
-            rows.append(row_of_scenes(names, time_cells(costs, method) | queries, data, of_scenes, scenes))
+            rows.append(row_of(names, time_cells(costs, method) | queries, data, of_scenes, scenes))
         blocks.append(Block(*kind_and_title(data), tuple(rows), kind.columns_of(scenes)))
     return blocks
 
@@ -46,27 +38,20 @@ def quality_blocks(kind: TableKind, sources: Sources) -> list[Block]:
 
     Labels with levels are a separate data set (Hi-LERF) or belong to the scene's own data set.
     """
-    blocks = []
-    scores = with_seeds(sources.scores)
-    given = scores[scores["protocol"].str.startswith(LEVEL_GIVEN.full_name)]
-    for data, answers in by_answer(sources).items():
-        rows, scenes = [], scenes_of(answers)
-        for variant, method, costs in answers:
-            part = given[
-                given["dataset"].isin([*LEVELLED, data])
-                & given["scene"].isin([cost.scene for cost in costs])
-                & (given["variant"] == variant)
-                & (given["method"] == method)
-            ]
-            if method in kind.methods and not part.empty:
-                part = of_comparable_seeds(part)
-                seeds = [component_cells(scores, of_seed) for _, of_seed in part.groupby("seed", sort=True)]
-                times = time_cells([cost for cost in costs if cost.scene in set(part["scene"])], method)
-                names = {"Method": row_name(variant, method, sources.labels)} | seeds_of_row(seeds)
-                cells = mean_over_seeds(seeds) | times
-                rows.append(row_of_scenes(names, cells, data, part["scene"], scenes))
-        blocks.append(Block(*kind_and_title(data), tuple(rows), kind.columns_of(())))
-    return blocks
+
+    def times(_: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
+        first, scenes = part.iloc[0], set(part["scene"])
+        costs = [
+            cost
+            for cost in sources.costs
+            if first["dataset"] in (cost.dataset, *LEVELLED)
+            and cost.scene in scenes
+            and seed_parts(cost.variant)[0] == first["variant"]
+            and first["method"] in cost.query_s
+        ]
+        return time_cells(costs, first["method"]) if costs else {}
+
+    return measured_blocks(kind, sources, component_cells, times)
 
 
 def without_costs(block: Block) -> Block:

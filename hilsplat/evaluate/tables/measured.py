@@ -67,16 +67,17 @@ def measured_blocks(
                 part = of_comparable_seeds(part)
                 seeds = [cells_of(scores, of_seed) for _, of_seed in part.groupby("seed", sort=True)]
                 seeds = seeds[:1] if method == "truth" else seeds  # annotations are the same under every seed
-                names = _row_names(variant, masks, method, label, sources.labels) | seeds_of_row(seeds)
+                names = _row_names(variant, masks, method, label, sources.labels)
+                if len(seeds) > 1:
+                    names["Seeds"] = str(len(seeds))
                 cells = mean_over_seeds(seeds) | over_seeds(scores, part)
                 is_ranked = method != "truth" and not made_from_truth(masks)
-                group = label if kind.ranked_by_protocol else ""
+                group = (label if kind.ranked_by_protocol else "") if is_ranked else None
                 protocol = list(PROTOCOLS).index(label) if label in PROTOCOLS else -1
                 order = row_place(variant, method, sources.labels)
                 place = made_from_truth(masks), protocol, *order, masks, label
                 scenes = part["scene"], selected["scene"], kind.averaged
-                row = row_of_scenes(names, cells, str(data), *scenes, group if is_ranked else None)
-                rows.append((place, row))
+                rows.append((place, row_of(names, cells, str(data), *scenes, group)))
             if rows:
                 distinct = without_repeats([row for _, row in sorted(rows, key=lambda pair: pair[0])])
                 columns = kind.columns_of(selected["scene"])
@@ -103,14 +104,14 @@ def _row_names(
     }
 
 
-def row_of_scenes(
+def row_of(
     names: Mapping[str, str],
     cells: Mapping[str, Cell],
     data: str,
     scenes: Collection[str],
     of_block: Collection[str],
     averaged: Collection[str] = (),
-    ranked_with: str | None = "",
+    group: str | None = "",
 ) -> Row:
     """Return a row; if its averages are over part of the scenes, it states so, and they are not ranked.
 
@@ -123,10 +124,10 @@ def row_of_scenes(
     every = set(averaged) if listed and averaged else {*listed, *of_block}
     number = len(every & set(scenes))
     if number == len(every):
-        return Row(names, cells, ranked_with)
+        return Row(names, cells, group)
     own = tuple(f"{scene} " for scene in set(scenes))
     averages = tuple(column for column in cells if not column.startswith(own))
-    return Row({**names, "Scenes": f"{number} of {len(every)}"}, cells, ranked_with, averages)
+    return Row({**names, "Scenes": f"{number} of {len(every)}"}, cells, group, averages)
 
 
 def with_seeds(scores: "pd.DataFrame") -> "pd.DataFrame":
@@ -134,11 +135,6 @@ def with_seeds(scores: "pd.DataFrame") -> "pd.DataFrame":
     parts = {name: seed_parts(name) for name in scores["variant"].unique()}
     variant, seed = (scores["variant"].map(lambda name, part=part: parts[name][part]) for part in (0, 1))
     return scores.assign(variant=variant, seed=seed)
-
-
-def seeds_of_row(seeds: Sequence[Mapping[str, Cell]]) -> dict[str, str]:
-    """Return the column Seeds of a row with several seeds, otherwise nothing."""
-    return {"Seeds": str(len(seeds))} if len(seeds) > 1 else {}
 
 
 def mean_over_seeds(seeds: Sequence[Mapping[str, Cell]]) -> dict[str, Cell]:

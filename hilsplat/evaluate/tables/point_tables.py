@@ -27,6 +27,9 @@ SCANNET_COLUMNS: Mapping[str, str] = {
 }
 """Protocol -> column in the paper."""
 
+INTERVAL_COLUMNS = {**SCANNET_COLUMNS, "replica/": "Mean", "waymo/": "Present classes"}
+"""Beginning of a protocol's name -> the mean whose interval is shown."""
+
 BENCHMARK = "scannet200/benchmark"
 SPLIT_COLUMNS = {f"miou_{split}": f"ScanNet200 {split} mIoU" for split in ("head", "common", "tail")}
 AP_COLUMNS = {
@@ -49,7 +52,7 @@ def scannet_blocks(kind: TableKind, sources: Sources) -> list[Block]:
     def mode_of(protocol: str) -> str:
         return protocol.partition("(")[2].rstrip(")")  # how points were classified
 
-    return measured_blocks(kind, sources, partial(scannet_cells, sources), scannet_intervals, mode_of)
+    return measured_blocks(kind, sources, partial(scannet_cells, sources), interval_cells, mode_of)
 
 
 def scannet_cells(sources: Sources, _: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
@@ -79,13 +82,6 @@ def scannet_cells(sources: Sources, _: "pd.DataFrame", part: "pd.DataFrame") -> 
     if scans:
         rows = measure_instances(first["method"], scans, "nearest")
         cells |= {AP_COLUMNS[row.metric]: Cell.percent(row.value) for row in rows}
-    return cells
-
-
-def scannet_intervals(scores: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
-    cells: dict[str, Cell] = {}
-    for protocol, name in SCANNET_COLUMNS.items():
-        cells |= interval_cells(name, False, scores, part[part["protocol"].str.startswith(protocol)])
     return cells
 
 
@@ -136,24 +132,22 @@ def bootstrap_mean(
     return float(low), float(high)
 
 
-def interval_cells(name: str, pooled: bool, _: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
-    """Return the interval and the numbers of names and scenes; empty if no row describes a class."""
-    ious = part[part["metric"] == "class_iou"]
-    true = part[part["metric"] == "class_accuracy"]
-    if ious.empty or true.empty:
-        return {}
-    scenes, names = sorted(set(ious["scene"])), sorted(set(ious["query"]))
+def interval_cells(_: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
+    """Return the interval and the numbers of names and scenes for each protocol that has rows of classes."""
+    import pandas as pd
 
-    def by_seed(frame: "pd.DataFrame", column: str) -> np.ndarray:
-        seeds = (
-            of_seed.pivot(index="scene", columns="query", values=column).reindex(index=scenes, columns=names)
-            for _, of_seed in frame.groupby("seed", sort=True)
-        )
-        return np.nan_to_num(np.stack([of_seed.to_numpy(float) for of_seed in seeds]))
-
-    union, counts = by_seed(ious, "n"), by_seed(true, "n")[0] > 0  # all seeds have the same ground truth
-    low, high = bootstrap_mean(by_seed(ious, "value") * union, union, counts, pooled)
-    return {
-        f"{name} 95 %": Cell(f"{100 * low:.0f} to {100 * high:.0f}"),
-        f"{name} names": Cell(f"{int(counts.sum())} in {len(counts)}"),
-    }
+    cells, keys = {}, ["metric", "seed", "scene", "query"]
+    of_classes = part[part["metric"].isin(("class_accuracy", "class_iou"))]
+    for protocol, name in INTERVAL_COLUMNS.items():
+        rows = of_classes[of_classes["protocol"].str.startswith(protocol)]
+        if rows["metric"].nunique() < 2:
+            continue
+        names = [sorted(set(rows[key])) for key in keys]
+        grid = rows.set_index(keys)[["value", "n"]].reindex(pd.MultiIndex.from_product(names)).fillna(0)
+        (_, ious), (true, union) = grid.to_numpy().T.reshape(2, *map(len, names))  # of accuracies, of IoUs
+        present = true[0] > 0  # all seeds have the same ground truth
+        is_pooled = card_of(rows["protocol"].iloc[0]).averaging == "pooled"
+        low, high = bootstrap_mean(ious * union, union, present, is_pooled)
+        cells[f"{name} 95 %"] = Cell(f"{100 * low:.0f} to {100 * high:.0f}")
+        cells[f"{name} names"] = Cell(f"{int(present.sum())} in {len(present)}")
+    return cells

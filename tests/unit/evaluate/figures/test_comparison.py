@@ -122,11 +122,12 @@ def test_a_curve_joins_rows_of_one_data_set_and_reading(tmp_path):
             "Hi-LERF mIoU": [(0.6, 38.4), (0.9, 39.1)],
             "Hi-LERF HC": [(0.6, 56.3), (0.9, 56.9)],
         },
-        "measured: hi_lerf": {"Hi-LERF mIoU": [(0.6, 31.0), (0.9, 32.0)]},
-        "measured: hi_3dovs": {"Hi-LERF mIoU": [(0.6, 51.0), (0.9, 52.0)]},
+        "measured: hi_lerf": {"Hi-LERF mIoU, sam": [(0.6, 31.0), (0.9, 32.0)]},
+        "measured: hi_3dovs": {"Hi-LERF mIoU, sam": [(0.6, 51.0), (0.9, 52.0)]},
         "synthetic stand-in: synthetic": {
-            "Hi-LERF mIoU, a": [(0.6, 41.0), (0.9, 42.0)],
+            "Hi-LERF mIoU, a": [(0.9, 42.0), (0.6, 41.0)],
             "Hi-LERF mIoU, by head, a": [(0.6, 61.0), (0.9, 62.0)],
+            "Hi-LERF mIoU, by head, b": [(0.9, 72.0)],
         },
     }
     run_sweep_plot("theta", tmp_path / "theta.csv", tmp_path / "theta.png")
@@ -138,3 +139,6 @@ def test_an_unknown_sweep_is_an_error_that_lists_the_sweeps(tmp_path):
         run_sweep_plot("lambda", tmp_path / "theta.csv", tmp_path / "x.png")
     with pytest.raises(ArtifactError, match="build the table first"):
         run_sweep_plot("theta", tmp_path / "theta.csv", tmp_path / "x.png")
+    (tmp_path / "lerf.csv").write_text("kind,data,method\nmeasured,lerf,hilsplat\n")
+    with pytest.raises(ArtifactError, match="rows named like 'theta = "):
+        run_sweep_plot("theta", tmp_path / "lerf.csv", tmp_path / "x.png")
