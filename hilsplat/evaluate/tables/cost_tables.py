@@ -22,7 +22,7 @@ def cost_blocks(kind: TableKind, sources: Sources) -> list[Block]:
     """Return times, memory and seconds per query in each scene."""
     blocks = []
     for data, answers in by_answer(sources).items():
-        rows, scenes = [], scenes_of(answers)
+        rows, scenes = [], {cost.scene for *_, costs in answers for cost in costs}
         for variant, method, costs in answers:
             of_scenes = {cost.scene: [each for each in costs if each.scene == cost.scene] for cost in costs}
             times = {scene: time_cells(of_scene, method) for scene, of_scene in of_scenes.items()}
@@ -67,10 +67,6 @@ def time_cells(costs: list[Cost], method: str) -> dict[str, Cell]:
         "Memory (GB)": Cell.number(float(np.max(peaks_mib)) / 1024),  # nan if any is unknown
         "Query (s)": Cell.number(statistics.fmean(cost.query_s[method] for cost in costs)),
     }
-
-
-def scenes_of(answers: list[tuple[str, str, list[Cost]]]) -> set[str]:
-    return {cost.scene for *_, costs in answers for cost in costs}
 
 
 def by_answer(sources: Sources) -> dict[str, list[tuple[str, str, list[Cost]]]]:
