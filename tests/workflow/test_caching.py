@@ -51,7 +51,7 @@ def test_an_edit_reruns_the_stages_that_import_the_module_and_what_follows(copy_
         ("hilsplat/embed/stage.py", FROM_CLIP),
         ("hilsplat/methods/lifted.py", {"method", "evaluate", "table", "comparison"}),
         ("hilsplat/datasets/images/lerf_ovs.py", {"table", "sweep_plot"}),
-        ("hilsplat/query/node_names.txt", {"names"}),
+        ("hilsplat/query/node_names.txt", {"names", "figures"} | FROM_SCORES),  # data of an imported module
         ("hilsplat_world/diagnostics/world_consistency.py", {"mask_truth"} | FROM_SCORES),
     ):
         file = copy_of_finished.root / path
