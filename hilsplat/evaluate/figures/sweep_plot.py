@@ -40,8 +40,8 @@ def read_curves(table: Path) -> Curves:
     panels: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for row in read_csv(table, None, "build the table first"):
         named = re.fullmatch(r"\w+ = ([0-9.]+)(?:, )?(.*)", row["method"])
-        for column in COLUMNS if named else ():
-            if shown := re.match(r"[-0-9.]+", row.get(column) or ""):
+        for column in COLUMNS:
+            if named and (shown := re.match(r"[-0-9.]+", row.get(column) or "")):
                 curve = ", ".join(filter(None, (column, named[2], row.get("masks"), row.get("protocol"))))
                 curves = panels.setdefault(f"{row['kind']}: {row['data']}", {})
                 curves.setdefault(curve, []).append((float(named[1]), float(shown[0])))
