@@ -21,6 +21,7 @@ from hilsplat.base.artifacts import provenance_path
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.plugins import entry_points
 from hilsplat.baselines import OURS, MethodSettings, method_of
+from hilsplat.datasets.registry import DATASETS, readers_of
 from hilsplat.models.store import AUTO
 from hilsplat.stage import (
     DEFAULT_CACHE,
@@ -54,7 +55,6 @@ stage = PIPELINE.stage
 
 
 def _source_files(arguments: Mapping[str, Any]) -> Reads:
-    from hilsplat.datasets.registry import readers_of
     from hilsplat.datasets.sources import image_files
     from hilsplat.scene.sheet import DATA_PREFIX
 
@@ -402,7 +402,6 @@ def field(
 
 
 def _labels(arguments: Mapping[str, Any]) -> Reads:
-    from hilsplat.datasets.registry import readers_of
     from hilsplat.datasets.sources import label_files
 
     labels = arguments["labels"] or ()
@@ -525,13 +524,11 @@ def label_fits(
 # ---- tables and pictures -------------------------------------------------------------------------
 
 
-def _readers(arguments: Mapping[str, Any]) -> Reads:
-    from hilsplat.datasets.registry import DATASETS, readers_of
-
-    return Reads(plugins=readers_of(DATASETS))
-
-
-@stage(scope="run", reads=_readers, beside=lambda out: tuple(map(out.with_suffix, (".md", ".tex", ".html"))))
+@stage(
+    scope="run",
+    reads=lambda arguments: Reads(plugins=readers_of(DATASETS)),  # their lists of scenes
+    beside=lambda out: tuple(map(out.with_suffix, (".md", ".tex", ".html"))),
+)
 def table(
     name: Annotated[str, typer.Argument(help="table: hierarchy, lerf, ablation, ... (docs/tables.md)")],
     published: PathIn,

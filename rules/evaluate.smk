@@ -63,7 +63,7 @@ use rule stage as table with:
     params:
         **PLAN.params(
             "table",
-            plugins=targets.readers,
+            plugins=lambda wildcards: READERS,
             name=targets.table_name,
             labels=PLAN.names,
             absent=targets.absent_of(PLAN),

@@ -5,7 +5,7 @@ from typing import Any
 
 from hilsplat.base.errors import shorten_list
 from hilsplat.datasets.generators import GENERATORS
-from hilsplat.datasets.registry import DATASETS, readers_of
+from hilsplat.datasets.registry import DATASETS
 from hilsplat.datasets.sources import published
 from hilsplat.evaluate.tables.kinds import TABLES
 from hilsplat.scene.sheet import SceneRow
@@ -35,11 +35,6 @@ def sweep_name(wildcards: Any) -> str:
 def scores_of(plan: Plan, name: str) -> Callable[[Any], list[str]]:
     """Return the input function of `table` for the files `name` of its scenes and variants."""
     return lambda wildcards: scores(plan, wildcards.table, name)
-
-
-def readers(_: Any) -> tuple[str, ...]:
-    """Return the readers of all data sets, whose lists of scenes tables show."""
-    return readers_of(DATASETS)
 
 
 def absent_of(plan: Plan) -> Callable[[Any], list[str]]:
