@@ -157,7 +157,7 @@ class Plan:
             "dataset": lambda job: job.dataset,
             "variant": lambda job: job.variant,
             "labels": self.data.label_names,
-            "data_root": str(Path(run.data_root)),
+            "data_root": self.data.root,
             "names": self.names,
             "queries": self.queries,
         }

@@ -170,6 +170,11 @@ class SceneData:
         """Return the labels of a scene, as `data set/scene`: published labels and your own annotations."""
         return () if row.generated else self._labels(row)
 
+    def root(self, job: Job) -> str:
+        """Return the folder of data sets, or an empty string for a scene that it does not concern."""
+        row = self.row(job)
+        return str(Path(self.data_root)) if row.source.startswith(DATA_PREFIX) or self.labels(row) else ""
+
     def label_readers(self, job: Job) -> tuple[str, ...]:
         return readers_of(self.labels(self.row(job)))
 

@@ -156,6 +156,17 @@ def test_photographs_that_you_annotated_are_scored_without_replacing_the_tables(
     assert not any("desk" in path for path in targets.scores(both, "lerf"))
 
 
+def test_the_folder_of_data_sets_counts_for_scenes_that_read_it(tmp_path):
+    (tmp_path / "annotated/photos/desk").mkdir(parents=True)
+    (tmp_path / "annotated/photos/desk/1.json").write_text("{}")
+    roots = {str(tmp_path): True, str(tmp_path / "other"): False}
+    plans = [plan(tmp_path, groups=["photos", "benchmark"], data_root=root) for root in roots]
+    for name in ("evaluate", "figures"):
+        for job, is_read in ((Job(), False), (Job("photos", "desk"), True)):
+            here, moved = (each.params(name, name=each.data.scene_name)["settings"](job) for each in plans)
+            assert (here == moved) is not is_read and ("--data-root" in here) is is_read
+
+
 @pytest.mark.parametrize(
     ("stage", "variant", "owner"),
     [
