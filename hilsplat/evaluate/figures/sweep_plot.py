@@ -34,15 +34,16 @@ def run_sweep_plot(name: str, table: Path, out: Path) -> None:
 def read_curves(table: Path) -> Curves:
     """Map each panel (kind of rows and data set) to its curves, by name: (setting, percentage) pairs.
 
-    Rows of a curve have the same masks and protocol, and names that differ only in the setting, such as
-    "theta = 0.6, by head".
+    Rows of a curve have the same masks and settings of the protocol, and names that differ only in the
+    setting, such as "theta = 0.6, by head".
     """
     panels: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for row in read_csv(table, None, "build the table first"):
         named = re.fullmatch(r"\w+ = ([0-9.]+)(?:, )?(.*)", row["method"])
+        departures = (row.get("protocol") or "").partition(" (")[2].removesuffix(")")
         for column in COLUMNS:
             if named and (shown := re.match(r"[-0-9.]+", row.get(column) or "")):
-                curve = ", ".join(filter(None, (column, named[2], row.get("masks"), row.get("protocol"))))
+                curve = ", ".join(filter(None, (column, named[2], row.get("masks"), departures)))
                 curves = panels.setdefault(f"{row['kind']}: {row['data']}", {})
                 curves.setdefault(curve, []).append((float(named[1]), float(shown[0])))
     return panels
@@ -60,7 +61,7 @@ def draw_sweep(name: str, curves: Curves) -> Figure:
             axes.set_xscale("log")
         axes.set_xlabel(SWEEPS[name])
         axes.set_ylabel("%")
-        axes.set_title(panel, fontsize=10)
+        axes.set_title(panel if panel.startswith("reported") else f"{panel}, not comparable", fontsize=10)
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)
     return figure

@@ -99,19 +99,20 @@ def test_comparing_no_variants_is_refused(compare):
         compare("none", [], {})
 
 
-SWEEP = """kind,data,method,masks,Hi-LERF mIoU,Hi-LERF HC,notes
-reported,LERF,theta = 0.6,,38.4,56.3,
-reported,LERF,theta = 0.9,,39.1,56.9,
-measured,hi_lerf,theta = 0.6,sam,31.00 ± 0.50,,
-measured,hi_lerf,theta = 0.9,sam,32.00,,
-measured,hi_3dovs,theta = 0.6,sam,51.00,,
-measured,hi_3dovs,theta = 0.9,sam,52.00,,
-synthetic stand-in,synthetic,hilsplat (field),a,42.10,50.00,
-synthetic stand-in,synthetic,theta = 0.9,a,42.00,,
-synthetic stand-in,synthetic,theta = 0.6,a,41.00,,
-synthetic stand-in,synthetic,"theta = 0.6, by head",a,61.00,,
-synthetic stand-in,synthetic,"theta = 0.9, by head",a,62.00,,
-synthetic stand-in,synthetic,"theta = 0.9, by head",b,72.00,,
+SWEEP = """kind,data,method,masks,protocol,Hi-LERF mIoU,Hi-LERF HC
+reported,LERF,theta = 0.6,,,38.4,56.3
+reported,LERF,theta = 0.9,,,39.1,56.9
+measured,hi_lerf,theta = 0.6,sam,level given,31.00 ± 0.50,
+measured,hi_lerf,theta = 0.9,sam,level given,32.00,
+measured,hi_3dovs,theta = 0.6,sam,level given,51.00,
+measured,hi_3dovs,theta = 0.9,sam,level given,52.00,
+synthetic stand-in,synthetic,hilsplat (field),a,level given,42.10,50.00
+synthetic stand-in,synthetic,theta = 0.9,a,level given,42.00,
+synthetic stand-in,synthetic,theta = 0.6,a,level given,41.00,
+synthetic stand-in,synthetic,"theta = 0.6, by head",a,level given,61.00,
+synthetic stand-in,synthetic,"theta = 0.9, by head",a,level given,62.00,
+synthetic stand-in,synthetic,"theta = 0.9, by head",b,level given,72.00,
+synthetic stand-in,synthetic,theta = 0.9,a,hierarchy/level-given@5 (filter 20),82.00,
 """
 
 
@@ -128,6 +129,7 @@ def test_a_curve_joins_rows_of_one_data_set_and_reading(tmp_path):
             "Hi-LERF mIoU, a": [(0.9, 42.0), (0.6, 41.0)],
             "Hi-LERF mIoU, by head, a": [(0.6, 61.0), (0.9, 62.0)],
             "Hi-LERF mIoU, by head, b": [(0.9, 72.0)],
+            "Hi-LERF mIoU, a, filter 20": [(0.9, 82.0)],
         },
     }
     run_sweep_plot("theta", tmp_path / "theta.csv", tmp_path / "theta.png")
