@@ -21,6 +21,7 @@ from hilsplat.base.errors import HilsplatError
 from hilsplat.base.files import INSTALLED, project_path
 from hilsplat.base.plugins import entry_points
 from hilsplat.configuration import CONFIG, merged_config
+from hilsplat.datasets.registry import DATASETS, readers_of
 from hilsplat.evaluate.tables.build import TABLES, published_values
 from hilsplat.workflow import targets
 from hilsplat.workflow.plan import PARTS, Plan, any_of
@@ -63,6 +64,8 @@ estimates.resources = RESOURCES
 for line in PLAN.absent_lines():
     logger.warning(line)
 LABELS = {"files": PLAN.data.label_files, "plugins": PLAN.data.label_readers}
+SCORED = {**LABELS, "plugins": PLAN.data.scorers}
+READERS = readers_of(DATASETS)
 FEATURES = {"files": PLAN.data.features, "features": PLAN.data.features_folder}
 
 

@@ -210,7 +210,7 @@ class RunSettings(StageSettings):
         return [variant, *(f"{variant}.seed{number}" for number in range(1, seeds))]
 
     def seed_of(self, variant: str) -> int:
-        return self.seed + _parts_of(variant)[1]
+        return self.seed + seed_parts(variant)[1]
 
     def stages(self, variant: str = "default", scopes: tuple[str, ...] = ()) -> StageSettings:
         """Return the settings of a variant for a scene.
@@ -221,7 +221,7 @@ class RunSettings(StageSettings):
         Raises:
             SettingsError: the variant is unknown or an override is invalid.
         """
-        variant, _ = _parts_of(variant)
+        variant, _ = seed_parts(variant)
         sections: dict[str, Section] = {name: getattr(self, name) for name in SECTIONS}
         layers = [(f"overrides.{scope}", self.overrides.get(scope, {})) for scope in scopes]
         if variant in self.variants:
@@ -240,7 +240,7 @@ class RunSettings(StageSettings):
         return StageSettings.model_validate(sections)
 
 
-def _parts_of(name: str) -> tuple[str, int]:
+def seed_parts(name: str) -> tuple[str, int]:
     """Split a variant name into the variant and its seed number (0 if the name has none)."""
     found = SEEDED.fullmatch(name)
     return (found[1], int(found[2])) if found else (name, 0)
@@ -266,7 +266,7 @@ def parse_run(config: dict[str, Any]) -> RunSettings:
     taken = dict.fromkeys((*RESERVED, *entry_points("hilsplat.generators")), "for files in a scene folder")
     for name in dict.fromkeys(["default", *run.variants]):
         # Names that differ only in case share a folder on some file systems; other seeds have own folders.
-        key = _parts_of(name)[0].casefold()
+        key = seed_parts(name)[0].casefold()
         if key in taken:
             raise SettingsError(
                 f"variants.{name}: this name is reserved {taken[key]}",

@@ -66,10 +66,6 @@ Device = Literal["auto", "cpu", "cuda"]
 NETWORKS = "device of the networks; auto: cuda if torch finds one with enough free memory, else cpu"
 
 
-LEAST_FIT_STEPS = 1500
-"""Steps below which fits to 12 photographs are clearly worse (docs/experiments.md, "Small sets")."""
-
-
 class PosesSettings(Section):
     """Camera poses, from structure from motion or imported."""
 
@@ -154,10 +150,6 @@ class GaussiansSettings(Section):
         "auto",
         "cuda: gsplat and torch; auto: cuda if it works and the card has enough free memory, else cpu",
     )
-
-    def steps(self, num_views: int) -> int:
-        """Return the number of steps of a fit; fits to few views overfit sooner, so they take fewer steps."""
-        return min(self.iterations, max(LEAST_FIT_STEPS, self.steps_per_view * num_views))
 
     @property
     def rasteriser(self) -> Device:

@@ -23,7 +23,7 @@ from hilsplat.base.artifacts import provenance_path
 from hilsplat.base.atomic import output_lock, require_free_space, was_interrupted
 from hilsplat.base.cache import writable
 from hilsplat.base.cards import take_card
-from hilsplat.base.code import code_digest, modules_of
+from hilsplat.base.code import code_digest, modules_of, statements_of
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.lineage import Inputs, write_provenance
 from hilsplat.base.ownership import require_replaceable
@@ -179,8 +179,7 @@ class Stage(Generic[P, R]):
 
     def code_digest(self, plugins: Sequence[str] = ()) -> str:
         """Return the digest of the function, its modules, and the plugins that a call uses."""
-        code = inspect.unwrap(self.function).__code__
-        text = repr((code.co_code, code.co_names, code_digest(*self.imports, *plugins)))
+        text = statements_of(self.function) + code_digest(*self.imports, *plugins)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @cached_property

@@ -21,6 +21,7 @@ from hilsplat.base.artifacts import provenance_path
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.plugins import entry_points
 from hilsplat.baselines import OURS, MethodSettings, method_of
+from hilsplat.datasets.registry import DATASETS, readers_of
 from hilsplat.models.store import AUTO
 from hilsplat.stage import (
     DEFAULT_CACHE,
@@ -54,7 +55,6 @@ stage = PIPELINE.stage
 
 
 def _source_files(arguments: Mapping[str, Any]) -> Reads:
-    from hilsplat.datasets.registry import readers_of
     from hilsplat.datasets.sources import image_files
     from hilsplat.scene.sheet import DATA_PREFIX
 
@@ -410,13 +410,12 @@ def field(
 
 
 def _labels(arguments: Mapping[str, Any]) -> Reads:
-    from hilsplat.datasets.registry import readers_of
     from hilsplat.datasets.sources import label_files
 
     labels = arguments["labels"] or ()
     named = [labels] if isinstance(labels, str) else list(labels)
     files = {f"labels {name}": label_files(name, str(arguments["data_root"])) for name in named}
-    return Reads(files, readers_of(named))
+    return Reads(files, readers_of([*named, arguments.get("source", "")]))
 
 
 @stage(
@@ -533,7 +532,11 @@ def label_fits(
 # ---- tables and pictures -------------------------------------------------------------------------
 
 
-@stage(scope="run", beside=lambda out: tuple(out.with_suffix(end) for end in (".md", ".tex", ".html")))
+@stage(
+    scope="run",
+    reads=lambda arguments: Reads(plugins=readers_of(DATASETS)),  # their lists of scenes
+    beside=lambda out: tuple(map(out.with_suffix, (".md", ".tex", ".html"))),
+)
 def table(
     name: Annotated[str, typer.Argument(help="table: hierarchy, lerf, ablation, ... (docs/tables.md)")],
     published: PathIn,

@@ -12,8 +12,6 @@ from hilsplat_world.settings import PerturbSettings, WorldSettings
 PIPELINE = Registry()
 stage = PIPELINE.stage
 
-NEIGHBOURS = 2  # number of nearest views that each view is compared with
-
 
 @stage(file="world/images", command="world make", scope="scene", loop="rendered views")
 def world(
@@ -66,7 +64,7 @@ def consistency(truth: PathIn, masks: PathIn, out: PathOut) -> str:
     """Measure, using exact geometry, how often a surface point has different masks in neighbouring views."""
     from hilsplat_world.diagnostics.world_consistency import run_consistency
 
-    return run_consistency(truth, masks, out, NEIGHBOURS)
+    return run_consistency(truth, masks, out)
 
 
 @stage(command="", scope="scene")

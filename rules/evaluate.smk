@@ -19,7 +19,7 @@ use rule stage as evaluate with:
     resources:
         **RESOURCES.of("evaluate"),
     params:
-        **PLAN.params("evaluate", **LABELS, name=PLAN.data.scene_name),
+        **PLAN.params("evaluate", **SCORED, name=PLAN.data.scene_name),
 
 
 use rule stage as score_means with:
@@ -63,6 +63,7 @@ use rule stage as table with:
     params:
         **PLAN.params(
             "table",
+            plugins=lambda wildcards: READERS,
             name=targets.table_name,
             labels=PLAN.names,
             absent=targets.absent_of(PLAN),

@@ -1,15 +1,17 @@
 """The code digest of a stage: of all modules that it imports, without comments and docstrings.
 
 It decides which rules rerun and which cache entries are valid (docs/workflow.md). A module counts as a whole,
-with its data: JSON and TSV files of the same name beside it. Imports inside functions count, imports for type
+with its data: files of the same name beside it. Imports inside functions count, imports for type
 checking do not, and neither do the packages that contain an imported module.
 """
 
 import ast
 import functools
 import importlib.util
+import inspect
 import json
 import sys
+import textwrap
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -59,6 +61,13 @@ def code_digest(*roots: Code) -> str:
 def modules_of(*roots: Code) -> list[str]:
     """Return the names of the modules that `code_digest` covers, sorted."""
     return sorted(_digests(roots))
+
+
+def statements_of(function: Callable[..., Any]) -> str:
+    """Return a function's statements as text, without its docstring and comments."""
+    with PARSING:
+        tree = _Bare().visit(ast.parse(textwrap.dedent(inspect.getsource(function))))
+    return "\n".join(map(ast.unparse, tree.body[0].body))
 
 
 def _digests(roots: tuple[Code, ...]) -> dict[str, str]:
@@ -115,7 +124,7 @@ def _file(module: str) -> Path | None:
 
 
 def _facts(module: str, path: Path, known: Facts | None) -> Facts:
-    files = [path, *filter(Path.is_file, (path.with_suffix(".json"), path.with_suffix(".tsv")))]
+    files = [path, *filter(Path.is_file, map(path.with_suffix, (".json", ".tsv", ".txt")))]
     text, *data = (file.read_bytes() for file in files)
     contents = sha256_of_bytes(path.name.encode(), text, *data)  # relative imports depend on the name
     if known is not None and known.files == contents:

@@ -35,9 +35,10 @@ DATASETS: Plugins[Dataset] = Plugins(
 
 
 def readers_of(labels: Collection[str]) -> tuple[str, ...]:
-    """Return the import paths of the readers for labels such as "lerf_ovs/figurines" (`base.plugins`)."""
-    names = {name.partition("/")[0] for name in labels}
-    return tuple(DATASETS.places[name] for name in sorted(names) if name in DATASETS)
+    """Return the import paths of what reads labels, such as "lerf_ovs/figurines" or "world:room:1"."""
+    places = {**entry_points("hilsplat.generators").places, **DATASETS.places}
+    names = {name.partition("/")[0].partition(":")[0] for name in labels}
+    return tuple(places[name] for name in sorted(names) if name in places)
 
 
 LISTED = "to list all data sets and scenes, run: hilsplat datasets list"

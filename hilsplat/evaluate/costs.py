@@ -65,7 +65,8 @@ def read_costs(scores: Iterable[Path]) -> list[Cost]:
         jobs = jobs_of(Path(path))
         place = rows[0]["dataset"], rows[0]["scene"], rows[0]["variant"]
         times = _seconds(jobs, PREPARATION), _seconds(jobs, TRAINING)
-        peak_mib = max((job.peak_mib for stage in TRAINING if (job := jobs.get(stage))), default=0)
+        training = [jobs[stage] for stage in TRAINING if stage in jobs]
+        peak_mib = 0.0 if None in training else max((job.peak_mib for job in training if job), default=0.0)
         query_s = {row["method"]: float(row["seconds"]) for row in rows}
         costs.append(Cost(*place, *times, peak_mib or math.nan, query_s))
     return costs

@@ -1,16 +1,20 @@
 """The scenes of a results folder: what each can answer, its size, and the quality of its fit and tree."""
 
+import logging
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from hilsplat.base.errors import ArtifactError, SettingsError, nearest
+from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError, nearest
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.ownership import require_beginning
 from hilsplat.base.tables import aligned_table, write_csv
-from hilsplat.evaluate.protocols.cards import BY_NAME
+from hilsplat.evaluate.protocols.cards import BY_NAME, card_of
 from hilsplat.evaluate.scores import read_scores
+from hilsplat.evaluate.tables.means import metric_means
 from hilsplat.query.scene_state import SceneState
 from hilsplat.scene.finished import scenes_in
+
+logger = logging.getLogger(__name__)
 
 COLUMNS = (
     *("scene", "state", "train_views", "test_views", "gaussians", "psnr_db"),
@@ -31,13 +35,14 @@ PROTOCOL = "lerf/tree-nodes"
 def run_scenes(results: Path, pattern: str, out: Path | None, protocol: str = PROTOCOL) -> str:
     """Return a table of the scenes that match a pattern, and write all columns to `out` as CSV, if given.
 
-    Cells of what a scene's run has not computed, such as scores without labels, are empty.
+    Cells of what a scene's run has not computed, such as scores without labels, are empty, as are those of
+    a scene with a damaged artifact, which a warning names.
 
     Args:
         protocol: name of the protocol whose mean IoU of the tree's answers is shown.
 
     Raises:
-        ArtifactError: no scene matches, an artifact is damaged, or `out` is another file.
+        ArtifactError: no scene matches, or `out` is another file.
         SettingsError: the protocol is unknown.
     """
     if protocol not in BY_NAME:
@@ -64,9 +69,16 @@ def scene_lines(
     rows: list[list[object]] = []
     shown: list[tuple[object, ...]] = [SHOWN]
     for name in names:
-        scene = SceneState.read(results / name)
+        try:
+            scene = SceneState.read(results / name)
+            iou = _tree_iou(results / name / "default/scores.csv", protocol)
+        except HilsplatError as error:
+            logger.warning("%s: %s", name, error)
+            rows.append([name, "damaged", *[""] * (len(COLUMNS) - 2)])
+            shown.append((name, "damaged", *[""] * (len(SHOWN) - 2)))
+            continue
         train, test = (scene.views[split] or "" for split in ("train", "test"))
-        psnr, iou = scene.fit.get("psnr_db"), _tree_iou(results / name / "default/scores.csv", protocol)
+        psnr = scene.fit.get("psnr_db")
         psnr_db, megabytes = "" if psnr is None else f"{psnr:.2f}", round(scene.num_bytes / 1e6)
         nodes = [scene.nodes.get(level.label, "") for level in LEVELS]
         known = [name, scene.state, train, test, scene.fit.get("gaussians", ""), psnr_db, *nodes]
@@ -77,9 +89,11 @@ def scene_lines(
 
 
 def _tree_iou(scores: Path, protocol: str) -> str:
-    """Return the mean IoU of the tree under a protocol, for the data set with the most labelled queries."""
+    """Return the mean IoU of the tree under the protocol and data set with the most labelled queries."""
     table = read_scores([scores] if scores.is_file() else [])
     is_shown = (table["method"] == "tree") & (table["metric"] == "iou")
     is_of_protocol = table["protocol"].str.split("@").str[0] == BY_NAME[protocol].name
-    values = table[is_shown & is_of_protocol].groupby("dataset")["value"]
-    return f"{values.mean()[values.count().idxmax()]:.4f}" if len(values) else ""
+    groups = table[is_shown & is_of_protocol].groupby(["dataset", "protocol"])
+    parts = [(name, part) for (_, name), part in groups]
+    name, most = max(parts, key=lambda named: len(named[1]), default=("", table))
+    return f"{metric_means(card_of(name), most)['iou']:.4f}" if name else ""

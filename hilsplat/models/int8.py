@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 
 from hilsplat.base.atomic import atomic_path
 from hilsplat.base.cache import ViewCache
+from hilsplat.base.code import code_digest
 from hilsplat.base.lineage import sha256_of_json, version_of
 from hilsplat.base.removal import is_unfinished
 from hilsplat.models.card import CPU
@@ -139,10 +140,11 @@ def use_reduced(
         reduced: "int8" or "fp16".
         precision: setting; if it equals `reduced`, the network is used whatever is measured.
         what: name of the network in the log.
-        inputs: digests of the model and of the data that `measure` reads; they are the cache key.
+        inputs: digests of the model and of the data that `measure` reads; with its code, the cache key.
         measure: function that returns the agreement with float32, by keys of `MIN_AGREEMENT`.
     """
-    key = [RECIPE, inputs] if reduced == "int8" else [reduced, version_of("torch"), inputs]
+    form = [RECIPE] if reduced == "int8" else [reduced, version_of("torch")]
+    key = [*form, inputs, code_digest(measure)]
     agreement = ViewCache(cache / "int8").get(
         sha256_of_json(key), lambda: {name: np.array([value]) for name, value in measure().items()}
     )

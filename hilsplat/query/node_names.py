@@ -47,9 +47,9 @@ MIN_ABSENT = 100
 words that are not the nearest word of any node. If these are too few as well, chance is not estimated."""
 
 VOCABULARY = "vocabulary.txt"
-"""Vocabulary file in a model's folder; models without this file use the one in this package."""
+"""Vocabulary file in a model's folder; models without this file use the one of this package."""
 
-COMMON = Path(__file__).with_name(VOCABULARY)
+COMMON = Path(__file__).with_suffix(".txt")
 SECTIONS = ("things", "parts", "surfaces", "absent")
 
 

@@ -7,8 +7,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Int32, Int64
 
-MAX_ALL = 300
-"""Scenes with at most this many views compare every view with every other."""
+from hilsplat.semantic_tree.limits import MAX_ALL
 
 NEAREST = 24
 """Number of views that share the most Gaussians with a view, which are its partners in a larger scene."""

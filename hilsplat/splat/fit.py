@@ -31,6 +31,7 @@ from hilsplat.splat.model import Model, StepOptions, means_rate, model_on
 from hilsplat.splat.ply import save_ply
 from hilsplat.splat.rasterise.api import render
 from hilsplat.splat.rasterise.device import Device, choose_device, explained_memory, require_card_memory
+from hilsplat.splat.steps import fit_steps
 
 logger = logging.getLogger(__name__)
 
@@ -148,7 +149,7 @@ def fit_gaussians(
     if not views:
         raise SceneError(f"{scene.name} has no training views", fix="hold out fewer views (poses.test_every)")
     model_class = model_on(fit_device(scene, settings))
-    settings = settings.model_copy(update={"iterations": settings.steps(len(views))})
+    settings = settings.model_copy(update={"iterations": fit_steps(settings, len(views))})
     cameras = [view.camera for view in views]
     extent = camera_extent(cameras)
     state = FitState.load(checkpoint, model_class, threads) if checkpoint else None
@@ -314,7 +315,7 @@ def run_gaussians(
             origin = {
                 "kind": "fitted",
                 "strategy": "frozen" if settings.initial == "frozen" else settings.strategy,
-                "iterations": settings.steps(len(scene.views("train"))),
+                "iterations": fit_steps(settings, len(scene.views("train"))),
                 "seed": seed,
             }
         report = write_report(out_report, gaussians, scene, curve, origin, settings, threads)

@@ -164,7 +164,7 @@ class Plan:
             "dataset": lambda job: job.dataset,
             "variant": lambda job: job.variant,
             "labels": self.data.label_names,
-            "data_root": str(Path(run.data_root)),
+            "data_root": self.data.root,
             "names": self.names,
             "queries": self.queries,
         }
@@ -517,11 +517,11 @@ class Plan:
         return []
 
     def _code_identity(self, variant: str, *situation: Any) -> Identity:
-        """Return what a code of the masks' own vectors depends on: neither levels nor, by default, trees."""
+        """Return what a code is made from: not levels and, for masks' own vectors, by default not trees."""
         stages, settings, seed = self.identity("autoencoder", variant, *situation)
         values = dict(settings)
         values["masks"] = values["masks"].model_copy(update={"levels": "head", "theta": None})
-        if values["clip"].crops == "masks":  # else the semantic tree selects them
+        if (values["clip"].crops, values["autoencoder"].targets) == ("masks", "mask"):  # else trees matter
             values["clip"] = values["clip"].model_copy(update={"crops_per_node": 0})
             linking = [kind for artifact in LINKING for kind in kinds_of(artifact)]
             stages = tuple(name for name in stages if name not in {kind.name for kind in linking})
@@ -533,12 +533,15 @@ class Plan:
         """Return the input of `field`: LangSplat's initial field; SettingsError if no variant computes it."""
         if self.stages(job).field.start != "langsplat":
             return []
-        situation, seed = self.situation(self.row(job)), self.run.seed_of(job.variant)
-        code = self.identity("autoencoder", job.variant, *situation)
+        situation = self.situation(self.row(job))
+
+        def start_of(name: str) -> tuple[Any, ...]:
+            masks = self.identity("masks", name, *situation)
+            return self.run.seed_of(name), masks, self._code_identity(name, *situation)
+
+        own = start_of(job.variant)
         for name in self.run.every_variant():
-            method = self.stages_of(name, situation[0]).method.name
-            is_first = method == "langsplat" and self.run.seed_of(name) == seed
-            if is_first and self.identity("autoencoder", name, *situation) == code:
+            if self.stages_of(name, situation[0]).method.name == "langsplat" and start_of(name) == own:
                 return [self.path(job, name, "field.safetensors")]
         raise SettingsError(
             f"{job.dataset}/{job.scene}, variant {job.variant}: field.start is langsplat, but no variant has "

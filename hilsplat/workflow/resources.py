@@ -32,7 +32,9 @@ from hilsplat.models.card import card_problem
 from hilsplat.models.store import RELEASES, model_path, planned_model
 from hilsplat.scene.layouts import vertex_count
 from hilsplat.scene.sheet import SceneRow
+from hilsplat.semantic_tree.limits import MAX_ALL
 from hilsplat.settings import GaussiansSettings, MasksSettings
+from hilsplat.splat.steps import fit_steps
 from hilsplat.stages import all_stages, family_of, stage_of
 from hilsplat.workflow.plan import SCORED, Plan
 from hilsplat.workflow.scene_data import Job
@@ -294,8 +296,6 @@ def _pairs_mb(views: int) -> float:
 
     The stage counts them, and refuses to start if they need more.
     """
-    from hilsplat.semantic_tree.view_pairs import MAX_ALL
-
     return 0.12 * views**2 if views <= MAX_ALL else 4.0 * views
 
 
@@ -313,7 +313,7 @@ def _steps_and_mp(fit: GaussiansSettings, views: int, view_mp: float) -> tuple[i
     """Return the steps of a fit, and the mean megapixels of a step."""
     small, half = fit.quarter_until, max(fit.half_until - fit.quarter_until, 0.0)
     seen_mp = view_mp * fit.image_scale**2 * (small / 16 + half / 4 + max(1 - small - half, 0.0))
-    return fit.steps(views), seen_mp
+    return fit_steps(fit, views), seen_mp
 
 
 def _crops(stages: StageSettings, views: int) -> int:

@@ -170,8 +170,17 @@ class SceneData:
         """Return the labels of a scene, as `data set/scene`: published labels and your own annotations."""
         return () if row.generated else self._labels(row)
 
+    def root(self, job: Job) -> str:
+        """Return the folder of data sets, or an empty string for a scene that it does not concern."""
+        row = self.row(job)
+        return str(Path(self.data_root)) if row.source.startswith(DATA_PREFIX) or self.labels(row) else ""
+
     def label_readers(self, job: Job) -> tuple[str, ...]:
         return readers_of(self.labels(self.row(job)))
+
+    def scorers(self, job: Job) -> tuple[str, ...]:
+        """Return the readers of a scene's labels, or the generator that has its ground truth."""
+        return readers_of([*self.labels(self.row(job)), self.generated_source(job)])
 
     def label_files(self, job: Job) -> list[str]:
         """Return the label files, which only evaluation reads, so that editing one reruns no other stage."""

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hilsplat.base.artifacts import rebuild_command, run_command
+from hilsplat.base.errors import HilsplatError
 from hilsplat.base.tables import aligned_table, counted, read_csv
 from hilsplat.evaluate.scenes import scene_lines
 from hilsplat.evaluate.tables.means import TEXTS
@@ -24,11 +25,7 @@ Gaussian Splatting has 23 to 29 dB on its photographs (Kerbl et al. 2023, Tab. 1
 
 
 def summary(plan: Plan, files: Sequence[str] = ()) -> list[str]:
-    """Return the summary of a plan's scenes that have poses; if files were made, only of theirs.
-
-    Raises:
-        ArtifactError: an artifact is damaged.
-    """
+    """Return the summary of a plan's scenes that have poses; if files were made, only of theirs."""
     found = set(scenes_in(plan.results))
     rows = [row for row in plan.scenes if row.name in found]
     if files:
@@ -46,12 +43,16 @@ def summary(plan: Plan, files: Sequence[str] = ()) -> list[str]:
 
 
 def _scene(plan: Plan, row: SceneRow) -> list[str]:
-    """Return a heading and the facts about one scene."""
+    """Return a heading and the facts about one scene, or what is wrong with an artifact."""
     folder, figures = Path(plan.path(row)), plan.results / "figures" / row.name
-    scene, name, means = SceneState.read(folder), command_name(folder), folder / "scores.csv"
+    name, means = command_name(folder), folder / "scores.csv"
+    try:
+        scene = SceneState.read(folder)
+        scores = read_csv(means, None, rebuild_command(means)) if means.is_file() else []
+    except HilsplatError as error:  # the run has succeeded, but an earlier artifact is damaged
+        return [f"{row.name}:", *(f"  {line}" for line in str(error).splitlines())]
     counts = ", ".join(f"{number} {level}" for level, number in scene.nodes.items())
     pictures = ", ".join(sorted(path.name for path in figures.glob("*.webp")))
-    scores = read_csv(means, None, rebuild_command(means)) if means.is_file() else []
     table = aligned_table([[*scores[0]], *([*each.values()] for each in scores)], TEXTS) if scores else []
     uses = f'hilsplat query {name} "..."  or  hilsplat view {name}'
     facts = {

@@ -201,7 +201,7 @@ def load_masks(folder: Path, view: str, size_hw: tuple[int, int]) -> Hierarchica
     return masks
 
 
-def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> str:
+def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int = 2) -> str:
     """Measure how consistently masks of neighbouring views divide the same surface; return a Markdown table.
 
     Each view is compared with its `count` nearest views. The CSV has one row per level for the masks and one

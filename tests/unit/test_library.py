@@ -28,6 +28,7 @@ from hilsplat.settings import GaussiansSettings, MasksSettings
 from hilsplat.splat.ply import save_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 from hilsplat.splat.rasterise.api import render as render_rgb
+from hilsplat.splat.steps import fit_steps
 from tests.unit.finished_desk import SCENE
 
 
@@ -85,13 +86,13 @@ def test_scenes_opened_by_a_relative_path_are_found_from_another_folder(desk, tm
 
 @pytest.mark.parametrize("iterations", [40, None])
 def test_a_fit_equals_that_of_the_stage(scene, tmp_path, monkeypatch, iterations):
-    monkeypatch.setattr("hilsplat.settings.LEAST_FIT_STEPS", 20)
+    monkeypatch.setattr("hilsplat.splat.steps.LEAST_FIT_STEPS", 20)
     settings = {"max_gaussians": 500, "densify_every": 10, "device": "cpu"}
     settings |= {} if iterations else {"steps_per_view": 5}
     found = hilsplat.fit(scene, iterations, seed=3, threads=2, **settings)
     steps = {"iterations": iterations, "steps_per_view": iterations} if iterations else {}
     out, section = tmp_path / "gaussians.ply", GaussiansSettings(**settings, **steps)
-    assert section.steps(5) == (iterations or 25)
+    assert fit_steps(section, 5) == (iterations or 25)
     stages.gaussians(scene.folder, out, tmp_path / "report", section, cache=tmp_path / "cache", seed=3)
     save_ply(tmp_path / "ours.ply", found)
     assert (tmp_path / "ours.ply").read_bytes() == out.read_bytes()

@@ -22,6 +22,7 @@ MODELS = ("models/sam-tiny", "models/clip-tiny")
 PACKAGES = ("cpusplat", "hilsplat", "hilsplat_world", "snakemake_logger_plugin_hilsplat")
 PARTS = ("Snakefile", "rules", "workflow", "profiles", "config", *PACKAGES, *MODELS)
 SCENE = Path("results/synthetic/tiny")
+RECORDER = Path(__file__).parent / "recorder"
 SKIPPED = shutil.ignore_patterns("*.pyc.*", "kernels-*")
 """Bytecode that other tests may be writing, renamed once complete, and what `copy_kernels` copies."""
 BY_CONTENTS = py_compile.PycInvalidationMode.CHECKED_HASH
@@ -69,11 +70,11 @@ class Project:
         }
 
     def snakemake(
-        self, *words: str, config: str = "ci", check: bool = True
+        self, *words: str, config: str = "ci", check: bool = True, **environment: str
     ) -> subprocess.CompletedProcess[str]:
         """Run Snakemake with a configuration of the project."""
         configured = ("--configfile", f"config/{config}.yaml", "--cores", "2")
-        return self.run(sys.executable, "-m", "snakemake", *configured, *words, check=check)
+        return self.run(sys.executable, "-m", "snakemake", *configured, *words, check=check, **environment)
 
     def hilsplat_run(self, *words: str, check: bool = True) -> subprocess.CompletedProcess[str]:
         """Run `hilsplat run` with the CI configuration."""
@@ -188,6 +189,13 @@ def given_to_stranger(project: Project) -> Project:
     return Project(project.root, project.package, (*AS_STRANGER, temporary))
 
 
+def recorded(project: Project) -> Path:
+    """Return the folder in which the processes of `finished` noted what they loaded."""
+    folder = project.root / "recorded"
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
 @pytest.fixture(scope="session")
 def finished(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Project:
     """A copy in which the CI configuration ran to its end; the processes of a test run share it."""
@@ -202,7 +210,7 @@ def finished(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Project
             copy_project(project, copy.root, results=False)
             for package in PACKAGES:  # so that no process compiles the package again; edited files still are
                 compileall.compile_dir(copy.root / package, quiet=1, invalidation_mode=BY_CONTENTS)
-            copy.snakemake()
+            copy.snakemake(PYTHONPATH=f"{copy.root}{os.pathsep}{RECORDER}", RECORDED=str(recorded(copy)))
             copy_kernels(copy.root, project)
             (folder / "finished.done").touch()
     return copy

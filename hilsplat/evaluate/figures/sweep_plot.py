@@ -10,56 +10,58 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.base.tables import read_csv
 from hilsplat.query.pictures import save_with_pdf
 
-SWEEPS = {"theta": ("coverage threshold theta", 0.9), "omega": ("similarity degree Omega", 10.0)}
-"""Sweep -> axis label, and the setting of the default variant, which its table row doesn't state."""
+SWEEPS = {"theta": "coverage threshold theta", "omega": "similarity degree Omega"}
+"""Sweep -> axis label."""
 
 COLUMNS = ("Hi-LERF mIoU", "Hi-LERF HC", "3D-OVS mIoU", "LERF mIoU")
 
-Lines = Mapping[tuple[str, str], list[tuple[float, float]]]
+Curves = Mapping[str, Mapping[str, list[tuple[float, float]]]]
 
 
 def run_sweep_plot(name: str, table: Path, out: Path) -> None:
     """Draw a sweep as PNG and PDF, from the finished CSV of the table called `name`.
 
     Raises:
-        ArtifactError: the sweep is unknown, or the table is missing.
+        ArtifactError: the sweep is unknown, or the table is missing or another.
     """
     if name not in SWEEPS:
         raise ArtifactError(f"there is no sweep {name!r}", expected=f"one of {', '.join(SWEEPS)}")
-    save_with_pdf(draw_sweep(name, read_lines(table, SWEEPS[name][1])), out)
+    if not (curves := read_curves(table)):
+        raise ArtifactError(f"{table} is not the table of a sweep", expected="rows named like 'theta = 0.9'")
+    save_with_pdf(draw_sweep(name, curves), out)
 
 
-def read_lines(table: Path, default: float) -> Lines:
-    """Map (kind of row, column) to sorted (setting, percentage) pairs; a curve has at least two."""
-    rows = read_csv(table, None, "build the table first")
-    lines = {}
-    for kind in dict.fromkeys(row["kind"] for row in rows):
+def read_curves(table: Path) -> Curves:
+    """Map each panel (kind of rows and data set) to its curves, by name: (setting, percentage) pairs.
+
+    Rows of a curve have the same masks and settings of the protocol, and names that differ only in the
+    setting, such as "theta = 0.6, by head".
+    """
+    panels: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    for row in read_csv(table, None, "build the table first"):
+        named = re.fullmatch(r"\w+ = ([0-9.]+)(?:, )?(.*)", row["method"])
+        departures = (row.get("protocol") or "").partition(" (")[2].removesuffix(")")
         for column in COLUMNS:
-            points = []
-            for row in rows:
-                shown = re.match(r"[-0-9.]+", row.get(column) or "")
-                if row["kind"] == kind and shown:
-                    named = re.search(r"= ([0-9.]+)", row["method"])
-                    points.append((float(named[1]) if named else default, float(shown[0])))
-            if len(points) > 1:
-                lines[kind, column] = sorted(points)
-    return lines
+            if named and (shown := re.match(r"[-0-9.]+", row.get(column) or "")):
+                curve = ", ".join(filter(None, (column, named[2], row.get("masks"), departures)))
+                curves = panels.setdefault(f"{row['kind']}: {row['data']}", {})
+                curves.setdefault(curve, []).append((float(named[1]), float(shown[0])))
+    return panels
 
 
-def draw_sweep(name: str, lines: Lines) -> Figure:
-    """Draw one panel per kind of row; axes are not shared because the kinds are not comparable."""
-    kinds = list(dict.fromkeys(kind for kind, _ in lines)) or ["reported"]
-    figure = Figure(figsize=(4.6 * len(kinds), 3.4), layout="constrained")
-    for axes, kind in zip(figure.subplots(1, len(kinds), squeeze=False)[0], kinds, strict=True):
-        for (of_kind, column), points in lines.items():
-            if of_kind == kind:
-                values, shares = zip(*points, strict=True)
-                axes.plot(values, shares, marker="o", label=column)
+def draw_sweep(name: str, curves: Curves) -> Figure:
+    """Draw one panel per kind of rows and data set; axes are not shared because these are not comparable."""
+    figure = Figure(figsize=(4.6 * len(curves), 3.4), layout="constrained")
+    all_axes = figure.subplots(1, len(curves), squeeze=False)[0]
+    for axes, (panel, points_of) in zip(all_axes, curves.items(), strict=True):
+        for label, points in points_of.items():
+            values, shares = zip(*sorted(points), strict=True)
+            axes.plot(values, shares, marker="o", label=label)
         if name == "omega":
             axes.set_xscale("log")
-        axes.set_xlabel(SWEEPS[name][0])
+        axes.set_xlabel(SWEEPS[name])
         axes.set_ylabel("%")
-        axes.set_title(kind if kind == "reported" else f"{kind}, not comparable", fontsize=10)
+        axes.set_title(panel if panel.startswith("reported") else f"{panel}, not comparable", fontsize=10)
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)
     return figure

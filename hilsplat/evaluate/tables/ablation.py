@@ -60,6 +60,7 @@ def step_cells(
         others = others[others[key] == first[key]]
     if others.empty or (first["variant"], first["method"]) == (before, "field"):
         return {}
+    others = measured.of_comparable_seeds(others)  # as are those of `part`
     pairs = ["scene", "seed"] if set(part["seed"]) == set(others["seed"]) else ["scene"]
     cells = {"step from": Cell(measured.row_name(before, "field", labels))}
     for name, metric in (("mIoU step", "iou"), ("HC step", "hc_containment")):

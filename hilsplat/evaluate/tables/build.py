@@ -17,7 +17,7 @@ from hilsplat.evaluate.tables.formats import as_html, as_latex, as_markdown, csv
 from hilsplat.evaluate.tables.image_tables import frames_blocks, hierarchy_cells, lerf_cells, ovs_cells
 from hilsplat.evaluate.tables.kinds import NOTES, SECONDS, TABLES, TableKind
 from hilsplat.evaluate.tables.measured import measured_blocks
-from hilsplat.evaluate.tables.point_tables import replica_cells, scannet_blocks, waymo_cells
+from hilsplat.evaluate.tables.point_tables import interval_cells, replica_cells, scannet_blocks, waymo_cells
 from hilsplat.evaluate.tables.rows import Block, Sources, Table, read_published, reported_block
 from hilsplat.segment.origin import made_from_truth
 
@@ -26,9 +26,9 @@ logger = logging.getLogger(__name__)
 BLOCKS: dict[str, Callable[[TableKind, Sources], list[Block]]] = {
     "lerf": partial(measured_blocks, cells_of=lerf_cells),
     "3dovs": partial(measured_blocks, cells_of=ovs_cells),
-    "replica": partial(measured_blocks, cells_of=replica_cells),
+    "replica": partial(measured_blocks, cells_of=replica_cells, over_seeds=interval_cells),
     "scannet": scannet_blocks,
-    "waymo": partial(measured_blocks, cells_of=waymo_cells),
+    "waymo": partial(measured_blocks, cells_of=waymo_cells, over_seeds=interval_cells),
     "hierarchy": partial(measured_blocks, cells_of=hierarchy_cells),
     **dict.fromkeys(("ablation", "components", "theta", "omega"), ablation_blocks),
     "cost": cost_blocks,

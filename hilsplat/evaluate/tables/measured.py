@@ -3,12 +3,12 @@
 A (view, query) pair without a prediction has a row with value 0 unless its protocol omits such pairs.
 """
 
-import re
 import statistics
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from hilsplat.base.levels import LEVELS, Level
+from hilsplat.configuration import seed_parts
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.evaluate.protocols import cards
 from hilsplat.evaluate.tables.kinds import TableKind
@@ -19,9 +19,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CellsOf = Callable[["pd.DataFrame", "pd.DataFrame"], dict[str, Cell]]
-
-SEED = re.compile(r"(?P<variant>.+)\.seed(?P<seed>[0-9]+)")
-"""Variant name with a seed; all seeds of a variant share a row."""
 
 ANSWERS = {"field": "field", "tree": "tree", "tree-path": "tree, path", "truth": "annotations"}
 """Method -> its name in rows, in row order."""
@@ -67,22 +64,20 @@ def measured_blocks(
             rows: list[tuple[tuple[Any, ...], Row]] = []
             groups = selected.groupby(["variant", "masks", "method", "label"], sort=True)
             for (variant, masks, method, label), part in groups:
-                seeds = [cells_of(scores, of_seed) for of_seed in _comparable_seeds(part)]
+                part = of_comparable_seeds(part)
+                seeds = [cells_of(scores, of_seed) for _, of_seed in part.groupby("seed", sort=True)]
                 seeds = seeds[:1] if method == "truth" else seeds  # annotations are the same under every seed
                 names = _row_names(variant, masks, method, label, sources.labels)
                 if len(seeds) > 1:
                     names["Seeds"] = str(len(seeds))
-                names |= scenes_of_row(str(data), part["scene"], selected["scene"], kind.averaged)
                 cells = mean_over_seeds(seeds) | over_seeds(scores, part)
                 is_ranked = method != "truth" and not made_from_truth(masks)
-                group = label if kind.ranked_by_protocol else ""
+                group = (label if kind.ranked_by_protocol else "") if is_ranked else None
                 protocol = list(PROTOCOLS).index(label) if label in PROTOCOLS else -1
                 order = row_place(variant, method, sources.labels)
                 place = made_from_truth(masks), protocol, *order, masks, label
-                own = tuple(f"{scene} " for scene in part["scene"].unique())
-                averages = tuple(column for column in cells if not column.startswith(own))
-                unranked = averages if "Scenes" in names else ()
-                rows.append((place, Row(names, cells, group if is_ranked else None, unranked)))
+                scenes = part["scene"], selected["scene"], kind.averaged
+                rows.append((place, row_of(names, cells, str(data), *scenes, group)))
             if rows:
                 distinct = without_repeats([row for _, row in sorted(rows, key=lambda pair: pair[0])])
                 columns = kind.columns_of(selected["scene"])
@@ -90,11 +85,11 @@ def measured_blocks(
     return blocks
 
 
-def _comparable_seeds(part: "pd.DataFrame") -> list["pd.DataFrame"]:
-    """Return a row's scores by seed, without seeds that lack scenes, whose means are of something else."""
-    seeds = [of_seed for _, of_seed in part.groupby("seed", sort=True)]
-    every = max(of_seed["scene"].nunique() for of_seed in seeds)
-    return [of_seed for of_seed in seeds if of_seed["scene"].nunique() == every]
+def of_comparable_seeds(part: "pd.DataFrame") -> "pd.DataFrame":
+    """Return a row's scores without seeds that lack scenes, whose means are of something else."""
+    scenes = {seed: set(of_seed["scene"]) for seed, of_seed in part.groupby("seed", sort=True)}
+    most = max(scenes.values(), key=len)
+    return part[part["seed"].isin([seed for seed, found in scenes.items() if found == most])]
 
 
 def _row_names(
@@ -109,10 +104,16 @@ def _row_names(
     }
 
 
-def scenes_of_row(
-    data: str, scenes: Collection[str], of_block: Collection[str], averaged: Collection[str] = ()
-) -> dict[str, str]:
-    """Return the column Scenes if a row's averages are over part of the scenes, otherwise nothing.
+def row_of(
+    names: Mapping[str, str],
+    cells: Mapping[str, Cell],
+    data: str,
+    scenes: Collection[str],
+    of_block: Collection[str],
+    averaged: Collection[str] = (),
+    group: str | None = "",
+) -> Row:
+    """Return a row; if its averages are over part of the scenes, it states so, and they are not ranked.
 
     All scenes are those that the data set lists and those of any row in the block.
 
@@ -122,25 +123,31 @@ def scenes_of_row(
     listed = DATASETS[data].scenes if data in DATASETS else ()
     every = set(averaged) if listed and averaged else {*listed, *of_block}
     number = len(every & set(scenes))
-    return {} if number == len(every) else {"Scenes": f"{number} of {len(every)}"}
+    if number == len(every):
+        return Row(names, cells, group)
+    own = tuple(f"{scene} " for scene in set(scenes))
+    averages = tuple(column for column in cells if not column.startswith(own))
+    return Row({**names, "Scenes": f"{number} of {len(every)}"}, cells, group, averages)
 
 
 def with_seeds(scores: "pd.DataFrame") -> "pd.DataFrame":
-    """Move the seed into its own column; the first seed is "0"."""
-    parts = scores["variant"].str.extract(f"^{SEED.pattern}$")
-    variant = parts["variant"].fillna(scores["variant"])
-    return scores.assign(variant=variant, seed=parts["seed"].fillna("0"))
+    """Move the seed into its own column; the first seed is 0."""
+    parts = {name: seed_parts(name) for name in scores["variant"].unique()}
+    variant, seed = (scores["variant"].map(lambda name, part=part: parts[name][part]) for part in (0, 1))
+    return scores.assign(variant=variant, seed=seed)
 
 
 def mean_over_seeds(seeds: Sequence[Mapping[str, Cell]]) -> dict[str, Cell]:
-    """Return mean and standard deviation (n - 1) of each cell over seeds; a single seed is unchanged."""
+    """Return mean and standard deviation (n - 1) of the cells that every seed has; one seed is unchanged."""
     if len(seeds) == 1:
         return dict(seeds[0])
     cells = {}
     for column, first in seeds[0].items():
-        values = [value for cells in seeds if (value := cells.get(column, Cell()).value) is not None]
-        if len(values) < 2 or first.text.isdigit():  # counts do not depend on the seed
+        if first.text.isdigit():  # counts do not depend on the seed
             cells[column] = first
+            continue
+        values = [value for of_seed in seeds if (value := of_seed.get(column, Cell()).value) is not None]
+        if len(values) < len(seeds):  # a mean over some of the seeds is of something else
             continue
         mean, spread = statistics.fmean(values), statistics.stdev(values)
         cells[column] = Cell(f"{mean:.1f} ± {spread:.1f}", mean, first.note, spread)

@@ -27,6 +27,9 @@ SCANNET_COLUMNS: Mapping[str, str] = {
 }
 """Protocol -> column in the paper."""
 
+INTERVAL_COLUMNS = {**SCANNET_COLUMNS, "replica/": "Mean", "waymo/": "Present classes"}
+"""Beginning of a protocol's name -> the mean whose interval is shown."""
+
 BENCHMARK = "scannet200/benchmark"
 SPLIT_COLUMNS = {f"miou_{split}": f"ScanNet200 {split} mIoU" for split in ("head", "common", "tail")}
 AP_COLUMNS = {
@@ -40,8 +43,7 @@ DRAWS = 1000
 
 
 def replica_cells(_: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
-    means = scene_cells(part, {"mIoU": "miou_present", "mAcc": "macc_present"}, "Mean")
-    return means | interval_cells(part, "Mean", pooled=False)
+    return scene_cells(part, {"mIoU": "miou_present", "mAcc": "macc_present"}, "Mean")
 
 
 def scannet_blocks(kind: TableKind, sources: Sources) -> list[Block]:
@@ -50,7 +52,7 @@ def scannet_blocks(kind: TableKind, sources: Sources) -> list[Block]:
     def mode_of(protocol: str) -> str:
         return protocol.partition("(")[2].rstrip(")")  # how points were classified
 
-    return measured_blocks(kind, sources, partial(scannet_cells, sources), label_of=mode_of)
+    return measured_blocks(kind, sources, partial(scannet_cells, sources), interval_cells, mode_of)
 
 
 def scannet_cells(sources: Sources, _: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
@@ -60,9 +62,8 @@ def scannet_cells(sources: Sources, _: "pd.DataFrame", part: "pd.DataFrame") -> 
         of_protocol = part[part["protocol"].str.startswith(protocol)]
         for mean, metric in (("mIoU", "miou_present"), ("mAcc", "macc_present")):
             cells[f"{name} {mean}"] = percent(of_protocol, metric)
-        cells |= interval_cells(of_protocol, name, pooled=False)
     first = part.iloc[0]
-    variant = first["variant"] if first["seed"] == "0" else f"{first['variant']}.seed{first['seed']}"
+    variant = first["variant"] if first["seed"] == 0 else f"{first['variant']}.seed{first['seed']}"
     key = (first["dataset"], variant, first["masks"], first["method"])
     scans = {
         scene: matches
@@ -93,59 +94,60 @@ def waymo_cells(_: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
     return {
         "mIoU": Cell.percent(means["miou_absent_as_one"]),
         "mIoU, present classes": Cell.percent(means["miou_present"]),
-        **interval_cells(part, "Present classes", pooled=True),
-        "Classes present": Cell.count(part[part["metric"] == "class_iou"]["query"].nunique()),
+        "Classes present": Cell.count(part[part["metric"] == "class_accuracy"]["query"].nunique()),
     }
 
 
 def bootstrap_mean(
-    hits: Float[np.ndarray, "S K"],
-    union: Float[np.ndarray, "S K"],
+    hits: Float[np.ndarray, "R S K"],
+    union: Float[np.ndarray, "R S K"],
     present: Bool[np.ndarray, "S K"],
     pooled: bool,
 ) -> tuple[float, float]:
-    """Return the 95 % bootstrap interval of a mean IoU, resampling scenes and the class names within them.
+    """Return the 95 % bootstrap interval of a mean IoU over seeds, resampling scenes and their class names.
 
     Args:
-        hits: correctly predicted points of each class, per scene.
-        union: points labelled or predicted as the class, per scene; 0 if the class doesn't occur.
-        present: classes included in the mean.
+        hits: correctly predicted points of each class, per seed and scene.
+        union: points labelled or predicted as the class; 0 if the class doesn't occur.
+        present: classes of each scene that are included in the mean.
         pooled: whether counts of all scenes are summed first; otherwise scenes are averaged.
     """
     draws = np.random.default_rng(0)
 
     def mean_over_names(iou: np.ndarray) -> float:
-        return float(iou[draws.integers(len(iou), size=len(iou))].mean())
+        of_seeds = iou.mean(axis=0)
+        return float(of_seeds[draws.integers(len(of_seeds), size=len(of_seeds))].mean())
 
     def resampled() -> float:
-        scenes = draws.integers(len(hits), size=len(hits))
+        scenes = draws.integers(len(present), size=len(present))
         if pooled:
             names = present[scenes].any(axis=0)
-            return mean_over_names(hits[scenes].sum(axis=0)[names] / union[scenes].sum(axis=0)[names])
+            of_names = (counts[:, scenes].sum(axis=1)[:, names] for counts in (hits, union))
+            return mean_over_names(np.divide(*of_names))
         named = [scene for scene in scenes if present[scene].any()]
-        means = [mean_over_names(hits[s, present[s]] / union[s, present[s]]) for s in named]
+        means = [mean_over_names(hits[:, s, present[s]] / union[:, s, present[s]]) for s in named]
         return float(np.mean(means)) if means else 0.0
 
     low, high = np.percentile([resampled() for _ in range(DRAWS)], (2.5, 97.5))
     return float(low), float(high)
 
 
-def interval_cells(part: "pd.DataFrame", name: str, pooled: bool) -> dict[str, Cell]:
-    """Return the interval and the numbers of names and scenes; empty if no row describes a class."""
-    ious = part[part["metric"] == "class_iou"]
-    true = part[part["metric"] == "class_accuracy"]
-    if ious.empty or true.empty:
-        return {}
-    values, points, present = (
-        frame.pivot(index="scene", columns="query", values=column).reindex(
-            index=sorted(set(ious["scene"])), columns=sorted(set(ious["query"]))
-        )
-        for frame, column in ((ious, "value"), (ious, "n"), (true, "n"))
-    )
-    union = points.fillna(0).to_numpy(float)
-    counts = present.fillna(0).to_numpy() > 0
-    low, high = bootstrap_mean(values.fillna(0).to_numpy() * union, union, counts, pooled)
-    return {
-        f"{name} 95 %": Cell(f"{100 * low:.0f} to {100 * high:.0f}"),
-        f"{name} names": Cell(f"{int(counts.sum())} in {len(counts)}"),
-    }
+def interval_cells(_: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
+    """Return the interval and the numbers of names and scenes for each protocol that has rows of classes."""
+    import pandas as pd
+
+    cells, keys = {}, ["metric", "seed", "scene", "query"]
+    of_classes = part[part["metric"].isin(("class_accuracy", "class_iou"))]
+    for protocol, name in INTERVAL_COLUMNS.items():
+        rows = of_classes[of_classes["protocol"].str.startswith(protocol)]
+        if rows["metric"].nunique() < 2:
+            continue
+        names = [sorted(set(rows[key])) for key in keys]
+        grid = rows.set_index(keys)[["value", "n"]].reindex(pd.MultiIndex.from_product(names)).fillna(0)
+        (_, ious), (true, union) = grid.to_numpy().T.reshape(2, *map(len, names))  # of accuracies, of IoUs
+        present = true[0] > 0  # all seeds have the same ground truth
+        is_pooled = card_of(rows["protocol"].iloc[0]).averaging == "pooled"
+        low, high = bootstrap_mean(ious * union, union, present, is_pooled)
+        cells[f"{name} 95 %"] = Cell(f"{100 * low:.0f} to {100 * high:.0f}")
+        cells[f"{name} names"] = Cell(f"{int(present.sum())} in {len(present)}")
+    return cells

@@ -1,19 +1,26 @@
 """A code digest covers the modules that a function imports, and changes with their code only."""
 
 import ast
+import builtins
+import dis
 import functools
+import inspect
 import json
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from types import FunctionType
 
 import pytest
 
 from hilsplat.base import code
-from hilsplat.base.code import code_digest, modules_of
+from hilsplat.base.code import code_digest, modules_of, statements_of
 from hilsplat.base.errors import HilsplatError
+from hilsplat.base.plugins import load
 from hilsplat.baselines import BASELINES
 from hilsplat.datasets.registry import DATASETS
+from hilsplat.settings import Section
 from hilsplat.stages import all_stages, stage_of
 
 
@@ -107,7 +114,7 @@ def test_comments_docstrings_and_modules_not_imported_do_not_count(tmp_path, for
     assert (code_digest("plug.a") != before) is counts
 
 
-@pytest.mark.parametrize("suffix", ["json", "tsv"])
+@pytest.mark.parametrize("suffix", ["json", "tsv", "txt"])
 def test_data_beside_a_module_count(tmp_path, forget, suffix):
     write(tmp_path, a="")
     digests = [code_digest("plug.a")]
@@ -148,3 +155,78 @@ def test_every_stage_and_plugin_has_its_code_and_nothing_else_is_imported_by_str
     texts = {path: path.read_text() for path in (project / "hilsplat").rglob("*.py")}
     by_string = [path for path, text in texts.items() if "import_module" in text or "__import__(" in text]
     assert {path.name for path in by_string} == {"plugins.py", "__init__.py"}
+
+
+NEUTRAL = ("hilsplat.settings.", "hilsplat.baselines.")
+OF_CONFIGURATIONS = {
+    *(f"hilsplat.settings.{name}" for name in ("LARGEST", "Share", "knob")),
+    *(f"hilsplat.baselines.{name}" for name in ("method_of", "own_settings", "settings_class")),
+}
+"""What reads and describes configurations; a stage gets the values."""
+
+
+def test_plugins_named_by_the_data_count_for_the_jobs_that_load_them():
+    given = {"labels": None, "data_root": "", "truth": Path("truth"), "source": "world:tabletop:1"}
+    assert "hilsplat_world.diagnostics.world_consistency" in modules_of(
+        *stage_of("evaluate").reads(given).plugins
+    )
+    assert stage_of("evaluate").reads({**given, "source": ""}).plugins == ()
+    listed = modules_of(*stage_of("table").reads({}).plugins)  # tables show the number of a data set's scenes
+    assert {"hilsplat.datasets.images.lerf_ovs", "hilsplat.datasets.waymo.reader"} <= {*listed}
+
+
+WHERE_AND_WHEN = {"is_random", "uses_model", "uses_card", "rasteriser"}
+"""Properties of settings that decide whether and where a stage runs, not what it computes."""
+
+NOT_OF_STAGES = {"hilsplat/models/releases.tsv", "hilsplat/workflow/gpu.json", "hilsplat/py.typed"}
+
+
+def is_section(value):
+    return isinstance(value, type) and issubclass(value, Section)
+
+
+def test_modules_that_do_not_count_have_nothing_to_compute_with():
+    modules = {module for stage in all_stages().values() for module in stage.modules()}
+    facts = [code._facts(module, code._file(module), code._memo().get(module)) for module in modules]
+    imports = {name for of_module in facts for name in of_module.imports if name.startswith(NEUTRAL)}
+    sections = {name: cls for name in imports if is_section(cls := load(":".join(name.rsplit(".", 1))))}
+    assert imports - {*sections} == OF_CONFIGURATIONS and len(sections) > 10
+    for name, cls in sections.items():
+        members = {key for key, each in vars(cls).items() if isinstance(each, (FunctionType, property))}
+        assert members - {"__hash__"} <= WHERE_AND_WHEN, name
+
+
+def test_a_module_that_reads_data_of_its_package_has_its_name(project):
+    packages = [project / name for name in ("hilsplat", "cpusplat", "hilsplat_world")]
+    files = {
+        path for package in packages for path in package.rglob("*.*") if path.suffix not in (".py", ".smk")
+    }
+    data = {
+        path for path in files if not {"static", "__pycache__"} & {*path.parts} and path.name != "README.md"
+    }
+    alone = {
+        path
+        for path in data
+        if path.suffix not in (".json", ".tsv", ".txt") or not path.with_suffix(".py").is_file()
+    }
+    names = {path.relative_to(project).as_posix() for path in alone}
+    assert names == NOT_OF_STAGES
+
+
+def double(scene, out):
+    """Do it twice."""
+    return scene * 2  # at least
+
+
+def triple(scene, out):
+    return scene * 3
+
+
+def test_the_body_of_a_stage_counts_and_uses_only_parameters_and_imports():
+    assert statements_of(double) == "return scene * 2" != statements_of(triple)
+    for stage in all_stages().values():
+        steps = dis.get_instructions(inspect.unwrap(stage.function))
+        names = {step.argval for step in steps if step.opname == "LOAD_GLOBAL"}
+        assert names <= set(dir(builtins)), stage.name
+    digests = [replace(stage_of("masks"), function=body).code_digest() for body in (double, triple)]
+    assert len(set(digests)) == 2

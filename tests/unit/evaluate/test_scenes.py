@@ -3,6 +3,7 @@
 import os
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -32,7 +33,15 @@ def results(desk, tmp_path) -> Path:
         score("tree", f"lerf/langsplat{version}", value)
         for version, value in (("@2 (wholes)", 0.2), ("-v2@2", 0.6))
     ]
-    others = [score("field", "lerf/langsplat@2", 0.1), score("tree", "hierarchy/level-auto@6", 0.3)]
+    of_levels = {"whole": (0.5, 0.7), "part": (0.1, 0.1, 0.1, 0.1), "subpart": (0.2,)}
+    others = [
+        score("field", "lerf/langsplat@2", 0.1),
+        *(
+            replace(score("tree", "hierarchy/level-auto@6", value), level=level)
+            for level, values in of_levels.items()
+            for value in values
+        ),
+    ]
     write_scores(one / "default/scores.csv", [*of_tree, *others])
     for part in ("clip", "semantic_tree", "masks"):
         shutil.copytree(desk / "default" / part, tmp_path / "rooms/early/key-views" / part)
@@ -61,12 +70,25 @@ def test_each_scene_has_a_row_with_what_its_run_has_computed(results, capsys):
     assert printed[0].split() == ["scene", "state", "views", "PSNR", "mIoU", "MB", "date", "models"]
     assert printed[3].split()[:6] == ["rooms/one", "tree,", "field", "6", "21.46", "0.6500"]
     assert printed[3].endswith(f"{date}  graph, colours")
+    # of all levels, the mean of 0.6, 0.1 and 0.2, as in the tables
     for protocol, iou in {"hierarchy/level-auto": "0.3000", "lerf/langsplat": "0.2000"}.items():
         options = ("--results", str(results), "--protocol", protocol)
         app(["scenes", "rooms/o*", *options], standalone_mode=False)
         assert iou in capsys.readouterr().out.splitlines()[1]
     with pytest.raises(SettingsError, match=r"'lerf/tree' is unknown(.|\n)*did you mean 'lerf/tree-nodes'"):
         app(["scenes", "--results", str(results), "--protocol", "lerf/tree"], standalone_mode=False)
+
+
+@pytest.mark.parametrize("file", ["gaussians/report.json", "default/scores.csv", "scene/index.json"])
+def test_a_damaged_scene_is_named_and_the_others_are_listed(results, capsys, file):
+    path, out = results / "rooms/one" / file, results / "scenes.csv"
+    path.write_bytes(path.read_bytes()[:20])
+    app(["scenes", "--results", str(results), "--out", str(out)], standalone_mode=False)
+    states = [line.split(",")[:2] for line in out.read_text().splitlines()[1:]]
+    assert states[2] == ["rooms/one", "damaged"] and states[3] == ["rooms/posed", "poses"]
+    printed = capsys.readouterr()
+    assert printed.out.splitlines()[3].split() == ["rooms/one", "damaged"]
+    assert printed.err.startswith(f"rooms/one: {path}") and "fix  " in printed.err
 
 
 def test_the_size_of_a_scene_is_that_of_its_files(results):

@@ -27,6 +27,7 @@ from hilsplat.splat.initial import RANDOM_POINTS, first_gaussians
 from hilsplat.splat.model import Model, means_rate, step_sizes
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.drawn import Gradients
+from hilsplat.splat.steps import fit_steps
 from tests.unit.round_gaussians import round_gaussians
 from tests.unit.splat.three_gaussians_world import mean_psnr, three_gaussians_scene
 
@@ -42,8 +43,8 @@ def scene(tmp_path_factory) -> Scene:
 
 @pytest.mark.parametrize(("views", "steps"), [(3, 1500), (25, 1500), (26, 1560), (60, 3000)])
 def test_the_steps_of_a_fit_grow_with_the_views_between_two_bounds(views, steps):
-    assert GaussiansSettings().steps(views) == steps
-    assert GaussiansSettings(iterations=600).steps(views) == 600
+    assert fit_steps(GaussiansSettings(), views) == steps
+    assert fit_steps(GaussiansSettings(iterations=600), views) == 600
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])

@@ -183,6 +183,17 @@ def test_photographs_that_you_annotated_are_scored_without_replacing_the_tables(
     assert not any("desk" in path for path in targets.scores(both, "lerf"))
 
 
+def test_the_folder_of_data_sets_counts_for_scenes_that_read_it(tmp_path):
+    (tmp_path / "annotated/photos/desk").mkdir(parents=True)
+    (tmp_path / "annotated/photos/desk/1.json").write_text("{}")
+    roots = {str(tmp_path): True, str(tmp_path / "other"): False}
+    plans = [plan(tmp_path, groups=["photos", "benchmark"], data_root=root) for root in roots]
+    for name in ("evaluate", "figures"):
+        for job, is_read in ((Job(), False), (Job("photos", "desk"), True)):
+            here, moved = (each.params(name, name=each.data.scene_name)["settings"](job) for each in plans)
+            assert (here == moved) is not is_read and ("--data-root" in here) is is_read
+
+
 @pytest.mark.parametrize(
     ("stage", "variant", "owner"),
     [
@@ -230,14 +241,19 @@ def test_levels_by_the_tree_take_the_theta_of_the_tree(tmp_path):
 
 
 def test_inputs_of_a_field_that_continues_langsplats(tmp_path):
-    shared = {"autoencoder": NETWORK}
+    shared, own = {"autoencoder": NETWORK}, {"autoencoder": {**NETWORK, "targets": "mask"}}
+    by_tree = {"masks": {"levels": "tree"}}
     variants = {
         "paper": {**shared, "method": {"name": "hi_lsplat"}},
         "langsplat": {**shared, "method": {"name": "langsplat"}},
         "on": {**shared, "field": {"start": "langsplat"}},
         "alone": {"field": {"start": "langsplat"}},
+        "tree": {**by_tree, **own, "contributions": {"keep": "none"}, "method": {"name": "langsplat"}},
+        "on-tree": {**by_tree, **own, "field": {"start": "langsplat"}},
     }
     found = plan(tmp_path, variants=variants, main_variants=["default"], seeds=2)
+    # LangSplat needs no pairs of Gaussians, which don't change the code of the masks' own vectors.
+    assert variants_in(found.first_field(Job(variant="on-tree.seed1"))) == ["tree.seed1"]
     on = Job(variant="on.seed1")
     assert found.first_field(on) == ["results/synthetic/one/langsplat.seed1/field.safetensors"]
     assert found.first_field(Job()) == []

@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -36,6 +38,21 @@ def test_requested_memory_exceeds_every_measured_peak(
     asked = found.memory_mb(rule)(job, threads=2, attempt=1) - RUNNER_MB
     assert 1.1 * float(peak_mb) <= asked
     assert asked <= 6 * float(peak_mb) + 1000  # a node has room for others
+
+
+def test_the_resources_of_every_rule_are_planned_without_slow_libraries(tmp_path):
+    code = f"""
+import sys
+from pathlib import Path
+from tests.unit.workflow.test_resources import COSTS, JOB, JobResources, plan
+found = JobResources(plan(Path({str(tmp_path)!r})))
+for rule in COSTS:
+    print(found.memory_mb(rule)(JOB, 2, 1), found.minutes(rule)(JOB, 2, 1), found.disk_mb(rule, JOB))
+print([name for name in ("scipy", "numba", "torch", "cv2", "pandas", "matplotlib") if name in sys.modules])
+"""
+    how = {"capture_output": True, "text": True, "check": True, "cwd": PROJECT}
+    done = subprocess.run([sys.executable, "-c", code], **how)
+    assert done.stdout.splitlines()[-1] == "[]"
 
 
 def test_a_retry_requests_twice_as_much(tmp_path):

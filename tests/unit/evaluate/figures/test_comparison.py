@@ -18,7 +18,7 @@ from hilsplat.evaluate.figures.comparison import (
     run_comparison,
 )
 from hilsplat.evaluate.figures.panel import annotated_rows, shown_truths
-from hilsplat.evaluate.figures.sweep_plot import read_lines, run_sweep_plot
+from hilsplat.evaluate.figures.sweep_plot import read_curves, run_sweep_plot
 from hilsplat.settings import EvaluateSettings, FiguresSettings
 
 EVALUATE = EvaluateSettings()
@@ -99,20 +99,38 @@ def test_comparing_no_variants_is_refused(compare):
         compare("none", [], {})
 
 
-SWEEP = """kind,data,method,Hi-LERF mIoU,Hi-LERF HC,notes
-reported,LERF,theta = 0.6,38.4,56.3,
-reported,LERF,theta = 0.9,39.1,56.9,
-synthetic stand-in,synthetic,hilsplat (field),42.10,50.00,
-synthetic stand-in,synthetic,theta = 0.6,41.00 ± 0.50,,
+SWEEP = """kind,data,method,masks,protocol,Hi-LERF mIoU,Hi-LERF HC
+reported,LERF,theta = 0.6,,,38.4,56.3
+reported,LERF,theta = 0.9,,,39.1,56.9
+measured,hi_lerf,theta = 0.6,sam,level given,31.00 ± 0.50,
+measured,hi_lerf,theta = 0.9,sam,level given,32.00,
+measured,hi_3dovs,theta = 0.6,sam,level given,51.00,
+measured,hi_3dovs,theta = 0.9,sam,level given,52.00,
+synthetic stand-in,synthetic,hilsplat (field),a,level given,42.10,50.00
+synthetic stand-in,synthetic,theta = 0.9,a,level given,42.00,
+synthetic stand-in,synthetic,theta = 0.6,a,level given,41.00,
+synthetic stand-in,synthetic,"theta = 0.6, by head",a,level given,61.00,
+synthetic stand-in,synthetic,"theta = 0.9, by head",a,level given,62.00,
+synthetic stand-in,synthetic,"theta = 0.9, by head",b,level given,72.00,
+synthetic stand-in,synthetic,theta = 0.9,a,hierarchy/level-given@5 (filter 20),82.00,
 """
 
 
-def test_curves_take_the_value_from_the_rows_name_and_kinds_stay_apart(tmp_path):
+def test_a_curve_joins_rows_of_one_data_set_and_reading(tmp_path):
     (tmp_path / "theta.csv").write_text(SWEEP)
-    assert read_lines(tmp_path / "theta.csv", 0.9) == {
-        ("reported", "Hi-LERF mIoU"): [(0.6, 38.4), (0.9, 39.1)],
-        ("reported", "Hi-LERF HC"): [(0.6, 56.3), (0.9, 56.9)],
-        ("synthetic stand-in", "Hi-LERF mIoU"): [(0.6, 41.0), (0.9, 42.1)],
+    assert read_curves(tmp_path / "theta.csv") == {
+        "reported: LERF": {
+            "Hi-LERF mIoU": [(0.6, 38.4), (0.9, 39.1)],
+            "Hi-LERF HC": [(0.6, 56.3), (0.9, 56.9)],
+        },
+        "measured: hi_lerf": {"Hi-LERF mIoU, sam": [(0.6, 31.0), (0.9, 32.0)]},
+        "measured: hi_3dovs": {"Hi-LERF mIoU, sam": [(0.6, 51.0), (0.9, 52.0)]},
+        "synthetic stand-in: synthetic": {
+            "Hi-LERF mIoU, a": [(0.9, 42.0), (0.6, 41.0)],
+            "Hi-LERF mIoU, by head, a": [(0.6, 61.0), (0.9, 62.0)],
+            "Hi-LERF mIoU, by head, b": [(0.9, 72.0)],
+            "Hi-LERF mIoU, a, filter 20": [(0.9, 82.0)],
+        },
     }
     run_sweep_plot("theta", tmp_path / "theta.csv", tmp_path / "theta.png")
     assert (tmp_path / "theta.pdf").is_file()
@@ -123,3 +141,6 @@ def test_an_unknown_sweep_is_an_error_that_lists_the_sweeps(tmp_path):
         run_sweep_plot("lambda", tmp_path / "theta.csv", tmp_path / "x.png")
     with pytest.raises(ArtifactError, match="build the table first"):
         run_sweep_plot("theta", tmp_path / "theta.csv", tmp_path / "x.png")
+    (tmp_path / "lerf.csv").write_text("kind,data,method\nmeasured,lerf,hilsplat\n")
+    with pytest.raises(ArtifactError, match="rows named like 'theta = "):
+        run_sweep_plot("theta", tmp_path / "lerf.csv", tmp_path / "x.png")

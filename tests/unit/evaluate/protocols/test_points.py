@@ -18,7 +18,7 @@ from hilsplat.datasets.classes import (
     splits_of,
 )
 from hilsplat.datasets.generators import GENERATORS
-from hilsplat.datasets.points.labelled_points import LabelledPoints
+from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.metrics.instances import average_precision, match_instances
@@ -34,7 +34,8 @@ from hilsplat.evaluate.protocols.points import (
     pooled_points,
 )
 from hilsplat.evaluate.scores import Measured, read_instances, read_scores, write_instances, write_scores
-from hilsplat.evaluate.stage import scene_from_true
+from hilsplat.evaluate.stage import point_rows, scene_from_true
+from hilsplat.settings import EvaluateSettings
 from tests.unit.evaluate.builders import cameras_of, score
 from tests.unit.round_gaussians import round_gaussians
 
@@ -164,6 +165,9 @@ def test_rows_name_the_mode_and_are_moved_into_the_frame_of_the_scene(block_worl
     assert all(isinstance(row, Measured) for row in rows)
     assert {row.protocol for row in rows} == {"drawn/points@1 (points: nearest)"}
     assert {row.method: row.value for row in rows if row.metric == "miou_present"} == {"tree": 1, "field": 1}
+    scored = PointScene("s", (), {"drawn": points}), ExtraProtocols(points=(card,))
+    of_template = point_rows(block_world.answers, *scored, EvaluateSettings(template="a {}"), 1)
+    assert {row.protocol for row in of_template} == {"drawn/points@1 (points: nearest, texts as a ...)"}
 
 
 def cameras_at(centres, rotation):

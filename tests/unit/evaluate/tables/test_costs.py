@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import shutil
 
 import pytest
 
@@ -60,6 +61,9 @@ def test_missing_records_and_unread_stages(scene):
     del inputs["coverage_tree"]
     write_record(field, inputs=inputs)
     assert read_costs(scene)[0].prepare_s == 114  # a stage that nothing read costs nothing
+    (scene[0].parent / "benchmarks" / "contributions.jsonl").unlink()
+    assert math.isnan(read_costs(scene)[0].peak_mib)  # the job may have needed the most memory
+    record(scene[0].parent, "contributions", 30, 512)
     (scene[0].parent / "benchmarks" / "masks.jsonl").unlink()
     first, _ = read_costs(scene)
     assert math.isnan(first.prepare_s)
@@ -100,6 +104,54 @@ def test_only_tables_of_seconds_change_with_what_the_jobs_took(scene, tmp_path, 
             record(path.parent, record_path.stem, 600, 4096)
     assert built(table) == before
     assert all(timed[kind] != content for kind, content in built(f"{table}-seconds").items())
+
+
+def test_rows_over_part_of_the_scenes_are_compared_only_within_a_scene(scene, tmp_path):
+    more = scene[0].parents[2] / "table-2/default/scores.csv"
+    shutil.copytree(scene[0].parent, more.parent)
+    for stage in STAGES:
+        record(more.parent, stage, 0.6, 256)
+    write_scores(more, [score("iou", 0.9, scene="table-2", method="field")])
+    write_times(more, "synthetic", "table-2", "default", {"field": 0.05})
+    out = tmp_path / "cost-seconds.csv"
+    for name in ("cost-seconds", "efficiency-seconds"):
+        run_table(name, [*scene, more], PROJECT / published_values(name), {}, tmp_path / f"{name}.csv")
+    lines = (out.with_suffix(".md")).read_text().splitlines()
+    part = next(line for line in lines if line.startswith("| omega-2"))
+    assert "| 1 of 2 |" in part and part.count("**") == 2 and "**0.25**" in part  # its scene's query alone
+    text = (tmp_path / "efficiency-seconds.md").read_text()
+    part = next(line for line in text.splitlines() if line.startswith("| omega-2"))
+    assert "| 1 of 2 |" in part and "**" not in part
+
+
+def test_quality_and_costs_of_a_row_are_of_the_same_scenes(scene, tmp_path):
+    more = scene[0].parents[2] / "table-2/default/scores.csv"
+    shutil.copytree(scene[0].parent, more.parent)
+    write_scores(more, [score("iou", 0.9, scene="table-2", method="field", protocol="lerf/langsplat@2")])
+    write_times(more, "synthetic", "table-2", "default", {"field": 0.05})
+    run_table(
+        "pruning-seconds", [scene[0], more], PROJECT / published_values("pruning"), {}, tmp_path / "p.csv"
+    )
+    with (tmp_path / "p.csv").open(newline="") as stream:
+        row = next(row for row in csv.DictReader(stream) if row["kind"] != "reported")
+    assert (row["Hi-LERF mIoU"], row["Query (s)"]) == ("50.00", "0.25")  # not of the scene without levels
+
+
+def test_seeds_of_a_variant_are_one_row_in_every_table(scene, tmp_path):
+    more = scene[1].parents[1] / "omega-2.seed1/scores.csv"
+    shutil.copytree(scene[1].parent, more.parent)
+    names = {"scene": "table-1", "variant": "omega-2.seed1", "method": "field"}
+    write_scores(more, [score("iou", 0.7, **names)])
+    write_times(more, "synthetic", "table-1", "omega-2.seed1", {"field": 0.75})
+    found = []
+    for name in ("cost-seconds", "pruning-seconds"):
+        out = tmp_path / f"{name}.csv"
+        run_table(name, [*scene, more], PROJECT / published_values(name), {}, out)
+        with out.open(newline="") as stream:
+            found += [row for row in csv.DictReader(stream) if row["method"].startswith("omega")]
+    cost, quality = found
+    assert (cost["table-1 query (s)"], quality["Query (s)"]) == ("0.50", "0.50")
+    assert (quality["Hi-LERF mIoU"], quality["seeds"]) == ("60.00 ± 14.14", "2")
 
 
 def test_stages_follow_the_order_of_the_workflow_with_a_total(tmp_path):

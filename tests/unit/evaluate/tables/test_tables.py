@@ -335,11 +335,36 @@ def test_waymo_pools_the_counts_of_all_scenes(tmp_path):
     assert cells(row, "mIoU, present classes", "Present classes 95 %") == ["50.00", "0 to 100"]
 
 
+@pytest.mark.parametrize(
+    ("name", "protocol", "column"),
+    [
+        ("scannet", "scannet200/opengaussian", "ScanNet200 95 %"),
+        ("replica", "replica/per-scene", "Mean 95 %"),
+        ("waymo", "waymo/segmentation", "Present classes 95 %"),
+    ],
+)
+def test_intervals_are_of_the_mean_over_seeds(tmp_path, name, protocol, column):
+    # One name: its IoU is the mean in each resample. With 0.2 and 0.6, the mean over seeds is 0.4.
+    query, values = "car" if name == "waymo" else "chair", {"v": 0.2, "v.seed1": 0.6}.items()
+    scores = [
+        row for variant, v in values for row in class_scores(protocol, v, 10, variant=variant, query=query)
+    ]
+    row = measured(built(tmp_path, name, scores)[0], method="v, tree")
+    assert cells(row, column, "seeds") == ["40 to 40", "2"]
+
+
+def test_classes_that_are_only_predicted_are_not_present(tmp_path):
+    predicted = point_score("waymo/segmentation", "class_iou", 0.0, n=5, query="bus")
+    scores = [*class_scores("waymo/segmentation", 1.0, 10, query="car"), predicted]
+    row = measured(built(tmp_path, "waymo", scores)[0])
+    assert cells(row, "mIoU, present classes", "Classes present") == ["100.00", "1"]
+
+
 def test_intervals_widen_with_fewer_scenes_and_names():
     # half of the names are found: the mean is 0.5, and its interval shrinks as names are added
     def interval(scenes, names, pooled=False):
-        hits = np.tile(np.arange(names) % 2 * 10.0, (scenes, 1))
-        return bootstrap_mean(hits, np.full_like(hits, 10), np.ones(hits.shape, bool), pooled)
+        hits = np.tile(np.arange(names) % 2 * 10.0, (1, scenes, 1))
+        return bootstrap_mean(hits, np.full_like(hits, 10), np.ones((scenes, names), bool), pooled)
 
     few, many = interval(1, 6), interval(8, 40)
     assert few[0] < many[0] < 0.5 < many[1] < few[1]
@@ -361,6 +386,16 @@ def test_seeds_of_a_variant_are_one_row_with_mean_and_spread(tmp_path):
     assert "50.0 ± 10.0" in forms[".md"]
     assert r"50.0 $\pm$ 10.0" in forms[".tex"]
     assert "standard deviation over seeds" in forms[".md"]
+
+
+def test_a_mean_over_seeds_is_of_all_seeds_or_missing(tmp_path):
+    values = {"default": None, "default.seed1": 0.5, "default.seed2": 0.6}
+    scores = [score("iou", 0.4, variant=variant, method="field") for variant in values]
+    for variant, value in values.items():
+        if value is not None:
+            scores.append(score("hc_anchored", value, variant=variant, method="field", query="", level=""))
+    row = measured(built(tmp_path, "hierarchy", scores)[0], method="hilsplat (field)")
+    assert cells(row, "L1", "L2", "HC anchored") == ["40.00 ± 0.00", "", ""]
 
 
 def test_annotations_are_one_unranked_row_whatever_the_variants_and_seeds(tmp_path):
