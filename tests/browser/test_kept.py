@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import zipfile
 
 import av
@@ -9,6 +10,7 @@ import pytest
 from plyfile import PlyData
 
 from tests.browser.conftest import answers, ask, ask_and_wait, chips, drawn, keep, late, pixels, save, until
+from tests.unit.many_nodes import add_nodes
 
 
 def greenish(page) -> float:
@@ -151,3 +153,38 @@ def test_a_film_follows_the_path_of_the_user(opened, desk_address, tmp_path):
     page.locator("#path").select_option("around")
     page.get_by_role("button", name="Clear").click()
     assert page.locator("#path").input_value() == "around"
+
+
+def two_trees(own_desk):
+    """Add a variant whose nodes have numbers of their own."""
+    records = shutil.ignore_patterns("*.provenance.json")  # otherwise, its parts would be those of default
+    shutil.copytree(own_desk / "default", own_desk / "other", ignore=records)
+    add_nodes(own_desk, 50)
+
+
+def test_kept_answers_of_another_tree_are_neither_painted_nor_saved(served, own_desk, tmp_path):
+    two_trees(own_desk)
+    page = served(own_desk)
+    keep(page, "book")
+    book = int(page.locator("#overlay path.kept").get_attribute("data-node"))
+    held, free = [], []
+    page.route("**/api/query**", lambda route: route.continue_() if free else held.append(route))
+    page.get_by_label("Answers by").select_option("other|tree")
+    until(page, lambda: held)
+    page.locator("#overlay path.kept").wait_for(state="detached")
+    page.locator("#save summary").click()
+    assert page.get_by_role("button", name="Boxes, JSON").is_disabled()
+    free.append(True)
+    held[0].continue_()
+    page.locator(f"#overlay path.kept[data-node='{book - 50}']").wait_for(state="attached")
+
+
+def test_similar_nodes_are_not_those_of_another_node_in_the_other_tree(served, own_desk):
+    two_trees(own_desk)
+    page = served(own_desk)
+    page.get_by_label("Beside").select_option("other|tree")
+    ask_and_wait(page, "mug > handle")
+    answers(page).first.click()
+    page.get_by_role("button", name="More like this").click()
+    page.get_by_role("status").get_by_text("most similar first").wait_for()
+    assert not page.locator("#answers-beside li").count()

@@ -108,7 +108,7 @@ export async function like(node) {
   if (node < 0 || api.offline) return;
   $("text").value = "";
   const name = nameOf(main(), node);
-  await askAll({}, (pane, signal) => api.like({ variant: variantOf(pane), node: variantOf(pane) === variantOf(panes[0]) ? node : 0 }, signal));
+  await askAll({}, (pane, signal) => outlines.get(variantOf(pane)).tree === main().tree ? api.like({ variant: variantOf(pane), node }, signal) : null);   // another tree has other nodes
   tell(`Like ${name}: ${$("status").textContent}`);
 }
 

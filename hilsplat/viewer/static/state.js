@@ -19,7 +19,7 @@ export const level = () => document.querySelector("[name=level]:checked").value;
 export const threshold = () => $("threshold-on").checked ? Number($("threshold-at").value) : null;
 export const levelIndex = (answer) => Math.max(0, LEVELS.indexOf(level() === "auto" ? answer?.level ?? "whole" : level()));
 // Return a pane's kept queries that are painted, with their colours.
-export const keptIn = (pane) => page.kept.filter((query) => query.shown && query.answers[pane]).map((query) => ({ answer: query.answers[pane], rgb: KEPT[query.colour], text: query.asked.text }));
+export const keptIn = (pane) => page.kept.filter((query) => query.shown && query.answers.has(panes[pane].by)).map((query) => ({ answer: query.answers.get(panes[pane].by), rgb: KEPT[query.colour], text: query.asked.text }));
 export const main = () => outlines.get(variantOf(panes[0]));
 
 export function tell(text, error = false) { $("status").textContent = text; $("status").classList.toggle("error", error); }

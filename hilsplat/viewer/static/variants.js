@@ -1,7 +1,7 @@
 // Variants of the scene, one or two side by side, including variants that appear during a run.
 
 import * as api from "./api.js";
-import { ask, listAnswers } from "./asking.js";
+import { ask, clearAnswer, listAnswers } from "./asking.js";
 import { choose } from "./choosing.js";
 import { restyle } from "./drawing.js";
 import { $, counted, make } from "./elements.js";
@@ -55,7 +55,9 @@ export async function choosePanes() {
     else if (panes[1]?.by !== right) panes[1] = { by: right, answer: null, field: null };
     for (const pane of panes) await loadVariant(variantOf(pane));
     if (changed) { choose(-1); showOutline(); }
-    if (page.asked?.text) await ask(true); else listAnswers();
+    if (page.asked?.text) await ask(true);
+    else if (page.asked && !panes[0].answer) clearAnswer();   // similar nodes of the previous tree
+    else listAnswers();
     await askKeptAgain();
     restyle();
   } catch (error) { failed(error); }
