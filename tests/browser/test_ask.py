@@ -12,6 +12,7 @@ from hilsplat.base.images import write_png
 from hilsplat.query.names import read_names
 from tests.browser.conftest import (
     HEIGHT,
+    PANEL_PX,
     WIDTH,
     answers,
     ask,
@@ -23,6 +24,7 @@ from tests.browser.conftest import (
     late,
     on_page,
     pixels,
+    projected,
     save,
     serving,
     until,
@@ -190,6 +192,16 @@ def test_keys_move_in_the_outline(opened, desk_address, scene):
     page.locator(f"#overlay path.chosen[data-node='{child}']").wait_for(state="attached")
 
 
+def frame(page, start, end) -> None:
+    """Draw a frame with Alt held."""
+    page.keyboard.down("Alt")
+    page.mouse.move(*start)
+    page.mouse.down()
+    page.mouse.move(*end, steps=4)
+    page.mouse.up()
+    page.keyboard.up("Alt")
+
+
 def test_queries_with_an_image_a_framed_part_of_the_view_and_a_node(opened, desk_address, scene, tmp_path):
     page = opened(desk_address)
     book = scene.query("book", "whole")[0].node
@@ -198,15 +210,21 @@ def test_queries_with_an_image_a_framed_part_of_the_view_and_a_node(opened, desk
     page.locator(f"#answers li[data-node='{book}']").first.wait_for()
     assert page.locator("#answers li").first.get_attribute("data-node") == str(book)
     page.locator("#view").press("Escape")
-    low, high = on_page(page, (18, 18, 0), (34, 22, 0)).tolist()  # corners of the book
-    page.keyboard.down("Alt")
-    page.mouse.move(*low)
-    page.mouse.down()
-    page.mouse.move(*high, steps=4)
-    page.mouse.up()
-    page.keyboard.up("Alt")
+    low, high = on_page(page, (18, 18, 0), (34, 22, 0))  # corners of the book
+    frame(page, low, high)
     answers(page).first.wait_for()
     assert page.locator("#answers li").first.get_attribute("data-node") == str(book)
+    page.get_by_label("Beside").select_option("default|field")
+    for moved in (0, 0.01):  # from the photograph and from the rendered picture, both in the right half
+        page.locator("#view").press("Escape")
+        page.evaluate(f"{moved} && hilsplat.camera.orbit({moved}, 0); hilsplat.redraw()")
+        width = page.locator("#view").bounding_box()["width"] / 2
+        wire = page.evaluate(f"hilsplat.camera.wire({width}, document.getElementById('view').clientHeight)")
+        low, high = (projected(wire, place)[0] + (PANEL_PX + width, 0) for place in ((18, 18, 0), (34, 22, 0)))
+        frame(page, low, high)
+        answers(page).first.wait_for()
+        assert page.locator("#answers li").first.get_attribute("data-node") == str(book)
+    page.get_by_label("Beside").select_option("")
     page.locator("#view").press("Escape")
     handle = scene.query("mug > handle")[0].node
     choose_row(page, handle)

@@ -2,11 +2,11 @@
 
 import { markChosen, showAnswers, summary } from "./answers.js";
 import * as api from "./api.js";
-import { acts, choose } from "./choosing.js";
+import { acts, choose, paneAt } from "./choosing.js";
 import { overlay, redraw, restyle } from "./drawing.js";
 import { $, nameOf } from "./elements.js";
 import { asking, keep, showKept, whenReopened } from "./kept.js";
-import { answererOf, failed, host, level, main, outlines, page, panes, tell, variantOf } from "./state.js";
+import { answererOf, failed, level, main, outlines, page, panes, tell, variantOf } from "./state.js";
 import { styleOf } from "./styles.js";
 
 const PICTURE_PX = 512;
@@ -136,12 +136,13 @@ export async function framed(points, done) {
   path.setAttribute("d", `M${x0} ${y0}H${x1}V${y1}H${x0}Z`);
   svg.append(path);
   if (!done || x1 - x0 < 6 || y1 - y0 < 6 || api.offline) return;
+  const { k, width, height } = paneAt(x0), left = x0 - k * width;
   if (page.camera.view >= 0) {
-    const photo = await (await fetch(api.photoUrl(page.camera.view))).blob(), { s, x, y } = page.camera.frame(host.clientWidth / panes.length, host.clientHeight);
-    await askPicture(photo, [(x0 - x) / s, (y0 - y) / s, (x1 - x0) / s, (y1 - y0) / s]);
+    const photo = await (await fetch(api.photoUrl(page.camera.view))).blob(), { s, x, y } = page.camera.frame(width, height);
+    await askPicture(photo, [(left - x) / s, (y0 - y) / s, (x1 - x0) / s, (y1 - y0) / s]);
   } else {
     const plain = [{ variant: "", style: styleOf({ outline: null, colour: "none", mode: "plain", chosen: -1, hover: -1 }), removed: page.removed }];
-    await askPicture(await page.painter.capture(page.camera, plain, host.clientWidth, host.clientHeight), [x0, y0, x1 - x0, y1 - y0]);
+    await askPicture(await page.painter.capture(page.camera, plain, Math.round(width), height), [left, y0, x1 - x0, y1 - y0]);
     redraw();
   }
 }
