@@ -23,8 +23,8 @@ from hilsplat.web.server import view_name
 CHUNK = 65_536
 """Gaussians per chunk: 16 rows of the page's textures."""
 
-LISTED = 24
-"""Maximum number of answers in the list."""
+ALIKE = 24
+"""Maximum number of similar nodes in an answer."""
 
 
 def arrival_order(gaussians: Gaussians) -> Int64[np.ndarray, " N"]:
@@ -147,13 +147,12 @@ class FoundNode(TypedDict):
 class Answer(TypedDict):
     """Answers to a text, or nodes that look like a node or a picture.
 
-    `relevancy` has one value per node, `hits` are the best of `total` answers; `route` is as in `Hit`.
+    `relevancy` has one value per node, `hits` are all answers, best first; `route` is as in `Hit`.
     """
 
     text: str
     level: str
     hits: list[FoundNode]
-    total: int
     relevancy: list[float]
     doubts: list[str]
     caution: str
@@ -174,9 +173,8 @@ def answer(scene: LanguageScene, asked: Question, answerer: str = "tree") -> Ans
     )
     relevancy = scene.node_relevancy(path_of(asked.text)[-1:], answerer)[0]
     return {
-        **_answer(scene, asked.text, scene.hits_of(nodes, LISTED), relevancy),
+        **_answer(scene, asked.text, scene.hits_of(nodes, len(nodes.ids)), relevancy),
         "level": nodes.level.label,
-        "total": len(nodes.ids),
         "doubts": [str(doubt) for doubt in doubts_of(nodes)],
         "caution": scene.caution_about(asked.text),
         "route": nodes.route,
@@ -206,7 +204,6 @@ def _answer(scene: LanguageScene, text: str, hits: Sequence[Hit], relevancy: np.
             }
             for hit in hits
         ],
-        "total": len(hits),
         "relevancy": np.round(relevancy, 4).tolist(),
         "doubts": [],
         "caution": "",

@@ -7,6 +7,7 @@ only arrays, so they have their own thread. The response contains lines of JSON,
 
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -19,10 +20,11 @@ from starlette.routing import Route
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.query.hits import NodeGroup, label_comments
 from hilsplat.query.language_scene import LanguageScene
+from hilsplat.query.scene_views import ViewStore
 from hilsplat.splat.gaussians import morton_order
 from hilsplat.viewer import exports, payload, wire
 from hilsplat.viewer.html_page import html_page
-from hilsplat.viewer.viewer_scene import ViewerScene
+from hilsplat.viewer.viewer_scene import VIEWS_MIB, ViewerScene
 from hilsplat.web.scene_thread import SceneThread, Work
 from hilsplat.web.server import as_json, read
 
@@ -119,7 +121,11 @@ def _boxes(shown: ViewerScene, asked: wire.Selection) -> dict[str, Any]:
 
 
 def _masks(shown: ViewerScene, asked: wire.Selection) -> exports.Steps:
-    return exports.masks_zip(*_selected(shown, asked))
+    scene, groups = _selected(shown, asked)
+    if asked.removed:
+        rest = replace(scene.views, gaussians=shown.remaining(asked.removed), cache=ViewStore(VIEWS_MIB))
+        scene = replace(scene, views=rest)
+    return exports.masks_zip(scene, groups)
 
 
 def _film(shown: ViewerScene, asked: wire.Film) -> exports.Steps:

@@ -146,11 +146,12 @@ class FieldRelevancy(Asked):
 
 
 class Pick(Edited):
-    """A pixel of the page's picture."""
+    """A pixel of the page's picture in a style, which may hide Gaussians."""
 
     camera: WireCamera
     x: float
     y: float
+    style: Style = Style()
 
 
 class Members(Asked):

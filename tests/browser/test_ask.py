@@ -76,6 +76,21 @@ def test_an_answer_outside_the_view_is_one_click_away(opened, desk_address):
     assert status.index("may not be in the scene") < status.index("answer")  # a doubt comes first
 
 
+@both
+def test_what_others_hides_is_not_chosen(opened, desk_address, painter):
+    page = opened(desk_address, painter)
+    page.get_by_label("Others").select_option("isolate")
+    ask_and_wait(page, "book")
+    mug, book = on_page(page, (6, 20, 0), (30, 20, 0)).tolist()
+    card = page.get_by_role("region", name="Chosen node")
+    page.mouse.click(*book)
+    card.wait_for()
+    page.locator("#view").press("Escape")
+    page.mouse.click(*mug)
+    page.wait_for_timeout(500)
+    assert not card.is_visible()
+
+
 def test_labels_of_boxes_do_not_cover_each_other(opened, desk_address):
     page = opened(desk_address)
     for text in ("mug", "mug > handle", "book"):

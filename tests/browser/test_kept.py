@@ -179,7 +179,7 @@ def test_kept_answers_of_another_tree_are_neither_painted_nor_saved(served, own_
     page.locator(f"#overlay path.kept[data-node='{book - 50}']").wait_for(state="attached")
 
 
-def test_similar_nodes_are_not_those_of_another_node_in_the_other_tree(served, own_desk):
+def test_similar_nodes_are_those_of_the_node_in_its_own_tree(served, own_desk, tmp_path):
     two_trees(own_desk)
     page = served(own_desk)
     page.get_by_label("Beside").select_option("other|tree")
@@ -188,3 +188,7 @@ def test_similar_nodes_are_not_those_of_another_node_in_the_other_tree(served, o
     page.get_by_role("button", name="More like this").click()
     page.get_by_role("status").get_by_text("most similar first").wait_for()
     assert not page.locator("#answers-beside li").count()
+    assert page.locator("#answers li").count() == 24
+    page.locator("#view").press("Escape")
+    boxes = json.loads(save(page, "Boxes, JSON", tmp_path / "boxes.json").read_text())["boxes"]
+    assert len(boxes) == page.locator("#overlay path.answer").count() == 5  # as painted

@@ -8,6 +8,7 @@ import { LEVELS } from "./elements.js";
 import { flyTo } from "./flights.js";
 import { inOrder, latest } from "./latest.js";
 import { failed, host, level, loadVariant, main, outlines, page, panes, tell, variantOf } from "./state.js";
+import { wireStyle } from "./styles.js";
 
 // Actions of lists and cards of nodes; asking.js adds `like`.
 export const acts = { choose, hover: setHover, fly: () => flyTo(page.chosen), name: rename };
@@ -36,7 +37,8 @@ export function paneAt(x) {
 }
 
 const exactPick = async (at, y) => {
-  const { nodes } = await api.pick({ variant: variantOf(panes[at.k]), camera: page.camera.wire(at.width, at.height), x: at.x, y, removed: page.removed });
+  const { style } = painted()[at.k];
+  const { nodes } = await api.pick({ variant: variantOf(panes[at.k]), camera: page.camera.wire(at.width, at.height), x: at.x, y, removed: page.removed, ...(style.mode === "isolate" ? { style: wireStyle(style) } : {}) });
   return nodes.map(([node]) => node);
 };
 export const quickPick = (at, y) => page.painter.nodesAt(variantOf(panes[at.k]), page.painter.gaussianAt(page.camera, painted()[at.k], at.x, y, at.width, at.height));

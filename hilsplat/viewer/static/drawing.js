@@ -5,7 +5,7 @@ import { $, nameOf } from "./elements.js";
 import { drawOverlay, inPicture } from "./overlay.js";
 import { showScale } from "./scale.js";
 import { host, keptIn, level, levelIndex, main, options, outlines, page, panes, threshold, variantOf } from "./state.js";
-import { shownHits, styleOf } from "./styles.js";
+import { LISTED, shownHits, styleOf } from "./styles.js";
 
 const SLOW_MS = 60, FRUSTUM = 0.08;   // depth of a drawn camera, in multiples of the photographs' mean distance
 let dirty = true, styles = [], lastFrame = 0, frames = 0;
@@ -61,8 +61,8 @@ const labelOf = ({ name, score }, text = "") => [...new Set([text, name].filter(
 function boxes(pane, k) {
   const own = outlines.get(variantOf(pane));
   if (!own || $("colour").value === "none") return [];
-  const found = $("colour").value === "answers" ? keptIn(k).flatMap(({ answer, rgb, text }) => shownHits(answer).map((hit) => ({ node: hit.node, kind: "kept", stroke: `rgb(${rgb.join(" ")})`, label: labelOf(hit, text) }))) : [];
-  for (const hit of shownHits(pane.answer)) found.push({ node: hit.node, kind: "answer", label: labelOf(hit) });
+  const found = $("colour").value === "answers" ? keptIn(k).flatMap(({ answer, rgb, text }) => shownHits(answer).slice(0, LISTED).map((hit) => ({ node: hit.node, kind: "kept", stroke: `rgb(${rgb.join(" ")})`, label: labelOf(hit, text) }))) : [];
+  for (const hit of shownHits(pane.answer).slice(0, LISTED)) found.push({ node: hit.node, kind: "answer", label: labelOf(hit) });
   if (!k || variantOf(pane) === variantOf(panes[0])) {
     if (page.chosen >= 0) found.push({ node: page.chosen, kind: "chosen", label: nameOf(own, page.chosen) });
     if (page.hover >= 0 && page.hover !== page.chosen) found.push({ node: page.hover, kind: "hover", label: nameOf(own, page.hover) });

@@ -54,7 +54,7 @@ export const askKeptAgain = () => next(async () => {
 
 // Return the nodes of all shown queries with scores and doubts, for saved files.
 export function groups() {
-  const saved = ({ answer, text }) => ({ name: text, nodes: answer.hits.map((hit) => hit.node), scores: answer.hits.map((hit) => hit.score), doubts: doubtsOf(answer) });
+  const saved = ({ answer, text }) => ({ name: text, nodes: shownHits(answer).map((hit) => hit.node), scores: shownHits(answer).map((hit) => hit.score), doubts: doubtsOf(answer) });
   const found = keptIn(0).map(saved), answer = panes[0].answer;
   if (answer) found.push(saved({ answer, text: answer.text }));
   return found.filter((group) => group.nodes.length);
@@ -78,7 +78,7 @@ export function showKept() {
       onclick: () => { query.shown = !query.shown; showKept(); } });
     return make("li", {}, swatch,
       make("button", { type: "button", class: "words", title: ["Edit", ...doubts].join("\n"), disabled: api.offline, onclick: () => { drop(query); reopen(query.asked); } },
-        text, make("small", {}, [...(doubts.length ? ["doubtful"] : []), ...(answer ? [at === "auto" ? answer.level : at, counted(answer.total, "answer")] : ["…"]), ...(answer?.hits.length ? [`best ${answer.hits[0].score.toFixed(2)}`] : []), ...(least ? [`score at least ${least.toFixed(2)}`] : [])].join(", "))),
+        text, make("small", {}, [...(doubts.length ? ["doubtful"] : []), ...(answer ? [at === "auto" ? answer.level : at, counted(answer.hits.length, "answer")] : ["…"]), ...(answer?.hits.length ? [`best ${answer.hits[0].score.toFixed(2)}`] : []), ...(least ? [`score at least ${least.toFixed(2)}`] : [])].join(", "))),
       api.offline ? null : make("button", { type: "button", class: "drop", "aria-label": `Remove ${text}`, title: "Remove", onclick: () => drop(query) }, "×"));
   }));
   $("overlaps").textContent = overlaps();

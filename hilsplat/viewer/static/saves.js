@@ -18,7 +18,7 @@ const sized = (bytes) => bytes < 1e6 ? `${Math.ceil(bytes / 1e3)} kB` : `${(byte
 
 export async function save(kind, { variant, answerer, groups, removed, style, capture, flown, kept, last, camera, name, told }) {
   const asked = {
-    masks: { variant, groups }, page: { variant, answerer, removed, kept, ...(last ? { last } : {}), start: camera },
+    masks: { variant, groups, removed }, page: { variant, answerer, removed, kept, ...(last ? { last } : {}), start: camera },
     mp4: { variant, removed, style: wireStyle(style), format: "mp4", side_px: Number($("mp4-side").value), ...flown },
     gif: { variant, removed, style: wireStyle(style), format: "gif", side_px: Number($("gif-side").value), ...flown },
   }[kind];
