@@ -453,3 +453,79 @@ def test_a_change_that_could_not_be_saved_is_shown_and_saved_with_the_next_one(p
         "mug",
         "book",
     ]
+
+
+def test_a_text_that_is_being_typed_is_not_replaced_by_a_late_reply(page, tmp_path):
+    late(page, "api/labels")
+    draw_polygon(page, (1, 1), (15, 1), (15, 20), (1, 20))
+    page.locator("#title", has_text="unnamed").wait_for()
+    page.keyboard.type("mug")
+    saved(page)
+    assert page.locator("#text").input_value() == "mug"
+    page.keyboard.press("Enter")
+    saved(page)
+    assert [label.text for label in kept(tmp_path)] == ["mug"]
+
+
+def test_a_photograph_is_not_shown_below_the_outlines_of_the_next_one(page):
+    held = []
+    page.route("**/api/photo/1*", lambda route: held.append(route))
+    page.locator("#view").press("]")
+    page.wait_for_timeout(300)
+    assert held and not page.locator("#picture").is_visible()
+    held[0].continue_()
+    page.locator("#picture").wait_for()
+
+
+@pytest.mark.parametrize("tool", ["b", "p"])
+def test_two_fingers_move_the_photograph_without_drawing(annotating, desk, tmp_path, tool):
+    page = annotating(desk, has_touch=True)
+    name(page, "mug")
+    page.locator("#view").press(tool)
+    scale = page.evaluate("hilsplat.sheet.scale")
+    fingers = page.context.new_cdp_session(page)
+    for kind, columns in (
+        ("touchStart", [10]),
+        ("touchStart", [10, 20]),
+        ("touchMove", [8, 26]),
+        ("touchEnd", []),
+    ):
+        points = [dict(zip("xy", place(page, column, 10), strict=True)) for column in columns]
+        fingers.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    saved(page)
+    assert page.evaluate("hilsplat.sheet.scale") > 1.1 * scale
+    assert kept(tmp_path) == [] and not page.locator("#drawing .draft").count()
+
+
+def test_undo_shows_the_photograph_that_it_changes(page, tmp_path):
+    draw_mug(page)
+    page.locator("#view").press("]")
+    page.locator("#view").press("Control+z")
+    saved(page)
+    assert kept(tmp_path) == [] and page.url.endswith("view=0")
+
+
+@pytest.mark.parametrize("key", ["]", "b"])
+def test_an_unfinished_polygon_is_kept_when_the_photograph_or_the_tool_changes(page, tmp_path, key):
+    name(page, "mug")
+    page.locator("#view").press("p")
+    for corner in ((1, 1), (15, 1), (15, 20)):
+        page.mouse.click(*place(page, *corner))
+    page.keyboard.press(key)
+    saved(page)
+    assert [label.text for label in kept(tmp_path)] == ["mug"]
+
+
+def test_annotations_of_another_tab_appear_and_ids_stay_apart(page, opened, tmp_path):
+    other = page.context.new_page()
+    other.goto(page.url)
+    other.locator("body[data-ready=yes]").wait_for()
+    draw_mug(other)
+    page.get_by_role("treeitem", name="mug, whole").wait_for()
+    page.locator("#view").press("]")
+    draw_book(page)
+    other.locator("#views button").nth(1).click()
+    other.get_by_role("treeitem", name="book, whole").wait_for()
+    ids = [label.id for view in ("000.png", "001.png") for label in kept(tmp_path, view)]
+    assert ids == [1, 2]
+    other.close()

@@ -91,6 +91,20 @@ def test_what_others_hides_is_not_chosen(opened, desk_address, painter):
     assert not card.is_visible()
 
 
+def test_a_photograph_is_not_shown_over_the_view_of_another(opened, desk_address):
+    page = opened(desk_address)
+    page.locator("#view").focus()
+    page.keyboard.press("o")
+    page.locator("#photo").wait_for()
+    held = []
+    page.route("**/api/photo/1*", lambda route: held.append(route))
+    page.keyboard.press("]")
+    until(page, lambda: held)
+    page.locator("#photo").wait_for(state="hidden")
+    held[0].continue_()
+    page.locator("#photo").wait_for()
+
+
 def test_labels_of_boxes_do_not_cover_each_other(opened, desk_address):
     page = opened(desk_address)
     for text in ("mug", "mug > handle", "book"):

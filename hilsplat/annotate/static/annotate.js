@@ -60,22 +60,22 @@ function refresh() {
 function aimAt(id, next = {}) { aim = { id, next: { ...aim.next, ...next } }; }
 
 function choose(id, next = {}) {
-  aimAt(id, next);
   drop();
+  aimAt(id, next);
   refresh();
 }
 
 function drop() {
-  draft = [];
+  closePolygon();
   stroke = offer = frame = corner = null;
   clicks = found = [];
   $("offers-section").hidden = true;
 }
 
 function stand(to) {
+  drop();
   number = (to + scene.views.length) % scene.views.length;
   aimAt(aim.id);
-  drop();
   sheet.show(number, scene.views[number].size_hw);
   $("picture").alt = scene.views[number].name;
   history.replaceState(null, "", `${location.pathname}#view=${number}`);
@@ -120,7 +120,7 @@ async function region(ring, brush, view, mine) {
   if (!made.polygons.length) {
     if (label) remove(view, label.id); else tell("The shape has no pixel inside the photograph and its parent.", true);
   } else if (label) reshaped(view, label.id, made.polygons);
-  else add(view, { ...mine.next, text: mine.next.text || UNNAMED, polygons: made.polygons, origin: "drawn" }, mine);
+  else add(view, { ...mine.next, text: mine.next.text || (mine === aim && $("text").value.trim()) || UNNAMED, polygons: made.polygons, origin: "drawn" }, mine);
 }
 
 function closePolygon() {
@@ -254,7 +254,12 @@ function accept() {
   tell(right.size > 1 ? "Accepted, with its ancestors." : "Accepted.");
 }
 
-function step(way) { tell(""); store[way](); }   // the last message no longer applies
+function step(way) {
+  if (way === "undo" && draft.length) { draft = draft.slice(0, -1); draw(); return; }
+  tell("");   // the last message no longer applies
+  const changed = store[way]();
+  if (changed.length && !changed.includes(number)) stand(changed[0]);
+}
 
 function remove(view = number, id = aim.id) {
   const gone = new Set([id, ...under(store.labels(view), id)]);
@@ -322,6 +327,13 @@ function up() {
   if (done) soon(() => region(null, done, view, mine)).then(() => { if (stroke === done) stroke = null; draw(); });
 }
 
+// Forget what the first of two fingers began.
+function cancel() {
+  if (tool() === "polygon") draft = draft.slice(0, -1);
+  stroke = frame = corner = null;
+  draw();
+}
+
 // With the choosing tool, dragging the chosen outline moves a corner; dragging elsewhere moves the photograph.
 function grabbed(event) {
   if (tool() !== "choose" || !own() || event.altKey) return false;
@@ -330,11 +342,12 @@ function grabbed(event) {
   return corner;
 }
 
-attachHands(sheet, { drawing: (event) => tool() !== "choose" || grabbed(event), down, drag, up, close: closePolygon, hover: (at) => { cross = at; draw(); } });
+attachHands(sheet, { drawing: (event) => tool() !== "choose" || grabbed(event), down, drag, up, cancel, close: closePolygon, hover: (at) => { cross = at; draw(); } });
 attachThings(choose);
 
 function escape() {
-  if (draft.length || stroke || clicks.length || frame || !$("offers-section").hidden) drop();
+  if (draft.length) draft = [];
+  else if (stroke || clicks.length || frame || !$("offers-section").hidden) drop();
   else if (aim.id) choose(0);
   draw();
 }
@@ -381,7 +394,7 @@ for (const [id, work] of Object.entries({ new: () => fresh(), child: () => fresh
 $("file").addEventListener("change", () => { const files = [...$("file").files]; $("file").value = ""; $("save").open = false; soon(() => take_in(files)); });
 $("radius").addEventListener("input", draw);
 window.addEventListener("pagehide", () => { if (store.views) store.remember(scene.folder); });
-window.addEventListener("beforeunload", (event) => { if (store.unsaved || waiting) event.preventDefault(); });
+window.addEventListener("beforeunload", (event) => { if (store.unsaved || waiting || draft.length) event.preventDefault(); });
 
 async function begin() {
   scene = await described();
@@ -401,7 +414,7 @@ async function begin() {
   setTool("choose");
   if (first < 0) tell("First annotation: 1. type what you see, 2. choose polygon (P) or brush (B) and draw around it, 3. press Enter. It is saved at once.");
   document.body.dataset.ready = "yes";
-  watch();
+  watch((versions) => store.follow(versions));
 }
 
 globalThis.hilsplat = { store, sheet };   // for tests

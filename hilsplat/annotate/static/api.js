@@ -23,14 +23,17 @@ export const photoUrl = (number) => at(`/api/photo/${number}`);
 export const thumbUrl = (number) => at(`/api/thumb/${number}`);
 export const exportUrl = (kind) => at(`/api/export/${kind}`);
 
-// Check regularly whether files of the scene changed; the page keeps its loaded state until a reload.
-export async function watch() {
-  while ($("changed").hidden) {
-    await new Promise((done) => setTimeout(done, POLL_MS));
+// Check regularly whether annotations or files of the scene changed; the page keeps its loaded state until a reload.
+export async function watch(follow) {
+  let wake = () => {};
+  document.addEventListener("visibilitychange", () => wake());
+  for (;;) {
+    await new Promise((done) => { wake = done; setTimeout(done, POLL_MS); });
     if (document.hidden) continue;
     try {
       const now = await (await get("/api/changes")).json();
       showStopped(false);
+      await follow(now.labels);
       if (now.of === state && !now.changed.length) continue;
       $("changed-what").textContent = `The scene has changed${now.changed.length ? ` (${now.changed.join(", ")})` : ""}. Reload to use the new files.`;
       $("changed").hidden = false;

@@ -45,6 +45,15 @@ export class Store {
     this.handlers.changed();
   }
 
+  // Show what another page or program has saved.
+  async follow(versions) {
+    if (this.unsaved || versions.join() === this.versions) return;
+    const loaded = this.saving.then(() => this.load());   // not while a change is being saved
+    this.saving = loaded.catch(() => {});
+    await loaded;
+    this.handlers.told("The annotations were changed elsewhere and have been reloaded.");
+  }
+
   get unsaved() { return this.waiting + this.refused.size; }
   labels(number) { return this.views[number].labels; }
   has(number, id) { return this.labels(number).some((label) => label.id === id); }
@@ -62,9 +71,16 @@ export class Store {
     this.future = [];
   }
 
-  undo() { this.step(this.past, this.future); }
-  redo() { this.step(this.future, this.past); }
-  step(from, to) { if (from.length) to.push(this.swap(from.pop().before)); }
+  undo() { return this.step(this.past, this.future); }
+  redo() { return this.step(this.future, this.past); }
+
+  // Return the photographs that changed.
+  step(from, to) {
+    if (!from.length) return [];
+    const entry = this.swap(from.pop().before);
+    to.push(entry);
+    return entry.before.map(([number]) => number);
+  }
 
   // Return a history entry: the previous labels, and the photographs whose change the server has not accepted yet.
   swap(after) {

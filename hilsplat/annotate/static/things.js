@@ -44,11 +44,14 @@ export function attachThings(choose) {
 export const level = () => Number(document.querySelector("[name=level]:checked").value);
 export const setLevel = (value) => { document.querySelector(`[name=level][value="${value}"]`).checked = true; };
 
-// Show the chosen object in the form, or the settings of the next object.
+let filled = "";   // the object and text that the form shows
+
+// Show the chosen object in the form, or the settings of the next object; a text that is being typed stays.
 export function fillForm(labels, label, next) {
-  const own = label ?? next;
+  const own = label ?? next, now = `${label?.id} ${own.text}`;
   $("title").textContent = label ? `${label.text}, ${LEVEL(label)}${label.origin === "proposed" ? ": proposed" : ""}` : "New thing";
-  if (document.activeElement !== $("text") || label) $("text").value = own.text;
+  if (document.activeElement !== $("text") || now !== filled) $("text").value = own.text;
+  filled = now;
   setLevel(own.level);
   const above = labels.filter((each) => each.level === own.level - 1);
   $("parent").replaceChildren(make("option", { value: "" }, "nothing"), ...above.map((each) => make("option", { value: each.id }, each.text)));

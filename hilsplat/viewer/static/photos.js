@@ -18,7 +18,8 @@ export class Photos {
       if (next) { next.focus(); next.click(); }
       event.preventDefault(); event.stopPropagation();
     });
-    $("photo").addEventListener("error", () => { $("photo").hidden = true; });
+    $("photo").addEventListener("load", () => { $("photo").style.visibility = "visible"; });
+    $("photo").addEventListener("error", () => { $("photo").dataset.number = ""; });   // so that it is loaded again
   }
 
   cycle() { this.opacity = (this.opacity + 1) % 3; }
@@ -30,7 +31,7 @@ export class Photos {
     $("blend").setAttribute("aria-pressed", String(this.opacity > 0));
     photo.hidden = !this.opacity || number < 0;
     if (photo.hidden) return;
-    if (photo.dataset.number !== String(number)) { photo.src = api.photoUrl(number); photo.dataset.number = number; }
+    if (photo.dataset.number !== String(number)) { photo.style.visibility = "hidden"; photo.src = api.photoUrl(number); photo.dataset.number = number; }   // until it is loaded, the browser would show the previous one
     photo.classList.toggle("whole", this.opacity === 2);
     Object.assign(photo.style, { left: `${x}px`, top: `${y}px`, width: `${s * camera.lens.w}px`, height: `${s * camera.lens.h}px` });
   }
