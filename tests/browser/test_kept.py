@@ -136,6 +136,52 @@ def test_a_saved_page_has_the_answers_of_the_page(opened, desk_address, scene, t
     assert answers(offline).first.inner_text() == shown
 
 
+def test_a_saved_page_opens_with_the_settings_of_its_last_query(opened, desk_address, scene, tmp_path):
+    page = opened(desk_address)
+    keep(page, "mug")
+    page.get_by_role("radio", name="part", exact=True).check(force=True)
+    page.get_by_label("Others").select_option("ghost")
+    ask_and_wait(page, "mug")
+    (part,), (whole,) = scene.query("mug", "part"), scene.query("mug")
+    assert part.node != whole.node
+    offline = page.context.new_page()
+    offline.goto(save(page, "Page with answers", tmp_path / "page.html").as_uri())
+    answers(offline).first.wait_for()
+    assert offline.locator("#answers li").get_attribute("data-node") == str(part.node)
+    assert offline.get_by_label("Others").input_value() == "ghost"
+
+
+def test_a_link_and_back_restore_the_settings_of_a_query(opened, desk_address):
+    page = opened(desk_address)
+    page.wait_for_timeout(800)
+    page.get_by_label("only what this photograph shows").check()
+    page.get_by_label("score at least").check()
+    page.get_by_label("Minimum score").fill("0.3")
+    ask_and_wait(page, "mug > handle")
+    view = page.evaluate("hilsplat.camera.view")
+    page.locator("#view").press("ArrowLeft")  # the answer remains that of the photograph
+    page.wait_for_timeout(1200)  # until the address is updated
+    asked = []
+    again = opened(desk_address)
+    again.on("request", lambda sent: sent.url.find("api/query") > 0 and asked.append(sent.post_data_json))
+    again.goto(f"{again.url.partition('#')[0]}{page.url[page.url.index('#') :]}")
+    until(again, lambda: asked)  # the link was opened in the same tab
+    again.reload()
+    until(again, lambda: len(asked) > 1)
+    question = {"text": "mug > handle", "level": "auto", "threshold": 0.3, "view": view}
+    assert asked == [{"variant": "default", "answerer": "tree", **question}] * 2
+    camera = [each.evaluate("hilsplat.camera.toText()") for each in (page, again)]
+    assert camera[0] == camera[1]
+    page.get_by_label("only what this photograph shows").uncheck()
+    ask_and_wait(page, "book")
+    page.get_by_label("score at least").uncheck()
+    page.wait_for_timeout(1200)
+    page.on("request", lambda sent: sent.url.find("api/query") > 0 and asked.append(sent.post_data_json))
+    page.go_back()
+    until(page, lambda: len(asked) > 2)
+    assert asked[2] == asked[0] and page.get_by_label("score at least").is_checked()
+
+
 def test_a_film_follows_the_path_of_the_user(opened, desk_address, tmp_path):
     page = opened(desk_address, "server")
     page.locator("#view").focus()

@@ -4,7 +4,7 @@ import { get, send, streamed } from "./http.js";
 import { restartWith } from "./stopped.js";
 
 export const offline = false;
-export const texts = [], kept = [], first = "", opening = "";   // answered queries and initial camera of an exported page
+export const texts = [], link = "";   // answered queries, and the part after # of the address, of an exported page
 
 // Each request contains the scene state with which this page was loaded; the server refuses any other state.
 let state = "";

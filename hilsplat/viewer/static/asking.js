@@ -6,7 +6,7 @@ import { acts, choose, paneAt } from "./choosing.js";
 import { overlay, redraw, restyle } from "./drawing.js";
 import { $, nameOf } from "./elements.js";
 import { asking, keep, showKept, whenReopened } from "./kept.js";
-import { answererOf, failed, level, main, outlines, page, panes, tell, variantOf } from "./state.js";
+import { answererOf, failed, level, main, outlines, page, panes, setThreshold, tell, variantOf } from "./state.js";
 import { styleOf } from "./styles.js";
 
 const PICTURE_PX = 512;
@@ -68,7 +68,14 @@ export async function fillField() {
   restyle();
 }
 
-export async function ask(keepChoice = false) {
+// Send the query of a link, if it has one.
+export async function askAs(link) {
+  $("text").value = link.get("q") ?? "";
+  if ($("text").value) await ask(false, link.has("view") ? Number(link.get("view")) : null);
+}
+
+// view: number of the photograph that restricts the answers, if it isn't the present one.
+export async function ask(keepChoice = false, view = null) {
   const text = $("text").value.trim();
   if (!text) { clearAnswer(); return; }
   if (!main()) {   // the nodes are still loading, or do not exist yet
@@ -76,10 +83,9 @@ export async function ask(keepChoice = false) {
     tell("Your query runs as soon as the semantic tree is loaded.");
     return;
   }
-  const view = $("here").checked ? page.camera.view : -1;
-  if ($("here").checked && view < 0) { refused(new Error("Go to a photograph first: choose one below.")); return; }
+  if ($("here").checked && view === null && page.camera.view < 0) { refused(new Error("Go to a photograph first: choose one below.")); return; }
   if (!keepChoice && page.chosen >= 0) choose(-1);   // without a choice, the view is drawn only with the answer
-  const asked = asking(text);
+  const asked = { ...asking(text), ...(view === null ? {} : { view }) };
   await askAll({ text, query: asked }, (pane, signal) => api.query({ variant: variantOf(pane), answerer: answererOf(pane), ...asked }, signal));
 }
 
@@ -97,9 +103,7 @@ whenReopened(({ text, level: at, threshold: least, view }) => {
   $("here").checked = view !== undefined;
   if (view !== undefined) page.camera.standAt(page.scene.views[view], view);
   document.querySelector(`[name=level][value=${at}]`).checked = true;
-  $("threshold-on").checked = least !== undefined;
-  if (least !== undefined) $("threshold-at").value = least;
-  $("threshold-on").dispatchEvent(new Event("change"));
+  setThreshold(least ?? null);
   $("text").value = text;
   ask();
 });

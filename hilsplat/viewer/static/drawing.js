@@ -83,6 +83,16 @@ export function drawn() {
   remember();
 }
 
+// Return the part after # of the address that opens this view.
+export function link() {
+  const link = new URLSearchParams({ c: page.camera.toText() });
+  const put = (key, value, usual) => { if (value && value !== usual) link.set(key, value); };
+  for (const query of page.kept) link.append("keep", JSON.stringify(query.asked));
+  put("q", page.asked?.text); put("view", page.asked?.query?.view?.toString()); put("level", level(), "auto"); put("by", panes[0].by, `${page.scene.variants[0]}|tree`); put("beside", panes[1]?.by);
+  put("node", page.chosen >= 0 ? `${page.chosen}.${main().tree}` : ""); put("colour", $("colour").value, "answers"); put("mode", $("mode").value, "tint"); put("least", threshold() === null ? "" : String(threshold()));
+  return link;
+}
+
 // A new query is an entry in the browser's history, so Back returns to the previous query.
 let remembering = 0, remembered = null;
 export const rememberedAs = (text) => { remembered = text; };
@@ -91,12 +101,7 @@ function remember() {
   remembering = setTimeout(() => {
     const text = page.asked?.text ?? "", isNew = remembered !== null && text && text !== remembered;
     remembered = text || remembered || "";
-    const link = new URLSearchParams({ c: page.camera.toText() });
-    const put = (key, value, usual) => { if (value && value !== usual) link.set(key, value); };
-    for (const query of page.kept) link.append("keep", JSON.stringify(query.asked));
-    put("q", page.asked?.text); put("level", level(), "auto"); put("by", panes[0].by, `${page.scene.variants[0]}|tree`); put("beside", panes[1]?.by);
-    put("node", page.chosen >= 0 ? `${page.chosen}.${main().tree}` : ""); put("colour", $("colour").value, "answers"); put("mode", $("mode").value, "tint"); put("least", threshold() === null ? "" : String(threshold()));
-    history[isNew ? "pushState" : "replaceState"](null, "", `${location.pathname}${api.offline ? location.search : keptSearch()}#${link}`);
+    history[isNew ? "pushState" : "replaceState"](null, "", `${location.pathname}${api.offline ? location.search : keptSearch()}#${link()}`);
   }, 400);
 }
 function keptSearch() {

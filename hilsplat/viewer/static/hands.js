@@ -1,12 +1,12 @@
 // Input handlers: mouse and touch on the view, keys, and all controls of the page.
 
 import * as api from "./api.js";
-import { ask, askPicture, clear, clearAnswer, fillField, framed, keepAnswer, like } from "./asking.js";
+import { ask, askAs, askPicture, clear, clearAnswer, fillField, framed, keepAnswer, like } from "./asking.js";
 import { children } from "./card.js";
 import { choose, pointed, tapped } from "./choosing.js";
 import { attach } from "./controls.js";
 import { attachEditing, draw, edit, edited, leaveTool, placeBrush, pressed, redo, resizeBrush, tool, undo } from "./editing.js";
-import { currentStyles, painted, redraw, rememberedAs, restyle } from "./drawing.js";
+import { currentStyles, link, painted, redraw, rememberedAs, restyle } from "./drawing.js";
 import { $, counted, nameOf } from "./elements.js";
 import { flyTo, nearestView, setMoving, stand, step, touched } from "./flights.js";
 import { groups, scoreOf } from "./kept.js";
@@ -14,7 +14,7 @@ import { attachKeys } from "./keyboard.js";
 import { addToPath, attachPath, flown } from "./path.js";
 import { save } from "./saves.js";
 import { attachScenes } from "./scenes.js";
-import { answererOf, failed, host, main, page, panes, start, tell, variantOf } from "./state.js";
+import { answererOf, failed, follow, host, main, page, panes, tell, variantOf } from "./state.js";
 import { choosePanes } from "./variants.js";
 
 function showFrustums() {
@@ -73,7 +73,6 @@ export function attachHands() {
   $("threshold-on").addEventListener("change", () => { thresholdChanged(); askAgain(); });
   $("threshold-at").addEventListener("input", thresholdChanged);
   $("threshold-at").addEventListener("change", askAgain);
-  if (start.get("least")) { $("threshold-on").checked = true; $("threshold-at").value = start.get("least"); thresholdChanged(); }
   $("colour").addEventListener("change", () => {
     if (["relevancy", "field"].includes($("colour").value) && !page.asked) tell("Run a query first: these colours show how well nodes or Gaussians match it.");
     fillField();
@@ -93,9 +92,8 @@ export function attachHands() {
     const kept = new URLSearchParams(location.hash.slice(1)), text = kept.get("q") ?? "";
     clearAnswer();
     rememberedAs(text);
-    document.querySelector(`[name=level][value=${CSS.escape(kept.get("level") ?? "auto")}]`)?.click();
-    $("text").value = text;
-    if (text) ask();
+    follow(kept);
+    askAs(kept);
   });
 
   const selected = () => page.chosen >= 0 ? [{ name: nameOf(main(), page.chosen), nodes: [page.chosen], ...scoreOf(page.chosen) }] : groups();
@@ -113,7 +111,7 @@ export function attachHands() {
       await edited();
       const side = Number($("still-side").value), scale = side ? side / Math.max(host.clientWidth, host.clientHeight) : devicePixelRatio, size = [host.clientWidth, host.clientHeight].map((px) => Math.round(px * scale));
       await save(kind, { variant: variantOf(panes[0]), answerer: answererOf(panes[0]), groups: selected(), removed: page.removed, style: currentStyles()[0], capture: () => page.painter.capture(page.camera, painted(), ...size), flown: flown(),
-        kept: page.kept.map((query) => query.asked), last: page.asked?.query, camera: page.camera.toText(), name: page.scene.name.split("/").at(-1), told: tell });
+        queries: [...page.kept, { asked: page.asked?.query }].map((query) => query.asked).filter(Boolean), link: link().toString(), name: page.scene.name.split("/").at(-1), told: tell });
       redraw();
     } catch (error) { failed(error); }
   });

@@ -40,7 +40,7 @@ async function keepNext(asked) {
 
 // Kept queries from the address or from an exported page.
 export async function keepFromStart() {
-  const kept = api.offline ? api.kept : start.getAll("keep").map((text) => { try { return JSON.parse(text); } catch { return null; } });
+  const kept = start.getAll("keep").map((text) => { try { return JSON.parse(text); } catch { return null; } });
   for (const asked of kept) if (asked?.text) await keep(asked);
 }
 

@@ -13,7 +13,7 @@ import { restorePath } from "./path.js";
 import { Photos } from "./photos.js";
 import { describe, Renderer } from "./renderer.js";
 import { ServerPainter } from "./server_painter.js";
-import { failed, host, options, page, start, tell } from "./state.js";
+import { failed, follow, host, options, page, start, tell } from "./state.js";
 import { fillVariants, useVariants, watch } from "./variants.js";
 
 function choosePainter(gl) {
@@ -35,13 +35,10 @@ async function begin() {
   document.title = `${page.scene.name} · hilsplat`;
   $("title").textContent = `Query ${page.scene.name.split("/").at(-1)}`;
   page.camera = new Camera(page.scene);
-  page.camera.fromText(start.get("c") ?? api.opening, page.scene.views);
   page.photos = new Photos(page.scene.views, stand);
   page.outline = new Outline(acts);
   if (!api.offline) restorePath();
-  for (const [id, key] of [["colour", "colour"], ["mode", "mode"]]) if ([...$(id).options].some((o) => o.value === start.get(key))) $(id).value = start.get(key);
-  const radio = [...document.querySelectorAll("[name=level]")].find((each) => each.value === start.get("level"));
-  if (radio) radio.checked = true;
+  follow(start);
   let made = choosePainter(describe());
   if (made.kind === "gl") {
     try { await made.load(page.scene, api.splats, arriving); } catch (error) {

@@ -6,7 +6,7 @@ import { isStopped, showStopped } from "./stopped.js";
 import { KEPT } from "./styles.js";
 
 export const host = $("view"), options = new URLSearchParams(location.search);
-export const start = new URLSearchParams(location.hash.slice(1));
+export const start = new URLSearchParams(location.hash.slice(1) || api.link);
 
 export const page = { scene: null, camera: null, painter: null, photos: null, outline: null, chosen: -1, hover: -1, asked: null, kept: [], path: [], frustums: false, previewing: false, removed: "", marked: "", waiting: false, moving: false, slow: false };
 export const outlines = new Map();                             // by variant
@@ -21,6 +21,21 @@ export const levelIndex = (answer) => Math.max(0, LEVELS.indexOf(level() === "au
 // Return a pane's kept queries that are painted, with their colours.
 export const keptIn = (pane) => page.kept.filter((query) => query.shown && query.answers.has(panes[pane].by)).map((query) => ({ answer: query.answers.get(panes[pane].by), rgb: KEPT[query.colour], text: query.asked.text }));
 export const main = () => outlines.get(variantOf(panes[0]));
+
+// Set the controls and the camera as in a link.
+export function follow(link) {
+  page.camera.fromText(link.get("c") ?? "", page.scene.views);
+  for (const [id, usual] of [["colour", "answers"], ["mode", "tint"]]) $(id).value = [...$(id).options].some((o) => o.value === link.get(id)) ? link.get(id) : usual;
+  for (const radio of document.querySelectorAll("[name=level]")) radio.checked = radio.value === (link.get("level") ?? "auto");
+  $("here").checked = link.has("view");
+  setThreshold(link.get("least"));
+}
+
+export function setThreshold(least) {
+  $("threshold-on").checked = least !== null;
+  if (least !== null) $("threshold-at").value = least;
+  $("threshold-on").dispatchEvent(new Event("change"));
+}
 
 export function tell(text, error = false) { $("status").textContent = text; $("status").classList.toggle("error", error); }
 export const failed = (error) => {

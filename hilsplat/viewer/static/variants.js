@@ -1,7 +1,7 @@
 // Variants of the scene, one or two side by side, including variants that appear during a run.
 
 import * as api from "./api.js";
-import { ask, clearAnswer, listAnswers } from "./asking.js";
+import { ask, askAs, clearAnswer, listAnswers } from "./asking.js";
 import { choose } from "./choosing.js";
 import { restyle } from "./drawing.js";
 import { $, counted, make } from "./elements.js";
@@ -30,10 +30,10 @@ export async function useVariants() {
   for (const pane of panes) await loadVariant(variantOf(pane));
   fillVariants();
   showOutline();
-  const text = page.waiting ? $("text").value : start.get("q") ?? api.first;   // an exported page opens with its last query
+  const wasWaiting = page.waiting;
   page.waiting = false;
   await keepFromStart();
-  if (text) { $("text").value = text; await ask(); }
+  if (wasWaiting) await ask(); else await askAs(start);
   const [node, tree] = (start.get("node") ?? "").split(".");   // the row is valid only in the same tree
   if (tree === main().tree && main().nodes[node]) choose(Number(node));
 }

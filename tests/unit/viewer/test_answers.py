@@ -365,7 +365,7 @@ def test_gaussians_are_sent_once(client, shown):
 def test_an_exported_page_sends_no_requests_and_escapes_texts(client, shown):
     evil = "mug </script><script>alert(1)</script>".replace(">", "")
     kept = {"text": "mug > handle", "level": "part", "threshold": 0.3}
-    progress, data = in_steps(client, "page", kept=[kept], last={"text": evil}, start="v3")
+    progress, data = in_steps(client, "page", asked=[kept, {"text": evil}], link="c=v3")
     nodes = len(shown.answering("default").tree)
     assert progress == [(made, nodes) for made in range(nodes + 1)]
     page = data.decode()
@@ -374,8 +374,8 @@ def test_an_exported_page_sends_no_requests_and_escapes_texts(client, shown):
     assert len(decoded(base64.b64decode(held["splats"]))) == len(shown.gaussians)
     data = json.loads(held["data"])
     assert [answer["text"] for answer in data["answers"]] == ["mug > handle", evil]
-    assert data["asked"] == [kept, {"text": evil, "level": "auto"}] and data["kept"] == 1
-    assert len(data["photos"]) == len(data["scene"]["views"]) and data["opening"] == "v3"
+    assert data["asked"] == [kept, {"text": evil, "level": "auto"}]
+    assert len(data["photos"]) == len(data["scene"]["views"]) and data["link"] == "c=v3"
 
 
 def test_gaussians_are_shown_during_a_run_before_queries_work(desk_project, tmp_path):
