@@ -105,6 +105,40 @@ def test_a_photograph_is_not_shown_over_the_view_of_another(opened, desk_address
     page.locator("#photo").wait_for()
 
 
+def test_escape_closes_the_menu_and_leaves_the_answer(opened, desk_address):
+    page = opened(desk_address)
+    ask_and_wait(page, "mug > handle")
+    page.locator("#save summary").click()
+    page.keyboard.press("Escape")
+    assert not page.get_by_role("button", name="Boxes, JSON").is_visible()
+    assert answers(page).count() == 1
+    page.keyboard.press("Escape")
+    assert not answers(page).count()
+
+
+def test_the_picture_is_drawn_again_once_the_server_is_back(opened, desk_address):
+    opened.expected.append("ERR_FAILED")
+    page = opened(desk_address, "server")
+    page.route("**/api/**", lambda route: route.abort())
+    page.locator("#view").press("ArrowLeft")
+    notice = page.get_by_role("alert").filter(has_text="The server has stopped")
+    notice.wait_for()
+    page.wait_for_timeout(1000)
+    drawn(page, lambda: page.unroute("**/api/**"))
+    notice.wait_for(state="hidden")
+
+
+def test_long_labels_of_boxes_end_in_the_picture_of_a_phone(opened, desk_address):
+    page = opened(desk_address)
+    page.set_viewport_size({"width": 390, "height": 780})
+    keep(page, "the book on the left side of the desk beside the mug near the window")
+    label = page.locator("#overlay text", has_text="the book on")
+    label.wait_for()
+    box = label.bounding_box()
+    assert box["x"] >= 0 and box["x"] + box["width"] <= 390
+    assert re.fullmatch(r"the book on .*… 0\.\d\d", label.text_content())
+
+
 def test_labels_of_boxes_do_not_cover_each_other(opened, desk_address):
     page = opened(desk_address)
     for text in ("mug", "mug > handle", "book"):

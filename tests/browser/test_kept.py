@@ -9,7 +9,19 @@ import av
 import pytest
 from plyfile import PlyData
 
-from tests.browser.conftest import answers, ask, ask_and_wait, chips, drawn, keep, late, pixels, save, until
+from tests.browser.conftest import (
+    answers,
+    ask,
+    ask_and_wait,
+    chips,
+    choose_row,
+    drawn,
+    keep,
+    late,
+    pixels,
+    save,
+    until,
+)
 from tests.unit.many_nodes import add_nodes
 
 
@@ -134,6 +146,17 @@ def test_a_saved_page_has_the_answers_of_the_page(opened, desk_address, scene, t
     offline.goto(save(page, "Page with answers", tmp_path / "page.html").as_uri())
     answers(offline).first.wait_for()
     assert answers(offline).first.inner_text() == shown
+
+
+def test_a_kept_answer_has_the_present_name_of_its_node(served, own_desk):
+    page = served(own_desk)
+    keep(page, "book")
+    page.get_by_role("treeitem").last.wait_for()
+    choose_row(page, int(page.locator("#overlay path.kept").get_attribute("data-node")))
+    page.get_by_role("textbox", name="Name").fill("atlas")
+    page.keyboard.press("Enter")
+    page.locator("#view").press("Escape")
+    page.locator("#overlay text", has_text=re.compile(r"^book atlas 0\.\d\d$")).wait_for()
 
 
 def test_a_saved_page_opens_with_the_settings_of_its_last_query(opened, desk_address, scene, tmp_path):

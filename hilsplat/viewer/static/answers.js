@@ -26,7 +26,7 @@ function item(outline, hit, rank, acts, note) {
   const look = acts && { onclick: () => acts.choose(hit.node), onpointerenter: () => acts.hover(hit.node), onpointerleave: () => acts.hover(-1), onfocus: () => acts.hover(hit.node), onblur: () => acts.hover(-1) };
   return make("li", { "data-node": hit.node }, make("button", { type: "button", disabled: !acts, ...look },
     picture(api.cropUrl(outline.variant, hit.node), { width: 48, height: 48 }),
-    make("span", { class: "name" }, hit.name || nameOf(outline, hit.node), make("small", {}, `${rank + 1}. ${hit.level}${note}`)),
+    make("span", { class: "name" }, nameOf(outline, hit.node), make("small", {}, `${rank + 1}. ${hit.level}${note}`)),
     bar(hit.score)));
 }
 

@@ -167,8 +167,8 @@ function showNothing() {
 }
 
 export function clear() {
-  $("save").open = false;
-  if (page.chosen >= 0) choose(-1); else clearAnswer();
+  if ($("save").open) $("save").open = false;
+  else if (page.chosen >= 0) choose(-1); else clearAnswer();
 }
 
 acts.like = like;

@@ -94,7 +94,6 @@ async function renameNow(variant, node, name) {
       each.version = kept.version;
       each.nodes.forEach((entry, row) => { entry.name = kept.names[row] ?? ""; });
     }
-    for (const pane of panes) for (const hit of pane.answer?.hits ?? []) if (hit.node === node) hit.name = name;
     page.outline.renamed(node);
     tell(name ? `Named “${name}”. Queries match this name, here and with hilsplat query.` : "The name was removed.");
     if (page.chosen === node) chooseNow(node);   // after showing the message, because it makes the outline smaller

@@ -56,13 +56,13 @@ function frustums() {
     ...(page.previewing ? [] : page.path).map((camera, k) => ({ kind: "frustum path", label: String(k + 1), corners: camera.corners(depth) }))];
 }
 
-const labelOf = ({ name, score }, text = "") => [...new Set([text, name].filter(Boolean)), score.toFixed(2)].join(" ");
+const labelOf = ({ name, called }, { score }, text = "") => [...new Set([text, name || called].filter((words) => words && words !== "?")), score.toFixed(2)].join(" ");
 
 function boxes(pane, k) {
   const own = outlines.get(variantOf(pane));
   if (!own || $("colour").value === "none") return [];
-  const found = $("colour").value === "answers" ? keptIn(k).flatMap(({ answer, rgb, text }) => shownHits(answer).slice(0, LISTED).map((hit) => ({ node: hit.node, kind: "kept", stroke: `rgb(${rgb.join(" ")})`, label: labelOf(hit, text) }))) : [];
-  for (const hit of shownHits(pane.answer).slice(0, LISTED)) found.push({ node: hit.node, kind: "answer", label: labelOf(hit) });
+  const found = $("colour").value === "answers" ? keptIn(k).flatMap(({ answer, rgb, text }) => shownHits(answer).slice(0, LISTED).map((hit) => ({ node: hit.node, kind: "kept", stroke: `rgb(${rgb.join(" ")})`, label: labelOf(own.nodes[hit.node], hit, text) }))) : [];
+  for (const hit of shownHits(pane.answer).slice(0, LISTED)) found.push({ node: hit.node, kind: "answer", label: labelOf(own.nodes[hit.node], hit) });
   if (!k || variantOf(pane) === variantOf(panes[0])) {
     if (page.chosen >= 0) found.push({ node: page.chosen, kind: "chosen", label: nameOf(own, page.chosen) });
     if (page.hover >= 0 && page.hover !== page.chosen) found.push({ node: page.hover, kind: "hover", label: nameOf(own, page.hover) });

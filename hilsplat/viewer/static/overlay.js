@@ -2,6 +2,13 @@
 
 const EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
 const LETTER_PX = 8, LINE_PX = 16;   // size of a label
+
+// Leave out the middle of a label that is longer than the picture is wide; its end is the score.
+function shortened(label, width) {
+  const most = Math.max(8, Math.floor(width / LETTER_PX) - 1);
+  return label.length > most ? `${label.slice(0, most - 6)}…${label.slice(-5)}` : label;
+}
+
 const NS = "http://www.w3.org/2000/svg";
 
 function element(name, attributes, text) {
@@ -34,15 +41,15 @@ export function drawOverlay(svg, camera, panes, width, height, covered = 0) {
       group.append(made);
       if (label) group.append(element("text", { x: at[0][0], y: at[0][1] }, label));
     }
-    for (const { corners, kind, label, node, stroke = null } of pane.boxes) {
+    for (const { corners, kind, label: whole, node, stroke = null } of pane.boxes) {
       const at = corners.map((corner) => camera.project(corner, k));
       if (at.some((point) => !point)) continue;   // a corner is behind the camera
       if (isOutside(at, each, height)) continue;
       const d = EDGES.map(([a, b]) => `M${at[a][0].toFixed(1)} ${at[a][1].toFixed(1)}L${at[b][0].toFixed(1)} ${at[b][1].toFixed(1)}`).join("");
       group.append(element("path", { d, class: "shadow" }), element("path", { d, class: kind, "data-node": node, ...(stroke ? { stroke } : {}) }));
       const top = at.reduce((best, point) => point[1] < best[1] ? point : best);
-      if (!label) continue;
-      const x = Math.max(4, Math.min(each - LETTER_PX * label.length, top[0])), right = x + LETTER_PX * label.length;
+      if (!whole) continue;
+      const label = shortened(whole, each), x = Math.max(4, Math.min(each - LETTER_PX * label.length, top[0])), right = x + LETTER_PX * label.length;
       let y = Math.max(covered + 14, top[1] - 6);
       while (placed.some((other) => x < other.right && other.x < right && Math.abs(y - other.y) < LINE_PX)) y += LINE_PX;   // below other labels
       placed.push({ x, right, y });

@@ -3,7 +3,7 @@
 import * as api from "./api.js";
 import { ask, askAs, clearAnswer, listAnswers } from "./asking.js";
 import { choose } from "./choosing.js";
-import { restyle } from "./drawing.js";
+import { redraw, restyle } from "./drawing.js";
 import { $, counted, make } from "./elements.js";
 import { askKeptAgain, keepFromStart } from "./kept.js";
 import { isStopped, showStopped } from "./stopped.js";
@@ -70,6 +70,7 @@ export async function watch() {
     if (document.hidden) continue;
     try {
       const now = await api.changes();
+      if (!$("stopped").hidden) redraw();
       showStopped(false);
       if (now.of !== page.scene.of || now.changed.length) sceneChanged(now.changed);
       else if (now.variants.join() !== page.scene.variants.join()) await moreAnswer(now.variants);
@@ -87,7 +88,6 @@ async function renamedElsewhere(versions) {
     nodes.forEach(({ name }, row) => {
       if (own.nodes[row].name === name) return;
       own.nodes[row].name = name;
-      for (const pane of panes) for (const hit of pane.answer?.hits ?? []) if (variantOf(pane) === variant && hit.node === row) hit.name = name;
       if (own === main()) page.outline.renamed(row);
     });
     listAnswers();
