@@ -128,6 +128,17 @@ def test_the_picture_is_drawn_again_once_the_server_is_back(opened, desk_address
     notice.wait_for(state="hidden")
 
 
+@pytest.mark.parametrize("path", ["splats/0", "variant/default", "nodes/default"])
+def test_what_a_lost_connection_interrupts_is_loaded_later(opened, desk_address, path):
+    opened.expected.append("ERR_FAILED")
+    page = opened(desk_address)
+    lost = []
+    page.route(f"**/api/{path}?**", lambda route: route.continue_() if lost else route.abort() or lost.append(1))
+    page.reload()
+    ask_and_wait(page, "mug > handle")
+    assert lost and page.locator("#view").get_attribute("data-painter") == "gl"
+
+
 def test_long_labels_of_boxes_end_in_the_picture_of_a_phone(opened, desk_address):
     page = opened(desk_address)
     page.set_viewport_size({"width": 390, "height": 780})
