@@ -1,11 +1,13 @@
 """The annotation page in a real browser; elements are found by role and label."""
 
+import io
 import json
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from hilsplat.annotate.labels import Label, label_path, read_labels, write_labels
 from hilsplat.base.tables import write_csv
@@ -529,3 +531,18 @@ def test_annotations_of_another_tab_appear_and_ids_stay_apart(page, opened, tmp_
     ids = [label.id for view in ("000.png", "001.png") for label in kept(tmp_path, view)]
     assert ids == [1, 2]
     other.close()
+
+
+def test_outlines_are_as_thin_on_a_small_photograph_as_on_a_large_one(page):
+    draw_mug(page)
+    page.locator("#view").press("v")
+    page.locator("#view").press("Escape")
+    page.mouse.move(5, 5)
+    for factor in (1, 2):
+        page.evaluate(f"hilsplat.sheet.zoom({factor})")
+        x, y = place(page, 15, 10)
+        clip = {"x": x - 30, "y": y, "width": 60, "height": 1}
+        row = np.asarray(Image.open(io.BytesIO(page.screenshot(clip=clip))).convert("RGB")).astype(int)[0]
+        stroke = page.evaluate("getComputedStyle(document.querySelector('#drawing .thing')).stroke")
+        colour = [int(value) for value in re.findall(r"\d+", stroke)]
+        assert 1 <= (np.abs(row - colour).max(axis=1) < 12).sum() <= 4

@@ -49,6 +49,7 @@ export class Sheet {
 
   place() {
     $("sheet").style.transform = `translate(${this.x}px, ${this.y}px) scale(${this.scale})`;
+    $("sheet").style.setProperty("--px", 1 / this.scale);
     $("sheet").classList.toggle("near", this.scale > 2);
   }
 
