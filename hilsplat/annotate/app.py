@@ -229,12 +229,10 @@ class Annotator:
 
 def _all_labels(opened: OpenedScene, of: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the annotations and file version of every view, in view order."""
-    names = opened.scene.cameras.names
-    versions = opened.versions()  # before the labels are read
-    known = opened.known()
+    versions, known = opened.versions(), opened.known()  # in this order
     return [
         {"version": version, "labels": [label.model_dump() for label in known.get(view, ())]}
-        for view, version in zip(names, versions, strict=True)
+        for view, version in zip(opened.scene.cameras.names, versions, strict=True)
     ]
 
 

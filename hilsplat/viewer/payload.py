@@ -1,7 +1,6 @@
 """Data for the page: scene, nodes, answers and boxes as JSON, and the Gaussians' order and nodes."""
 
 import gzip
-import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -115,11 +114,8 @@ def described_nodes(scene: LanguageScene) -> dict[str, Any]:
                 "surface": naming is not None and naming.surfaces[node],
                 "gaussians": int(members[node]),
                 "views": int(tree.views[node]),
-                "quality": round(float(tree.quality[node]), 3),
-                "centroid": [round(value, 5) for value in tree.centroid[node].tolist()],
                 "corners": corners[node],
                 "size": [round(value, 5) for value in tree.oriented_box[node][4].tolist()],
-                "best_view": tree.view_names[int(tree.view_area_px[node].argmax())],
             }
             for node in range(len(tree))
         ],
@@ -157,7 +153,6 @@ class Answer(TypedDict):
     doubts: list[str]
     caution: str
     route: str
-    ms: float
 
 
 def answer(scene: LanguageScene, asked: Question, answerer: str = "tree") -> Answer:
@@ -166,7 +161,6 @@ def answer(scene: LanguageScene, asked: Question, answerer: str = "tree") -> Ans
     Raises:
         SettingsError: the text is empty, or the view does not exist.
     """
-    begin = time.perf_counter()
     view = None if asked.view is None else view_name(scene.scene, asked.view)
     nodes = scene.select(
         asked.text, level=asked.level, answerer=answerer, view=view, threshold=asked.threshold
@@ -178,7 +172,6 @@ def answer(scene: LanguageScene, asked: Question, answerer: str = "tree") -> Ans
         "doubts": [str(doubt) for doubt in doubts_of(nodes)],
         "caution": scene.caution_about(asked.text),
         "route": nodes.route,
-        "ms": round(1e3 * (time.perf_counter() - begin), 2),
     }
 
 
@@ -208,7 +201,6 @@ def _answer(scene: LanguageScene, text: str, hits: Sequence[Hit], relevancy: np.
         "doubts": [],
         "caution": "",
         "route": "like",
-        "ms": 0,
     }
 
 

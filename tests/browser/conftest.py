@@ -257,7 +257,7 @@ def save(page, name: str, path: Path) -> Path:
 def on_page(page, *points: tuple[float, float, float]) -> np.ndarray:
     """Positions of points of the scene on the page, px."""
     view = page.locator("#view").bounding_box()
-    return projected(wire_camera(page), *points) + (view["x"], view["y"])
+    return projected(wire_camera(page), *points) + np.array([view["x"], view["y"]])
 
 
 def projected(wire: dict, *points: tuple[float, float, float]) -> np.ndarray:

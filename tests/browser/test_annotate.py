@@ -546,3 +546,18 @@ def test_outlines_are_as_thin_on_a_small_photograph_as_on_a_large_one(page):
         stroke = page.evaluate("getComputedStyle(document.querySelector('#drawing .thing')).stroke")
         colour = [int(value) for value in re.findall(r"\d+", stroke)]
         assert 1 <= (np.abs(row - colour).max(axis=1) < 12).sum() <= 4
+
+
+def test_a_file_that_is_dropped_on_the_page_is_imported(page, tmp_path):
+    draw_mug(page)
+    mug = label_path(tmp_path / "annotated/photos/desk", "000.png").read_text()
+    page.keyboard.press("Control+z")
+    saved(page)
+    drop = """(text) => {
+        const data = new DataTransfer(), panel = document.getElementById("panel");
+        data.items.add(new File([text], "000.json"));
+        const event = new DragEvent("drop", { dataTransfer: data, bubbles: true, cancelable: true });
+        return !panel.dispatchEvent(event);   // or the browser would leave the page to open the file
+    }"""
+    assert page.evaluate(drop, mug)
+    page.get_by_text("1 label imported into 1 photograph.").wait_for()

@@ -133,7 +133,9 @@ def test_what_a_lost_connection_interrupts_is_loaded_later(opened, desk_address,
     opened.expected.append("ERR_FAILED")
     page = opened(desk_address)
     lost = []
-    page.route(f"**/api/{path}?**", lambda route: route.continue_() if lost else route.abort() or lost.append(1))
+    page.route(
+        f"**/api/{path}?**", lambda route: route.continue_() if lost else route.abort() or lost.append(1)
+    )
     page.reload()
     ask_and_wait(page, "mug > handle")
     assert lost and page.locator("#view").get_attribute("data-painter") == "gl"
@@ -294,7 +296,7 @@ def test_queries_with_an_image_a_framed_part_of_the_view_and_a_node(opened, desk
         page.evaluate(f"{moved} && hilsplat.camera.orbit({moved}, 0); hilsplat.redraw()")
         width = page.locator("#view").bounding_box()["width"] / 2
         wire = page.evaluate(f"hilsplat.camera.wire({width}, document.getElementById('view').clientHeight)")
-        low, high = (projected(wire, place)[0] + (PANEL_PX + width, 0) for place in ((18, 18, 0), (34, 22, 0)))
+        low, high = projected(wire, (18, 18, 0), (34, 22, 0)) + (PANEL_PX + width, 0)
         frame(page, low, high)
         answers(page).first.wait_for()
         assert page.locator("#answers li").first.get_attribute("data-node") == str(book)

@@ -257,8 +257,9 @@ function accept() {
 function step(way) {
   if (way === "undo" && draft.length) { draft = draft.slice(0, -1); draw(); return; }
   tell("");   // the last message no longer applies
-  const changed = store[way]();
-  if (changed.length && !changed.includes(number)) stand(changed[0]);
+  const before = store[way === "undo" ? "past" : "future"].at(-1)?.before ?? [];
+  store[way]();
+  if (before.length && !before.some(([view]) => view === number)) stand(before[0][0]);
 }
 
 function remove(view = number, id = aim.id) {
@@ -392,6 +393,8 @@ for (const radio of document.querySelectorAll("[name=tool]")) radio.addEventList
 for (const [id, work] of Object.entries({ new: () => fresh(), child: () => fresh(true), accept, delete: () => remove(), undo: () => step("undo"), redo: () => step("redo"),
   carry: () => transfer(), reload: () => location.reload(), import: () => $("file").click(), "help-button": () => $("help").showModal() })) $(id).addEventListener("click", work);
 $("file").addEventListener("change", () => { const files = [...$("file").files]; $("file").value = ""; $("save").open = false; soon(() => take_in(files)); });
+document.addEventListener("dragover", (event) => event.preventDefault());
+document.addEventListener("drop", (event) => { event.preventDefault(); const files = [...event.dataTransfer.files]; if (files.length) soon(() => take_in(files)); });
 $("radius").addEventListener("input", draw);
 window.addEventListener("pagehide", () => { if (store.views) store.remember(scene.folder); });
 window.addEventListener("beforeunload", (event) => { if (store.unsaved || waiting || draft.length) event.preventDefault(); });

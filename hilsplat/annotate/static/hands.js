@@ -9,11 +9,7 @@ export function attachHands(sheet, { drawing, down, drag, up, cancel, hover, clo
   host.addEventListener("pointerdown", (event) => {
     host.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, { x: event.clientX, y: event.clientY, moved: 0 });
-    if (pointers.size === 2) {
-      if (acting) ([...pointers.values()][0].moved < STILL_PX ? cancel : up)();
-      acting = false; apart = 0;
-      return;
-    }
+    if (pointers.size === 2) { if (acting) ([...pointers.values()][0].moved < STILL_PX ? cancel : up)(); acting = false; apart = 0; return; }
     acting = event.button === 0 && Boolean(drawing(event));
     if (acting) down(sheet.pixel(event), event);
   });

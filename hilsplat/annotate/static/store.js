@@ -71,16 +71,9 @@ export class Store {
     this.future = [];
   }
 
-  undo() { return this.step(this.past, this.future); }
-  redo() { return this.step(this.future, this.past); }
-
-  // Return the photographs that changed.
-  step(from, to) {
-    if (!from.length) return [];
-    const entry = this.swap(from.pop().before);
-    to.push(entry);
-    return entry.before.map(([number]) => number);
-  }
+  undo() { this.step(this.past, this.future); }
+  redo() { this.step(this.future, this.past); }
+  step(from, to) { if (from.length) to.push(this.swap(from.pop().before)); }
 
   // Return a history entry: the previous labels, and the photographs whose change the server has not accepted yet.
   swap(after) {

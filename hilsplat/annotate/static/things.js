@@ -1,7 +1,7 @@
 // The objects of a photograph as a tree widget, the form of the chosen object, and the strip of photographs.
 
 import { thumbUrl } from "./api.js";
-import { $, counted, LEVELS, make } from "./elements.js";
+import { $, attachArrows, counted, LEVELS, make } from "./elements.js";
 import { colour, element } from "./sheet.js";
 
 export const LEVEL = (label) => LEVELS[label.level - 1];
@@ -69,13 +69,7 @@ export function showTexts(things) {
 export function makeStrip(views, stand) {
   $("views").replaceChildren(...views.map((view, number) => make("button", { type: "button", role: "option", class: view.split, title: view.name, onclick: () => stand(number) },
     make("img", { src: thumbUrl(number), alt: "", loading: "lazy" }))));
-  $("views").addEventListener("keydown", (event) => {
-    const all = [...$("views").children], by = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
-    if (!by) return;
-    const next = all[all.indexOf(document.activeElement) + by];
-    if (next) { next.focus(); next.click(); }
-    event.preventDefault(); event.stopPropagation();
-  });
+  attachArrows($("views"));
 }
 
 export function markStrip(views, store, number) {

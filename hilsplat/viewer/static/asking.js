@@ -6,8 +6,8 @@ import { acts, choose, paneAt } from "./choosing.js";
 import { overlay, redraw, restyle } from "./drawing.js";
 import { $, nameOf } from "./elements.js";
 import { asking, keep, showKept, whenReopened } from "./kept.js";
-import { answererOf, failed, level, main, outlines, page, panes, setThreshold, tell, variantOf } from "./state.js";
-import { styleOf } from "./styles.js";
+import { answererOf, failed, level, main, outlines, page, panes, setQuery, tell, variantOf } from "./state.js";
+import { base64, styleOf } from "./styles.js";
 
 const PICTURE_PX = 512;
 let aborting = new AbortController();
@@ -99,12 +99,10 @@ export async function keepAnswer() {
   $("text").focus();
 }
 
-whenReopened(({ text, level: at, threshold: least, view }) => {
-  $("here").checked = view !== undefined;
-  if (view !== undefined) page.camera.standAt(page.scene.views[view], view);
-  document.querySelector(`[name=level][value=${at}]`).checked = true;
-  setThreshold(least ?? null);
-  $("text").value = text;
+whenReopened((asked) => {
+  if (asked.view !== undefined) page.camera.standAt(page.scene.views[asked.view], asked.view);
+  setQuery(asked);
+  $("text").value = asked.text;
   ask();
 });
 
@@ -123,11 +121,9 @@ export async function askPicture(source, part = null) {
     const scale = Math.min(1, PICTURE_PX / Math.max(w, h)), canvas = new OffscreenCanvas(Math.max(1, Math.round(w * scale)), Math.max(1, Math.round(h * scale)));
     canvas.getContext("2d").drawImage(image, x, y, w, h, 0, 0, canvas.width, canvas.height);
     const bytes = new Uint8Array(await (await canvas.convertToBlob({ type: "image/jpeg", quality: 0.9 })).arrayBuffer());
-    let text = "";
-    for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
     $("text").value = "";
     choose(-1);
-    await askAll({}, (pane, signal) => api.like({ variant: variantOf(pane), picture: btoa(text) }, signal));
+    await askAll({}, (pane, signal) => api.like({ variant: variantOf(pane), picture: base64(bytes) }, signal));
   } catch (error) { failed(error); }
 }
 

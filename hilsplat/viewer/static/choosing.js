@@ -7,7 +7,7 @@ import { painted, restyle } from "./drawing.js";
 import { LEVELS } from "./elements.js";
 import { flyTo } from "./flights.js";
 import { inOrder, latest } from "./latest.js";
-import { failed, host, level, loadVariant, main, outlines, page, panes, tell, variantOf } from "./state.js";
+import { failed, host, level, main, outlines, page, panes, tell, variantOf } from "./state.js";
 import { wireStyle } from "./styles.js";
 
 // Actions of lists and cards of nodes; asking.js adds `like`.
@@ -78,6 +78,15 @@ const hoverAt = latest(async (x, y) => {
 let pointing = 0;
 export const pointed = (x, y) => { clearTimeout(pointing); pointing = setTimeout(() => hoverAt(x, y), page.painter?.kind === "gl" && !page.slow ? 16 : 60); };
 
+// Show the names that a tree's nodes have on the server.
+export async function readNames(own) {
+  const { nodes, version } = await api.variant(own.variant);
+  own.version = version;
+  nodes.forEach(({ name }, row) => { if (own.nodes[row].name !== name) { own.nodes[row].name = name; if (own === main()) page.outline.renamed(row); } });
+  acts.list();
+  restyle();
+}
+
 const nextName = inOrder(failed);   // each name is sent with the version that the one before it made
 function rename(node, name) {
   const variant = variantOf(panes[0]);
@@ -99,6 +108,6 @@ async function renameNow(variant, node, name) {
     if (page.chosen === node) chooseNow(node);   // after showing the message, because it makes the outline smaller
     acts.list();
   } catch (error) {
-    if (error.status === 412) { await loadVariant(own.variant, true); page.outline.show(main()); choose(page.chosen); tell("The names were changed elsewhere and have been reloaded. Name the node again.", true); } else failed(error);
+    if (error.status === 412) { await readNames(own); choose(page.chosen); tell("The names were changed elsewhere and have been reloaded. Name the node again.", true); } else failed(error);
   }
 }

@@ -69,10 +69,9 @@ export function attachHands() {
     $("threshold-told").textContent = Number($("threshold-at").value).toFixed(2);
     restyle();
   };
-  const askAgain = () => { if (page.asked?.text && !api.offline) ask(true); };
-  $("threshold-on").addEventListener("change", () => { thresholdChanged(); askAgain(); });
+  $("threshold-on").addEventListener("change", () => { thresholdChanged(); levelChanged(); });
   $("threshold-at").addEventListener("input", thresholdChanged);
-  $("threshold-at").addEventListener("change", askAgain);
+  $("threshold-at").addEventListener("change", levelChanged);
   $("colour").addEventListener("change", () => {
     if (["relevancy", "field"].includes($("colour").value) && !page.asked) tell("Run a query first: these colours show how well nodes or Gaussians match it.");
     fillField();
@@ -85,8 +84,8 @@ export function attachHands() {
   $("picture-button").addEventListener("click", () => $("picture").click());
   $("picture").addEventListener("change", () => { if ($("picture").files[0]) askPicture($("picture").files[0]); $("picture").value = ""; });
   document.addEventListener("paste", (event) => { const file = [...event.clipboardData.files].find((each) => each.type.startsWith("image/")); if (file) askPicture(file); });
-  host.addEventListener("dragover", (event) => event.preventDefault());
-  host.addEventListener("drop", (event) => { event.preventDefault(); const file = event.dataTransfer.files[0]; if (file?.type.startsWith("image/")) askPicture(file); });
+  document.addEventListener("dragover", (event) => event.preventDefault());
+  document.addEventListener("drop", (event) => { event.preventDefault(); const file = event.dataTransfer.files[0]; if (file?.type.startsWith("image/")) askPicture(file); });
   new ResizeObserver(redraw).observe(host);
   window.addEventListener("popstate", () => {   // Back and Forward restore the query of that entry
     const kept = new URLSearchParams(location.hash.slice(1)), text = kept.get("q") ?? "";

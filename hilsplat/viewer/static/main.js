@@ -21,7 +21,19 @@ function choosePainter(gl) {
   host.dataset.gl = gl.name;
   if (wanted === "server" && !api.offline) return serverPainter();
   host.dataset.painter = "gl";
-  return new Renderer(host, redraw);
+  return new Renderer(host, redraw, lost);
+}
+
+function lost() {
+  if (api.offline) { tell("The graphics card was reset: reload the page.", true); return; }
+  page.painter = insteadOf(page.painter, "The graphics card was reset");
+  redraw();
+}
+
+function insteadOf(painter, why) {
+  painter?.canvas.remove();
+  tell(`${why}, so the server renders the scene.`);
+  return serverPainter();
 }
 
 function serverPainter() {
@@ -43,9 +55,8 @@ async function begin() {
   if (made.kind === "gl") {
     try { await made.load(page.scene, api.splats, arriving); } catch (error) {
       if (api.offline) throw error;
-      made.canvas.remove();
-      console.warn(error); tell(`${error.message}, so the server renders the scene.`);
-      made = serverPainter();
+      console.warn(error);
+      made = insteadOf(made, error.message);
     }
   }
   page.painter = made;

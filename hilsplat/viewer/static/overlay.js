@@ -2,13 +2,6 @@
 
 const EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
 const LETTER_PX = 8, LINE_PX = 16;   // size of a label
-
-// Leave out the middle of a label that is longer than the picture is wide; its end is the score.
-function shortened(label, width) {
-  const most = Math.max(8, Math.floor(width / LETTER_PX) - 1);
-  return label.length > most ? `${label.slice(0, most - 6)}…${label.slice(-5)}` : label;
-}
-
 const NS = "http://www.w3.org/2000/svg";
 
 function element(name, attributes, text) {
@@ -49,7 +42,8 @@ export function drawOverlay(svg, camera, panes, width, height, covered = 0) {
       group.append(element("path", { d, class: "shadow" }), element("path", { d, class: kind, "data-node": node, ...(stroke ? { stroke } : {}) }));
       const top = at.reduce((best, point) => point[1] < best[1] ? point : best);
       if (!whole) continue;
-      const label = shortened(whole, each), x = Math.max(4, Math.min(each - LETTER_PX * label.length, top[0])), right = x + LETTER_PX * label.length;
+      const most = Math.max(8, Math.floor(each / LETTER_PX) - 1), label = whole.length > most ? `${whole.slice(0, most - 6)}…${whole.slice(-5)}` : whole;   // ends with the score
+      const x = Math.max(4, Math.min(each - LETTER_PX * label.length, top[0])), right = x + LETTER_PX * label.length;
       let y = Math.max(covered + 14, top[1] - 6);
       while (placed.some((other) => x < other.right && other.x < right && Math.abs(y - other.y) < LINE_PX)) y += LINE_PX;   // below other labels
       placed.push({ x, right, y });

@@ -1,7 +1,7 @@
 // The strip of photographs, and the photograph shown over the view if the camera has the photograph's pose.
 
 import * as api from "./api.js";
-import { $, make } from "./elements.js";
+import { $, attachArrows, make } from "./elements.js";
 import { picture } from "./pictures.js";
 
 export class Photos {
@@ -11,13 +11,7 @@ export class Photos {
     $("views").replaceChildren(...views.map((view, number) => make("button", { type: "button", role: "option", "aria-selected": "false", tabindex: number ? "-1" : "0",
       "aria-label": `${view.name}${view.split === "test" ? ", held out" : ""}`, title: view.name, class: view.split, onclick: () => stand(number) },
     picture(api.thumbUrl(number), {}))));
-    $("views").addEventListener("keydown", (event) => {
-      const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
-      if (!step) return;
-      const next = $("views").children[[...$("views").children].indexOf(document.activeElement) + step];
-      if (next) { next.focus(); next.click(); }
-      event.preventDefault(); event.stopPropagation();
-    });
+    attachArrows($("views"));
     $("photo").addEventListener("load", () => { $("photo").style.visibility = "visible"; });
     $("photo").addEventListener("error", () => { $("photo").dataset.number = ""; });   // so that it is loaded again
   }

@@ -26,14 +26,15 @@ export const main = () => outlines.get(variantOf(panes[0]));
 export function follow(link) {
   page.camera.fromText(link.get("c") ?? "", page.scene.views);
   for (const [id, usual] of [["colour", "answers"], ["mode", "tint"]]) $(id).value = [...$(id).options].some((o) => o.value === link.get(id)) ? link.get(id) : usual;
-  for (const radio of document.querySelectorAll("[name=level]")) radio.checked = radio.value === (link.get("level") ?? "auto");
-  $("here").checked = link.has("view");
-  setThreshold(link.get("least"));
+  const { level, least: threshold, view } = Object.fromEntries(link);
+  setQuery({ level, threshold, view });
 }
 
-export function setThreshold(least) {
-  $("threshold-on").checked = least !== null;
-  if (least !== null) $("threshold-at").value = least;
+export function setQuery({ level = "auto", threshold: least, view }) {
+  for (const radio of document.querySelectorAll("[name=level]")) radio.checked = radio.value === level;
+  $("here").checked = view !== undefined;
+  $("threshold-on").checked = least !== undefined;
+  if (least !== undefined) $("threshold-at").value = least;
   $("threshold-on").dispatchEvent(new Event("change"));
 }
 
@@ -50,8 +51,8 @@ export function sceneChanged(parts = []) {
   $("changed-what").textContent = `The scene has changed${parts.length ? ` (${parts.join(", ")})` : ""}. The page still shows the previous state.`;
 }
 
-export async function loadVariant(name, again = false) {
-  if (outlines.has(name) && !again) return;
-  const [described] = await Promise.all([api.variant(name), again ? null : page.painter.loadNodes(name)]);
+export async function loadVariant(name) {
+  if (outlines.has(name)) return;
+  const [described] = await Promise.all([api.variant(name), page.painter.loadNodes(name)]);
   outlines.set(name, described);
 }

@@ -2,14 +2,12 @@
 
 import * as api from "./api.js";
 import { ask, askAs, clearAnswer, listAnswers } from "./asking.js";
-import { choose } from "./choosing.js";
+import { choose, readNames } from "./choosing.js";
 import { redraw, restyle } from "./drawing.js";
 import { $, counted, make } from "./elements.js";
 import { askKeptAgain, keepFromStart } from "./kept.js";
-import { isStopped, showStopped } from "./stopped.js";
+import { follow } from "./stopped.js";
 import { failed, loadVariant, main, outlines, page, panes, sceneChanged, start, tell, variantOf } from "./state.js";
-
-const POLL_MS = 4000;
 
 export function fillVariants() {
   const choices = page.scene.variants.flatMap((name) => [[`${name}|tree`, `${name}, tree`], [`${name}|field`, `${name}, field`]]);
@@ -64,34 +62,19 @@ export async function choosePanes() {
 }
 
 // Check regularly whether files of the scene changed and whether there are new variants.
-export async function watch() {
-  while ($("changed").hidden) {
-    await new Promise((done) => setTimeout(done, POLL_MS));
-    if (document.hidden) continue;
-    try {
-      const now = await api.changes();
-      if (!$("stopped").hidden) redraw();
-      showStopped(false);
-      if (now.of !== page.scene.of || now.changed.length) sceneChanged(now.changed);
-      else if (now.variants.join() !== page.scene.variants.join()) await moreAnswer(now.variants);
-      else await renamedElsewhere(now.names);
-    } catch (error) { if (isStopped(error)) showStopped(true); else failed(error); }
-  }
-}
+export const watch = () => follow(api.changes, async (now) => {
+  if (page.painter.unfinished) redraw();   // the server could not render the last picture
+  if (!$("changed").hidden) return;
+  if (now.of !== page.scene.of || now.changed.length) sceneChanged(now.changed);
+  else if (now.variants.join() !== page.scene.variants.join()) await moreAnswer(now.variants);
+  else await renamedElsewhere(now.names);
+}, { failed });
 
 // Show names that were given in another tab.
 async function renamedElsewhere(versions) {
   for (const [variant, own] of outlines) {
     if (!(variant in versions) || versions[variant] === own.version) continue;
-    const { nodes, version } = await api.variant(variant);
-    own.version = version;
-    nodes.forEach(({ name }, row) => {
-      if (own.nodes[row].name === name) return;
-      own.nodes[row].name = name;
-      if (own === main()) page.outline.renamed(row);
-    });
-    listAnswers();
-    restyle();
+    await readNames(own);
   }
 }
 
