@@ -561,3 +561,13 @@ def test_a_file_that_is_dropped_on_the_page_is_imported(page, tmp_path):
     }"""
     assert page.evaluate(drop, mug)
     page.get_by_text("1 label imported into 1 photograph.").wait_for()
+
+
+def test_a_part_is_kept_in_a_photograph_without_its_whole(page, tmp_path):
+    draw_mug(page)
+    page.locator("#view").press("j")
+    name(page, "handle")
+    page.locator("#view").press("]")
+    polygon(page, (1, 1), (15, 1), (15, 20))
+    (handle,) = kept(tmp_path, "001.png")
+    assert (handle.text, handle.level, handle.parent) == ("handle", 2, None)

@@ -296,7 +296,7 @@ def test_queries_with_an_image_a_framed_part_of_the_view_and_a_node(opened, desk
         page.evaluate(f"{moved} && hilsplat.camera.orbit({moved}, 0); hilsplat.redraw()")
         width = page.locator("#view").bounding_box()["width"] / 2
         wire = page.evaluate(f"hilsplat.camera.wire({width}, document.getElementById('view').clientHeight)")
-        low, high = projected(wire, (18, 18, 0), (34, 22, 0)) + (PANEL_PX + width, 0)
+        low, high = projected(wire, (18, 18, 0), (34, 22, 0)) + np.array([PANEL_PX + width, 0])
         frame(page, low, high)
         answers(page).first.wait_for()
         assert page.locator("#answers li").first.get_attribute("data-node") == str(book)

@@ -114,13 +114,13 @@ function add(view, thing, mine) {
 const reshaped = (view, id, polygons) => store.change([[view, store.labels(view).map((each) => each.id === id ? { ...each, polygons, origin: edited(each) } : each)]]);
 
 async function region(ring, brush, view, mine) {
-  const label = labelOf(view, mine.id), parent = label ? label.parent : mine.next.parent;
+  const label = labelOf(view, mine.id), parent = label ? label.parent : labelOf(view, mine.next.parent)?.id ?? null;
   if (!label && brush?.erase) { tell("Select the thing to erase from.", true); return; }
   const made = await ask("/api/shape", { view, add: [...(label?.polygons ?? []), ...(ring ? [ring] : [])], stroke: brush, inside: parent ? ringsOf(view, parent) : null });
   if (!made.polygons.length) {
     if (label) remove(view, label.id); else tell("The shape has no pixel inside the photograph and its parent.", true);
   } else if (label) reshaped(view, label.id, made.polygons);
-  else add(view, { ...mine.next, text: mine.next.text || (mine === aim && $("text").value.trim()) || UNNAMED, polygons: made.polygons, origin: "drawn" }, mine);
+  else add(view, { ...mine.next, parent, text: mine.next.text || (mine === aim && $("text").value.trim()) || UNNAMED, polygons: made.polygons, origin: "drawn" }, mine);
 }
 
 function closePolygon() {

@@ -63,8 +63,8 @@ export async function choosePanes() {
 
 // Check regularly whether files of the scene changed and whether there are new variants.
 export const watch = () => follow(api.changes, async (now) => {
-  if (page.painter.unfinished) redraw();   // the server could not render the last picture
   if (!$("changed").hidden) return;
+  if (page.painter.unfinished) redraw();   // the server could not render the last picture
   if (now.of !== page.scene.of || now.changed.length) sceneChanged(now.changed);
   else if (now.variants.join() !== page.scene.variants.join()) await moreAnswer(now.variants);
   else await renamedElsewhere(now.names);
