@@ -50,6 +50,7 @@ function answered(what, answer) {
 export function listAnswers() {
   const right = panes[1];
   showAnswers(main(), panes[0].answer, acts, right && { outline: outlines.get(variantOf(right)), answer: right.answer, by: right.by.replace("|", ", ") });
+  restyle();   // names in the list are also those of labels
 }
 
 export async function fillField() {

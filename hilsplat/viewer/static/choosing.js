@@ -84,7 +84,6 @@ export async function readNames(own) {
   own.version = version;
   nodes.forEach(({ name }, row) => { if (own.nodes[row].name !== name) { own.nodes[row].name = name; if (own === main()) page.outline.renamed(row); } });
   acts.list();
-  restyle();
 }
 
 const nextName = inOrder(failed);   // each name is sent with the version that the one before it made

@@ -14,7 +14,7 @@ import { attachKeys } from "./keyboard.js";
 import { addToPath, attachPath, flown } from "./path.js";
 import { save } from "./saves.js";
 import { attachScenes } from "./scenes.js";
-import { answererOf, failed, follow, host, main, page, panes, tell, variantOf } from "./state.js";
+import { answererOf, failed, host, main, openLink, page, panes, tell, variantOf } from "./state.js";
 import { choosePanes } from "./variants.js";
 
 function showFrustums() {
@@ -91,7 +91,7 @@ export function attachHands() {
     const kept = new URLSearchParams(location.hash.slice(1)), text = kept.get("q") ?? "";
     clearAnswer();
     rememberedAs(text);
-    follow(kept);
+    openLink(kept);
     askAs(kept);
   });
 

@@ -13,7 +13,7 @@ import { restorePath } from "./path.js";
 import { Photos } from "./photos.js";
 import { describe, Renderer } from "./renderer.js";
 import { ServerPainter } from "./server_painter.js";
-import { failed, follow, host, options, page, start, tell } from "./state.js";
+import { failed, host, openLink, options, page, start, tell } from "./state.js";
 import { fillVariants, useVariants, watch } from "./variants.js";
 
 function choosePainter(gl) {
@@ -50,7 +50,7 @@ async function begin() {
   page.photos = new Photos(page.scene.views, stand);
   page.outline = new Outline(acts);
   if (!api.offline) restorePath();
-  follow(start);
+  openLink(start);
   let made = choosePainter(describe());
   if (made.kind === "gl") {
     try { await made.load(page.scene, api.splats, arriving); } catch (error) {

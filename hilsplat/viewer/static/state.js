@@ -23,7 +23,7 @@ export const keptIn = (pane) => page.kept.filter((query) => query.shown && query
 export const main = () => outlines.get(variantOf(panes[0]));
 
 // Set the controls and the camera as in a link.
-export function follow(link) {
+export function openLink(link) {
   page.camera.fromText(link.get("c") ?? "", page.scene.views);
   for (const [id, usual] of [["colour", "answers"], ["mode", "tint"]]) $(id).value = [...$(id).options].some((o) => o.value === link.get(id)) ? link.get(id) : usual;
   const { level, least: threshold, view } = Object.fromEntries(link);

@@ -42,7 +42,6 @@ function showOutline() {
   if (names.length && !api.offline) $("text").placeholder = names.slice(0, 2).join(", or ");
   listAnswers();
   $("about").textContent = `${page.scene.name}: ${counted(page.scene.gaussians, "Gaussian")}. Masks: ${main().masks}. Text and image vectors: ${main().clip}.`;
-  restyle();
 }
 
 export async function choosePanes() {
