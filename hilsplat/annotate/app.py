@@ -157,6 +157,13 @@ class OpenedScene(ShownScene):
             ],
         }
 
+    def versions(self) -> list[str]:
+        """Return the version of every view's annotations, in view order."""
+        return [version_of(label_path(self.labels, view)) for view in self.scene.cameras.names]
+
+    def news(self) -> dict[str, Any]:
+        return {**super().news(), "labels": self.versions()}
+
     def scores(self) -> str:
         """Return the first mean scores that the last run saved, in one line; empty if there are none."""
         means = self.folder / "scores.csv"
@@ -222,12 +229,10 @@ class Annotator:
 
 def _all_labels(opened: OpenedScene, of: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the annotations and file version of every view, in view order."""
-    names = opened.scene.cameras.names
-    versions = [version_of(label_path(opened.labels, view)) for view in names]  # before the labels are read
-    known = opened.known()
+    versions, known = opened.versions(), opened.known()  # in this order
     return [
         {"version": version, "labels": [label.model_dump() for label in known.get(view, ())]}
-        for view, version in zip(names, versions, strict=True)
+        for view, version in zip(opened.scene.cameras.names, versions, strict=True)
     ]
 
 

@@ -21,11 +21,11 @@ from hilsplat.base.levels import Level
 from hilsplat.base.removal import delete
 from hilsplat.datasets.images.hi import by_id, parents_of
 from hilsplat.datasets.images.isat import IsatFile, Polygon, fill_polygons, read_isat, trace_polygons
-from hilsplat.scene.cameras import Camera, Cameras
+from hilsplat.scene.cameras import MAX_SIDE_PX, Camera, Cameras
 from hilsplat.scene.layouts import read_json_object
 from hilsplat.scene.placement import placed
 from hilsplat.web.file_changes import replacing, version_of
-from hilsplat.web.messages import MAX_SIDE_PX, Message, Text
+from hilsplat.web.messages import Message, Text
 
 Origin = Literal["drawn", "edited", "accepted", "proposed"]
 Place = Annotated[int, Field(ge=-MAX_SIDE_PX, le=2 * MAX_SIDE_PX)]

@@ -21,7 +21,7 @@ from hilsplat.base.images import read_image
 from hilsplat.query.names import write_names
 from hilsplat.query.tree_picture import crop
 from hilsplat.viewer import exports, payload, wire
-from hilsplat.viewer.frames import painted, pick, within
+from hilsplat.viewer.frames import faded, painted, pick, within
 from hilsplat.viewer.openapi import description
 from hilsplat.viewer.saved_files import SavedFiles
 from hilsplat.viewer.viewer_scene import ViewerScene
@@ -133,10 +133,10 @@ def _like(shown: ViewerScene, asked: wire.Like) -> payload.Answer:
     """Return nodes similar to a node or a picture."""
     scene = shown.answering(asked.variant)
     if asked.node is not None:
-        hits = scene.like_node(asked.node, limit=payload.LISTED)
+        hits = scene.like_node(asked.node, limit=payload.ALIKE)
         what = scene.name_of(asked.node) or f"node {asked.node}"
         return payload.alike(scene, hits, f"like {what}", [asked.node])
-    hits = scene.like_picture(_picture(asked.picture), limit=payload.LISTED)
+    hits = scene.like_picture(_picture(asked.picture), limit=payload.ALIKE)
     return payload.alike(scene, hits, "like the picture")
 
 
@@ -150,7 +150,9 @@ def _pick(shown: ViewerScene, asked: wire.Pick) -> dict[str, Any]:
     """Return the nodes at a pixel of a camera, with their shares."""
     has_tree = asked.variant in shown.variants
     of_gaussian = shown.answering(asked.variant).tree.node_of_gaussian if has_tree else None
-    gaussians = shown.remaining(asked.removed)
+    gaussians, paint = shown.remaining(asked.removed), shown.paint(asked.variant, asked.style)
+    if paint is not None:
+        gaussians = faded(gaussians, ~paint.hidden)
     picked = pick(gaussians, of_gaussian, asked.camera.camera(), asked.x, asked.y, shown.threads)
     return picked or {"nodes": [], "alpha": 0}
 
@@ -167,8 +169,8 @@ def _within(shown: ViewerScene, asked: wire.Region) -> bytes:
     """Return one bit for each Gaussian: whether its centre is in a region of a picture."""
     found = within(shown.gaussians.means, asked.camera.camera(), asked.points, asked.radius)
     paint = shown.paint(asked.variant, asked.style)
-    if paint is not None and paint.mode == "isolate":
-        found &= paint.share > 0
+    if paint is not None:
+        found &= ~paint.hidden
     return shown.bits_of(found)
 
 

@@ -45,6 +45,11 @@ class Paint:
     share: Float32[np.ndarray, " N"]
     mode: str
 
+    @property
+    def hidden(self) -> Bool[np.ndarray, " N"]:
+        """Whether each Gaussian is invisible."""
+        return (self.share == 0) & (self.mode == "isolate")
+
     @staticmethod
     def plain(count: int) -> "Paint":
         """Return the scene's own colours."""

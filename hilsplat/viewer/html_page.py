@@ -33,7 +33,6 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
         StaleSceneError: a part of the scene was rewritten since it was opened.
     """
     scene, rows = shown.answering(asked.variant), shown.kept_rows(asked.removed)
-    questions = [*asked.kept, *([asked.last] if asked.last else [])]
     with shown.unchanged():
         images = [resize_to_fit(scene.views.image(view), PHOTO_PX) for view in scene.views.names]
     described: dict[str, Any] = {
@@ -45,11 +44,10 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
             "restart": "",
         },
         "variant": shown.described_variant(asked.variant),
-        "asked": [question.model_dump(exclude_none=True) for question in questions],
-        "answers": [payload.answer(scene, question, asked.answerer) for question in questions],
-        "kept": len(asked.kept),
+        "asked": [question.model_dump(exclude_none=True) for question in asked.asked],
+        "answers": [payload.answer(scene, question, asked.answerer) for question in asked.asked],
         "photos": [_text(encoded(image, quality=75)) for image in images],
-        "opening": asked.start,
+        "link": asked.link,
         "crops": {},
     }
     nodes = list(range(len(scene.tree)))

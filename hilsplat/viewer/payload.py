@@ -1,7 +1,6 @@
 """Data for the page: scene, nodes, answers and boxes as JSON, and the Gaussians' order and nodes."""
 
 import gzip
-import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -23,8 +22,8 @@ from hilsplat.web.server import view_name
 CHUNK = 65_536
 """Gaussians per chunk: 16 rows of the page's textures."""
 
-LISTED = 24
-"""Maximum number of answers in the list."""
+ALIKE = 24
+"""Maximum number of similar nodes in an answer."""
 
 
 def arrival_order(gaussians: Gaussians) -> Int64[np.ndarray, " N"]:
@@ -115,11 +114,8 @@ def described_nodes(scene: LanguageScene) -> dict[str, Any]:
                 "surface": naming is not None and naming.surfaces[node],
                 "gaussians": int(members[node]),
                 "views": int(tree.views[node]),
-                "quality": round(float(tree.quality[node]), 3),
-                "centroid": [round(value, 5) for value in tree.centroid[node].tolist()],
                 "corners": corners[node],
                 "size": [round(value, 5) for value in tree.oriented_box[node][4].tolist()],
-                "best_view": tree.view_names[int(tree.view_area_px[node].argmax())],
             }
             for node in range(len(tree))
         ],
@@ -147,18 +143,16 @@ class FoundNode(TypedDict):
 class Answer(TypedDict):
     """Answers to a text, or nodes that look like a node or a picture.
 
-    `relevancy` has one value per node, `hits` are the best of `total` answers; `route` is as in `Hit`.
+    `relevancy` has one value per node, `hits` are all answers, best first; `route` is as in `Hit`.
     """
 
     text: str
     level: str
     hits: list[FoundNode]
-    total: int
     relevancy: list[float]
     doubts: list[str]
     caution: str
     route: str
-    ms: float
 
 
 def answer(scene: LanguageScene, asked: Question, answerer: str = "tree") -> Answer:
@@ -167,20 +161,17 @@ def answer(scene: LanguageScene, asked: Question, answerer: str = "tree") -> Ans
     Raises:
         SettingsError: the text is empty, or the view does not exist.
     """
-    begin = time.perf_counter()
     view = None if asked.view is None else view_name(scene.scene, asked.view)
     nodes = scene.select(
         asked.text, level=asked.level, answerer=answerer, view=view, threshold=asked.threshold
     )
     relevancy = scene.node_relevancy(path_of(asked.text)[-1:], answerer)[0]
     return {
-        **_answer(scene, asked.text, scene.hits_of(nodes, LISTED), relevancy),
+        **_answer(scene, asked.text, scene.hits_of(nodes, len(nodes.ids)), relevancy),
         "level": nodes.level.label,
-        "total": len(nodes.ids),
         "doubts": [str(doubt) for doubt in doubts_of(nodes)],
         "caution": scene.caution_about(asked.text),
         "route": nodes.route,
-        "ms": round(1e3 * (time.perf_counter() - begin), 2),
     }
 
 
@@ -206,12 +197,10 @@ def _answer(scene: LanguageScene, text: str, hits: Sequence[Hit], relevancy: np.
             }
             for hit in hits
         ],
-        "total": len(hits),
         "relevancy": np.round(relevancy, 4).tolist(),
         "doubts": [],
         "caution": "",
         "route": "like",
-        "ms": 0,
     }
 
 

@@ -7,6 +7,7 @@ only arrays, so they have their own thread. The response contains lines of JSON,
 
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -19,10 +20,11 @@ from starlette.routing import Route
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.query.hits import NodeGroup, label_comments
 from hilsplat.query.language_scene import LanguageScene
+from hilsplat.query.scene_views import ViewStore
 from hilsplat.splat.gaussians import morton_order
 from hilsplat.viewer import exports, payload, wire
 from hilsplat.viewer.html_page import html_page
-from hilsplat.viewer.viewer_scene import ViewerScene
+from hilsplat.viewer.viewer_scene import VIEWS_MIB, ViewerScene
 from hilsplat.web.scene_thread import SceneThread, Work
 from hilsplat.web.server import as_json, read
 
@@ -41,8 +43,8 @@ class SavedFiles:
             post("/api/export/ply", wire.Selection, _ply),
             post("/api/export/spz", wire.Selection, _spz),
             post("/api/export/boxes", wire.Selection, _boxes),
-            post("/api/export/scene-ply", wire.Edited, _scene_ply),
-            post("/api/export/scene-spz", wire.Edited, _scene_spz),
+            post("/api/export/scene-ply", wire.Edited, _ply),
+            post("/api/export/scene-spz", wire.Edited, _spz),
             self._slow("/api/export/masks", wire.Selection, _masks),
             self._slow("/api/export/film", wire.Film, _film, self.films),
             self._slow("/api/export/page", wire.Page, partial(html_page, static=self.static)),
@@ -86,30 +88,20 @@ class SavedFiles:
         yield result
 
 
-def _ply(shown: ViewerScene, asked: wire.Selection) -> bytes:
-    """Return the Gaussians of nodes as a 3DGS PLY, with labels."""
-    scene, groups = _selected(shown, asked)
+def _ply(shown: ViewerScene, asked: wire.Edited) -> bytes:
+    """Return the scene, or nodes with labels, without removed Gaussians as a 3DGS PLY."""
     rows, labels = _rows(shown, asked)
+    comments = []
+    if isinstance(asked, wire.Selection):
+        scene, groups = _selected(shown, asked)
+        comments = label_comments(groups, scene.name_of)
     with shown.unchanged():
-        return exports.ply(shown.ply, rows, labels, label_comments(groups, scene.name_of))
+        return exports.ply(shown.ply, rows, labels, comments)
 
 
-def _spz(shown: ViewerScene, asked: wire.Selection) -> bytes:
-    """Return the Gaussians of nodes as SPZ."""
+def _spz(shown: ViewerScene, asked: wire.Edited) -> bytes:
+    """Return the scene, or nodes, without removed Gaussians as SPZ."""
     rows, _ = _rows(shown, asked)
-    return shown.spz(rows[morton_order(shown.gaussians.means[rows])])
-
-
-def _scene_ply(shown: ViewerScene, asked: wire.Edited) -> bytes:
-    """Return the scene without removed Gaussians as a 3DGS PLY, with the values of the scene's PLY."""
-    rows = np.sort(shown.kept_rows(asked.removed))
-    with shown.unchanged():
-        return exports.ply(shown.ply, rows)
-
-
-def _scene_spz(shown: ViewerScene, asked: wire.Edited) -> bytes:
-    """Return the scene without removed Gaussians as SPZ."""
-    rows = np.sort(shown.kept_rows(asked.removed))
     return shown.spz(rows[morton_order(shown.gaussians.means[rows])])
 
 
@@ -119,7 +111,11 @@ def _boxes(shown: ViewerScene, asked: wire.Selection) -> dict[str, Any]:
 
 
 def _masks(shown: ViewerScene, asked: wire.Selection) -> exports.Steps:
-    return exports.masks_zip(*_selected(shown, asked))
+    scene, groups = _selected(shown, asked)
+    if asked.removed:
+        rest = replace(scene.views, gaussians=shown.remaining(asked.removed), cache=ViewStore(VIEWS_MIB))
+        scene = replace(scene, views=rest)
+    return exports.masks_zip(scene, groups)
 
 
 def _film(shown: ViewerScene, asked: wire.Film) -> exports.Steps:
@@ -128,8 +124,10 @@ def _film(shown: ViewerScene, asked: wire.Film) -> exports.Steps:
     return exports.film(gaussians, cameras, paint, kind=asked.format, threads=shown.threads)
 
 
-def _rows(shown: ViewerScene, asked: wire.Selection) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows and labels of `exports.labelled` without removed Gaussians."""
+def _rows(shown: ViewerScene, asked: wire.Edited) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the rows of the scene or of nodes, without removed Gaussians, and labels of the nodes' rows."""
+    if not isinstance(asked, wire.Selection):
+        return np.sort(shown.kept_rows(asked.removed)), None
     rows, labels = exports.labelled(*_selected(shown, asked))
     kept = ~shown.marked(asked.removed)[rows]
     if not kept.any():

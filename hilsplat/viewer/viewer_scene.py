@@ -171,7 +171,7 @@ class ViewerScene(ShownScene):
                 self._variants[variant] = parts, replace(scene, names=names)
 
     def described(self) -> dict[str, Any]:
-        state = {"variants": self.variants, "of": self.state, "folder": self.folder.name}
+        state = {"variants": self.variants, "of": self.state}
         state["gaussians_sha256"] = self.splats_tag
         state["restart"] = shlex.join(["hilsplat", "view", str(self.folder)])
         return payload.described_scene(self.scene, self.gaussians) | state

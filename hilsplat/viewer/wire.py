@@ -146,11 +146,12 @@ class FieldRelevancy(Asked):
 
 
 class Pick(Edited):
-    """A pixel of the page's picture."""
+    """A pixel of the page's picture in a style, which may hide Gaussians."""
 
     camera: WireCamera
     x: float
     y: float
+    style: Style = Style()
 
 
 class Members(Asked):
@@ -226,10 +227,9 @@ class Names(Asked):
 
 
 class Page(Edited):
-    """A page as one HTML file, with the answers to kept queries and to the last query."""
+    """A page as one HTML file, with the answers to some queries."""
 
-    kept: Annotated[tuple[Question, ...], Field(max_length=40)] = ()
-    last: Question | None = None
+    asked: Annotated[tuple[Question, ...], Field(max_length=40)] = ()
     answerer: Answerer = "tree"
-    start: Annotated[str, Field(max_length=400, pattern=r"^(v\d+|[-+.,e\d]*)$")] = ""
-    """Initial camera, in the format of the page's address; empty for the first photograph's camera."""
+    link: Annotated[str, Field(max_length=100_000)] = ""
+    """Part after # of the address that the page opens with; empty for the first photograph's camera."""

@@ -256,7 +256,12 @@ def save(page, name: str, path: Path) -> Path:
 
 def on_page(page, *points: tuple[float, float, float]) -> np.ndarray:
     """Positions of points of the scene on the page, px."""
-    wire, view = wire_camera(page), page.locator("#view").bounding_box()
+    view = page.locator("#view").bounding_box()
+    return projected(wire_camera(page), *points) + np.array([view["x"], view["y"]])
+
+
+def projected(wire: dict, *points: tuple[float, float, float]) -> np.ndarray:
+    """Positions of points of the scene in the picture of a camera, px."""
     K, pose = np.array(wire["K"]), np.array(wire["cam_from_world"])
     places = (np.array(points) @ pose[:3, :3].T + pose[:3, 3]) @ K.T
-    return places[:, :2] / places[:, 2:] + (view["x"], view["y"])
+    return places[:, :2] / places[:, 2:]

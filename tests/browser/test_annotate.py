@@ -1,11 +1,13 @@
 """The annotation page in a real browser; elements are found by role and label."""
 
+import io
 import json
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from hilsplat.annotate.labels import Label, label_path, read_labels, write_labels
 from hilsplat.base.tables import write_csv
@@ -453,3 +455,119 @@ def test_a_change_that_could_not_be_saved_is_shown_and_saved_with_the_next_one(p
         "mug",
         "book",
     ]
+
+
+def test_a_text_that_is_being_typed_is_not_replaced_by_a_late_reply(page, tmp_path):
+    late(page, "api/labels")
+    draw_polygon(page, (1, 1), (15, 1), (15, 20), (1, 20))
+    page.locator("#title", has_text="unnamed").wait_for()
+    page.keyboard.type("mug")
+    saved(page)
+    assert page.locator("#text").input_value() == "mug"
+    page.keyboard.press("Enter")
+    saved(page)
+    assert [label.text for label in kept(tmp_path)] == ["mug"]
+
+
+def test_a_photograph_is_not_shown_below_the_outlines_of_the_next_one(page):
+    held = []
+    page.route("**/api/photo/1*", lambda route: held.append(route))
+    page.locator("#view").press("]")
+    page.wait_for_timeout(300)
+    assert held and not page.locator("#picture").is_visible()
+    held[0].continue_()
+    page.locator("#picture").wait_for()
+
+
+@pytest.mark.parametrize("tool", ["b", "p"])
+def test_two_fingers_move_the_photograph_without_drawing(annotating, desk, tmp_path, tool):
+    page = annotating(desk, has_touch=True)
+    name(page, "mug")
+    page.locator("#view").press(tool)
+    scale = page.evaluate("hilsplat.sheet.scale")
+    fingers = page.context.new_cdp_session(page)
+    for kind, columns in (
+        ("touchStart", [10]),
+        ("touchStart", [10, 20]),
+        ("touchMove", [8, 26]),
+        ("touchEnd", []),
+    ):
+        points = [dict(zip("xy", place(page, column, 10), strict=True)) for column in columns]
+        fingers.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    saved(page)
+    assert page.evaluate("hilsplat.sheet.scale") > 1.1 * scale
+    assert kept(tmp_path) == [] and not page.locator("#drawing .draft").count()
+
+
+def test_undo_shows_the_photograph_that_it_changes(page, tmp_path):
+    draw_mug(page)
+    page.locator("#view").press("]")
+    page.locator("#view").press("Control+z")
+    saved(page)
+    assert kept(tmp_path) == [] and page.url.endswith("view=0")
+
+
+@pytest.mark.parametrize("key", ["]", "b"])
+def test_an_unfinished_polygon_is_kept_when_the_photograph_or_the_tool_changes(page, tmp_path, key):
+    name(page, "mug")
+    page.locator("#view").press("p")
+    for corner in ((1, 1), (15, 1), (15, 20)):
+        page.mouse.click(*place(page, *corner))
+    page.keyboard.press(key)
+    saved(page)
+    assert [label.text for label in kept(tmp_path)] == ["mug"]
+
+
+def test_annotations_of_another_tab_appear_and_ids_stay_apart(page, opened, tmp_path):
+    other = page.context.new_page()
+    other.goto(page.url)
+    other.locator("body[data-ready=yes]").wait_for()
+    draw_mug(other)
+    page.get_by_role("treeitem", name="mug, whole").wait_for()
+    page.locator("#view").press("]")
+    draw_book(page)
+    other.locator("#views button").nth(1).click()
+    other.get_by_role("treeitem", name="book, whole").wait_for()
+    ids = [label.id for view in ("000.png", "001.png") for label in kept(tmp_path, view)]
+    assert ids == [1, 2]
+    other.close()
+
+
+def test_outlines_are_as_thin_on_a_small_photograph_as_on_a_large_one(page):
+    draw_mug(page)
+    page.locator("#view").press("v")
+    page.locator("#view").press("Escape")
+    page.mouse.move(5, 5)
+    for factor in (1, 2):
+        page.evaluate(f"hilsplat.sheet.zoom({factor})")
+        x, y = place(page, 15, 10)
+        clip = {"x": x - 30, "y": y, "width": 60, "height": 1}
+        row = np.asarray(Image.open(io.BytesIO(page.screenshot(clip=clip))).convert("RGB")).astype(int)[0]
+        stroke = page.evaluate("getComputedStyle(document.querySelector('#drawing .thing')).stroke")
+        colour = [int(value) for value in re.findall(r"\d+", stroke)]
+        assert 1 <= (np.abs(row - colour).max(axis=1) < 12).sum() <= 4
+
+
+def test_a_file_that_is_dropped_on_the_page_is_imported(page, tmp_path):
+    draw_mug(page)
+    mug = label_path(tmp_path / "annotated/photos/desk", "000.png").read_text()
+    page.keyboard.press("Control+z")
+    saved(page)
+    drop = """(text) => {
+        const data = new DataTransfer(), panel = document.getElementById("panel");
+        data.items.add(new File([text], "000.json"));
+        const event = new DragEvent("drop", { dataTransfer: data, bubbles: true, cancelable: true });
+        return !panel.dispatchEvent(event);   // or the browser would leave the page to open the file
+    }"""
+    assert page.evaluate(drop, mug)
+    page.get_by_text("1 label imported into 1 photograph.").wait_for()
+
+
+def test_a_part_is_kept_in_a_photograph_without_its_whole(page, tmp_path):
+    draw_mug(page)
+    page.locator("#view").press("j")
+    name(page, "handle")
+    page.locator("#view").press("]")
+    polygon(page, (1, 1), (15, 1), (15, 20))
+    (handle,) = kept(tmp_path, "001.png")
+    assert (handle.text, handle.level, handle.parent) == ("handle", 2, None)

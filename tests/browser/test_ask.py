@@ -12,6 +12,7 @@ from hilsplat.base.images import write_png
 from hilsplat.query.names import read_names
 from tests.browser.conftest import (
     HEIGHT,
+    PANEL_PX,
     WIDTH,
     answers,
     ask,
@@ -23,6 +24,7 @@ from tests.browser.conftest import (
     late,
     on_page,
     pixels,
+    projected,
     save,
     serving,
     until,
@@ -72,6 +74,82 @@ def test_an_answer_outside_the_view_is_one_click_away(opened, desk_address):
     ask(page, "unicorn")
     status = page.get_by_role("status").filter(has_text="'unicorn' may not be in the scene").inner_text()
     assert status.index("may not be in the scene") < status.index("answer")  # a doubt comes first
+
+
+@both
+def test_what_others_hides_is_not_chosen(opened, desk_address, painter):
+    page = opened(desk_address, painter)
+    page.get_by_label("Others").select_option("isolate")
+    ask_and_wait(page, "book")
+    mug, book = on_page(page, (6, 20, 0), (30, 20, 0)).tolist()
+    card = page.get_by_role("region", name="Chosen node")
+    page.mouse.click(*book)
+    card.wait_for()
+    page.locator("#view").press("Escape")
+    page.mouse.click(*mug)
+    page.wait_for_timeout(500)
+    assert not card.is_visible()
+
+
+def test_a_photograph_is_not_shown_over_the_view_of_another(opened, desk_address):
+    page = opened(desk_address)
+    page.locator("#view").focus()
+    page.keyboard.press("o")
+    page.locator("#photo").wait_for()
+    held = []
+    page.route("**/api/photo/1*", lambda route: held.append(route))
+    page.keyboard.press("]")
+    until(page, lambda: held)
+    page.locator("#photo").wait_for(state="hidden")
+    held[0].continue_()
+    page.locator("#photo").wait_for()
+
+
+def test_escape_closes_the_menu_and_leaves_the_answer(opened, desk_address):
+    page = opened(desk_address)
+    ask_and_wait(page, "mug > handle")
+    page.locator("#save summary").click()
+    page.keyboard.press("Escape")
+    assert not page.get_by_role("button", name="Boxes, JSON").is_visible()
+    assert answers(page).count() == 1
+    page.keyboard.press("Escape")
+    assert not answers(page).count()
+
+
+def test_the_picture_is_drawn_again_once_the_server_is_back(opened, desk_address):
+    opened.expected.append("ERR_FAILED")
+    page = opened(desk_address, "server")
+    page.route("**/api/**", lambda route: route.abort())
+    page.locator("#view").press("ArrowLeft")
+    notice = page.get_by_role("alert").filter(has_text="The server has stopped")
+    notice.wait_for()
+    page.wait_for_timeout(1000)
+    drawn(page, lambda: page.unroute("**/api/**"))
+    notice.wait_for(state="hidden")
+
+
+@pytest.mark.parametrize("path", ["splats/0", "variant/default", "nodes/default"])
+def test_what_a_lost_connection_interrupts_is_loaded_later(opened, desk_address, path):
+    opened.expected.append("ERR_FAILED")
+    page = opened(desk_address)
+    lost = []
+    page.route(
+        f"**/api/{path}?**", lambda route: route.continue_() if lost else route.abort() or lost.append(1)
+    )
+    page.reload()
+    ask_and_wait(page, "mug > handle")
+    assert lost and page.locator("#view").get_attribute("data-painter") == "gl"
+
+
+def test_long_labels_of_boxes_end_in_the_picture_of_a_phone(opened, desk_address):
+    page = opened(desk_address)
+    page.set_viewport_size({"width": 390, "height": 780})
+    keep(page, "the book on the left side of the desk beside the mug near the window")
+    label = page.locator("#overlay text", has_text="the book on")
+    label.wait_for()
+    box = label.bounding_box()
+    assert box["x"] >= 0 and box["x"] + box["width"] <= 390
+    assert re.fullmatch(r"the book on .*… 0\.\d\d", label.text_content())
 
 
 def test_labels_of_boxes_do_not_cover_each_other(opened, desk_address):
@@ -190,6 +268,16 @@ def test_keys_move_in_the_outline(opened, desk_address, scene):
     page.locator(f"#overlay path.chosen[data-node='{child}']").wait_for(state="attached")
 
 
+def frame(page, start, end) -> None:
+    """Draw a frame with Alt held."""
+    page.keyboard.down("Alt")
+    page.mouse.move(*start)
+    page.mouse.down()
+    page.mouse.move(*end, steps=4)
+    page.mouse.up()
+    page.keyboard.up("Alt")
+
+
 def test_queries_with_an_image_a_framed_part_of_the_view_and_a_node(opened, desk_address, scene, tmp_path):
     page = opened(desk_address)
     book = scene.query("book", "whole")[0].node
@@ -198,15 +286,21 @@ def test_queries_with_an_image_a_framed_part_of_the_view_and_a_node(opened, desk
     page.locator(f"#answers li[data-node='{book}']").first.wait_for()
     assert page.locator("#answers li").first.get_attribute("data-node") == str(book)
     page.locator("#view").press("Escape")
-    low, high = on_page(page, (18, 18, 0), (34, 22, 0)).tolist()  # corners of the book
-    page.keyboard.down("Alt")
-    page.mouse.move(*low)
-    page.mouse.down()
-    page.mouse.move(*high, steps=4)
-    page.mouse.up()
-    page.keyboard.up("Alt")
+    low, high = on_page(page, (18, 18, 0), (34, 22, 0))  # corners of the book
+    frame(page, low, high)
     answers(page).first.wait_for()
     assert page.locator("#answers li").first.get_attribute("data-node") == str(book)
+    page.get_by_label("Beside").select_option("default|field")
+    for moved in (0, 0.01):  # from the photograph and from the rendered picture, both in the right half
+        page.locator("#view").press("Escape")
+        page.evaluate(f"{moved} && hilsplat.camera.orbit({moved}, 0); hilsplat.redraw()")
+        width = page.locator("#view").bounding_box()["width"] / 2
+        wire = page.evaluate(f"hilsplat.camera.wire({width}, document.getElementById('view').clientHeight)")
+        low, high = projected(wire, (18, 18, 0), (34, 22, 0)) + np.array([PANEL_PX + width, 0])
+        frame(page, low, high)
+        answers(page).first.wait_for()
+        assert page.locator("#answers li").first.get_attribute("data-node") == str(book)
+    page.get_by_label("Beside").select_option("")
     page.locator("#view").press("Escape")
     handle = scene.query("mug > handle")[0].node
     choose_row(page, handle)

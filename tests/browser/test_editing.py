@@ -217,3 +217,33 @@ def test_removed_gaussians_are_kept_over_a_reload_until_they_are_restored(opened
     shows(page, 25, 18, lambda rgb: rgb[2] > 150)
     press(page, "Control+z")
     has(page, 0, 32)
+
+
+def test_what_is_removed_in_one_tab_is_removed_in_another(opened, desk_address):
+    page = opened(desk_address)
+    other = page.context.new_page()
+    other.goto(page.url)
+    other.locator("body[data-ready=yes]").wait_for()
+    for tab, columns in ((page, (-0.5, 1.5)), (other, (1.5, 3.5))):
+        edit(tab)
+        use(tab, "box")
+        drag(tab, *[(column, row) for column, row in zip(columns, (-0.5, 23.5), strict=True)])
+        press(tab, "Delete")
+    for tab in (page, other):
+        has(tab, 0, 4 * 24)
+    page.reload()
+    page.locator("body[data-ready=yes]").wait_for()
+    has(page, 0, 4 * 24)
+    page.get_by_role("button", name="Restore all").click()
+    has(other, 0, 0)
+    other.close()
+
+
+def test_the_delete_key_removes_after_the_brush_size_was_set(opened, desk_address):
+    page = opened(desk_address)
+    edit(page)
+    press(page, "c")
+    drag(page, (6, 8), (26, 14))
+    until(page, lambda: page.get_by_role("button", name="Remove", exact=True).is_enabled())
+    page.get_by_label("Size").press("Delete")
+    until(page, lambda: page.get_by_role("button", name="Restore all").is_enabled())

@@ -2,13 +2,27 @@
 
 import json
 import re
+import shutil
 import zipfile
 
 import av
 import pytest
 from plyfile import PlyData
 
-from tests.browser.conftest import answers, ask, ask_and_wait, chips, drawn, keep, late, pixels, save, until
+from tests.browser.conftest import (
+    answers,
+    ask,
+    ask_and_wait,
+    chips,
+    choose_row,
+    drawn,
+    keep,
+    late,
+    pixels,
+    save,
+    until,
+)
+from tests.unit.many_nodes import add_nodes
 
 
 def greenish(page) -> float:
@@ -134,6 +148,64 @@ def test_a_saved_page_has_the_answers_of_the_page(opened, desk_address, scene, t
     assert answers(offline).first.inner_text() == shown
 
 
+def test_a_kept_answer_has_the_present_name_of_its_node(served, own_desk):
+    page = served(own_desk)
+    keep(page, "book")
+    page.get_by_role("treeitem").last.wait_for()
+    late(page, "api/names")
+    choose_row(page, int(page.locator("#overlay path.kept").get_attribute("data-node")))
+    page.get_by_role("textbox", name="Name").fill("atlas")
+    page.keyboard.press("Enter")
+    page.locator("#view").press("Escape")
+    page.locator("#overlay text", has_text=re.compile(r"^book atlas 0\.\d\d$")).wait_for()
+
+
+def test_a_saved_page_opens_with_the_settings_of_its_last_query(opened, desk_address, scene, tmp_path):
+    page = opened(desk_address)
+    keep(page, "mug")
+    page.get_by_role("radio", name="part", exact=True).check(force=True)
+    page.get_by_label("Others").select_option("ghost")
+    ask_and_wait(page, "mug")
+    (part,), (whole,) = scene.query("mug", "part"), scene.query("mug")
+    assert part.node != whole.node
+    offline = page.context.new_page()
+    offline.goto(save(page, "Page with answers", tmp_path / "page.html").as_uri())
+    answers(offline).first.wait_for()
+    assert offline.locator("#answers li").get_attribute("data-node") == str(part.node)
+    assert offline.get_by_label("Others").input_value() == "ghost"
+
+
+def test_a_link_and_back_restore_the_settings_of_a_query(opened, desk_address):
+    page = opened(desk_address)
+    page.wait_for_timeout(800)
+    page.get_by_label("only what this photograph shows").check()
+    page.get_by_label("score at least").check()
+    page.get_by_label("Minimum score").fill("0.3")
+    ask_and_wait(page, "mug > handle")
+    view = page.evaluate("hilsplat.camera.view")
+    page.locator("#view").press("ArrowLeft")  # the answer remains that of the photograph
+    page.wait_for_timeout(1200)  # until the address is updated
+    asked = []
+    again = opened(desk_address)
+    again.on("request", lambda sent: sent.url.find("api/query") > 0 and asked.append(sent.post_data_json))
+    again.goto(f"{again.url.partition('#')[0]}{page.url[page.url.index('#') :]}")
+    until(again, lambda: asked)  # the link was opened in the same tab
+    again.reload()
+    until(again, lambda: len(asked) > 1)
+    question = {"text": "mug > handle", "level": "auto", "threshold": 0.3, "view": view}
+    assert asked == [{"variant": "default", "answerer": "tree", **question}] * 2
+    camera = [each.evaluate("hilsplat.camera.toText()") for each in (page, again)]
+    assert camera[0] == camera[1]
+    page.get_by_label("only what this photograph shows").uncheck()
+    ask_and_wait(page, "book")
+    page.get_by_label("score at least").uncheck()
+    page.wait_for_timeout(1200)
+    page.on("request", lambda sent: sent.url.find("api/query") > 0 and asked.append(sent.post_data_json))
+    page.go_back()
+    until(page, lambda: len(asked) > 2)
+    assert asked[2] == asked[0] and page.get_by_label("score at least").is_checked()
+
+
 def test_a_film_follows_the_path_of_the_user(opened, desk_address, tmp_path):
     page = opened(desk_address, "server")
     page.locator("#view").focus()
@@ -151,3 +223,42 @@ def test_a_film_follows_the_path_of_the_user(opened, desk_address, tmp_path):
     page.locator("#path").select_option("around")
     page.get_by_role("button", name="Clear").click()
     assert page.locator("#path").input_value() == "around"
+
+
+def two_trees(own_desk):
+    """Add a variant whose nodes have numbers of their own."""
+    records = shutil.ignore_patterns("*.provenance.json")  # otherwise, its parts would be those of default
+    shutil.copytree(own_desk / "default", own_desk / "other", ignore=records)
+    add_nodes(own_desk, 50)
+
+
+def test_kept_answers_of_another_tree_are_neither_painted_nor_saved(served, own_desk, tmp_path):
+    two_trees(own_desk)
+    page = served(own_desk)
+    keep(page, "book")
+    book = int(page.locator("#overlay path.kept").get_attribute("data-node"))
+    held, free = [], []
+    page.route("**/api/query**", lambda route: route.continue_() if free else held.append(route))
+    page.get_by_label("Answers by").select_option("other|tree")
+    until(page, lambda: held)
+    page.locator("#overlay path.kept").wait_for(state="detached")
+    page.locator("#save summary").click()
+    until(page, page.get_by_role("button", name="Boxes, JSON").is_disabled)
+    free.append(True)
+    held[0].continue_()
+    page.locator(f"#overlay path.kept[data-node='{book - 50}']").wait_for(state="attached")
+
+
+def test_similar_nodes_are_those_of_the_node_in_its_own_tree(served, own_desk, tmp_path):
+    two_trees(own_desk)
+    page = served(own_desk)
+    page.get_by_label("Beside").select_option("other|tree")
+    ask_and_wait(page, "mug > handle")
+    answers(page).first.click()
+    page.get_by_role("button", name="More like this").click()
+    page.get_by_role("status").get_by_text("most similar first").wait_for()
+    assert not page.locator("#answers-beside li").count()
+    assert page.locator("#answers li").count() == 24
+    page.locator("#view").press("Escape")
+    boxes = json.loads(save(page, "Boxes, JSON", tmp_path / "boxes.json").read_text())["boxes"]
+    assert len(boxes) == page.locator("#overlay path.answer").count() == 5  # as painted

@@ -13,7 +13,7 @@ from hilsplat.splat.rasterise.api import render
 from hilsplat.splat.spz import fractional_bits, spz_bytes
 from hilsplat.viewer.frames import Paint, faded, painted, within
 from hilsplat.viewer.wire import WireCamera
-from tests.browser.conftest import drawn, pixels, until, wire_camera
+from tests.browser.conftest import ask_and_wait, drawn, pixels, until, wire_camera
 from tests.unit.splat.spz_reader import decoded
 
 
@@ -111,3 +111,12 @@ def test_selected_and_removed_gaussians_are_shown_by_both_painters(opened, cloud
     assert psnr(expected, painted(gaussians, camera)) < 20
     visible = np.s_[120:200]  # neither the tools nor the scale cover these rows
     assert psnr(np.asarray(picture)[visible], expected[visible]) > 30
+
+
+def test_the_server_renders_once_the_graphics_card_is_lost(opened, desk_address):
+    page = opened(desk_address)
+    view = page.locator("#view")
+    drawn(page, lambda: page.evaluate("hilsplat.painter.gl.getExtension('WEBGL_lose_context').loseContext()"))
+    page.get_by_role("status").get_by_text("the server renders the scene").wait_for()
+    assert view.get_attribute("data-painter") == "server" and page.locator("#view > canvas").count() == 1
+    ask_and_wait(page, "mug > handle")

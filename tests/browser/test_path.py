@@ -136,3 +136,17 @@ def test_a_path_is_saved_as_json_and_opened_again(opened, desk_address, tmp_path
     page.locator("#path-file").set_input_files(tmp_path / "wrong.json")
     page.get_by_text("wrong.json is not a camera path").wait_for()
     assert steps(page).count() == 2
+
+
+def test_a_kept_path_follows_its_photographs_when_others_are_left_out(opened, desk_address):
+    page = opened(desk_address)
+    add(page, "003.png")
+
+    def without_first(route):
+        described = route.fetch().json()
+        route.fulfill(json={**described, "views": described["views"][1:]})
+
+    page.route("**/api/scene?**", without_first)
+    page.reload()
+    page.locator("body[data-ready=yes]").wait_for()
+    assert places(page) == ["003.png"]

@@ -60,22 +60,22 @@ function refresh() {
 function aimAt(id, next = {}) { aim = { id, next: { ...aim.next, ...next } }; }
 
 function choose(id, next = {}) {
-  aimAt(id, next);
   drop();
+  aimAt(id, next);
   refresh();
 }
 
 function drop() {
-  draft = [];
+  closePolygon();
   stroke = offer = frame = corner = null;
   clicks = found = [];
   $("offers-section").hidden = true;
 }
 
 function stand(to) {
+  drop();
   number = (to + scene.views.length) % scene.views.length;
   aimAt(aim.id);
-  drop();
   sheet.show(number, scene.views[number].size_hw);
   $("picture").alt = scene.views[number].name;
   history.replaceState(null, "", `${location.pathname}#view=${number}`);
@@ -114,13 +114,13 @@ function add(view, thing, mine) {
 const reshaped = (view, id, polygons) => store.change([[view, store.labels(view).map((each) => each.id === id ? { ...each, polygons, origin: edited(each) } : each)]]);
 
 async function region(ring, brush, view, mine) {
-  const label = labelOf(view, mine.id), parent = label ? label.parent : mine.next.parent;
+  const label = labelOf(view, mine.id), parent = label ? label.parent : labelOf(view, mine.next.parent)?.id ?? null;
   if (!label && brush?.erase) { tell("Select the thing to erase from.", true); return; }
   const made = await ask("/api/shape", { view, add: [...(label?.polygons ?? []), ...(ring ? [ring] : [])], stroke: brush, inside: parent ? ringsOf(view, parent) : null });
   if (!made.polygons.length) {
     if (label) remove(view, label.id); else tell("The shape has no pixel inside the photograph and its parent.", true);
   } else if (label) reshaped(view, label.id, made.polygons);
-  else add(view, { ...mine.next, text: mine.next.text || UNNAMED, polygons: made.polygons, origin: "drawn" }, mine);
+  else add(view, { ...mine.next, parent, text: mine.next.text || (mine === aim && $("text").value.trim()) || UNNAMED, polygons: made.polygons, origin: "drawn" }, mine);
 }
 
 function closePolygon() {
@@ -254,7 +254,13 @@ function accept() {
   tell(right.size > 1 ? "Accepted, with its ancestors." : "Accepted.");
 }
 
-function step(way) { tell(""); store[way](); }   // the last message no longer applies
+function step(way) {
+  if (way === "undo" && draft.length) { draft = draft.slice(0, -1); draw(); return; }
+  tell("");   // the last message no longer applies
+  const before = store[way === "undo" ? "past" : "future"].at(-1)?.before ?? [];
+  store[way]();
+  if (before.length && !before.some(([view]) => view === number)) stand(before[0][0]);
+}
 
 function remove(view = number, id = aim.id) {
   const gone = new Set([id, ...under(store.labels(view), id)]);
@@ -322,6 +328,13 @@ function up() {
   if (done) soon(() => region(null, done, view, mine)).then(() => { if (stroke === done) stroke = null; draw(); });
 }
 
+// Forget what the first of two fingers began.
+function cancel() {
+  if (tool() === "polygon") draft = draft.slice(0, -1);
+  stroke = frame = corner = null;
+  draw();
+}
+
 // With the choosing tool, dragging the chosen outline moves a corner; dragging elsewhere moves the photograph.
 function grabbed(event) {
   if (tool() !== "choose" || !own() || event.altKey) return false;
@@ -330,11 +343,12 @@ function grabbed(event) {
   return corner;
 }
 
-attachHands(sheet, { drawing: (event) => tool() !== "choose" || grabbed(event), down, drag, up, close: closePolygon, hover: (at) => { cross = at; draw(); } });
+attachHands(sheet, { drawing: (event) => tool() !== "choose" || grabbed(event), down, drag, up, cancel, close: closePolygon, hover: (at) => { cross = at; draw(); } });
 attachThings(choose);
 
 function escape() {
-  if (draft.length || stroke || clicks.length || frame || !$("offers-section").hidden) drop();
+  if (draft.length) draft = [];
+  else if (stroke || clicks.length || frame || !$("offers-section").hidden) drop();
   else if (aim.id) choose(0);
   draw();
 }
@@ -379,9 +393,11 @@ for (const radio of document.querySelectorAll("[name=tool]")) radio.addEventList
 for (const [id, work] of Object.entries({ new: () => fresh(), child: () => fresh(true), accept, delete: () => remove(), undo: () => step("undo"), redo: () => step("redo"),
   carry: () => transfer(), reload: () => location.reload(), import: () => $("file").click(), "help-button": () => $("help").showModal() })) $(id).addEventListener("click", work);
 $("file").addEventListener("change", () => { const files = [...$("file").files]; $("file").value = ""; $("save").open = false; soon(() => take_in(files)); });
+document.addEventListener("dragover", (event) => event.preventDefault());
+document.addEventListener("drop", (event) => { event.preventDefault(); const files = [...event.dataTransfer.files]; if (files.length) soon(() => take_in(files)); });
 $("radius").addEventListener("input", draw);
 window.addEventListener("pagehide", () => { if (store.views) store.remember(scene.folder); });
-window.addEventListener("beforeunload", (event) => { if (store.unsaved || waiting) event.preventDefault(); });
+window.addEventListener("beforeunload", (event) => { if (store.unsaved || waiting || draft.length) event.preventDefault(); });
 
 async function begin() {
   scene = await described();
@@ -401,7 +417,7 @@ async function begin() {
   setTool("choose");
   if (first < 0) tell("First annotation: 1. type what you see, 2. choose polygon (P) or brush (B) and draw around it, 3. press Enter. It is saved at once.");
   document.body.dataset.ready = "yes";
-  watch();
+  watch((versions) => store.follow(versions));
 }
 
 globalThis.hilsplat = { store, sheet };   // for tests

@@ -2,9 +2,8 @@
 
 import { $ } from "./elements.js";
 import { get, send } from "./http.js";
-import { insist, isStopped, restartWith, showStopped } from "./stopped.js";
+import { follow, insist, restartWith } from "./stopped.js";
 
-const POLL_MS = 4000;
 let state = "", unsaved = () => "";
 export const tellUnsaved = (sentence) => { unsaved = sentence; };
 const at = (path) => `${path}?of=${state}`;
@@ -23,17 +22,11 @@ export const photoUrl = (number) => at(`/api/photo/${number}`);
 export const thumbUrl = (number) => at(`/api/thumb/${number}`);
 export const exportUrl = (kind) => at(`/api/export/${kind}`);
 
-// Check regularly whether files of the scene changed; the page keeps its loaded state until a reload.
-export async function watch() {
-  while ($("changed").hidden) {
-    await new Promise((done) => setTimeout(done, POLL_MS));
-    if (document.hidden) continue;
-    try {
-      const now = await (await get("/api/changes")).json();
-      showStopped(false);
-      if (now.of === state && !now.changed.length) continue;
-      $("changed-what").textContent = `The scene has changed${now.changed.length ? ` (${now.changed.join(", ")})` : ""}. Reload to use the new files.`;
-      $("changed").hidden = false;
-    } catch (error) { if (isStopped(error)) showStopped(true, unsaved()); }
+// Check regularly whether annotations or files of the scene changed; the page keeps its loaded state until a reload.
+export const watch = (labelled) => follow(async () => (await get("/api/changes")).json(), async (now) => {
+  if (now.of !== state || now.changed.length) {
+    $("changed-what").textContent = `The scene has changed${now.changed.length ? ` (${now.changed.join(", ")})` : ""}. Reload to use the new files.`;
+    $("changed").hidden = false;
   }
-}
+  await labelled(now.labels);
+}, { more: unsaved });

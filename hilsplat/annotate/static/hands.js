@@ -1,13 +1,15 @@
 // Mouse, pen and touch on the photograph: one pointer draws with the tool, the right button or two fingers move, wheel and pinch zoom.
 
-export function attachHands(sheet, { drawing, down, drag, up, hover, close }) {
+const STILL_PX = 10;   // a finger that moved less before the second one touched has not drawn
+
+export function attachHands(sheet, { drawing, down, drag, up, cancel, hover, close }) {
   const host = sheet.host, pointers = new Map();
   let acting = false, apart = 0;
 
   host.addEventListener("pointerdown", (event) => {
     host.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, { x: event.clientX, y: event.clientY, moved: 0 });
-    if (pointers.size === 2) { if (acting) up(null); acting = false; apart = 0; return; }
+    if (pointers.size === 2) { if (acting) ([...pointers.values()][0].moved < STILL_PX ? cancel : up)(); acting = false; apart = 0; return; }
     acting = event.button === 0 && Boolean(drawing(event));
     if (acting) down(sheet.pixel(event), event);
   });
@@ -31,7 +33,7 @@ export function attachHands(sheet, { drawing, down, drag, up, hover, close }) {
     const last = pointers.get(event.pointerId);
     pointers.delete(event.pointerId);
     host.classList.remove("moving");
-    if (acting) up(event.type === "pointerup" ? sheet.pixel(event) : null);
+    if (acting) up();
     else if (event.type === "pointerup" && last?.moved < 4 && event.button === 0) down(sheet.pixel(event), event);
     acting = false;
   };

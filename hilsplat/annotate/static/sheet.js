@@ -5,6 +5,7 @@ import { $ } from "./elements.js";
 import { colourOf } from "./styles.js";
 
 const MOST_CORNERS = 600;   // outlines with more corners are drawn without corners, which would be too close together
+const RETRY_MS = 2000;
 const NS = "http://www.w3.org/2000/svg";
 export const colour = (id) => `rgb(${colourOf(id).join(" ")})`;
 
@@ -23,10 +24,14 @@ export class Sheet {
     this.scale = 1;
     this.x = this.y = 0;
     new ResizeObserver(() => this.fit()).observe(this.host);
+    $("picture").addEventListener("load", () => { $("picture").hidden = false; });
+    $("picture").addEventListener("error", () => setTimeout(() => { $("picture").src = photoUrl(this.number); }, RETRY_MS));
   }
 
   show(number, [height, width]) {
     this.size = [width, height];
+    this.number = number;
+    $("picture").hidden = true;   // until it is loaded, the browser would show the previous photograph
     $("picture").src = photoUrl(number);
     for (const each of [$("picture"), $("drawing")]) { each.setAttribute("width", width); each.setAttribute("height", height); }
     $("drawing").setAttribute("viewBox", `0 0 ${width} ${height}`);
@@ -44,6 +49,7 @@ export class Sheet {
 
   place() {
     $("sheet").style.transform = `translate(${this.x}px, ${this.y}px) scale(${this.scale})`;
+    $("sheet").style.setProperty("--px", 1 / this.scale);
     $("sheet").classList.toggle("near", this.scale > 2);
   }
 

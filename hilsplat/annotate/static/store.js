@@ -45,6 +45,15 @@ export class Store {
     this.handlers.changed();
   }
 
+  // Show what another page or program has saved.
+  async follow(versions) {
+    if (this.unsaved || versions.join() === this.versions) return;
+    const loaded = this.saving.then(() => this.load());   // not while a change is being saved
+    this.saving = loaded.catch(() => {});
+    await loaded;
+    this.handlers.told("The annotations were changed elsewhere and have been reloaded.");
+  }
+
   get unsaved() { return this.waiting + this.refused.size; }
   labels(number) { return this.views[number].labels; }
   has(number, id) { return this.labels(number).some((label) => label.id === id); }

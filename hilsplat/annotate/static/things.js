@@ -1,7 +1,7 @@
 // The objects of a photograph as a tree widget, the form of the chosen object, and the strip of photographs.
 
 import { thumbUrl } from "./api.js";
-import { $, counted, LEVELS, make } from "./elements.js";
+import { $, attachArrows, counted, LEVELS, make } from "./elements.js";
 import { colour, element } from "./sheet.js";
 
 export const LEVEL = (label) => LEVELS[label.level - 1];
@@ -44,11 +44,14 @@ export function attachThings(choose) {
 export const level = () => Number(document.querySelector("[name=level]:checked").value);
 export const setLevel = (value) => { document.querySelector(`[name=level][value="${value}"]`).checked = true; };
 
-// Show the chosen object in the form, or the settings of the next object.
+let filled = "";   // the object and text that the form shows
+
+// Show the chosen object in the form, or the settings of the next object; a text that is being typed stays.
 export function fillForm(labels, label, next) {
-  const own = label ?? next;
+  const own = label ?? next, now = `${label?.id} ${own.text}`;
   $("title").textContent = label ? `${label.text}, ${LEVEL(label)}${label.origin === "proposed" ? ": proposed" : ""}` : "New thing";
-  if (document.activeElement !== $("text") || label) $("text").value = own.text;
+  if (document.activeElement !== $("text") || now !== filled) $("text").value = own.text;
+  filled = now;
   setLevel(own.level);
   const above = labels.filter((each) => each.level === own.level - 1);
   $("parent").replaceChildren(make("option", { value: "" }, "nothing"), ...above.map((each) => make("option", { value: each.id }, each.text)));
@@ -66,13 +69,7 @@ export function showTexts(things) {
 export function makeStrip(views, stand) {
   $("views").replaceChildren(...views.map((view, number) => make("button", { type: "button", role: "option", class: view.split, title: view.name, onclick: () => stand(number) },
     make("img", { src: thumbUrl(number), alt: "", loading: "lazy" }))));
-  $("views").addEventListener("keydown", (event) => {
-    const all = [...$("views").children], by = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
-    if (!by) return;
-    const next = all[all.indexOf(document.activeElement) + by];
-    if (next) { next.focus(); next.click(); }
-    event.preventDefault(); event.stopPropagation();
-  });
+  attachArrows($("views"));
 }
 
 export function markStrip(views, store, number) {

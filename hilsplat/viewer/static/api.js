@@ -1,10 +1,10 @@
 // Requests to the server. An exported page has offline.js instead, with the same exports.
 
 import { get, send, streamed } from "./http.js";
-import { restartWith } from "./stopped.js";
+import { insist, restartWith } from "./stopped.js";
 
 export const offline = false;
-export const texts = [], kept = [], first = "", opening = "";   // answered queries and initial camera of an exported page
+export const texts = [], link = "";   // answered queries, and the part after # of the address, of an exported page
 
 // Each request contains the scene state with which this page was loaded; the server refuses any other state.
 let state = "";
@@ -14,17 +14,20 @@ const token = new URLSearchParams(location.search).has("embedded") ? new URLSear
 const named = new URLSearchParams(location.search).get("scene");
 const at = (path, of = `of=${state}`) => `${path}?${of}${named ? `&scene=${encodeURIComponent(named)}` : ""}${token ? `&token=${token}` : ""}`;
 
+// What the page cannot do without is requested again after a lost connection.
+const loaded = (path, of) => insist(() => get(at(path, of)), () => "");
+
 export async function scene() {
-  const described = await (await get(at("api/scene", ""))).json();
+  const described = await (await loaded("api/scene", "")).json();
   state = described.of;
   restartWith(token ? "" : described.restart);
   return described;
 }
 export const scenes = async () => (await get(at("api/scenes"))).json();
 export const changes = async () => (await get(at("api/changes", ""))).json();
-export const variant = async (name) => (await get(at(`api/variant/${encodeURIComponent(name)}`))).json();
-export const splats = async (chunk) => (await get(at(`api/splats/${chunk}`))).arrayBuffer();
-export const nodes = async (name) => (await get(at(`api/nodes/${encodeURIComponent(name)}`))).arrayBuffer();
+export const variant = async (name) => (await loaded(`api/variant/${encodeURIComponent(name)}`)).json();
+export const splats = async (chunk) => (await loaded(`api/splats/${chunk}`)).arrayBuffer();
+export const nodes = async (name) => (await loaded(`api/nodes/${encodeURIComponent(name)}`)).arrayBuffer();
 export const photoUrl = (number) => at(`api/photo/${number}`);
 export const thumbUrl = (number) => at(`api/thumb/${number}`);
 export const cropUrl = (variant, node) => at(`api/crop/${encodeURIComponent(variant)}/${node}`);

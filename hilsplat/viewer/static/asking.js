@@ -2,12 +2,12 @@
 
 import { markChosen, showAnswers, summary } from "./answers.js";
 import * as api from "./api.js";
-import { acts, choose } from "./choosing.js";
+import { acts, choose, paneAt } from "./choosing.js";
 import { overlay, redraw, restyle } from "./drawing.js";
 import { $, nameOf } from "./elements.js";
 import { asking, keep, showKept, whenReopened } from "./kept.js";
-import { answererOf, failed, host, level, main, outlines, page, panes, tell, variantOf } from "./state.js";
-import { styleOf } from "./styles.js";
+import { answererOf, failed, level, main, outlines, page, panes, setQuery, tell, variantOf } from "./state.js";
+import { base64, styleOf } from "./styles.js";
 
 const PICTURE_PX = 512;
 let aborting = new AbortController();
@@ -50,6 +50,7 @@ function answered(what, answer) {
 export function listAnswers() {
   const right = panes[1];
   showAnswers(main(), panes[0].answer, acts, right && { outline: outlines.get(variantOf(right)), answer: right.answer, by: right.by.replace("|", ", ") });
+  restyle();   // names in the list are also those of labels
 }
 
 export async function fillField() {
@@ -68,7 +69,14 @@ export async function fillField() {
   restyle();
 }
 
-export async function ask(keepChoice = false) {
+// Send the query of a link, if it has one.
+export async function askAs(link) {
+  $("text").value = link.get("q") ?? "";
+  if ($("text").value) await ask(false, link.has("view") ? Number(link.get("view")) : null);
+}
+
+// view: number of the photograph that restricts the answers, if it isn't the present one.
+export async function ask(keepChoice = false, view = null) {
   const text = $("text").value.trim();
   if (!text) { clearAnswer(); return; }
   if (!main()) {   // the nodes are still loading, or do not exist yet
@@ -76,10 +84,9 @@ export async function ask(keepChoice = false) {
     tell("Your query runs as soon as the semantic tree is loaded.");
     return;
   }
-  const view = $("here").checked ? page.camera.view : -1;
-  if ($("here").checked && view < 0) { refused(new Error("Go to a photograph first: choose one below.")); return; }
+  if ($("here").checked && view === null && page.camera.view < 0) { refused(new Error("Go to a photograph first: choose one below.")); return; }
   if (!keepChoice && page.chosen >= 0) choose(-1);   // without a choice, the view is drawn only with the answer
-  const asked = asking(text);
+  const asked = { ...asking(text), ...(view === null ? {} : { view }) };
   await askAll({ text, query: asked }, (pane, signal) => api.query({ variant: variantOf(pane), answerer: answererOf(pane), ...asked }, signal));
 }
 
@@ -93,14 +100,10 @@ export async function keepAnswer() {
   $("text").focus();
 }
 
-whenReopened(({ text, level: at, threshold: least, view }) => {
-  $("here").checked = view !== undefined;
-  if (view !== undefined) page.camera.standAt(page.scene.views[view], view);
-  document.querySelector(`[name=level][value=${at}]`).checked = true;
-  $("threshold-on").checked = least !== undefined;
-  if (least !== undefined) $("threshold-at").value = least;
-  $("threshold-on").dispatchEvent(new Event("change"));
-  $("text").value = text;
+whenReopened((asked) => {
+  if (asked.view !== undefined) page.camera.standAt(page.scene.views[asked.view], asked.view);
+  setQuery(asked);
+  $("text").value = asked.text;
   ask();
 });
 
@@ -108,7 +111,7 @@ export async function like(node) {
   if (node < 0 || api.offline) return;
   $("text").value = "";
   const name = nameOf(main(), node);
-  await askAll({}, (pane, signal) => api.like({ variant: variantOf(pane), node: variantOf(pane) === variantOf(panes[0]) ? node : 0 }, signal));
+  await askAll({}, (pane, signal) => outlines.get(variantOf(pane)).tree === main().tree ? api.like({ variant: variantOf(pane), node }, signal) : null);   // another tree has other nodes
   tell(`Like ${name}: ${$("status").textContent}`);
 }
 
@@ -119,11 +122,9 @@ export async function askPicture(source, part = null) {
     const scale = Math.min(1, PICTURE_PX / Math.max(w, h)), canvas = new OffscreenCanvas(Math.max(1, Math.round(w * scale)), Math.max(1, Math.round(h * scale)));
     canvas.getContext("2d").drawImage(image, x, y, w, h, 0, 0, canvas.width, canvas.height);
     const bytes = new Uint8Array(await (await canvas.convertToBlob({ type: "image/jpeg", quality: 0.9 })).arrayBuffer());
-    let text = "";
-    for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
     $("text").value = "";
     choose(-1);
-    await askAll({}, (pane, signal) => api.like({ variant: variantOf(pane), picture: btoa(text) }, signal));
+    await askAll({}, (pane, signal) => api.like({ variant: variantOf(pane), picture: base64(bytes) }, signal));
   } catch (error) { failed(error); }
 }
 
@@ -136,12 +137,13 @@ export async function framed(points, done) {
   path.setAttribute("d", `M${x0} ${y0}H${x1}V${y1}H${x0}Z`);
   svg.append(path);
   if (!done || x1 - x0 < 6 || y1 - y0 < 6 || api.offline) return;
+  const { k, width, height } = paneAt(x0), left = x0 - k * width;
   if (page.camera.view >= 0) {
-    const photo = await (await fetch(api.photoUrl(page.camera.view))).blob(), { s, x, y } = page.camera.frame(host.clientWidth / panes.length, host.clientHeight);
-    await askPicture(photo, [(x0 - x) / s, (y0 - y) / s, (x1 - x0) / s, (y1 - y0) / s]);
+    const photo = await (await fetch(api.photoUrl(page.camera.view))).blob(), { s, x, y } = page.camera.frame(width, height);
+    await askPicture(photo, [(left - x) / s, (y0 - y) / s, (x1 - x0) / s, (y1 - y0) / s]);
   } else {
     const plain = [{ variant: "", style: styleOf({ outline: null, colour: "none", mode: "plain", chosen: -1, hover: -1 }), removed: page.removed }];
-    await askPicture(await page.painter.capture(page.camera, plain, host.clientWidth, host.clientHeight), [x0, y0, x1 - x0, y1 - y0]);
+    await askPicture(await page.painter.capture(page.camera, plain, Math.round(width), height), [left, y0, x1 - x0, y1 - y0]);
     redraw();
   }
 }
@@ -162,8 +164,8 @@ function showNothing() {
 }
 
 export function clear() {
-  $("save").open = false;
-  if (page.chosen >= 0) choose(-1); else clearAnswer();
+  if ($("save").open) $("save").open = false;
+  else if (page.chosen >= 0) choose(-1); else clearAnswer();
 }
 
 acts.like = like;

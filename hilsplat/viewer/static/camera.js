@@ -35,9 +35,9 @@ export class Camera {
   }
 
   // Return the camera of a photograph.
-  ofView(view) {
+  ofView(view, number = -1) {
     const next = this.copy();
-    next.standAt(view, -1);
+    next.standAt(view, number);
     return next;
   }
 

@@ -7,7 +7,8 @@ import { painted, restyle } from "./drawing.js";
 import { LEVELS } from "./elements.js";
 import { flyTo } from "./flights.js";
 import { inOrder, latest } from "./latest.js";
-import { failed, host, level, loadVariant, main, outlines, page, panes, tell, variantOf } from "./state.js";
+import { failed, host, level, main, outlines, page, panes, tell, variantOf } from "./state.js";
+import { wireStyle } from "./styles.js";
 
 // Actions of lists and cards of nodes; asking.js adds `like`.
 export const acts = { choose, hover: setHover, fly: () => flyTo(page.chosen), name: rename };
@@ -36,7 +37,8 @@ export function paneAt(x) {
 }
 
 const exactPick = async (at, y) => {
-  const { nodes } = await api.pick({ variant: variantOf(panes[at.k]), camera: page.camera.wire(at.width, at.height), x: at.x, y, removed: page.removed });
+  const { style } = painted()[at.k];
+  const { nodes } = await api.pick({ variant: variantOf(panes[at.k]), camera: page.camera.wire(at.width, at.height), x: at.x, y, removed: page.removed, ...(style.mode === "isolate" ? { style: wireStyle(style) } : {}) });
   return nodes.map(([node]) => node);
 };
 export const quickPick = (at, y) => page.painter.nodesAt(variantOf(panes[at.k]), page.painter.gaussianAt(page.camera, painted()[at.k], at.x, y, at.width, at.height));
@@ -76,6 +78,14 @@ const hoverAt = latest(async (x, y) => {
 let pointing = 0;
 export const pointed = (x, y) => { clearTimeout(pointing); pointing = setTimeout(() => hoverAt(x, y), page.painter?.kind === "gl" && !page.slow ? 16 : 60); };
 
+// Show the names that a tree's nodes have on the server.
+export async function readNames(own) {
+  const { nodes, version } = await api.variant(own.variant);
+  own.version = version;
+  nodes.forEach(({ name }, row) => { if (own.nodes[row].name !== name) { own.nodes[row].name = name; if (own === main()) page.outline.renamed(row); } });
+  acts.list();
+}
+
 const nextName = inOrder(failed);   // each name is sent with the version that the one before it made
 function rename(node, name) {
   const variant = variantOf(panes[0]);
@@ -92,12 +102,11 @@ async function renameNow(variant, node, name) {
       each.version = kept.version;
       each.nodes.forEach((entry, row) => { entry.name = kept.names[row] ?? ""; });
     }
-    for (const pane of panes) for (const hit of pane.answer?.hits ?? []) if (hit.node === node) hit.name = name;
     page.outline.renamed(node);
     tell(name ? `Named “${name}”. Queries match this name, here and with hilsplat query.` : "The name was removed.");
     if (page.chosen === node) chooseNow(node);   // after showing the message, because it makes the outline smaller
     acts.list();
   } catch (error) {
-    if (error.status === 412) { await loadVariant(own.variant, true); page.outline.show(main()); choose(page.chosen); tell("The names were changed elsewhere and have been reloaded. Name the node again.", true); } else failed(error);
+    if (error.status === 412) { await readNames(own); choose(page.chosen); tell("The names were changed elsewhere and have been reloaded. Name the node again.", true); } else failed(error);
   }
 }

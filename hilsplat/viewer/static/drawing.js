@@ -5,7 +5,7 @@ import { $, nameOf } from "./elements.js";
 import { drawOverlay, inPicture } from "./overlay.js";
 import { showScale } from "./scale.js";
 import { host, keptIn, level, levelIndex, main, options, outlines, page, panes, threshold, variantOf } from "./state.js";
-import { shownHits, styleOf } from "./styles.js";
+import { LISTED, shownHits, styleOf } from "./styles.js";
 
 const SLOW_MS = 60, FRUSTUM = 0.08;   // depth of a drawn camera, in multiples of the photographs' mean distance
 let dirty = true, styles = [], lastFrame = 0, frames = 0;
@@ -56,13 +56,13 @@ function frustums() {
     ...(page.previewing ? [] : page.path).map((camera, k) => ({ kind: "frustum path", label: String(k + 1), corners: camera.corners(depth) }))];
 }
 
-const labelOf = ({ name, score }, text = "") => [...new Set([text, name].filter(Boolean)), score.toFixed(2)].join(" ");
+const labelOf = ({ name, called }, { score }, text = "") => [...new Set([text, name || called].filter((words) => words && words !== "?")), score.toFixed(2)].join(" ");
 
 function boxes(pane, k) {
   const own = outlines.get(variantOf(pane));
   if (!own || $("colour").value === "none") return [];
-  const found = $("colour").value === "answers" ? keptIn(k).flatMap(({ answer, rgb, text }) => shownHits(answer).map((hit) => ({ node: hit.node, kind: "kept", stroke: `rgb(${rgb.join(" ")})`, label: labelOf(hit, text) }))) : [];
-  for (const hit of shownHits(pane.answer)) found.push({ node: hit.node, kind: "answer", label: labelOf(hit) });
+  const found = $("colour").value === "answers" ? keptIn(k).flatMap(({ answer, rgb, text }) => shownHits(answer).slice(0, LISTED).map((hit) => ({ node: hit.node, kind: "kept", stroke: `rgb(${rgb.join(" ")})`, label: labelOf(own.nodes[hit.node], hit, text) }))) : [];
+  for (const hit of shownHits(pane.answer).slice(0, LISTED)) found.push({ node: hit.node, kind: "answer", label: labelOf(own.nodes[hit.node], hit) });
   if (!k || variantOf(pane) === variantOf(panes[0])) {
     if (page.chosen >= 0) found.push({ node: page.chosen, kind: "chosen", label: nameOf(own, page.chosen) });
     if (page.hover >= 0 && page.hover !== page.chosen) found.push({ node: page.hover, kind: "hover", label: nameOf(own, page.hover) });
@@ -83,6 +83,16 @@ export function drawn() {
   remember();
 }
 
+// Return the part after # of the address that opens this view.
+export function link() {
+  const link = new URLSearchParams({ c: page.camera.toText() });
+  const put = (key, value, usual) => { if (value && value !== usual) link.set(key, value); };
+  for (const query of page.kept) link.append("keep", JSON.stringify(query.asked));
+  put("q", page.asked?.text); put("view", page.asked?.query?.view?.toString()); put("level", level(), "auto"); put("by", panes[0].by, `${page.scene.variants[0]}|tree`); put("beside", panes[1]?.by);
+  put("node", page.chosen >= 0 ? `${page.chosen}.${main().tree}` : ""); put("colour", $("colour").value, "answers"); put("mode", $("mode").value, "tint"); put("least", threshold() === null ? "" : String(threshold()));
+  return link;
+}
+
 // A new query is an entry in the browser's history, so Back returns to the previous query.
 let remembering = 0, remembered = null;
 export const rememberedAs = (text) => { remembered = text; };
@@ -91,12 +101,7 @@ function remember() {
   remembering = setTimeout(() => {
     const text = page.asked?.text ?? "", isNew = remembered !== null && text && text !== remembered;
     remembered = text || remembered || "";
-    const link = new URLSearchParams({ c: page.camera.toText() });
-    const put = (key, value, usual) => { if (value && value !== usual) link.set(key, value); };
-    for (const query of page.kept) link.append("keep", JSON.stringify(query.asked));
-    put("q", page.asked?.text); put("level", level(), "auto"); put("by", panes[0].by, `${page.scene.variants[0]}|tree`); put("beside", panes[1]?.by);
-    put("node", page.chosen >= 0 ? `${page.chosen}.${main().tree}` : ""); put("colour", $("colour").value, "answers"); put("mode", $("mode").value, "tint"); put("least", threshold() === null ? "" : String(threshold()));
-    history[isNew ? "pushState" : "replaceState"](null, "", `${location.pathname}${api.offline ? location.search : keptSearch()}#${link}`);
+    history[isNew ? "pushState" : "replaceState"](null, "", `${location.pathname}${api.offline ? location.search : keptSearch()}#${link()}`);
   }, 400);
 }
 function keptSearch() {

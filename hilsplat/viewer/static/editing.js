@@ -146,15 +146,21 @@ export function edit(open = !isEditing()) {
   showCounts();
 }
 
-// Remove what the browser has kept as removed from these Gaussians.
-export function restoreRemoved() {
+// Remove what the browser has kept as removed from these Gaussians, by this tab or another one.
+function readRemoved() {
   let kept = ["", ""];
   try { kept = (localStorage.getItem(key()) ?? " ").split(" "); } catch { /* a frame in another site's page may have no storage */ }
-  if (kept[0] !== page.scene.gaussians_sha256 || !kept[1]) return;
+  if (kept[0] !== page.scene.gaussians_sha256) return;
   const packed = Uint8Array.from(atob(kept[1]), (letter) => letter.charCodeAt(0));
-  marks = Uint8Array.from({ length: page.scene.gaussians }, (_, row) => packed[row >> 3] >> (row & 7) & 1 ? REMOVED : 0);
-  changed();
-  edit(true);
+  if (!marks.length) marks = new Uint8Array(page.scene.gaussians);
+  become((mark, row) => packed[row >> 3] >> (row & 7) & 1 ? REMOVED : mark === REMOVED ? 0 : mark);
+}
+
+export function restoreRemoved() {
+  readRemoved();
+  done = [];
+  if (page.removed) edit(true);
+  window.addEventListener("storage", (event) => { if (event.key === key()) next(readRemoved); });
 }
 
 const change = (markOf) => next(() => become(markOf));

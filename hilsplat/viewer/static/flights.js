@@ -50,9 +50,7 @@ export function play(cameras, perSecond, ended) {
 export const halt = () => { flight++; };
 
 export function stand(number) {
-  const target = page.camera.copy();
-  target.standAt(page.scene.views[number], number);
-  goTo(target);
+  goTo(page.camera.ofView(page.scene.views[number], number));
 }
 
 export const flyTo = (node) => {
@@ -71,8 +69,7 @@ export const step = (by) => {
 export function nearestView() {
   let best = 0, least = Infinity;
   page.scene.views.forEach((view, number) => {
-    const other = page.camera.copy();
-    other.standAt(view, number);
+    const other = page.camera.ofView(view);
     const away = Math.hypot(...other.c.map((v, k) => v - page.camera.c[k])) + page.scene.reach * (1 - other.R[2].reduce((sum, v, k) => sum + v * page.camera.R[2][k], 0));
     if (away < least) { least = away; best = number; }
   });

@@ -1,12 +1,12 @@
 // Input handlers: mouse and touch on the view, keys, and all controls of the page.
 
 import * as api from "./api.js";
-import { ask, askPicture, clear, clearAnswer, fillField, framed, keepAnswer, like } from "./asking.js";
+import { ask, askAs, askPicture, clear, clearAnswer, fillField, framed, keepAnswer, like } from "./asking.js";
 import { children } from "./card.js";
 import { choose, pointed, tapped } from "./choosing.js";
 import { attach } from "./controls.js";
 import { attachEditing, draw, edit, edited, leaveTool, placeBrush, pressed, redo, resizeBrush, tool, undo } from "./editing.js";
-import { currentStyles, painted, redraw, rememberedAs, restyle } from "./drawing.js";
+import { currentStyles, link, painted, redraw, rememberedAs, restyle } from "./drawing.js";
 import { $, counted, nameOf } from "./elements.js";
 import { flyTo, nearestView, setMoving, stand, step, touched } from "./flights.js";
 import { groups, scoreOf } from "./kept.js";
@@ -14,7 +14,7 @@ import { attachKeys } from "./keyboard.js";
 import { addToPath, attachPath, flown } from "./path.js";
 import { save } from "./saves.js";
 import { attachScenes } from "./scenes.js";
-import { answererOf, failed, host, main, page, panes, start, tell, variantOf } from "./state.js";
+import { answererOf, failed, host, main, openLink, page, panes, tell, variantOf } from "./state.js";
 import { choosePanes } from "./variants.js";
 
 function showFrustums() {
@@ -69,11 +69,9 @@ export function attachHands() {
     $("threshold-told").textContent = Number($("threshold-at").value).toFixed(2);
     restyle();
   };
-  const askAgain = () => { if (page.asked?.text && !api.offline) ask(true); };
-  $("threshold-on").addEventListener("change", () => { thresholdChanged(); askAgain(); });
+  $("threshold-on").addEventListener("change", () => { thresholdChanged(); levelChanged(); });
   $("threshold-at").addEventListener("input", thresholdChanged);
-  $("threshold-at").addEventListener("change", askAgain);
-  if (start.get("least")) { $("threshold-on").checked = true; $("threshold-at").value = start.get("least"); thresholdChanged(); }
+  $("threshold-at").addEventListener("change", levelChanged);
   $("colour").addEventListener("change", () => {
     if (["relevancy", "field"].includes($("colour").value) && !page.asked) tell("Run a query first: these colours show how well nodes or Gaussians match it.");
     fillField();
@@ -86,16 +84,15 @@ export function attachHands() {
   $("picture-button").addEventListener("click", () => $("picture").click());
   $("picture").addEventListener("change", () => { if ($("picture").files[0]) askPicture($("picture").files[0]); $("picture").value = ""; });
   document.addEventListener("paste", (event) => { const file = [...event.clipboardData.files].find((each) => each.type.startsWith("image/")); if (file) askPicture(file); });
-  host.addEventListener("dragover", (event) => event.preventDefault());
-  host.addEventListener("drop", (event) => { event.preventDefault(); const file = event.dataTransfer.files[0]; if (file?.type.startsWith("image/")) askPicture(file); });
+  document.addEventListener("dragover", (event) => event.preventDefault());
+  document.addEventListener("drop", (event) => { event.preventDefault(); const file = event.dataTransfer.files[0]; if (file?.type.startsWith("image/")) askPicture(file); });
   new ResizeObserver(redraw).observe(host);
   window.addEventListener("popstate", () => {   // Back and Forward restore the query of that entry
     const kept = new URLSearchParams(location.hash.slice(1)), text = kept.get("q") ?? "";
     clearAnswer();
     rememberedAs(text);
-    document.querySelector(`[name=level][value=${CSS.escape(kept.get("level") ?? "auto")}]`)?.click();
-    $("text").value = text;
-    if (text) ask();
+    openLink(kept);
+    askAs(kept);
   });
 
   const selected = () => page.chosen >= 0 ? [{ name: nameOf(main(), page.chosen), nodes: [page.chosen], ...scoreOf(page.chosen) }] : groups();
@@ -113,7 +110,7 @@ export function attachHands() {
       await edited();
       const side = Number($("still-side").value), scale = side ? side / Math.max(host.clientWidth, host.clientHeight) : devicePixelRatio, size = [host.clientWidth, host.clientHeight].map((px) => Math.round(px * scale));
       await save(kind, { variant: variantOf(panes[0]), answerer: answererOf(panes[0]), groups: selected(), removed: page.removed, style: currentStyles()[0], capture: () => page.painter.capture(page.camera, painted(), ...size), flown: flown(),
-        kept: page.kept.map((query) => query.asked), last: page.asked?.query, camera: page.camera.toText(), name: page.scene.name.split("/").at(-1), told: tell });
+        queries: [...page.kept, { asked: page.asked?.query }].map((query) => query.asked).filter(Boolean), link: link().toString(), name: page.scene.name.split("/").at(-1), told: tell });
       redraw();
     } catch (error) { failed(error); }
   });

@@ -14,10 +14,9 @@ const MOST = 12;
 export const asking = (text) => ({ text, level: level(), ...(threshold() === null ? {} : { threshold: threshold() }),
   ...($("here").checked && page.camera.view >= 0 ? { view: page.camera.view } : {}) });
 
-// Until all answers have arrived, the query keeps those that it had.
 async function answered(query) {
-  const answers = [];
-  for (const pane of panes) answers.push(await api.query({ variant: variantOf(pane), answerer: answererOf(pane), ...query.asked }));
+  const answers = new Map();   // by answerer, because nodes of one tree mean nothing in another
+  for (const pane of [...panes]) answers.set(pane.by, await api.query({ variant: variantOf(pane), answerer: answererOf(pane), ...query.asked }));
   query.answers = answers;
 }
 
@@ -41,20 +40,21 @@ async function keepNext(asked) {
 
 // Kept queries from the address or from an exported page.
 export async function keepFromStart() {
-  const kept = api.offline ? api.kept : start.getAll("keep").map((text) => { try { return JSON.parse(text); } catch { return null; } });
+  const kept = start.getAll("keep").map((text) => { try { return JSON.parse(text); } catch { return null; } });
   for (const asked of kept) if (asked?.text) await keep(asked);
 }
 
 // Send all kept queries again after a change of answerer or tree.
 export const askKeptAgain = () => next(async () => {
   if (!page.kept.length) return;
+  showKept();
   for (const query of page.kept) await answered(query);
   showKept();
 });
 
 // Return the nodes of all shown queries with scores and doubts, for saved files.
 export function groups() {
-  const saved = ({ answer, text }) => ({ name: text, nodes: answer.hits.map((hit) => hit.node), scores: answer.hits.map((hit) => hit.score), doubts: doubtsOf(answer) });
+  const saved = ({ answer, text }) => ({ name: text, nodes: shownHits(answer).map((hit) => hit.node), scores: shownHits(answer).map((hit) => hit.score), doubts: doubtsOf(answer) });
   const found = keptIn(0).map(saved), answer = panes[0].answer;
   if (answer) found.push(saved({ answer, text: answer.text }));
   return found.filter((group) => group.nodes.length);
@@ -73,12 +73,12 @@ export function showKept() {
   $("kept-section").hidden = !page.kept.length && !page.asked?.text;
   $("keep").hidden = !page.asked?.text || !panes[0].answer?.hits.length || api.offline;
   $("kept").replaceChildren(...page.kept.map((query) => {
-    const { text, level: at, threshold: least } = query.asked, [{ total, level: found, hits }] = query.answers, doubts = doubtsOf(query.answers[0]);
+    const { text, level: at, threshold: least } = query.asked, answer = query.answers.get(panes[0].by), doubts = answer ? doubtsOf(answer) : [];
     const swatch = make("button", { type: "button", class: `swatch kept-${query.colour}`, "aria-pressed": String(query.shown), "aria-label": `Show ${text}`, title: query.shown ? "Hide" : "Show",
       onclick: () => { query.shown = !query.shown; showKept(); } });
     return make("li", {}, swatch,
       make("button", { type: "button", class: "words", title: ["Edit", ...doubts].join("\n"), disabled: api.offline, onclick: () => { drop(query); reopen(query.asked); } },
-        text, make("small", {}, [...(doubts.length ? ["doubtful"] : []), at === "auto" ? found : at, counted(total, "answer"), ...(hits.length ? [`best ${hits[0].score.toFixed(2)}`] : []), ...(least ? [`score at least ${least.toFixed(2)}`] : [])].join(", "))),
+        text, make("small", {}, [...(doubts.length ? ["doubtful"] : []), ...(answer ? [at === "auto" ? answer.level : at, counted(answer.hits.length, "answer")] : ["…"]), ...(answer?.hits.length ? [`best ${answer.hits[0].score.toFixed(2)}`] : []), ...(least ? [`score at least ${least.toFixed(2)}`] : [])].join(", "))),
       api.offline ? null : make("button", { type: "button", class: "drop", "aria-label": `Remove ${text}`, title: "Remove", onclick: () => drop(query) }, "×"));
   }));
   $("overlaps").textContent = overlaps();

@@ -1,6 +1,7 @@
 // Keyboard shortcuts, which are ignored while the user types and don't override the keys of the browser or of controls.
 
 const STEPS_PER_MS = 0.012, EASE_MS = 70;
+const TYPED = "input:not([type=radio]):not([type=checkbox]):not([type=range])";
 const ORBITS = { ArrowLeft: [-1, 0, 0], ArrowRight: [1, 0, 0], ArrowUp: [0, 1, 0], ArrowDown: [0, -1, 0] };
 const MOVES = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, 1, 0], e: [0, -1, 0] };
 const calm = matchMedia("(prefers-reduced-motion: reduce)");
@@ -45,9 +46,9 @@ export function attachKeys(act) {
   document.addEventListener("keyup", (event) => glide.held.delete(event.key.toLowerCase()));
   window.addEventListener("blur", () => glide.held.clear());
   document.addEventListener("keydown", (event) => {
-    if ((event.ctrlKey || event.metaKey) && !event.target.closest("input:not([type=radio]):not([type=checkbox]):not([type=range])") && act.undone(event)) { event.preventDefault(); return; }
+    if ((event.ctrlKey || event.metaKey) && !event.target.closest(TYPED) && act.undone(event)) { event.preventDefault(); return; }
     if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
-    const typing = event.target.closest("input:not([type=radio]):not([type=checkbox]), textarea, [contenteditable]");
+    const typing = event.target.closest(TYPED);
     if (event.key === "Escape") { act.clear(); return; }
     if (typing) return;
     const on = (selector) => event.target.closest(selector), letter = event.key.toLowerCase();

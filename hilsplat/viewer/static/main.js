@@ -13,7 +13,7 @@ import { restorePath } from "./path.js";
 import { Photos } from "./photos.js";
 import { describe, Renderer } from "./renderer.js";
 import { ServerPainter } from "./server_painter.js";
-import { failed, host, options, page, start, tell } from "./state.js";
+import { failed, host, openLink, options, page, start, tell } from "./state.js";
 import { fillVariants, useVariants, watch } from "./variants.js";
 
 function choosePainter(gl) {
@@ -21,7 +21,19 @@ function choosePainter(gl) {
   host.dataset.gl = gl.name;
   if (wanted === "server" && !api.offline) return serverPainter();
   host.dataset.painter = "gl";
-  return new Renderer(host, redraw);
+  return new Renderer(host, redraw, lost);
+}
+
+function lost() {
+  if (api.offline) { tell("The graphics card was reset: reload the page.", true); return; }
+  page.painter = insteadOf(page.painter, "The graphics card was reset");
+  redraw();
+}
+
+function insteadOf(painter, why) {
+  painter?.canvas.remove();
+  tell(`${why}, so the server renders the scene.`);
+  return serverPainter();
 }
 
 function serverPainter() {
@@ -35,20 +47,16 @@ async function begin() {
   document.title = `${page.scene.name} · hilsplat`;
   $("title").textContent = `Query ${page.scene.name.split("/").at(-1)}`;
   page.camera = new Camera(page.scene);
-  page.camera.fromText(start.get("c") ?? api.opening, page.scene.views);
   page.photos = new Photos(page.scene.views, stand);
   page.outline = new Outline(acts);
   if (!api.offline) restorePath();
-  for (const [id, key] of [["colour", "colour"], ["mode", "mode"]]) if ([...$(id).options].some((o) => o.value === start.get(key))) $(id).value = start.get(key);
-  const radio = [...document.querySelectorAll("[name=level]")].find((each) => each.value === start.get("level"));
-  if (radio) radio.checked = true;
+  openLink(start);
   let made = choosePainter(describe());
   if (made.kind === "gl") {
     try { await made.load(page.scene, api.splats, arriving); } catch (error) {
       if (api.offline) throw error;
-      made.canvas.remove();
-      console.warn(error); tell(`${error.message}, so the server renders the scene.`);
-      made = serverPainter();
+      console.warn(error);
+      made = insteadOf(made, error.message);
     }
   }
   page.painter = made;

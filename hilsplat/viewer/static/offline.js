@@ -7,7 +7,7 @@ export class Refused extends Error {}
 const held = (id) => document.getElementById(id).textContent.trim();
 const data = JSON.parse(held("data"));
 const plain = (words) => words.trim().toLowerCase().replace(/\s*>\s*/g, " > ");
-export const texts = data.asked.map((query) => query.text), opening = data.opening, kept = data.asked.slice(0, data.kept), first = data.asked[data.kept]?.text;
+export const texts = data.asked.map((query) => query.text), { link } = data;
 
 const unpacked = (id) => Uint8Array.from(atob(held(id)), (c) => c.charCodeAt(0)).buffer;
 
@@ -23,9 +23,9 @@ export const thumbUrl = photoUrl;
 export const cropUrl = (variant, node) => image(data.crops[node]);
 export const sorter = () => new Worker(URL.createObjectURL(new Blob([held("sorter")], { type: "text/javascript" })));
 
-export async function query({ text, level, threshold }) {
+export async function query({ text, level, threshold, view }) {
   const same = data.asked.map((asked, k) => plain(asked.text) === plain(text) ? k : -1).filter((k) => k >= 0);
-  const found = data.answers[same.find((k) => data.asked[k].level === level && data.asked[k].threshold === threshold) ?? same[0]];
+  const found = data.answers[same.find((k) => data.asked[k].level === level && data.asked[k].threshold === threshold && data.asked[k].view === view) ?? same[0]];
   if (!found) throw new Refused(`This page contains only the answers to: ${texts.join(", ") || "nothing"}.`);
   return found;
 }

@@ -34,14 +34,15 @@ export function drawOverlay(svg, camera, panes, width, height, covered = 0) {
       group.append(made);
       if (label) group.append(element("text", { x: at[0][0], y: at[0][1] }, label));
     }
-    for (const { corners, kind, label, node, stroke = null } of pane.boxes) {
+    for (const { corners, kind, label: whole, node, stroke = null } of pane.boxes) {
       const at = corners.map((corner) => camera.project(corner, k));
       if (at.some((point) => !point)) continue;   // a corner is behind the camera
       if (isOutside(at, each, height)) continue;
       const d = EDGES.map(([a, b]) => `M${at[a][0].toFixed(1)} ${at[a][1].toFixed(1)}L${at[b][0].toFixed(1)} ${at[b][1].toFixed(1)}`).join("");
       group.append(element("path", { d, class: "shadow" }), element("path", { d, class: kind, "data-node": node, ...(stroke ? { stroke } : {}) }));
       const top = at.reduce((best, point) => point[1] < best[1] ? point : best);
-      if (!label) continue;
+      if (!whole) continue;
+      const most = Math.max(8, Math.floor(each / LETTER_PX) - 1), label = whole.length > most ? `${whole.slice(0, most - 6)}…${whole.slice(-5)}` : whole;   // ends with the score
       const x = Math.max(4, Math.min(each - LETTER_PX * label.length, top[0])), right = x + LETTER_PX * label.length;
       let y = Math.max(covered + 14, top[1] - 6);
       while (placed.some((other) => x < other.right && other.x < right && Math.abs(y - other.y) < LINE_PX)) y += LINE_PX;   // below other labels

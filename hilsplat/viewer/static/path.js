@@ -13,14 +13,13 @@ let dragged = -1;
 
 const key = () => `hilsplat path of ${page.scene.name}`;
 const wired = () => page.path.map((view) => view.wire(host.clientWidth, host.clientHeight));
-const viewed = (set) => { const camera = page.camera.copy(); set(camera); return camera; };
 
 // The film's path and length, in the format of a request.
 export const flown = () => ({ frames: FRAMES_PER_S * seconds(), ...($("path").value === "path" ? { path: wired() } : {}) });
 const seconds = () => Math.min(20, Math.max(1, Math.round(Number($("seconds").value)) || 5));
 
 function changed() {
-  try { localStorage.setItem(key(), JSON.stringify(page.path.map((view) => view.toText()))); } catch { /* a frame in another site's page may have no storage */ }
+  try { localStorage.setItem(key(), JSON.stringify(page.path.map((view) => page.scene.views[view.view]?.name ?? view.toText()))); } catch { /* a frame in another site's page may have no storage */ }
   const count = page.path.length, flies = $("path").querySelector("[value=path]");
   flies.disabled = count < 2;
   flies.textContent = `along your path (${counted(count, "view")})`;
@@ -70,7 +69,7 @@ async function preview() {
   page.previewing = true;
   $("path-preview").textContent = "Stop";
   try {
-    const cameras = (await api.path(flown())).map((wire) => viewed((camera) => camera.standAt(wire, -1)));
+    const cameras = (await api.path(flown())).map((wire) => page.camera.ofView(wire));
     if (mine === previews) play(cameras, FRAMES_PER_S, ended);
   } catch (error) { if (mine === previews) ended(); failed(error); }
 }
@@ -84,7 +83,7 @@ async function openJson(file) {
   try {
     const { format, frames, path } = JSON.parse(await file.text());
     if (format !== FORMAT) throw new Error();
-    page.path = path.slice(0, MOST).map((wire) => viewed((camera) => camera.standAt(wire, -1)));
+    page.path = path.slice(0, MOST).map((wire) => page.camera.ofView(wire));
     $("seconds").value = Math.round(frames / FRAMES_PER_S);
     changed();
   } catch { tell(`${file.name} is not a camera path: choose a file that “Save JSON” wrote.`, true); }
@@ -104,6 +103,10 @@ export function attachPath() {
 export function restorePath() {
   let kept = [];
   try { kept = JSON.parse(localStorage.getItem(key()) ?? "[]"); } catch { /* no storage */ }
-  page.path = kept.map((text) => viewed((camera) => camera.fromText(text, page.scene.views)));
+  page.path = kept.map((text) => {
+    const number = page.scene.views.findIndex(({ name }) => name === text), camera = page.camera.copy();
+    camera.fromText(number < 0 ? text : `v${number}`, page.scene.views);
+    return camera;
+  });
   if (page.path.length) changed();
 }

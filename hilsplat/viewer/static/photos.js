@@ -1,7 +1,7 @@
 // The strip of photographs, and the photograph shown over the view if the camera has the photograph's pose.
 
 import * as api from "./api.js";
-import { $, make } from "./elements.js";
+import { $, attachArrows, make } from "./elements.js";
 import { picture } from "./pictures.js";
 
 export class Photos {
@@ -11,14 +11,9 @@ export class Photos {
     $("views").replaceChildren(...views.map((view, number) => make("button", { type: "button", role: "option", "aria-selected": "false", tabindex: number ? "-1" : "0",
       "aria-label": `${view.name}${view.split === "test" ? ", held out" : ""}`, title: view.name, class: view.split, onclick: () => stand(number) },
     picture(api.thumbUrl(number), {}))));
-    $("views").addEventListener("keydown", (event) => {
-      const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
-      if (!step) return;
-      const next = $("views").children[[...$("views").children].indexOf(document.activeElement) + step];
-      if (next) { next.focus(); next.click(); }
-      event.preventDefault(); event.stopPropagation();
-    });
-    $("photo").addEventListener("error", () => { $("photo").hidden = true; });
+    attachArrows($("views"));
+    $("photo").addEventListener("load", () => { $("photo").style.visibility = "visible"; });
+    $("photo").addEventListener("error", () => { $("photo").dataset.number = ""; });   // so that it is loaded again
   }
 
   cycle() { this.opacity = (this.opacity + 1) % 3; }
@@ -30,7 +25,7 @@ export class Photos {
     $("blend").setAttribute("aria-pressed", String(this.opacity > 0));
     photo.hidden = !this.opacity || number < 0;
     if (photo.hidden) return;
-    if (photo.dataset.number !== String(number)) { photo.src = api.photoUrl(number); photo.dataset.number = number; }
+    if (photo.dataset.number !== String(number)) { photo.style.visibility = "hidden"; photo.src = api.photoUrl(number); photo.dataset.number = number; }   // until it is loaded, the browser would show the previous one
     photo.classList.toggle("whole", this.opacity === 2);
     Object.assign(photo.style, { left: `${x}px`, top: `${y}px`, width: `${s * camera.lens.w}px`, height: `${s * camera.lens.h}px` });
   }

@@ -18,9 +18,10 @@ export function describe() {
 export class Renderer {
   kind = "gl";
 
-  constructor(host, onOrdered) {
+  constructor(host, onOrdered, onLost) {
     this.canvas = document.createElement("canvas");
     host.prepend(this.canvas);
+    this.canvas.addEventListener("webglcontextlost", onLost);
     this.gl = this.canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
     this.onOrdered = onOrdered;
     this.nodeTextures = new Map();

@@ -16,9 +16,9 @@ const KINDS = { "scene-ply": "scene.ply", "scene-spz": "scene.spz", ply: "select
 const IN_STEPS = { masks: ["Masks", "photographs"], mp4: ["Film", "pictures"], gif: ["Film", "pictures"], page: ["Page", "crops"] };
 const sized = (bytes) => bytes < 1e6 ? `${Math.ceil(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`;
 
-export async function save(kind, { variant, answerer, groups, removed, style, capture, flown, kept, last, camera, name, told }) {
+export async function save(kind, { variant, answerer, groups, removed, style, capture, flown, queries, link, name, told }) {
   const asked = {
-    masks: { variant, groups }, page: { variant, answerer, removed, kept, ...(last ? { last } : {}), start: camera },
+    masks: { variant, groups, removed }, page: { variant, answerer, removed, asked: queries, link },
     mp4: { variant, removed, style: wireStyle(style), format: "mp4", side_px: Number($("mp4-side").value), ...flown },
     gif: { variant, removed, style: wireStyle(style), format: "gif", side_px: Number($("gif-side").value), ...flown },
   }[kind];

@@ -4,16 +4,14 @@ import { $, counted } from "./elements.js";
 import { levelIndex, main, panes, threshold } from "./state.js";
 import { RAMP } from "./styles.js";
 
-let shown = "";
+let shown = null;
 
 export function showScale(style) {
   const has = style.high !== undefined && Boolean(panes[0].answer);
   $("scale").hidden = !has;
-  if (!has) { shown = ""; return; }
-  const least = threshold(), key = [style.low, style.high, least, panes[0].answer.text, Boolean(style.ramp)].join();
-  if (key === shown) return;
-  shown = key;
-  const bar = $("scale-bar"), context = bar.getContext("2d"), pixels = context.createImageData(256, 1);
+  if (!has || style === shown) return;
+  shown = style;
+  const least = threshold(), bar = $("scale-bar"), context = bar.getContext("2d"), pixels = context.createImageData(256, 1);
   for (let i = 0; i < 256; i++) {
     const value = style.low + i / 255 * (style.high - style.low), below = least !== null && value < least;
     pixels.data.set(below ? [28, 28, 28, 255] : [...RAMP.subarray(3 * i, 3 * i + 3), 255], 4 * i);

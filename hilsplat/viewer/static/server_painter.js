@@ -26,6 +26,7 @@ export class ServerPainter {
   async loadNodes() {}
   loadField() {}   // a frame request contains the text
   mark() {}        // and the marks
+  get unfinished() { return this.asked > 0 && !this.last; }
   get settled() { return this.drawn === this.asked; }
 
   resize(width, height) {

@@ -1,15 +1,13 @@
 // Variants of the scene, one or two side by side, including variants that appear during a run.
 
 import * as api from "./api.js";
-import { ask, listAnswers } from "./asking.js";
-import { choose } from "./choosing.js";
-import { restyle } from "./drawing.js";
+import { ask, askAs, clearAnswer, listAnswers } from "./asking.js";
+import { choose, readNames } from "./choosing.js";
+import { redraw, restyle } from "./drawing.js";
 import { $, counted, make } from "./elements.js";
 import { askKeptAgain, keepFromStart } from "./kept.js";
-import { isStopped, showStopped } from "./stopped.js";
+import { follow } from "./stopped.js";
 import { failed, loadVariant, main, outlines, page, panes, sceneChanged, start, tell, variantOf } from "./state.js";
-
-const POLL_MS = 4000;
 
 export function fillVariants() {
   const choices = page.scene.variants.flatMap((name) => [[`${name}|tree`, `${name}, tree`], [`${name}|field`, `${name}, field`]]);
@@ -30,10 +28,10 @@ export async function useVariants() {
   for (const pane of panes) await loadVariant(variantOf(pane));
   fillVariants();
   showOutline();
-  const text = page.waiting ? $("text").value : start.get("q") ?? api.first;   // an exported page opens with its last query
+  const wasWaiting = page.waiting;
   page.waiting = false;
   await keepFromStart();
-  if (text) { $("text").value = text; await ask(); }
+  if (wasWaiting) await ask(); else await askAs(start);
   const [node, tree] = (start.get("node") ?? "").split(".");   // the row is valid only in the same tree
   if (tree === main().tree && main().nodes[node]) choose(Number(node));
 }
@@ -44,7 +42,6 @@ function showOutline() {
   if (names.length && !api.offline) $("text").placeholder = names.slice(0, 2).join(", or ");
   listAnswers();
   $("about").textContent = `${page.scene.name}: ${counted(page.scene.gaussians, "Gaussian")}. Masks: ${main().masks}. Text and image vectors: ${main().clip}.`;
-  restyle();
 }
 
 export async function choosePanes() {
@@ -55,41 +52,28 @@ export async function choosePanes() {
     else if (panes[1]?.by !== right) panes[1] = { by: right, answer: null, field: null };
     for (const pane of panes) await loadVariant(variantOf(pane));
     if (changed) { choose(-1); showOutline(); }
-    if (page.asked?.text) await ask(true); else listAnswers();
+    if (page.asked?.text) await ask(true);
+    else if (page.asked && !panes[0].answer) clearAnswer();   // similar nodes of the previous tree
+    else listAnswers();
     await askKeptAgain();
     restyle();
   } catch (error) { failed(error); }
 }
 
 // Check regularly whether files of the scene changed and whether there are new variants.
-export async function watch() {
-  while ($("changed").hidden) {
-    await new Promise((done) => setTimeout(done, POLL_MS));
-    if (document.hidden) continue;
-    try {
-      const now = await api.changes();
-      showStopped(false);
-      if (now.of !== page.scene.of || now.changed.length) sceneChanged(now.changed);
-      else if (now.variants.join() !== page.scene.variants.join()) await moreAnswer(now.variants);
-      else await renamedElsewhere(now.names);
-    } catch (error) { if (isStopped(error)) showStopped(true); else failed(error); }
-  }
-}
+export const watch = () => follow(api.changes, async (now) => {
+  if (!$("changed").hidden) return;
+  if (page.painter.unfinished) redraw();   // the server could not render the last picture
+  if (now.of !== page.scene.of || now.changed.length) sceneChanged(now.changed);
+  else if (now.variants.join() !== page.scene.variants.join()) await moreAnswer(now.variants);
+  else await renamedElsewhere(now.names);
+}, { failed });
 
 // Show names that were given in another tab.
 async function renamedElsewhere(versions) {
   for (const [variant, own] of outlines) {
     if (!(variant in versions) || versions[variant] === own.version) continue;
-    const { nodes, version } = await api.variant(variant);
-    own.version = version;
-    nodes.forEach(({ name }, row) => {
-      if (own.nodes[row].name === name) return;
-      own.nodes[row].name = name;
-      for (const pane of panes) for (const hit of pane.answer?.hits ?? []) if (variantOf(pane) === variant && hit.node === row) hit.name = name;
-      if (own === main()) page.outline.renamed(row);
-    });
-    listAnswers();
-    restyle();
+    await readNames(own);
   }
 }
 

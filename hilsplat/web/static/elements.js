@@ -13,6 +13,16 @@ export function make(tag, attributes = {}, ...children) {
   return element;
 }
 
+// Let the arrow keys choose the next and previous item of a list of buttons.
+export function attachArrows(list) {
+  list.addEventListener("keydown", (event) => {
+    const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key], next = list.children[[...list.children].indexOf(document.activeElement) + step];
+    if (!step) return;
+    if (next) { next.focus(); next.click(); }
+    event.preventDefault(); event.stopPropagation();
+  });
+}
+
 export const counted = (count, noun) => `${count.toLocaleString("en")} ${noun}${count === 1 ? "" : "s"}`;
 export const LEVELS = ["whole", "part", "subpart"];
 // Return the user's name, else the vocabulary name, else "?".

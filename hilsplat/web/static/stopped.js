@@ -3,7 +3,7 @@
 
 import { $, make } from "./elements.js";
 
-const RETRY_MS = 2000;
+const RETRY_MS = 2000, POLL_MS = 4000;
 let command = "";
 
 export const restartWith = (words) => { command = words; };
@@ -28,5 +28,20 @@ export async function insist(request, more) {
       showStopped(true, more());
       await new Promise((done) => setTimeout(done, RETRY_MS));
     }
+  }
+}
+
+// Pass the server's news to `work` regularly while the page is visible; `more` is as in `insist`.
+export async function follow(news, work, { failed = () => {}, more = () => "" }) {
+  let wake = () => {};
+  document.addEventListener("visibilitychange", () => wake());
+  for (;;) {
+    await new Promise((done) => { wake = done; setTimeout(done, POLL_MS); });
+    if (document.hidden) continue;
+    try {
+      const now = await news();
+      showStopped(false);
+      await work(now);
+    } catch (error) { if (isStopped(error)) showStopped(true, more()); else failed(error); }
   }
 }

@@ -33,7 +33,8 @@ export function colourOf(node) {
   return [value(0), value(8), value(4)];
 }
 
-// Hits that are painted and boxed; only the first few hits for a similarity query, because all nodes are ranked.
+export const LISTED = 24;   // answers with an entry in the list and a box
+// Hits that are painted and saved; only the first few hits for a similarity query, because all nodes are ranked.
 const PAINTED_ALIKE = 5;
 export const shownHits = (answer) => answer?.route === "like" ? answer.hits.slice(0, PAINTED_ALIKE) : answer?.hits ?? [];
 

@@ -175,3 +175,11 @@ def test_labels_without_levels_are_wholes_with_the_ids_of_the_same_objects(tmp_p
     write_labels(tmp_path / "a.json", "a.jpg", SIZE, known["a.jpg"], version_of(tmp_path / "a.json"))
     assert json.loads((tmp_path / "a.json").read_text())["original"] == before
     assert known_labels(tmp_path, cameras, cameras.names) == known
+
+
+def test_a_region_can_be_anywhere_in_the_widest_photograph():
+    corners = [(32_700, 2), (32_767, 2), (32_767, 5), (32_700, 5)]
+    label = Label(id=1, level=1, text="mug", polygons=[corners])
+    expected = np.zeros((8, 32_768), bool)
+    expected[2:6, 32_700:] = True
+    np.testing.assert_array_equal(label.mask((8, 32_768)), expected)

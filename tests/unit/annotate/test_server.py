@@ -219,11 +219,11 @@ def test_files_that_cannot_be_imported_are_noted_beside_the_others(client):
 def test_a_rewritten_tree_is_reported_and_not_used_until_a_reload(own_desk, labels):
     client = opened(own_desk, labels)
     of = {"of": client.get("/api/scene").json()["of"]}
-    assert client.get("/api/changes").json() == {**of, "changed": []}
+    assert client.get("/api/changes").json() == {**of, "changed": [], "labels": ["none"] * 6}
     pixel = {"view": 0, "x": 6, "y": 6}
     assert client.post("/api/at", json=pixel, params=of).status_code == 200
     write_again(own_desk / "default/semantic_tree")
-    assert client.get("/api/changes").json() == {**of, "changed": ["semantic_tree"]}
+    assert client.get("/api/changes").json() == {**of, "changed": ["semantic_tree"], "labels": ["none"] * 6}
     for path, sent in (("at", pixel), ("carry", {"ids": [1], "view": 1})):
         refused = client.post(f"/api/{path}", json=sent, params=of)
         assert refused.status_code == 409

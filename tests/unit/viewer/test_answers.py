@@ -20,6 +20,7 @@ from plyfile import PlyData
 from pycocotools import mask as coco_masks
 from starlette.requests import Request
 
+import hilsplat
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.query.names import FILE
 from hilsplat.splat.ply import load_ply
@@ -31,6 +32,7 @@ from hilsplat.viewer.viewer_scene import ViewerScene
 from hilsplat.web.scene_thread import SceneThread
 from tests.unit.base.test_untrusted_files import png, write_eps
 from tests.unit.finished_desk import SCENE
+from tests.unit.many_nodes import add_nodes
 from tests.unit.splat.spz_reader import decoded
 from tests.unit.viewer.conftest import browsing, in_steps, run_apart, wire_camera
 
@@ -53,6 +55,15 @@ def test_the_server_returns_the_answers_of_the_scene(client, scene, text, answer
     assert found["doubts"] == [str(doubt) for doubt in hits[0].doubts] and found["route"] == hits[0].route
     last = text.split(">")[-1].strip()
     np.testing.assert_allclose(found["relevancy"], scene.node_relevancy([last], answerer)[0], atol=1e-4)
+
+
+def test_all_answers_are_sent(own_desk):
+    add_nodes(own_desk, 100)
+    asked = {"text": "unicorn", "level": "part", "threshold": 0.4}
+    with browsing(ViewerScene(own_desk)) as client:
+        found = client.post("/api/query", json=asked).json()["hits"]
+    hits = hilsplat.open_scene(own_desk).query("unicorn", "part", threshold=0.4, limit=1000)
+    assert [hit["node"] for hit in found] == [hit.node for hit in hits] and len(found) > 90
 
 
 def test_requests_match_their_openapi_description(client):
@@ -354,7 +365,7 @@ def test_gaussians_are_sent_once(client, shown):
 def test_an_exported_page_sends_no_requests_and_escapes_texts(client, shown):
     evil = "mug </script><script>alert(1)</script>".replace(">", "")
     kept = {"text": "mug > handle", "level": "part", "threshold": 0.3}
-    progress, data = in_steps(client, "page", kept=[kept], last={"text": evil}, start="v3")
+    progress, data = in_steps(client, "page", asked=[kept, {"text": evil}], link="c=v3")
     nodes = len(shown.answering("default").tree)
     assert progress == [(made, nodes) for made in range(nodes + 1)]
     page = data.decode()
@@ -363,8 +374,8 @@ def test_an_exported_page_sends_no_requests_and_escapes_texts(client, shown):
     assert len(decoded(base64.b64decode(held["splats"]))) == len(shown.gaussians)
     data = json.loads(held["data"])
     assert [answer["text"] for answer in data["answers"]] == ["mug > handle", evil]
-    assert data["asked"] == [kept, {"text": evil, "level": "auto"}] and data["kept"] == 1
-    assert len(data["photos"]) == len(data["scene"]["views"]) and data["opening"] == "v3"
+    assert data["asked"] == [kept, {"text": evil, "level": "auto"}]
+    assert len(data["photos"]) == len(data["scene"]["views"]) and data["link"] == "c=v3"
 
 
 def test_gaussians_are_shown_during_a_run_before_queries_work(desk_project, tmp_path):

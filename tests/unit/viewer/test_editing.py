@@ -2,11 +2,14 @@
 
 import base64
 import io
+import zipfile
 from itertools import pairwise
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from plyfile import PlyData
 
 from hilsplat.scene.cameras import Camera
@@ -119,6 +122,30 @@ def test_pictures_picks_and_films_leave_out_removed_gaussians(shown, client, cam
         for more in ({}, {"removed": bits(shown, np.arange(len(left)) > 0)})
     ]
     assert sizes[1] < 0.8 * sizes[0]  # one Gaussian remains
+
+
+def test_a_pick_ignores_what_the_style_hides(shown, client, camera):
+    (book,) = shown.answering("default").query("book")
+    table = np.zeros((1 + len(shown.answering("default").tree), 4), np.uint8)
+    table[1 + book.node] = 255
+    style = {"table": base64.b64encode(table.tobytes()).decode()}
+    for mode, is_shown in (("isolate", False), ("tint", True), ("ghost", True)):
+        sent = {"camera": wire_camera(camera), "x": 8.5, "y": 8.5, "style": {**style, "mode": mode}}
+        assert (client.post("/api/pick", json=sent).json()["alpha"] > 0.9) == is_shown  # of the mug
+        assert client.post("/api/pick", json={**sent, "x": 24.5}).json()["alpha"] > 0.9
+
+
+def test_saved_masks_leave_out_removed_gaussians(shown, client, left):
+    scene = shown.answering("default")
+    (book,) = scene.query("book", "whole")
+    groups = [{"name": "book", "nodes": [book.node]}]
+    _, data = in_steps(client, "masks", groups=groups, removed=bits(shown, left))
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        for shift, view in enumerate(scene.views.names):
+            mask = np.array(Image.open(archive.open(f"masks/{Path(view).stem}/{book.node}.png")))
+            whole = book.mask(view)
+            assert whole[:, : 17 + shift].any() and not mask[:, : 17 + shift].any()
+            np.testing.assert_array_equal(mask[:, 19 + shift :], whole[:, 19 + shift :])
 
 
 def test_selected_gaussians_have_their_colour_in_frames(shown, client, camera, left):
