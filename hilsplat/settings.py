@@ -244,11 +244,6 @@ class MasksSettings(Section):
     )
 
     @property
-    def tree_theta(self) -> float | None:
-        """Threshold of the trees whose depths are the levels; None if the levels are those of the heads."""
-        return (self.theta or CoverageTreeSettings().theta) if self.levels == "tree" else None
-
-    @property
     def uses_model(self) -> bool:
         return self.segmenter == "sam"
 

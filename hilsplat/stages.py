@@ -136,7 +136,7 @@ def imported_masks(scene: PathIn, features: PathIn, out: PathOut, settings: of.M
     """Import LangSplat's masks, a folder of _s.npy and _f.npy files; only levels and theta apply."""
     from hilsplat.embed.langsplat_files import run_imported_masks
 
-    run_imported_masks(scene, features, out, settings.tree_theta)
+    run_imported_masks(scene, features, out, settings)
 
 
 @stage(artifact="masks", loop="masks of views", when=lambda scene: scene.settings.masks.key_views < 1)
@@ -267,7 +267,7 @@ def imported_clip(
     """Import LangSplat's CLIP vectors, a folder of _s.npy and _f.npy files."""
     from hilsplat.embed.langsplat_files import run_imported_clip
 
-    run_imported_clip(scene, features, out, settings, levels.tree_theta)
+    run_imported_clip(scene, features, out, settings, levels)
 
 
 @stage(loop="CLIP of views")

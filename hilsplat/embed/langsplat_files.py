@@ -23,14 +23,15 @@ from hilsplat.embed.clip import ClipModel, unit
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.placement import placed
 from hilsplat.scene.scene import Scene
-from hilsplat.segment.coverage import with_tree_levels
+from hilsplat.segment.coverage import levelled
 from hilsplat.segment.digests import MASKS_SHA256, digest_of
 from hilsplat.segment.masks import HierarchicalMasks, runs_of_labels
 from hilsplat.segment.stage import train_views, write_masks
-from hilsplat.settings import ClipSettings
+from hilsplat.settings import ClipSettings, MasksSettings
 
 logger = logging.getLogger(__name__)
 
+OF_HEADS = MasksSettings(levels="head")
 MIN_SHARE = 0.5
 """Minimum share of training views with files; if fewer, the files probably belong to a different scene."""
 CHECKED_MASKS, MIN_COSINE = 32, 0.8
@@ -55,13 +56,13 @@ def stems_of(views: list[str]) -> dict[str, str]:
 
 
 def read_view(
-    folder: Path, view: str, camera: Camera | None = None, theta: float | None = None
+    folder: Path, view: str, camera: Camera | None = None, levels: MasksSettings = OF_HEADS
 ) -> tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]:
     """Read the masks and vectors of one view, with rows in `content_order`.
 
-    The mixed-level map is ignored. Levels are those of the other maps or, with `theta`, the depths in the
-    view's coverage tree. Where masks of one level overlap, the files contain only the mask
-    painted last. The files contain no scores, so predicted IoU and stability are set to 1. Maps of the
+    The mixed-level map is ignored. Levels are those of the other maps or, as `levels` asks for, the depths in
+    the view's coverage tree. Where masks of one level overlap, the files contain only the mask painted last.
+    The files contain no scores, so predicted IoU and stability are set to 1. Maps of the
     photograph or of a scaled copy, such as LangSplat's 1080 rows, are transferred to the view (nearest
     pixel); without a camera, they stay as they are.
 
@@ -100,16 +101,14 @@ def read_view(
         runs = runs_of_labels(label_map, rows)
         parts.append(HierarchicalMasks.from_runs(*runs, level, ones, ones, label_map.shape))
         vector_rows.append(rows)
-    masks = HierarchicalMasks.concatenate(parts)
-    if theta is not None:
-        masks = with_tree_levels(masks, theta)
+    masks = levelled(HierarchicalMasks.concatenate(parts), levels)
     order = masks.content_order()
     vectors = vectors[np.concatenate(vector_rows)[order]].astype(np.float32)
     return masks.take(order), unit(vectors).astype(np.float16)
 
 
 def read_views(
-    folder: Path, cameras: Mapping[str, Camera | None], theta: float | None = None
+    folder: Path, cameras: Mapping[str, Camera | None], levels: MasksSettings = OF_HEADS
 ) -> tuple[dict[str, tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]], list[str]]:
     """Read training views (`read_view`); also return why others, whose files cannot be used, are left out.
 
@@ -119,7 +118,7 @@ def read_views(
     found, lost = {}, []
     for view in track(stems_of([*cameras]), "LangSplat's files"):
         try:
-            found[view] = read_view(folder, view, cameras[view], theta)
+            found[view] = read_view(folder, view, cameras[view], levels)
         except HilsplatError as error:
             lost.append(in_one_line(error))
     if len(found) < MIN_SHARE * len(cameras):
@@ -131,11 +130,11 @@ def read_views(
     return found, lost
 
 
-def run_imported_masks(scene_folder: Path, files: Path, out: Path, theta: float | None = None) -> None:
+def run_imported_masks(scene_folder: Path, files: Path, out: Path, levels: MasksSettings = OF_HEADS) -> None:
     """Write LangSplat's masks in the format of `segment.stage.write_masks`."""
     scene = Scene.load(scene_folder)
     with stage_log("langsplat masks", scene.name) as counts:
-        views, lost = read_views(files, {view: scene.cameras[view] for view in train_views(scene)}, theta)
+        views, lost = read_views(files, {view: scene.cameras[view] for view in train_views(scene)}, levels)
         if lost:
             logger.warning("%s: %d views are left out: %s", files, len(lost), "; ".join(lost[:5]))
         masks = {view: masks for view, (masks, _) in views.items()}
@@ -143,7 +142,7 @@ def run_imported_masks(scene_folder: Path, files: Path, out: Path, theta: float 
 
 
 def run_imported_clip(
-    scene_folder: Path, files: Path, out: Path, settings: ClipSettings, theta: float | None = None
+    scene_folder: Path, files: Path, out: Path, settings: ClipSettings, levels: MasksSettings = OF_HEADS
 ) -> None:
     """Write LangSplat's vectors in the format of the clip stage, with rows as in `run_imported_masks`.
 
@@ -153,7 +152,7 @@ def run_imported_clip(
     model = ClipModel.load(Path(settings.model), variant=settings.variant)
     with stage_log("langsplat clip", scene.name) as counts, atomic_folder(out) as folder:
         index = {}
-        views, _ = read_views(files, {view: scene.cameras[view] for view in train_views(scene)}, theta)
+        views, _ = read_views(files, {view: scene.cameras[view] for view in train_views(scene)}, levels)
         _require_model(model, scene, files, views)
         for view, (masks, vectors) in views.items():
             write_npy(folder / f"{view}.npy", vectors)

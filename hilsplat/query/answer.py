@@ -61,14 +61,14 @@ def answer(
         SettingsError: `masks`, which is written last, is or contains another output.
     """
     finished = FinishedScene.locate(Path(folder), variant)
+    scene = LanguageScene.of(finished, threads=threads)
+    nodes = scene.select(text, level=level, answerer=answerer, view=view, threshold=threshold)
     folder = Path(out) if out is not None else finished.folder / "queries" / file_name(text)
     panel, selection, compressed = (folder / name for name in ("panel.png", "selection.ply", "selection.spz"))
     spz = spz or compressed.is_file()  # that of an earlier answer would remain
     written = (panel, selection, compressed) if spz else (panel, selection)
     if masks is not None and any(path.resolve().is_relative_to(Path(masks).resolve()) for path in written):
         raise SettingsError(f"--masks {masks} would replace {panel}", fix="choose a folder of its own")
-    scene = LanguageScene.of(finished, threads=threads)
-    nodes = scene.select(text, level=level, answerer=answerer, view=view, threshold=threshold)
     label = masks_label(finished.parts.masks)
     note = f"; diagnostic only, with masks made from true labels: {label}" if made_from_truth(label) else ""
     caution = scene.caution_about(text)

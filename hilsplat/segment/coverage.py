@@ -13,7 +13,7 @@ from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.progress import stage_log, track
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.settings import CoverageTreeSettings
+from hilsplat.settings import CoverageTreeSettings, MasksSettings
 
 
 def coverage_parents(
@@ -73,12 +73,16 @@ def coverage_tree(
     return parent, depths(parent)
 
 
-def with_tree_levels(masks: HierarchicalMasks, theta: float) -> HierarchicalMasks:
-    """Return the masks, in the same order, with levels set to their depths in the view's tree.
+def levelled(masks: HierarchicalMasks, settings: MasksSettings) -> HierarchicalMasks:
+    """Return the masks, in the same order, with the levels that the settings ask for: their own by default.
 
-    Roots become wholes, their children parts, and all other descendants subparts, regardless of the head
-    that predicted them. This rule is from a comment in the source of the paper (Sec. III-B).
+    With `levels: tree`, they are the depths in the view's tree: roots become wholes, their children parts,
+    and all other descendants subparts, regardless of the head that predicted them. This rule is from a
+    comment in the source of the paper (Sec. III-B).
     """
+    if settings.levels == "head":
+        return masks
+    theta = settings.theta or CoverageTreeSettings().theta
     depth = depths(coverage_parents(masks.overlaps_px(), None, theta))
     return replace(masks, level=np.minimum(depth, len(LEVELS)).astype(np.uint8))
 

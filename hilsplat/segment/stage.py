@@ -21,7 +21,7 @@ from hilsplat.models.card import recorded
 from hilsplat.models.int8 import CHECKED_VIEWS
 from hilsplat.models.memory import needs_of
 from hilsplat.scene.scene import Scene
-from hilsplat.segment.coverage import with_tree_levels
+from hilsplat.segment.coverage import levelled
 from hilsplat.segment.digests import digests_in, index_entry, load_masks
 from hilsplat.segment.generate import Candidates, candidates_key, decode_candidates, masks_from_candidates
 from hilsplat.segment.graph import segment_graph
@@ -114,9 +114,9 @@ def segment_views(
         if finished and view in finished_digests:
             return load_masks(finished, view, finished_digests)
         masks = segment_view(view)
-        if settings.tree_theta is None:
+        if settings.levels == "head":
             return masks
-        masks = with_tree_levels(masks, settings.tree_theta)
+        masks = levelled(masks, settings)
         return masks.take(masks.content_order())
 
     return zip(views, in_order(segment, views, threads), strict=True), origin

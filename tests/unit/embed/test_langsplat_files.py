@@ -14,10 +14,11 @@ from hilsplat.embed.langsplat_files import read_view, run_imported_clip, run_imp
 from hilsplat.scene.cameras import Camera
 from hilsplat.segment.digests import digest_of, index_entry
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.settings import ClipSettings
+from hilsplat.settings import ClipSettings, MasksSettings
 from tests.unit.segment.handmade import assert_equal_masks, pack, save_scene
 
 SIZE = (6, 8)
+BY_TREE = MasksSettings(levels="tree", theta=0.9)
 
 
 def camera(size_hw: tuple[int, int], name: str = "a.png") -> Camera:
@@ -99,11 +100,11 @@ def test_exported_files_are_read_back(ours, files, scene, model, tmp_path):
 def test_levels_by_the_tree_replace_those_of_the_maps(ours, files, scene, model, tmp_path):
     for path in files.glob("*_s.npy"):
         np.save(path, np.load(path)[[0, 3, 2, 1]])  # subparts in the map of wholes
-    run_imported_masks(scene, files, tmp_path / "masks again", theta=0.9)
+    run_imported_masks(scene, files, tmp_path / "masks again", BY_TREE)
     found = HierarchicalMasks.load(tmp_path / "masks again" / "a.png.npz")
     assert_equal_masks(found, nested())
     settings = ClipSettings(model=str(model.model.folder))
-    run_imported_clip(scene, files, tmp_path / "clip again", settings, theta=0.9)
+    run_imported_clip(scene, files, tmp_path / "clip again", settings, BY_TREE)
     assert read_index(tmp_path / "clip again")["views"]["a.png"]["masks_sha256"] == digest_of(found)
     again = read_npy(tmp_path / "clip again" / "a.png.npy").astype(float)
     np.testing.assert_allclose(again, read_npy(ours[1] / "a.png.npy").astype(float), atol=1e-3)

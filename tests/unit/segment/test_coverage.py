@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from hilsplat.base.levels import NONE
-from hilsplat.segment.coverage import coverage_parents, coverage_tree, with_tree_levels
+from hilsplat.segment.coverage import coverage_parents, coverage_tree, levelled
+from hilsplat.settings import MasksSettings
 from tests.unit.segment.handmade import pack
 
 shapes = st.tuples(st.integers(1, 8), st.just(3), st.just(4))
@@ -17,6 +18,10 @@ nonempty_masks = hnp.arrays(bool, shapes).filter(lambda masks: masks.any(axis=(1
 def rows(*texts: str) -> np.ndarray:
     """Masks of one image row: `#` inside, `.` outside."""
     return np.array([[[letter == "#" for letter in text]] for text in texts])
+
+
+def of_tree(theta: float) -> MasksSettings:
+    return MasksSettings(levels="tree", theta=theta)
 
 
 def parents_of(masks: np.ndarray, theta: float, level: list[int]) -> list[int]:
@@ -82,7 +87,7 @@ def test_the_tree_equals_a_loop_over_pairs(masks, theta, data):
 
 def test_levels_by_the_tree_are_depths_for_masks_of_any_head_and_depend_on_theta():
     masks = rows("##########", "######....", "###.......", "##........", ".......##.")
-    by_tree = with_tree_levels(pack(masks, [3, 3, 1, 2, 2]), 0.9)
+    by_tree = levelled(pack(masks, [3, 3, 1, 2, 2]), of_tree(0.9))
     assert sorted(zip(by_tree.area_px.tolist(), by_tree.level.tolist(), strict=True)) == [
         (2, 2),  # a child of the root
         (2, 3),  # fourth generation
@@ -91,5 +96,5 @@ def test_levels_by_the_tree_are_depths_for_masks_of_any_head_and_depend_on_theta
         (10, 1),
     ]
     overlapping = pack(rows("########..", ".....####."))  # 3 of the second mask's 4 px are in the first
-    assert with_tree_levels(overlapping, 0.9).level.tolist() == [1, 1]
-    assert with_tree_levels(overlapping, 0.7).level.tolist() == [1, 2]
+    assert levelled(overlapping, of_tree(0.9)).level.tolist() == [1, 1]
+    assert levelled(overlapping, of_tree(0.7)).level.tolist() == [1, 2]

@@ -159,7 +159,8 @@ def test_imported_masks_get_the_levels_of_the_variant_and_need_no_model(tmp_path
     found = Plan({"scenes": str(sheet), **variants, "coverage_tree": {"theta": 0.7}})
     jobs = [Job("photos", "desk", variant) for variant in ("default", "tree")]
     levels = [MasksSettings.model_validate_json(found.settings("masks", job)) for job in jobs]
-    assert [(each.tree_theta, each.uses_model) for each in levels] == [(None, False), (0.7, False)]
+    assert [(each.levels, each.uses_model) for each in levels] == [("head", False), ("tree", False)]
+    assert levels[1].theta == 0.7
     values = found.params("imported_masks")["settings"](jobs[1])
     assert found.settings("masks", jobs[1]) in values  # as `workflow.records` expects
     first, other = (found.identity("clip", variant, (), True) for variant in ("default", "tree"))
