@@ -49,8 +49,9 @@ style: $(STAMP)
 types: $(STAMP)
 	mypy
 
+# One more process than cores, because tests wait for servers and locks; files that take a minute start first.
 test: lint
-	python -m pytest --numprocesses $(CORES) --dist loadfile --no-loadscope-reorder tests/workflow tests/browser tests/bad_inputs tests/damage tests/published_models tests/imports tests/unit tests/cpusplat
+	python -m pytest --numprocesses $$(($(CORES) + 1)) --dist loadfile --no-loadscope-reorder tests/workflow tests/unit/test_benchmarks.py tests/unit/training tests/browser tests/bad_inputs tests/damage tests/published_models tests/imports tests/unit tests/cpusplat
 
 # The variable turns off mkdocs-material's notice about MkDocs 2, which pyproject.toml excludes.
 docs: $(STAMP)
