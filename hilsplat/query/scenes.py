@@ -262,7 +262,10 @@ def report_of(scenes: Scenes, text: str, hits: Sequence[SceneHit]) -> str:
             f"{hit.name or '?':<{names}}  {hit.picture}"
             for hit in hits
         ]
-        lines.append(f"more about the best: {shlex.join(['hilsplat', 'query', str(hits[0].folder), text])}")
+        variant = scenes.found[0].finished.variant
+        of_variant = [] if variant == "default" else ["--variant", variant]
+        command = shlex.join(["hilsplat", "query", str(hits[0].folder), text, *of_variant])
+        lines.append(f"more about the best: {command}")
     lines += [f"doubtful: {doubt}" for hit in hits[:1] for doubt in hit.doubts]
     lines += dict.fromkeys(hit.caution for hit in hits if hit.caution)
     lines += [f"{name} is skipped: {reason}" for name, reason in sorted(scenes.skipped.items())]

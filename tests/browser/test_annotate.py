@@ -561,6 +561,8 @@ def test_a_file_that_is_dropped_on_the_page_is_imported(page, tmp_path):
     }"""
     assert page.evaluate(drop, mug)
     page.get_by_text("1 label imported into 1 photograph.").wait_for()
+    saved(page)
+    assert [label.text for label in kept(tmp_path)] == ["mug"]
 
 
 def test_a_part_is_kept_in_a_photograph_without_its_whole(page, tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.lineage import read_provenance
 from hilsplat.cli.main import app
 from hilsplat.query.names import write_names
+from hilsplat.query.scenes import Scenes, report_of
 from tests.unit.artifact_changes import write_record
 
 SCENES = 50
@@ -152,6 +154,13 @@ def test_the_command_prints_a_table_or_json(changed, capsys):
     assert row["doubts"] == ["'unicorn' may not be in the scene: the model's vocabulary lacks 'unicorn'"]
     with pytest.raises(SettingsError, match="there is no text to search for in mug"):
         app(["query", "mug", *place], standalone_mode=False)
+
+
+def test_the_next_command_queries_the_same_variant(changed):
+    scenes = hilsplat.open_scenes(changed.parents[1])
+    of_paper = [replace(scene, finished=replace(scene.finished, variant="paper")) for scene in scenes.found]
+    report = report_of(Scenes(tuple(of_paper), {}), "mug", scenes.query("mug", limit=1))
+    assert report.splitlines()[-1].endswith(" mug --variant paper")
 
 
 def test_the_index_is_recorded_and_small(results):
