@@ -60,8 +60,8 @@ def read_view(
 ) -> tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]:
     """Read the masks and vectors of one view, with rows in `content_order`.
 
-    The mixed-level map is ignored. Levels are those of the other maps or, as `levels` asks for, the depths in
-    the view's coverage tree. Where masks of one level overlap, the files contain only the mask painted last.
+    The mixed-level map is ignored. `levels` selects those of the other maps or the depths in the
+    view's coverage tree. Where masks of one level overlap, the files contain only the mask painted last.
     The files contain no scores, so predicted IoU and stability are set to 1. Maps of the
     photograph or of a scaled copy, such as LangSplat's 1080 rows, are transferred to the view (nearest
     pixel); without a camera, they stay as they are.

@@ -74,7 +74,7 @@ def coverage_tree(
 
 
 def levelled(masks: HierarchicalMasks, settings: MasksSettings) -> HierarchicalMasks:
-    """Return the masks, in the same order, with the levels that the settings ask for: their own by default.
+    """Return the masks, in the same order, with the levels that the settings select; by default, their own.
 
     With `levels: tree`, they are the depths in the view's tree: roots become wholes, their children parts,
     and all other descendants subparts, regardless of the head that predicted them. This rule is from a
