@@ -19,6 +19,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export PATH := $(CURDIR)/$(BIN):$(PATH)
+# Images of containers often set this variable. Without compiled modules, each of the hundreds of processes that
+# a run starts takes a sixth longer to start.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: run demo test lint style types docs bench gpu gpu-build chaos published report setup
 
