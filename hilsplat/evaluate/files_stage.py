@@ -1,6 +1,7 @@
 """The evaluate-files stage: scores any program's predictions without the pipeline; writes `scores.csv`."""
 
 import logging
+import math
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
@@ -254,12 +255,14 @@ def read_point_instances(
             continue
         try:
             name, class_id, confidence = line.rsplit(maxsplit=2)
-            classes.append(int(class_id))
+            classes.append(np.int64(int(class_id)))
             confidences.append(float(confidence))
-        except ValueError as error:
+            if not math.isfinite(confidences[-1]):
+                raise ValueError(confidence)
+        except (ValueError, OverflowError) as error:
             raise ArtifactError(
                 f"line {number} of {path} does not describe an instance",
-                expected="<mask file> <class id> <confidence>",
+                expected="<mask file> <class id> <finite confidence>",
                 found=line,
                 fix="write one line per predicted instance, in ScanNet's format",
             ) from error

@@ -240,14 +240,14 @@ def flat_rows(
         level: level whose texts are queried, on a stand-in with levels; None if the labels have no levels.
         are_masks: whether all views have masks as answers, not relevancy.
     """
-    words: list[str] = []
+    words = truth.departures
     if card in OF_EVERY_TEXT:
         queries = truth.categories
     elif level is None:
         queries = (*truth.categories, *truth.absent)
     else:
         queries = tuple(query for query in truth.queries if query.level is level)
-        words = ["wholes"] if level is Level.WHOLE else []
+        words = [*(["wholes"] if level is Level.WHOLE else []), *words]
     words += [WORDS] if are_masks else []
     if card is cards.OVS_ARGMAX:
         yield from argmax_rows(METHOD, queries, partial(_cosine, answers), words, level is not None)
@@ -260,7 +260,7 @@ def flat_rows(
 
 def level_rows(answers: Answers, truth: ViewTruth, are_masks: bool = True) -> Iterator[Measured]:
     """Yield the rows of a view's answers with levels, and their hierarchical consistency."""
-    card, words = cards.LEVEL_GIVEN, [WORDS] if are_masks else []
+    card, words = cards.LEVEL_GIVEN, [*truth.departures, *([WORDS] if are_masks else [])]
     for query in truth.queries:
         assert query.level is not None
         answer = answers.get((query.level.label, query.text))

@@ -1,5 +1,6 @@
 """Queries of a view, their scores, and the scores of missing answers."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -29,8 +30,13 @@ def annotations_of(folder, nodes, regions):
     return HierarchyAnnotations.load(folder)
 
 
+def truth_in(annotations, min_px=1):
+    """Truth whose minimum area is not in protocol names."""
+    return replace(ViewTruth.of(annotations, "v.png", SIZE, min_px), min_px=0)
+
+
 def truth_of(folder, nodes, regions):
-    return ViewTruth.of(annotations_of(folder, nodes, regions), "v.png", SIZE, 1)
+    return truth_in(annotations_of(folder, nodes, regions))
 
 
 class HandMade:
@@ -85,7 +91,7 @@ def worked_example(tmp_path, without=()):
             answers[text, Level(level)] = answers[text, None] = [node]
             answers[annotations.path_of(node)] = [node]
     scene = HandMade([box(*each) for each in ANSWERED], answers)
-    return scene, ViewTruth.of(annotations, "v.png", SIZE, 1)
+    return scene, truth_in(annotations)
 
 
 def test_consistency_rows_match_the_worked_example(tmp_path):
@@ -141,7 +147,7 @@ def test_text_at_two_levels_is_one_category_and_two_queries(tmp_path):
 
 def test_small_regions_are_not_scored_and_labels_of_another_size_are_refused(tmp_path):
     annotations = annotations_of(tmp_path, NODES, REGIONS)
-    truth = ViewTruth.of(annotations, "v.png", SIZE, min_px=9)
+    truth = truth_in(annotations, 9)
     assert [query.text for query in truth.queries] == ["A", "B", "a1", "b1"]  # x has 4 px, a2 has 8
     assert truth.families() == [[(("A",), [("A", "a1")]), (("B",), [("B", "b1")])], []]
     with pytest.raises(MisalignedArtifactError, match=r"10 x 10"):
@@ -203,17 +209,6 @@ def test_an_answer_with_nothing_in_it_localizes_nothing(tmp_path, constant):
     found = {key: value for key, value in values.items() if key[-1].startswith("localization")}
     assert {key[0] for key in found} == {"field", "tree", "tree-path"}
     assert set(found.values()) == {0.0}
-
-
-def test_settings_of_nodes_are_in_the_names_of_all_protocols_of_nodes(block_world):
-    view, size_hw = "001.png", (64, 64)
-    settings = EvaluateSettings(node_select=0.5, methods=("tree",))
-    truth = ViewTruth.of(block_world.annotations, view, size_hw, settings.min_region_px)
-    flat = ExtraProtocols((card_of("3d-ovs/tree-nodes"), card_of("lerf-mask/gaussian-grouping")))
-    selections = Selections(block_world.answers)
-    rows = list(measure_view(selections, truth, view, PackedMasks(size_hw), settings, flat))
-    names = {row.protocol for row in rows if row.protocol.startswith(("3d-ovs", "lerf-mask"))}
-    assert len(names) == 2 and all("node share 0.5" in name for name in names)
 
 
 def test_a_repeated_text_nests_in_each_of_its_wholes(tmp_path):
