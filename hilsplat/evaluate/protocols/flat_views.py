@@ -13,14 +13,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int64
 
 from hilsplat.base.levels import Level
-from hilsplat.evaluate.metrics.masks import argmax_masks, iou, peak_points, pixel_accuracy
+from hilsplat.evaluate.metrics.masks import argmax_masks, iou, pixel_accuracy
 from hilsplat.evaluate.metrics.relevancy_rule import (
     RelevancyRule,
     SmoothedRelevancy,
     relevancy_mask,
     smoothing_of,
 )
-from hilsplat.evaluate.protocols.answers import NO_POINTS, mask_rows, relevancy_of
+from hilsplat.evaluate.protocols.answers import NO_POINTS, mask_rows, peaks_of_answer, relevancy_of
 from hilsplat.evaluate.protocols.cards import (
     LERF_LANGSPLAT,
     LERF_MASK,
@@ -126,7 +126,8 @@ def mask_of(
     if answer.ndim == 2 or rule is None:
         return answer, NO_POINTS
     smoothed = (smooth or smoothing_of(answer))(rule)
-    return relevancy_mask(smoothed, level, rule, united), peak_points(smoothed.filtered, level)
+    peaks = peaks_of_answer(answer, smoothed.filtered, level)
+    return relevancy_mask(smoothed, level, rule, united), peaks
 
 
 def answer_rows(

@@ -150,6 +150,8 @@ def test_classes_of_points_are_pooled_and_instances_matched():
         hilsplat.score(*absent, "scannet200/instances")
     half = hilsplat.score((masks[:1], [chair], [0.9]), (of_points, instances), "scannet200/instances")
     assert 0 < half.means["ap50"] < 1
+    nothing = hilsplat.score((masks[:0], [], []), (of_points, instances), "scannet200/instances")
+    assert nothing.means["ap50"] == 0
 
 
 def test_every_protocol_scores_arrays_or_says_that_it_needs_more():
@@ -182,8 +184,13 @@ SCAN = "scannet200/instances"
         ({"a": {}}, {"a": {"cup": CUP.astype(int)}}, LANGSPLAT, "label 'cup' is not a region"),
         ({"a": {}}, {"a": {"cup": CUP, "mug": CUP[1:]}}, LANGSPLAT, "a: the labels differ in size"),
         ({"a": {}}, {"a": {}}, LANGSPLAT, "a: there are no labels"),
+        ({"a": {}}, {"a": {"cup": CUP[:0]}}, LANGSPLAT, "label 'cup' is not a region"),
+        ([CUP], [CUP], LANGSPLAT, "the predictions are not arrays by view and text"),
+        ({"a": {5: CUP}}, {"a": {5: CUP}}, LANGSPLAT, "the predictions are not arrays by view and text"),
+        ({"a": {"cup": None}}, LABELS, LANGSPLAT, r"a: cup cannot be scored(.|\n)*\(\) object"),
         ({"a": {}}, {"a": {"cup": CUP & False}}, LANGSPLAT, "contain nothing that lerf/langsplat@2"),
         ({"a": {}}, {"a": {"a > b > c > d": CUP}}, LEVELLED, "more than 3 levels"),
+        (3, 3, "replica/opennerf", r"same points(.|\n)*\(\) int64, \(\) int64"),
         (np.zeros(3, int), np.zeros(4, int), "replica/opennerf", r"same points(.|\n)*\(3,\) int64, \(4,\)"),
         ((np.ones((2, 4)), [1], [0.5]), ([1] * 4, [1] * 4), SCAN, r"masks \(M, P\) bool"),
         ((np.ones((2, 4), int), [1] * 2, [0.5] * 2), ([1] * 4, [1] * 4), SCAN, "M, P. bool"),
@@ -196,6 +203,18 @@ SCAN = "scannet200/instances"
 def test_arrays_that_cannot_be_scored_are_refused(found, labels, protocol, message):
     with pytest.raises(HilsplatError, match=message):
         hilsplat.score(found, labels, protocol)
+
+
+def test_a_constant_relevancy_localizes_nothing():
+    """The maximum is everywhere, so it would be on any object."""
+    for protocol in (LANGSPLAT, "lerf/langsplat-v2"):
+        means = hilsplat.score({"a": {"cup": np.full((3, *SIZE), 0.5)}}, LABELS, protocol).means
+        assert means["localization_box"] == means["localization_mask"] == 0
+
+
+def test_texts_are_the_same_composed_or_decomposed():
+    for text, label in (("cafe\u0301", "caf\xe9"), ("caf\xe9", "cafe\u0301")):
+        assert hilsplat.score({"a": {text: CUP}}, {"a": {label: CUP}}).means["iou"] == 1
 
 
 def test_masks_and_relevancy_cannot_be_mixed():

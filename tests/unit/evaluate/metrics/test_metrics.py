@@ -109,7 +109,7 @@ def test_the_finest_of_the_levels_with_the_highest_value_is_chosen(level_rule, v
     smoothed = rules.SmoothedRelevancy.of(relevancy, rule)
     assert np.argwhere(rules.relevancy_mask(smoothed, None, rule)).tolist() == [place]
     if levels == LEVELS:
-        assert masks.peak_points(smoothed.filtered, None).tolist() == [place]
+        assert masks.peak_points(smoothed.filtered).tolist() == [place]
 
 
 # --- masks ----------------------------------------------------------------------------------------
@@ -173,7 +173,7 @@ def test_argmax_protocol_of_3d_ovs_on_four_pixels():
 def test_any_of_several_maxima_may_hit_and_borders_count():
     filtered = np.zeros((3, 24, 24), dtype=np.float32)
     filtered[1, 5, 10] = filtered[1, 5, 12] = 0.8
-    points = masks.peak_points(filtered, None)
+    points = masks.peak_points(filtered)
     assert points.tolist() == [[10, 5], [12, 5]]
     assert masks.hits_a_box(points, np.array([[0, 0, 9, 9], [12, 5, 20, 20]]))
     assert not masks.hits_a_box(points, np.array([[0, 0, 9, 9], [13, 5, 20, 20]]))
