@@ -188,7 +188,7 @@ def _polygons(where: str, value: Any) -> tuple[Float[np.ndarray, "_ 2"], ...]:
     try:
         nested = isinstance(value[0][0], list)
         polygons = tuple(np.array(points, dtype=np.float64) for points in (value if nested else [value]))
-        usable = all(each.shape == (len(each), 2) and np.isfinite(each).all() for each in polygons)
+        usable = all(each.shape == (len(each), 2) and (abs(each) < 2**31).all() for each in polygons)
     except (TypeError, IndexError, KeyError, ValueError):
         usable = False
     if not usable:

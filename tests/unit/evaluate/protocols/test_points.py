@@ -8,15 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilsplat.base.errors import MisalignedArtifactError, SceneError
-from hilsplat.datasets.classes import (
-    LABELLINGS,
-    SCANNET200,
-    SCANNET200_INSTANCES,
-    SCANNET_19,
-    WAYMO_22,
-    ClassSet,
-    splits_of,
-)
+from hilsplat.datasets import classes as sets
 from hilsplat.datasets.generators import GENERATORS
 from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
 from hilsplat.datasets.registry import DATASETS
@@ -36,7 +28,7 @@ WAYMO = card_of("waymo/segmentation")
 
 
 def test_rows_of_the_worked_example():
-    rows = list(scoring.measure_points(OPENGAUSSIAN, "tree", TRUTH, PREDICTION, SCANNET_19, "frozen"))
+    rows = list(scoring.measure_points(OPENGAUSSIAN, "tree", TRUTH, PREDICTION, sets.SCANNET_19, "frozen"))
     assert {row.protocol for row in rows} == {"scannet/opengaussian-19@1 (points: frozen)"}
     ious = {row.query: row.value for row in rows if row.metric == "class_iou"}
     # the first four of the 19 classes; the bed is only predicted. The wall has 2 hits, 4 true and 3 predicted
@@ -51,26 +43,31 @@ def test_rows_of_the_worked_example():
 
 def test_missed_points_count_zero_and_a_scene_without_truth_has_no_rows():
     nothing = np.zeros(10, dtype=int)
-    rows = list(scoring.measure_points(OPENGAUSSIAN, "tree", TRUTH, nothing, SCANNET_19, "frozen"))
+    rows = list(scoring.measure_points(OPENGAUSSIAN, "tree", TRUTH, nothing, sets.SCANNET_19, "frozen"))
     assert {row.value for row in rows} == {0.0}
     assert {row.query for row in rows} == {"", "wall", "floor", "cabinet"}
-    assert list(scoring.measure_points(OPENGAUSSIAN, "tree", nothing, PREDICTION, SCANNET_19, "frozen")) == []
+    assert (
+        list(scoring.measure_points(OPENGAUSSIAN, "tree", nothing, PREDICTION, sets.SCANNET_19, "frozen"))
+        == []
+    )
 
 
 def test_pooled_rows_equal_points_put_together_also_after_a_file(tmp_path):
     rng = np.random.default_rng(0)
     scenes = [(rng.integers(0, 6, 997), rng.integers(0, 6, 997)) for _ in range(3)]
     rows = [
-        row for scene in scenes for row in scoring.measure_points(WAYMO, "tree", *scene, WAYMO_22, "nearest")
+        row
+        for scene in scenes
+        for row in scoring.measure_points(WAYMO, "tree", *scene, sets.WAYMO_22, "nearest")
     ]
     assert all(row.query for row in rows)  # no number per scene
     together = np.concatenate(scenes, axis=1)
     expected = scoring.pooled_points(
-        WAYMO, scoring.measure_points(WAYMO, "t", *together, WAYMO_22, "x"), WAYMO_22
+        WAYMO, scoring.measure_points(WAYMO, "t", *together, sets.WAYMO_22, "x"), sets.WAYMO_22
     )
     write_scores(tmp_path / "scores.csv", [score(**vars(row), view="") for row in rows])
     assert (
-        scoring.pooled_points(WAYMO, read_scores([tmp_path / "scores.csv"]).itertuples(), WAYMO_22)
+        scoring.pooled_points(WAYMO, read_scores([tmp_path / "scores.csv"]).itertuples(), sets.WAYMO_22)
         == expected
     )
     # five of 22 classes occur; the other 17 count 1 under Waymo's own mean
@@ -79,16 +76,16 @@ def test_pooled_rows_equal_points_put_together_also_after_a_file(tmp_path):
 
 def test_scannet200_is_split_into_head_common_and_tail():
     card = card_of("scannet200/benchmark")
-    places = [members.index(True) + 1 for members in splits_of(SCANNET200).values()]
+    places = [members.index(True) + 1 for members in sets.splits_of(sets.SCANNET200).values()]
     truth = np.repeat(places, 2)
     prediction = truth * np.array([1, 1, 1, 0, 0, 0])  # head right, common half, tail missed
-    rows = list(scoring.measure_points(card, "tree", truth, prediction, SCANNET200, "nearest"))
+    rows = list(scoring.measure_points(card, "tree", truth, prediction, sets.SCANNET200, "nearest"))
     expected = {"miou_occurring": 0.5, "miou_head": 1.0, "miou_common": 0.5, "miou_tail": 0.0}
-    assert scoring.pooled_points(card, rows, SCANNET200) == expected
+    assert scoring.pooled_points(card, rows, sets.SCANNET200) == expected
 
 
 def test_class_sets_turn_file_labels_into_rows():
-    classes = ClassSet("c", (7, 3, 1191), ("a", "b", "c"))
+    classes = sets.ClassSet("c", (7, 3, 1191), ("a", "b", "c"))
     found = classes.labels(np.array([3, 7, 1191, 5, 0, -2, 2000]))
     assert found.tolist() == [2, 1, 3, 0, 0, 0, 0]
 
@@ -98,7 +95,7 @@ def test_instance_rows_are_of_all_scans_together():
     mask = np.repeat([[True, False]], 4, axis=1)
     found = (truth, mask, np.array([4]), np.ones(1))
     missed = (truth, mask[:0], np.zeros(0, int), np.zeros(0))
-    ids = SCANNET200_INSTANCES.ids
+    ids = sets.SCANNET200_INSTANCES.ids
     scans = {"a": match_instances(*found, ids, 1), "b": match_instances(*missed, ids, 1)}
     rows = list(scoring.measure_instances("tree", scans, "nearest"))
     assert {row.n for row in rows} == {2}
@@ -111,7 +108,7 @@ def test_instance_rows_are_of_all_scans_together():
     assert list(scoring.measure_instances("tree", nothing, "nearest")) == []
 
 
-CLASSES = ClassSet("blocks", (7, 9), ("chest", "bear"))
+CLASSES = sets.ClassSet("blocks", (7, 9), ("chest", "bear"))
 
 
 def points_of(block_world, count=1):
@@ -149,7 +146,7 @@ def test_a_node_is_an_instance_of_its_best_class_also_after_a_file(block_world, 
 
 
 def test_rows_name_the_mode_and_are_moved_into_the_frame_of_the_scene(block_world, monkeypatch):
-    monkeypatch.setitem(LABELLINGS, "drawn", (CLASSES,))
+    monkeypatch.setitem(sets.LABELLINGS, "drawn", (CLASSES,))
     card = type(card_of("replica/per-scene"))(
         "drawn/points@1", ("miou_present",), "scenes", "argmax", "drawn", classes="blocks"
     )

@@ -172,27 +172,6 @@ def test_automatic_level_of_the_field_follows_the_highest_value(tmp_path):
     assert values["field", given, "cup", "whole", "best_threshold_iou"] == 1
 
 
-def test_other_protocols_are_measured_with_their_own_rules():
-    # The right place has the higher mean, another level the higher value.
-    relevancy = np.full((3, *SIZE), 0.1, np.float32)
-    relevancy[0, 2:6, 2:6] = 0.8
-    relevancy[2, 8, 8], relevancy[2, 8, 9] = 0.9, 0.66  # min-max 0.7: just in the mask
-    truth = ViewTruth.of_regions([region_of(box((2, 6), (2, 6)), "cup")], SIZE)
-    scene = HandMade([], {}, {"cup": relevancy})
-    cards = [card_of("3d-ovs/langsplat"), card_of("3d-ovs/langsplat-raw")]
-    settings = EvaluateSettings(methods=("field",), filter_px=1, mix=False, majority=False, relevancy_scale=5)
-    extra = ExtraProtocols(tuple(cards))
-    rows = list(measure_view(Selections(scene), truth, "v.png", PackedMasks(SIZE), settings, extra))
-    ious = {row.protocol: row.value for row in rows if row.metric == "iou"}
-    assert ious == {
-        "lerf/langsplat@2 (filter 1, no mix, no majority, relevancy scale 5)": 0,
-        "3d-ovs/langsplat@2 (relevancy scale 5)": 1,
-        "3d-ovs/langsplat-raw@2 (relevancy scale 5)": 1,
-    }
-    own = {row.metric for row in rows if row.protocol.startswith("3d-ovs/")}
-    assert own == {"iou", "boundary_iou"}
-
-
 def test_a_relevancy_that_is_not_a_number_is_an_error():
     relevancy = np.full((3, *SIZE), 0.1, np.float32)
     relevancy[1, 2, 3] = np.nan
