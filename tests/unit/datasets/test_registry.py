@@ -121,8 +121,8 @@ def test_a_source_that_cannot_be_used_has_a_reason_in_one_line(root):
 
 def test_segments_on_disk_without_a_row_are_listed(root):
     touch(*(root / f"waymo/validation/lidar_segmentation/{segment}.parquet" for segment in ("one", "two")))
-    sources = {"data:waymo/one", "data:lerf_ovs/figurines"}
-    assert sources.unlisted(sources, ["lerf", "waymo"], str(root)) == ["waymo/two"]
+    listed = {"data:waymo/one", "data:lerf_ovs/figurines"}
+    assert sources.unlisted(listed, ["lerf", "waymo"], str(root)) == ["waymo/two"]
 
 
 def test_all_labels_on_a_scenes_images_score_it_and_only_evaluation_reads_them(root):

@@ -36,6 +36,16 @@ def poses(count: int):
     return lambda root: np.savetxt(root / SEQUENCE / "traj_w_c.txt", rows)
 
 
+def text_in(name: str, text: str):
+    """Return a change that replaces the text of a file."""
+    return lambda root: (root / name).write_text(text)
+
+
+def moved(name: str, target: str):
+    """Return a change that moves a file or folder."""
+    return lambda root: (root / name).rename(root / target)
+
+
 def make_frames(root: Path, count: int) -> None:
     """Write the images of a sequence in the layout of Semantic-NeRF, and a picture that is no frame."""
     for name in (*(f"rgb_{number}" for number in range(count)), "vis_rgb_0"):
@@ -91,25 +101,13 @@ def test_a_sequence_of_nice_slam_is_preferred_and_has_its_own_lens(root, tmp_pat
         (info([-2, 20]), "do not match\n  expected  object ids 0 to 1\n  found     1 to 3"),
         (info([-2, 20, 205, 93]), "classes that are not in Replica.*found     class id 205"),
         (info([0, 1, 2, 3], [{"id": 20, "name": "sofa"}]), "found     20 sofa"),
-        (lambda root: (root / INFO).write_text("{}"), "expected  an object with the keys classes, id"),
-        (
-            lambda root: (root / INFO).unlink(),
-            r"info_semantic\.json is missing\n  found     mesh_semantic\.p",
-        ),
+        (text_in(INFO, "{}"), "expected  an object with the keys classes, id"),
+        (lambda root: (root / INFO).unlink(), r"info_semantic\.json is missing\n.*mesh_semantic\.ply"),
         (lambda root: (root / MESH).unlink(), r"mesh_semantic\.ply is missing"),
         (poses(1), "1 lines, 3 images; the first frame without a line is 1"),
-        (
-            lambda root: (root / SEQUENCE / "traj_w_c.txt").write_text("1 0 0 0\n"),
-            "cannot be read: 1 lines of 4 numbers\n  expected  16 numbers per line",
-        ),
-        (
-            lambda root: (root / SEQUENCE).rename(root / "00"),
-            "no rendered sequence.*in room0 or room_0/imap/00 or room_0/Sequence_1\n.*unpack the rendered",
-        ),
-        (
-            lambda root: (root / "room_0/imap").rename(root / "room0"),
-            "no rendered sequence.*found     00\n.*move the files in .*room0/00 one level up",
-        ),
+        (text_in(f"{SEQUENCE}/traj_w_c.txt", "1 0 0 0\n"), "1 lines of 4 numbers\n.*16 numbers per line"),
+        (moved(SEQUENCE, "00"), "in room0 or room_0/imap/00 or room_0/Sequence_1\n.*unpack the rendered"),
+        (moved("room_0/imap", "room0"), "found     00\n.*move the files in .*room0/00 one level up"),
     ],
 )
 def test_unusable_scenes_are_refused_with_a_fix(root, damage, message):

@@ -189,21 +189,10 @@ def test_ablation_rows_are_compared_with_the_default_field_scene_by_scene(tmp_pa
 
 
 def test_rows_of_the_ladder_are_compared_with_the_row_that_they_extend_by_scene_and_seed(tmp_path):
-    values = {
-        ("one", "whole"): {
-            "paper-hc": 0.4,
-            "paper-hc.seed1": 0.6,
-            "paper-part": 0.5,
-            "paper-part.seed1": 0.6,
-        },
-        ("two", "whole"): {
-            "paper-hc": 0.2,
-            "paper-hc.seed1": 0.8,
-            "paper-part": 0.3,
-            "paper-part.seed1": 0.8,
-        },
-    }
-    steps, _ = ablation_of(tmp_path, values)
+    variants = "paper-hc", "paper-hc.seed1", "paper-part", "paper-part.seed1"
+    values = {"one": (0.4, 0.6, 0.5, 0.6), "two": (0.2, 0.8, 0.3, 0.8)}
+    of_levels = {(name, "whole"): dict(zip(variants, of, strict=True)) for name, of in values.items()}
+    steps, _ = ablation_of(tmp_path, of_levels)
     # differences of 0.1, 0, 0.1 and 0: mean 0.05, deviation 0.0577, error 0.0289
     assert steps == {"3D-HC": ("", ""), "paper-part": ("3D-HC", "5.00 ± 2.89")}
     assert mean_difference([-0.03, 0.02]).text == "+0.0 ± 0.0"
