@@ -149,8 +149,10 @@ def test_scenes_with_labelled_points_are_exported_first(root):
 def test_unknown_data_sets_missing_scene_names_and_needless_exports_are_refused(root, monkeypatch):
     with pytest.raises(SceneError, match=r"'lerf' is unknown\n.*lerf_ovs, lerf_mask, 3d_ovs, hi_lerf"):
         dataset_of("lerf")
-    with pytest.raises(SceneError, match="does not contain a scene name"):
-        open_labels("scannet", Path())
+    for name in ("scannet", "3d_ovs/"):
+        for reads in (open_labels, sources.label_files):
+            with pytest.raises(SceneError, match="does not contain a scene name"):
+                reads(name, Path())
     monkeypatch.setattr("hilsplat.datasets.sources.open_labels", lambda *_: object())
     with pytest.raises(SceneError, match="needs no export"):
         sources.export_images("lerf_ovs/figurines", root, root / "out")
