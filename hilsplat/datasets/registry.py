@@ -64,7 +64,7 @@ def open_labels(name: str, data_root: Path) -> "LabelledScene | PointScene":
 
 
 def scene_of(name: str) -> tuple[Dataset, str]:
-    """Return the data set and scene in a name such as "scannet/scene0000_00"; raise SceneError if it has none."""
+    """Return the data set and scene in a name such as "scannet/scene0000_00"; raise SceneError if unknown."""
     dataset_name, _, scene = name.partition("/")
     dataset = dataset_of(dataset_name)
     if not scene:

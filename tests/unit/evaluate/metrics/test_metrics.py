@@ -71,17 +71,6 @@ def test_mixing_halves_the_filtered_and_the_raw_map():
     assert smoothed.filtered[0, 3, 4] == pytest.approx(0.25)
 
 
-def test_the_mean_in_the_mask_chooses_the_higher_mean_not_the_higher_value():
-    relevancy = np.zeros((3, 1, 6), dtype=np.float32)
-    relevancy[0, 0, :2] = 0.9, 0.5  # mean 0.7
-    relevancy[1, 0, :4] = 0.6, 0.6, 0.6, 0.9  # mean 0.675; the mask of the subpart is empty
-    rule = rules.RelevancyRule(
-        1, threshold=0.0, threshold_on="raw", majority=False, level_rule="mean_in_mask"
-    )
-    mask = rules.relevancy_mask(rules.SmoothedRelevancy.of(relevancy, rule), None, rule)
-    np.testing.assert_array_equal(mask, relevancy[0] > 0)
-
-
 def test_majority_inside_the_image_includes_the_last_row_and_column():
     mask = box((4, 8), (4, 8), (8, 8))
     # turned by 180 degrees this is the same square at the other corner, and so is the smoothed mask

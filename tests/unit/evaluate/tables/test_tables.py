@@ -212,11 +212,6 @@ def test_averaging_orders_are_not_mixed_and_pooled_protocols_have_no_number_per_
             table_value(frame, "iou")
 
 
-@pytest.mark.parametrize("name", ["hierarchy", "lerf", "ablation"])
-def test_tables_are_the_same_bytes_whatever_the_order_of_rows(tmp_path, name):
-    assert built(tmp_path / "forward", name) == built(tmp_path / "backward", name, SCORES[::-1])
-
-
 @pytest.mark.parametrize(
     ("column", "texts", "ranks"),
     [
