@@ -219,8 +219,9 @@ def check_answers(answers: Mapping[str, Answers], truths: Mapping[str, ViewTruth
     """
     texts: dict[str, set[str]] = {}
     for truth in truths.values():
-        for query in (*truth.categories, *truth.absent, *truth.queries):
-            texts.setdefault(query.level.label if query.level else "", set()).add(query.text)
+        for of_level, text in truth.texts:
+            for name in {of_level.label if of_level else "", ""}:
+                texts.setdefault(name, set()).add(text)
     for view, truth in truths.items():
         for (level, text), answer in answers[view].items():
             where = f"{view}: {level}/{text}" if level else f"{view}: {text}"

@@ -49,7 +49,8 @@ class ViewTruth:
     regions: dict[tuple[str, ...], Bool[np.ndarray, "H W"]]  # of each path that is large enough
     # Texts that are labelled but not visible in the view compete in an argmax, and may have `any_grey`.
     absent: tuple[Query, ...]
-    min_px: int = 0  # minimum area of a scored region
+    texts: frozenset[tuple[Level | None, str]]  # labelled in the view, also in regions that are too small
+    min_px: int  # minimum area of a scored region
 
     @staticmethod
     def of(
@@ -117,6 +118,7 @@ class ViewTruth:
             tuple(query for query in united if query.truth.any()),
             {path: mask for path, mask in by_path.items() if np.count_nonzero(mask) >= min_px},
             tuple(query for query in united if not query.truth.any()),
+            frozenset((query.level, query.text) for query in merged),
             min_px,
         )
 

@@ -75,6 +75,10 @@ def test_files_of_our_own_run_have_the_same_scores_and_make_a_table(block_world,
     assert set(frame["variant"]) == {"theirs"}
     assert "lerf-mask/gaussian-grouping@1 (wholes, masks of files)" in set(frame["protocol"])
     assert "3d-ovs/argmax@3 (labelled pixels, wholes, masks of files)" in set(frame["protocol"])
+    # the regions of lid and nose are smaller
+    large = score(block_world, tmp_path / "theirs", tmp_path / "large.csv", min_region_px=300)
+    assert set(large["query"]) == {"bear", "chest", "head", ""}
+    assert large["protocol"].str.contains("(regions from 300 px, masks of files)", regex=False).all()
     published = tmp_path / "published.csv"
     published.write_text(",".join(PUBLISHED_COLUMNS) + "\n")
     run_table("lerf", [tmp_path / "scores.csv"], published, {"theirs": "Their method"}, tmp_path / "lerf.csv")
