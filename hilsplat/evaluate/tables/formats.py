@@ -7,7 +7,7 @@ much code, and writes an id and three classes per cell, so HTML files would be 1
 import html
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from hilsplat.base.tables import plain_markdown
 from hilsplat.evaluate.tables.rows import Block, Cell, Table
@@ -120,9 +120,13 @@ def _inert(note: str) -> str:
 
 
 def latex_text(text: str) -> str:
-    """Escape a text; a bracket or star is protected, because LaTeX reads it as an argument of a row's end."""
-    escaped = " ".join(text.splitlines()).translate(LATEX_SPECIAL)
-    return "{}" + escaped if escaped.startswith(("[", "*")) else escaped
+    return " ".join(text.splitlines()).translate(LATEX_SPECIAL)
+
+
+def latex_row(cells: Sequence[str]) -> str:
+    """Join escaped cells; a bracket or star would be read as an argument of the line before."""
+    row = " & ".join(cells) + r" \\"
+    return "{}" + row if row.startswith(("[", "*")) else row
 
 
 def as_latex(table: Table) -> str:
@@ -136,13 +140,13 @@ def as_latex(table: Table) -> str:
         lines += [rf"\par\smallskip\textit{{{latex_text(block.title)}}}\par\smallskip"]
         lines += [r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"]
         lines += [rf"\begin{{tabular}}{{{'l' * len(names)}{'r' * len(values)}}}", r"\toprule"]
-        lines += [" & ".join(map(latex_text, [*names, *values])) + r" \\", r"\midrule"]
+        lines += [latex_row(list(map(latex_text, [*names, *values]))), r"\midrule"]
         for texts, shown in shown_rows(block, notes):
             cells = [latex_text(text) for text in texts]
             for text, rank, note in shown:
                 raised = rf"\textsuperscript{{{note}}}" if note else ""
                 cells.append(marks[rank] % latex_text(text) + raised)
-            lines.append(" & ".join(cells) + r" \\")
+            lines.append(latex_row(cells))
         lines += [r"\bottomrule", r"\end{tabular}}"]
     lines.append(r"\par\smallskip\raggedright\footnotesize")
     lines += [latex_text(note) + r"\par" for note in table.footnotes]
