@@ -6,6 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as parquet
 import pytest
 
 from hilsplat.base.errors import SceneError
@@ -176,6 +178,52 @@ def test_damaged_components_are_refused_with_a_fix(root):
     (root / "all").mkdir()
     (root / "validation").rename(root / "all" / "validation")
     refused("one level too deep\n  fix       move .*all/validation to")
+
+
+CALIBRATION, SHOT = "[CameraCalibrationComponent]", "[CameraImageComponent]"
+
+
+@pytest.mark.parametrize(
+    ("tag", "column", "value", "message"),
+    [
+        (
+            "camera_calibration",
+            "key.camera_name",
+            7,
+            "calibration.*cannot be read: 7 is missing.*cameras 1 to 5",
+        ),
+        ("camera_calibration", f"{CALIBRATION}.intrinsic.f_u", None, "a lens is not finite"),
+        ("camera_calibration", f"{CALIBRATION}.width", None, "calibration/.*cannot be read"),
+        (
+            "camera_image",
+            f"{SHOT}.pose.transform",
+            [1.0] * 12,
+            "camera_image/.*cannot be read: cannot reshape",
+        ),
+        ("camera_image", f"{SHOT}.image", None, "camera_image/.*cannot be read"),
+        (
+            "vehicle_pose",
+            "[VehiclePoseComponent].world_from_vehicle.transform",
+            None,
+            "pose/.*cannot be read",
+        ),
+        ("vehicle_pose", "[VehiclePoseComponent].world_from_vehicle.transform", [0.0] * 16, "not a rotation"),
+        (
+            "lidar_calibration",
+            "[LiDARCalibrationComponent].beam_inclination.values",
+            [np.nan],
+            "no inclination",
+        ),
+    ],
+)
+def test_components_with_unusable_values_are_refused(root, tag, column, value, message):
+    path = root / f"validation/{tag}/{SEGMENT}.parquet"
+    table = parquet.read_table(path, partitioning=None)
+    place, column_type = table.column_names.index(column), table.schema.field(column).type
+    values = pa.array([value, *table.column(column).to_pylist()[1:]], type=column_type)
+    parquet.write_table(table.set_column(place, column, values), path)
+    with pytest.raises(SceneError, match=f"(?s){message}"):
+        open_segment(root, SEGMENT)
 
 
 def test_images_and_classes_that_do_not_fit_are_refused():

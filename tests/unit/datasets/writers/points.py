@@ -107,6 +107,9 @@ def write_scan(
     write_text(folder / f"{scan}.aggregation.json", json.dumps({"segGroups": groups}))
 
 
+NUMBERS = {name: number for number, name in waymo.CAMERAS.items()}
+"""Number of each camera of Waymo."""
+
 UNDEFINED, NO_OBJECT = -1, -2
 """Class of an object without a class in Replica, and of object 0, which means no object."""
 
@@ -179,7 +182,7 @@ def write_segment(
     cameras = {shot.camera.name: shot.camera for shot in reversed(shots)}
     calibrations = [
         {
-            CAMERA: waymo.CAMERAS.index(camera.name) + 1,
+            CAMERA: NUMBERS[camera.name],
             **{f"{base}.intrinsic.{name}": v for name, v in zip(INTRINSIC, camera.intrinsic, strict=True)},
             f"{base}.extrinsic.transform": camera.vehicle_from_cam.ravel(),
             f"{base}.width": camera.size_hw[1],
@@ -193,7 +196,7 @@ def write_segment(
         [
             {
                 FRAME: shot.timestamp_micros,
-                CAMERA: waymo.CAMERAS.index(shot.camera.name) + 1,
+                CAMERA: NUMBERS[shot.camera.name],
                 "[CameraImageComponent].image": shot.encoded,
                 "[CameraImageComponent].pose.transform": shot.world_from_vehicle.ravel(),
             }
