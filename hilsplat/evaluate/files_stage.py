@@ -20,12 +20,7 @@ from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.metrics.instances import InstanceMatches
 from hilsplat.evaluate.protocols import cards
-from hilsplat.evaluate.protocols.points import (
-    class_set,
-    instance_scan,
-    measure_instances,
-    measure_points,
-)
+from hilsplat.evaluate.protocols.points import class_set, instance_scan, measure_instances, measure_points
 from hilsplat.evaluate.protocols.view_truth import ViewTruth, truths_of
 from hilsplat.evaluate.score import METHOD, OF_EVERY_TEXT, check_answers, flat_rows, key_of, level_rows
 from hilsplat.evaluate.scores import COLUMNS, Measured, Score, write_instances, write_scores

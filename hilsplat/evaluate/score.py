@@ -115,16 +115,9 @@ def _rows_of_images(
 ) -> Iterator[tuple[str, Measured]]:
     """Yield the rows of all views."""
     for what, given in (("predictions", predictions), ("labels", labels)):
-        of_views = given.values() if isinstance(given, Mapping) else [None]
-        if not all(
-            isinstance(each, Mapping) and all(isinstance(text, str) for text in each) for each in of_views
-        ):
-            raise SettingsError(
-                f"the {what} are not arrays by view and text",
-                expected="{view: {text: array}}",
-                found=type(given).__name__,
-                fix="pass a dict of a dict for each view",
-            )
+        if not (isinstance(given, Mapping) and all(isinstance(each, Mapping) for each in given.values())):
+            problem, expected = f"the {what} are not arrays by view and text", "{view: {text: array}}"
+            raise SettingsError(problem, expected=expected, found=type(given).__name__)
     if lacking := sorted(set(labels) ^ set(predictions)):
         has_labels = lacking[0] in labels
         raise MisalignedArtifactError(

@@ -145,9 +145,10 @@ class SmoothedRelevancy:
         return SmoothedRelevancy(filtered, np.float32(0.5) * (filtered + raw) if rule.mix else raw)
 
 
-def smoothing_of(
-    relevancy: Float[np.ndarray, "3 H W"],
-) -> Callable[[RelevancyRule], SmoothedRelevancy]:
+Smooth = Callable[[RelevancyRule], SmoothedRelevancy]
+
+
+def smoothing_of(relevancy: Float[np.ndarray, "3 H W"]) -> Smooth:
     """Return a function that smooths a query's relevancy once for all rules with the same filter."""
 
     @cache

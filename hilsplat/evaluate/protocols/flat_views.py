@@ -14,12 +14,7 @@ from jaxtyping import Bool, Float, Float32, Int, Int64
 
 from hilsplat.base.levels import Level
 from hilsplat.evaluate.metrics.masks import argmax_masks, iou, pixel_accuracy
-from hilsplat.evaluate.metrics.relevancy_rule import (
-    RelevancyRule,
-    SmoothedRelevancy,
-    relevancy_mask,
-    smoothing_of,
-)
+from hilsplat.evaluate.metrics.relevancy_rule import RelevancyRule, Smooth, relevancy_mask, smoothing_of
 from hilsplat.evaluate.protocols.answers import NO_POINTS, mask_rows, peaks_of_answer, relevancy_of
 from hilsplat.evaluate.protocols.cards import (
     LERF_LANGSPLAT,
@@ -38,8 +33,6 @@ if TYPE_CHECKING:
 
 Answer = Bool[np.ndarray, "_ _"] | Float[np.ndarray, "_ _ _"]
 """A mask (H, W), or relevancy (3, H, W); under `3d-ovs/argmax`, cosines (L, H, W)."""
-
-Smooth = Callable[[RelevancyRule], SmoothedRelevancy]
 
 
 class FlatProtocols:

@@ -106,12 +106,7 @@ def test_a_view_without_predictions_or_with_two_is_refused_but_its_folder_may_be
 @pytest.mark.parametrize(
     ("name", "height", "value", "message"),
     [
-        (
-            "whole/bear",
-            32,
-            255,
-            r"001.png: whole/bear: the mask .*\n.*64 x 64 \(height x width\)\n.*32 x 64",
-        ),
+        ("whole/bear", 32, 255, r"001.png: whole/bear: the mask .*\n.*64 x 64 \(height x width\)\n.*32 x 64"),
         ("baer", 64, 255, "the labels have no text 'baer'\n(.|\n)*rename it to .bear."),
         ("whole/nose", 64, 255, "the labels have no text 'nose' at level whole"),
         ("bear", 64, 1, "none is foreground"),

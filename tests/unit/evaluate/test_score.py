@@ -186,7 +186,7 @@ SCAN = "scannet200/instances"
         ({"a": {}}, {"a": {}}, LANGSPLAT, "a: there are no labels"),
         ({"a": {}}, {"a": {"cup": CUP[:0]}}, LANGSPLAT, "label 'cup' is not a region"),
         ([CUP], [CUP], LANGSPLAT, "the predictions are not arrays by view and text"),
-        ({"a": {5: CUP}}, {"a": {5: CUP}}, LANGSPLAT, "the predictions are not arrays by view and text"),
+        (LABELS, {"a": CUP}, LANGSPLAT, "the labels are not arrays by view and text"),
         ({"a": {"cup": None}}, LABELS, LANGSPLAT, r"a: cup cannot be scored(.|\n)*\(\) object"),
         ({"a": {}}, {"a": {"cup": CUP & False}}, LANGSPLAT, "contain nothing that lerf/langsplat@2"),
         ({"a": {}}, {"a": {"a > b > c > d": CUP}}, LEVELLED, "more than 3 levels"),

@@ -138,10 +138,7 @@ def test_contrastive_losses_of_a_block_count_the_other_blocks():
         mass=toy.problem.mass[:6],
         lifted=toy.problem.lifted[:6],
         blocks=((0, 6),),
-        others=(
-            toy.problem.quadratic.across(0, 6, whole),
-            contrast.masks.block(6, 12).means(whole[6:]),
-        ),
+        others=(toy.problem.quadratic.across(0, 6, whole), contrast.masks.block(6, 12).means(whole[6:])),
     )
     rest = [operator.block(6, 12).means(whole[6:]) for operator in (contrast.masks, contrast.half_masks)]
     of_block = replace(
