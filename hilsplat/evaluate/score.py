@@ -212,8 +212,8 @@ def check_answers(answers: Mapping[str, Answers], truths: Mapping[str, ViewTruth
     """
     texts: dict[str, set[str]] = {}
     for truth in truths.values():
-        for of_level, text in truth.texts:
-            for name in {of_level.label if of_level else "", ""}:
+        for level_of_text, text in truth.texts:
+            for name in {level_of_text.label if level_of_text else "", ""}:
                 texts.setdefault(name, set()).add(text)
     for view, truth in truths.items():
         for (level, text), answer in answers[view].items():
