@@ -5,7 +5,7 @@ Source: minghanqin/LangSplat `eval/evaluate_iou_loc.py`; every departure is a fi
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Literal
 
 import numpy as np
@@ -81,7 +81,7 @@ def mean_filter(
     return summed / _pixels_inside(values.shape, side_px)
 
 
-@cache
+@lru_cache(maxsize=4)  # views of a scene mostly have one size
 def _pixels_inside(shape: tuple[int, int], side_px: int) -> Float32[np.ndarray, "H W"]:
     """Return the number of pixels of each window of the mean filter that are inside the image."""
     import cv2
