@@ -288,6 +288,6 @@ def _as_mask(array: np.ndarray, where: str) -> Bool[np.ndarray, "h w"]:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise ArtifactError(f"{path} cannot be read: {error}", fix="write it as UTF-8 text") from error

@@ -201,7 +201,7 @@ def test_class_ids_of_points_score_as_the_same_labels_in_memory(data_set, tmp_pa
     known = point_scene()
     data_set(known, points=SEMANTIC)
     predicted = np.random.default_rng(1).choice([0, 1, 2, 3, 4, 5, 40], 400)
-    (tmp_path / "nyu40.txt").write_text("\n".join(map(str, predicted)))
+    (tmp_path / "nyu40.txt").write_text("\n".join(map(str, predicted)), "utf-8-sig")  # as Windows writes it
     of_ten = np.full(400, SCANNET_10.ids[0])
     (tmp_path / "scannet-10.txt").write_text("\n".join(map(str, of_ten)))
     frame, _ = scored(tmp_path)

@@ -219,7 +219,11 @@ def test_the_package_in_the_documentation_adds_a_method_with_two_settings(inputs
 
 @pytest.mark.parametrize(
     ("code", "problem"),
-    [("import no_such_module", "cannot be imported: No module named"), ("METHOD = 1", "is not a method")],
+    [
+        ("import no_such_module", "cannot be imported: No module named"),
+        ("METHOD = 1 / 0", "cannot be imported: division by zero"),
+        ("METHOD = 1", "is not a method"),
+    ],
 )
 def test_a_broken_package_is_reported(nearest_mask, code, problem):
     (nearest_mask / "nearest_mask/__init__.py").write_text(code)
