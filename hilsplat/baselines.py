@@ -154,7 +154,7 @@ def method_of(name: str) -> Method:
     point = installed()[name]
     try:
         method = point.load()
-    except (ImportError, AttributeError) as error:
+    except Exception as error:  # a broken package can raise anything
         raise SettingsError(f"method {name}: {point.value} cannot be imported: {error}") from error
     if not isinstance(method, Method):
         raise SettingsError(

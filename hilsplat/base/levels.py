@@ -42,9 +42,14 @@ PATH_SEPARATOR = ">"
 MAX_TEXT = 500  # maximum number of characters in a query; CLIP reads 77 tokens
 
 
+def composed(text: str) -> str:
+    """Return a text in composed Unicode; macOS decomposes the names of files."""
+    return unicodedata.normalize("NFC", text)
+
+
 def plain_text(text: str) -> str:
     """Return a text in composed Unicode and lower case with single spaces, to compare it with others."""
-    return " ".join(unicodedata.normalize("NFC", text).split()).casefold()
+    return " ".join(composed(text).split()).casefold()
 
 
 def path_of(text: str) -> tuple[str, ...]:

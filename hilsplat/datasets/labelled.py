@@ -18,7 +18,7 @@ from jaxtyping import Bool, Int
 from hilsplat.base.errors import ImageError, SceneError
 from hilsplat.base.files import list_images
 from hilsplat.base.images import image_size_hw, read_mask
-from hilsplat.base.levels import Level, plain_text
+from hilsplat.base.levels import Level, composed, plain_text
 from hilsplat.datasets.dataset import SceneReport
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.layouts import find_known_poses
@@ -218,7 +218,8 @@ def mask_region(
     warnings += check_label_size(f"mask {path}", size_hw, image_hw, share)
     any_grey = None if min_grey is None else partial(read_mask_file, path, min_grey)
     pixels = partial(read_mask_file, path, foreground)
-    return LabelledRegion(path.stem, size_hw, pixels, path=(path.stem,), any_grey=any_grey)
+    text = composed(path.stem)
+    return LabelledRegion(text, size_hw, pixels, path=(text,), any_grey=any_grey)
 
 
 def read_mask_file(path: Path, minimum: int) -> Bool[np.ndarray, "H W"]:

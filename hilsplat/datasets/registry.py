@@ -59,12 +59,18 @@ def open_labelled(name: str, data_root: Path) -> "LabelledScene":
 
 def open_labels(name: str, data_root: Path) -> "LabelledScene | PointScene":
     """Open a scene with any kind of labels, such as "scannet/scene0000_00"; raise SceneError on failure."""
+    dataset, scene = scene_of(name)
+    return dataset.open(dataset.locate(data_root), scene)
+
+
+def scene_of(name: str) -> tuple[Dataset, str]:
+    """Return the data set and scene in a name such as "scannet/scene0000_00"; raise SceneError if unknown."""
     dataset_name, _, scene = name.partition("/")
     dataset = dataset_of(dataset_name)
     if not scene:
         expected = "<data set>/<scene>, such as scannet/scene0000_00"
         raise SceneError(f"{name!r} does not contain a scene name", expected=expected, fix=LISTED)
-    return dataset.open(dataset.locate(data_root), scene)
+    return dataset, scene
 
 
 def dataset_of(name: str) -> Dataset:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hilsplat.base.errors import SceneError, SettingsError, in_one_line
 from hilsplat.base.lineage import files_of
-from hilsplat.datasets.registry import DATASETS, dataset_of, open_labels
+from hilsplat.datasets.registry import DATASETS, dataset_of, open_labels, scene_of
 from hilsplat.scene.sheet import DATA_PREFIX
 
 logger = logging.getLogger(__name__)
@@ -91,8 +91,7 @@ def label_sets(source: str, data_root: str, row: str) -> tuple[str, ...]:
 
 def label_files(labels: str, data_root: str) -> tuple[Path, ...]:
     """Return the sorted files of `data set/scene` that only evaluation reads; edits rerun only evaluation."""
-    name, _, scene = labels.partition("/")
-    dataset = dataset_of(name)
+    dataset, scene = scene_of(labels)
     root = dataset.root(data_root)
     files = {path for pattern in dataset.label_places(scene) for path in root.glob(pattern) if path.is_file()}
     return tuple(sorted(files))
@@ -100,12 +99,12 @@ def label_files(labels: str, data_root: str) -> tuple[Path, ...]:
 
 def image_files(source: str, data_root: str) -> tuple[Path, ...]:
     """Return the data set's files from which a scene's images and poses are exported."""
-    name, _, scene = source.removeprefix(DATA_PREFIX).partition("/")
-    dataset = dataset_of(name)
+    name = source.removeprefix(DATA_PREFIX)
+    dataset, scene = scene_of(name)
     files, root = set[Path](), dataset.root(data_root)
     for place in dataset.needs(root, scene):
         files.update(files_of(root / place))
-    labels = label_files(f"{name}/{scene}", data_root)
+    labels = label_files(name, data_root)
     return tuple(sorted(files.difference(labels)))
 
 

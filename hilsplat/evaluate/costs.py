@@ -58,7 +58,7 @@ def read_costs(scores: Iterable[Path]) -> list[Cost]:
     costs = []
     for path in scores:
         table = Path(path).with_name(TIMES)
-        rows = read_csv(table, TIME_COLUMNS, "run the evaluate stage again")
+        rows = read_csv(table, TIME_COLUMNS, "run `hilsplat evaluate` again (evaluate-files has no times)")
         require_as_written(table, sha256_of_file(table))
         if not rows:  # a scene without labels
             continue

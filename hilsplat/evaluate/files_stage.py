@@ -1,6 +1,7 @@
 """The evaluate-files stage: scores any program's predictions without the pipeline; writes `scores.csv`."""
 
 import logging
+import math
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
@@ -19,12 +20,7 @@ from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.metrics.instances import InstanceMatches
 from hilsplat.evaluate.protocols import cards
-from hilsplat.evaluate.protocols.points import (
-    class_set,
-    instance_scan,
-    measure_instances,
-    measure_points,
-)
+from hilsplat.evaluate.protocols.points import class_set, instance_scan, measure_instances, measure_points
 from hilsplat.evaluate.protocols.view_truth import ViewTruth, truths_of
 from hilsplat.evaluate.score import METHOD, OF_EVERY_TEXT, check_answers, flat_rows, key_of, level_rows
 from hilsplat.evaluate.scores import COLUMNS, Measured, Score, write_instances, write_scores
@@ -254,12 +250,14 @@ def read_point_instances(
             continue
         try:
             name, class_id, confidence = line.rsplit(maxsplit=2)
-            classes.append(int(class_id))
+            classes.append(np.int64(int(class_id)))
             confidences.append(float(confidence))
-        except ValueError as error:
+            if not math.isfinite(confidences[-1]):
+                raise ValueError(confidence)
+        except (ValueError, OverflowError) as error:
             raise ArtifactError(
                 f"line {number} of {path} does not describe an instance",
-                expected="<mask file> <class id> <confidence>",
+                expected="<mask file> <class id> <finite confidence>",
                 found=line,
                 fix="write one line per predicted instance, in ScanNet's format",
             ) from error
@@ -290,6 +288,6 @@ def _as_mask(array: np.ndarray, where: str) -> Bool[np.ndarray, "h w"]:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise ArtifactError(f"{path} cannot be read: {error}", fix="write it as UTF-8 text") from error

@@ -11,7 +11,7 @@ import pandas as pd
 from jaxtyping import Bool, Float, Int64
 
 from hilsplat.base.errors import MisalignedArtifactError, SettingsError
-from hilsplat.base.levels import LEVELS, Level, path_of
+from hilsplat.base.levels import LEVELS, Level, composed, path_of
 from hilsplat.datasets.labelled import LabelledRegion
 from hilsplat.datasets.points.labelled_points import LabelledPoints
 from hilsplat.evaluate.metrics.instances import CLASS_STRIDE
@@ -114,6 +114,10 @@ def _rows_of_images(
     card: cards.ProtocolCard, predictions: Any, labels: Any
 ) -> Iterator[tuple[str, Measured]]:
     """Yield the rows of all views."""
+    for what, given in (("predictions", predictions), ("labels", labels)):
+        if not (isinstance(given, Mapping) and all(isinstance(each, Mapping) for each in given.values())):
+            problem, expected = f"the {what} are not arrays by view and text", "{view: {text: array}}"
+            raise SettingsError(problem, expected=expected, found=type(given).__name__)
     if lacking := sorted(set(labels) ^ set(predictions)):
         has_labels = lacking[0] in labels
         raise MisalignedArtifactError(
@@ -141,13 +145,13 @@ def _truth_of(card: cards.ProtocolCard, view: str, regions: Mapping[str, Any]) -
     found = []
     for name, region in regions.items():
         mask = np.asarray(region)
-        if mask.dtype != bool or mask.ndim != 2:
+        if mask.dtype != bool or mask.ndim != 2 or not mask.size:
             raise SettingsError(
                 f"{view}: label {name!r} is not a region",
                 expected="(H, W) bool",
                 found=f"{mask.shape} {mask.dtype}",
             )
-        path = path_of(name) if _has_levels(card) else (name,)
+        path = path_of(composed(name)) if _has_levels(card) else (composed(name),)
         if len(path) > len(LEVELS):
             raise SettingsError(f"{view}: label {name!r} has more than {len(LEVELS)} levels")
         level = Level(len(path)) if _has_levels(card) else None
@@ -170,7 +174,9 @@ def _are_masks(card: cards.ProtocolCard, answers: Mapping[str, Mapping[tuple[str
         for (level, text), answer in of_view.items():
             kind = answer.dtype.kind
             is_map = kind == "f" and answer.ndim == 3 and bool((answer < np.inf).all())  # False for NaN
-            is_map &= is_argmax or (len(answer) == len(LEVELS) and bool(np.isfinite(answer).all()))
+            is_map = is_map and (
+                is_argmax or (len(answer) == len(LEVELS) and bool(np.isfinite(answer).all()))
+            )
             if not (is_map or (kind == "b" and answer.ndim == 2)) or bool(level) != _has_levels(card):
                 name = "'part/handle'" if _has_levels(card) else "'handle', without a level"
                 raise SettingsError(
@@ -194,7 +200,7 @@ def _has_levels(card: cards.ProtocolCard) -> bool:
 
 def key_of(name: str) -> tuple[str, str]:
     """Split the name of an answer, such as "part/handle", into level ("" for none) and text."""
-    first, _, rest = name.partition("/")
+    first, _, rest = (name := composed(name)).partition("/")
     return (first, rest) if rest and first in [level.label for level in LEVELS] else ("", name)
 
 
@@ -206,8 +212,9 @@ def check_answers(answers: Mapping[str, Answers], truths: Mapping[str, ViewTruth
     """
     texts: dict[str, set[str]] = {}
     for truth in truths.values():
-        for query in (*truth.categories, *truth.absent, *truth.queries):
-            texts.setdefault(query.level.label if query.level else "", set()).add(query.text)
+        for level_of_text, text in truth.texts:
+            for name in {level_of_text.label if level_of_text else "", ""}:
+                texts.setdefault(name, set()).add(text)
     for view, truth in truths.items():
         for (level, text), answer in answers[view].items():
             where = f"{view}: {level}/{text}" if level else f"{view}: {text}"
@@ -240,14 +247,14 @@ def flat_rows(
         level: level whose texts are queried, on a stand-in with levels; None if the labels have no levels.
         are_masks: whether all views have masks as answers, not relevancy.
     """
-    words: list[str] = []
+    words = truth.departures
     if card in OF_EVERY_TEXT:
         queries = truth.categories
     elif level is None:
         queries = (*truth.categories, *truth.absent)
     else:
         queries = tuple(query for query in truth.queries if query.level is level)
-        words = ["wholes"] if level is Level.WHOLE else []
+        words = [*(["wholes"] if level is Level.WHOLE else []), *words]
     words += [WORDS] if are_masks else []
     if card is cards.OVS_ARGMAX:
         yield from argmax_rows(METHOD, queries, partial(_cosine, answers), words, level is not None)
@@ -260,7 +267,7 @@ def flat_rows(
 
 def level_rows(answers: Answers, truth: ViewTruth, are_masks: bool = True) -> Iterator[Measured]:
     """Yield the rows of a view's answers with levels, and their hierarchical consistency."""
-    card, words = cards.LEVEL_GIVEN, [WORDS] if are_masks else []
+    card, words = cards.LEVEL_GIVEN, [*truth.departures, *([WORDS] if are_masks else [])]
     for query in truth.queries:
         assert query.level is not None
         answer = answers.get((query.level.label, query.text))
@@ -300,12 +307,14 @@ def _rows_of_points(card: cards.ProtocolCard, predictions: Any, labels: Any) -> 
     _, classes = class_set(card.classes)
     is_scan = card is cards.INSTANCES
     given = [np.asarray(each) for each in ((*predictions, *labels) if is_scan else (predictions, labels))]
-    sizes = dict(zip("MP", given[0].shape, strict=False)) if is_scan else {"P": len(labels)}
+    given = [array if array.size else array.astype(np.int64) for array in given]  # NumPy reads [] as floats
+    sizes = dict(zip("MP", given[0].shape, strict=False)) if is_scan else {"P": given[1].size}
     axes, ids = (("MP", "M", "M", "P", "P"), (1, 3, 4)) if is_scan else (("P", "P"), (0, 1))
     shapes = [tuple(sizes.get(axis) for axis in each) for each in axes]
     fits = [array.shape for array in given] == shapes and all(given[row].dtype.kind in "iu" for row in ids)
     if is_scan and fits:  # masks of ids, such as -1 for none, would be read as masks of all points
-        fits = given[0].dtype == bool and given[2].dtype.kind in "fiu" and bool(np.isfinite(given[2]).all())
+        fits = given[0].dtype == bool or not given[0].size
+        fits = fits and given[2].dtype.kind in "fiu" and bool(np.isfinite(given[2]).all())
         fits = fits and not (given[4] < 0).any() and len(np.unique(given[4])) < CLASS_STRIDE
     if not fits:
         scan = (

@@ -168,23 +168,22 @@ def train(
             levels.append((level, Adam(features[level.index], settings.rate), order, len(labelled)))
     repeats = 1 if terms is None else 2
     codes = [padded(np.repeat(latents[view.rows], repeats, axis=0)) for view in views]
+    labels = [np.ascontiguousarray(view.labels.T) for view in (views if terms is None else terms.views)]
+    labelled_px = [np.count_nonzero(of_view >= 0, axis=1) for of_view in labels]
     by_l1 = terms is None or terms.settings.language == "l1"
     # Levels that don't interact are trained one after the other, because their arrays then stay in the cache.
     groups = [[own] for own in levels] if terms is None else [levels]
     turns = (own for group in groups for _ in range(settings.steps) for own in group)
     for level, adam, order, num_views in track(turns, "steps", total=settings.steps * len(levels)):
         number = next(order)
-        weights, labels = views[number].weights, views[number].labels
-        attraction, offsets = 0.0, np.zeros(0, np.float32)
+        weights, attraction, offsets = views[number].weights, 0.0, np.zeros(0, np.float32)
         if terms is not None:
-            labels = terms.views[number].labels
             attraction, of_rows = terms.gradient(number, level, features, num_views)
             offsets = padded(of_rows)
-        labels = labels[:, level.index]
-        share = by_l1 / (np.count_nonzero(labels >= 0) * channels)
+        share = by_l1 / (labelled_px[number][level.index] * channels)
         rendered_gradient(
-            *(weights.indptr, weights.indices, weights.data),
-            *(labels, codes[number], np.float32(share), np.float32(attraction), offsets),
+            *(weights.indptr, weights.indices, weights.data, labels[number][level.index]),
+            *(codes[number], np.float32(share), np.float32(attraction), offsets),
             *(wide, features[level.index].reshape(-1), gradient),
         )
         adam.step(gradient)

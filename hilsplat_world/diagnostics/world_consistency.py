@@ -272,11 +272,12 @@ def measure_world_consistency(
     for number, (a, b) in enumerate(pairs):
         depth_a, depth_b = (true_depth(surface, true[view]) for view in (a, b))
         pixel_a, pixel_b = shared_points(true[a], depth_a, true[b], depth_b)
-        queries = spread(truths[a]().queries, TEXTS_PER_LEVEL)
+        known = truths[a]()
+        queries = spread(known.queries, TEXTS_PER_LEVEL)
         for method in ("field", "tree"):
             if method not in settings.methods:
                 continue
-            protocol = label_of(VIEW_CONSISTENCY, method, settings)
+            protocol = label_of(VIEW_CONSISTENCY, method, settings, known.departures)
             masks_a, masks_b = (
                 answers_in_view(selections, answered.get(view, nothing), method, view, queries, settings)
                 for view in (a, b)
@@ -317,7 +318,7 @@ def answers_in_view(
         size_hw = scene.scene.cameras[view].size_hw
         nodes = [selections.nodes((query.text,), query.level, view) for query in queries]
         return [selections.mask(view, ids, size_hw) for ids in nodes]
-    keys = [given_key(method, query, settings) for query in queries]
+    keys = [given_key(method, query) for query in queries]
     texts = [query.text for query, key in zip(queries, keys, strict=True) if key not in stored]
     missing, rule = list(dict.fromkeys(texts)), rule_of(settings)
     maps = dict(zip(missing, scene.field.relevancy(missing, view), strict=True)) if missing else {}

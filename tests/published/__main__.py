@@ -25,20 +25,7 @@ from hilsplat.evaluate.tables.build import TABLES
 from hilsplat_world.settings import WorldSettings
 from hilsplat_world.stage import run_world
 from tests.conftest import PROJECT
-from tests.unit.datasets.writers.labelled import (
-    LERF_STEMS,
-    OVS_STEMS,
-    TrueWorld,
-    write_3d_ovs,
-    write_hi,
-    write_lerf_mask,
-    write_lerf_ovs,
-)
-from tests.unit.datasets.writers.points import (
-    write_room_as_replica,
-    write_room_as_scannet,
-    write_street_as_waymo,
-)
+from tests.unit.datasets.writers import labelled, points
 from tests.workflow.conftest import copy_project
 
 WORLD = WorldSettings(views=12, image_px=128, arc_deg=100, objects=3, samples=1)
@@ -89,15 +76,15 @@ def write_data(work: Path, root: Path) -> None:
     """Write one scene of each data set below the data root, from synthetic scenes in `work`."""
     for kind in ("tabletop", "room", "street"):
         run_world(f"world:{kind}:{SEED}", WORLD, work / kind / "images", work / kind / "truth", threads=2)
-    table = TrueWorld.open(work / "tabletop")
-    write_lerf_ovs(table, root / "lerf_ovs", "figurines", LABELLED)
-    write_hi(table, root / "hi_lerf", root / "lerf_ovs", "figurines", LABELLED, LERF_STEMS)
-    write_lerf_mask(table, root / "lerf_mask", "figurines", LABELLED)
-    write_3d_ovs(table, root / "3d_ovs", "sofa", LABELLED)
-    write_hi(table, root / "hi_3dovs", root / "3d_ovs", "sofa", LABELLED, OVS_STEMS)
-    write_room_as_scannet(work / "room", root / "scannet", "scene0000_00")
-    write_room_as_replica(work / "room", root / "replica", "room_0")
-    write_street_as_waymo(work / "street", root / "waymo" / "validation", "1000_segment")
+    table = labelled.TrueWorld.open(work / "tabletop")
+    labelled.write_lerf_ovs(table, root / "lerf_ovs", "figurines", LABELLED)
+    labelled.write_hi(table, root / "hi_lerf", root / "lerf_ovs", "figurines", LABELLED, labelled.LERF_STEMS)
+    labelled.write_lerf_mask(table, root / "lerf_mask", "figurines", LABELLED)
+    labelled.write_3d_ovs(table, root / "3d_ovs", "sofa", LABELLED)
+    labelled.write_hi(table, root / "hi_3dovs", root / "3d_ovs", "sofa", LABELLED, labelled.OVS_STEMS)
+    points.write_room_as_scannet(work / "room", root / "scannet", "scene0000_00")
+    points.write_room_as_replica(work / "room", root / "replica", "room_0")
+    points.write_street_as_waymo(work / "street", root / "waymo" / "validation", "1000_segment")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

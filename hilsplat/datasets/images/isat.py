@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int, Int64
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.images import image_size_hw
+from hilsplat.base.levels import composed
 from hilsplat.datasets.labelled import check_label_size
 from hilsplat.scene.layouts import read_json_object
 
@@ -71,7 +72,7 @@ def trace_polygons(mask: Bool[np.ndarray, "H W"]) -> list[Int[np.ndarray, "_ 2"]
 class IsatObject:
     """One annotated object."""
 
-    category: str  # the text, verbatim
+    category: str  # the text, in composed Unicode
     polygons: tuple[Float[np.ndarray, "_ 2"], ...]  # vertices, px; the region is their filled union
     box_xyxy: Int64[np.ndarray, " 4"]  # whole pixels inside the annotated box, borders included
     keys: Mapping[str, Any]  # all keys of the object in the file
@@ -146,6 +147,7 @@ def read_object(where: str, entry: Any, size_hw: tuple[int, int], warnings: list
     category = entry.get("category")
     if not isinstance(category, str) or not category.strip():
         raise SceneError(f"{where} has no category", found=repr(category), fix="enter the query text")
+    category = composed(category)
     where = f"{where} ({category})"
     polygons = _polygons(where, entry.get("segmentation"))
     height, width = size_hw
@@ -186,7 +188,7 @@ def _polygons(where: str, value: Any) -> tuple[Float[np.ndarray, "_ 2"], ...]:
     try:
         nested = isinstance(value[0][0], list)
         polygons = tuple(np.array(points, dtype=np.float64) for points in (value if nested else [value]))
-        usable = all(each.shape == (len(each), 2) and np.isfinite(each).all() for each in polygons)
+        usable = all(each.shape == (len(each), 2) and (abs(each) < 2**31).all() for each in polygons)
     except (TypeError, IndexError, KeyError, ValueError):
         usable = False
     if not usable:

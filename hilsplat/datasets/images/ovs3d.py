@@ -10,6 +10,7 @@ from pathlib import Path
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import list_files
 from hilsplat.base.images import image_size_hw
+from hilsplat.base.levels import composed
 from hilsplat.datasets.dataset import ABLATIONS, Dataset
 from hilsplat.datasets.labelled import (
     LabelledRegion,
@@ -60,7 +61,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
 def read_classes(path: Path) -> tuple[str, ...]:
     """Return the prompts of `classes.txt`: stripped, without empty lines, sorted (capitals first)."""
     try:
-        lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
+        lines = [composed(line.strip()) for line in path.read_text(encoding="utf-8-sig").splitlines()]
         prompts = sorted(line for line in lines if line)
         twice = sorted({prompt for prompt in prompts if prompts.count(prompt) > 1})
         if not prompts or twice:
@@ -77,7 +78,7 @@ def read_classes(path: Path) -> tuple[str, ...]:
 def _regions(
     place: Path, prompts: tuple[str, ...], image_hw: tuple[int, int], warnings: list[str]
 ) -> tuple[LabelledRegion, ...]:
-    files = {path.stem: path for path in list_files(place, {".png"})}
+    files = {composed(path.stem): path for path in list_files(place, {".png"})}
     missing = [prompt for prompt in prompts if prompt not in files]
     extra = sorted(set(files) - set(prompts))
     if missing:

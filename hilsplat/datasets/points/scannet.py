@@ -58,7 +58,7 @@ def read_label_table(path: Path) -> dict[str, int]:
     """Map each raw category to its id in the label table, or to 0 if it is not one of the 200 classes."""
     require_file(path, f"download {LABEL_TABLE} from ScanNet's release to the data set's folder")
     labels = {}
-    with path.open(encoding="utf-8", newline="") as stream:
+    with decoding(path), path.open(encoding="utf-8-sig", newline="") as stream:
         rows = csv.DictReader(stream, delimiter="\t")
         needed = {"id", "raw_category"}
         if not needed <= set(rows.fieldnames or ()):
@@ -89,11 +89,12 @@ def read_images(folder: Path, scan: str) -> tuple[tuple[PosedImage, ...], tuple[
     K = read_matrices(lens, 4)[0, :3, :3] + HALF_PIXEL
     lost, unposed, images = [], [], []
     described = folder / f"{scan}.txt"
-    info = dict(re.findall("(.*) = (.*)", described.read_text("utf-8"))) if described.is_file() else {}
-    if "colorHeight" in info and "colorWidth" in info:
-        size_hw = int(info["colorHeight"]), int(info["colorWidth"])
-    else:
-        size_hw = image_size_hw(frames[0][1]) if frames else (0, 0)
+    with decoding(described, expected="colorHeight and colorWidth as whole numbers"):
+        info = dict(re.findall("(.*) = (.*)", described.read_text("utf-8"))) if described.is_file() else {}
+        if "colorHeight" in info and "colorWidth" in info:
+            size_hw = int(info["colorHeight"]), int(info["colorWidth"])
+        else:
+            size_hw = image_size_hw(frames[0][1]) if frames else (0, 0)
     for number, path in frames:
         if (pose := poses.get(number)) is None:
             unposed.append(number)
@@ -169,7 +170,8 @@ def _from_aggregation(
 ) -> tuple[Int32[np.ndarray, " P"], Int32[np.ndarray, " P"], Counter[str]]:
     """Return each vertex's ScanNet200 id and instance, and the raw categories missing from the table."""
     segments_path = folder / f"{scan}_vh_clean_2.0.010000.segs.json"
-    segments = np.asarray(read_json_object(segments_path, ("segIndices",))["segIndices"])
+    with decoding(segments_path):
+        segments = np.asarray(read_json_object(segments_path, ("segIndices",))["segIndices"])
     if segments.shape != (num_points,) or segments.dtype.kind != "i":
         raise SceneError(
             f"{segments_path} does not match the mesh of {scan}",
@@ -180,7 +182,9 @@ def _from_aggregation(
     path = folder / f"{scan}.aggregation.json"
     fine, instance = np.zeros((2, num_points), dtype=np.int32)
     unknown = Counter[str]()
-    for row, group in enumerate(read_json_object(path, ("segGroups",))["segGroups"]):
+    with decoding(path):
+        groups = list(read_json_object(path, ("segGroups",))["segGroups"])
+    for row, group in enumerate(groups):
         with decoding(f"{path}, group {row}", expected="objectId, label and a list of segments"):
             category, number = str(group["label"]), int(group["objectId"]) + 1
             members = np.asarray(group["segments"], dtype=np.int64)

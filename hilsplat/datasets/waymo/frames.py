@@ -16,8 +16,8 @@ from hilsplat.datasets.classes import WAYMO_22
 from hilsplat.datasets.points.labelled_points import LabelledPoints
 from hilsplat.scene.posed_images import PosedImage
 
-CAMERAS = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")
-"""Camera names; numbered from 1 in the files."""
+CAMERAS = dict(enumerate(("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT"), start=1))
+"""Name of each camera by its number in the files."""
 TOP = 1
 """Number of the roof lidar, the only one that has labels and a pose for each pixel."""
 CV_FROM_WAYMO = np.array(
@@ -75,10 +75,12 @@ def beam_inclinations(
     """Return the inclination of each row of a range image, radians; row 0 is the highest beam.
 
     `values` are calibrated inclinations, ascending; None if the beams are evenly spaced between the limits
-    `lowest` and `highest`.
+    `lowest` and `highest`. ValueError is raised if one isn't finite.
     """
     if values is None:
         values = lowest + (np.arange(height) + 0.5) / height * (highest - lowest)
+    if not np.isfinite(values).all():
+        raise ValueError("a beam has no inclination")
     return np.asarray(values, dtype=np.float64)[::-1]
 
 

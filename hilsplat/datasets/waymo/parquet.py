@@ -77,7 +77,12 @@ def vehicle_poses(split: Path, segment: str) -> dict[int, Float[np.ndarray, "4 4
     """Return the vehicle's pose in the world at each frame's timestamp, in order of time."""
     name = "[VehiclePoseComponent].world_from_vehicle.transform"
     rows = read_component(split, "vehicle_pose", segment, [FRAME, name])
-    return dict(sorted((row[FRAME], row[name].reshape(4, 4)) for row in rows))
+    with decoding(component_path(split, "vehicle_pose", segment)):
+        return {row[FRAME]: _matrix4(row[name]) for row in sorted(rows, key=lambda row: row[FRAME])}
+
+
+def _matrix4(values: Any) -> Float[np.ndarray, "4 4"]:
+    return np.reshape(values, (4, 4)).astype(np.float64)
 
 
 def lidar_frames(split: Path, segment: str) -> Iterator[LidarFrame]:
@@ -106,9 +111,10 @@ def lidar_frames(split: Path, segment: str) -> Iterator[LidarFrame]:
         )
         if not returns:
             continue
-        values, lowest, highest = (lidar[0][f"{beams}.{name}"] for name in ("values", "min", "max"))
-        inclinations = beam_inclinations(values, lowest, highest, pixel_pose.shape[0])
-        in_vehicle = lidar[0][place].reshape(4, 4)
+        with decoding(component_path(split, "lidar_calibration", segment)):
+            values, lowest, highest = (lidar[0][f"{beams}.{name}"] for name in ("values", "min", "max"))
+            inclinations = beam_inclinations(values, lowest, highest, pixel_pose.shape[0])
+            in_vehicle = _matrix4(lidar[0][place])
         pixel_pose = pixel_pose.astype(np.float32)
         yield LidarFrame(time, poses[time], in_vehicle, inclinations, pixel_pose, returns)
 
@@ -145,15 +151,16 @@ def _cameras(split: Path, segment: str) -> dict[int, WaymoCamera]:
     inner = [f"{base}.intrinsic.{name}" for name in INTRINSIC]
     place, width, height = f"{base}.extrinsic.transform", f"{base}.width", f"{base}.height"
     rows = read_component(split, "camera_calibration", segment, [CAMERA, *inner, place, width, height])
-    return {
-        row[CAMERA]: WaymoCamera(
-            CAMERAS[row[CAMERA] - 1],
-            np.array([row[name] for name in inner], dtype=np.float64),
-            row[place].reshape(4, 4),
-            (row[height], row[width]),
-        )
-        for row in rows
-    }
+    with decoding(component_path(split, "camera_calibration", segment), expected="cameras 1 to 5 and lenses"):
+        lenses = np.array([[row[name] for name in inner] for row in rows], dtype=np.float64)
+        if not np.isfinite(lenses).all():
+            raise ValueError("a lens is not finite")
+        return {
+            row[CAMERA]: WaymoCamera(
+                CAMERAS[row[CAMERA]], lens, _matrix4(row[place]), (int(row[height]), int(row[width]))
+            )
+            for row, lens in zip(rows, lenses, strict=True)
+        }
 
 
 def camera_shots(split: Path, segment: str, every: int = 1) -> Iterator[CameraShot]:
@@ -173,5 +180,6 @@ def camera_shots(split: Path, segment: str, every: int = 1) -> Iterator[CameraSh
         columns = [CAMERA, "[CameraImageComponent].image", pose]
         of_frame = read_component(split, "camera_image", segment, columns, {FRAME: time})
         for row in sorted(of_frame, key=lambda row: row[CAMERA]):
-            encoded = row["[CameraImageComponent].image"]
-            yield CameraShot(time, cameras[row[CAMERA]], encoded, row[pose].reshape(4, 4))
+            with decoding(component_path(split, "camera_image", segment)):
+                encoded, taken = bytes(row["[CameraImageComponent].image"]), _matrix4(row[pose])
+            yield CameraShot(time, cameras[row[CAMERA]], encoded, taken)

@@ -14,6 +14,7 @@ from hilsplat.datasets.dataset import Dataset, SceneReport, listing
 from hilsplat.datasets.points.labelled_points import PointScene
 from hilsplat.datasets.waymo import parquet, records
 from hilsplat.datasets.waymo.frames import frame_points, joined_points, shot_image
+from hilsplat.scene.posed_images import rigid_pose
 
 SPLITS = ("validation", "training")
 """Splits searched for a segment. Labels of the testing split are not public."""
@@ -62,7 +63,7 @@ def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
             found=found,
             fix=fix,
         )
-    segment_from_world = np.linalg.inv(first)
+    segment_from_world = np.linalg.inv(rigid_pose(first, f"segment {segment}, first frame"))
     points = [frame_points(frame, segment_from_world) for frame in frames]
     if not points:
         raise SceneError(

@@ -176,7 +176,7 @@ def camera_shots(path: Path, every: int = 1) -> Iterator[CameraShot]:
         for image in sorted(frame.images, key=lambda image: image.name):
             with decoding(where):
                 lens = _named(frame.context.camera_calibrations, image.name)
-                name, size_hw = CAMERAS[image.name - 1], (lens.height, lens.width)
+                name, size_hw = CAMERAS[image.name], (lens.height, lens.width)
                 camera = WaymoCamera(name, np.array(lens.intrinsic), _matrix4(lens.extrinsic), size_hw)
                 pose = _matrix4(image.pose)
             yield CameraShot(frame.timestamp_micros, camera, image.image, pose)

@@ -5,8 +5,6 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int
 
-from hilsplat.base.levels import Level
-
 BOUNDARY_RATIO = 0.02
 """Boundary width as a fraction of the image diagonal (Cheng et al. 2021)."""
 
@@ -80,12 +78,12 @@ def pixel_accuracy(prediction: Bool[np.ndarray, "K H W"], truth: Bool[np.ndarray
     return float((prediction == truth).all(axis=0).mean())
 
 
-def peak_points(filtered: Float[np.ndarray, "L H W"], level: Level | None) -> Int[np.ndarray, "P 2"]:
-    """Return all pixels (x, y) at which the filtered map of a level has its maximum.
+def peak_points(filtered: Float[np.ndarray, "L H W"]) -> Int[np.ndarray, "P 2"]:
+    """Return all pixels (x, y) at which the filtered maps of levels have their maximum.
 
-    If `level` is None, the map with the highest maximum is used; the finest level wins ties, as in LangSplat.
+    The map with the highest maximum is used; the finest level wins ties, as in LangSplat.
     """
-    chosen = max(filtered[::-1], key=np.max) if level is None else filtered[level.index]
+    chosen = max(filtered[::-1], key=np.max)
     pixels = np.flatnonzero(chosen == chosen.max())  # np.nonzero in two dimensions is six times slower
     return np.stack([pixels % chosen.shape[1], pixels // chosen.shape[1]], axis=1)
 

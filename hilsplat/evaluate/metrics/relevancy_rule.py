@@ -3,8 +3,9 @@
 Source: minghanqin/LangSplat `eval/evaluate_iou_loc.py`; every departure is a field of `RelevancyRule`.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Literal
 
 import numpy as np
@@ -76,11 +77,17 @@ def mean_filter(
     values, side_hw = np.asarray(relevancy, np.float32), (side_px, side_px)
     if border == "langsplat":
         return cv2.boxFilter(values, cv2.CV_32F, side_hw, borderType=cv2.BORDER_DEFAULT)
-    summed, count = (
-        cv2.boxFilter(each, cv2.CV_32F, side_hw, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        for each in (values, np.ones_like(values))
-    )
-    return summed / count
+    summed = cv2.boxFilter(values, cv2.CV_32F, side_hw, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    return summed / _pixels_inside(values.shape, side_px)
+
+
+@lru_cache(maxsize=4)  # views of a scene mostly have one size
+def _pixels_inside(shape: tuple[int, int], side_px: int) -> Float32[np.ndarray, "H W"]:
+    """Return the number of pixels of each window of the mean filter that are inside the image."""
+    import cv2
+
+    ones, side_hw = np.ones(shape, np.float32), (side_px, side_px)
+    return cv2.boxFilter(ones, cv2.CV_32F, side_hw, normalize=False, borderType=cv2.BORDER_CONSTANT)
 
 
 def threshold_mask(
@@ -136,6 +143,19 @@ class SmoothedRelevancy:
         raw = np.asarray(relevancy, np.float32)
         filtered = np.stack([mean_filter(of_level, side_px, rule.border) for of_level in raw])
         return SmoothedRelevancy(filtered, np.float32(0.5) * (filtered + raw) if rule.mix else raw)
+
+
+Smooth = Callable[[RelevancyRule], SmoothedRelevancy]
+
+
+def smoothing_of(relevancy: Float[np.ndarray, "3 H W"]) -> Smooth:
+    """Return a function that smooths a query's relevancy once for all rules with the same filter."""
+
+    @cache
+    def by_filter(filter_px: int, mix: bool, border: Border) -> SmoothedRelevancy:
+        return SmoothedRelevancy.of(relevancy, RelevancyRule(filter_px, mix, border=border))
+
+    return lambda rule: by_filter(rule.filter_px, rule.mix, rule.border)
 
 
 def relevancy_mask(

@@ -48,7 +48,7 @@ def peaks_of_answer(
     """
     searched = range(len(relevancy)) if level is None else (level.index,)
     answered = [index for index in searched if relevancy[index].min() < relevancy[index].max()]
-    return masks.peak_points(filtered[answered], None) if answered else NO_POINTS
+    return masks.peak_points(filtered[answered]) if answered else NO_POINTS
 
 
 class PackedMasks:

@@ -27,6 +27,9 @@ NODE_SELECT = 0.95
 ANCESTORS = 0.2
 """Fraction of the ancestors' mean margin that is added to a node's own margin, except on paths."""
 
+MIN_REGION_PX = 60
+"""Minimum area of a scored region of a generated scene; published labels have no minimum."""
+
 Averaging = Literal["pairs", "classes", "levels", "views", "scenes", "pooled"]
 """How rows are averaged into one number of a table.
 

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int64
 
 from hilsplat.base.levels import Level
-from hilsplat.evaluate.metrics.masks import argmax_masks, iou, peak_points, pixel_accuracy
-from hilsplat.evaluate.metrics.relevancy_rule import Border, RelevancyRule, SmoothedRelevancy, relevancy_mask
-from hilsplat.evaluate.protocols.answers import NO_POINTS, mask_rows, relevancy_of
+from hilsplat.evaluate.metrics.masks import argmax_masks, iou, pixel_accuracy
+from hilsplat.evaluate.metrics.relevancy_rule import RelevancyRule, Smooth, relevancy_mask, smoothing_of
+from hilsplat.evaluate.protocols.answers import NO_POINTS, mask_rows, peaks_of_answer, relevancy_of
 from hilsplat.evaluate.protocols.cards import (
     LERF_LANGSPLAT,
     LERF_MASK,
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
 Answer = Bool[np.ndarray, "_ _"] | Float[np.ndarray, "_ _ _"]
 """A mask (H, W), or relevancy (3, H, W); under `3d-ovs/argmax`, cosines (L, H, W)."""
-
-Smooth = Callable[[Float[np.ndarray, "_ _ _"], RelevancyRule], SmoothedRelevancy]
 
 
 class FlatProtocols:
@@ -62,28 +60,20 @@ class FlatProtocols:
         self,
         method: str,
         relevancy: Float32[np.ndarray, "3 H W"],
+        smooth: Smooth,
         nodes_mask: Bool[np.ndarray, "H W"] | None,
         category: Query,
         queries: Sequence[Query],
     ) -> Iterator[Measured]:
         """Yield the rows of one text, merged over levels (`category`) or at one of its levels (`queries`).
 
-        `nodes_mask` is the tree's mask, for LERF-Mask and `3d-ovs/tree-nodes`. If it is None, LERF-Mask
-        derives the mask from the relevancy maps.
+        `smooth` returns the smoothed `relevancy` (`smoothing_of`). `nodes_mask` is the tree's mask, for
+        LERF-Mask and `3d-ovs/tree-nodes`. If it is None, LERF-Mask derives the mask from the relevancy maps.
         """
         query = category if self.level is None else next((q for q in queries if q.level is self.level), None)
         if query is None:
             return
         flat = replace(query, level=None)
-
-        @functools.cache
-        def smoothed_by(filter_px: int, mix: bool, border: Border) -> SmoothedRelevancy:
-            """Smooth once for all rules with the same filter, because smoothing takes most of the time."""
-            return SmoothedRelevancy.of(relevancy, RelevancyRule(filter_px, mix, border=border))
-
-        def smooth(relevancy: np.ndarray, rule: RelevancyRule) -> SmoothedRelevancy:
-            return smoothed_by(rule.filter_px, rule.mix, rule.border)
-
         for card in self.cards:
             is_of_nodes = nodes_mask is not None and card in (LERF_MASK, LERF_MASK_SKIPPING, OVS_NODES)
             if is_of_nodes:
@@ -118,17 +108,19 @@ def mask_of(
     level: Level | None,
     answer: Answer,
     united: Answer | None = None,
-    smooth: Smooth = SmoothedRelevancy.of,
+    smooth: Smooth | None = None,
 ) -> tuple[Bool[np.ndarray, "H W"], Int[np.ndarray, "P 2"]]:
     """Return an answer's mask, made from relevancy by the protocol's rule, and the peaks of the relevancy.
 
-    `united` is the relevancy of a second text that the protocol merges with the first.
+    `united` is the relevancy of a second text that the protocol merges with the first, and `smooth` returns
+    the answer smoothed, if the caller has that already.
     """
     rule = rule_of(card)
     if answer.ndim == 2 or rule is None:
         return answer, NO_POINTS
-    smoothed = smooth(answer, rule)
-    return relevancy_mask(smoothed, level, rule, united), peak_points(smoothed.filtered, level)
+    smoothed = (smooth or smoothing_of(answer))(rule)
+    peaks = peaks_of_answer(answer, smoothed.filtered, level)
+    return relevancy_mask(smoothed, level, rule, united), peaks
 
 
 def answer_rows(
@@ -139,7 +131,7 @@ def answer_rows(
     words: Sequence[str],
     metrics: Sequence[str],
     united: Answer | None = None,
-    smooth: Smooth = SmoothedRelevancy.of,
+    smooth: Smooth | None = None,
 ) -> Iterator[Measured]:
     """Yield the rows of a text's answer (see `mask_of`), or of an empty mask without an answer.
 

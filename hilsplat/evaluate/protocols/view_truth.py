@@ -15,6 +15,7 @@ from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
 from hilsplat.datasets.labelled import LabelledRegion, LabelledScene
+from hilsplat.evaluate.protocols.cards import MIN_REGION_PX
 from hilsplat.scene.scene import Scene
 
 logger = logging.getLogger(__name__)
@@ -48,6 +49,8 @@ class ViewTruth:
     regions: dict[tuple[str, ...], Bool[np.ndarray, "H W"]]  # of each path that is large enough
     # Texts that are labelled but not visible in the view compete in an argmax, and may have `any_grey`.
     absent: tuple[Query, ...]
+    texts: frozenset[tuple[Level | None, str]]  # labelled in the view, also in regions that are too small
+    min_px: int  # minimum area of a scored region
 
     @staticmethod
     def of(
@@ -115,7 +118,14 @@ class ViewTruth:
             tuple(query for query in united if query.truth.any()),
             {path: mask for path, mask in by_path.items() if np.count_nonzero(mask) >= min_px},
             tuple(query for query in united if not query.truth.any()),
+            frozenset((query.level, query.text) for query in merged),
+            min_px,
         )
+
+    @property
+    def departures(self) -> list[str]:
+        """Return a description of the minimum area, for protocol names, unless it is the default or none."""
+        return [] if self.min_px in (0, MIN_REGION_PX) else [f"regions from {self.min_px} px"]
 
     def own_part(self, path: tuple[str, ...], answer: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
         """Return the answer to a part, minus the area of other annotated wholes that have the same part.

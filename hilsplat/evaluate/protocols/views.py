@@ -22,6 +22,7 @@ from hilsplat.evaluate.metrics.relevancy_rule import (
     filter_side_px,
     mean_filter,
     relevancy_mask,
+    smoothing_of,
 )
 from hilsplat.evaluate.protocols import cards
 from hilsplat.evaluate.protocols.answers import (
@@ -52,32 +53,38 @@ def rule_of(settings: EvaluateSettings) -> RelevancyRule:
     )
 
 
-def label_of(card: cards.ProtocolCard, method: str, settings: EvaluateSettings) -> str:
-    """Return the protocol name of a row: the card's name and the non-default settings that affect the row."""
+def label_of(
+    card: cards.ProtocolCard, method: str, settings: EvaluateSettings, of_truth: Sequence[str] = ()
+) -> str:
+    """Return the protocol name of a row: the card's name and the non-default settings that affect the row.
+
+    `of_truth` describes those that affect which regions are scored (`ViewTruth.departures`).
+    """
     if method == "truth":
-        return card.labelled()
+        return card.labelled(of_truth)
     rule = rule_of(settings)
     words: list[str] = []
     if method == "field":
         words += rule.departures()
     else:  # nodes are selected without thresholds; localization and diagnostics still use smoothed maps
         words += RelevancyRule(rule.filter_px, rule.mix).departures()
-        words += node_departures(method, settings)
-    return card.labelled([*words, *relevancy_departures(settings)])
+        words += node_departures(settings)
+    return card.labelled([*words, *relevancy_departures(settings), *of_truth])
 
 
-def node_departures(method: str, settings: EvaluateSettings) -> list[str]:
-    """Return descriptions of the settings that change which nodes answer a text, or a path."""
+def node_departures(settings: EvaluateSettings) -> list[str]:
+    """Return descriptions of the settings that change which nodes answer a text, or a path of one text."""
     words = []
     if settings.node_select != cards.NODE_SELECT:
         words.append(f"node share {settings.node_select:g}")
-    if method == "tree" and settings.ancestors != cards.ANCESTORS:
+    if settings.ancestors != cards.ANCESTORS:
         words.append(f"ancestors {settings.ancestors:g}")
     return words
 
 
-def given_key(method: str, query: Query, settings: EvaluateSettings) -> tuple[Any, ...]:
-    return (method, label_of(cards.LEVEL_GIVEN, method, settings), query.text, query.level)
+def given_key(method: str, query: Query) -> tuple[Any, ...]:
+    """Return the key of a method's stored answer to a query at its level."""
+    return (method, cards.LEVEL_GIVEN.name, query.text, query.level)
 
 
 def relevancy_departures(settings: EvaluateSettings) -> list[str]:
@@ -105,9 +112,9 @@ def measure_view(
     extra: ExtraProtocols,
 ) -> Iterator[Measured]:
     """Yield all rows of one view, in arbitrary order, and store the answers in `masks`."""
-    answers, scene = _ViewAnswers(selections, view, settings, masks), selections.scene
-    of_nodes = node_departures("tree", settings)
-    flat_views = FlatProtocols(scene, view, extra.flat, extra.level, relevancy_departures(settings), of_nodes)
+    answers, scene = _ViewAnswers(selections, view, settings, masks, truth), selections.scene
+    words, of_nodes = [*relevancy_departures(settings), *truth.departures], node_departures(settings)
+    flat_views = FlatProtocols(scene, view, extra.flat, extra.level, words, of_nodes)
     rule = rule_of(settings)
 
     needs_nodes = "tree" in settings.methods or "tree-path" in settings.methods
@@ -124,20 +131,20 @@ def measure_view(
             for method, found in (("field", fields), ("tree", nodes)):
                 if found is None or method not in settings.methods:
                     continue
-                mask = None
+                mask, smooth = None, smoothing_of(found[row])
                 if category.truth.any():
-                    smoothed = SmoothedRelevancy.of(found[row], rule)
+                    smoothed = smooth(rule)
                     flat, answer = cards.LERF_LANGSPLAT, partial(relevancy_mask, smoothed, rule=rule)
                     if method == "tree":
                         flat, answer = cards.TREE_NODES, partial(answers.of_nodes, (category.text,))
                         yield from answers.scene_wide_rows(queries)
                         mask = answer(None)
                     yield from answers.rows(method, flat, found[row], smoothed, answer, category, queries)
-                yield from flat_views.add(method, found[row], mask, category, queries)
+                yield from flat_views.add(method, found[row], smooth, mask, category, queries)
             if nodes is not None and "tree-path" in settings.methods:
                 yield from answers.path_rows(nodes[row], queries)
     yield from flat_views.finish()
-    yield from answers.consistency_rows(truth)
+    yield from answers.consistency_rows()
 
 
 @dataclass(frozen=True)
@@ -148,6 +155,10 @@ class _ViewAnswers:
     view: str
     settings: EvaluateSettings
     masks: PackedMasks
+    truth: ViewTruth
+
+    def label(self, card: cards.ProtocolCard, method: str) -> str:
+        return label_of(card, method, self.settings, self.truth.departures)
 
     def of_nodes(self, path: tuple[str, ...], level: Level | None, *, scene_wide: bool = False) -> np.ndarray:
         """Return the mask of the nodes that answer the last text of a path."""
@@ -169,12 +180,12 @@ class _ViewAnswers:
         `answer` returns the text's mask at a level; None lets the method choose the level.
         """
         united, given, auto = (
-            label_of(card, method, self.settings) for card in (flat, cards.LEVEL_GIVEN, cards.LEVEL_AUTO)
+            self.label(card, method) for card in (flat, cards.LEVEL_GIVEN, cards.LEVEL_AUTO)
         )
         auto_mask = answer(None)
         auto_points = peaks_of_answer(relevancy, smoothed.filtered, None)
         yield from mask_rows(method, category, united, auto_mask, auto_points)
-        self.masks.put((method, auto, category.text), auto_mask)
+        self.masks.put((method, cards.LEVEL_AUTO.name, category.text), auto_mask)
         for query in queries:
             assert query.level is not None
             given_mask = answer(query.level)
@@ -183,19 +194,19 @@ class _ViewAnswers:
             yield from mask_rows(method, query, auto, auto_mask, auto_points)
             best = best_threshold_iou(smoothed.mixed[query.level.index], query.truth)
             yield Measured(method, query.text, query.level.label, "best_threshold_iou", given, best)
-            self.masks.put(given_key(method, query, self.settings), given_mask)
+            self.masks.put(given_key(method, query), given_mask)
 
     def scene_wide_rows(self, queries: Sequence[Query]) -> Iterator[Measured]:
         """Yield the rows of the tree's scene-wide answers, without localization, which is per view."""
-        protocol = label_of(cards.SCENE_WIDE, "tree", self.settings)
+        protocol = self.label(cards.SCENE_WIDE, "tree")
         for query in queries:
             mask = self.of_nodes((query.text,), query.level, scene_wide=True)
             yield from mask_rows("tree", query, protocol, mask, NO_POINTS, cards.MASK)
-            self.masks.put(("tree", protocol, query.text, query.level), mask)
+            self.masks.put(("tree", cards.SCENE_WIDE.name, query.text, query.level), mask)
 
     def path_rows(self, relevancy: np.ndarray, queries: Sequence[Query]) -> Iterator[Measured]:
         """Yield the rows of answers to paths; localization searches the parent's predicted mask, if any."""
-        protocol = label_of(cards.PATH, "tree-path", self.settings)
+        protocol = self.label(cards.PATH, "tree-path")
         size_hw = self.masks.size_hw
         side_px = filter_side_px(self.settings.filter_px, size_hw[0])
         for query in queries:
@@ -204,7 +215,7 @@ class _ViewAnswers:
             inside = np.zeros(size_hw, dtype=bool)
             for path in query.paths:
                 path_mask = self.of_nodes(path, query.level)
-                self.masks.put(("tree-path", protocol, path), path_mask)
+                self.masks.put(("tree-path", cards.PATH.name, path), path_mask)
                 mask |= path_mask
                 if len(path) > 1:
                     is_full = len(path) == int(query.level)  # labels may lack an intermediate level
@@ -214,7 +225,7 @@ class _ViewAnswers:
             points = peaks_of_answer(level_map[None], filtered[None], None)
             yield from mask_rows("tree-path", query, protocol, mask, points)
 
-    def consistency_rows(self, truth: ViewTruth) -> Iterator[Measured]:
+    def consistency_rows(self) -> Iterator[Measured]:
         """Yield the HC of every method and the annotations; nothing for a view without parents."""
         of_methods = {
             "truth": (cards.ANNOTATIONS,),
@@ -223,20 +234,18 @@ class _ViewAnswers:
             "tree-path": (cards.PATH,),
         }
 
-        def mask_of(
-            method: str, card: cards.ProtocolCard, protocol: str, path: tuple[str, ...]
-        ) -> np.ndarray:
+        def mask_of(method: str, card: cards.ProtocolCard, path: tuple[str, ...]) -> np.ndarray:
             if card is cards.ANNOTATIONS:
-                return truth.regions[path]
+                return self.truth.regions[path]
             if card is cards.PATH:
-                return self.masks.get((method, protocol, path))
+                return self.masks.get((method, card.name, path))
             key = path[-1:] if card is cards.LEVEL_AUTO else (path[-1], Level(len(path)))
-            return truth.own_part(path, self.masks.get((method, protocol, *key)))
+            return self.truth.own_part(path, self.masks.get((method, card.name, *key)))
 
         for method, of_method in of_methods.items():
             for card in of_method if method in ("truth", *self.settings.methods) else ():
-                protocol = label_of(card, method, self.settings)
-                yield from consistency_rows(method, protocol, truth, partial(mask_of, method, card, protocol))
+                answer = partial(mask_of, method, card)
+                yield from consistency_rows(method, self.label(card, method), self.truth, answer)
 
 
 def consistency_rows(

@@ -6,7 +6,8 @@ much code, and writes an id and three classes per cell, so HTML files would be 1
 
 import html
 import re
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 
 from hilsplat.base.tables import plain_markdown
 from hilsplat.evaluate.tables.rows import Block, Cell, Table
@@ -43,16 +44,24 @@ HTML_STYLE = """<style>
 def csv_rows(table: Table) -> tuple[list[str], list[list[str]]]:
     """Return the columns and rows of all blocks: measured values with two decimals, others as printed.
 
-    A scene has one column, whatever its case and whether its words are joined, separated by spaces or by _.
+    Blocks may spell a scene differently: the paper writes Waldo kitchen, the data set waldo_kitchen. Columns
+    that differ only in case, spaces and _ are therefore the same, unless a block has several of them.
     """
     names = list(dict.fromkeys(name for block in table.blocks for name in block.names()))
-    values: dict[str, str] = {}  # the paper writes Waldo kitchen, the data set waldo_kitchen
+    several = {
+        key for block in table.blocks for key, n in Counter(map(_plain, block.columns)).items() if n > 1
+    }
+
+    def by_key(block: Block) -> dict[str, str]:
+        return {column if (key := _plain(column)) in several else key: column for column in block.columns}
+
+    values: dict[str, str] = {}
     for block in table.blocks:
-        for column in block.columns:
-            values.setdefault(_column_key(column), column)
+        for key, column in by_key(block).items():
+            values.setdefault(key, column)
     rows = []
     for block in table.blocks:
-        own = {_column_key(column): column for column in block.columns}
+        own = by_key(block)
         for row in block.rows:
             cells = [row.cell(own[key]) if key in own else Cell() for key in values]
             notes = " ".join(dict.fromkeys(cell.note for cell in cells if cell.note))
@@ -61,7 +70,7 @@ def csv_rows(table: Table) -> tuple[list[str], list[list[str]]]:
     return ["kind", "data", *(name.lower() for name in names), *values.values(), "notes"], rows
 
 
-def _column_key(column: str) -> str:
+def _plain(column: str) -> str:
     return re.sub("[ _]", "", column).casefold()
 
 
@@ -89,27 +98,35 @@ def as_markdown(table: Table) -> str:
     lines = [f"# {table.title}", ""]
     for block in table.blocks:
         names, values = block.names(), block.filled_columns()
-        lines += [f"## {block.title}", "", "| " + " | ".join([*names, *values]) + " |"]
+        header = " | ".join(map(plain_markdown, [*names, *values]))
+        lines += [f"## {plain_markdown(block.title)}", "", f"| {header} |"]
         lines.append("|" + "---|" * len(names) + "---:|" * len(values))
         for texts, shown in shown_rows(block, notes):
             cells = [plain_markdown(text) for text in texts]
             for text, rank, note in shown:
-                cells.append(marks[rank].format(text) + (f"<sup>{note}</sup>" if note else ""))
+                raised = f"<sup>{note}</sup>" if note else ""
+                cells.append(marks[rank].format(plain_markdown(text)) + raised)
             lines.append("| " + " | ".join(cells) + " |")
         lines.append("")
     lines += ["Best three in a block and protocol: **best**, <u>second</u>, *third*.", ""]
-    lines += [f"- {_plain(note)}".replace("*:", "\\*:") for note in table.footnotes]
-    lines += [f"- <sup>{number}</sup> {_plain(note)}" for note, number in notes.items()]
+    lines += [f"- {_inert(note)}".replace("*:", "\\*:") for note in table.footnotes]
+    lines += [f"- <sup>{number}</sup> {_inert(note)}" for note, number in notes.items()]
     return "\n".join(lines).rstrip() + "\n"
 
 
-def _plain(note: str) -> str:
+def _inert(note: str) -> str:
     """Return a note with HTML and links disabled; Markdown emphasis is kept."""
     return " ".join(note.replace("<", "&lt;").replace("](", "]\\(").splitlines())
 
 
 def latex_text(text: str) -> str:
-    return text.translate(LATEX_SPECIAL)
+    return " ".join(text.splitlines()).translate(LATEX_SPECIAL)
+
+
+def latex_row(cells: Sequence[str]) -> str:
+    """Join escaped cells; a bracket or star would be read as an argument of the line before."""
+    row = " & ".join(cells) + r" \\"
+    return "{}" + row if row.startswith(("[", "*")) else row
 
 
 def as_latex(table: Table) -> str:
@@ -123,13 +140,13 @@ def as_latex(table: Table) -> str:
         lines += [rf"\par\smallskip\textit{{{latex_text(block.title)}}}\par\smallskip"]
         lines += [r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"]
         lines += [rf"\begin{{tabular}}{{{'l' * len(names)}{'r' * len(values)}}}", r"\toprule"]
-        lines += [" & ".join(map(latex_text, [*names, *values])) + r" \\", r"\midrule"]
+        lines += [latex_row(list(map(latex_text, [*names, *values]))), r"\midrule"]
         for texts, shown in shown_rows(block, notes):
             cells = [latex_text(text) for text in texts]
             for text, rank, note in shown:
                 raised = rf"\textsuperscript{{{note}}}" if note else ""
                 cells.append(marks[rank] % latex_text(text) + raised)
-            lines.append(" & ".join(cells) + r" \\")
+            lines.append(latex_row(cells))
         lines += [r"\bottomrule", r"\end{tabular}}"]
     lines.append(r"\par\smallskip\raggedright\footnotesize")
     lines += [latex_text(note) + r"\par" for note in table.footnotes]

@@ -65,10 +65,11 @@ def scannet_cells(sources: Sources, _: "pd.DataFrame", part: "pd.DataFrame") -> 
     first = part.iloc[0]
     variant = first["variant"] if first["seed"] == 0 else f"{first['variant']}.seed{first['seed']}"
     key = (first["dataset"], variant, first["masks"], first["method"])
+    scenes = set(part["scene"])  # another row may have those that were scored under other settings
     scans = {
         scene: matches
         for (dataset, scene, *rest), matches in sources.instances.items()
-        if (dataset, *rest) == key
+        if (dataset, *rest) == key and scene in scenes
     }
     of_benchmark = part[part["protocol"].str.startswith(BENCHMARK)]
     if of_benchmark.empty and not scans:
@@ -109,7 +110,7 @@ def bootstrap_mean(
     Args:
         hits: correctly predicted points of each class, per seed and scene.
         union: points labelled or predicted as the class; 0 if the class doesn't occur.
-        present: classes of each scene that are included in the mean.
+        present: classes of each scene that are included in the mean, at least one.
         pooled: whether counts of all scenes are summed first; otherwise scenes are averaged.
     """
     draws = np.random.default_rng(0)
@@ -124,9 +125,8 @@ def bootstrap_mean(
             names = present[scenes].any(axis=0)
             of_names = (counts[:, scenes].sum(axis=1)[:, names] for counts in (hits, union))
             return mean_over_names(np.divide(*of_names))
-        named = [scene for scene in scenes if present[scene].any()]
-        means = [mean_over_names(hits[:, s, present[s]] / union[:, s, present[s]]) for s in named]
-        return float(np.mean(means)) if means else 0.0
+        means = [mean_over_names(hits[:, s, present[s]] / union[:, s, present[s]]) for s in scenes]
+        return float(np.mean(means))
 
     low, high = np.percentile([resampled() for _ in range(DRAWS)], (2.5, 97.5))
     return float(low), float(high)

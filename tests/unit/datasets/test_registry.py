@@ -11,18 +11,9 @@ from typer.testing import CliRunner
 from hilsplat.base.errors import SceneError
 from hilsplat.base.images import write_png
 from hilsplat.cli.main import app
+from hilsplat.datasets import sources
 from hilsplat.datasets.published import FRAMES, PAIRS, PROMPTS
 from hilsplat.datasets.registry import DATASETS, dataset_of, open_labels
-from hilsplat.datasets.sources import (
-    absence,
-    export_images,
-    image_files,
-    is_exported,
-    label_files,
-    label_sets,
-    published,
-    unlisted,
-)
 from hilsplat.evaluate.protocols.cards import card_of
 from tests.conftest import PROJECT
 from tests.unit.datasets.writers.labelled import write_lerf_ovs
@@ -116,53 +107,55 @@ def test_the_command_checks_scenes_and_reports_one_that_cannot_be_read(tmp_path,
 
 
 def test_a_source_that_cannot_be_used_has_a_reason_in_one_line(root):
-    assert published("data:lerf_ovs/figurines") == ("lerf_ovs", "figurines")
+    assert sources.published("data:lerf_ovs/figurines") == ("lerf_ovs", "figurines")
     for other in ("data:desk/mine", "world:tabletop:201", "lerf_ovs/figurines"):
-        assert published(other) is None
+        assert sources.published(other) is None
     for usable in ("data:lerf_ovs/figurines", "world:tabletop:201"):
-        assert absence(usable, str(root)) is None
-    assert absence("data:lerf_ovs/figurines", "") == "data_root is not set"
-    assert absence("data:desk/mine", str(root)) == f"{root / 'desk/mine'} is missing"
+        assert sources.absence(usable, str(root)) is None
+    assert sources.absence("data:lerf_ovs/figurines", "") == "data_root is not set"
+    assert sources.absence("data:desk/mine", str(root)) == f"{root / 'desk/mine'} is missing"
     (root / "lerf_ovs/figurines/sparse").rename(root / "aside")
-    reason = absence("data:lerf_ovs/figurines", str(root))
+    reason = sources.absence("data:lerf_ovs/figurines", str(root))
     assert "incomplete" in reason and "sparse" in reason and "\n" not in reason
 
 
 def test_segments_on_disk_without_a_row_are_listed(root):
     touch(*(root / f"waymo/validation/lidar_segmentation/{segment}.parquet" for segment in ("one", "two")))
-    sources = {"data:waymo/one", "data:lerf_ovs/figurines"}
-    assert unlisted(sources, ["lerf", "waymo"], str(root)) == ["waymo/two"]
+    listed = {"data:waymo/one", "data:lerf_ovs/figurines"}
+    assert sources.unlisted(listed, ["lerf", "waymo"], str(root)) == ["waymo/two"]
 
 
 def test_all_labels_on_a_scenes_images_score_it_and_only_evaluation_reads_them(root):
     both = ("lerf_ovs/figurines", "hi_lerf/figurines")
-    assert label_sets("data:lerf_ovs/figurines", str(root), "lerf/figurines") == both
-    assert label_sets("data:3d_ovs/bed", str(root), "3d_ovs/bed") == ("3d_ovs/bed",)
+    assert sources.label_sets("data:lerf_ovs/figurines", str(root), "lerf/figurines") == both
+    assert sources.label_sets("data:3d_ovs/bed", str(root), "3d_ovs/bed") == ("3d_ovs/bed",)
     touch(root / "hi_3dovs/label/bed/00.json")
-    assert label_sets("data:3d_ovs/bed", str(root), "3d_ovs/bed") == ("3d_ovs/bed", "hi_3dovs/bed")
-    assert label_sets("data:lerf_ovs/ramen", str(root), "lerf/ramen") == ()
+    assert sources.label_sets("data:3d_ovs/bed", str(root), "3d_ovs/bed") == ("3d_ovs/bed", "hi_3dovs/bed")
+    assert sources.label_sets("data:lerf_ovs/ramen", str(root), "lerf/ramen") == ()
     label, masks = root / "lerf_ovs/label/figurines/frame_00041.json", root / "3d_ovs/bed/segmentations"
-    assert label_files("lerf_ovs/figurines", str(root)) == (label,)
-    assert label_files("3d_ovs/bed", str(root)) == (masks / "00/banana.png", masks / "classes.txt")
+    assert sources.label_files("lerf_ovs/figurines", str(root)) == (label,)
+    assert sources.label_files("3d_ovs/bed", str(root)) == (masks / "00/banana.png", masks / "classes.txt")
 
 
 def test_scenes_with_labelled_points_are_exported_first(root):
     scan = root / "scannet/scans/scene0000_00"
     touch(scan / "color/0.jpg", scan / "pose/0.txt", scan / "scene0000_00.aggregation.json")
-    assert is_exported("data:scannet/scene0000_00")
-    assert not is_exported("data:lerf_ovs/figurines")
-    files = image_files("data:scannet/scene0000_00", str(root))
+    assert sources.is_exported("data:scannet/scene0000_00")
+    assert not sources.is_exported("data:lerf_ovs/figurines")
+    files = sources.image_files("data:scannet/scene0000_00", str(root))
     assert files == (scan / "color/0.jpg", scan / "pose/0.txt")  # labels are read by evaluation alone
 
 
 def test_unknown_data_sets_missing_scene_names_and_needless_exports_are_refused(root, monkeypatch):
     with pytest.raises(SceneError, match=r"'lerf' is unknown\n.*lerf_ovs, lerf_mask, 3d_ovs, hi_lerf"):
         dataset_of("lerf")
-    with pytest.raises(SceneError, match="does not contain a scene name"):
-        open_labels("scannet", Path())
+    for name in ("scannet", "3d_ovs/"):
+        for reads in (open_labels, sources.label_files):
+            with pytest.raises(SceneError, match="does not contain a scene name"):
+                reads(name, Path())
     monkeypatch.setattr("hilsplat.datasets.sources.open_labels", lambda *_: object())
     with pytest.raises(SceneError, match="needs no export"):
-        export_images("lerf_ovs/figurines", root, root / "out")
+        sources.export_images("lerf_ovs/figurines", root, root / "out")
 
 
 def test_the_data_set_of_the_documentation_is_read(tmp_path):

@@ -119,15 +119,19 @@ def opened(block_world, monkeypatch):
     from hilsplat.evaluate.scores import read_scores
     from hilsplat.scene.finished import SceneParts
 
-    opener, folder = SimpleNamespace(from_parts=lambda *_, **__: block_world.answers), block_world.folder
+    answers, folder = block_world.answers, block_world.folder
+
+    def from_parts(_, settings, **__):
+        return replace(answers, settings=settings, decoded_field=replace(answers.field, settings=settings))
+
     for module in (stage, panel):
-        monkeypatch.setattr(module, "LanguageScene", opener)
+        monkeypatch.setattr(module, "LanguageScene", SimpleNamespace(from_parts=from_parts))
     names = ("scene", "gaussians", "semantic_tree", "field", "autoencoder", "clip", "masks")
     parts = SceneParts(**{name: folder / name for name in names})
 
-    def evaluate(out, **changes):
+    def evaluate(out, settings=None, **changes):
         given = {"dataset": "synthetic", "scene": "blocks", "truth": folder / "truth", **changes}
-        stage.run_evaluate(parts, out, EvaluateSettings(), **given)
+        stage.run_evaluate(parts, out, settings or EvaluateSettings(), **given)
         return read_scores([out])
 
     return SimpleNamespace(parts=parts, truth=folder / "truth", evaluate=evaluate)

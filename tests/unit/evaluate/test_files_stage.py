@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import hilsplat
 from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError
 from hilsplat.base.images import write_png
 from hilsplat.datasets.classes import SCANNET_10, SCANNET_19
@@ -15,10 +16,9 @@ from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.files_stage import run_evaluate_files
 from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
-from hilsplat.evaluate.protocols.cards import LEVEL_AUTO, LEVEL_GIVEN, card_of
-from hilsplat.evaluate.protocols.points import measure_points
+from hilsplat.evaluate.protocols.cards import LEVEL_AUTO, card_of
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
-from hilsplat.evaluate.protocols.views import label_of, measure_view
+from hilsplat.evaluate.protocols.views import given_key, measure_view
 from hilsplat.evaluate.scores import read_instances, read_scores
 from hilsplat.evaluate.tables.build import run_table
 from hilsplat.evaluate.tables.rows import PUBLISHED_COLUMNS
@@ -34,11 +34,9 @@ def write_answers(folder, world, packed=False):
     truth = ViewTruth.of(world.annotations, VIEW, (64, 64), SETTINGS.min_region_px)
     kept, selections = PackedMasks((64, 64)), Selections(world.answers)
     rows = list(measure_view(selections, truth, VIEW, kept, SETTINGS, ExtraProtocols()))
-    auto, given = (label_of(card, "tree", SETTINGS) for card in (LEVEL_AUTO, LEVEL_GIVEN))
-    masks = {query.text: kept.get(("tree", auto, query.text)) for query in truth.categories}
+    masks = {query.text: kept.get(("tree", LEVEL_AUTO.name, query.text)) for query in truth.categories}
     for query in truth.queries:
-        key = ("tree", given, query.text, query.level)
-        masks[f"{query.level.label}/{query.text}"] = kept.get(key)
+        masks[f"{query.level.label}/{query.text}"] = kept.get(given_key("tree", query))
     if packed:
         folder.mkdir(parents=True)
         np.savez(folder / "001.npz", **masks)
@@ -77,6 +75,10 @@ def test_files_of_our_own_run_have_the_same_scores_and_make_a_table(block_world,
     assert set(frame["variant"]) == {"theirs"}
     assert "lerf-mask/gaussian-grouping@1 (wholes, masks of files)" in set(frame["protocol"])
     assert "3d-ovs/argmax@3 (labelled pixels, wholes, masks of files)" in set(frame["protocol"])
+    # the regions of lid and nose are smaller
+    large = score(block_world, tmp_path / "theirs", tmp_path / "large.csv", min_region_px=300)
+    assert set(large["query"]) == {"bear", "chest", "head", ""}
+    assert large["protocol"].str.contains("(regions from 300 px, masks of files)", regex=False).all()
     published = tmp_path / "published.csv"
     published.write_text(",".join(PUBLISHED_COLUMNS) + "\n")
     run_table("lerf", [tmp_path / "scores.csv"], published, {"theirs": "Their method"}, tmp_path / "lerf.csv")
@@ -102,27 +104,22 @@ def test_a_view_without_predictions_or_with_two_is_refused_but_its_folder_may_be
 
 
 @pytest.mark.parametrize(
-    ("name", "mask", "message"),
+    ("name", "height", "value", "message"),
     [
-        (
-            "whole/bear",
-            np.full((32, 64), 255),
-            "001.png: whole/bear: the mask and the labels differ in size\n"
-            "  expected  64 x 64 \\(height x width\\)\n  found     32 x 64",
-        ),
-        ("baer", np.full((64, 64), 255), "the labels have no text 'baer'\n(.|\n)*rename it to .bear."),
-        ("whole/nose", np.full((64, 64), 255), "the labels have no text 'nose' at level whole"),
-        ("bear", np.ones((64, 64)), "none is foreground"),
+        ("whole/bear", 32, 255, r"001.png: whole/bear: the mask .*\n.*64 x 64 \(height x width\)\n.*32 x 64"),
+        ("baer", 64, 255, "the labels have no text 'baer'\n(.|\n)*rename it to .bear."),
+        ("whole/nose", 64, 255, "the labels have no text 'nose' at level whole"),
+        ("bear", 64, 1, "none is foreground"),
     ],
 )
-def test_masks_that_cannot_be_scored_are_refused(block_world, tmp_path, name, mask, message):
-    write_png(tmp_path / "001" / f"{name}.png", mask.astype(np.uint8))
+def test_masks_that_cannot_be_scored_are_refused(block_world, tmp_path, name, height, value, message):
+    write_png(tmp_path / "001" / f"{name}.png", np.full((height, 64), value, np.uint8))
     assert re.search(message, refused(block_world, tmp_path, tmp_path, HilsplatError))
 
 
 def test_masks_may_have_any_image_format_and_other_files_are_refused(data_set, tmp_path):
     cup, mug = box((2, 14), (0, 4), (16, 16)), box((2, 14), (9, 16), (16, 16))
-    data_set(LabelledScene("set", "s", {}, None, {"a.png": (region_of(cup, "cup"), region_of(mug, "mug"))}))
+    data_set({"a.png": (region_of(cup, "cup"), region_of(mug, "mug"))})
     (tmp_path / "a").mkdir()
     Image.fromarray(cup * np.uint8(255)).save(tmp_path / "a/cup.PNG", "PNG")
     Image.fromarray(mug * np.uint8(255)).save(tmp_path / "a/mug.jpg", quality=95)
@@ -148,9 +145,11 @@ def test_exactly_one_of_labels_and_truth_is_required(tmp_path):
 
 @pytest.fixture
 def data_set(monkeypatch):
-    """Function that makes `--labels set/s` open the given labels."""
+    """Function that makes `--labels set/s` open the given labels: a `PointScene`, or regions by view."""
 
     def put(known, flat=(), points=()):
+        if isinstance(known, dict):
+            known = LabelledScene("set", "s", {}, None, known)
         extra = ExtraProtocols(*(tuple(map(card_of, names)) for names in (flat, points)))
         monkeypatch.setattr(
             ExtraProtocols, "open", staticmethod(lambda name, data_root: ("set", known, extra))
@@ -170,7 +169,7 @@ def test_labels_of_a_data_set_take_grey_where_the_protocol_does(data_set, tmp_pa
     label, grey = box((0, 4), (0, 16), (16, 16)), box((0, 8), (0, 16), (16, 16))
     region = replace(region_of(label, "cup"), any_grey=lambda: grey)
     cards = ("3d-ovs/langsplat", "3d-ovs/langsplat-v2", "3d-ovs/argmax")
-    data_set(LabelledScene("set", "s", {}, None, {"a.png": (region,)}), cards)
+    data_set({"a.png": (region,)}, cards)
     write_png(tmp_path / "a" / "cup.png", grey.astype(np.uint8) * 255)
     frame, means = scored(tmp_path)
     ious = {row.protocol: row.value for row in frame[frame["metric"] == "iou"].itertuples()}
@@ -184,21 +183,6 @@ def test_labels_of_a_data_set_take_grey_where_the_protocol_does(data_set, tmp_pa
     assert means["protocol"] == ["method", "mIoU", "accuracy", "queries"]
     assert means["3d-ovs/langsplat@2 (masks of files)"] == ["m", "50.0", "1"]
     assert means["3d-ovs/argmax@3 (masks of files)"] == ["m", "0.0", "50.0", "1"]
-
-
-def test_a_text_without_a_mask_counts_zero_or_is_left_out(data_set, tmp_path):
-    cup, mug = box((0, 1), (0, 4), (1, 16)), box((0, 1), (9, 16), (1, 16))
-    regions = (region_of(cup, "cup"), region_of(mug, "mug"))
-    cards = ("lerf-mask/gaussian-grouping", "lerf-mask/gaussian-grouping-skipping")
-    data_set(LabelledScene("set", "s", {}, None, {"a.png": regions}), cards)
-    write_png(tmp_path / "a" / "cup.png", cup.astype(np.uint8) * 255)
-    frame, _ = scored(tmp_path)
-    assert frame["protocol"].str.endswith(" (masks of files)").all()
-    ious = {(row.protocol, row.query): row.value for row in frame[frame["metric"] == "iou"].itertuples()}
-    expected = {("lerf-mask/gaussian-grouping-skipping@1", "cup"): 1}
-    for name in ("lerf-mask/gaussian-grouping@1", "lerf/langsplat@2", "lerf/opengaussian@1"):
-        expected |= {(name, "cup"): 1, (name, "mug"): 0}
-    assert {(protocol.split()[0], text): value for (protocol, text), value in ious.items()} == expected
 
 
 def point_scene(num=400, seed=0):
@@ -217,17 +201,18 @@ def test_class_ids_of_points_score_as_the_same_labels_in_memory(data_set, tmp_pa
     known = point_scene()
     data_set(known, points=SEMANTIC)
     predicted = np.random.default_rng(1).choice([0, 1, 2, 3, 4, 5, 40], 400)
-    (tmp_path / "nyu40.txt").write_text("\n".join(map(str, predicted)))
+    (tmp_path / "nyu40.txt").write_text("\n".join(map(str, predicted)), "utf-8-sig")  # as Windows writes it
     of_ten = np.full(400, SCANNET_10.ids[0])
     (tmp_path / "scannet-10.txt").write_text("\n".join(map(str, of_ten)))
     frame, _ = scored(tmp_path)
     for classes, given in ((SCANNET_19, predicted), (SCANNET_10, of_ten)):
-        card = card_of(f"scannet/opengaussian-{len(classes)}")
-        truth = classes.labels(known.truth["nyu40"].class_id)
-        rows = measure_points(card, "files", truth, classes.labels(given), classes, "files")
-        expected = {(row.query, row.metric): pytest.approx(row.value, abs=1e-6) for row in rows}
-        kept = frame[frame["protocol"] == f"{card.full_name} (points: files)"]
-        assert {(row.query, row.metric): row.value for row in kept.itertuples()} == expected
+        expected = hilsplat.score(
+            given, known.truth["nyu40"].class_id, f"scannet/opengaussian-{len(classes)}"
+        )
+        kept = frame[frame["protocol"] == expected.protocol]
+        assert {(row.query, row.metric): row.value for row in kept.itertuples()} == {
+            (row["query"], row["metric"]): pytest.approx(row["value"], abs=1e-6) for row in expected.rows
+        }
 
 
 def test_instances_in_scannets_format_are_matched(data_set, tmp_path):
@@ -250,6 +235,8 @@ def test_instances_in_scannets_format_are_matched(data_set, tmp_path):
         ("nyu40.txt", "1\n2\n", "expected  400 lines"),
         ("nyu40.txt", "chair\n" * 400, "one integer per line"),
         ("instances.txt", "only-a-mask.txt\n", "line 1 of .* does not describe an instance"),
+        ("instances.txt", "nyu40.txt 2 nan\n", "line 1 of .* does not describe an instance"),
+        ("instances.txt", f"nyu40.txt {10**30} 0.5\n", "line 1 of .* does not describe an instance"),
         ("instances.txt", "no.txt 2 0.9\n", "no.txt cannot be read"),
         ("other.txt", "1\n", "has no point labels"),
     ],

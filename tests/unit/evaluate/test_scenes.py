@@ -3,7 +3,6 @@
 import os
 import shutil
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,11 +13,11 @@ from hilsplat.cli.main import app
 from hilsplat.evaluate.scenes import COLUMNS
 from hilsplat.evaluate.scores import Score, write_scores
 from hilsplat.query.scene_state import SceneState
+from tests.unit.evaluate.builders import score
 
 
-def score(method: str, protocol: str, value: float) -> Score:
-    place = {"dataset": "rooms", "scene": "one", "variant": "default", "masks": "m", "view": "000.png"}
-    return Score(method, f"text {value}", "", "iou", protocol, value, **place)
+def of_protocol(protocol: str, value: float, method: str = "tree", level: str = "") -> Score:
+    return score("iou", value, method=method, query=f"text {value}", level=level, protocol=protocol)
 
 
 @pytest.fixture
@@ -28,21 +27,17 @@ def results(desk, tmp_path) -> Path:
         shutil.copytree(desk, tmp_path / name)
     one = tmp_path / "rooms/one"
     write_json(one / "gaussians/report.json", {"psnr_db": 21.456, "gaussians": 864})
-    of_tree = [score("tree", "lerf/tree-nodes@5", value) for value in (0.5, 0.8)]
-    of_tree += [
-        score("tree", f"lerf/langsplat{version}", value)
-        for version, value in (("@2 (wholes)", 0.2), ("-v2@2", 0.6))
-    ]
+    values = {
+        "lerf/tree-nodes@5": (0.5, 0.8),
+        "lerf/langsplat@2 (wholes)": (0.2,),
+        "lerf/langsplat-v2@2": (0.6,),
+    }
+    scores = [of_protocol(name, value) for name, of_name in values.items() for value in of_name]
+    scores.append(of_protocol("lerf/langsplat@2", 0.1, "field"))
     of_levels = {"whole": (0.5, 0.7), "part": (0.1, 0.1, 0.1, 0.1), "subpart": (0.2,)}
-    others = [
-        score("field", "lerf/langsplat@2", 0.1),
-        *(
-            replace(score("tree", "hierarchy/level-auto@6", value), level=level)
-            for level, values in of_levels.items()
-            for value in values
-        ),
-    ]
-    write_scores(one / "default/scores.csv", [*of_tree, *others])
+    for level, of_level in of_levels.items():
+        scores += [of_protocol("hierarchy/level-auto@6", value, level=level) for value in of_level]
+    write_scores(one / "default/scores.csv", scores)
     for part in ("clip", "semantic_tree", "masks"):
         shutil.copytree(desk / "default" / part, tmp_path / "rooms/early/key-views" / part)
     for name in ("early", "posed"):
@@ -93,12 +88,8 @@ def test_a_damaged_scene_is_named_and_the_others_are_listed(results, capsys, fil
 
 def test_the_size_of_a_scene_is_that_of_its_files(results):
     (results / "rooms/posed/scene/large.bin").write_bytes(b"x" * 2_600_000)
-    assert (
-        SceneState.read(results / "rooms/posed").num_bytes // 1_000
-        == 2_600
-        + sum(path.stat().st_size for path in (results / "rooms/early/scene").rglob("*") if path.is_file())
-        // 1_000
-    )
+    scene = sum(path.stat().st_size for path in (results / "rooms/early/scene").rglob("*") if path.is_file())
+    assert SceneState.read(results / "rooms/posed").num_bytes // 1_000 == 2_600 + scene // 1_000
 
 
 def test_a_foreign_file_is_kept_and_a_pattern_without_scenes_is_refused(results):

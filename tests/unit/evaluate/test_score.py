@@ -11,6 +11,7 @@ from hilsplat.datasets.classes import SCANNET200_INSTANCES, SCANNET_10
 from hilsplat.datasets.labelled import LabelledScene
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.files_stage import run_evaluate_files
+from hilsplat.evaluate.metrics.relevancy_rule import smoothing_of
 from hilsplat.evaluate.protocols.answers import relevancy_of
 from hilsplat.evaluate.protocols.cards import CARDS, card_of
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols
@@ -40,25 +41,20 @@ def some_masks(seed: int, texts: tuple[str, ...]) -> dict[str, dict[str, np.ndar
 
 def test_ious_are_averaged_by_hand():
     """A quarter and a half of two regions are found, and nothing of the third."""
-    labels = {
-        "v.png": {"cup": box((0, 8), (0, 8)), "mug": box((8, 10), (0, 10)), "pen": box((0, 2), (8, 10))}
-    }
-    found = {"v.png": {"cup": box((0, 4), (0, 4)), "mug": box((8, 9), (0, 10))}}
+    regions = {"cup": box((0, 8), (0, 8)), "mug": box((8, 10), (0, 10)), "pen": box((0, 2), (8, 10))}
+    found, labels = {"v": {"cup": box((0, 4), (0, 4)), "mug": box((8, 9), (0, 10))}}, {"v": regions}
     scores = hilsplat.score(found, labels)
     assert scores.protocol == "lerf/langsplat@2 (masks of files)"
     assert scores.means["iou"] == pytest.approx((0.25 + 0.5 + 0) / 3)
     assert scores.means.keys() == {"iou", "boundary_iou"}
-    assert {row["query"]: row["value"] for row in scores.rows if row["metric"] == "iou"} == {
-        "cup": 0.25,
-        "mug": 0.5,
-        "pen": 0.0,
-    }
+    ious = {row["query"]: row["value"] for row in scores.rows if row["metric"] == "iou"}
+    assert ious == {"cup": 0.25, "mug": 0.5, "pen": 0.0}
     skipping = hilsplat.score(found, labels, "lerf-mask/gaussian-grouping-skipping")
     assert skipping.means["iou"] == pytest.approx((0.25 + 0.5) / 2)
     shares = hilsplat.score(found, labels, "lerf/opengaussian@1")
     assert shares.means["acc_25"] == pytest.approx(1 / 3)  # 0.25 is not above 0.25
-    assert "\n" not in repr(scores) and repr(scores).startswith(
-        "Scores(lerf/langsplat@2 (masks of files): iou"
+    assert repr(scores).startswith("Scores(lerf/langsplat@2 (masks of files): iou") and "\n" not in repr(
+        scores
     )
 
 
@@ -95,7 +91,7 @@ def test_relevancy_scores_like_that_of_our_own_scene(block_world, protocol):
     expected = {}
     for category in truth.categories:
         (found,) = relevancy_of(block_world.answers, "field", [category.text], view)
-        rows = flat.add("field", found, None, category, [])
+        rows = flat.add("field", found, smoothing_of(found), None, category, [])
         expected |= {(row.query, row.metric): (row.value, row.protocol) for row in rows}
     maps = {text: relevancy_of(block_world.answers, "field", [text], view)[0] for text in TEXTS}
     labels = {text: region(row) for row, text in enumerate(TEXTS)}
@@ -154,6 +150,8 @@ def test_classes_of_points_are_pooled_and_instances_matched():
         hilsplat.score(*absent, "scannet200/instances")
     half = hilsplat.score((masks[:1], [chair], [0.9]), (of_points, instances), "scannet200/instances")
     assert 0 < half.means["ap50"] < 1
+    nothing = hilsplat.score((masks[:0], [], []), (of_points, instances), "scannet200/instances")
+    assert nothing.means["ap50"] == 0
 
 
 def test_every_protocol_scores_arrays_or_says_that_it_needs_more():
@@ -164,58 +162,41 @@ def test_every_protocol_scores_arrays_or_says_that_it_needs_more():
 
 
 CUP = box((0, 4), (0, 8), SIZE)
+LABELS = {"a": {"cup": CUP}}
+LANGSPLAT, LEVELLED, ARGMAX = "lerf/langsplat", "hierarchy/level-given", "3d-ovs/argmax"
+SCAN = "scannet200/instances"
 
 
 @pytest.mark.parametrize(
     ("found", "labels", "protocol", "message"),
     [
-        ({}, {"a": {"cup": CUP}}, "lerf/langsplat", r"view 'a' has no predictions(.|\n)*an empty dict"),
-        ({"a": {}, "b": {}}, {"a": {"cup": CUP}}, "lerf/langsplat", "view 'b' has no labels"),
-        ({"a": {"cpu": CUP}}, {"a": {"cup": CUP}}, "lerf/langsplat", "rename it to 'cup'"),
-        ({"a": {"cup": CUP[1:]}}, {"a": {"cup": CUP}}, "lerf/langsplat", "expected  32 x 48"),
-        ({"a": {"cup": CUP * 255}}, {"a": {"cup": CUP}}, "lerf/langsplat", r"a: cup cannot .*(.|\n)*int64"),
-        (
-            {"a": {"cup": np.full((3, *SIZE), np.nan)}},
-            {"a": {"cup": CUP}},
-            "lerf/langsplat",
-            "finite relevancy",
-        ),
-        ({"a": {"cup": np.full((3, *SIZE), np.inf)}}, {"a": {"cup": CUP}}, "lerf/langsplat", "finite"),
-        ({"a": {"cup": np.full((1, *SIZE), np.inf)}}, {"a": {"cup": CUP}}, "3d-ovs/argmax", "finite"),
-        (
-            {"a": {"cup": CUP * np.ones((3, 1, 1))}},
-            {"a": {"cup": CUP}},
-            "lerf/opengaussian",
-            "only masks, or",
-        ),
-        ({"a": {"cup": CUP}}, {"a": {"cup": CUP}}, "hierarchy/level-given", "named like 'part/handle'"),
-        ({"a": {"whole/cup": CUP}}, {"a": {"cup": CUP}}, "lerf/langsplat", "without a level"),
-        ({"a": {}}, {"a": {"cup": CUP.astype(int)}}, "lerf/langsplat", "label 'cup' is not a region"),
-        ({"a": {}}, {"a": {"cup": CUP, "mug": CUP[1:]}}, "lerf/langsplat", "a: the labels differ in size"),
-        ({"a": {}}, {"a": {}}, "lerf/langsplat", "a: there are no labels"),
-        ({"a": {}}, {"a": {"cup": CUP & False}}, "lerf/langsplat", "contain nothing that lerf/langsplat@2"),
-        ({"a": {}}, {"a": {"a > b > c > d": CUP}}, "hierarchy/level-given", "more than 3 levels"),
+        ({}, LABELS, LANGSPLAT, r"view 'a' has no predictions(.|\n)*an empty dict"),
+        ({"a": {}, "b": {}}, LABELS, LANGSPLAT, "view 'b' has no labels"),
+        ({"a": {"cpu": CUP}}, LABELS, LANGSPLAT, "rename it to 'cup'"),
+        ({"a": {"cup": CUP[1:]}}, LABELS, LANGSPLAT, "expected  32 x 48"),
+        ({"a": {"cup": CUP * 255}}, LABELS, LANGSPLAT, r"a: cup cannot .*(.|\n)*int64"),
+        ({"a": {"cup": np.full((3, *SIZE), np.nan)}}, LABELS, LANGSPLAT, "finite relevancy"),
+        ({"a": {"cup": np.full((3, *SIZE), np.inf)}}, LABELS, LANGSPLAT, "finite"),
+        ({"a": {"cup": np.full((1, *SIZE), np.inf)}}, LABELS, ARGMAX, "finite"),
+        ({"a": {"cup": CUP * np.ones((3, 1, 1))}}, LABELS, "lerf/opengaussian", "only masks, or"),
+        (LABELS, LABELS, LEVELLED, "named like 'part/handle'"),
+        ({"a": {"whole/cup": CUP}}, LABELS, LANGSPLAT, "without a level"),
+        ({"a": {}}, {"a": {"cup": CUP.astype(int)}}, LANGSPLAT, "label 'cup' is not a region"),
+        ({"a": {}}, {"a": {"cup": CUP, "mug": CUP[1:]}}, LANGSPLAT, "a: the labels differ in size"),
+        ({"a": {}}, {"a": {}}, LANGSPLAT, "a: there are no labels"),
+        ({"a": {}}, {"a": {"cup": CUP[:0]}}, LANGSPLAT, "label 'cup' is not a region"),
+        ([CUP], [CUP], LANGSPLAT, "the predictions are not arrays by view and text"),
+        (LABELS, {"a": CUP}, LANGSPLAT, "the labels are not arrays by view and text"),
+        ({"a": {"cup": None}}, LABELS, LANGSPLAT, r"a: cup cannot be scored(.|\n)*\(\) object"),
+        ({"a": {}}, {"a": {"cup": CUP & False}}, LANGSPLAT, "contain nothing that lerf/langsplat@2"),
+        ({"a": {}}, {"a": {"a > b > c > d": CUP}}, LEVELLED, "more than 3 levels"),
+        (3, 3, "replica/opennerf", r"same points(.|\n)*\(\) int64, \(\) int64"),
         (np.zeros(3, int), np.zeros(4, int), "replica/opennerf", r"same points(.|\n)*\(3,\) int64, \(4,\)"),
-        ((np.ones((2, 4)), [1], [0.5]), ([1] * 4, [1] * 4), "scannet200/instances", r"masks \(M, P\) bool"),
-        (
-            (np.ones((2, 4), int), [1] * 2, [0.5] * 2),
-            ([1] * 4, [1] * 4),
-            "scannet200/instances",
-            "M, P. bool",
-        ),
-        (
-            (CUP[:2], [1] * 2, [0.5, np.nan]),
-            ([1] * 48, [1] * 48),
-            "scannet200/instances",
-            "finite confidences",
-        ),
-        ((CUP[:2], [1] * 2, [0.5] * 2), ([1] * 48, [-1] * 48), "scannet200/instances", "0 for none"),
-        (
-            (np.ones((1, 1000), bool), [1], [0.5]),
-            ([1] * 1000, range(1000)),
-            "scannet200/instances",
-            "fewer than",
-        ),
+        ((np.ones((2, 4)), [1], [0.5]), ([1] * 4, [1] * 4), SCAN, r"masks \(M, P\) bool"),
+        ((np.ones((2, 4), int), [1] * 2, [0.5] * 2), ([1] * 4, [1] * 4), SCAN, "M, P. bool"),
+        ((CUP[:2], [1] * 2, [0.5, np.nan]), ([1] * 48, [1] * 48), SCAN, "finite confidences"),
+        ((CUP[:2], [1] * 2, [0.5] * 2), ([1] * 48, [-1] * 48), SCAN, "0 for none"),
+        ((np.ones((1, 1000), bool), [1], [0.5]), ([1] * 1000, range(1000)), SCAN, "fewer than"),
         ({}, {}, "lerf/langplat", "is unknown"),
     ],
 )
@@ -224,11 +205,21 @@ def test_arrays_that_cannot_be_scored_are_refused(found, labels, protocol, messa
         hilsplat.score(found, labels, protocol)
 
 
+def test_a_constant_relevancy_localizes_nothing():
+    """The maximum is everywhere, so it would be on any object."""
+    for protocol in (LANGSPLAT, "lerf/langsplat-v2"):
+        means = hilsplat.score({"a": {"cup": np.full((3, *SIZE), 0.5)}}, LABELS, protocol).means
+        assert means["localization_box"] == means["localization_mask"] == 0
+
+
+def test_texts_are_the_same_composed_or_decomposed():
+    for text, label in (("cafe\u0301", "caf\xe9"), ("caf\xe9", "cafe\u0301")):
+        assert hilsplat.score({"a": {text: CUP}}, {"a": {label: CUP}}).means["iou"] == 1
+
+
 def test_masks_and_relevancy_cannot_be_mixed():
-    labels = {"a": {"cup": CUP, "mug": CUP}}
-    found = {"a": {"cup": CUP, "mug": np.zeros((3, *SIZE))}}
+    labels = {"a": {"cup": CUP, "mug": ~CUP}}
     with pytest.raises(HilsplatError, match="cannot score these predictions"):
-        hilsplat.score(found, labels)
+        hilsplat.score({"a": {"cup": CUP, "mug": np.zeros((3, *SIZE))}}, labels)
     cosines = {"cup": np.where(CUP, 0.9, 0.1)[None], "mug": np.full((1, *SIZE), 0.5)}
-    labels["a"]["mug"] = ~CUP
-    assert hilsplat.score({"a": cosines}, labels, "3d-ovs/argmax").means["pixel_accuracy"] == 1.0
+    assert hilsplat.score({"a": cosines}, labels, ARGMAX).means["pixel_accuracy"] == 1.0

@@ -7,12 +7,13 @@ from PIL import Image
 from hilsplat.base.errors import MisalignedArtifactError, SceneError
 from hilsplat.base.images import read_image, write_png
 from hilsplat.base.levels import Level
+from hilsplat.base.tables import read_csv
 from hilsplat.datasets.labelled import LabelledScene
 from hilsplat.datasets.registry import open_labelled
+from hilsplat.evaluate.costs import TIME_COLUMNS
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.figures import panel
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
-from hilsplat.evaluate.stage import time_queries
 from hilsplat.settings import EvaluateSettings, FiguresSettings
 from tests.unit.evaluate.builders import box, region_of
 
@@ -22,14 +23,12 @@ def test_only_test_views_are_scored_and_evaluating_twice_gives_the_same_bytes(op
     assert set(scores["view"]) == {"001.png"}
     assert set(scores["masks"]) == {"sam-tiny"}
     assert set(scores["method"]) == {"field", "tree", "tree-path", "truth"}
+    times = read_csv(tmp_path / "times.csv", TIME_COLUMNS, "")
+    assert [row["method"] for row in times] == ["field", "tree"]
+    assert all(float(row["seconds"]) > 0 for row in times)
     opened.evaluate(tmp_path / "two.csv")
     assert (tmp_path / "scores.csv").read_bytes() == (tmp_path / "two.csv").read_bytes()
     assert len(opened.evaluate(tmp_path / "none.csv", truth=None)) == 0  # no annotations
-
-
-def test_queries_of_every_method_are_timed(block_world):
-    seconds = time_queries(block_world.answers, "001.png", ["bear", "chest"], EvaluateSettings())
-    assert list(seconds) == ["field", "tree"] and min(seconds.values()) > 0
 
 
 def test_the_panel_is_written_with_the_pictures_of_poses_and_fit_beside_it(opened, tmp_path):
@@ -54,6 +53,27 @@ def labelled(block_world, views=("001.png",), levels=True):
         place = (Level(node.level), annotations.path_of(node.id)) if levels else ()
         regions.append(region_of(annotations.mask("001.png", [node.id]), node.text, *place))
     return LabelledScene("hi_lerf", "blocks", {}, None, dict.fromkeys(views, tuple(regions)))
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        *[("canonical", ("bear",)), ("filter_px", 20), ("relevancy_threshold", 0.9), ("threshold_on", "raw")],
+        *[("majority", False), ("node_select", 0), ("min_region_px", 300)],
+    ],
+)
+def test_rows_of_one_name_have_the_same_scores_under_all_settings(opened, tmp_path, setting, value):
+    def scored(settings):
+        return opened.evaluate(tmp_path / "scores.csv", settings, source="world:tabletop:1")
+
+    usual, changed = scored(EvaluateSettings()), scored(EvaluateSettings(**{setting: value}))
+    assert not usual.drop(columns="protocol").equals(changed.drop(columns="protocol"))
+    of_usual, of_changed = (
+        {names: rows.to_csv(index=False) for names, rows in frame.groupby(["method", "protocol"])}
+        for frame in (usual, changed)
+    )
+    shared = of_usual.keys() & of_changed.keys()
+    assert {names: of_usual[names] for names in shared} == {names: of_changed[names] for names in shared}
 
 
 @pytest.fixture

@@ -11,20 +11,8 @@ from hilsplat.base.artifacts import read_index, read_npy, write_npy
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.contributions.rows import Contributions
 from hilsplat.embed.vectors import mask_embeddings
-from hilsplat.field.autoencoder import (
-    loss_gradients,
-    run_autoencoder,
-    statistics,
-    train_autoencoder,
-)
-from hilsplat.field.code import (
-    Autoencoder,
-    PackedLayers,
-    autoencoder_file,
-    load_code,
-    load_latents,
-    unit_rows,
-)
+from hilsplat.field import autoencoder as training
+from hilsplat.field import code as codes
 from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import AutoencoderSettings, SemanticTreeSettings
@@ -35,7 +23,7 @@ QUICK = AutoencoderSettings(code="network", latent=3, epochs=1, min_steps=200)
 
 
 def unit_vectors(rows: int, channels: int, seed: int = 0) -> np.ndarray:
-    return unit_rows(np.random.default_rng(seed).normal(size=(rows, channels)).astype(np.float32))
+    return codes.unit_rows(np.random.default_rng(seed).normal(size=(rows, channels)).astype(np.float32))
 
 
 def torch_layers(widths: list[int], norm: bool) -> nn.Sequential:
@@ -70,16 +58,16 @@ def torch_loss(model: TorchAutoencoder, vectors: np.ndarray, cosine_weight: floa
     return (decoded - given).square().mean() + cosine_weight * (1 - cosine).mean()
 
 
-def without_statistics(model: Autoencoder) -> dict[str, np.ndarray]:
+def without_statistics(model: codes.Autoencoder) -> dict[str, np.ndarray]:
     return {name: values for name, values in model.arrays.items() if "running" not in name}
 
 
 @pytest.mark.parametrize("channels", [16, 300])
 def test_gradients_are_those_of_autograd(channels):
     vectors, weight = unit_vectors(24, channels), 0.3
-    parameters = without_statistics(Autoencoder.initial(channels, 3, np.random.RandomState(1)))
+    parameters = without_statistics(codes.Autoencoder.initial(channels, 3, np.random.RandomState(1)))
     found = {name: np.full_like(values, np.nan) for name, values in parameters.items()}
-    loss_gradients(parameters, vectors, 3, weight, found)
+    training.loss_gradients(parameters, vectors, 3, weight, found)
     model = TorchAutoencoder(parameters, channels, 3)
     torch_loss(model, vectors, weight).backward()
     expected = {name: values.grad.numpy() for name, values in model.named_parameters()}
@@ -91,8 +79,8 @@ def test_gradients_are_those_of_autograd(channels):
 
 def test_a_trained_network_equals_torch_with_the_statistics_of_all_vectors():
     vectors = unit_vectors(50, 16)
-    model = Autoencoder.initial(16, 3, np.random.RandomState(2))
-    model.arrays |= statistics(without_statistics(model), vectors, 3)
+    model = codes.Autoencoder.initial(16, 3, np.random.RandomState(2))
+    model.arrays |= training.statistics(without_statistics(model), vectors, 3)
     reference = TorchAutoencoder(model.arrays, 16, 3)
     for module in reference.modules():
         if isinstance(module, nn.BatchNorm1d):
@@ -117,14 +105,14 @@ def test_compiled_layers_equal_matrix_products_with_relu(rows, widths):
         before = values @ weight.T.astype(np.float64) + bias
         values = np.maximum(before, 0)
     expected = before / np.linalg.norm(before, axis=1, keepdims=True)
-    packed = PackedLayers.of(layers)
+    packed = codes.PackedLayers.of(layers)
     assert packed.through(given) == pytest.approx(expected, abs=2e-6)
     assert np.array_equal(packed.through(given)[rows // 2 :], packed.through(given[rows // 2 :]))
 
 
 @pytest.mark.parametrize("latent", [1, 2, 3])
 def test_pieces_decode_what_the_network_decodes(latent):
-    random, code = np.random.default_rng(0), Autoencoder.initial(40, latent, np.random.RandomState(0))
+    random, code = np.random.default_rng(0), codes.Autoencoder.initial(40, latent, np.random.RandomState(0))
     centres = random.normal(size=(12, latent)).astype(np.float32)
     near = random.normal(scale=1e-3, size=(1500, latent)).astype(np.float32)
     latents = np.concatenate([centres[random.integers(0, 12, 1500)] + near, near * 1e3])
@@ -138,12 +126,12 @@ def test_pieces_decode_what_the_network_decodes(latent):
 
 def test_missing_files_and_weights_are_reported(tmp_path):
     with pytest.raises(ArtifactError, match=r"autoencoder\.safetensors cannot be read"):
-        load_code(tmp_path)
-    model = Autoencoder.initial(16, 3, np.random.RandomState(0))
+        codes.load_code(tmp_path)
+    model = codes.Autoencoder.initial(16, 3, np.random.RandomState(0))
     del model.arrays["encoder.4.running_var"]
-    model.save(autoencoder_file(tmp_path))
+    model.save(codes.autoencoder_file(tmp_path))
     with pytest.raises(ArtifactError, match=r"encoder.4.running_var of shape \(16,\) is missing"):
-        load_code(tmp_path)
+        codes.load_code(tmp_path)
 
 
 def test_training_takes_the_steps_of_torch_from_its_initial_weights():
@@ -162,7 +150,7 @@ def test_training_takes_the_steps_of_torch_from_its_initial_weights():
             torch_loss(reference, vectors[order[begin : begin + 32]], settings.cosine_weight).backward()
             optimiser.step()
             schedule.step()
-    trained = train_autoencoder(vectors, settings, seed=5).arrays
+    trained = training.train_autoencoder(vectors, settings, seed=5).arrays
     for name, values in reference.named_parameters():
         assert trained[name] == pytest.approx(values.detach().numpy(), abs=2e-4), name
 
@@ -171,8 +159,8 @@ def test_training_takes_the_steps_of_torch_from_its_initial_weights():
 def test_same_seed_same_bytes(tmp_path, rows):
     written = []
     for seed in (0, 0, 1):
-        path = autoencoder_file(tmp_path)
-        train_autoencoder(unit_vectors(rows, 16), QUICK, seed).save(path)
+        path = codes.autoencoder_file(tmp_path)
+        training.train_autoencoder(unit_vectors(rows, 16), QUICK, seed).save(path)
         written.append(path.read_bytes())
     assert written[0] == written[1] != written[2]
 
@@ -194,9 +182,9 @@ def test_targets_are_the_vectors_of_nodes_or_of_masks(boxes_with_tree, monkeypat
     of_nodes[3] = tree.clip.mean(axis=0)
     for targets, expected in (("node", of_nodes), ("mask", mask_embeddings(world.clip, contributions))):
         settings = AutoencoderSettings(latent=2, targets=targets)
-        run_autoencoder(world.clip, folder, contributions, out, settings, 0)
-        latents = load_latents(out, Contributions.load(contributions))
-        np.testing.assert_allclose(latents, load_code(out).encode_array(expected), atol=1e-6)
+        training.run_autoencoder(world.clip, folder, contributions, out, settings, 0)
+        latents = codes.load_latents(out, Contributions.load(contributions))
+        np.testing.assert_allclose(latents, codes.load_code(out).encode_array(expected), atol=1e-6)
 
 
 def test_targets_of_masks_without_vectors_are_refused(boxes_with_tree):
@@ -208,8 +196,8 @@ def test_targets_of_masks_without_vectors_are_refused(boxes_with_tree):
     inputs = world.clip, tree, contributions, world.folder / "autoencoder"
     own_vectors = AutoencoderSettings(latent=2, targets="mask")
     with pytest.raises(ArtifactError, match=r"1 of 24 masks have no (.|\n)*set clip\.crops to masks"):
-        run_autoencoder(*inputs, own_vectors, 0)
-    run_autoencoder(*inputs, AutoencoderSettings(latent=2), 0)
+        training.run_autoencoder(*inputs, own_vectors, 0)
+    training.run_autoencoder(*inputs, AutoencoderSettings(latent=2), 0)
 
 
 def test_a_tree_of_masks_in_another_order_is_refused(boxes_with_tree):
@@ -219,15 +207,17 @@ def test_a_tree_of_masks_in_another_order_is_refused(boxes_with_tree):
     with pytest.raises(
         MisalignedArtifactError, match=rf"{tree} was not made from the masks of view 003\.png"
     ):
-        run_autoencoder(world.clip, tree, contributions, world.folder / "out", AutoencoderSettings(), 0)
+        training.run_autoencoder(
+            world.clip, tree, contributions, world.folder / "out", AutoencoderSettings(), 0
+        )
 
 
 def test_stage_encodes_every_mask(boxes_with_tree):
     world, contributions, tree = boxes_with_tree
     out = world.folder / "autoencoder"
     settings = AutoencoderSettings(code="network", latent=3, epochs=1, min_steps=600, learning_rate=2e-3)
-    run_autoencoder(world.clip, tree, contributions, out, settings, 0)
-    latents = load_latents(out, Contributions.load(contributions))
+    training.run_autoencoder(world.clip, tree, contributions, out, settings, 0)
+    latents = codes.load_latents(out, Contributions.load(contributions))
     assert latents.shape == (24, 3)
     index = read_index(out)
     assert index["latent"] == 3
@@ -236,7 +226,7 @@ def test_stage_encodes_every_mask(boxes_with_tree):
     # masks of one node share its code; with some BLAS libraries, a row's last bits depend on its place
     node = SemanticTree.load(tree).node_of_mask
     np.testing.assert_allclose(latents[0], latents[np.flatnonzero(node == node[0])[1]], atol=1e-6)
-    model = load_code(out)
+    model = codes.load_code(out)
     decoded = model.decode_array(latents)
     assert (decoded * SemanticTree.load(tree, world.clip).clip[node]).sum(axis=1).mean() > 0.8
 
@@ -246,10 +236,10 @@ def test_a_code_of_other_masks_of_the_scene_is_reused(boxes_with_tree):
     first, second = world.folder / "first", world.folder / "second"
     inputs = world.clip, tree, contributions
     settings = QUICK.model_copy(update={"targets": "mask"})
-    run_autoencoder(*inputs, first, settings, 0)
-    run_autoencoder(*inputs, second, settings, 1, first)
-    assert autoencoder_file(first).read_bytes() == autoencoder_file(second).read_bytes()
+    training.run_autoencoder(*inputs, first, settings, 0)
+    training.run_autoencoder(*inputs, second, settings, 1, first)
+    assert codes.autoencoder_file(first).read_bytes() == codes.autoencoder_file(second).read_bytes()
     masks = Contributions.load(contributions)
-    assert np.array_equal(load_latents(first, masks), load_latents(second, masks))
+    assert np.array_equal(codes.load_latents(first, masks), codes.load_latents(second, masks))
     with pytest.raises(ArtifactError, match=r"does not fit the vectors(.|\n)*codes of 4(.|\n)*16 and 3"):
-        run_autoencoder(*inputs, second, settings.model_copy(update={"latent": 4}), 0, first)
+        training.run_autoencoder(*inputs, second, settings.model_copy(update={"latent": 4}), 0, first)

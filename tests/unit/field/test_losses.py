@@ -7,15 +7,6 @@ import pytest
 import torch
 
 from hilsplat.field import losses
-from hilsplat.field.losses import (
-    SOFTENING,
-    common_ancestor_depth,
-    instance_loss_literal,
-    instance_loss_tree,
-    part_loss_disentangle,
-    part_loss_literal,
-    similarity_without_parent,
-)
 from tests.unit.field import torch_losses
 
 
@@ -25,7 +16,7 @@ def doubles(*shape: int, seed: int = 0) -> torch.Tensor:
 
 def test_depth_of_common_ancestors():
     # 0 contains 1 and 2, 1 contains 3; 4 is unrelated
-    depth = common_ancestor_depth(np.array([-1, 0, 0, 1, -1], dtype=np.int32))
+    depth = losses.common_ancestor_depth(np.array([-1, 0, 0, 1, -1], dtype=np.int32))
     assert depth.tolist() == [
         [1, 1, 1, 1, 0],
         [1, 2, 1, 2, 0],
@@ -40,8 +31,8 @@ def test_literal_instance_loss_is_least_at_omega_to_the_minus_level_difference(l
     level = np.array(levels)
 
     def loss(d: float) -> float:
-        means = np.array([[0.0], [math.sqrt(d**2 - SOFTENING**2)]])
-        return instance_loss_literal(means, level, 10.0)[0]
+        means = np.array([[0.0], [math.sqrt(d**2 - losses.SOFTENING**2)]])
+        return losses.instance_loss_literal(means, level, 10.0)[0]
 
     assert loss(distance) == pytest.approx(0, abs=1e-9)
     assert loss(distance * 2) == pytest.approx(math.log(2) ** 2, rel=1e-6)
@@ -51,16 +42,18 @@ def test_literal_instance_loss_is_least_at_omega_to_the_minus_level_difference(l
 def test_the_tree_instance_loss_depends_on_relation_not_on_level():
     depth = np.array([[1, 0], [0, 1]])  # unrelated: distance 1
     means = np.array([[0.0], [1.0]])
-    assert instance_loss_tree(means, depth, 10.0)[0] == pytest.approx(0, abs=1e-9)
+    assert losses.instance_loss_tree(means, depth, 10.0)[0] == pytest.approx(0, abs=1e-9)
     related = np.array([[1, 1], [1, 2]])  # a part and its whole: distance 0.1
-    assert instance_loss_tree(means, related, 10.0)[0] == pytest.approx(math.log(10) ** 2, rel=1e-5)
+    assert losses.instance_loss_tree(means, related, 10.0)[0] == pytest.approx(math.log(10) ** 2, rel=1e-5)
 
 
 def test_similarity_subtracts_the_anchors_parent():
     anchors, parent = np.array([[2.0, 1.0]]), np.array([[1.0, 1.0]])
     others = np.array([[1.0, 3.0], [0.0, 1.0], [5.0, 1.0]])
     # anchor - parent = (1, 0); others - parent = (0, 2), (-1, 0), (4, 0)
-    assert similarity_without_parent(anchors, others, parent)[0][0].tolist() == pytest.approx([0, -1, 1])
+    assert losses.similarity_without_parent(anchors, others, parent)[0][0].tolist() == pytest.approx(
+        [0, -1, 1]
+    )
 
 
 def test_literal_part_loss_matches_hand_computation():
@@ -69,7 +62,7 @@ def test_literal_part_loss_matches_hand_computation():
     parent = np.array([7, 7, 8])
     # anchors 0 and 1 (mask 2 has no sibling): positive cosine 0; negative cosines -1 and 0.
     # -log(exp(0) / exp(-1 / 0.5)) = -2, and -log(exp(0) / exp(0)) = 0; mean -1
-    loss, _ = part_loss_literal(means, parent, np.zeros_like(means), tau=0.5)
+    loss, _ = losses.part_loss_literal(means, parent, np.zeros_like(means), tau=0.5)
     assert loss == pytest.approx(-1.0)
 
 
@@ -77,12 +70,12 @@ def test_disentangling_part_loss_matches_hand_computation():
     half = np.array([[1.0, 0.0], [0.0, 1.0]])
     parents = np.zeros((2, 2))
     # each half meets its twin (cosine 1) and one other mask (cosine 0): log(1 + exp(-1 / 0.5))
-    loss, _, _ = part_loss_disentangle(half, half.copy(), np.array([True, True]), parents, tau=0.5)
+    loss, _, _ = losses.part_loss_disentangle(half, half.copy(), np.array([True, True]), parents, tau=0.5)
     assert loss == pytest.approx(math.log(1 + math.exp(-2)))
 
 
 LEVEL = np.array([1, 2, 2, 3, 1])
-DEPTH = common_ancestor_depth(np.array([-1, 0, 0, 1, -1], dtype=np.int32))
+DEPTH = losses.common_ancestor_depth(np.array([-1, 0, 0, 1, -1], dtype=np.int32))
 PARENT, HAS = np.array([0, 0, 1, 1, -1]), np.array([True, True, False, True, False])
 ANCHORS_ALONE = np.array([0, 1, 2, 3, -1])  # no mask has a sibling
 

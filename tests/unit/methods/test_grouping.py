@@ -38,17 +38,12 @@ def test_thresholds_out_of_order_are_refused(name, thresholds, direction):
 
 def test_labelled_pixels_are_covered_and_have_their_coordinates():
     # 2 x 3 pixels: 0 not labelled, 4 not covered
-    labels = np.full((6, 3), 0, np.int32)
+    labels = np.zeros((6, 3), np.int32)
     labels[0] = -1
-
-    def view_weights(view: str, step: int) -> sp.csr_matrix:
-        weights = np.zeros((2, 3), np.float32)
-        weights[::step, ::step] = np.float32([[1, 1, 1], [1, 0, 1]])[::step, ::step]
-        return sp.csr_matrix(weights.reshape(6, 1))
-
+    weights = {1: [1, 1, 1, 1, 0, 1], 2: [1, 0, 1, 0, 0, 0], 3: [1, 0, 0, 0, 0, 0]}  # by step
     inputs = types.SimpleNamespace(
         contributions=types.SimpleNamespace(views=("a",), rows_of_views=lambda: [np.arange(1)]),
-        view_weights=view_weights,
+        view_weights=lambda view, step: sp.csr_matrix(np.float32([weights[step]]).T),
         view_labels=lambda view: labels,
         view_camera=lambda view: types.SimpleNamespace(size_hw=(2, 3)),
     )

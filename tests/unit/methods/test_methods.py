@@ -29,20 +29,10 @@ from hilsplat.methods.method import MethodInputs
 from hilsplat.scene.cameras import Camera
 from hilsplat.stages import stage_of
 from tests.conftest import PROJECT
-from tests.unit.two_boxes_world import (
-    HEIGHT,
-    ONE_DROPPED,
-    REGIONS,
-    WIDTH,
-    TwoBoxes,
-    build_contributions,
-    build_two_boxes,
-    region_mask,
-    two_boxes_weights,
-)
+from tests.unit import two_boxes_world as boxes
 
 pytestmark = pytest.mark.filterwarnings("error")  # such as the mean of an empty array
-EVERY, LARGE = tuple(range(len(REGIONS))), (0, 1, 2, 3, 5, 6)
+EVERY, LARGE = tuple(range(len(boxes.REGIONS))), (0, 1, 2, 3, 5, 6)
 """LARGE lacks part "B top", which covers too little of its box to be distinguished from the rest."""
 FITS = {
     # method: settings, regions that it finds, least share of a region's Gaussians with its code
@@ -70,22 +60,26 @@ FITS = {
 class BoxesInputs(MethodInputs):
     """Inputs from the world with two boxes; the code of a region is one-hot."""
 
-    world: TwoBoxes | None = None
+    world: boxes.TwoBoxes | None = None
 
     @property
     def latents(self):
-        return np.eye(len(REGIONS), dtype=np.float32)[np.concatenate(list(self.world.regions.values()))]
+        return np.eye(len(boxes.REGIONS), dtype=np.float32)[np.concatenate(list(self.world.regions.values()))]
 
     def linear_code(self, method):
-        return LinearCode(np.full(len(REGIONS), 0.1, np.float32), np.eye(len(REGIONS), dtype=np.float32))
+        return LinearCode(
+            np.full(len(boxes.REGIONS), 0.1, np.float32), np.eye(len(boxes.REGIONS), dtype=np.float32)
+        )
 
     def view_weights(self, view, step=1):
-        return normalised_weights(two_boxes_weights(self.world.views.index(view)))
+        return normalised_weights(boxes.two_boxes_weights(self.world.views.index(view)))
 
     def view_camera(self, view):
         ahead = np.eye(4)
         ahead[:3, 3] = self.world.views.index(view), 0, 1
-        return Camera(view, ahead, np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]]), (HEIGHT, WIDTH))
+        return Camera(
+            view, ahead, np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]]), (boxes.HEIGHT, boxes.WIDTH)
+        )
 
 
 @pytest.fixture(scope="module")
@@ -93,10 +87,10 @@ def inputs_of(tmp_path_factory):
     """A cached function that builds inputs with masks of the given regions in each view."""
 
     @cache
-    def inputs_of(regions=ONE_DROPPED):
+    def inputs_of(regions=boxes.ONE_DROPPED):
         with pytest.MonkeyPatch.context() as monkeypatch:
-            world = build_two_boxes(tmp_path_factory.mktemp("boxes"), monkeypatch, regions)
-            folders = world.scene, world.ply, world.masks, build_contributions(world), world.folder
+            world = boxes.build_two_boxes(tmp_path_factory.mktemp("boxes"), monkeypatch, regions)
+            folders = world.scene, world.ply, world.masks, boxes.build_contributions(world), world.folder
             return BoxesInputs(*folders, world.coverage_tree, world=world)
 
     return inputs_of
@@ -117,10 +111,10 @@ def test_regions_of_every_level_get_their_own_code(inputs_of, monkeypatch, name)
     features = fit_of(name, inputs_of())
     _, rows, least = FITS[name]
     for row in rows:
-        inside = np.flatnonzero(region_mask(row).ravel())
-        own = features[inside, Level(REGIONS[row][1]).index]
+        inside = np.flatnonzero(boxes.region_mask(row).ravel())
+        own = features[inside, Level(boxes.REGIONS[row][1]).index]
         right = (own.argmax(axis=1) == row) & (own.max(axis=1) > 0.5)
-        assert np.mean(right) > least, REGIONS[row][0]
+        assert np.mean(right) > least, boxes.REGIONS[row][0]
 
 
 @pytest.mark.parametrize("name", BASELINES)
@@ -145,7 +139,7 @@ def test_without_its_losses_the_paper_s_method_is_langsplat(inputs_of):
 
 THIN = {
     **{
-        f"no {level.label}": (tuple(row for row in EVERY if REGIONS[row][1] != int(level)),) * 6
+        f"no {level.label}": (tuple(row for row in EVERY if boxes.REGIONS[row][1] != int(level)),) * 6
         for level in LEVELS
     },
     "a single view": (EVERY,),
@@ -157,7 +151,7 @@ THIN = {
 @pytest.mark.parametrize("regions", THIN.values(), ids=THIN)
 @pytest.mark.parametrize("name", BASELINES)
 def test_levels_with_masks_get_features_and_the_others_zeros(inputs_of, name, regions):
-    present = {REGIONS[row][1] for view in regions for row in view}
+    present = {boxes.REGIONS[row][1] for view in regions for row in view}
     features = fit_of(name, inputs_of(regions), steps=30)
     assert features.any(axis=(0, 2)).tolist() == [int(level) in present for level in LEVELS]
 
@@ -217,13 +211,19 @@ def test_the_package_in_the_documentation_adds_a_method_with_two_settings(inputs
     method.run_method(inputs, out, settings, 0)
     features = LanguageField.load(out).features
     for row in EVERY:
-        inside = np.flatnonzero(region_mask(row).ravel())
-        assert (features[inside, Level(REGIONS[row][1]).index, row] == 1).mean() > 0.8, REGIONS[row][0]
+        inside = np.flatnonzero(boxes.region_mask(row).ravel())
+        assert (features[inside, Level(boxes.REGIONS[row][1]).index, row] == 1).mean() > 0.8, boxes.REGIONS[
+            row
+        ][0]
 
 
 @pytest.mark.parametrize(
     ("code", "problem"),
-    [("import no_such_module", "cannot be imported: No module named"), ("METHOD = 1", "is not a method")],
+    [
+        ("import no_such_module", "cannot be imported: No module named"),
+        ("METHOD = 1 / 0", "cannot be imported: division by zero"),
+        ("METHOD = 1", "is not a method"),
+    ],
 )
 def test_a_broken_package_is_reported(nearest_mask, code, problem):
     (nearest_mask / "nearest_mask/__init__.py").write_text(code)

@@ -207,6 +207,14 @@ def test_classes_are_stripped_and_sorted_without_empty_lines(tmp_path):
     assert ovs3d.read_classes(tmp_path / "classes.txt") == ("Gundam", "banana", "red bag")
 
 
+def test_file_names_may_be_decomposed_as_on_macos(bed):
+    (bed / "segmentations/classes.txt").write_text("Ring\nb\xe4r\n", encoding="utf-8")
+    for view in ("00", "03"):
+        (bed / f"segmentations/{view}/bear.png").rename(bed / f"segmentations/{view}/ba\u0308r.png")
+    assert open_scene(bed).prompts == ("Ring", "b\xe4r")
+    assert {region.text for region in open_scene(bed).views["00.png"]} == {"Ring", "b\xe4r"}
+
+
 def test_masks_of_another_size_or_an_unknown_class_are_reported(bed):
     small = np.zeros((12, 20), np.uint8)
     small[1, 2] = 255

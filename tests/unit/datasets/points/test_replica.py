@@ -8,12 +8,7 @@ import pytest
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.images import write_png
-from hilsplat.datasets.points.replica import (
-    object_of_vertices,
-    open_scene,
-    read_images,
-    read_semantic_mesh,
-)
+from hilsplat.datasets.points import replica
 from hilsplat.datasets.registry import DATASETS
 from tests.unit.datasets.writers.labelled import flat_images
 from tests.unit.datasets.writers.points import write_ply, write_sequence
@@ -41,6 +36,16 @@ def poses(count: int):
     return lambda root: np.savetxt(root / SEQUENCE / "traj_w_c.txt", rows)
 
 
+def text_in(name: str, text: str):
+    """Return a change that replaces the text of a file."""
+    return lambda root: (root / name).write_text(text)
+
+
+def moved(name: str, target: str):
+    """Return a change that moves a file or folder."""
+    return lambda root: (root / name).rename(root / target)
+
+
 def make_frames(root: Path, count: int) -> None:
     """Write the images of a sequence in the layout of Semantic-NeRF, and a picture that is no frame."""
     for name in (*(f"rgb_{number}" for number in range(count)), "vis_rgb_0"):
@@ -58,20 +63,20 @@ def root(tmp_path) -> Path:
 
 
 def test_a_vertex_belongs_to_the_object_of_most_faces_or_the_smallest_id_on_ties(root):
-    points = read_semantic_mesh((root / MESH).parent)
+    points = replica.read_semantic_mesh((root / MESH).parent)
     # vertices 1 and 5 lie on objects 2 and 1, vertices 2 and 6 on 1 and 3: object 1 both times
     assert points.instance_id.tolist() == [3, 2, 2, 0, 3, 2, 2, 0]
     assert points.class_id.tolist() == [93, 20, 20, 0, 93, 20, 20, 0]
     np.testing.assert_array_equal(points.xyz, XYZ)
     # object 3 twice at vertex 0: most faces win over the smaller id
     faces = np.array([[0, 1], [0, 2], [0, 3]])
-    assert object_of_vertices(faces, np.array([3, 3, 1]), 5).tolist() == [3, 3, 3, 1, -1]
+    assert replica.object_of_vertices(faces, np.array([3, 3, 1]), 5).tolist() == [3, 3, 3, 1, -1]
 
 
 def test_frames_are_sorted_by_number_and_other_pictures_are_ignored(root):
     make_frames(root, 12)
     poses(15)(root)
-    images, warnings = read_images(root, "room_0")
+    images, warnings = replica.read_images(root, "room_0")
     assert [image.name for image in images] == [f"rgb_{number}.png" for number in range(12)]
     assert [image.world_from_cam[0, 3] for image in images] == list(range(12))
     assert warnings == ("3 poses have no image and are skipped",)
@@ -81,7 +86,7 @@ def test_frames_are_sorted_by_number_and_other_pictures_are_ignored(root):
 def test_a_sequence_of_nice_slam_is_preferred_and_has_its_own_lens(root, tmp_path):
     K = np.array([[7.0, 0, 5], [0, 7.0, 3], [0, 0, 1]])
     write_sequence(root / "room0", flat_images(tmp_path / "own", [np.eye(4)] * 2, K, (6, 10)))
-    scene = open_scene(root, "room_0")
+    scene = replica.open_scene(root, "room_0")
     assert [image.name for image in scene.images] == ["frame000000.jpg", "frame000001.jpg"]
     assert scene.images[0].K.tolist() == K.tolist()
     lens = json.loads((root / "cam_params.json").read_text())["camera"]
@@ -96,28 +101,16 @@ def test_a_sequence_of_nice_slam_is_preferred_and_has_its_own_lens(root, tmp_pat
         (info([-2, 20]), "do not match\n  expected  object ids 0 to 1\n  found     1 to 3"),
         (info([-2, 20, 205, 93]), "classes that are not in Replica.*found     class id 205"),
         (info([0, 1, 2, 3], [{"id": 20, "name": "sofa"}]), "found     20 sofa"),
-        (lambda root: (root / INFO).write_text("{}"), "expected  an object with the keys classes, id"),
-        (
-            lambda root: (root / INFO).unlink(),
-            r"info_semantic\.json is missing\n  found     mesh_semantic\.p",
-        ),
+        (text_in(INFO, "{}"), "expected  an object with the keys classes, id"),
+        (lambda root: (root / INFO).unlink(), r"info_semantic\.json is missing\n.*mesh_semantic\.ply"),
         (lambda root: (root / MESH).unlink(), r"mesh_semantic\.ply is missing"),
         (poses(1), "1 lines, 3 images; the first frame without a line is 1"),
-        (
-            lambda root: (root / SEQUENCE / "traj_w_c.txt").write_text("1 0 0 0\n"),
-            "cannot be read: 1 lines of 4 numbers\n  expected  16 numbers per line",
-        ),
-        (
-            lambda root: (root / SEQUENCE).rename(root / "00"),
-            "no rendered sequence.*in room0 or room_0/imap/00 or room_0/Sequence_1\n.*unpack the rendered",
-        ),
-        (
-            lambda root: (root / "room_0/imap").rename(root / "room0"),
-            "no rendered sequence.*found     00\n.*move the files in .*room0/00 one level up",
-        ),
+        (text_in(f"{SEQUENCE}/traj_w_c.txt", "1 0 0 0\n"), "1 lines of 4 numbers\n.*16 numbers per line"),
+        (moved(SEQUENCE, "00"), "in room0 or room_0/imap/00 or room_0/Sequence_1\n.*unpack the rendered"),
+        (moved("room_0/imap", "room0"), "found     00\n.*move the files in .*room0/00 one level up"),
     ],
 )
 def test_unusable_scenes_are_refused_with_a_fix(root, damage, message):
     damage(root)
     with pytest.raises(SceneError, match=f"(?s){message}"):
-        open_scene(root, "room_0")
+        replica.open_scene(root, "room_0")

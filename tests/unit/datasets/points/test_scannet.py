@@ -11,6 +11,7 @@ from hilsplat.base.errors import SceneError
 from hilsplat.datasets.points.scannet import LABEL_TABLE, open_scan, read_label_table
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.scene.posed_images import write_posed_images
+from tests.unit.datasets.points.test_replica import moved, text_in
 from tests.unit.datasets.writers.labelled import flat_images
 from tests.unit.datasets.writers.points import write_label_table, write_ply, write_scan
 
@@ -118,16 +119,6 @@ def test_ids_outside_the_200_are_none(root):
     assert read_label_table(path)["gizmo"] == 0
 
 
-def text_in(name: str, text: str):
-    """Return a change that replaces the text of a file in the scan's folder."""
-    return lambda folder: (folder / name).write_text(text)
-
-
-def moved(name: str, target: str):
-    """Return a change that moves a file or folder of the scan."""
-    return lambda folder: (folder / name).rename(folder / target)
-
-
 def mesh_of(xyz: np.ndarray):
     """Return a change that replaces the unlabelled mesh."""
     return lambda folder: write_ply(folder / f"{SCAN}_vh_clean_2.ply", xyz, FACES)
@@ -160,6 +151,10 @@ NUMBERLESS = '{"segGroups": [{"label": "wall", "segments": [7]}]}'
         (keep_frames_in_archive, r"still inside scene0000_00\.sens.*SensReader"),
         (text_in(GROUPS, STRANGER), r"group 0 \(wall\): none of its segments.*fix "),
         (text_in(GROUPS, NUMBERLESS), r"group 0 cannot be read: 'objectId' is missing"),
+        (text_in(GROUPS, '{"segGroups": null}'), r"aggregation\.json cannot be read"),
+        (text_in(SEGMENTS, '{"segIndices": [[1], [2, 3]]}'), r"segs\.json cannot be read"),
+        (text_in(f"{SCAN}.txt", "colorHeight = a\ncolorWidth = 9\n"), r"\.txt cannot be read.*whole numbers"),
+        (lambda scan: (scan / f"../../{LABEL_TABLE}").write_bytes(b"\xe9"), r"tsv cannot be read: 'utf-8'"),
         (text_in(SEGMENTS, '{"segIndices": [1]}'), r"segs\.json does not match.*each of 5 .*found     1 val"),
         (text_in("pose/0.txt", "2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"), "the pose is not a rotation"),
         (text_in("pose/0.txt", "1 0 0\n"), r"0\.txt cannot be read: 1 lines of 3 numbers\n.*4 lines"),

@@ -6,23 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as parquet
 import pytest
 
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.datasets.sources import image_files
-from hilsplat.datasets.waymo.frames import (
-    CameraShot,
-    LidarFrame,
-    LidarReturn,
-    WaymoCamera,
-    beam_inclinations,
-    column_azimuths,
-    frame_points,
-    range_image_points,
-    rotation_of,
-    shot_image,
-)
+from hilsplat.datasets.waymo import frames as waymo
 from hilsplat.datasets.waymo.reader import open_segment
 from hilsplat.datasets.waymo.records import MESSAGES, matrix
 from tests.unit.datasets.writers.points import write_segment
@@ -34,69 +25,73 @@ SQRT2 = np.sqrt(2.0)
 
 def turned(degrees: float, x: float = 0.0) -> np.ndarray:
     pose = np.eye(4)
-    pose[:3, :3] = rotation_of(np.array([0.0, 0.0, np.radians(degrees)]))
+    pose[:3, :3] = waymo.rotation_of(np.array([0.0, 0.0, np.radians(degrees)]))
     pose[0, 3] = x
     return pose
 
 
 STILL, VEHICLE, LIDAR = np.eye(4), turned(90, x=20000.0), turned(30)
-FRONT = WaymoCamera("FRONT", np.array([2000.0, 2000, 960, 640, 1, 2, 3, 4, 5]), STILL, (1280, 1920))
+FRONT = waymo.WaymoCamera("FRONT", np.array([2000.0, 2000, 960, 640, 1, 2, 3, 4, 5]), STILL, (1280, 1920))
 SIDE = replace(FRONT, name="SIDE_LEFT", vehicle_from_cam=turned(90), size_hw=(886, 1920))
 
 
-def one_return(ranges, classes, instances=0) -> LidarReturn:
+def one_return(ranges, classes, instances=0) -> waymo.LidarReturn:
     """A return of one row."""
     image = np.zeros((1, len(ranges), 4), np.float32)
     image[0, :, 0] = ranges
     labels = np.stack(np.broadcast_arrays(instances, classes), axis=1).astype(np.int32)
-    return LidarReturn(image, labels[None])
+    return waymo.LidarReturn(image, labels[None])
 
 
-def make_frame(time: int = 1000, vehicle: np.ndarray = STILL, lidar: np.ndarray = STILL) -> LidarFrame:
+def make_frame(time: int = 1000, vehicle: np.ndarray = STILL, lidar: np.ndarray = STILL) -> waymo.LidarFrame:
     """Four columns, range 2 all around; the second return has two hits, one of them unlabelled."""
     yaw = np.arctan2(vehicle[1, 0], vehicle[0, 0])
     pose = np.tile(np.float32([0, 0, yaw, *vehicle[:3, 3]]), (1, 4, 1))
     first = one_return([2, 2, 2, 2], [1, 14, 15, 18], [7, 0, 0, 0])
     second = one_return([-1, 4, 0, 6], [22, 10, 22, 0], [0, 9, 0, 0])
-    return LidarFrame(time, vehicle, lidar, np.zeros(1), pose, (first, second))
+    return waymo.LidarFrame(time, vehicle, lidar, np.zeros(1), pose, (first, second))
 
 
-def make_shots(vehicle: np.ndarray) -> list[CameraShot]:
+def make_shots(vehicle: np.ndarray) -> list[waymo.CameraShot]:
     times = (1000, 2000, 3000)
-    return [CameraShot(time, lens, b"jpeg %d" % time, vehicle) for time in times for lens in (FRONT, SIDE)]
+    return [
+        waymo.CameraShot(time, lens, b"jpeg %d" % time, vehicle) for time in times for lens in (FRONT, SIDE)
+    ]
 
 
 @pytest.mark.parametrize("turn", [0, 30, 148])
 def test_columns_start_at_the_rear_and_turn_clockwise(turn):
-    azimuths = np.degrees(column_azimuths(4, turned(turn)))  # in the lidar's own frame
+    azimuths = np.degrees(waymo.column_azimuths(4, turned(turn)))  # in the lidar's own frame
     np.testing.assert_allclose(azimuths, np.array([135, 45, -45, -135]) - turn)
-    points = range_image_points(np.full((1, 4), 2.0), np.zeros(1), turned(turn))[0]
+    points = waymo.range_image_points(np.full((1, 4), 2.0), np.zeros(1), turned(turn))[0]
     expected = [[-SQRT2, SQRT2, 0], [SQRT2, SQRT2, 0], [SQRT2, -SQRT2, 0], [-SQRT2, -SQRT2, 0]]
     np.testing.assert_allclose(points, expected, atol=1e-12)
 
 
 def test_the_first_row_is_the_highest_beam():
     # two beams share -20 to 0 degrees: -15 and -5
-    even = beam_inclinations(None, np.radians(-20), 0.0, 2)
+    even = waymo.beam_inclinations(None, np.radians(-20), 0.0, 2)
     np.testing.assert_allclose(np.degrees(even), [-5, -15])
-    np.testing.assert_allclose(beam_inclinations(np.array([-0.3, -0.1, 0.2]), 0.0, 0.0, 3), [0.2, -0.1, -0.3])
-    points = range_image_points(np.ones((2, 4)), even, np.eye(4))
+    np.testing.assert_allclose(
+        waymo.beam_inclinations(np.array([-0.3, -0.1, 0.2]), 0.0, 0.0, 3), [0.2, -0.1, -0.3]
+    )
+    points = waymo.range_image_points(np.ones((2, 4)), even, np.eye(4))
     np.testing.assert_allclose(points[:, 0, 2], np.sin(np.radians([-5, -15])))
 
 
 def test_rotation_is_yaw_after_pitch_after_roll():
     roll, pitch, yaw = np.pi / 2 * np.eye(3)
-    np.testing.assert_allclose(rotation_of(yaw) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
-    np.testing.assert_allclose(rotation_of(pitch) @ [1, 0, 0], [0, 0, -1], atol=1e-12)
-    np.testing.assert_allclose(rotation_of(roll) @ [0, 1, 0], [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(waymo.rotation_of(yaw) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(waymo.rotation_of(pitch) @ [1, 0, 0], [0, 0, -1], atol=1e-12)
+    np.testing.assert_allclose(waymo.rotation_of(roll) @ [0, 1, 0], [0, 0, 1], atol=1e-12)
     # roll takes y to z, pitch takes z to x, yaw takes x to y
-    np.testing.assert_allclose(rotation_of(roll + pitch + yaw) @ [0, 1, 0], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(waymo.rotation_of(roll + pitch + yaw) @ [0, 1, 0], [0, 1, 0], atol=1e-12)
 
 
 def test_opencv_axes_yield_the_same_pixel():
     """K is unchanged, because 0 is the left edge of the first pixel in Waymo, as here."""
     vehicle = turned(40, x=7.0)
-    image = shot_image(CameraShot(1000, SIDE, b"", vehicle), STILL)
+    image = waymo.shot_image(waymo.CameraShot(1000, SIDE, b"", vehicle), STILL)
     x, y, z, _ = image.cam_from_world @ vehicle @ turned(90) @ [10, 1, -0.5, 1]
     np.testing.assert_allclose([x, y, z], [-1, 0.5, 10], atol=1e-12)
     np.testing.assert_allclose((image.K @ [x, y, z])[:2] / z, [760, 740])
@@ -104,7 +99,7 @@ def test_opencv_axes_yield_the_same_pixel():
 
 
 def test_each_return_has_its_own_mask_and_channel_one_is_the_class():
-    points = frame_points(make_frame(), STILL)
+    points = waymo.frame_points(make_frame(), STILL)
     assert points.class_id.tolist() == [1, 14, 15, 18, 10, 0]
     assert points.instance_id.tolist() == [7, 0, 0, 0, 9, 0]
     np.testing.assert_allclose(points.xyz[4], [2 * SQRT2, 2 * SQRT2, 0])  # range 4 in column 1
@@ -115,7 +110,7 @@ def test_pixel_poses_move_points_into_the_world():
     frame = make_frame()
     pose = np.zeros((1, 4, 6), np.float32)
     pose[0, 1] = [0, 0, np.pi / 2, 10, 0, 1]  # column 1 was measured a quarter turn and 10 m later
-    points = frame_points(replace(frame, pixel_pose=pose), np.eye(4))
+    points = waymo.frame_points(replace(frame, pixel_pose=pose), np.eye(4))
     np.testing.assert_allclose(points.xyz[0], [-SQRT2, SQRT2, 0], atol=1e-6)
     np.testing.assert_allclose(points.xyz[1], [10 - SQRT2, SQRT2, 1], atol=1e-6)
     # the second return has no poses and uses those of the first
@@ -135,7 +130,7 @@ def root(tmp_path):
 def test_a_written_segment_reads_back_in_the_frame_of_its_first_vehicle(root):
     scene = open_segment(root, SEGMENT)
     truth = scene.truth["waymo"]
-    one = frame_points(make_frame(), STILL)
+    one = waymo.frame_points(make_frame(), STILL)
     np.testing.assert_allclose(truth.xyz, np.tile(one.xyz, (2, 1)), atol=2e-3)  # pixel poses are float32
     np.testing.assert_array_equal(truth.class_id, np.tile(one.class_id, 2))
     names = [image.name for image in scene.images]
@@ -185,13 +180,41 @@ def test_damaged_components_are_refused_with_a_fix(root):
     refused("one level too deep\n  fix       move .*all/validation to")
 
 
+CALIBRATION, SHOT = "[CameraCalibrationComponent]", "[CameraImageComponent]"
+VEHICLE_POSE = "[VehiclePoseComponent].world_from_vehicle.transform"
+BEAMS = "[LiDARCalibrationComponent].beam_inclination.values"
+
+
+@pytest.mark.parametrize(
+    ("tag", "column", "value", "message"),
+    [
+        ("camera_calibration", "key.camera_name", 7, "7 is missing.*expected  cameras 1 to 5"),
+        ("camera_calibration", f"{CALIBRATION}.intrinsic.f_u", None, "a lens is not finite"),
+        ("camera_calibration", f"{CALIBRATION}.width", None, "calibration/.*cannot be read"),
+        ("camera_image", f"{SHOT}.pose.transform", [1.0] * 12, "camera_image/.*cannot reshape"),
+        ("camera_image", f"{SHOT}.image", None, "camera_image/.*cannot be read"),
+        ("vehicle_pose", VEHICLE_POSE, None, "vehicle_pose/.*cannot be read"),
+        ("vehicle_pose", VEHICLE_POSE, [0.0] * 16, "not a rotation"),
+        ("lidar_calibration", BEAMS, [np.nan], "no inclination"),
+    ],
+)
+def test_components_with_unusable_values_are_refused(root, tag, column, value, message):
+    path = root / f"validation/{tag}/{SEGMENT}.parquet"
+    table = parquet.read_table(path, partitioning=None)
+    place, column_type = table.column_names.index(column), table.schema.field(column).type
+    values = pa.array([value, *table.column(column).to_pylist()[1:]], type=column_type)
+    parquet.write_table(table.set_column(place, column, values), path)
+    with pytest.raises(SceneError, match=f"(?s){message}"):
+        open_segment(root, SEGMENT)
+
+
 def test_images_and_classes_that_do_not_fit_are_refused():
     frame = make_frame()
     with pytest.raises(SceneError, match=r"return 1 of the top lidar at 1000(.|\n)*one inclination per row"):
-        frame_points(replace(frame, inclinations=np.zeros(2)), np.eye(4))
+        waymo.frame_points(replace(frame, inclinations=np.zeros(2)), np.eye(4))
     strange = replace(frame, returns=(one_return([1, 1], [3, 23]),), pixel_pose=frame.pixel_pose[:, :2])
     with pytest.raises(SceneError, match=r"unknown class\n  expected  0 to 22\n  found     3 to 23"):
-        frame_points(strange, np.eye(4))
+        waymo.frame_points(strange, np.eye(4))
 
 
 # --- release 1 ------------------------------------------------------------------------------------
@@ -207,7 +230,7 @@ def transform(pose: np.ndarray) -> dict:
     return {"transform": pose.ravel()}
 
 
-def encoded(frame: LidarFrame, shots: list[CameraShot], labelled: bool = True) -> bytes:
+def encoded(frame: waymo.LidarFrame, shots: list[waymo.CameraShot], labelled: bool = True) -> bytes:
     """The record of a frame, with its cameras in reverse and a second lidar that is not read."""
     pose = transform(frame.world_from_vehicle)
     message = MESSAGES["Frame"](timestamp_micros=frame.timestamp_micros, pose=pose)

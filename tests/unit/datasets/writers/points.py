@@ -22,17 +22,7 @@ from hilsplat.datasets.classes import REPLICA_NAMES
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
 from hilsplat.datasets.points.labelled_points import PlyMesh
 from hilsplat.datasets.points.scannet import LABEL_TABLE
-from hilsplat.datasets.waymo.frames import (
-    CAMERAS,
-    CV_FROM_WAYMO,
-    TOP,
-    CameraShot,
-    LidarFrame,
-    LidarReturn,
-    WaymoCamera,
-    beam_inclinations,
-    column_azimuths,
-)
+from hilsplat.datasets.waymo import frames as waymo
 from hilsplat.datasets.waymo.parquet import CAMERA, FRAME, INTRINSIC, LASER, component_path
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage
@@ -117,6 +107,9 @@ def write_scan(
     write_text(folder / f"{scan}.aggregation.json", json.dumps({"segGroups": groups}))
 
 
+NUMBERS = {name: number for number, name in waymo.CAMERAS.items()}
+"""Number of each camera of Waymo."""
+
 UNDEFINED, NO_OBJECT = -1, -2
 """Class of an object without a class in Replica, and of object 0, which means no object."""
 
@@ -158,7 +151,7 @@ def write_sequence(folder: Path, images: Sequence[PosedImage]) -> None:
 
 
 def write_segment(
-    split: Path, segment: str, frames: Sequence[LidarFrame], shots: Sequence[CameraShot]
+    split: Path, segment: str, frames: Sequence[waymo.LidarFrame], shots: Sequence[waymo.CameraShot]
 ) -> None:
     """Write the components of a segment of release 2 to a folder such as `validation`.
 
@@ -171,7 +164,7 @@ def write_segment(
     base = "[LiDARCalibrationComponent]"
     beams = frames[0].inclinations[::-1]
     calibration = {
-        LASER: TOP,
+        LASER: waymo.TOP,
         f"{base}.extrinsic.transform": frames[0].vehicle_from_lidar.ravel(),
         f"{base}.beam_inclination.min": float(beams[0]),
         f"{base}.beam_inclination.max": float(beams[-1]),
@@ -189,7 +182,7 @@ def write_segment(
     cameras = {shot.camera.name: shot.camera for shot in reversed(shots)}
     calibrations = [
         {
-            CAMERA: CAMERAS.index(camera.name) + 1,
+            CAMERA: NUMBERS[camera.name],
             **{f"{base}.intrinsic.{name}": v for name, v in zip(INTRINSIC, camera.intrinsic, strict=True)},
             f"{base}.extrinsic.transform": camera.vehicle_from_cam.ravel(),
             f"{base}.width": camera.size_hw[1],
@@ -203,7 +196,7 @@ def write_segment(
         [
             {
                 FRAME: shot.timestamp_micros,
-                CAMERA: CAMERAS.index(shot.camera.name) + 1,
+                CAMERA: NUMBERS[shot.camera.name],
                 "[CameraImageComponent].image": shot.encoded,
                 "[CameraImageComponent].pose.transform": shot.world_from_vehicle.ravel(),
             }
@@ -212,9 +205,9 @@ def write_segment(
     )
 
 
-def _cells(component: str, frame: LidarFrame, images: Sequence[np.ndarray]) -> dict[str, Any]:
+def _cells(component: str, frame: waymo.LidarFrame, images: Sequence[np.ndarray]) -> dict[str, Any]:
     """Return a row with values and shape of the first and second return, null if there is none."""
-    row: dict[str, Any] = {FRAME: frame.timestamp_micros, LASER: TOP}
+    row: dict[str, Any] = {FRAME: frame.timestamp_micros, LASER: waymo.TOP}
     for number in (1, 2):
         image = images[number - 1] if len(images) >= number else None
         name = f"[{component}].range_image_return{number}"
@@ -291,30 +284,30 @@ def write_street_as_waymo(world: Path, split: Path, segment: str) -> None:
     write_segment(split, segment, frames, shots)
 
 
-def _shot(image: PosedImage, time: int) -> CameraShot:
+def _shot(image: PosedImage, time: int) -> waymo.CameraShot:
     """Return a view as an image of the front camera."""
     assert isinstance(image.image, Path)
     K = image.K
     lens = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], 0, 0, 0, 0, 0], dtype=np.float64)
     stream = io.BytesIO()
     Image.fromarray(read_image(image.image)).save(stream, format="JPEG", quality=95)
-    world_from_vehicle = image.world_from_cam @ CV_FROM_WAYMO @ np.linalg.inv(VEHICLE_FROM_CAM)
-    camera = WaymoCamera("FRONT", lens, VEHICLE_FROM_CAM, image.size_hw)
-    return CameraShot(time, camera, stream.getvalue(), world_from_vehicle)
+    world_from_vehicle = image.world_from_cam @ waymo.CV_FROM_WAYMO @ np.linalg.inv(VEHICLE_FROM_CAM)
+    camera = waymo.WaymoCamera("FRONT", lens, VEHICLE_FROM_CAM, image.size_hw)
+    return waymo.CameraShot(time, camera, stream.getvalue(), world_from_vehicle)
 
 
 def _lidar_frame(
     scan: dict[str, np.ndarray], labels: np.ndarray, origin: Float[np.ndarray, " 3"], time: int
-) -> LidarFrame:
+) -> waymo.LidarFrame:
     """Return one revolution of the scan as a range image; the vehicle heads along the world's x axis."""
     height, width = BEAMS, AZIMUTH_STEPS
-    inclinations = beam_inclinations(None, *np.radians(INCLINATION_DEG), height)
+    inclinations = waymo.beam_inclinations(None, *np.radians(INCLINATION_DEG), height)
     vehicle_from_lidar, world_from_vehicle = np.eye(4), np.eye(4)
     vehicle_from_lidar[:3, 3] = LIDAR_AT
     world_from_vehicle[:3, 3] = origin - np.array(LIDAR_AT)
     away = scan["points"] - origin
     azimuth = np.arctan2(away[:, 1], away[:, 0])
-    column = (column_azimuths(width, vehicle_from_lidar)[0] - azimuth) / (2 * np.pi / width)
+    column = (waymo.column_azimuths(width, vehicle_from_lidar)[0] - azimuth) / (2 * np.pi / width)
     assert np.abs(column - column.round()).max(initial=0) < 0.1  # the scan has the directions of the columns
     place = height - 1 - scan["beam"], column.round().astype(int) % width
     image = np.zeros((height, width, 4), dtype=np.float32)
@@ -323,5 +316,5 @@ def _lidar_frame(
     of_pixel = np.zeros((height, width, 2), dtype=np.int32)
     of_pixel[place] = labels
     pose = np.tile(np.float32([0, 0, 0, *world_from_vehicle[:3, 3]]), (height, width, 1))
-    returns = (LidarReturn(image, of_pixel),)
-    return LidarFrame(time, world_from_vehicle, vehicle_from_lidar, inclinations, pose, returns)
+    returns = (waymo.LidarReturn(image, of_pixel),)
+    return waymo.LidarFrame(time, world_from_vehicle, vehicle_from_lidar, inclinations, pose, returns)

@@ -6,13 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilsplat.base.errors import MisalignedArtifactError
-from hilsplat.evaluate.metrics.instances import (
-    OVERLAPS,
-    average_precision,
-    curve_area,
-    match_instances,
-    mean_precision,
-)
+from hilsplat.evaluate.metrics import instances
 
 CLASS = 4
 
@@ -32,7 +26,9 @@ def scan_of(truth, predictions, classes=None):
 
 
 def precisions(*scans, class_ids=(CLASS,), min_points=1):
-    return average_precision([match_instances(*scan, class_ids, min_points) for scan in scans])
+    return instances.average_precision(
+        [instances.match_instances(*scan, class_ids, min_points) for scan in scans]
+    )
 
 
 A, B, VOID = 4001, 4002, 0
@@ -46,12 +42,12 @@ def test_worked_example_of_ten_vertices():
 
 
 def test_area_under_the_curves_of_the_worked_examples():
-    assert curve_area(np.array([0.9, 0.6]), np.array([True, False]), 1) == pytest.approx(0.5)
+    assert instances.curve_area(np.array([0.9, 0.6]), np.array([True, False]), 1) == pytest.approx(0.5)
     # P = 2/3, 1/2, 1, 1 and R = 2/3, 1/3, 1/3, 0: every step is 1/6
     three = np.array([True, False, True])
-    assert curve_area(np.array([0.9, 0.8, 0.6]), three, 1) == pytest.approx(0.527778, abs=1e-6)
-    assert curve_area(np.ones(3), three, 1) == pytest.approx(0.555556, abs=1e-6)
-    assert curve_area(np.zeros(0), np.zeros(0, dtype=bool), 2) == 0
+    assert instances.curve_area(np.array([0.9, 0.8, 0.6]), three, 1) == pytest.approx(0.527778, abs=1e-6)
+    assert instances.curve_area(np.ones(3), three, 1) == pytest.approx(0.555556, abs=1e-6)
+    assert instances.curve_area(np.zeros(0), np.zeros(0, dtype=bool), 2) == 0
 
 
 def test_perfect_instances_score_one_missing_ones_zero_and_an_absent_class_nothing():
@@ -59,8 +55,8 @@ def test_perfect_instances_score_one_missing_ones_zero_and_an_absent_class_nothi
     result = precisions(scan_of(EXAMPLE, []), class_ids=(CLASS, 9))
     assert result[0].tolist() == [0.0] * 10
     assert np.isnan(result[1]).all()
-    assert mean_precision(result) == 0
-    assert np.isnan(mean_precision(result[1:]))
+    assert instances.mean_precision(result) == 0
+    assert np.isnan(instances.mean_precision(result[1:]))
 
 
 @pytest.mark.parametrize(
@@ -76,8 +72,8 @@ def test_perfect_instances_score_one_missing_ones_zero_and_an_absent_class_nothi
 def test_a_second_match_is_a_false_positive_and_may_be_the_first_of_another(
     truth, predictions, overlap, entries
 ):
-    matches = match_instances(*scan_of(truth, predictions), (CLASS,), 1)
-    kept = matches.overlap_index == range(len(OVERLAPS))[overlap]
+    matches = instances.match_instances(*scan_of(truth, predictions), (CLASS,), 1)
+    kept = matches.overlap_index == range(len(instances.OVERLAPS))[overlap]
     found = zip(matches.confidence[kept].tolist(), matches.is_match[kept].tolist(), strict=True)
     assert sorted(found) == entries
     assert matches.misses[0, overlap] == 0
@@ -85,8 +81,8 @@ def test_a_second_match_is_a_false_positive_and_may_be_the_first_of_another(
 
 def test_only_the_first_match_marks_a_prediction_as_used():
     # one prediction over A and B overlaps each by 4 of 8 > 0.25: it matches A, and B is missed
-    matches = match_instances(*scan_of([(A, 4), (B, 4)], [(0, 8, 0.9)]), (CLASS,), 1)
-    quarter = len(OVERLAPS) - 1
+    matches = instances.match_instances(*scan_of([(A, 4), (B, 4)], [(0, 8, 0.9)]), (CLASS,), 1)
+    quarter = len(instances.OVERLAPS) - 1
     assert matches.is_match[matches.overlap_index == quarter].tolist() == [True]
     assert matches.misses[0, quarter] == 1
 
@@ -127,7 +123,9 @@ def test_small_instances_and_predictions_and_other_classes_do_not_count():
 
 def test_masks_of_other_points_are_refused():
     with pytest.raises(MisalignedArtifactError, match=r"expected  3 points\n  found     4"):
-        match_instances(np.zeros(3, int), np.ones((1, 4), bool), np.array([CLASS]), np.ones(1), (CLASS,))
+        instances.match_instances(
+            np.zeros(3, int), np.ones((1, 4), bool), np.array([CLASS]), np.ones(1), (CLASS,)
+        )
 
 
 # --- a second implementation ----------------------------------------------------------------------
@@ -154,6 +152,6 @@ def plain_curve(entries, misses):
 )
 def test_area_equals_the_plain_sum_and_is_bounded(entries, misses):
     confidence = np.array([value for value, _ in entries], dtype=float)
-    area = curve_area(confidence, np.array([hit for _, hit in entries], dtype=bool), misses)
+    area = instances.curve_area(confidence, np.array([hit for _, hit in entries], dtype=bool), misses)
     assert area == pytest.approx(plain_curve(entries, misses))
     assert 0 <= area <= 1 + 1e-12  # rounding of a sum of a dozen shares

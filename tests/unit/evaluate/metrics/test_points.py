@@ -6,59 +6,40 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilsplat.datasets.waymo.records import matrix, message_classes
-from hilsplat.evaluate.metrics.point_classes import (
-    ClassCounts,
-    class_iou,
-    frequency_weighted_iou,
-    macc_over_all,
-    macc_over_present,
-    miou_absent_as_one,
-    miou_over_all,
-    miou_over_occurring,
-    miou_over_present,
-)
+from hilsplat.evaluate.metrics import point_classes as metrics
 from tests.conftest import PROJECT
 
 TRUTH = np.array([1, 1, 1, 1, 2, 2, 3, 3, 0, 0])
 PREDICTION = np.array([1, 1, 2, 4, 2, 2, 3, 1, 1, 2])
-
-
-def example():
-    return ClassCounts.of(TRUTH, PREDICTION, 4)
+IOU, ACCURACY = 2 / 5 + 2 / 3 + 1 / 2, 1 / 2 + 1 + 1 / 2
+"""Sums over the three classes of the truth; class 4 occurs in the prediction alone, and class 5 nowhere."""
 
 
 @pytest.mark.parametrize(
     ("mean", "expected"),
     [
-        (miou_over_present, (2 / 5 + 2 / 3 + 1 / 2) / 3),
-        (macc_over_present, (1 / 2 + 1 + 1 / 2) / 3),
-        # class 4 occurs in the prediction alone and counts 0
-        (miou_over_occurring, (2 / 5 + 2 / 3 + 1 / 2 + 0) / 4),
-        (miou_over_all, (2 / 5 + 2 / 3 + 1 / 2 + 0) / 4),
-        (macc_over_all, (1 / 2 + 1 + 1 / 2) / 4),
+        (metrics.miou_over_present, IOU / 3),
+        (metrics.macc_over_present, ACCURACY / 3),
+        (metrics.miou_over_occurring, IOU / 4),
+        (metrics.miou_over_all, IOU / 5),
+        (metrics.macc_over_all, ACCURACY / 5),
+        (metrics.miou_absent_as_one, (IOU + 1) / 5),
         # 4, 2 and 2 points of the classes
-        (frequency_weighted_iou, (4 * 2 / 5 + 2 * 2 / 3 + 2 * 1 / 2) / 8),
+        (metrics.frequency_weighted_iou, (4 * 2 / 5 + 2 * 2 / 3 + 2 * 1 / 2) / 8),
     ],
 )
 def test_means_of_the_worked_example(mean, expected):
-    assert mean(example()) == pytest.approx(expected)
+    assert mean(metrics.ClassCounts.of(TRUTH, PREDICTION, 5)) == pytest.approx(expected)
 
 
-def test_means_differ_for_a_class_that_occurs_nowhere_and_may_be_among_some_classes():
-    counts = ClassCounts.of(TRUTH, PREDICTION, 5)
-    assert miou_over_occurring(counts) == pytest.approx((2 / 5 + 2 / 3 + 1 / 2) / 4)
-    assert miou_over_all(counts) == pytest.approx((2 / 5 + 2 / 3 + 1 / 2) / 5)
-    assert miou_absent_as_one(counts) == pytest.approx((2 / 5 + 2 / 3 + 1 / 2 + 1) / 5)
+def test_a_mean_may_be_among_some_classes_and_a_scene_without_truth_has_none():
+    counts = metrics.ClassCounts.of(TRUTH, PREDICTION, 5)
     among = np.array([True, False, False, True, True])
-    assert miou_over_occurring(counts, among) == pytest.approx((2 / 5 + 0) / 2)
-    assert np.isnan(miou_over_occurring(counts, np.zeros(5, dtype=bool)))
-
-
-def test_scene_without_truth_has_no_mean():
-    counts = ClassCounts.of(np.zeros(3, int), np.array([1, 2, 0]), 2)
-    assert np.isnan(miou_over_present(counts))
-    assert np.isnan(macc_over_present(counts))
-    assert np.isnan(frequency_weighted_iou(counts))
+    assert metrics.miou_over_occurring(counts, among) == pytest.approx((2 / 5 + 0) / 2)
+    assert np.isnan(metrics.miou_over_occurring(counts, np.zeros(5, dtype=bool)))
+    nothing = metrics.ClassCounts.of(np.zeros(3, int), np.array([1, 2, 0]), 2)
+    for mean in (metrics.miou_over_present, metrics.macc_over_present, metrics.frequency_weighted_iou):
+        assert np.isnan(mean(nothing))
 
 
 labels = st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), min_size=1, max_size=30)
@@ -69,7 +50,7 @@ labels = st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), min_size=1, m
 def test_ious_equal_those_of_the_masks_of_each_class(pairs):
     truth, prediction = np.array(pairs).T
     prediction = np.where(truth > 0, prediction, 0)
-    for row, value in enumerate(class_iou(ClassCounts.of(truth, prediction, 4))):
+    for row, value in enumerate(metrics.class_iou(metrics.ClassCounts.of(truth, prediction, 4))):
         union = np.count_nonzero((truth == row + 1) | (prediction == row + 1))
         both = np.count_nonzero((truth == row + 1) & (prediction == row + 1))
         assert value == pytest.approx(both / union if union else np.nan, nan_ok=True)
@@ -106,10 +87,10 @@ def test_waymo_regression_value():
     truth = frames_of(folder / "fake_segmentation_groundtruths.bin")
     prediction = frames_of(folder / "fake_segmentation_predictions.bin")
     assert len(truth) == 6
-    counts = ClassCounts.of(
+    counts = metrics.ClassCounts.of(
         *(np.concatenate([of[frame] for frame in truth]) for of in (truth, prediction)), 22
     )
     expected = np.zeros(22)
     expected[[0, 6]] = 0.0434832  # 1 CAR, 7 PEDESTRIAN
-    np.testing.assert_allclose(class_iou(counts), expected, atol=5e-8)
-    assert miou_absent_as_one(counts) == pytest.approx(0.00395302, abs=5e-9)
+    np.testing.assert_allclose(metrics.class_iou(counts), expected, atol=5e-8)
+    assert metrics.miou_absent_as_one(counts) == pytest.approx(0.00395302, abs=5e-9)

@@ -7,60 +7,50 @@ from dataclasses import asdict
 import pytest
 
 from hilsplat.base.errors import ArtifactError
-from hilsplat.evaluate.protocols.cards import CARDS, LERF_LANGSPLAT, LEVEL_GIVEN, TREE_NODES, card_of
+from hilsplat.evaluate.protocols.cards import CARDS, LERF_LANGSPLAT, LEVEL_GIVEN, PATH, TREE_NODES, card_of
 from hilsplat.evaluate.protocols.points import class_set
 from hilsplat.evaluate.protocols.views import label_of
 from hilsplat.settings import EvaluateSettings
 from tests.conftest import PROJECT
 
 DECIDED = {
-    # full name: digest of metrics, averaging, missing, rule and classes
-    "lerf/langsplat@2": "704f6f3d",
-    "lerf/tree-nodes@5": "2cdcbb8d",
-    "lerf/langsplat-v2@2": "f209b912",
-    "lerf/paper-filter@2": "128bc7c0",
-    "lerf/paper-mean@2": "4fed36ea",
-    "lerf/opengaussian@1": "68a14e17",
-    "lerf-mask/gaussian-grouping@1": "34874a8b",
-    "lerf-mask/gaussian-grouping-skipping@1": "b146f4ac",
-    "3d-ovs/argmax@3": "44dac158",
-    "3d-ovs/langsplat@2": "f962ef1a",
-    "3d-ovs/langsplat-raw@2": "7797b61a",
-    "3d-ovs/langsplat-v2@3": "107e57a0",
-    "3d-ovs/tree-nodes@1": "3fb8af27",
-    "scannet/opengaussian-19@1": "ced31f5d",
-    "scannet/opengaussian-15@1": "df507111",
-    "scannet/opengaussian-10@1": "e9893d38",
-    "scannet200/opengaussian@1": "367d9a7d",
-    "scannet200/benchmark@1": "af79327f",
-    "scannet200/instances@1": "e9f60d74",
-    "replica/per-scene@1": "5160df43",
-    "replica/opennerf@1": "2368b7a9",
-    "replica/conceptgraphs@1": "d89e022d",
-    "waymo/segmentation@1": "06e4086c",
-    "hierarchy/level-given@5": "69d8a3a5",
-    "hierarchy/level-auto@6": "688db14e",
-    "hierarchy/path@3": "6003caee",
-    "hierarchy/scene-wide@2": "a57a3edc",
-    "hierarchy/annotations@1": "2b3b53c4",
-    "world/view-consistency@2": "c057895c",
+    # full name: digest of all that determines a number
+    "lerf/langsplat@2": "00e1f107",
+    "lerf/tree-nodes@5": "1fa14c68",
+    "lerf/langsplat-v2@2": "b0d9afb3",
+    "lerf/paper-filter@2": "804964c0",
+    "lerf/paper-mean@2": "5768b3cc",
+    "lerf/opengaussian@1": "1b122683",
+    "lerf-mask/gaussian-grouping@1": "e6d93a59",
+    "lerf-mask/gaussian-grouping-skipping@1": "c241ea72",
+    "3d-ovs/argmax@3": "1128109f",
+    "3d-ovs/langsplat@2": "f6e46c55",
+    "3d-ovs/langsplat-raw@2": "032c1219",
+    "3d-ovs/langsplat-v2@3": "e9ed3d71",
+    "3d-ovs/tree-nodes@1": "e097e501",
+    "scannet/opengaussian-19@1": "d64c6a7c",
+    "scannet/opengaussian-15@1": "9c2bf111",
+    "scannet/opengaussian-10@1": "d9b46593",
+    "scannet200/opengaussian@1": "55c18009",
+    "scannet200/benchmark@1": "8ed63d14",
+    "scannet200/instances@1": "c9866886",
+    "replica/per-scene@1": "02a2f18f",
+    "replica/opennerf@1": "3bd79743",
+    "replica/conceptgraphs@1": "a221d8a0",
+    "waymo/segmentation@1": "9622c7a0",
+    "hierarchy/level-given@5": "cc1e20b7",
+    "hierarchy/level-auto@6": "97938d15",
+    "hierarchy/path@3": "90fed6d1",
+    "hierarchy/scene-wide@2": "0ddcebe5",
+    "hierarchy/annotations@1": "7aa18d6b",
+    "world/view-consistency@2": "e5909c33",
 }
 
 
-LATER = {"empty_wins": False, "truth": "labels", "united": ()}
-
-
 def digest(card):
-    """Digest of everything that determines a number, without the explanations.
-
-    Fields added later are included only if they differ from their default, so other digests are unchanged.
-    """
-    rule = asdict(card.rule) if card.rule else None
-    if rule:
-        rule["levels"] = [int(level) for level in rule["levels"]]
-        rule = {key: value for key, value in rule.items() if key not in LATER or value != LATER[key]}
-    decided = (card.metrics, card.averaging, card.missing, rule, card.classes)
-    decided += tuple((key, value) for key, value in vars(card).items() if value != LATER.get(key, value))
+    """Digest of everything that determines a number, without the explanations."""
+    explanations = ("selection", "source", "public")
+    decided = {name: value for name, value in asdict(card).items() if name not in explanations}
     return hashlib.sha256(repr(decided).encode()).hexdigest()[:8]
 
 
@@ -104,6 +94,8 @@ RULE = {"mix": False, "relevancy_threshold": 0.5, "majority": False, "level_rule
         (LERF_LANGSPLAT, "field", CHANGED, " (filter 20, raw, relevancy scale 5)"),
         (LERF_LANGSPLAT, "field", RULE, " (no mix, threshold 0.5, no majority, mean_in_mask)"),
         (TREE_NODES, "tree", {"ancestors": 0}, " (ancestors 0)"),
+        # labels may lack a part's whole, so its path has one text
+        (PATH, "tree-path", {"ancestors": 0}, " (ancestors 0)"),
         # nodes are not thresholded, so the scale of the threshold doesn't affect them
         (LEVEL_GIVEN, "tree", CHANGED, " (filter 20, node share 0.7, relevancy scale 5)"),
         (LEVEL_GIVEN, "truth", CHANGED, ""),

@@ -10,7 +10,7 @@ from hilsplat.base.images import write_png
 from hilsplat.base.levels import Level
 from hilsplat.datasets.images.ovs3d import FOREGROUND
 from hilsplat.datasets.labelled import mask_region
-from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
+from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask, smoothing_of
 from hilsplat.evaluate.protocols.cards import LERF_MASK, OVS_ARGMAX, OVS_NODES, card_of
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
@@ -50,7 +50,7 @@ def flat_of(cards, level=Level.WHOLE, **cosines):
 
 def added(flat, found, text, method="field", nodes_mask=None):
     """Rows of a text, labelled at its own level, whose relevancy is given."""
-    return list(flat.add(method, found, nodes_mask, text, [text]))
+    return list(flat.add(method, found, smoothing_of(found), nodes_mask, text, [text]))
 
 
 def test_argmax_compares_labelled_pixels_of_a_stand_in_alone():

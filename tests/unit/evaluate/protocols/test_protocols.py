@@ -1,5 +1,6 @@
 """Queries of a view, their scores, and the scores of missing answers."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -29,8 +30,13 @@ def annotations_of(folder, nodes, regions):
     return HierarchyAnnotations.load(folder)
 
 
+def truth_in(annotations, min_px=1):
+    """Truth whose minimum area is not in protocol names."""
+    return replace(ViewTruth.of(annotations, "v.png", SIZE, min_px), min_px=0)
+
+
 def truth_of(folder, nodes, regions):
-    return ViewTruth.of(annotations_of(folder, nodes, regions), "v.png", SIZE, 1)
+    return truth_in(annotations_of(folder, nodes, regions))
 
 
 class HandMade:
@@ -85,7 +91,7 @@ def worked_example(tmp_path, without=()):
             answers[text, Level(level)] = answers[text, None] = [node]
             answers[annotations.path_of(node)] = [node]
     scene = HandMade([box(*each) for each in ANSWERED], answers)
-    return scene, ViewTruth.of(annotations, "v.png", SIZE, 1)
+    return scene, truth_in(annotations)
 
 
 def test_consistency_rows_match_the_worked_example(tmp_path):
@@ -141,7 +147,7 @@ def test_text_at_two_levels_is_one_category_and_two_queries(tmp_path):
 
 def test_small_regions_are_not_scored_and_labels_of_another_size_are_refused(tmp_path):
     annotations = annotations_of(tmp_path, NODES, REGIONS)
-    truth = ViewTruth.of(annotations, "v.png", SIZE, min_px=9)
+    truth = truth_in(annotations, 9)
     assert [query.text for query in truth.queries] == ["A", "B", "a1", "b1"]  # x has 4 px, a2 has 8
     assert truth.families() == [[(("A",), [("A", "a1")]), (("B",), [("B", "b1")])], []]
     with pytest.raises(MisalignedArtifactError, match=r"10 x 10"):
@@ -166,27 +172,6 @@ def test_automatic_level_of_the_field_follows_the_highest_value(tmp_path):
     assert values["field", given, "cup", "whole", "best_threshold_iou"] == 1
 
 
-def test_other_protocols_are_measured_with_their_own_rules():
-    # The right place has the higher mean, another level the higher value.
-    relevancy = np.full((3, *SIZE), 0.1, np.float32)
-    relevancy[0, 2:6, 2:6] = 0.8
-    relevancy[2, 8, 8], relevancy[2, 8, 9] = 0.9, 0.66  # min-max 0.7: just in the mask
-    truth = ViewTruth.of_regions([region_of(box((2, 6), (2, 6)), "cup")], SIZE)
-    scene = HandMade([], {}, {"cup": relevancy})
-    cards = [card_of("3d-ovs/langsplat"), card_of("3d-ovs/langsplat-raw")]
-    settings = EvaluateSettings(methods=("field",), filter_px=1, mix=False, majority=False, relevancy_scale=5)
-    extra = ExtraProtocols(tuple(cards))
-    rows = list(measure_view(Selections(scene), truth, "v.png", PackedMasks(SIZE), settings, extra))
-    ious = {row.protocol: row.value for row in rows if row.metric == "iou"}
-    assert ious == {
-        "lerf/langsplat@2 (filter 1, no mix, no majority, relevancy scale 5)": 0,
-        "3d-ovs/langsplat@2 (relevancy scale 5)": 1,
-        "3d-ovs/langsplat-raw@2 (relevancy scale 5)": 1,
-    }
-    own = {row.metric for row in rows if row.protocol.startswith("3d-ovs/")}
-    assert own == {"iou", "boundary_iou"}
-
-
 def test_a_relevancy_that_is_not_a_number_is_an_error():
     relevancy = np.full((3, *SIZE), 0.1, np.float32)
     relevancy[1, 2, 3] = np.nan
@@ -203,17 +188,6 @@ def test_an_answer_with_nothing_in_it_localizes_nothing(tmp_path, constant):
     found = {key: value for key, value in values.items() if key[-1].startswith("localization")}
     assert {key[0] for key in found} == {"field", "tree", "tree-path"}
     assert set(found.values()) == {0.0}
-
-
-def test_settings_of_nodes_are_in_the_names_of_all_protocols_of_nodes(block_world):
-    view, size_hw = "001.png", (64, 64)
-    settings = EvaluateSettings(node_select=0.5, methods=("tree",))
-    truth = ViewTruth.of(block_world.annotations, view, size_hw, settings.min_region_px)
-    flat = ExtraProtocols((card_of("3d-ovs/tree-nodes"), card_of("lerf-mask/gaussian-grouping")))
-    selections = Selections(block_world.answers)
-    rows = list(measure_view(selections, truth, view, PackedMasks(size_hw), settings, flat))
-    names = {row.protocol for row in rows if row.protocol.startswith(("3d-ovs", "lerf-mask"))}
-    assert len(names) == 2 and all("node share 0.5" in name for name in names)
 
 
 def test_a_repeated_text_nests_in_each_of_its_wholes(tmp_path):

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import re
 import shutil
 
 import pytest
@@ -73,6 +74,24 @@ def test_missing_records_and_unread_stages(scene):
         read_costs(scene)
 
 
+def built(name, scores, folder, labels=None):
+    """The rows measured in a table, and the table in every format."""
+    out = folder / f"{name}.csv"
+    run_table(name, scores, PROJECT / published_values(name), labels or {}, out)
+    forms = {kind: out.with_suffix(kind).read_text() for kind in (".csv", ".md", ".tex", ".html")}
+    rows = csv.DictReader(forms[".csv"].splitlines())
+    return [row for row in rows if row["kind"] != "reported"], forms
+
+
+def another(scores, scene, variant, value, seconds, **names):
+    """A copy of a scene's records under another scene or variant, with a score and a time of its own."""
+    more = scores.parents[2] / scene / variant / "scores.csv"
+    shutil.copytree(scores.parent, more.parent)
+    write_scores(more, [score("iou", value, scene=scene, variant=variant, method="field", **names)])
+    write_times(more, "synthetic", scene, variant, {"field": seconds})
+    return more
+
+
 @pytest.mark.parametrize(
     ("table", "columns"),
     [
@@ -82,74 +101,41 @@ def test_missing_records_and_unread_stages(scene):
     ],
 )
 def test_only_tables_of_seconds_change_with_what_the_jobs_took(scene, tmp_path, table, columns):
-    def built(name):
-        out = tmp_path / f"{name}.csv"
-        run_table(name, scene, PROJECT / published_values(name), {"omega-2": "Omega = 2"}, out)
-        return {kind: out.with_suffix(kind).read_text() for kind in (".csv", ".md", ".tex", ".html")}
-
-    def measured(forms):
-        rows = csv.DictReader(forms[".csv"].splitlines())
-        return [row for row in rows if row["kind"] != "reported"]
-
-    before, timed = built(table), built(f"{table}-seconds")
-    rows = measured(timed)
+    labels = {"omega-2": "Omega = 2"}
+    quality, before = built(table, scene, tmp_path, labels)
+    rows, timed = built(f"{table}-seconds", scene, tmp_path, labels)
     assert [row["method"] for row in rows] == ["hilsplat (field)", "Omega = 2"]
     assert {column: [row[column] for row in rows] for column in columns} == columns
     assert "main memory" in timed[".md"] and f"{table}-seconds" in before[".md"]
-    quality = [row["Hi-LERF mIoU"] for row in measured(before)]
-    assert quality == ([] if table == "cost" else ["50.00", "50.00"])
+    assert [row["Hi-LERF mIoU"] for row in quality] == ([] if table == "cost" else ["50.00", "50.00"])
     for path in scene:
         write_times(path, "synthetic", "table-1", path.parent.name, {"field": 0.75})
         for record_path in path.parent.glob("benchmarks/*.jsonl"):
             record(path.parent, record_path.stem, 600, 4096)
-    assert built(table) == before
-    assert all(timed[kind] != content for kind, content in built(f"{table}-seconds").items())
+    assert built(table, scene, tmp_path, labels)[1] == before
+    again = built(f"{table}-seconds", scene, tmp_path, labels)[1]
+    assert all(timed[kind] != content for kind, content in again.items())
 
 
 def test_rows_over_part_of_the_scenes_are_compared_only_within_a_scene(scene, tmp_path):
-    more = scene[0].parents[2] / "table-2/default/scores.csv"
-    shutil.copytree(scene[0].parent, more.parent)
+    more = another(scene[0], "table-2", "default", 0.9, 0.05)
     for stage in STAGES:
         record(more.parent, stage, 0.6, 256)
-    write_scores(more, [score("iou", 0.9, scene="table-2", method="field")])
-    write_times(more, "synthetic", "table-2", "default", {"field": 0.05})
-    out = tmp_path / "cost-seconds.csv"
-    for name in ("cost-seconds", "efficiency-seconds"):
-        run_table(name, [*scene, more], PROJECT / published_values(name), {}, tmp_path / f"{name}.csv")
-    lines = (out.with_suffix(".md")).read_text().splitlines()
-    part = next(line for line in lines if line.startswith("| omega-2"))
-    assert "| 1 of 2 |" in part and part.count("**") == 2 and "**0.25**" in part  # its scene's query alone
-    text = (tmp_path / "efficiency-seconds.md").read_text()
-    part = next(line for line in text.splitlines() if line.startswith("| omega-2"))
-    assert "| 1 of 2 |" in part and "**" not in part
+    for name, best in (("cost-seconds", ["**0.25**"]), ("efficiency-seconds", [])):  # its scene's query alone
+        lines = built(name, [*scene, more], tmp_path)[1][".md"].splitlines()
+        part = next(line for line in lines if line.startswith("| omega-2"))
+        assert "| 1 of 2 |" in part and re.findall(r"\*\*.*?\*\*", part) == best
 
 
 def test_quality_and_costs_of_a_row_are_of_the_same_scenes(scene, tmp_path):
-    more = scene[0].parents[2] / "table-2/default/scores.csv"
-    shutil.copytree(scene[0].parent, more.parent)
-    write_scores(more, [score("iou", 0.9, scene="table-2", method="field", protocol="lerf/langsplat@2")])
-    write_times(more, "synthetic", "table-2", "default", {"field": 0.05})
-    run_table(
-        "pruning-seconds", [scene[0], more], PROJECT / published_values("pruning"), {}, tmp_path / "p.csv"
-    )
-    with (tmp_path / "p.csv").open(newline="") as stream:
-        row = next(row for row in csv.DictReader(stream) if row["kind"] != "reported")
+    more = another(scene[0], "table-2", "default", 0.9, 0.05, protocol="lerf/langsplat@2")
+    (row,), _ = built("pruning-seconds", [scene[0], more], tmp_path)
     assert (row["Hi-LERF mIoU"], row["Query (s)"]) == ("50.00", "0.25")  # not of the scene without levels
 
 
 def test_seeds_of_a_variant_are_one_row_in_every_table(scene, tmp_path):
-    more = scene[1].parents[1] / "omega-2.seed1/scores.csv"
-    shutil.copytree(scene[1].parent, more.parent)
-    names = {"scene": "table-1", "variant": "omega-2.seed1", "method": "field"}
-    write_scores(more, [score("iou", 0.7, **names)])
-    write_times(more, "synthetic", "table-1", "omega-2.seed1", {"field": 0.75})
-    found = []
-    for name in ("cost-seconds", "pruning-seconds"):
-        out = tmp_path / f"{name}.csv"
-        run_table(name, [*scene, more], PROJECT / published_values(name), {}, out)
-        with out.open(newline="") as stream:
-            found += [row for row in csv.DictReader(stream) if row["method"].startswith("omega")]
-    cost, quality = found
+    files = [*scene, another(scene[1], "table-1", "omega-2.seed1", 0.7, 0.75)]
+    cost, quality = (built(name, files, tmp_path)[0][1] for name in ("cost-seconds", "pruning-seconds"))
     assert (cost["table-1 query (s)"], quality["Query (s)"]) == ("0.50", "0.50")
     assert (quality["Hi-LERF mIoU"], quality["seeds"]) == ("60.00 ± 14.14", "2")
 

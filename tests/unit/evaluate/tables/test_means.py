@@ -1,11 +1,13 @@
-"""Means of score files, as a run and `evaluate-files` print them."""
+"""Score files, and their means as a run and `evaluate-files` print them."""
 
 import pandas as pd
+import pytest
 
+from hilsplat.base.errors import ArtifactError
 from hilsplat.base.tables import read_csv
 from hilsplat.cli.main import app
 from hilsplat.datasets.classes import WAYMO_22
-from hilsplat.evaluate.scores import COLUMNS, write_scores
+from hilsplat.evaluate.scores import COLUMNS, read_scores, write_scores
 from hilsplat.evaluate.tables.means import mean_rows
 from tests.unit.evaluate.builders import score
 
@@ -78,3 +80,37 @@ def test_labels_of_several_data_sets_are_not_averaged_together():
         ("annotated", "0.0"),
         ("lerf_ovs", "80.0"),
     ]
+
+
+def test_score_files_are_sorted_and_stable(tmp_path):
+    rows = [
+        score("iou", 1 / 3, query="b"),
+        score("iou", 0.5, query="a, or b"),
+        score("boundary_iou", 0.5, query="a"),
+    ]
+    write_scores(tmp_path / "one.csv", rows)
+    write_scores(tmp_path / "two.csv", rows[::-1])
+    text = (tmp_path / "one.csv").read_bytes()
+    assert text == (tmp_path / "two.csv").read_bytes()
+    assert text.decode().splitlines()[0] == ",".join(COLUMNS)
+    frame = read_scores([tmp_path / "one.csv"])
+    assert list(frame["query"]) == ["a", "a, or b", "b"]
+    assert frame["value"].tolist() == [0.5, 0.5, 0.333333]
+
+
+def test_queries_like_formulas_are_inert_in_spreadsheets_and_read_back_unchanged(tmp_path):
+    write_scores(
+        tmp_path / "scores.csv", [score("iou", 0.5, query='=HYPERLINK("x")'), score("iou", 0.0, query="-")]
+    )
+    assert ",\"'=HYPERLINK" in (tmp_path / "scores.csv").read_text()
+    assert list(read_scores([tmp_path / "scores.csv"])["query"]) == ["-", '=HYPERLINK("x")']
+    text = (tmp_path / "scores.csv").read_text()
+    (tmp_path / "scores.csv").write_text(text.replace("0.500000", "half"))
+    with pytest.raises(ArtifactError, match=r"scores\.csv cannot be read: .*'half'"):
+        read_scores([tmp_path / "scores.csv"])
+
+
+def test_other_columns_are_refused_by_name(tmp_path):
+    (tmp_path / "scores.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(ArtifactError, match=r"found     a, b"):
+        read_scores([tmp_path / "scores.csv"])

@@ -1,8 +1,10 @@
 """Tables from rows small enough to add up by hand, and the paper's values as transcribed."""
 
 import csv
+import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -26,7 +28,7 @@ from tests.unit.evaluate.builders import score
 
 PUBLISHED = PROJECT / "config" / "published"
 
-LERF = {"protocol": "lerf/tree-nodes@5", "level": ""}
+LERF, LEVELS = {"protocol": "lerf/tree-nodes@5", "level": ""}, "hierarchy/level-given@5"
 SCORES = [
     # scene one: L1 0.8 and 0.6, L2 0.5, L3 0.2, 0.0, 0.1; scene two: L1 0.3 only
     score("iou", 0.8, query="a"),
@@ -187,21 +189,10 @@ def test_ablation_rows_are_compared_with_the_default_field_scene_by_scene(tmp_pa
 
 
 def test_rows_of_the_ladder_are_compared_with_the_row_that_they_extend_by_scene_and_seed(tmp_path):
-    values = {
-        ("one", "whole"): {
-            "paper-hc": 0.4,
-            "paper-hc.seed1": 0.6,
-            "paper-part": 0.5,
-            "paper-part.seed1": 0.6,
-        },
-        ("two", "whole"): {
-            "paper-hc": 0.2,
-            "paper-hc.seed1": 0.8,
-            "paper-part": 0.3,
-            "paper-part.seed1": 0.8,
-        },
-    }
-    steps, _ = ablation_of(tmp_path, values)
+    variants = "paper-hc", "paper-hc.seed1", "paper-part", "paper-part.seed1"
+    values = {"one": (0.4, 0.6, 0.5, 0.6), "two": (0.2, 0.8, 0.3, 0.8)}
+    of_levels = {(name, "whole"): dict(zip(variants, of, strict=True)) for name, of in values.items()}
+    steps, _ = ablation_of(tmp_path, of_levels)
     # differences of 0.1, 0, 0.1 and 0: mean 0.05, deviation 0.0577, error 0.0289
     assert steps == {"3D-HC": ("", ""), "paper-part": ("3D-HC", "5.00 ± 2.89")}
     assert mean_difference([-0.03, 0.02]).text == "+0.0 ± 0.0"
@@ -221,11 +212,6 @@ def test_averaging_orders_are_not_mixed_and_pooled_protocols_have_no_number_per_
             table_value(frame, "iou")
 
 
-@pytest.mark.parametrize("name", ["hierarchy", "lerf", "ablation"])
-def test_tables_are_the_same_bytes_whatever_the_order_of_rows(tmp_path, name):
-    assert built(tmp_path / "forward", name) == built(tmp_path / "backward", name, SCORES[::-1])
-
-
 @pytest.mark.parametrize(
     ("column", "texts", "ranks"),
     [
@@ -240,13 +226,29 @@ def test_best_three_share_ranks_when_equal(column, texts, ranks):
     assert block.ranks() == {(row, column): rank for row, rank in ranks.items()}
 
 
-def test_names_from_a_configuration_are_text_in_every_format(tmp_path):
-    hostile = "<script>alert(1)</script> [x](javascript:alert(1)) a|b\nc"
-    _, forms = built(tmp_path, "hierarchy", [score("iou", 0.5)], {"default": hostile}, [hostile])
-    for suffix in (".md", ".html"):
-        assert "alert(1)" in forms[suffix]
-        assert "<script" not in forms[suffix]
-    assert "](java" not in forms[".md"]
+def test_names_are_text_in_every_format(tmp_path):
+    hostile = "[x](javascript:alert(1)) <script>alert(1)</script> a|b\n\nc"
+    scores = [score("iou", 0.5, scene=hostile, dataset=hostile, view=hostile, **LERF)]
+    for name, own in (("lerf", scores), ("frames-hi-lerf", [replace(scores[0], protocol=LEVELS)])):
+        _, forms = built(tmp_path, name, own, {"default": hostile}, [hostile])
+        for suffix in (".md", ".html"):
+            assert "alert(1)" in forms[suffix]
+            assert "<script" not in forms[suffix]
+        block = forms[".md"].rpartition("## ")[2].splitlines()
+        assert "](java" not in forms[".md"]
+        bars = {len(re.findall(r"(?<!\\)\|", line)) for line in block if line.startswith("|")}
+        assert len(bars) == 1  # every row has the columns of the header
+        assert (
+            "\n[" not in forms[".tex"] and "\n\n" not in forms[".tex"]
+        )  # arguments of a row's end, paragraphs
+
+
+def test_scenes_whose_names_differ_only_in_a_space_have_columns_of_their_own(tmp_path):
+    scores = [score("iou", value, scene=scene, **LERF) for scene, value in (("desk1", 0.5), ("desk_1", 0.7))]
+    assert cells(measured(built(tmp_path, "lerf", scores)[0]), "desk1 mIoU", "desk_1 mIoU") == [
+        "50.00",
+        "70.00",
+    ]
 
 
 def test_an_unknown_table_is_an_error_that_lists_the_tables(tmp_path):
@@ -303,15 +305,18 @@ def test_scannet_shows_all_sets_of_classes_in_one_row_and_instances_of_all_scans
         "room-1": match_instances(truth, found, np.array([2]), np.array([0.5]), ids),
         "room-2": match_instances(truth, found[:0], np.zeros(0, int), np.zeros(0), ids),
     }
-    key = ("default", "sam-tiny", "tree")
-    keyed = {("synthetic-rooms", scene, *key): each for scene, each in matches.items()}
+    matches["frozen"] = matches["room-2"]
+    keyed = {("synthetic-rooms", name, "default", "sam-tiny", "tree"): each for name, each in matches.items()}
     write_instances(tmp_path / "scores.csv", keyed)
+    frozen = "scannet200/opengaussian@1 (points: frozen)"
+    scores.append(replace(scores[2], scene="frozen", protocol=frozen))
     rows, _ = built(tmp_path, "scannet", scores)
-    row = measured(rows)
+    assert measured(rows, protocol="points: frozen")["ScanNet200 AP"] == "0.00"
+    row = measured(rows, protocol="points: nearest")
     assert cells(row, "19 classes mIoU", "ScanNet200 mAcc") == ["30.00", "10.00"]
     assert cells(row, *(f"ScanNet200 {name}" for name in ("AP", "AP@25", "head AP"))) == ["50.00"] * 3
     assert cells(row, "ScanNet200 head mIoU", "ScanNet200 tail mIoU") == ["60.00", ""]
-    assert cells(row, "ScanNet200 tail AP", "protocol") == ["", "points: nearest"]
+    assert row["ScanNet200 tail AP"] == ""
 
 
 def test_replica_shows_scenes_and_their_mean(tmp_path):
@@ -324,9 +329,11 @@ def test_replica_shows_scenes_and_their_mean(tmp_path):
 def test_waymo_pools_the_counts_of_all_scenes(tmp_path):
     first = class_scores("waymo/segmentation", 1 / 2, 2, scene="street-1", query="car")
     second = class_scores("waymo/segmentation", 8 / 8, 8, scene="street-2", query="car")
-    row = measured(built(tmp_path, "waymo", [*first, *second])[0])
-    # (1 + 8) / (2 + 8) for cars, and 21 absent classes that count 1
-    assert cells(row, "mIoU, present classes", "mIoU") == ["90.00", f"{100 * (21 + 0.9) / 22:.2f}"]
+    predicted = replace(second[0], query="bus", value=0.0)
+    row = measured(built(tmp_path, "waymo", [*first, *second, predicted])[0])
+    # (1 + 8) / (2 + 8) for cars, 0 for buses, which are not present, and 20 absent classes that count 1
+    assert cells(row, "mIoU, present classes", "mIoU") == ["90.00", f"{100 * (20 + 0.9) / 22:.2f}"]
+    assert row["Classes present"] == "1"
     others = {"pedestrian": 0.0, "bus": 1.0, "truck": 0.0, "car": 1.0}.items()
     scores = [
         row for name, value in others for row in class_scores("waymo/segmentation", value, 9, query=name)
@@ -353,13 +360,6 @@ def test_intervals_are_of_the_mean_over_seeds(tmp_path, name, protocol, column):
     assert cells(row, column, "seeds") == ["40 to 40", "2"]
 
 
-def test_classes_that_are_only_predicted_are_not_present(tmp_path):
-    predicted = point_score("waymo/segmentation", "class_iou", 0.0, n=5, query="bus")
-    scores = [*class_scores("waymo/segmentation", 1.0, 10, query="car"), predicted]
-    row = measured(built(tmp_path, "waymo", scores)[0])
-    assert cells(row, "mIoU, present classes", "Classes present") == ["100.00", "1"]
-
-
 def test_intervals_widen_with_fewer_scenes_and_names():
     # half of the names are found: the mean is 0.5, and its interval shrinks as names are added
     def interval(scenes, names, pooled=False):
@@ -377,25 +377,16 @@ def test_intervals_widen_with_fewer_scenes_and_names():
 # --- seeds, annotations, consistency, frames, true masks -------------------------------------------
 
 
-def test_seeds_of_a_variant_are_one_row_with_mean_and_spread(tmp_path):
+def test_seeds_of_a_variant_are_one_row_with_mean_and_spread_of_what_all_have(tmp_path):
     values = {"default": 0.4, "default.seed1": 0.5, "default.seed2": 0.6}
     scores = [score("iou", value, variant=variant, method="field") for variant, value in values.items()]
-    rows, forms = built(tmp_path, "hierarchy", scores)
+    of_two = [replace(row, metric="hc_anchored", query="", level="") for row in scores[1:]]
+    rows, forms = built(tmp_path, "hierarchy", [*scores, *of_two])
     row = measured(rows, method="hilsplat (field)")
-    assert cells(row, "L1", "seeds", "Pairs") == ["50.00 ± 10.00", "3", "1"]
+    assert cells(row, "L1", "seeds", "Pairs", "HC anchored") == ["50.00 ± 10.00", "3", "1", ""]
     assert "50.0 ± 10.0" in forms[".md"]
     assert r"50.0 $\pm$ 10.0" in forms[".tex"]
     assert "standard deviation over seeds" in forms[".md"]
-
-
-def test_a_mean_over_seeds_is_of_all_seeds_or_missing(tmp_path):
-    values = {"default": None, "default.seed1": 0.5, "default.seed2": 0.6}
-    scores = [score("iou", 0.4, variant=variant, method="field") for variant in values]
-    for variant, value in values.items():
-        if value is not None:
-            scores.append(score("hc_anchored", value, variant=variant, method="field", query="", level=""))
-    row = measured(built(tmp_path, "hierarchy", scores)[0], method="hilsplat (field)")
-    assert cells(row, "L1", "L2", "HC anchored") == ["40.00 ± 0.00", "", ""]
 
 
 def test_annotations_are_one_unranked_row_whatever_the_variants_and_seeds(tmp_path):

@@ -1,25 +1,26 @@
-"""Figures of the paper: methods, queries, titles and masks of answers."""
+"""Figures: panels of a scene, the comparison of methods, and plots of sweeps."""
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from hilsplat.base.artifacts import write_index
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import Level
 from hilsplat.evaluate.figures import comparison
-from hilsplat.evaluate.figures.comparison import (
-    Answerer,
-    Column,
-    draw_methods,
-    node_image,
-    over_views,
-    run_comparison,
-)
-from hilsplat.evaluate.figures.panel import annotated_rows, shown_truths
+from hilsplat.evaluate.figures.panel import annotated_rows, draw_panel, free_rows, shown_truths
 from hilsplat.evaluate.figures.sweep_plot import read_curves, run_sweep_plot
+from hilsplat.query.answer import report, views_of
+from hilsplat.query.pictures import ANSWER_RGB, TRUTH_RGB, outline, paint_answer, save_figure
+from hilsplat.query.query_panel import query_panel
 from hilsplat.settings import EvaluateSettings, FiguresSettings
+from tests.unit.assembled_scene import GivenClip
+from tests.unit.evaluate.builders import box
+from tests.unit.evaluate.conftest import encode_texts
 
 EVALUATE = EvaluateSettings()
 
@@ -30,17 +31,100 @@ def rows(block_world):
     return truths, annotated_rows(truths, FiguresSettings(queries_per_level=1))
 
 
+# --- panels ---------------------------------------------------------------------------------------
+
+
+def test_answer_is_filled_and_truth_outlined():
+    image = np.full((20, 20, 3), 100, np.uint8)
+    answer, truth = box((0, 20), (0, 8), (20, 20)), box((0, 20), (12, 18), (20, 20))
+    painted = paint_answer(image, answer, truth)
+    inside = (0.4 * 100 + 0.6 * np.array(ANSWER_RGB)).astype(np.uint8)
+    assert painted[10, 4].tolist() == inside.tolist()
+    assert painted[10, 12].tolist() == list(TRUTH_RGB)
+    assert painted[10, 15].tolist() == [65, 65, 65]  # outside: 0.25 of the photograph and 0.4 of its grey
+
+
+def test_outline_runs_inside_the_mask_but_not_along_the_image_border():
+    mask = box((0, 6), (2, 6), (6, 6))
+    assert np.argwhere(outline(mask)).tolist() == [[row, 2] for row in range(6)]
+
+
+def test_largest_text_of_each_level_is_shown_first(rows):
+    truths, first = rows
+    assert [(row.text, int(row.level)) for row in first] == [("bear", 1), ("head", 2), ("nose", 3)]
+    assert first[2].path == ("bear", "head", "nose")
+    assert (
+        len(annotated_rows(truths, FiguresSettings())) == 5
+    )  # two of whole and part, the only one of subpart
+
+
+@pytest.mark.parametrize("texts", [["bear", "bear > head"], []])
+def test_panel_without_annotations_shows_given_texts_below_the_overview(block_world, tmp_path, texts):
+    rows = free_rows(block_world.answers, texts, FiguresSettings())
+    paths = [(("bear",), "000.png"), (("bear", "head"), "000.png")]
+    assert [(row.path, row.view) for row in rows] == paths[: len(texts)]
+    figure = draw_panel(block_world.answers, block_world.folder / "masks", rows, EVALUATE)
+    save_figure(figure, tmp_path / "panel.png")
+    assert (tmp_path / "panel.png").stat().st_size > 10_000
+
+
+def test_a_panel_of_meaningless_answers_or_true_masks_is_marked(block_world, tmp_path):
+    answers, masks = block_world.answers, block_world.folder / "masks"
+    title = draw_panel(answers, masks, [], EVALUATE).get_suptitle()
+    assert "\n" not in title and "true" not in title
+    doubtful = draw_panel(replace(answers, clip=GivenClip(encode_texts, True)), masks, [], EVALUATE)
+    assert "answers about photographs are meaningless" in doubtful.get_suptitle().replace("\n", " ")
+    shutil.copytree(masks, tmp_path / "masks")
+    label = "truth-perturbed (merge 0.2)"
+    write_index(tmp_path / "masks", {"000.png": {}}, segmenter="truth-perturbed", model=None, label=label)
+    figure = draw_panel(answers, tmp_path / "masks", [], EVALUATE)
+    assert "masks made from the true labels" in figure.get_suptitle()
+    assert f"masks: {label}" in [axes.get_ylabel() for axes in figure.axes]
+
+
+def test_a_query_is_reported_and_drawn(block_world, tmp_path):
+    answers, text = block_world.answers, "bear > head"
+    found = answers.select(text)
+    assert views_of(answers, answers.hits_of(found, 10), 2) == ["000.png", "001.png"]
+    lines = report(answers, text, found).splitlines()
+    assert lines[0] == "1 answer to 'bear > head' in synthetic/blocks; lengths in metres"
+    assert lines[2].split()[:3] == ["2", "part", "1.00"]
+    assert "doubtful" not in lines[-1]
+    query_panel(answers, text, found, ["000.png", "001.png"], tmp_path / "panel.png")
+    assert (tmp_path / "panel.png").stat().st_size > 10_000
+
+
+def test_reports_state_what_was_not_found(block_world):
+    answers = block_world.answers
+    empty = replace(answers.select("bear"), ids=np.zeros(0, np.int64), values=np.zeros(0))
+    expected = "nothing in synthetic/blocks matches 'unicorn' at level whole; try --level part"
+    assert report(answers, "unicorn", empty).startswith(expected)
+    expected = "nothing in view 000.png of synthetic/blocks matches 'unicorn'"
+    assert report(answers, "unicorn", empty, "000.png").startswith(expected)
+    found = answers.select("bear > head")
+    assert "the whole scene was searched" not in report(answers, "bear > head", found)
+    outside = report(answers, "bear > head", replace(found, route="fallback"))
+    assert "no answer is part of a match for 'bear'" in outside
+    found = answers.select("unicorn > head")
+    assert found.route == "child"
+    last = report(answers, "unicorn > head", found).splitlines()[-1]
+    assert last.startswith("doubtful: no node is closer to 'unicorn' than to a generic word")
+
+
+# --- methods and sweeps ---------------------------------------------------------------------------
+
+
 def test_tree_and_field_of_an_exact_world_answer_with_the_truth(block_world, rows):
     for method in ("tree", "field"):
-        answerer = Answerer(method, method, block_world.answers)
+        answerer = comparison.Answerer(method, method, block_world.answers)
         for row, mask in zip(rows[1], answerer.masks(rows[1], EVALUATE), strict=True):
             assert np.count_nonzero(mask != row.truth) <= 0.05 * row.truth.size, (method, row.text)
 
 
 def test_many_methods_are_rows_and_queries_columns(block_world, rows):
-    masks = Answerer("tree", "tree", block_world.answers).masks(rows[1], EVALUATE)
-    columns = [Column(f"method {n}", masks, [], []) for n in range(comparison.MAX_COLUMNS + 1)]
-    figure = draw_methods(block_world.scene, block_world.answers.views.image, columns, rows[1])
+    masks = comparison.Answerer("tree", "tree", block_world.answers).masks(rows[1], EVALUATE)
+    columns = [comparison.Column(f"method {n}", masks, [], []) for n in range(comparison.MAX_COLUMNS + 1)]
+    figure = comparison.draw_methods(block_world.scene, block_world.answers.views.image, columns, rows[1])
     grid = np.array(figure.get_axes()).reshape(len(columns) + 1, len(rows[1]))
     assert [axes.get_ylabel() for axes in grid[:, 0]] == ["", *(column.title for column in columns)]
     assert all("IoU" in axes.get_title() for axes in grid[1:].ravel())
@@ -49,14 +133,14 @@ def test_many_methods_are_rows_and_queries_columns(block_world, rows):
 
 
 def test_one_part_is_shown_over_views_and_views_without_truth_fill_up(block_world, rows):
-    shown = over_views(block_world.scene, rows[1], rows[0])
+    shown = comparison.over_views(block_world.scene, rows[1], rows[0])
     assert {(row.text, row.level) for row in shown} == {("head", Level.PART)}
     assert [row.view for row in shown] == ["001.png", "000.png"]  # there are two views
     assert shown[1].truth is None
 
 
 def test_equal_nodes_have_equal_colours_and_other_pixels_are_black(block_world):
-    picture = node_image(block_world.answers, "001.png", Level.WHOLE)
+    picture = comparison.node_image(block_world.answers, "001.png", Level.WHOLE)
     bear, chest, nothing = picture[20, 20], picture[50, 50], picture[2, 2]
     assert (picture[40, 10] == bear).all()
     assert not (bear == chest).all()
@@ -70,7 +154,7 @@ def compare(block_world, tmp_path, monkeypatch):
 
     def run(name, variants, names, **more):
         out, settings = tmp_path / name / "comparison.webp", FiguresSettings(queries_per_level=1)
-        run_comparison(block_world.folder, variants, names, out, settings, EVALUATE, **more)
+        comparison.run_comparison(block_world.folder, variants, names, out, settings, EVALUATE, **more)
 
     return run
 
