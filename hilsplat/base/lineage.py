@@ -137,7 +137,8 @@ class Inputs:
         for name, path in paths.items():
             if isinstance(path, Path) and not path.exists():
                 raise HilsplatError(
-                    f"{stage}: input {name} is missing: {path}", fix="run the stage that writes it"
+                    f"{stage}: input {name} is missing: {path}",
+                    fix="correct the path, or run the stage that writes it",
                 )
         self._files = self._signatures()
         self.records = {name: self._record(path) for name, path in paths.items()}

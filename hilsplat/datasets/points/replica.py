@@ -12,6 +12,7 @@ All readers raise SceneError if a file is missing, damaged, or doesn't match the
 Poses are camera-to-world in OpenCV axes, 16 numbers per line.
 """
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -83,6 +84,10 @@ def read_images(root: Path, scene: str) -> tuple[tuple[PosedImage, ...], tuple[s
         for image in list_images(folder / image_folder)
         if image.stem.startswith(prefix) and image.stem.removeprefix(prefix).isdecimal()
     )  # other images are depth or colour visualisations
+    if twice := [other.name for (number, _), (again, other) in pairwise(frames) if number == again]:
+        raise SceneError(
+            f"{folder / image_folder} has several images of one frame", found=twice[0], fix=UNPACK_AGAIN
+        )
     beyond = [number for number, _ in frames if number >= len(poses)]
     if beyond or not frames:
         missing = f"; the first frame without a line is {beyond[0]}" if beyond else ""

@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
+from hilsplat.base.tables import counted
 from hilsplat.evaluate.metrics.hierarchy import READINGS
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN, VIEW_CONSISTENCY
 from hilsplat.evaluate.tables.kinds import TABLES, TableKind
@@ -51,7 +52,8 @@ def frames_blocks(_: TableKind, sources: Sources) -> list[Block]:
     views: dict[str, dict[str, list[str]]] = {}
     for (dataset, scene, view), of_view in sorted(texts.items()):
         name = view.rpartition(".")[0] or view
-        views.setdefault(dataset, {}).setdefault(scene, []).append(f"{name} ({len(of_view)} texts)")
+        cell = f"{name} ({counted(len(of_view), 'text')})"
+        views.setdefault(dataset, {}).setdefault(scene, []).append(cell)
     blocks = []
     for dataset, of_scenes in views.items():
         rows = []

@@ -105,6 +105,7 @@ def test_a_sequence_of_nice_slam_is_preferred_and_has_its_own_lens(root, tmp_pat
         (lambda root: (root / INFO).unlink(), r"info_semantic\.json is missing\n.*mesh_semantic\.ply"),
         (lambda root: (root / MESH).unlink(), r"mesh_semantic\.ply is missing"),
         (poses(1), "1 lines, 3 images; the first frame without a line is 1"),
+        (moved(f"{SEQUENCE}/rgb/rgb_2.png", f"{SEQUENCE}/rgb/rgb_001.png"), "several images of one frame"),
         (text_in(f"{SEQUENCE}/traj_w_c.txt", "1 0 0 0\n"), "1 lines of 4 numbers\n.*16 numbers per line"),
         (moved(SEQUENCE, "00"), "in room0 or room_0/imap/00 or room_0/Sequence_1\n.*unpack the rendered"),
         (moved("room_0/imap", "room0"), "found     00\n.*move the files in .*room0/00 one level up"),

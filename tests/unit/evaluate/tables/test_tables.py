@@ -420,7 +420,7 @@ def test_frames_are_the_views_that_were_queried_at_levels(tmp_path):
         for view, query, method in [*views, ("015.png", "cup", "field")]
     ]
     rows, _ = built(tmp_path, "frames-hi-lerf", scores)
-    assert [row["one"] for row in rows if row["kind"] != "reported"] == ["007 (2 texts)", "015 (1 texts)"]
+    assert [row["one"] for row in rows if row["kind"] != "reported"] == ["007 (2 texts)", "015 (1 text)"]
     assert rows[0]["Figurines"] == "frame_00016"  # reported in the paper
 
 
