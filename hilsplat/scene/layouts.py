@@ -291,8 +291,8 @@ def model_files(folder: Path) -> list[Path]:
 
 
 def colmap_models(folder: Path) -> list[Path]:
-    """Return the folders of the COLMAP models in `sparse/`, those with the most images first."""
-    folders = [*sorted((folder / "sparse").glob("*/")), folder / "sparse"]
+    """Return the folders of the COLMAP models in `sparse/` or in the folder, those with most images first."""
+    folders = [*sorted((folder / "sparse").glob("*/")), folder / "sparse", folder]
     return sorted((model for model in folders if model_files(model)), key=lambda model: -_num_images(model))
 
 
@@ -342,7 +342,10 @@ def photo_files(folder: Path, named: Path | None = None) -> list[Path]:
         return [path for path in list_images(photo_folder(folder)) if path.is_file()]
     files = set() if known.kind in ("polycam", "record3d") else set(used_images(known.root))
     for path in known.files:
-        files.update(visible_files(path) if path.is_dir() else [path])
+        if known.kind == "colmap":
+            files.update((*model_files(path), path / "test.txt"))
+        else:
+            files.update(visible_files(path) if path.is_dir() else [path])
         if known.kind == "transforms":
             with suppress(SceneError):
                 points = str(read_json_object(path, "").get("ply_file_path", ""))

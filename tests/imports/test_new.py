@@ -11,14 +11,19 @@ from plyfile import PlyData
 from typer.testing import CliRunner
 
 from hilsplat.base.errors import SceneError
+from hilsplat.base.images import read_image
 from hilsplat.cli.main import app
+from hilsplat.embed.clip import ClipModel
+from hilsplat.embed.langsplat_files import read_view
 from hilsplat.scene.importers.reading import read_source
 from hilsplat.scene.layouts import find_known_poses, photo_folder
 from hilsplat.scene.sheet import read_sheet
-from hilsplat.splat.gaussians import Gaussians
+from hilsplat.settings import ClipSettings
 from hilsplat.splat.ply import save_ply
 from hilsplat.workflow.new_scene import add_scene
+from tests.conftest import PROJECT
 from tests.imports import analytic_world as world
+from tests.unit.round_gaussians import round_gaussians
 
 WIDTH, HEIGHT = 64, 48
 POSES = world.cameras(6)
@@ -41,9 +46,7 @@ def model(folder, place="sparse/0", count=6):
 
 def gaussians(path, count):
     path.parent.mkdir(parents=True, exist_ok=True)
-    ones = np.ones((count, 3), np.float32)
-    quats = np.tile(np.float32([1, 0, 0, 0]), (count, 1))
-    save_ply(path, Gaussians(ones, ones, quats, ones[:, 0], np.ones((count, 1, 3), np.float32)))
+    save_ply(path, round_gaussians(np.ones((count, 3))))
 
 
 def without_some(path, bad):
@@ -55,7 +58,7 @@ def without_some(path, bad):
 
 def langsplat_files(folder, name, size_hw=(HEIGHT, WIDTH)):
     """Write LangSplat's maps and vectors of an image: one mask, which covers the image at every level."""
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     np.save(folder / f"{name}_s.npy", np.zeros((4, *size_hw), np.float32))
     np.save(folder / f"{name}_f.npy", np.ones((1, 8), np.float32))
 
@@ -113,6 +116,7 @@ def test_every_part_is_counted_and_what_is_left_out_is_named(options, tmp_path):
         "004.json: no view with an image and a pose has this name",
         "003.json does not match the size of its image",
         "001.json: ignored 1 unaccepted proposal(s)",
+        "_f.npy does not match the CLIP model in models/clip-tiny",
         "skipped, because pickle files can run code: chkpnt30000.pth",
         "5 photographs in",
     ):
@@ -161,6 +165,37 @@ def test_labels_that_evaluation_would_refuse_are_left_out_or_refused(files, reas
     output = new(folder, tmp_path / "p").output
     assert "labels: 1 regions in 1 photographs" in output and reason in output, output
     assert [path.stem for path in (tmp_path / "p/annotated/photos/desk").iterdir()] == ["001"]
+
+
+@pytest.mark.parametrize("lens", [None, "PINHOLE 60 60 32 24", "SIMPLE_RADIAL 60 32 24 0.3"])
+def test_labels_of_another_shape_are_left_out(lens, tmp_path):
+    folder = labelled(tmp_path / "a", v000="mug")
+    if lens is not None:
+        poses = {f"{name}.jpg": pose for name, pose in zip(PICTURES, POSES, strict=True)}
+        world.write_colmap(folder / "sparse/0", lens, (WIDTH, HEIGHT), poses, POINTS)
+    for name, size in (("001", (2 * WIDTH, 2 * HEIGHT)), ("002", (HEIGHT, WIDTH)), ("003", (WIDTH, 36))):
+        label_file(folder / f"label/{name}.json", [thing("mug")], *size)
+    output = new(folder, tmp_path / "p", "--dry-run").output
+    assert "labels: 2 regions in 2 photographs" in output, output
+    for name in ("002", "003"):
+        assert f"{name}.json does not match the size of its" in output
+
+
+@pytest.mark.parametrize(("turn", "is_right"), [(0, True), (1, False)])
+def test_vectors_are_compared_with_those_of_the_clip_model(turn, is_right, tmp_path):
+    folder = photographs(tmp_path / "a")
+    model = ClipModel.load(PROJECT / "models/clip-tiny")
+    maps = np.full((4, HEIGHT, WIDTH), -1, np.float32)
+    maps[1:, :24, :32] = 0
+    for path in folder.glob("*.jpg"):
+        langsplat_files(folder / "language_features", path.stem)
+        np.save(folder / f"language_features/{path.stem}_s.npy", maps)
+        masks, _ = read_view(folder / "language_features", path.stem)
+        vector = model.embed_masks(read_image(path), masks, ClipSettings(crop="langsplat"))[:1]
+        np.save(folder / f"language_features/{path.stem}_f.npy", np.roll(vector.astype(np.float32), turn))
+    output = new(folder, tmp_path / "p", "--dry-run").output
+    assert "masks and vectors of 6 of 6 views" in output
+    assert ("were not computed by the CLIP model" in output) == (not is_right), output
 
 
 @pytest.mark.parametrize("kind", ["zip", "r3d"])
@@ -270,6 +305,22 @@ def test_the_coordinates_of_a_nerfstudio_export_are_stated(has_run, tmp_path):
     assert f"Gaussians: 3 from {ply}" in result.output
     stated = f"nerfstudio's, from {run}/dataparser_transforms.json" if has_run else "unknown"
     assert f"  coordinates: {stated}" in result.output
+
+
+def test_poses_and_gaussians_that_are_not_used_are_named_with_what_to_do(tmp_path):
+    folder = photographs(tmp_path / "a")
+    for name in ("cameras.xml", "scene.spz", "points.ply"):
+        (folder / name).write_bytes(b"ply\n")
+    model(folder, "colmap/sparse/0")
+    gaussians(folder / "Scan.ply", 3)
+    lines = new(folder, tmp_path / "p", "--dry-run").output.splitlines()
+    assert lines[:5] == [
+        "poses: structure from motion",
+        f"  not used: {folder}/colmap/sparse/0; to use these poses, pass --poses",
+        f"  not used: {folder}/cameras.xml; for poses, export a COLMAP model or transforms.json",
+        f"  not used: {folder}/Scan.ply; to use Gaussians in the coordinates of the poses, pass --gaussians",
+        f"  not used: {folder}/scene.spz; for Gaussians, export an uncompressed 3DGS PLY",
+    ]
 
 
 def test_label_files_are_copied_under_the_names_of_their_views(tmp_path):

@@ -1,11 +1,13 @@
 """Likely problems are reported before the run; good photographs raise no doubt."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
-from hilsplat.photos.check import CheckedPhoto, blur, photo_doubts
+from hilsplat.photos.check import MAX_PAIRS, blur, checked_photo, matched_rows, photo_doubts
 from tests.unit.scene.test_poses import plane_views
 
 SIZE = 360
@@ -35,11 +37,21 @@ def turning(picture, steps_deg):
 
 
 def doubts_of(pictures, focals=None, sizes=None, have_poses=False):
-    sizes = sizes or [picture.shape for picture in pictures]
     focals = focals or [None] * len(pictures)
-    rows = zip(sizes, focals, pictures, strict=True)
-    photos = [CheckedPhoto(f"{number}.jpg", *row) for number, row in enumerate(rows)]
+    matched, photos = matched_rows(len(pictures)), []
+    for number, (picture, focal) in enumerate(zip(pictures, focals, strict=True)):
+        pixels = cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB)
+        photo = checked_photo(f"{number}.jpg", pixels, focal, is_matched=number in matched)
+        photos.append(replace(photo, size_hw=sizes[number]) if sizes else photo)
     return photo_doubts(photos, have_poses=have_poses)
+
+
+@pytest.mark.parametrize("number", [0, 1, 2, 61, 62, 2000])
+def test_all_neighbours_of_a_small_set_and_some_of_a_large_one_are_compared(number):
+    rows = matched_rows(number)
+    assert rows <= set(range(number)) and len(rows) <= 2 * MAX_PAIRS
+    assert sum(row + 1 in rows for row in rows) >= min(number - 1, MAX_PAIRS)
+    assert number > 61 or number < 2 or rows == set(range(number))
 
 
 def test_a_moving_camera_raises_no_doubt_unless_photographs_are_few(moving):
