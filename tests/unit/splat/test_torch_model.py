@@ -1,6 +1,5 @@
 """A fit on a card, run on the CPU with gsplat's reference functions in torch; and the choice of a card."""
 
-import copy
 import logging
 from dataclasses import replace
 
@@ -17,9 +16,8 @@ from hilsplat.settings import GaussiansSettings
 from hilsplat.splat import fit, torch_model
 from hilsplat.splat.gaussians import FIELDS
 from hilsplat.splat.initial import camera_extent, first_gaussians, load_views
-from hilsplat.splat.model import TABLES, Model, StepOptions, step_sizes
+from hilsplat.splat.model import TABLES, Model, StepOptions
 from hilsplat.splat.rasterise import cuda, device, parity
-from hilsplat.splat.rasterise.drawn import Gradients
 from hilsplat.splat.torch_model import TorchModel, bytes_needed
 from tests.unit.card_on_cpu import replace_kernels
 from tests.unit.splat.rasterise_scenes import random_gaussians
@@ -177,19 +175,6 @@ def test_the_loss_and_its_gradient_equal_those_of_cpusplat(monkeypatch, size_hw,
     assert relative(leaf.grad.numpy(), by_image) < 1e-5
 
 
-def test_steps_of_adam_equal_those_of_cpusplat():
-    start, rng = vars(random_gaussians(20, degree=2)), np.random.default_rng(0)
-    one, other = (kind({name: start[name].copy() for name in FIELDS}) for kind in (Model, TorchModel))
-    for _ in range(4):
-        gradients = {name: rng.normal(size=start[name].shape).astype(np.float32) for name in FIELDS}
-        rates = step_sizes(SETTINGS, 1e-3)
-        extra = {"features": np.zeros((20, 0), np.float32), "means_px": np.zeros((20, 2), np.float32)}
-        one.descend(Gradients(**gradients, **extra), rates)
-        other._descend({name: torch.from_numpy(values) for name, values in gradients.items()}, rates)
-    for name, values in one.state().items():
-        np.testing.assert_allclose(other.state()[name], values, rtol=1e-5, atol=1e-7, err_msg=name)
-
-
 @pytest.mark.usefixtures("same_noise")
 @pytest.mark.parametrize("width", [0.0, 60.0])
 def test_noise_equals_that_of_the_cpu(width):
@@ -221,32 +206,6 @@ def test_gaussians_that_cannot_be_drawn_are_reported_with_the_scores(scene):
         scores()
 
 
-# ---- rows -----------------------------------------------------------------------------------------
-
-
-def test_row_operations_equal_those_of_the_cpu():
-    start, rng = vars(random_gaussians(8, degree=1)), np.random.default_rng(0)
-    one, other = (kind({name: start[name].copy() for name in FIELDS}) for kind in (Model, TorchModel))
-    moments = {name: rng.normal(size=start[name].shape).astype(np.float32) for name in FIELDS}
-    for model in (one, other):
-        for table in TABLES[1:]:
-            for name, values in moments.items():
-                getattr(model, table)[name] = model.array(values.copy())
-        model.copy(np.array([1, 1]), np.array([4, 0]))
-        model.select(np.array([0, 5, 2, 2, 4, 7]))
-        model.reset_moments(np.array([3]))
-        model.reset_moments(slice(None), ("opacity_logits",))
-        model.write("quats", np.array([1, 2]), np.eye(4, dtype=np.float32)[:2])
-        model.restart_sums()
-        model.steps = 7
-    for name, values in one.state().items():
-        np.testing.assert_array_equal(other.state()[name], values, err_msg=name)
-        assert other.state()[name].dtype == values.dtype
-    np.testing.assert_array_equal(one.read("means")[[0, 2]], start["means"][[1, 2]])
-    restored = TorchModel.restore(copy.deepcopy(one.state()), 1)
-    for name, values in restored.state().items():
-        np.testing.assert_array_equal(values, one.state()[name], err_msg=name)
-
 
 @STRATEGIES
 def test_a_resumed_fit_equals_an_uninterrupted_one(scene, tmp_path, monkeypatch, strategy):
@@ -269,13 +228,6 @@ def test_a_resumed_fit_equals_an_uninterrupted_one(scene, tmp_path, monkeypatch,
     for name in FIELDS:
         np.testing.assert_array_equal(getattr(resumed, name), getattr(whole, name), err_msg=name)
     assert not checkpoint.exists()
-
-
-def test_frozen_gaussians_stay_at_their_points(scene):
-    settings = SETTINGS.model_copy(update={"initial": "frozen", "iterations": 5})
-    gaussians, _ = fit.fit_gaussians(scene, settings, seed=0)
-    np.testing.assert_array_equal(gaussians.means, scene.points_xyz)
-    assert np.ptp(gaussians.opacity_logits) > 0
 
 
 # ---- memory of the card ---------------------------------------------------------------------------
