@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
+from hilsplat.base.errors import shorten_list
 from hilsplat.base.images import resize_to_fit
 
 FEW_PHOTOS = 10
@@ -175,9 +176,8 @@ def _motion_doubts(photos: Sequence[CheckedPhoto]) -> list[str]:
 
 def _listed(names: Sequence[str], photos: Sequence[CheckedPhoto]) -> str:
     """Format a list, such as "3 of 40 photographs (a.jpg, b.jpg, c.jpg) are"."""
-    more = ", ..." if len(names) > MAX_NAMED else ""
     verb = "is" if len(names) == 1 else "are"
-    return f"{len(names)} of {len(photos)} photographs ({', '.join(names[:MAX_NAMED])}{more}) {verb}"
+    return f"{len(names)} of {len(photos)} photographs ({shorten_list(names, MAX_NAMED)}) {verb}"
 
 
 def blur(grey: UInt8[np.ndarray, "h w"]) -> float:

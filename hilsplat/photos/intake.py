@@ -15,13 +15,11 @@ from hilsplat.base.errors import HilsplatError, SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_outside, list_files, list_images
 from hilsplat.base.lineage import CONVERTED
 from hilsplat.base.removal import undone_on_error
-from hilsplat.scene.layouts import has_known_poses, photo_folder, unwrapped
+from hilsplat.scene.layouts import UNREAD_GAUSSIANS, has_known_poses, photo_folder, unwrapped
 
 MAX_FILES = 50_000
 MAX_TOTAL_GIB = 20
 """Limits on the contents of an archive. A capture has a few hundred files and rarely exceeds a gigabyte."""
-
-GAUSSIANS_SUFFIXES = frozenset({".ply", ".spz", ".splat", ".ksplat", ".sog", ".glb", ".gltf"})
 
 POSE_SUFFIXES = frozenset({".json", ".txt", ".bin", ".npy", ".ply"})
 """Suffixes of files that may contain poses or points; Record3D's `metadata` has no suffix."""
@@ -51,7 +49,7 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tu
         return
     if not videos and source.suffix.lower() not in (".zip", ".r3d"):
         fix = "pass the folder that contains the photographs; unpack other archives than .zip first"
-        if source.suffix.lower() in GAUSSIANS_SUFFIXES:
+        if source.suffix.lower() in (".ply", *UNREAD_GAUSSIANS):
             fix = "pass the folder of the photographs and their poses, and --gaussians with a 3DGS PLY"
         raise SceneError(
             f"{source} has an unsupported file type",

@@ -21,6 +21,7 @@ from hilsplat.scene.importers.reading import read_source
 from hilsplat.scene.layouts import (
     DATAPARSER,
     NO_POSES,
+    UNREAD_GAUSSIANS,
     dataparser_of,
     find_known_poses,
     has_known_poses,
@@ -44,8 +45,6 @@ few percent; 4:3 and 3:2 differ by 12 %."""
 
 UNREAD_POSES = ("*.xml", "cameras.json", "*.nvm", "bundle.out", "*.sfm")
 """Poses that Metashape, 3DGS, VisualSFM, Bundler and Meshroom write."""
-
-UNREAD_GAUSSIANS = ("*.spz", "*.splat", "*.ksplat", "*.sog", "*.glb", "*.gltf")
 
 
 @dataclass
@@ -147,7 +146,7 @@ def _gaussians(folder: Path, named: dict[str, Path | None], parts: Parts) -> Non
     if not plys:
         others = [path for path in folder.glob("*.ply") if b" f_dc_0\n" in ply_header(path)]
         _name_unused(others, "to use Gaussians in the coordinates of the poses, pass --gaussians", parts)
-        unread = [path for pattern in UNREAD_GAUSSIANS for path in folder.glob(pattern)]
+        unread = [path for path in folder.iterdir() if path.suffix.lower() in UNREAD_GAUSSIANS]
         _name_unused(unread, "for Gaussians, export an uncompressed 3DGS PLY", parts)
     if not plys or plys[0] == NO_POSES:
         return

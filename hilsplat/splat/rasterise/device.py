@@ -66,10 +66,14 @@ def _build_failure() -> str:
 
 def kernel_problem() -> str | None:
     """Return why the card cannot run one of gsplat's kernels, or None; the card may only be busy or full."""
+    import gsplat
+    import torch
+
     from hilsplat.splat.rasterise import cuda
 
     try:
-        cuda.run_a_kernel()
+        direction, harmonics = (torch.ones(shape, device=cuda.DEVICE) for shape in ((1, 3), (1, 1, 3)))
+        gsplat.spherical_harmonics(0, direction, harmonics)
     except Exception as error:  # torch, the driver and gsplat raise several types
         return f"the card cannot run gsplat's kernels: {first_line(error)}"
     return None
