@@ -35,6 +35,13 @@ WHITE_LEVEL = 250
 WHITE_SHARE = 0.5
 """A photograph is over-exposed if more than this share of its pixels is white."""
 
+FAULTS = (
+    "blurred: omit them, or retake them with more light, a steady hand and correct focus",
+    "too dark: retake them with more light",
+    "more than half white: retake them with less exposure, unless the background is white",
+)
+"""Faults of a photograph, and what to do."""
+
 SAME_PLACE = 0.01
 """Displacement of matches (90th percentile), as a share of the diagonal, below which two pictures count as
 the same. The median would be too small: around a centred object, half of the matches may barely move."""
@@ -68,16 +75,14 @@ Features = tuple[Float32[np.ndarray, "_ 2"], Float32[np.ndarray, "_ 128"], tuple
 class CheckedPhoto:
     """Properties of a photograph that the checks use.
 
-    `focal_px` is the focal length from EXIF, in px at full size, or None. `features` are those of an upright
-    copy, or None if the photograph isn't matched with its neighbours.
+    `focal_px` is the focal length from EXIF, in px at full size, or None. `faults` are some of `FAULTS`.
+    `features` are those of an upright copy, or None if the photograph isn't matched with its neighbours.
     """
 
     name: str
     size_hw: tuple[int, int]
     focal_px: float | None
-    is_blurred: bool
-    is_dark: bool
-    is_white: bool
+    faults: tuple[str, ...]
     features: Features | None
 
 
@@ -86,15 +91,11 @@ def checked_photo(
 ) -> CheckedPhoto:
     """Measure a photograph; only if it `is_matched`, its features are computed and kept."""
     grey = cv2.cvtColor(resize_to_fit(pixels, CHECK_SIDE_PX), cv2.COLOR_RGB2GRAY)
-    return CheckedPhoto(
-        name,
-        (pixels.shape[0], pixels.shape[1]),
-        focal_px,
-        is_blurred=blur(grey) > BLURRED,
-        is_dark=bool(np.percentile(grey, 95) < DARK_LEVEL),
-        is_white=bool((grey >= WHITE_LEVEL).mean() > WHITE_SHARE),
-        features=_features(resize_to_fit(grey, FEATURE_SIDE_PX)) if is_matched else None,
-    )
+    is_dark, is_white = np.percentile(grey, 95) < DARK_LEVEL, (grey >= WHITE_LEVEL).mean() > WHITE_SHARE
+    found = zip(FAULTS, (blur(grey) > BLURRED, is_dark, is_white), strict=True)
+    faults = tuple(fault for fault, is_found in found if is_found)
+    features = _features(resize_to_fit(grey, FEATURE_SIDE_PX)) if is_matched else None
+    return CheckedPhoto(name, (pixels.shape[0], pixels.shape[1]), focal_px, faults, features)
 
 
 def matched_rows(number: int) -> set[int]:
@@ -112,16 +113,9 @@ def photo_doubts(photos: Sequence[CheckedPhoto], *, have_poses: bool) -> list[st
     doubts = []
     if len(photos) < FEW_PHOTOS:
         doubts.append(f"only {len(photos)} photographs: take 20 or more, less than 10 degrees apart")
-    blurred = [photo.name for photo in photos if photo.is_blurred]
-    dark = [photo.name for photo in photos if photo.is_dark]
-    white = [photo.name for photo in photos if photo.is_white]
-    for names, advice in (
-        (blurred, "blurred: omit them, or retake them with more light, a steady hand and correct focus"),
-        (dark, "too dark: retake them with more light"),
-        (white, "more than half white: retake them with less exposure, unless the background is white"),
-    ):
-        if names:
-            doubts.append(f"{_listed(names, photos)} {advice}")
+    for fault in FAULTS:
+        if names := [photo.name for photo in photos if fault in photo.faults]:
+            doubts.append(f"{_listed(names, photos)} {fault}")
     if not have_poses:
         doubts += _lens_doubts(photos) + _motion_doubts(photos)
     return doubts

@@ -114,10 +114,9 @@ def test_points_are_triangulated_from_known_poses(tmp_path):
     assert report["points_from"] == "triangulated from the known poses"
 
 
-@pytest.mark.parametrize("settings", [{"mapper": "global"}, {"matcher": "retrieval"}])
-def test_other_mapper_and_matcher_pose_the_renders_too(tmp_path, settings):
+def test_the_global_mapper_poses_the_renders_too(tmp_path):
     plane_views(tmp_path / "renders")
-    run_poses(tmp_path / "renders", tmp_path / "scene", "w/c", "metre", True, PosesSettings(**settings), 0, 1)
+    pose_photos(tmp_path / "renders", tmp_path / "scene", mapper="global")
     assert len(Scene.load(tmp_path / "scene").cameras) == 5
 
 

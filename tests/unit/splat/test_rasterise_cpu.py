@@ -24,10 +24,10 @@ def everything(threads: int, order: str) -> list[np.ndarray]:
     gaussians = Gaussians(*(np.asarray(values, order=order) for values in vars(gaussians).values()))
     features = np.linspace(-1, 1, 1800, dtype=np.float32).reshape(300, 6)
     seen = draw(gaussians, view, 3, features=features, threads=threads)
-    gradients = seen.gradients(2 * seen.image, np.ones_like(seen.alpha))
+    by_parameter, by_mean_px = seen.gradients(2 * seen.image, np.ones_like(seen.alpha))
     matrix = pixel_weights(gaussians, view, min_weight=1e-3, threads=threads)
     sparse = [matrix.data, matrix.indices, matrix.indptr]
-    return [seen.image, seen.alpha, *vars(gradients).values(), *sparse]
+    return [seen.image, seen.alpha, *by_parameter, by_mean_px, *sparse]
 
 
 @pytest.mark.parametrize(

@@ -206,7 +206,6 @@ def test_gaussians_that_cannot_be_drawn_are_reported_with_the_scores(scene):
         scores()
 
 
-
 @STRATEGIES
 def test_a_resumed_fit_equals_an_uninterrupted_one(scene, tmp_path, monkeypatch, strategy):
     changes = {"strategy": strategy, "iterations": 24, "densify_every": 4, "checkpoint_every": 10}
