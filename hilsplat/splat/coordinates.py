@@ -62,7 +62,7 @@ def move_gaussians(gaussians: Gaussians, similarity: Float[np.ndarray, "4 4"]) -
     """
     scale, rotation, translation = decompose(similarity)
     g, turn = gaussians, sh_rotation(rotation, gaussians.sh_degree)
-    moved = Gaussians(*(np.empty_like(getattr(g, name)) for name in FIELDS))
+    moved = Gaussians(*(np.empty_like(getattr(g, name), order="C") for name in FIELDS))
     moved.opacity_logits[:] = g.opacity_logits
     for start in range(0, len(g), MOVED_TOGETHER):
         rows = slice(start, start + MOVED_TOGETHER)
