@@ -3,6 +3,8 @@
 They replace gsplat's kernels on machines without a device, and in float64 they are the backends' reference.
 """
 
+from typing import Any
+
 import torch
 from gsplat.cuda import _torch_impl as reference
 from torch import Tensor
@@ -45,6 +47,14 @@ def rasterization(
     weights = alpha * _light_before(alpha)
     image = torch.einsum("np,nc->pc", weights, colors[order]).reshape(1, height, width, -1)
     return image, weights.sum(dim=0).reshape(1, height, width, 1), notes
+
+
+def rasterization_of_view(*arguments: Any) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    """As `rasterization` with gsplat's defaults, for one viewmat and K."""
+    *gaussians, viewmat, K, width, height = arguments
+    options = {"radius_clip": 0, "rasterize_mode": "classic", "packed": False, "sh_degree": None}
+    size = {"width": width, "height": height}
+    return rasterization(*gaussians, viewmat[None], K[None], **size, near_plane=0.01, eps2d=0.3, **options)
 
 
 def rasterize_to_indices_in_range(

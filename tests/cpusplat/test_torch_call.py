@@ -35,11 +35,8 @@ def reference(gaussians: dict, cameras: dict, mode: str, sh_degree: int | None, 
             channels = channels.clamp(min=0)
         depth = means @ viewmat[2, :3] + viewmat[2, 3]
         channels = torch.cat([channels, depth[:, None]], dim=1)
-        rows = means, quats, scales, opacities, channels, viewmat[None], K[None]
-        options = {"radius_clip": 0, "rasterize_mode": "classic", "packed": False, "sh_degree": None}
-        image, alpha, meta = gsplat_on_cpu.rasterization(
-            *rows, cameras["width"], cameras["height"], near_plane=0.01, eps2d=0.3, **options
-        )
+        rows, size = (means, quats, scales, opacities, channels), (cameras["width"], cameras["height"])
+        image, alpha, meta = gsplat_on_cpu.rasterization_of_view(*rows, viewmat, K, *size)
         shown = image[..., :-1] + (1 - alpha) * torch.tensor(backgrounds[number]).double()
         depth = image[..., -1:] / alpha.clamp(min=1e-10) if "ED" in mode else image[..., -1:]
         parts = ([shown] if "RGB" in mode else []) + ([depth] if "D" in mode else [])
