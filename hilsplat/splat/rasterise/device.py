@@ -5,6 +5,7 @@ import io
 import logging
 import os
 import socket
+import warnings
 from collections.abc import Iterator
 from functools import cache
 from importlib.util import find_spec
@@ -43,7 +44,11 @@ def cuda_problem() -> str | None:
         import gsplat
         import torch
 
-        if not torch.cuda.is_available():
+        with warnings.catch_warnings(record=True, action="always") as caught:
+            is_available = torch.cuda.is_available()
+        if not is_available and caught:  # such as of an old driver
+            return f"CUDA cannot be used: {first_line(caught[-1].message)}"
+        if not is_available:
             return f"torch {torch.__version__} finds no CUDA device"
         # a compilation that fails takes minutes, and each stage runs in its own process
         versions = [torch.__version__, str(torch.version.cuda), gsplat.__version__]

@@ -3,6 +3,7 @@
 import logging
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
 from types import SimpleNamespace
 
@@ -175,14 +176,22 @@ def test_a_self_test_that_fails_selects_the_cpu(card, caplog):
     assert "the self-test on CUDA failed: " in caplog.text
 
 
-def test_a_broken_driver_selects_the_cpu(card, monkeypatch, caplog):
+def raised() -> bool:
+    raise RuntimeError("the driver is broken\nmore")
+
+
+def warned() -> bool:
+    warnings.warn("the driver is too old (found version 11040)\nmore", stacklevel=1)
+    return False
+
+
+@pytest.mark.parametrize("is_available", [raised, warned])
+def test_a_driver_that_cannot_be_used_selects_the_cpu_with_a_warning(card, monkeypatch, caplog, is_available):
     card(object())
-
-    def fail() -> bool:
-        raise RuntimeError("Unexpected error from cudaGetDeviceCount()\ndriver too old")
-
-    monkeypatch.setattr("torch.cuda.is_available", fail)
-    assert choose_device("auto") == "cpu" and "Unexpected error from cudaGetDeviceCount()" in caplog.text
+    monkeypatch.setattr("torch.cuda.is_available", is_available)
+    assert choose_device("auto") == "cpu"
+    (line,) = [each.message for each in caplog.records if each.levelname == "WARNING"]
+    assert ": the driver is " in line and "more" not in line
 
 
 def test_the_cpu_is_selected_without_a_check_for_cuda(monkeypatch):
