@@ -182,7 +182,7 @@ def test_one_quaternion_that_is_not_a_rotation_leaves_out_its_view(change, tmp_p
         ({"sparse/0": 6, "sparse/1": 6}, "sparse/0"),
         ({"sparse": 6, "sparse/0": 3}, "sparse"),
         ({"sparse/model": 6}, "sparse/model"),
-        ({".": 6}, "."),  # RealityCapture
+        ({".": 6}, "."),
         ({"sparse/0": 3, ".": 6}, "."),
     ],
 )
