@@ -13,9 +13,9 @@ from hilsplat.configuration import StageSettings
 from hilsplat.datasets.images.hi import annotated_regions
 from hilsplat.embed.clip import ClipModel
 from hilsplat.embed.langsplat_files import read_view, read_views, require_model
-from hilsplat.scene.assemble import photo_of
+from hilsplat.scene.assemble import photo_of, pinhole_of
 from hilsplat.scene.cameras import Camera
-from hilsplat.scene.colmap import is_pinhole, pycolmap
+from hilsplat.scene.colmap import is_pinhole
 from hilsplat.scene.importers.importing import fitted_camera
 from hilsplat.scene.importers.reading import read_source
 from hilsplat.scene.layouts import (
@@ -112,17 +112,15 @@ def _poses(folder: Path, named: Path | None, settings: StageSettings, parts: Par
         photos = list_images(photo_folder(folder))
         return Views(dict(zip(view_names(photos), photos, strict=True)))
     source, views, max_side_px = read_source(known), Views(), settings.poses.max_side_px
-    options = pycolmap.UndistortCameraOptions()
-    options.max_image_size = max_side_px
     with_image = {view.image: view for view in source.views if view.image is not None}
     for (image, view), name in zip(with_image.items(), view_names([*with_image]), strict=True):
         try:
             lens, photo, _ = fitted_camera(view, max_side_px)
+            if not is_pinhole(lens):
+                photo, lens = photo or photo_of(lens), pinhole_of(name, lens, max_side_px)
         except ImageError as error:
             source.drop(view, error)
             continue
-        if not is_pinhole(lens):
-            photo, lens = photo or photo_of(lens), pycolmap.undistort_camera(options, lens)
         views.held_out |= {name} if view.is_test else set()
         views.photos[name] = image
         K, size_hw = lens.calibration_matrix(), (lens.height, lens.width)

@@ -134,6 +134,10 @@ def test_poses_that_the_run_would_refuse_are_refused(tmp_path):
     model(folder)
     assert "2 of 6 views of" in str(new(folder, tmp_path / "p").exception)
     assert not (tmp_path / "p/config/scenes.tsv").exists()
+    names = {f"{name}.jpg": pose for name, pose in zip(PICTURES, POSES, strict=True)}
+    world.write_colmap(folder / "sparse/0", "OPENCV 60 60 32 24 -1.5 0 0 0", (WIDTH, HEIGHT), names, POINTS)
+    assert "lens distortion of view 000.png cannot be undone" in str(new(folder, tmp_path / "p").exception)
+    model(folder)
     Image.new("RGB", (HEIGHT, HEIGHT)).save(folder / "images/004.jpg")
     photographs(folder / "images", 3)
     error = str(new(folder, tmp_path / "p").exception)
