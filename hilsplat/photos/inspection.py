@@ -18,10 +18,6 @@ OTHER_PHOTO_SUFFIXES = frozenset({".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf"
 """Suffixes of unsupported photograph formats. Such files are counted and reported as skipped."""
 
 
-MAX_GROUPS = 5
-"""Maximum number of groups of identical photographs that are listed."""
-
-
 @dataclass(frozen=True)
 class PhotoReport:
     """Report on a folder of photographs.
@@ -58,10 +54,9 @@ class PhotoReport:
             lines.append(f"  {count:>5}  of {width} x {height} px (width x height)")
         if self.num_rotated:
             lines.append(f"  {self.num_rotated:>5}  rotated upright according to their EXIF orientation")
-        for names in self.duplicates[:MAX_GROUPS]:
-            lines.append(f"  {len(names):>5}  are identical: {shorten_list(names, 5)}")
-        if (num_more := len(self.duplicates) - MAX_GROUPS) > 0:
-            lines.append(f"         and {num_more} more groups of identical photographs")
+        if copies := sum(len(names) - 1 for names in self.duplicates):
+            equal = shorten_list([" = ".join(names) for names in self.duplicates], 5)
+            lines.append(f"  {copies:>5}  are copies of others: {equal}")
         for suffix, count in sorted(self.passed_over.items()):
             lines.append(f"  {count:>5}  {suffix} files skipped: convert them to JPEG or PNG to use them")
         if self.unreadable:

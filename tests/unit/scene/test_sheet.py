@@ -245,8 +245,9 @@ def test_inspection_finds_damaged_turned_and_copied_photographs(tmp_path):
     assert "truncated" in unreadable["truncated.jpg"]
     assert report.passed_over == {".nef": 1}
     assert "5 photographs in" in str(report) and "4  of 40 x 30 px" in str(report)
-    many = str(replace(report, duplicates=(("a.jpg", "b.jpg"),) * 8))
-    assert many.count("2  are identical: a.jpg, b.jpg") == 5 and "and 3 more groups of identical" in many
+    assert "1  are copies of others: 1.jpg = copy.jpg" in str(report)
+    many = str(replace(report, duplicates=(("a.jpg", "b.jpg", "c.jpg"),) * 8))
+    assert "16  are copies of others" in many and many.count("a.jpg = b.jpg = c.jpg") == 5
 
 
 @pytest.mark.parametrize(("columns", "more"), [(5, ""), (6, "\t-")])
