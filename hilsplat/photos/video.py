@@ -1,6 +1,7 @@
 """Extraction of photographs from videos: the sharpest frame of each section of the camera path."""
 
 import logging
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -213,7 +214,10 @@ def _candidates(video: Path, position: int, max_spans: int, decoding: Decoding) 
         if (num_streams := len(container.streams.video)) > 1:
             used = f"{stream.index} ({stream.width} x {stream.height} px)"
             decoding.notes.append(f"video stream {used} is used, the best of {num_streams}")
-        if stream.duration is not None and stream.time_base is not None:
+        tag = re.fullmatch(r"(\d+):(\d\d):(\d\d[.\d]*)", stream.metadata.get("DURATION", ""))
+        if tag is not None:  # Matroska; the container's duration is that of the longest stream
+            decoding.stated_s = 3600 * int(tag[1]) + 60 * int(tag[2]) + float(tag[3])
+        elif stream.duration is not None and stream.time_base is not None:
             decoding.stated_s = float(stream.duration * stream.time_base)
         elif container.duration is not None:
             decoding.stated_s = container.duration / av.time_base

@@ -112,6 +112,12 @@ def test_the_best_stream_is_used_and_others_are_reported(tmp_path, case, suffix)
     assert notes[0].endswith(f"of {len(STREAMS[case])}")
 
 
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+def test_a_video_that_ends_before_another_stream_is_complete(tmp_path, suffix):
+    _, notes = extracted(write(tmp_path / f"a.{suffix}", MAIN, {**SMALL, "frames": 60}))
+    assert not any("ends after" in note for note in notes)
+
+
 def test_equal_streams_are_ranked_by_the_container(tmp_path):
     first, second = ({**MAIN, "turn": turn} for turn in (0.0, 1.5))
     streams = [{**first, "disposition": Disposition(0)}, {**second, "disposition": Disposition.default}]
