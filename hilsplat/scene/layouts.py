@@ -234,9 +234,9 @@ class KnownPoses:
 def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | None:
     """Find poses from COLMAP, transforms files, LLFF, Polycam or Record3D, in this order, or return None.
 
-    Of several COLMAP models, the one with the most images is taken. If `named` is a COLMAP model, a
-    transforms file, or a folder with either, it is used instead of the poses in `folder`; `NO_POSES` ignores
-    all poses.
+    Of several COLMAP models in `sparse/`, the one with the most images is taken; a model in the folder itself
+    comes last. If `named` is a COLMAP model, a transforms file, or a folder with either, it is used instead
+    of the poses in `folder`; `NO_POSES` ignores all poses.
 
     Raises:
         SceneError: there is a `sparse/` folder without a complete model, or `named` has no poses.
@@ -256,6 +256,7 @@ def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | No
         poses.append(("llff", (folder / POSES_BOUNDS,)))
     exports = (("polycam", polycam_folders(folder)), ("record3d", record3d_export(folder)))
     poses += [(kind, export) for kind, export in exports if export is not None]
+    poses += [("colmap", (folder,))] if model_files(folder) else []
     if poses:
         (kind, files), *others = poses
         return KnownPoses(folder, kind, files, tuple(paths[-1] for _, paths in others))
@@ -294,8 +295,8 @@ def model_files(folder: Path) -> list[Path]:
 
 
 def colmap_models(folder: Path) -> list[Path]:
-    """Return the folders of the COLMAP models in `sparse/` or in the folder, those with most images first."""
-    folders = [*sorted((folder / "sparse").glob("*/")), folder / "sparse", folder]
+    """Return the folders of the COLMAP models in `sparse/`, those with the most images first."""
+    folders = [*sorted((folder / "sparse").glob("*/")), folder / "sparse"]
     return sorted((model for model in folders if model_files(model)), key=lambda model: -_num_images(model))
 
 

@@ -183,7 +183,7 @@ def test_one_quaternion_that_is_not_a_rotation_leaves_out_its_view(change, tmp_p
         ({"sparse": 6, "sparse/0": 3}, "sparse"),
         ({"sparse/model": 6}, "sparse/model"),
         ({".": 6}, "."),
-        ({"sparse/0": 3, ".": 6}, "."),
+        ({"sparse/0": 6, ".": 3}, "sparse/0"),
     ],
 )
 @pytest.mark.parametrize("form", ["text", "binary"])
