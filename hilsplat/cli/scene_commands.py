@@ -88,15 +88,7 @@ def new(
 
     settings = settings_of_photographs(sheet.with_name("config.yaml"), name)
     parts = {"poses": poses, "gaussians": gaussians, "features": features, "labels": labels}
-    report = add_scene(
-        sheet,
-        name,
-        photos,
-        frames=frames,
-        **parts,
-        settings=settings.poses,
-        dry_run=dry_run,
-    )
+    report = add_scene(sheet, name, photos, frames, **parts, settings=settings, dry_run=dry_run)
     if dry_run:
         echo(f"{report}\n\nnothing was added (--dry-run)")
         return

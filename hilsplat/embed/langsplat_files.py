@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float16
+from jaxtyping import Float16, UInt8
 
 from hilsplat.base.artifacts import read_npy, write_index, write_npy
 from hilsplat.base.atomic import atomic_folder
@@ -153,7 +153,8 @@ def run_imported_clip(
     with stage_log("langsplat clip", scene.name) as counts, atomic_folder(out) as folder:
         index = {}
         views, _ = read_views(files, {view: scene.cameras[view] for view in train_views(scene)}, levels)
-        _require_model(model, scene, files, views)
+        view = max(views, key=lambda view: len(views[view][0]))
+        require_model(model, files, view, scene.image(view), *views[view])
         for view, (masks, vectors) in views.items():
             write_npy(folder / f"{view}.npy", vectors)
             index[view] = {MASKS_SHA256: digest_of(masks), "masks": len(vectors)}
@@ -161,18 +162,22 @@ def run_imported_clip(
         counts.update(views=len(index), dim=model.width)
 
 
-def _require_model(
-    model: ClipModel, scene: Scene, files: Path, views: dict[str, tuple[HierarchicalMasks, np.ndarray]]
+def require_model(
+    model: ClipModel,
+    files: Path,
+    view: str,
+    image: UInt8[np.ndarray, "H W 3"],
+    masks: HierarchicalMasks,
+    vectors: Float16[np.ndarray, "M C"],
 ) -> None:
-    """Embed some masks of a view again, as LangSplat does, and compare the vectors.
+    """Raise MisalignedArtifactError unless the vectors of a view, from `read_view`, are those of a model.
 
-    Comparing only widths would not distinguish all CLIP models.
+    Some masks are embedded again, as LangSplat does, and the vectors are compared. Comparing only widths
+    would not distinguish all CLIP models.
     """
-    view = max(views, key=lambda view: len(views[view][0]))
-    masks, vectors = views[view]
     model.require_width(vectors.shape[1], f"{files / stem_of(view)}_f.npy")
     rows = np.arange(len(masks))[:: max(1, len(masks) // CHECKED_MASKS)]
-    again = model.embed_masks(scene.image(view), masks, ClipSettings(crop="langsplat"), rows)
+    again = model.embed_masks(image, masks, ClipSettings(crop="langsplat"), rows)
     cosines = (again.astype(np.float32) * vectors[rows].astype(np.float32)).sum(axis=1)
     cosine = float(np.median(cosines)) if len(rows) else 1.0
     logger.info("the CLIP model in %s agrees with %s: median cosine %.3f", model.model.folder, files, cosine)

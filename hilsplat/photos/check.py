@@ -4,14 +4,15 @@ Thresholds were chosen on three sets of real photographs that all register, on b
 over-exposed copies of them, and on pictures from a camera that only rotates (values: docs/scene.md).
 """
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
+from hilsplat.base.errors import shorten_list
 from hilsplat.base.images import resize_to_fit
 
 FEW_PHOTOS = 10
@@ -33,6 +34,13 @@ DARK_LEVEL = 64
 WHITE_LEVEL = 250
 WHITE_SHARE = 0.5
 """A photograph is over-exposed if more than this share of its pixels is white."""
+
+FAULTS = (
+    "blurred: omit them, or retake them with more light, a steady hand and correct focus",
+    "too dark: retake them with more light",
+    "more than half white: retake them with less exposure, unless the background is white",
+)
+"""Faults of a photograph, and what to do."""
 
 SAME_PLACE = 0.01
 """Displacement of matches (90th percentile), as a share of the diagonal, below which two pictures count as
@@ -59,22 +67,41 @@ FOCALS = (0.6, 0.75, 0.9, 1.1, 1.35, 1.7, 2.2, 3.0)
 MAX_NAMED = 5
 """Maximum number of photographs or sizes that a doubt names."""
 
-Features = tuple[Float32[np.ndarray, "_ 2"], Float32[np.ndarray, "_ 128"]]
-"""SIFT positions in px and RootSIFT descriptors."""
+Features = tuple[Float32[np.ndarray, "_ 2"], Float32[np.ndarray, "_ 128"], tuple[int, int]]
+"""SIFT positions in px, RootSIFT descriptors, and height and width of the picture that has them."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CheckedPhoto:
     """Properties of a photograph that the checks use.
 
-    `focal_px` is the focal length from EXIF, in px at full size, or None. `grey` is an upright grey copy
-    whose longer side is at most `CHECK_SIDE_PX`.
+    `focal_px` is the focal length from EXIF, in px at full size, or None. `faults` are some of `FAULTS`.
+    `features` are those of an upright copy, or None if the photograph isn't matched with its neighbours.
     """
 
     name: str
     size_hw: tuple[int, int]
     focal_px: float | None
-    grey: UInt8[np.ndarray, "h w"]
+    faults: tuple[str, ...]
+    features: Features | None
+
+
+def checked_photo(
+    name: str, pixels: UInt8[np.ndarray, "H W 3"], focal_px: float | None, *, is_matched: bool
+) -> CheckedPhoto:
+    """Measure a photograph; only if it `is_matched`, its features are computed and kept."""
+    grey = cv2.cvtColor(resize_to_fit(pixels, CHECK_SIDE_PX), cv2.COLOR_RGB2GRAY)
+    is_dark, is_white = np.percentile(grey, 95) < DARK_LEVEL, (grey >= WHITE_LEVEL).mean() > WHITE_SHARE
+    found = zip(FAULTS, (blur(grey) > BLURRED, is_dark, is_white), strict=True)
+    faults = tuple(fault for fault, is_found in found if is_found)
+    features = _features(resize_to_fit(grey, FEATURE_SIDE_PX)) if is_matched else None
+    return CheckedPhoto(name, (pixels.shape[0], pixels.shape[1]), focal_px, faults, features)
+
+
+def matched_rows(number: int) -> set[int]:
+    """Return the rows of at most `MAX_PAIRS` evenly spaced pairs of neighbours among photographs."""
+    first = np.linspace(0, max(number - 2, 0), min(max(number - 1, 0), MAX_PAIRS)).round().astype(int)
+    return {*first.tolist(), *(first + 1).tolist()}
 
 
 def photo_doubts(photos: Sequence[CheckedPhoto], *, have_poses: bool) -> list[str]:
@@ -86,16 +113,9 @@ def photo_doubts(photos: Sequence[CheckedPhoto], *, have_poses: bool) -> list[st
     doubts = []
     if len(photos) < FEW_PHOTOS:
         doubts.append(f"only {len(photos)} photographs: take 20 or more, less than 10 degrees apart")
-    blurred = [photo.name for photo in photos if blur(photo.grey) > BLURRED]
-    dark = [photo.name for photo in photos if np.percentile(photo.grey, 95) < DARK_LEVEL]
-    white = [photo.name for photo in photos if (photo.grey >= WHITE_LEVEL).mean() > WHITE_SHARE]
-    for names, advice in (
-        (blurred, "blurred: omit them, or retake them with more light, a steady hand and correct focus"),
-        (dark, "too dark: retake them with more light"),
-        (white, "more than half white: retake them with less exposure, unless the background is white"),
-    ):
-        if names:
-            doubts.append(f"{_listed(names, photos)} {advice}")
+    for fault in FAULTS:
+        if names := [photo.name for photo in photos if fault in photo.faults]:
+            doubts.append(f"{_listed(names, photos)} {fault}")
     if not have_poses:
         doubts += _lens_doubts(photos) + _motion_doubts(photos)
     return doubts
@@ -120,18 +140,15 @@ def _lens_doubts(photos: Sequence[CheckedPhoto]) -> list[str]:
 
 def _motion_doubts(photos: Sequence[CheckedPhoto]) -> list[str]:
     """Return problems with the camera's motion, measured by matching neighbouring photographs."""
-    last = len(photos) - 1
-    rows = sorted(set(np.linspace(0, last - 1, min(last, MAX_PAIRS)).round().astype(int))) if last > 0 else []
-    small = functools.cache(lambda row: resize_to_fit(photos[row].grey, FEATURE_SIDE_PX))
-    features = functools.cache(lambda row: _features(small(row)))
     same, turned, moved = [], 0, 0
-    for row in rows:
-        motion = pair_motion(features(row), features(row + 1), small(row).shape)
-        if motion is None:
+    for one, other in pairwise(photos):
+        if one.features is None or other.features is None:
+            continue
+        if (motion := pair_motion(one.features, other.features)) is None:
             continue
         displacement, turn_share = motion
         if displacement < SAME_PLACE:
-            same.append(photos[row + 1].name)
+            same.append(other.name)
         elif turn_share >= TURN_SHARE:
             turned += 1
         else:
@@ -153,9 +170,8 @@ def _motion_doubts(photos: Sequence[CheckedPhoto]) -> list[str]:
 
 def _listed(names: Sequence[str], photos: Sequence[CheckedPhoto]) -> str:
     """Format a list, such as "3 of 40 photographs (a.jpg, b.jpg, c.jpg) are"."""
-    more = ", ..." if len(names) > MAX_NAMED else ""
     verb = "is" if len(names) == 1 else "are"
-    return f"{len(names)} of {len(photos)} photographs ({', '.join(names[:MAX_NAMED])}{more}) {verb}"
+    return f"{len(names)} of {len(photos)} photographs ({shorten_list(names, MAX_NAMED)}) {verb}"
 
 
 def blur(grey: UInt8[np.ndarray, "h w"]) -> float:
@@ -177,12 +193,13 @@ def blur(grey: UInt8[np.ndarray, "h w"]) -> float:
 def _features(grey: UInt8[np.ndarray, "h w"]) -> Features:
     points, descriptors = cv2.SIFT.create(NUM_FEATURES).detectAndCompute(grey, None)
     if descriptors is None:
-        return np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32)
+        return np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), grey.shape
     xy = np.array([point.pt for point in points], dtype=np.float32)
-    return xy, np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
+    descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
+    return xy, descriptors, grey.shape
 
 
-def pair_motion(one: Features, other: Features, size_hw: tuple[int, int]) -> tuple[float, float] | None:
+def pair_motion(one: Features, other: Features) -> tuple[float, float] | None:
     """Measure the motion between two pictures, or return None if too few matches fit an epipolar geometry.
 
     Return the displacement of the verified matches (90th percentile, as a share of the diagonal) and the
@@ -209,6 +226,7 @@ def pair_motion(one: Features, other: Features, size_hw: tuple[int, int]) -> tup
     if inliers is None or inliers.sum() < MIN_MATCHES:
         return None
     a, b = a[inliers.ravel() > 0].astype(np.float64), b[inliers.ravel() > 0].astype(np.float64)
+    size_hw = one[2]
     displacement = float(np.percentile(np.linalg.norm(b - a, axis=1), 90) / np.hypot(*size_hw))
     return displacement, max(_turn_share(a, b, size_hw, focal * max(size_hw)) for focal in FOCALS)
 

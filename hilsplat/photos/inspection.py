@@ -4,14 +4,12 @@ from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
-
-from hilsplat.base.errors import ImageError, first_line
+from hilsplat.base.errors import ImageError, first_line, shorten_list
 from hilsplat.base.files import list_images
-from hilsplat.base.images import opened_image, orientation, read_image, require_usable_size, resize_to_fit
+from hilsplat.base.images import opened_image, orientation, read_image, require_usable_size
 from hilsplat.base.lineage import sha256_of_file
 from hilsplat.base.progress import track
-from hilsplat.photos.check import CHECK_SIDE_PX, CheckedPhoto, photo_doubts
+from hilsplat.photos.check import CheckedPhoto, checked_photo, matched_rows, photo_doubts
 from hilsplat.scene.features import exif_focal_px
 from hilsplat.scene.layouts import has_known_poses, photo_folder
 from hilsplat.scene.view_names import view_names
@@ -56,8 +54,9 @@ class PhotoReport:
             lines.append(f"  {count:>5}  of {width} x {height} px (width x height)")
         if self.num_rotated:
             lines.append(f"  {self.num_rotated:>5}  rotated upright according to their EXIF orientation")
-        for names in self.duplicates:
-            lines.append(f"  {len(names):>5}  are identical: {', '.join(names)}")
+        if copies := sum(len(names) - 1 for names in self.duplicates):
+            equal = shorten_list([" = ".join(names) for names in self.duplicates], 5)
+            lines.append(f"  {copies:>5}  are copies of others: {equal}")
         for suffix, count in sorted(self.passed_over.items()):
             lines.append(f"  {count:>5}  {suffix} files skipped: convert them to JPEG or PNG to use them")
         if self.unreadable:
@@ -82,7 +81,8 @@ def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
     by_digest: dict[str, list[str]] = defaultdict(list)
     num_rotated = 0
     checked: list[CheckedPhoto] = []
-    for path in track(photos, "photographs checked"):
+    matched, have_poses = matched_rows(len(photos)), has_known_poses(folder, poses)
+    for row, path in enumerate(track(photos, "photographs checked")):
         try:
             pixels = read_image(path)
             require_usable_size(path, pixels.shape[:2])
@@ -95,8 +95,8 @@ def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
         sizes[size_hw] += 1
         with opened_image(path) as image:
             num_rotated += orientation(image) > 1
-        grey = cv2.cvtColor(resize_to_fit(pixels, CHECK_SIDE_PX), cv2.COLOR_RGB2GRAY)
-        checked.append(CheckedPhoto(path.name, size_hw, exif_focal_px(path, size_hw), grey))
+        is_matched = row in matched and not have_poses
+        checked.append(checked_photo(path.name, pixels, exif_focal_px(path, size_hw), is_matched=is_matched))
         by_digest[sha256_of_file(path)].append(path.name)
     copies = {name for names in by_digest.values() for name in names[1:]}
     distinct = [photo for photo in checked if photo.name not in copies]
@@ -108,5 +108,5 @@ def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
         num_rotated=num_rotated,
         duplicates=tuple(tuple(names) for names in by_digest.values() if len(names) > 1),
         passed_over={suffix: count for suffix, count in suffixes.items() if suffix in OTHER_PHOTO_SUFFIXES},
-        doubts=tuple(photo_doubts(distinct, have_poses=has_known_poses(folder, poses))),
+        doubts=tuple(photo_doubts(distinct, have_poses=have_poses)),
     )

@@ -4,6 +4,7 @@ import os
 import stat
 import struct
 import zipfile
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path, PurePosixPath
@@ -14,7 +15,7 @@ from hilsplat.base.errors import HilsplatError, SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_outside, list_files, list_images
 from hilsplat.base.lineage import CONVERTED
 from hilsplat.base.removal import undone_on_error
-from hilsplat.scene.layouts import has_known_poses, photo_folder, unwrapped
+from hilsplat.scene.layouts import UNREAD_GAUSSIANS, has_known_poses, photo_folder, unwrapped
 
 MAX_FILES = 50_000
 MAX_TOTAL_GIB = 20
@@ -47,10 +48,13 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tu
         yield unwrapped(source), [note] if beside else []
         return
     if not videos and source.suffix.lower() not in (".zip", ".r3d"):
+        fix = "pass the folder that contains the photographs; unpack other archives than .zip first"
+        if source.suffix.lower() in (".ply", *UNREAD_GAUSSIANS):
+            fix = "pass the folder of the photographs and their poses, and --gaussians with a 3DGS PLY"
         raise SceneError(
             f"{source} has an unsupported file type",
             expected=f"a folder of photographs, a video ({', '.join(sorted(VIDEO_SUFFIXES))}), or a .zip",
-            fix="pass the folder that contains the photographs",
+            fix=fix,
         )
     files = [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in videos or [source]]
     mark = {"files": files, "frames": frames}
@@ -103,6 +107,14 @@ def unpack_photographs(archive: Path, folder: Path) -> None:
             entries = [entry for entry in listed if not entry.filename.endswith(("/", "\\"))]
             _check_entries(archive, entries)
             chosen = [entry for entry in entries if _is_wanted(PurePosixPath(entry.filename))]
+            suffixes = Counter(PurePosixPath(entry.filename).suffix.lower() for entry in entries)
+            if not IMAGE_SUFFIXES & suffixes.keys():
+                raise SceneError(
+                    f"archive {archive} contains no photographs",
+                    expected=f"images: {' '.join(sorted(IMAGE_SUFFIXES))}",
+                    found=", ".join(f"{count} files ({suffix})" for suffix, count in suffixes.items()),
+                    fix="unpack it yourself, and pass the folder of the photographs, or the video",
+                )
             require_free_space(folder, sum(entry.file_size for entry in chosen) / 2**20 + 200)
             opened.extractall(folder, chosen)  # stops at the declared size; checks the CRC
             for entry in chosen:

@@ -1,6 +1,7 @@
 """Extraction of photographs from videos: the sharpest frame of each section of the camera path."""
 
 import logging
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -213,17 +214,24 @@ def _candidates(video: Path, position: int, max_spans: int, decoding: Decoding) 
         if (num_streams := len(container.streams.video)) > 1:
             used = f"{stream.index} ({stream.width} x {stream.height} px)"
             decoding.notes.append(f"video stream {used} is used, the best of {num_streams}")
-        if stream.duration is not None and stream.time_base is not None:
+        tag = re.fullmatch(r"(\d+):(\d\d):(\d\d[.\d]*)", stream.metadata.get("DURATION", ""))
+        if tag is not None:  # Matroska; the container's duration is that of the longest stream
+            decoding.stated_s = 3600 * int(tag[1]) + 60 * int(tag[2]) + float(tag[3])
+        elif stream.duration is not None and stream.time_base is not None:
             decoding.stated_s = float(stream.duration * stream.time_base)
         elif container.duration is not None:
-            # Matroska's duration may include the time before the first frame.
-            decoding.stated_s = (container.duration - max(container.start_time or 0, 0)) / av.time_base
-        span_s = max((decoding.stated_s or 0.0) / max_spans, 1e-3)
+            decoding.stated_s = container.duration / av.time_base
         expected = round((decoding.stated_s or 0.0) * float(stream.average_rate or USUAL_RATE)) or None
         decoded = track(_decoded(container, stream, decoding), f"frames of {video.name}", expected)
         for number, (frame, time_s) in enumerate(decoded):
-            if number == 0 and frame.interlaced_frame:
-                decoding.notes.append("it is interlaced: deinterlace it first if edges are combed")
+            if number == 0:
+                stated_s, before_s = decoding.stated_s or 0.0, frame.time or 0.0
+                # Matroska's duration includes the time before the first frame.
+                if "matroska" in container.format.name and 0 < before_s < stated_s:
+                    decoding.stated_s = stated_s = stated_s - before_s
+                span_s = max(stated_s / max_spans, 1e-3)
+                if frame.interlaced_frame:
+                    decoding.notes.append("it is interlaced: deinterlace it first if edges are combed")
             row = int(time_s / span_s)
             score = sharpness(_grey(frame, SHARPNESS_SIDE_PX))
             if row in best and best[row].sharpness >= score:

@@ -64,31 +64,41 @@ def undistort(view: PosedView, folder: Path, max_side_px: int = 2**16) -> PosedV
     if is_pinhole(view.camera):
         shutil.copyfile(view.image, target)
         return replace(view, image=target)
+    camera = pinhole_of(view.view, view.camera, max_side_px)
     bitmap = pycolmap.Bitmap.from_array(read_image(view.image))
-    options = pycolmap.UndistortCameraOptions()
-    options.max_image_size = max_side_px
-    warped, camera = pycolmap.undistort_image(options, bitmap, view.camera)
-    require_usable_size(view.view, (camera.height, camera.width))
-    _require_invertible(view, camera)
+    warped, _ = pycolmap.undistort_image(_options(max_side_px), bitmap, view.camera)
     write_png(target, warped.to_array())
     return replace(view, image=target, camera=camera, photo=view.photo or photo_of(view.camera))
 
 
-def _require_invertible(view: PosedView, pinhole: pycolmap.Camera) -> None:
-    """Raise ImageError if a lens maps several directions within the pinhole image to one pixel."""
+def _options(max_side_px: int) -> pycolmap.UndistortCameraOptions:
+    options = pycolmap.UndistortCameraOptions()
+    options.max_image_size = max_side_px
+    return options
+
+
+def pinhole_of(view: str, lens: pycolmap.Camera, max_side_px: int) -> pycolmap.Camera:
+    """Return the camera of a view's undistorted image (`undistort`).
+
+    Raises:
+        ImageError: the image would be too small, or the lens maps several directions in it to one pixel.
+    """
+    pinhole = pycolmap.undistort_camera(_options(max_side_px), lens)
+    require_usable_size(view, (pinhole.height, pinhole.width))
     across = (np.linspace(0, side, CHECKED_DIRECTIONS) for side in (pinhole.width, pinhole.height))
     xy = np.stack(np.meshgrid(*across), axis=-1).reshape(-1, 2)
     directions = (xy - [pinhole.principal_point_x, pinhole.principal_point_y]) / pinhole.mean_focal_length()
-    pixels = view.camera.img_from_cam(np.column_stack([directions, np.ones(len(xy))]))
-    inverse = np.asarray(view.camera.cam_from_img(np.asarray(pixels)))
+    pixels = lens.img_from_cam(np.column_stack([directions, np.ones(len(xy))]))
+    inverse = np.asarray(lens.cam_from_img(np.asarray(pixels)))
     shift_px = np.abs(inverse - directions).max() * pinhole.mean_focal_length()
     if not (shift_px < MAX_SHIFT_PX):  # also true for NaN
         raise ImageError(
-            f"the lens distortion of view {view.view} cannot be undone",
+            f"the lens distortion of view {view} cannot be undone",
             expected="a lens that maps each direction in the image to another pixel",
-            found=f"{view.camera.model_name} {np.round(view.camera.params, 6).tolist()}",
+            found=f"{lens.model_name} {np.round(lens.params, 6).tolist()}",
             fix="correct the lens, or undistort the image with the program that calibrated it",
         )
+    return pinhole
 
 
 def up_direction(cam_from_source: Float64[np.ndarray, "V 4 4"]) -> Float64[np.ndarray, " 3"]:

@@ -28,6 +28,8 @@ FIX = (
 COPY_AGAIN = "copy it again from nerfstudio"
 KEY = "source_from_scene"
 TOLERANCE = 1e-5  # maximum deviation of a matrix from a scaled rotation, relative to the scale
+MOVED_TOGETHER = 2**16
+"""Number of Gaussians that are moved in float64 at once, to save memory."""
 BEFORE_APPLIED_TRANSFORM = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
 """Transform of COLMAP coordinates by `ns-process-data` versions that do not record `applied_transform`."""
 
@@ -59,16 +61,19 @@ def move_gaussians(gaussians: Gaussians, similarity: Float[np.ndarray, "4 4"]) -
     they are functions of the world direction. The errors are those of `decompose`.
     """
     scale, rotation, translation = decompose(similarity)
-    g = gaussians
-    means, log_scales, quats, sh = (a.astype(np.float64) for a in (g.means, g.log_scales, g.quats, g.sh))
-    moved = (
-        scale * np.einsum("ij,nj->ni", rotation, means) + translation,
-        log_scales + np.log(scale),
-        multiply(quaternion_of(rotation), quats),
-        g.opacity_logits.copy(),
-        np.einsum("kj,njc->nkc", sh_rotation(rotation, g.sh_degree), sh),
-    )
-    return Gaussians(*(np.ascontiguousarray(values, dtype=np.float32) for values in moved))
+    g, turn = gaussians, sh_rotation(rotation, gaussians.sh_degree)
+    moved = Gaussians(*(np.empty_like(getattr(g, name), order="C") for name in FIELDS))
+    moved.opacity_logits[:] = g.opacity_logits
+    for start in range(0, len(g), MOVED_TOGETHER):
+        rows = slice(start, start + MOVED_TOGETHER)
+        means, log_scales, quats, sh = (
+            a[rows].astype(np.float64) for a in (g.means, g.log_scales, g.quats, g.sh)
+        )
+        moved.means[rows] = scale * np.einsum("ij,nj->ni", rotation, means) + translation
+        moved.log_scales[rows] = log_scales + np.log(scale)
+        moved.quats[rows] = multiply(quaternion_of(rotation), quats)
+        moved.sh[rows] = np.einsum("kj,njc->nkc", turn, sh)
+    return moved
 
 
 def sh_basis(directions: Float64[np.ndarray, "P 3"], degree: int) -> Float64[np.ndarray, "P K"]:

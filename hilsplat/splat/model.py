@@ -10,6 +10,7 @@ from scipy.special import expit
 from cpusplat.adam import adam_step
 from cpusplat.photometric import photometric_loss
 from cpusplat.threads import over_ranges
+from cpusplat.views import Parameters
 from hilsplat.base.images import to_float
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.gaussians import FIELDS, Gaussians
@@ -17,7 +18,6 @@ from hilsplat.splat.initial import TrainingView
 from hilsplat.splat.kernels import noise_rows
 from hilsplat.splat.rasterise.api import draw
 from hilsplat.splat.rasterise.device import Device
-from hilsplat.splat.rasterise.drawn import Gradients
 
 OPACITY_RATE = 0.05  # 3DGS
 SH_REST_SHARE = 1 / 20
@@ -166,15 +166,15 @@ class Model:
         loss, grad = photometric_loss(image, target, ssim_weight=settings.ssim_weight, threads=self.threads)
         if background.any():
             grad_alpha = -(grad @ background)
-        gradients = drawing.gradients(grad, grad_alpha)
+        gradients, by_mean_px = drawing.gradients(grad, grad_alpha)
         if is_regularised(settings):
             self.add_regularisers(gradients, settings, extent)
         if is_watched:
-            self.add_screen_gradients(gradients.means_px, drawing.drawn, view.camera.size_hw)
+            self.add_screen_gradients(by_mean_px, drawing.drawn, view.camera.size_hw)
         self.descend(gradients, step_sizes(settings, extent * rate))
         return lambda: (loss, float(np.square(image - target).mean(dtype=np.float64)))
 
-    def add_regularisers(self, gradients: Gradients, settings: GaussiansSettings, extent: float) -> None:
+    def add_regularisers(self, gradients: Parameters, settings: GaussiansSettings, extent: float) -> None:
         """Add the gradients of opacity_weight x mean opacity + scale_weight x mean scale (MCMC, Eq. 10).
 
         Scales are in units of the extent.
@@ -194,7 +194,7 @@ class Model:
         self.total += np.sqrt(x * x + y * y)
         self.seen += drawn
 
-    def descend(self, gradients: Gradients, rates: dict[str, float]) -> None:
+    def descend(self, gradients: Parameters, rates: dict[str, float]) -> None:
         """Take one step of Adam with the given step sizes (see `step_sizes`)."""
         self.steps += 1
         for name, rate in rates.items():

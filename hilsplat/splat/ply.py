@@ -56,7 +56,7 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
     n, sh = len(gaussians), gaussians.sh
     columns = (
         gaussians.means,
-        np.zeros((n, 3)),
+        np.zeros((n, 3), np.float32),
         sh[:, 0],
         sh[:, 1:].transpose(0, 2, 1).reshape(n, 3 * (sh.shape[1] - 1)),
         gaussians.opacity_logits[:, None],
@@ -99,19 +99,8 @@ def import_ply(path: Path, fix: str) -> tuple[Gaussians, list[str], list[str]]:
     """
     if not path.exists():
         raise ArtifactError(f"{path} is missing", fix=fix)
-    with foreign(path, ArtifactError, expected="a 3DGS PLY", fix=fix), np.errstate(over="ignore"):
-        ply = read_ply(path)
-        vertex = ply["vertex"]
-        kinds = {prop.name: vertex.data.dtype[prop.name].kind for prop in vertex.properties}
-        others = sorted({*kinds, *(element.name for element in ply)} - {*_names(16), "filter_3D", "vertex"})
-        for pattern, problem in REFUSED.items():
-            if refused := [name for name in others if re.fullmatch(pattern, name, re.IGNORECASE)]:
-                raise ArtifactError(f"{path} {problem}", found=", ".join(refused[:5]), fix=fix)
-        names = _columns(path, kinds, fix)
-        values = np.stack([np.asarray(vertex[name], dtype=np.float32) for name in names], axis=1)
-        if "filter_3D" in kinds:
-            _smooth(values, np.asarray(vertex["filter_3D"], np.float64))
-    notes = ["filter_3D was applied to scales and opacities"] if "filter_3D" in kinds else []
+    values, others, is_smoothed = _values(path, fix)
+    notes = ["filter_3D was applied to scales and opacities"] if is_smoothed else []
     infinite = np.isinf(values[:, -8])
     if infinite.any():
         values[infinite, -8] = np.copysign(SATURATED_LOGIT, values[infinite, -8])
@@ -122,7 +111,26 @@ def import_ply(path: Path, fix: str) -> tuple[Gaussians, list[str], list[str]]:
     if unusable.sum() > MAX_UNUSABLE * len(values):
         raise ArtifactError(f"{path}: {notes[-1].removeprefix('left out: ')}", fix=fix)
     unknown = {re.sub(r"\d+$", "*", name) for name in others if not HARMLESS.fullmatch(name)}
-    return _gaussians(values[~unusable]), notes, sorted(unknown)
+    return _gaussians(values[~unusable] if unusable.any() else values), notes, sorted(unknown)
+
+
+def _values(path: Path, fix: str) -> tuple[Float32[np.ndarray, "N P"], list[str], bool]:
+    """Read 3DGS's properties (`_columns`), the names of others, and whether `filter_3D` was applied."""
+    with foreign(path, ArtifactError, expected="a 3DGS PLY", fix=fix), np.errstate(over="ignore"):
+        ply = read_ply(path)
+        vertex = ply["vertex"]
+        kinds = {prop.name: vertex.data.dtype[prop.name].kind for prop in vertex.properties}
+        others = sorted({*kinds, *(element.name for element in ply)} - {*_names(16), "filter_3D", "vertex"})
+        for pattern, problem in REFUSED.items():
+            if refused := [name for name in others if re.fullmatch(pattern, name, re.IGNORECASE)]:
+                raise ArtifactError(f"{path} {problem}", found=", ".join(refused[:5]), fix=fix)
+        names = _columns(path, kinds, fix)
+        values = np.empty((len(vertex.data), len(names)), np.float32)
+        for column, name in enumerate(names):
+            values[:, column] = vertex[name]
+        if "filter_3D" in kinds:
+            _smooth(values, np.asarray(vertex["filter_3D"], np.float64))
+    return values, others, "filter_3D" in kinds
 
 
 def _columns(path: Path, kinds: dict[str, str], fix: str) -> list[str]:
@@ -143,11 +151,13 @@ def _columns(path: Path, kinds: dict[str, str], fix: str) -> list[str]:
 
 
 def _gaussians(values: Float32[np.ndarray, "N P"]) -> Gaussians:
-    num_rest = values.shape[1] - 14
-    means, dc, rest, opacity, scales, quats = np.split(values, np.cumsum([3, 3, num_rest, 1, 3]), axis=1)
-    rest = rest.reshape(len(values), 3, num_rest // 3).transpose(0, 2, 1)
-    sh = np.concatenate([dc[:, None], rest], axis=1)
-    return Gaussians(*(np.ascontiguousarray(column) for column in (means, scales, quats, opacity[:, 0], sh)))
+    num_others = (values.shape[1] - 14) // 3  # harmonics besides the constant one
+    sh = np.empty((len(values), 1 + num_others, 3), np.float32)
+    sh[:, 0] = values[:, 3:6]
+    for channel in range(3):
+        sh[:, 1:, channel] = values[:, 6 + channel * num_others :][:, :num_others]
+    columns = values[:, :3], values[:, -7:-4], values[:, -4:], values[:, -8], sh
+    return Gaussians(*map(np.ascontiguousarray, columns))
 
 
 def _smooth(values: Float32[np.ndarray, "N P"], filter_3d: Float64[np.ndarray, " N"]) -> None:
@@ -161,5 +171,7 @@ def _smooth(values: Float32[np.ndarray, "N P"], filter_3d: Float64[np.ndarray, "
 
 def _unusable(values: Float[np.ndarray, "N P"]) -> Bool[np.ndarray, " N"]:
     """Return which Gaussians have a value or scale that is not finite or too large, or no rotation."""
-    sound = (np.abs(values) < MAX_VALUE).all(axis=1) & (values[:, -7:-4] < np.log(MAX_VALUE)).all(axis=1)
+    # extremes instead of magnitudes, which would need as much memory as the values; NaN compares as false
+    sound = (values.max(axis=1) < MAX_VALUE) & (values.min(axis=1) > -MAX_VALUE)
+    sound &= (values[:, -7:-4] < np.log(MAX_VALUE)).all(axis=1)
     return ~sound | (np.linalg.norm(values[:, -4:].astype(np.float64), axis=1) < 1e-12)

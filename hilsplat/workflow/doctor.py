@@ -73,11 +73,11 @@ def libraries() -> Iterator[Finding]:
 
 def cuda() -> Iterator[Finding]:
     """Check whether torch and gsplat can use CUDA, and whether their renders match the CPU's."""
-    from hilsplat.splat.rasterise.device import cuda_problem, forget_cuda
+    from hilsplat.splat.rasterise.device import cuda_problem, forget_cuda, kernel_problem
     from hilsplat.splat.rasterise.parity import cuda_disagreement
 
     forget_cuda()
-    if problem := cuda_problem():
+    if problem := cuda_problem() or kernel_problem():
         fix = "on a machine with an NVIDIA GPU: pip install 'hilsplat[gpu]', and a CUDA toolkit (nvcc)"
         yield Finding("cuda", "note", f"{problem}: everything runs on the CPU", fix)
         return

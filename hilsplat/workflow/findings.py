@@ -1,15 +1,19 @@
 """What a scene's folder offers besides photographs: what will be used, what is left out, and why."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from hilsplat.base.errors import HilsplatError, ImageError, SceneError, in_one_line, shorten_list
 from hilsplat.base.files import list_images
+from hilsplat.base.images import image_size_hw, read_image
+from hilsplat.configuration import StageSettings
 from hilsplat.datasets.images.hi import annotated_regions
-from hilsplat.embed.langsplat_files import read_views
+from hilsplat.embed.clip import ClipModel
+from hilsplat.embed.langsplat_files import read_view, read_views, require_model
+from hilsplat.scene.assemble import photo_of, pinhole_of
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.colmap import is_pinhole
 from hilsplat.scene.importers.importing import fitted_camera
@@ -17,6 +21,7 @@ from hilsplat.scene.importers.reading import read_source
 from hilsplat.scene.layouts import (
     DATAPARSER,
     NO_POSES,
+    UNREAD_GAUSSIANS,
     dataparser_of,
     find_known_poses,
     has_known_poses,
@@ -24,13 +29,22 @@ from hilsplat.scene.layouts import (
     label_files,
     langsplat_features,
     langsplat_level,
+    model_files,
     photo_folder,
+    ply_header,
     trained_gaussians,
 )
 from hilsplat.scene.placement import placement
 from hilsplat.scene.view_names import match_names, view_names
-from hilsplat.settings import PosesSettings
 from hilsplat.splat.coordinates import read_gaussians
+
+MAX_UNDISTORTION = 0.1
+"""Relative change of the aspect ratio by undistortion, above which a drawing is of another picture. It is a
+few percent; 4:3 and 3:2 differ by 12 %."""
+
+
+UNREAD_POSES = ("*.xml", "cameras.json", "*.nvm", "bundle.out", "*.sfm")
+"""Poses that Metashape, 3DGS, VisualSFM, Bundler and Meshroom write."""
 
 
 @dataclass
@@ -48,11 +62,22 @@ class Parts:
     lines: list[str] = field(default_factory=list)
 
 
-Views = Mapping[str, Camera | None]
-"""The views to be expected, and their cameras if these are known and have no distortion."""
+@dataclass
+class Views:
+    """The views to be expected.
+
+    Attributes:
+        photos: photographs, by view.
+        cameras: cameras after undistortion, by view; empty if the poses are unknown.
+        held_out: views that the source of the poses holds out.
+    """
+
+    photos: dict[str, Path] = field(default_factory=dict)
+    cameras: dict[str, Camera] = field(default_factory=dict)
+    held_out: set[str] = field(default_factory=set)
 
 
-def find_parts(folder: Path, named: dict[str, Path | None], settings: PosesSettings) -> Parts:
+def find_parts(folder: Path, named: dict[str, Path | None], settings: StageSettings) -> Parts:
     """Find poses, Gaussians, features and labels: those that the user named, or else those in the folder.
 
     Without known poses, the coordinates of another program's Gaussians are unknown, so these are ignored.
@@ -64,53 +89,63 @@ def find_parts(folder: Path, named: dict[str, Path | None], settings: PosesSetti
         if path is not None and path != NO_POSES and not path.exists():
             raise SceneError(f"--{what} {path} is missing", fix="correct the path, or pass `none`")
     parts = Parts()
-    views, held_out = _poses(folder, named["poses"], settings, parts)
+    views = _poses(folder, named["poses"], settings, parts)
     _gaussians(folder, named, parts)
-    _features(folder, named["features"], {view: views[view] for view in views if view not in held_out}, parts)
+    _features(folder, named["features"], views, settings, parts)
     _labels(folder, named["labels"], views, parts)
     if skipped := [path.name for path in sorted(folder.rglob("*.pth"))[:3]]:
         parts.lines.append(f"skipped, because pickle files can run code: {', '.join(skipped)}")
     return parts
 
 
-def _poses(folder: Path, named: Path | None, settings: PosesSettings, parts: Parts) -> tuple[Views, set[str]]:
-    """Read the poses; return the views to be expected, and which of them the source holds out."""
+def _poses(folder: Path, named: Path | None, settings: StageSettings, parts: Parts) -> Views:
+    """Read the poses."""
     known = find_known_poses(folder, named)
     if named is not None and (named != NO_POSES or has_known_poses(folder)):
         parts.columns["poses"] = named if named == NO_POSES else named.resolve()
     if known is None:
         parts.lines.append("poses: structure from motion")
-        return dict.fromkeys(view_names(list_images(photo_folder(folder)))), set()
-    source = read_source(known)
-    with_image = [view for view in source.views if view.image is not None]
-    names = view_names([view.image for view in with_image if view.image is not None])
-    cameras: dict[str, Camera | None] = {}
-    held_out: set[str] = set()
-    for view, name in zip(with_image, names, strict=True):
+        below = [path for path in sorted(folder.glob("*/sparse/**/")) if model_files(path)]
+        _name_unused(below, "to use these poses, pass --poses", parts)
+        unread = [path for pattern in UNREAD_POSES for path in folder.glob(pattern)]
+        _name_unused(unread, "for poses, export a COLMAP model or transforms.json", parts)
+        photos = list_images(photo_folder(folder))
+        return Views(dict(zip(view_names(photos), photos, strict=True)))
+    source, views, max_side_px = read_source(known), Views(), settings.poses.max_side_px
+    with_image = {view.image: view for view in source.views if view.image is not None}
+    for (image, view), name in zip(with_image.items(), view_names([*with_image]), strict=True):
         try:
-            lens, *_ = fitted_camera(view, settings.max_side_px)
+            lens, photo, _ = fitted_camera(view, max_side_px)
+            if not is_pinhole(lens):
+                photo, lens = photo or photo_of(lens), pinhole_of(name, lens, max_side_px)
         except ImageError as error:
             source.drop(view, error)
             continue
-        held_out |= {name} if view.is_test else set()
+        views.held_out |= {name} if view.is_test else set()
+        views.photos[name] = image
         K, size_hw = lens.calibration_matrix(), (lens.height, lens.width)
-        cameras[name] = Camera(name, np.eye(4), K, size_hw) if is_pinhole(lens) else None
-    source.require_most(settings.min_registered_share, known.files[0], images=True)
-    parts.lines.append(f"poses: {', '.join(map(str, known.files))}: {len(cameras)} views with an image")
+        views.cameras[name] = Camera(name, np.eye(4), K, size_hw, photo)
+    source.require_most(settings.poses.min_registered_share, known.files[0], images=True)
+    parts.lines.append(f"poses: {', '.join(map(str, known.files))}: {len(views.cameras)} views with an image")
     if missing := source.without_image:
         parts.lines.append(f"  left out: {len(missing)} views without an image: {shorten_list(missing, 5)}")
     if source.left_out:
         reasons = shorten_list([*source.left_out.values()], 5)
         parts.lines.append(f"  left out: {len(source.left_out)} views: {reasons}")
-    if held_out:
-        parts.lines.append(f"  {len(held_out)} views are held out for tests by the source's own split")
+    if views.held_out:
+        parts.lines.append(f"  {len(views.held_out)} views are held out for tests by the source's own split")
     count = "none; they are triangulated" if source.points is None else f"{len(source.points[0])}"
     parts.lines += [f"  points: {count}", *(f"  {note}" for note in source.notes)]
-    return cameras, held_out
+    return views
 
 
 def _gaussians(folder: Path, named: dict[str, Path | None], parts: Parts) -> None:
     plys = [named["gaussians"]] if named["gaussians"] is not None else trained_gaussians(folder)
+    if not plys:
+        others = [path for path in folder.glob("*.ply") if b" f_dc_0\n" in ply_header(path)]
+        _name_unused(others, "to use Gaussians in the coordinates of the poses, pass --gaussians", parts)
+        unread = [path for path in folder.iterdir() if path.suffix.lower() in UNREAD_GAUSSIANS]
+        _name_unused(unread, "for Gaussians, export an uncompressed 3DGS PLY", parts)
     if not plys or plys[0] == NO_POSES:
         return
     ply, *others = plys
@@ -131,16 +166,34 @@ def _gaussians(folder: Path, named: dict[str, Path | None], parts: Parts) -> Non
         parts.lines.append(f"  coordinates: {problem}; those of the poses are assumed")
 
 
-def _features(folder: Path, named: Path | None, views: Views, parts: Parts) -> None:
+def _name_unused(paths: list[Path], advice: str, parts: Parts) -> None:
+    """Name files and folders that the user may expect to be used."""
+    if paths:
+        parts.lines.append(f"  not used: {shorten_list([str(path) for path in sorted(paths)], 5)}; {advice}")
+
+
+def _features(folder: Path, named: Path | None, views: Views, settings: StageSettings, parts: Parts) -> None:
     features = langsplat_features(folder) if named is None else named
     if features is None or features == NO_POSES:
         return
-    _, lost = read_views(features, views)
+    train = [view for view in views.photos if view not in views.held_out]
+    found, lost = read_views(features, {view: views.cameras.get(view) for view in train})
     parts.columns["features"] = features.resolve()
-    count = f"{len(views) - len(lost)} of {len(views)} views"
+    count = f"{len(found)} of {len(train)} views"
     parts.lines.append(f"features: {features}: masks and vectors of {count}")
     if lost:
         parts.lines.append(f"  left out: {shorten_list(lost, 5)}")
+    if not found:
+        return
+    view = max(found, key=lambda view: len(found[view][0]))
+    try:
+        model = ClipModel.load(Path(settings.clip.model), settings.clip.variant)
+        masks, vectors = read_view(features, view)
+        size = masks.size_hw[::-1]  # of LangSplat's copy of the photograph
+        image = np.asarray(Image.fromarray(read_image(views.photos[view])).resize(size))
+        require_model(model, features, view, image, masks, vectors)
+    except HilsplatError as error:
+        parts.lines.append(f"  warning: {in_one_line(error)}")
 
 
 def _labels(folder: Path, named: Path | None, views: Views, parts: Parts) -> None:
@@ -156,7 +209,7 @@ def _labels(folder: Path, named: Path | None, views: Views, parts: Parts) -> Non
     lost: list[str] = []
     warnings: list[str] = []
     num_regions = 0
-    matched = match_names([path.stem for path in files], views)
+    matched = match_names([path.stem for path in files], views.photos)
     for path in files:
         if (view := matched[path.stem]) is None:
             lost.append(f"{path.name}: no view with an image and a pose has this name")
@@ -164,9 +217,8 @@ def _labels(folder: Path, named: Path | None, views: Views, parts: Parts) -> Non
             lost.append(f"{path.name}: another file has the labels of {view}")
         else:
             try:
-                regions, camera = annotated_regions(path, warnings), views[view]
-                if camera is not None and regions:
-                    placement(camera, regions[0].size_hw, f"label file {path}")
+                if regions := annotated_regions(path, warnings):
+                    _require_shape(views, view, regions[0].size_hw, path)
                 num_regions, parts.labels[path] = num_regions + len(regions), copy
             except HilsplatError as error:
                 lost.append(in_one_line(error))
@@ -180,3 +232,17 @@ def _labels(folder: Path, named: Path | None, views: Views, parts: Parts) -> Non
     parts.lines.append(f"labels: {count}, used for evaluation: {files[0].parent}")
     parts.lines += [f"  left out: {shorten_list(lost, 5)}"] if lost else []
     parts.lines += [f"  {shorten_list(warnings, 5)}"] if warnings else []
+
+
+def _require_shape(views: Views, view: str, drawn_hw: tuple[int, int], path: Path) -> None:
+    """Raise HilsplatError if labels don't have the shape of their photograph or undistorted view."""
+    if view in views.cameras:
+        placement(views.cameras[view], drawn_hw, f"label file {path}")
+        return
+    height, width = image_size_hw(views.photos[view], upright=True)
+    if abs(drawn_hw[0] * width / (drawn_hw[1] * height) - 1) > MAX_UNDISTORTION:
+        raise SceneError(
+            f"label file {path} does not match the size of its photograph",
+            expected=f"{width} x {height} px (width x height), or a scaled copy",
+            found=f"{drawn_hw[1]} x {drawn_hw[0]} px",
+        )

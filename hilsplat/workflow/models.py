@@ -47,7 +47,7 @@ def check_stages(stages: StageSettings, where: str) -> None:
 
 def check_device(stages: StageSettings, where: str) -> None:
     """Raise an error for `device: cuda` if this machine has no usable CUDA device."""
-    from hilsplat.splat.rasterise.device import choose_device
+    from hilsplat.splat.rasterise.device import cuda_problem, require_cuda
 
     for section, values in stages:
         if getattr(values, "device", "") == "cuda":
@@ -55,7 +55,7 @@ def check_device(stages: StageSettings, where: str) -> None:
                 if section in ("masks", "clip"):
                     network_device("cuda", section, 0.0)
                 else:
-                    choose_device("cuda")
+                    require_cuda(cuda_problem())
             except HilsplatError as error:
                 raise HilsplatError(f"{section}.device of {where}: {error}") from error
 

@@ -12,6 +12,7 @@ from hilsplat.base.atomic import atomic_folder, changing
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import NAME_RULE, name_problem
 from hilsplat.base.removal import undone_on_error
+from hilsplat.configuration import StageSettings
 from hilsplat.photos.inspection import PhotoReport, inspect_photos
 from hilsplat.photos.intake import prepared_photographs
 from hilsplat.scene.layouts import contents, has_known_poses
@@ -25,7 +26,6 @@ from hilsplat.scene.sheet import (
     read_sheet,
     sheet_text,
 )
-from hilsplat.settings import PosesSettings
 from hilsplat.workflow.findings import Parts, find_parts
 
 
@@ -39,7 +39,7 @@ def add_scene(
     features: Path | None = None,
     labels: Path | None = None,
     *,
-    settings: PosesSettings | None = None,
+    settings: StageSettings | None = None,
     dry_run: bool = False,
 ) -> PhotoReport:
     """Append your own photographs to the sheet as scene `photos/<name>`, creating the sheet if it is missing.
@@ -57,7 +57,7 @@ def add_scene(
         features: folder of LangSplat's masks and CLIP vectors, used instead of SAM and CLIP.
         labels: folder of label files from LERF-OVS or `hilsplat annotate`, used only for evaluation and
             copied to `annotated/photos/<name>/` in the project.
-        settings: how the run will import poses; None: the defaults.
+        settings: those of the run, for poses and CLIP; None: the defaults.
         dry_run: only report; videos and archives are converted in a temporary folder.
 
     Raises:
@@ -74,7 +74,7 @@ def add_scene(
             found=problem,
             fix="choose another name, such as my-desk_2",
         )
-    settings = settings or PosesSettings()
+    settings = settings or StageSettings()
     named = {"poses": poses, "gaussians": gaussians, "features": features, "labels": labels}
     with nullcontext(sheet) if dry_run else changing(sheet) as sheet:  # `sheet` may be a link
         _require_new(sheet, name)
@@ -87,7 +87,7 @@ def add_scene(
                 copied_labels = _labels_to_copy(annotated, parts)
                 report = inspect_photos(folder, poses)
                 report = replace(report, notes=(*notes, *parts.lines), columns=parts.columns)
-                _check(report, has_known_poses(folder, poses), settings.min_registered_share)
+                _check(report, has_known_poses(folder, poses), settings.poses.min_registered_share)
                 if dry_run:
                     return report
                 if copied_labels:

@@ -3,6 +3,8 @@
 They replace gsplat's kernels on machines without a device, and in float64 they are the backends' reference.
 """
 
+from typing import Any
+
 import torch
 from gsplat.cuda import _torch_impl as reference
 from torch import Tensor
@@ -33,15 +35,26 @@ def rasterization(
         means, covariances, viewmats, Ks, width, height, eps2d=eps2d, near_plane=near_plane
     )
     notes = {"means2d": means2d, "depths": depths, "conics": conics, "radii": radii}
-    notes["opacities"] = opacities[None]
     order = torch.argsort(depths[0], stable=True)
-    order = order[(radii[0, order] > 0).all(dim=-1)]
+    drawn = (radii[0] > 0).all(dim=-1)
+    opacities = torch.where(drawn, opacities, 0.0)
+    notes["opacities"] = opacities[None]
     notes["flatten_ids"] = order
     notes["isect_offsets"] = torch.zeros(1, 1, 1, dtype=torch.int32)
-    alpha = _alpha(means2d[0, order], conics[0, order], opacities[order], width, height)
+    # without boolean indices, because a test has tensors without values; the others may be infinite
+    shown, curves = (torch.where(drawn[:, None], values[0], 1.0) for values in (means2d, conics))
+    alpha = _alpha(shown[order], curves[order], opacities[order], width, height)
     weights = alpha * _light_before(alpha)
     image = torch.einsum("np,nc->pc", weights, colors[order]).reshape(1, height, width, -1)
     return image, weights.sum(dim=0).reshape(1, height, width, 1), notes
+
+
+def rasterization_of_view(*arguments: Any) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    """As `rasterization` with gsplat's defaults, for one viewmat and K."""
+    *gaussians, viewmat, K, width, height = arguments
+    options = {"radius_clip": 0, "rasterize_mode": "classic", "packed": False, "sh_degree": None}
+    size = {"width": width, "height": height}
+    return rasterization(*gaussians, viewmat[None], K[None], **size, near_plane=0.01, eps2d=0.3, **options)
 
 
 def rasterize_to_indices_in_range(
@@ -57,7 +70,8 @@ def rasterize_to_indices_in_range(
 
 def _alpha(means2d: Tensor, conics: Tensor, opacities: Tensor, width: int, height: int) -> Tensor:
     """Alpha of each Gaussian (front to back) at each pixel; 0 where the kernel skips it or has stopped."""
-    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    rows, columns = (torch.arange(side, device=means2d.device) + 0.5 for side in (height, width))
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
     dx = means2d[:, :1] - x.reshape(1, -1)
     dy = means2d[:, 1:] - y.reshape(1, -1)
     power = 0.5 * (conics[:, :1] * dx**2 + conics[:, 2:] * dy**2) + conics[:, 1:2] * dx * dy

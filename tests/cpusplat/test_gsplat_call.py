@@ -90,12 +90,6 @@ def test_colours_may_differ_between_views():
     np.testing.assert_allclose(colors[1], 2 * plain[1], rtol=1e-6, atol=1e-7)
 
 
-def test_threads_do_not_change_the_bytes():
-    one, two = (rasterization(**random_gaussians(300), **two_cameras(), threads=n)[:2] for n in (1, 2))
-    for a, b in zip(one, two, strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
 def test_no_gaussians_render_the_background():
     gaussians = {name: values[:0] for name, values in random_gaussians(1).items()}
     colors, alphas, _ = rasterization(**gaussians, **two_cameras(), backgrounds=np.ones((2, 3)))

@@ -44,6 +44,7 @@ def used(folder: Path, named: Path | None = None) -> list[str]:
         ("1.jpg", "2.JPG"),
         ("images/1.png", "images/2.png"),
         ("images/1.png", *MODEL),
+        ("1.png", "cameras.txt", "images.txt"),
         ("1.png", *MODEL),
         ("images/rig/left/1.png", *MODEL),
         ("images/1.png", "poses_bounds.npy"),

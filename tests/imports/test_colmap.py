@@ -75,11 +75,6 @@ def test_text_models_are_read(form, tmp_path):
     assert rgb.tolist() == [list(point[3:]) for point in POINTS]
 
 
-def test_pictures_of_a_model_are_right(tmp_path, imported):
-    views, *_ = imported(write(tmp_path / "in"))
-    world.require_right(views, {f"{number:03d}.png": pose for number, pose in enumerate(POSES)}, 45)
-
-
 @pytest.mark.parametrize(
     "name",
     [
@@ -187,6 +182,8 @@ def test_one_quaternion_that_is_not_a_rotation_leaves_out_its_view(change, tmp_p
         ({"sparse/0": 6, "sparse/1": 6}, "sparse/0"),
         ({"sparse": 6, "sparse/0": 3}, "sparse"),
         ({"sparse/model": 6}, "sparse/model"),
+        ({".": 6}, "."),
+        ({"sparse/0": 6, ".": 3}, "sparse/0"),
     ],
 )
 @pytest.mark.parametrize("form", ["text", "binary"])
@@ -294,14 +291,6 @@ def test_a_missing_picture_is_not_replaced_by_one_in_another_folder(names, moved
     views = {view.name: view.image for view in read_source(find_known_poses(tmp_path)).views}
     expected = {name: None if name in missing else tmp_path / files[name] for name in poses}
     assert views == expected
-
-
-def test_missing_pictures_are_named(tmp_path, imported):
-    folder = write(tmp_path / "in")
-    (folder / "images/002.png").rename(folder / "002 (copy).png")
-    views, _, _, report = imported(folder)
-    assert [view.view for view in views] == [f"{number:03d}.png" for number in (0, 1, 3, 4, 5)]
-    assert report["warnings"] == ["1 of 6 posed views have no image file: 002.png"]
 
 
 def test_the_test_views_that_3dgs_lists_are_held_out(tmp_path, imported):

@@ -173,10 +173,13 @@ def test_forms_and_elements_that_mean_something_else_are_refused_by_name(tmp_pat
         import_ply(path, "export it plainly")
 
 
-@pytest.mark.parametrize("content", [gzip.compress(b"NGSP", mtime=0), b"PK\x03\x04", b"\0" * 320, b""])
-def test_files_of_other_formats_are_named_as_such(tmp_path, content):
+OTHER_FILES = [gzip.compress(b"NGSP", mtime=0), b"PK\x03\x04", b"\0" * 320, b"", b"ply\n"]
+
+
+@pytest.mark.parametrize("content", [*OTHER_FILES, b"ply\nformat ascii 1.0\nend_header\n"])
+def test_files_of_other_formats_are_refused_with_a_program_that_converts_them(tmp_path, content):
     (tmp_path / "desk.spz").write_bytes(content)
-    with pytest.raises(ArtifactError, match=r"desk\.spz cannot be read: it is not a PLY(.|\n)*SuperSplat"):
+    with pytest.raises(ArtifactError, match=r"desk\.spz cannot be read: (.|\n)*SuperSplat"):
         read_gaussians(tmp_path / "desk.spz")
 
 
@@ -235,13 +238,6 @@ def test_more_than_half_unusable_rows_refuse_the_file(tmp_path, bad, is_read):
 
 
 # ---- damage ------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("content", [b"", b"ply\n", b"\x00" * 100, b"ply\nformat ascii 1.0\nend_header\n"])
-def test_other_files_are_refused_by_name(tmp_path, content):
-    (tmp_path / "g.ply").write_bytes(content)
-    with pytest.raises(ArtifactError, match=r"g\.ply cannot be read"):
-        import_ply(tmp_path / "g.ply", "fix")
 
 
 @pytest.mark.parametrize("text", [False, True])

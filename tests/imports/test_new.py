@@ -2,7 +2,6 @@
 
 import json
 import zipfile
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,14 +10,18 @@ from plyfile import PlyData
 from typer.testing import CliRunner
 
 from hilsplat.base.errors import SceneError
+from hilsplat.base.images import read_image
 from hilsplat.cli.main import app
-from hilsplat.scene.importers.reading import read_source
-from hilsplat.scene.layouts import find_known_poses, photo_folder
+from hilsplat.embed.clip import ClipModel
+from hilsplat.embed.langsplat_files import read_view
+from hilsplat.scene.layouts import photo_folder
 from hilsplat.scene.sheet import read_sheet
-from hilsplat.splat.gaussians import Gaussians
+from hilsplat.settings import ClipSettings
 from hilsplat.splat.ply import save_ply
 from hilsplat.workflow.new_scene import add_scene
+from tests.conftest import PROJECT
 from tests.imports import analytic_world as world
+from tests.unit.round_gaussians import round_gaussians
 
 WIDTH, HEIGHT = 64, 48
 POSES = world.cameras(6)
@@ -41,9 +44,7 @@ def model(folder, place="sparse/0", count=6):
 
 def gaussians(path, count):
     path.parent.mkdir(parents=True, exist_ok=True)
-    ones = np.ones((count, 3), np.float32)
-    quats = np.tile(np.float32([1, 0, 0, 0]), (count, 1))
-    save_ply(path, Gaussians(ones, ones, quats, ones[:, 0], np.ones((count, 1, 3), np.float32)))
+    save_ply(path, round_gaussians(np.ones((count, 3))))
 
 
 def without_some(path, bad):
@@ -55,7 +56,7 @@ def without_some(path, bad):
 
 def langsplat_files(folder, name, size_hw=(HEIGHT, WIDTH)):
     """Write LangSplat's maps and vectors of an image: one mask, which covers the image at every level."""
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     np.save(folder / f"{name}_s.npy", np.zeros((4, *size_hw), np.float32))
     np.save(folder / f"{name}_f.npy", np.ones((1, 8), np.float32))
 
@@ -113,6 +114,7 @@ def test_every_part_is_counted_and_what_is_left_out_is_named(options, tmp_path):
         "004.json: no view with an image and a pose has this name",
         "003.json does not match the size of its image",
         "001.json: ignored 1 unaccepted proposal(s)",
+        "_f.npy does not match the CLIP model in models/clip-tiny",
         "skipped, because pickle files can run code: chkpnt30000.pth",
         "5 photographs in",
     ):
@@ -131,6 +133,11 @@ def test_poses_that_the_run_would_refuse_are_refused(tmp_path):
     folder = photographs(tmp_path / "a/images", 4).parent
     model(folder)
     assert "2 of 6 views of" in str(new(folder, tmp_path / "p").exception)
+    assert not (tmp_path / "p/config/scenes.tsv").exists()
+    names = {f"{name}.jpg": pose for name, pose in zip(PICTURES, POSES, strict=True)}
+    world.write_colmap(folder / "sparse/0", "OPENCV 60 60 32 24 -1.5 0 0 0", (WIDTH, HEIGHT), names, POINTS)
+    assert "lens distortion of view 000.png cannot be undone" in str(new(folder, tmp_path / "p").exception)
+    model(folder)
     Image.new("RGB", (HEIGHT, HEIGHT)).save(folder / "images/004.jpg")
     photographs(folder / "images", 3)
     error = str(new(folder, tmp_path / "p").exception)
@@ -161,6 +168,37 @@ def test_labels_that_evaluation_would_refuse_are_left_out_or_refused(files, reas
     output = new(folder, tmp_path / "p").output
     assert "labels: 1 regions in 1 photographs" in output and reason in output, output
     assert [path.stem for path in (tmp_path / "p/annotated/photos/desk").iterdir()] == ["001"]
+
+
+@pytest.mark.parametrize("lens", [None, "PINHOLE 60 60 32 24", "SIMPLE_RADIAL 60 32 24 0.3"])
+def test_labels_of_another_shape_are_left_out(lens, tmp_path):
+    folder = labelled(tmp_path / "a", v000="mug")
+    if lens is not None:
+        poses = {f"{name}.jpg": pose for name, pose in zip(PICTURES, POSES, strict=True)}
+        world.write_colmap(folder / "sparse/0", lens, (WIDTH, HEIGHT), poses, POINTS)
+    for name, size in (("001", (2 * WIDTH, 2 * HEIGHT)), ("002", (HEIGHT, WIDTH)), ("003", (WIDTH, 36))):
+        label_file(folder / f"label/{name}.json", [thing("mug")], *size)
+    output = new(folder, tmp_path / "p", "--dry-run").output
+    assert "labels: 2 regions in 2 photographs" in output, output
+    for name in ("002", "003"):
+        assert f"{name}.json does not match the size of its" in output
+
+
+@pytest.mark.parametrize(("turn", "is_right"), [(0, True), (1, False)])
+def test_vectors_are_compared_with_those_of_the_clip_model(turn, is_right, tmp_path):
+    folder = photographs(tmp_path / "a")
+    model = ClipModel.load(PROJECT / "models/clip-tiny")
+    maps = np.full((4, HEIGHT, WIDTH), -1, np.float32)
+    maps[1:, :24, :32] = 0
+    for path in folder.glob("*.jpg"):
+        langsplat_files(folder / "language_features", path.stem)
+        np.save(folder / f"language_features/{path.stem}_s.npy", maps)
+        masks, _ = read_view(folder / "language_features", path.stem)
+        vector = model.embed_masks(read_image(path), masks, ClipSettings(crop="langsplat"))[:1]
+        np.save(folder / f"language_features/{path.stem}_f.npy", np.roll(vector.astype(np.float32), turn))
+    output = new(folder, tmp_path / "p", "--dry-run").output
+    assert "masks and vectors of 6 of 6 views" in output
+    assert ("were not computed by the CLIP model" in output) == (not is_right), output
 
 
 @pytest.mark.parametrize("kind", ["zip", "r3d"])
@@ -213,12 +251,6 @@ def test_poses_in_a_single_folder_below_are_found(tmp_path):
     assert row.folder == tmp_path / "desk/desk"
 
 
-def test_images_of_poses_are_found_in_input(tmp_path):
-    photographs(tmp_path / "input")
-    model(tmp_path)
-    assert all(view.image is not None for view in read_source(find_known_poses(tmp_path)).views)
-
-
 def test_some_photographs_that_cannot_be_read_are_left_out(tmp_path):
     folder = photographs(tmp_path / "a")
     Image.new("1", (20_000, 10_000)).save(folder / "large.png")  # 200 megapixels
@@ -254,22 +286,30 @@ def test_other_programs_gaussians_without_poses_are_named_but_not_used(tmp_path)
     assert row.gaussians is None
 
 
-@pytest.mark.parametrize("has_run", [True, False])
-def test_the_coordinates_of_a_nerfstudio_export_are_stated(has_run, tmp_path):
-    folder = photographs(tmp_path / "a/images").parent
+def test_unknown_coordinates_of_a_nerfstudio_export_are_stated(tmp_path):
+    folder, ply = photographs(tmp_path / "a/images").parent, tmp_path / "a/exports/splat/desk.ply"
     model(folder)
-    ply, run = folder / "exports/splat/desk.ply", folder / "outputs/desk/splatfacto/2026-01-01_120000"
     gaussians(ply, 3)
-    ply.write_bytes(
-        ply.read_bytes().replace(b"\nelement", b"\ncomment Generated by Nerstudio 1.1.5\nelement", 1)
-    )
-    if has_run:
-        run.mkdir(parents=True)
-        (run / "dataparser_transforms.json").write_text("{}")
+    comment = b"\ncomment Generated by Nerstudio 1.1.5\nelement"
+    ply.write_bytes(ply.read_bytes().replace(b"\nelement", comment, 1))
     result = new(folder, tmp_path / "p", "--gaussians", str(ply), "--dry-run")
-    assert f"Gaussians: 3 from {ply}" in result.output
-    stated = f"nerfstudio's, from {run}/dataparser_transforms.json" if has_run else "unknown"
-    assert f"  coordinates: {stated}" in result.output
+    assert f"Gaussians: 3 from {ply}\n  coordinates: unknown" in result.output
+
+
+def test_poses_and_gaussians_that_are_not_used_are_named_with_what_to_do(tmp_path):
+    folder = photographs(tmp_path / "a")
+    for name in ("cameras.xml", "scene.spz", "points.ply"):
+        (folder / name).write_bytes(b"ply\n")
+    model(folder, "colmap/sparse/0")
+    gaussians(folder / "Scan.ply", 3)
+    lines = new(folder, tmp_path / "p", "--dry-run").output.splitlines()
+    assert lines[:5] == [
+        "poses: structure from motion",
+        f"  not used: {folder}/colmap/sparse/0; to use these poses, pass --poses",
+        f"  not used: {folder}/cameras.xml; for poses, export a COLMAP model or transforms.json",
+        f"  not used: {folder}/Scan.ply; to use Gaussians in the coordinates of the poses, pass --gaussians",
+        f"  not used: {folder}/scene.spz; for Gaussians, export an uncompressed 3DGS PLY",
+    ]
 
 
 def test_label_files_are_copied_under_the_names_of_their_views(tmp_path):
@@ -331,12 +371,3 @@ def test_labels_of_an_earlier_scene_are_never_used_unnoticed(tmp_path):
     (annotated / "notes.txt").unlink()
     assert f"used for evaluation: {second}/label" in new(second, project).output
     assert "train" in (annotated / "000.json").read_text()
-
-
-def test_damaged_poses_are_refused_before_the_scene_is_added(tmp_path):
-    folder = photographs(tmp_path / "theirs/images").parent
-    model(folder)
-    Path(folder / "sparse/0/images.txt").write_text("1 2 3\n")
-    result = new(folder, tmp_path / "project")
-    assert "images.txt, line 1, cannot be read" in str(result.exception)
-    assert not (tmp_path / "project/config/scenes.tsv").exists()

@@ -216,11 +216,6 @@ def test_the_test_frames_of_scannetpp_are_held_out(tmp_path, imported):
         read_source(find_known_poses(folder))
 
 
-def test_names_of_a_split_without_a_frame_are_reported(tmp_path):
-    folder = write(tmp_path, PLAIN, {**NUMBERS, "test_filenames": ["images/a.png", "images/zz.png"]})
-    assert read_source(find_known_poses(folder)).notes == ["1 names in test_filenames belong to no view"]
-
-
 @pytest.mark.parametrize(
     "name",
     [

@@ -12,6 +12,7 @@ from PIL import Image
 from hilsplat.base.errors import SceneError
 from hilsplat.photos.video import extract_frames
 from tests.imports import analytic_world as world
+from tests.unit.photos.test_intake import write_video
 
 HEIGHT = 96
 
@@ -111,6 +112,12 @@ def test_the_best_stream_is_used_and_others_are_reported(tmp_path, case, suffix)
     assert notes[0].endswith(f"of {len(STREAMS[case])}")
 
 
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+def test_a_video_that_ends_before_another_stream_is_complete(tmp_path, suffix):
+    _, notes = extracted(write(tmp_path / f"a.{suffix}", MAIN, {**SMALL, "frames": 60}))
+    assert not any("ends after" in note for note in notes)
+
+
 def test_equal_streams_are_ranked_by_the_container(tmp_path):
     first, second = ({**MAIN, "turn": turn} for turn in (0.0, 1.5))
     streams = [{**first, "disposition": Disposition(0)}, {**second, "disposition": Disposition.default}]
@@ -168,19 +175,10 @@ def test_pixel_formats_keep_their_colours(tmp_path, codec, form, suffix):
 )
 def test_times_start_at_the_first_frame_that_is_shown(tmp_path, suffix, start_ms):
     """MP4 gets an edit list that hides frames before 0, as phones write for trimmed videos."""
-    path = tmp_path / f"a.{suffix}"
     times = [0, 200, 650, 2000]
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=10)
-        stream.height, stream.width, stream.pix_fmt = HEIGHT, 128, "yuv420p"
-        stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
-        rng = np.random.default_rng(2)
-        for time_ms in times:  # pictures without a common corner, so that each is selected
-            frame = av.VideoFrame.from_ndarray(rng.integers(0, 256, (HEIGHT, 128, 3), np.uint8), "rgb24")
-            frame = frame.reformat(format="yuv420p")
-            frame.pts, frame.time_base = start_ms + time_ms, Fraction(1, 1000)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+    # pictures without a common corner, so that each is selected
+    pictures = list(np.random.default_rng(2).integers(0, 256, (len(times), HEIGHT, 128, 3), np.uint8))
+    path = write_video(tmp_path / f"a.{suffix}", pictures, [start_ms + time_ms for time_ms in times])
     times = times if start_ms >= 0 else [0, 1350]
     notes = extract_frames([path], tmp_path, len(times))
     assert notes == []

@@ -71,7 +71,7 @@ def import_poses(
     if unposed:
         warnings.append(f"{len(unposed)} images have no pose and are skipped")
     origin = ", ".join(
-        path.relative_to(known.root).as_posix() if path.is_relative_to(known.root) else path.name
+        path.relative_to(known.root).as_posix() if known.root in path.parents else path.name
         for path in known.files
     )
     report = {

@@ -82,7 +82,8 @@ def _keep_one_view_per_image(source: Source) -> None:
     num_repeated = len(source.views) - len(views)
     source.views = []
     for first, *others in views.values():
-        if all(_is_same(first, other) for other in others):
+        poses = [other.cam_from_source for other in others if other.camera == first.camera]
+        if len(poses) == len(others) and all(np.array_equal(pose, first.cam_from_source) for pose in poses):
             source.views.append(first)
             continue
         num_repeated -= len(others)
@@ -90,7 +91,3 @@ def _keep_one_view_per_image(source: Source) -> None:
             source.leave_out(view.name, f"view {view.name}: other views have the same image {view.image}")
     if num_repeated:
         source.notes.append(f"{num_repeated} of the views listed are repetitions, which are dropped")
-
-
-def _is_same(view: KnownView, other: KnownView) -> bool:
-    return view.camera == other.camera and np.array_equal(view.cam_from_source, other.cam_from_source)

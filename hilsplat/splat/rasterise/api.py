@@ -5,10 +5,10 @@ from jaxtyping import Float32
 from scipy.sparse import csr_matrix
 
 from cpusplat import views
-from cpusplat.project import MOMENTS, pack_camera
+from cpusplat.project import pack_camera
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
-from hilsplat.splat.rasterise.drawn import Drawn, Gradients, refuse_broken, weight_matrix
+from hilsplat.splat.rasterise.drawn import Drawn, refuse_broken, weight_matrix
 
 
 def render(
@@ -49,11 +49,9 @@ def draw(
         channels = np.concatenate([channels, features], axis=1)
     image, alpha = views.blend_forward(view, channels, threads)
 
-    def gradients(grad_image: np.ndarray, grad_alpha: np.ndarray) -> Gradients:
+    def gradients(grad_image: np.ndarray, grad_alpha: np.ndarray) -> tuple[views.Parameters, np.ndarray]:
         sums = views.blend_gradients(view, channels, image, alpha, grad_image, grad_alpha, threads)
-        by_parameter, by_mean_px = views.project_gradients(view, sums, threads)
-        by_feature = sums[: len(gaussians), MOMENTS + 3 : MOMENTS + channels.shape[1]].copy()
-        return Gradients(**by_parameter._asdict(), features=by_feature, means_px=by_mean_px)
+        return views.project_gradients(view, sums, threads)
 
     return Drawn(image, alpha, view.drawn, gradients)
 

@@ -24,13 +24,6 @@ TILE = 16  # side of a gsplat tile, px
 EVERYTHING = 2**31 - 1  # a number larger than any tile's batch index
 
 
-def run_a_kernel() -> None:
-    """Evaluate spherical harmonics of one Gaussian."""
-    import gsplat
-
-    gsplat.spherical_harmonics(0, torch.ones(1, 3, device=DEVICE), torch.ones(1, 1, 3, device=DEVICE))
-
-
 class CardCamera(NamedTuple):
     """Camera on the device."""
 

@@ -5,7 +5,7 @@ import io
 import logging
 import os
 import socket
-import sys
+import warnings
 from collections.abc import Iterator
 from functools import cache
 from importlib.util import find_spec
@@ -14,7 +14,7 @@ from typing import Literal
 from hilsplat.base.cache import forget, remembered
 from hilsplat.base.cards import has_driver, release_card
 from hilsplat.base.errors import DeviceError, first_line
-from hilsplat.models.card import MIB, free_mib
+from hilsplat.models.card import MIB, free_mib, is_out_of_memory
 
 logger = logging.getLogger(__name__)
 
@@ -44,32 +44,44 @@ def cuda_problem() -> str | None:
         import gsplat
         import torch
 
-        if not torch.cuda.is_available():
+        with warnings.catch_warnings(record=True, action="always") as caught:
+            is_available = torch.cuda.is_available()
+        if not is_available and caught:  # such as of an old driver
+            return f"CUDA cannot be used: {first_line(caught[-1].message)}"
+        if not is_available:
             return f"torch {torch.__version__} finds no CUDA device"
-        versions = [torch.__version__, str(torch.version.cuda), gsplat.__version__]
-        paths = [os.environ.get(name, "") for name in ("PATH", "CUDA_HOME")]
         # a compilation that fails takes minutes, and each stage runs in its own process
-        key = ["build", *versions, *paths, socket.gethostname()]
-        return remembered(KIND, key, _build_failure) or None
+        versions = [torch.__version__, str(torch.version.cuda), gsplat.__version__]
+        known = [os.environ.get(name, "") for name in ("PATH", "CUDA_HOME", "CUDA_VISIBLE_DEVICES")]
+        return remembered(KIND, ["build", *versions, *known, socket.gethostname()], _build_failure) or None
     except Exception as error:  # a broken installation can raise anything
         return f"gsplat cannot be imported: {first_line(error)}"
 
 
 def _build_failure() -> str:
-    """Run one of gsplat's kernels, which compiles all on first use; return why it fails, or an empty text."""
-    from torch.utils.cpp_extension import CUDA_HOME
-
-    from hilsplat.splat.rasterise import cuda
-
+    """Load gsplat's kernels, which compiles them on first use; return why it fails, or an empty text."""
     logger.info("loading the CUDA kernels of gsplat, which are compiled on first use, in several minutes")
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # it prints what is reported here
-            cuda.run_a_kernel()
+            from gsplat.cuda._backend import _C as kernels
     except Exception as error:  # compilers, linkers and torch raise several types
-        if CUDA_HOME is None:
-            return f"{UNBUILT}, because no CUDA toolkit (nvcc) is installed"
         return f"{UNBUILT}: {first_line(error)}"
-    return ""
+    return "" if kernels is not None else f"{UNBUILT}, because no CUDA toolkit (nvcc) is installed"
+
+
+def kernel_problem() -> str | None:
+    """Return why the card cannot run one of gsplat's kernels, or None; the card may only be busy or full."""
+    import gsplat
+    import torch
+
+    from hilsplat.splat.rasterise import cuda
+
+    try:
+        direction, harmonics = (torch.ones(shape, device=cuda.DEVICE) for shape in ((1, 3), (1, 1, 3)))
+        gsplat.spherical_harmonics(0, direction, harmonics)
+    except Exception as error:  # torch, the driver and gsplat raise several types
+        return f"the card cannot run gsplat's kernels: {first_line(error)}"
+    return None
 
 
 def forget_cuda() -> None:
@@ -94,9 +106,9 @@ def choose_device(requested: Requested) -> Device:
     return CHOSEN[requested]
 
 
-def _examined(requested: Requested) -> Device:
-    problem = None if requested == "cpu" else cuda_problem()
-    if requested == "cuda" and problem:
+def require_cuda(problem: str | None) -> None:
+    """Raise DeviceError if there is a problem with the CUDA backend, such as that of `cuda_problem`."""
+    if problem:
         raise DeviceError(
             "device: cuda was requested but cannot be used",
             expected="a CUDA build of torch that finds a device, and gsplat",
@@ -104,6 +116,12 @@ def _examined(requested: Requested) -> Device:
             fix="pip install 'hilsplat[gpu]' and a CUDA toolkit on a machine with a CUDA device, or set "
             "device: auto or cpu; after a change, run `hilsplat doctor`",
         )
+
+
+def _examined(requested: Requested) -> Device:
+    problem = None if requested == "cpu" else cuda_problem() or kernel_problem()
+    if requested == "cuda":
+        require_cuda(problem)
     if requested == "auto" and problem is None:
         from hilsplat.splat.rasterise.parity import cuda_disagreement  # lazy: loads the CPU's kernels
 
@@ -155,7 +173,6 @@ def explained_memory(user: str, fix: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        torch = sys.modules.get("torch")  # importing it is slow, and not needed on the CPU
-        if torch is None or not isinstance(error, torch.OutOfMemoryError):
+        if not is_out_of_memory(error):
             raise
         raise DeviceError(f"{user} {TOO_MUCH}", found=first_line(error), fix=fix) from error

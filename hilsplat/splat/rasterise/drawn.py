@@ -7,20 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float32
 from scipy.sparse import csr_matrix
 
+from cpusplat.views import Parameters
 from hilsplat.base.errors import HilsplatError
-
-
-@dataclass(frozen=True)
-class Gradients:
-    """Gradients with respect to each parameter, and to the projected means in pixels."""
-
-    means: Float32[np.ndarray, "N 3"]
-    log_scales: Float32[np.ndarray, "N 3"]
-    quats: Float32[np.ndarray, "N 4"]
-    opacity_logits: Float32[np.ndarray, " N"]
-    sh: Float32[np.ndarray, "N K 3"]
-    features: Float32[np.ndarray, "N D"]
-    means_px: Float32[np.ndarray, "N 2"]
 
 
 @dataclass(frozen=True)
@@ -30,8 +18,8 @@ class Drawn:
     image: Float32[np.ndarray, "H W C"]  # premultiplied RGB, then features, without background
     alpha: Float32[np.ndarray, "H W"]  # coverage in [0, 1], the sum of the blending weights
     drawn: Bool[np.ndarray, " N"]  # whether each Gaussian reaches a pixel of the view
-    # maps gradients of image and alpha to gradients of the parameters
-    gradients: Callable[[np.ndarray, np.ndarray], Gradients]
+    # maps gradients of image and alpha to those of the parameters, and of the projected means [N 2] in px
+    gradients: Callable[[np.ndarray, np.ndarray], tuple[Parameters, np.ndarray]]
 
 
 def refuse_broken(broken: int, total: int) -> None:

@@ -1,11 +1,13 @@
 """Likely problems are reported before the run; good photographs raise no doubt."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
-from hilsplat.photos.check import CheckedPhoto, blur, photo_doubts
+from hilsplat.photos.check import MAX_PAIRS, blur, checked_photo, matched_rows, photo_doubts
 from tests.unit.scene.test_poses import plane_views
 
 SIZE = 360
@@ -34,31 +36,51 @@ def turning(picture, steps_deg):
     return pictures
 
 
-def doubts_of(pictures, focals=None, sizes=None, have_poses=False):
-    sizes = sizes or [picture.shape for picture in pictures]
-    focals = focals or [None] * len(pictures)
-    rows = zip(sizes, focals, pictures, strict=True)
-    photos = [CheckedPhoto(f"{number}.jpg", *row) for number, row in enumerate(rows)]
-    return photo_doubts(photos, have_poses=have_poses)
+def checked(pictures):
+    matched = matched_rows(len(pictures))
+    colours = [cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB) for picture in pictures]
+    return [
+        checked_photo(f"{row}.jpg", pixels, None, is_matched=row in matched)
+        for row, pixels in enumerate(colours)
+    ]
 
 
-def test_a_moving_camera_raises_no_doubt_unless_photographs_are_few(moving):
-    assert doubts_of(moving) == []
-    (doubt,) = doubts_of(moving[:9])
+def doubts_of(pictures, have_poses=False):
+    return photo_doubts(checked(pictures), have_poses=have_poses)
+
+
+@pytest.fixture(scope="module")
+def photos(moving):
+    return checked(moving)
+
+
+@pytest.mark.parametrize("number", [0, 1, 2, 61, 62, 2000])
+def test_all_neighbours_of_a_small_set_and_some_of_a_large_one_are_compared(number):
+    rows = matched_rows(number)
+    assert rows <= set(range(number)) and len(rows) <= 2 * MAX_PAIRS
+    assert sum(row + 1 in rows for row in rows) >= min(number - 1, MAX_PAIRS)
+    assert number > 61 or number < 2 or rows == set(range(number))
+
+
+def test_a_moving_camera_raises_no_doubt_unless_photographs_are_few(photos):
+    assert photo_doubts(photos, have_poses=False) == []
+    (doubt,) = photo_doubts(photos[:9], have_poses=False)
     assert doubt.startswith("only 9 photographs: take 20 or more")
 
 
 def test_a_camera_that_turns_in_place_is_reported_with_its_evidence(moving):
-    (doubt,) = doubts_of(turning(moving[0], np.linspace(-8, 8, 10)))
+    pictures = turning(moving[0], np.linspace(-8, 8, 10))
+    (doubt,) = doubts_of(pictures)
     assert "turn in place: rotation alone explains 9 of the 9 pairs" in doubt
     assert "walk around the scene" in doubt
-    assert doubts_of(turning(moving[0], np.linspace(-8, 8, 10)), have_poses=True) == []
+    assert doubts_of(pictures, have_poses=True) == []
     assert doubts_of([*turning(moving[0], np.linspace(-4, 4, 5)), *moving]) == []
 
 
-def test_blurred_dark_and_white_photographs_are_named(moving):
+def test_blurred_dark_and_white_photographs_are_named(moving, photos):
     def with_third(change):
-        return doubts_of([change(picture) if row == 2 else picture for row, picture in enumerate(moving)])
+        third = replace(checked([change(moving[2])])[0], name="2.jpg")
+        return photo_doubts([*photos[:2], third, *photos[3:]], have_poses=False)
 
     (blurred,) = with_third(lambda picture: cv2.GaussianBlur(picture, (0, 0), 5))
     assert blurred.startswith("1 of 12 photographs (2.jpg) is blurred")
@@ -72,17 +94,24 @@ def test_photographs_from_one_place_are_named(moving):
     shifted = [np.roll(picture, 1, axis=1) for picture in moving]
     pictures = [picture for pair in zip(moving, shifted, strict=True) for picture in pair]
     (doubt,) = doubts_of(pictures)
-    listed = "1.jpg, 3.jpg, 5.jpg, 7.jpg, 9.jpg, ..."
+    listed = "1.jpg, 3.jpg, 5.jpg, 7.jpg, 9.jpg and 7 more"
     assert doubt.startswith(f"12 of 24 photographs ({listed}) are nearly identical")
 
 
-def test_different_sizes_and_lenses_are_reported_but_not_a_turned_camera(moving):
-    assert doubts_of(moving, sizes=[(480, 640)] * 6 + [(640, 480)] * 6) == []
-    (sizes,) = doubts_of(moving, sizes=[(480, 640)] * 6 + [(600, 800)] * 6)
+def test_different_sizes_and_lenses_are_reported_but_not_a_turned_camera(photos):
+    def with_half(first, second):
+        half = len(photos) // 2
+        return photo_doubts(
+            [replace(photo, **(first if row < half else second)) for row, photo in enumerate(photos)],
+            have_poses=False,
+        )
+
+    assert with_half({"size_hw": (480, 640)}, {"size_hw": (640, 480)}) == []
+    (sizes,) = with_half({"size_hw": (480, 640)}, {"size_hw": (600, 800)})
     assert sizes.startswith("the photographs have 2 sizes (800 x 600, 640 x 480)")
-    (lenses,) = doubts_of(moving, focals=[500.0] * 8 + [900.0] * 4)
+    (lenses,) = with_half({"focal_px": 500.0}, {"focal_px": 900.0})
     assert lenses.startswith("the focal lengths range from 500 to 900 px")
-    assert doubts_of(moving, focals=[500.0] * 8 + [510.0] * 4) == []
+    assert with_half({"focal_px": 500.0}, {"focal_px": 510.0}) == []
 
 
 def test_flat_photographs_do_not_break_the_check():

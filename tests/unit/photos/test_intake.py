@@ -223,14 +223,23 @@ def test_a_folder_of_videos_is_one_capture_and_a_static_one_leaves_no_files(tmp_
 
 
 def test_an_existing_folder_is_kept_and_other_files_are_refused(tmp_path, sheet):
-    mine, archive = tmp_path / "project/photos/desk", zipped(tmp_path / "a.zip", [])
+    mine, archive = tmp_path / "project/photos/desk", zipped(tmp_path / "a.zip", [("photos.zip", b"PK")])
     write_noise(mine, 1)
     with pytest.raises(SceneError, match=r"photos/desk already exists"):
         add_scene(sheet, "desk", archive)
     assert len(list(mine.iterdir())) == 1
-    (tmp_path / "notes.txt").write_text("x")
-    with pytest.raises(SceneError, match=r"notes\.txt has an unsupported file type(.|\n)*a \.zip"):
-        add_scene(sheet, "desk", tmp_path / "notes.txt")
+    with pytest.raises(SceneError, match=r"a\.zip contains no photographs(.|\n)*1 files \(\.zip\)"):
+        add_scene(sheet, "room", archive)
+    for name, fix in (
+        ("notes.txt", "pass the folder"),
+        ("a.tar.gz", "unpack"),
+        ("a.spz", "--gaussians with a 3DGS"),
+    ):
+        (tmp_path / name).write_text("x")
+        with pytest.raises(
+            SceneError, match=rf"{name} has an unsupported file type(.|\n)*a \.zip(.|\n)*{fix}"
+        ):
+            add_scene(sheet, "desk", tmp_path / name)
 
 
 def test_a_command_that_was_killed_after_it_unpacked_resumes(tmp_path, sheet):

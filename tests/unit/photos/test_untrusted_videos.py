@@ -7,6 +7,7 @@ import pytest
 from hilsplat.base.errors import SceneError
 from hilsplat.photos import video
 from hilsplat.photos.video import extract_frames
+from tests.imports.test_videos import write
 from tests.unit.photos.test_intake import pan, write_video
 
 CONCAT = "ffconcat version 1.0\nfile 'secret.mp4'\n"
@@ -28,15 +29,8 @@ def test_a_playlist_cannot_name_another_file(secret, tmp_path, content, suffix):
 
 @pytest.mark.parametrize("suffix", [".gif", ".ts", ".flv"])
 def test_other_containers_are_refused_whatever_the_suffix(tmp_path, suffix):
-    import av
-
-    with av.open(str(tmp_path / f"a{suffix}"), "w") as container:
-        stream = container.add_stream("gif" if suffix == ".gif" else "libx264", rate=10)
-        stream.width, stream.height = 32, 32
-        stream.pix_fmt = "rgb8" if suffix == ".gif" else "yuv420p"
-        for picture in pan([0, 6, 6], (32, 32)):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
-        container.mux(stream.encode())
+    gif = {"codec": "gif", "format": "rgb8", "options": {}} if suffix == ".gif" else {}
+    write(tmp_path / f"a{suffix}", {"size": (32, 32), **gif})
     (tmp_path / f"a{suffix}").rename(tmp_path / "a.mp4")
     with pytest.raises(SceneError, match=r"a.mp4 cannot be read"):
         extract_frames([tmp_path / "a.mp4"], tmp_path, 3)

@@ -17,6 +17,7 @@ from hilsplat.scene.layouts import NO_POSES, find_known_poses
 from hilsplat.scene.poses import run_poses
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import PosesSettings
+from tests.imports import analytic_world as world
 
 
 def import_scene(folder, out, unit="metre", **settings):
@@ -30,23 +31,14 @@ def write_images(folder, names, size_hw=(30, 40)):
         Image.fromarray(np.full((*size_hw, 3), 20 * number, dtype=np.uint8)).save(folder / name, quality=95)
 
 
-def write_colmap(folder, suffix="bin"):
+def write_colmap(folder):
     """Three PINHOLE cameras at x = 0, 1, 2 that look along +z, and two points."""
-    names = ["a.jpg", "b.jpg", "c.jpg"]
-    write_images(folder / "images", names)
-    model = pycolmap.Reconstruction()
-    params = [50.0, 51.0, 19.0, 16.0]
-    camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=40, height=30, params=params)
-    model.add_camera_with_trivial_rig(camera)
-    for number, name in enumerate(names):
-        pose = np.eye(4)[:3]
-        pose[0, 3] = -number
-        image = pycolmap.Image(name=name, camera_id=1, image_id=number + 1)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
-    for x in (0.0, 2.0):
-        model.add_point3D(np.array([x, 0.0, 4.0]), pycolmap.Track(), np.array([10, 20, 30], dtype=np.uint8))
-    (folder / "sparse" / "0").mkdir(parents=True)
-    (model.write_binary if suffix == "bin" else model.write_text)(folder / "sparse" / "0")
+    poses = {name: np.eye(4) for name in ("a.jpg", "b.jpg", "c.jpg")}
+    write_images(folder / "images", poses)
+    for x, pose in enumerate(poses.values()):
+        pose[0, 3] = x
+    points = [(0, 0, 4, 10, 20, 30), (2, 0, 4, 10, 20, 30)]
+    world.write_colmap(folder / "sparse/0", "PINHOLE 50 51 19 16", (40, 30), poses, points)
 
 
 def test_colmap_model_keeps_intrinsics_and_metric_poses(tmp_path):
@@ -110,7 +102,7 @@ def test_poses_named_by_the_user_replace_those_in_the_folder(tmp_path, place):
     (export_colmap if "json" not in place else write_nerfstudio)(scene, tmp_path / "poses")
     shutil.copytree(tmp_path / "poses/images", tmp_path / "photos/images")
     shutil.copytree(tmp_path / "in/sparse", tmp_path / "photos/sparse")
-    (tmp_path / "photos/sparse/0/images.bin").write_bytes(b"")
+    (tmp_path / "photos/sparse/0/images.txt").write_bytes(b"")
     out = tmp_path / "out"
     run_poses(tmp_path / "photos", out, "a/b", "metre", False, PosesSettings(), 0, 1, tmp_path / place)
     cameras = Scene.load(out).cameras
@@ -122,14 +114,14 @@ def test_missing_poses_are_refused_and_none_ignores_those_in_the_folder(tmp_path
     with pytest.raises(SceneError, match="images has no poses for"):
         find_known_poses(tmp_path / "in", tmp_path / "in/images")
     assert find_known_poses(tmp_path / "in").kind == "colmap"
-    (tmp_path / "in" / "sparse" / "0" / "images.bin").unlink()
+    (tmp_path / "in/sparse/0/images.txt").unlink()
     with pytest.raises(SceneError, match="does not contain a complete COLMAP model"):
         find_known_poses(tmp_path / "in")
     assert find_known_poses(tmp_path / "in", NO_POSES) is None
 
 
 def test_a_colmap_model_cannot_name_files_outside_its_folder(tmp_path):
-    write_colmap(tmp_path / "in", "txt")
+    write_colmap(tmp_path / "in")
     images = tmp_path / "in" / "sparse" / "0" / "images.txt"
     images.write_text(images.read_text().replace("b.jpg", "../../../b.jpg"))
     shutil.copy(tmp_path / "in/images/a.jpg", tmp_path / "b.jpg")  # the name means the b.jpg in the folder
@@ -144,7 +136,9 @@ def test_a_colmap_model_cannot_name_files_outside_its_folder(tmp_path):
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
 def test_a_truncated_file_a_larger_count_and_trailing_bytes_are_damage(tmp_path, name):
     write_colmap(tmp_path)
-    model = tmp_path / "sparse/0"
+    model = tmp_path / "binary"
+    model.mkdir()
+    pycolmap.Reconstruction(tmp_path / "sparse/0").write_binary(model)
     read_model(model)
     whole = (model / name).read_bytes()
     count = int.from_bytes(whole[:8], "little")

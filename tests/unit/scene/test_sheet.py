@@ -2,6 +2,8 @@
 
 import json
 import shutil
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,14 +12,11 @@ from PIL import Image
 
 from hilsplat.base.errors import SceneError
 from hilsplat.photos.inspection import inspect_photos
-from hilsplat.scene.exporting import pinhole_model
 from hilsplat.scene.layouts import NO_POSES
-from hilsplat.scene.posed_images import PosedImage
 from hilsplat.scene.sheet import choose_scenes, read_sheet
-from hilsplat.splat.ply import save_ply
 from hilsplat.workflow.new_scene import add_scene
 from hilsplat.workflow.scene_data import SceneData
-from tests.unit.round_gaussians import round_gaussians
+from tests.imports.test_new import PICTURES, gaussians, label_file, langsplat_files, model, photographs
 from tests.unit.scene.test_poses import write_noise
 
 COLUMNS = ("dataset", "scene", "group", "source", "unit", "gaussians", "features", "poses")
@@ -132,42 +131,20 @@ def test_data_sources_are_below_the_data_root(tmp_path, monkeypatch):
 # ---- new scenes -----------------------------------------------------------------------------------
 
 
-def write_files(folder: Path, *paths: str) -> None:
-    for path in paths:
-        (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        if path.endswith(".ply"):
-            save_ply(folder / path, round_gaussians(np.ones((1, 3))))
-        else:
-            (folder / path).write_bytes(b"")
-
-
-def write_features(folder: Path) -> None:
-    """Write LangSplat's maps of three photographs: one mask, which covers each of them at every level."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for name in range(3):
-        np.save(folder / f"{name}_s.npy", np.zeros((4, 30, 40), np.float32))
-        np.save(folder / f"{name}_f.npy", np.ones((1, 8), np.float32))
+def write_features(folder: Path, names: Iterable[str] = "012") -> None:
+    for name in names:
+        langsplat_files(folder, name)
 
 
 def langsplat_scene(folder: Path) -> Path:
     """Photographs, and beside them what COLMAP, 3DGS and LangSplat write."""
-    write_noise(folder / "images", 3, (30, 40))
-    poses = [np.eye(4) for _ in range(3)]
-    for number, pose in enumerate(poses):
-        pose[0, 3] = number
-    lens = np.array([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
-    images = [PosedImage(f"{number}.png", Path(), pose, lens, (30, 40)) for number, pose in enumerate(poses)]
-    (folder / "sparse/0").mkdir(parents=True)
-    pinhole_model(images, np.zeros((1, 3)), np.zeros((1, 3), np.uint8)).write_binary(folder / "sparse/0")
-    write_files(
-        folder,
-        *(f"output/a/point_cloud/iteration_{steps}/point_cloud.ply" for steps in (7000, 30000)),
-        "output/a/chkpnt30000.pth",
-    )
-    write_features(folder / "language_features")
-    labels = {"info": {"width": 40, "height": 30}, "objects": []}
-    (folder / "label").mkdir()
-    (folder / "label/0.json").write_text(json.dumps(labels))
+    photographs(folder / "images")
+    model(folder)
+    for steps in (7000, 30000):
+        gaussians(folder / f"output/a/point_cloud/iteration_{steps}/point_cloud.ply", 1)
+    (folder / "output/a/chkpnt30000.pth").touch()
+    write_features(folder / "language_features", PICTURES)
+    label_file(folder / "label/000.json", [])
     return folder
 
 
@@ -185,8 +162,8 @@ def langsplat_scene(folder: Path) -> Path:
 def test_gaussians_written_by_langsplat_s_script_are_found(tmp_path, parent, written, expected, shared):
     folder = langsplat_scene(tmp_path / "theirs")
     shutil.rmtree(folder / "output")
-    for model, steps in written.items():
-        write_files(folder, f"{parent}{model}/point_cloud/iteration_{steps}/point_cloud.ply")
+    for case, steps in written.items():
+        gaussians(folder / f"{parent}{case}/point_cloud/iteration_{steps}/point_cloud.ply", 1)
     sheet = write_sheet(tmp_path)
     report = str(add_scene(sheet, "desk", folder))
     (row,) = read_sheet(sheet)
@@ -197,7 +174,7 @@ def test_gaussians_written_by_langsplat_s_script_are_found(tmp_path, parent, wri
 
 def test_found_files_can_be_ignored_or_replaced(tmp_path):
     folder, none = langsplat_scene(tmp_path / "theirs"), Path("none")
-    write_files(tmp_path, "other.ply")
+    gaussians(tmp_path / "other.ply", 1)
     sheet = write_sheet(tmp_path)
     add_scene(sheet, "plain", folder, gaussians=none, features=none, labels=none)
     assert not (tmp_path / "annotated").exists()
@@ -229,7 +206,10 @@ def test_nerfstudios_export_is_found_with_the_record_of_its_coordinates(tmp_path
     folder = tmp_path / "theirs"
     write_noise(folder / "images", 3)
     runs = [f"outputs/desk/splatfacto/2026-0{month}-01/dataparser_transforms.json" for month in (2, 1)]
-    write_files(folder, "exports/splat/splat.ply", *runs)
+    gaussians(folder / "exports/splat/splat.ply", 1)
+    for run in runs:
+        (folder / run).parent.mkdir(parents=True)
+        (folder / run).touch()
     frames = [{"file_path": "images/0.png", "transform_matrix": np.eye(4).tolist()}]
     (folder / "transforms.json").write_text(json.dumps({"fl_x": 50, "frames": frames}))
     sheet = write_sheet(tmp_path)
@@ -265,6 +245,9 @@ def test_inspection_finds_damaged_turned_and_copied_photographs(tmp_path):
     assert "truncated" in unreadable["truncated.jpg"]
     assert report.passed_over == {".nef": 1}
     assert "5 photographs in" in str(report) and "4  of 40 x 30 px" in str(report)
+    assert "1  are copies of others: 1.jpg = copy.jpg" in str(report)
+    many = str(replace(report, duplicates=(("a.jpg", "b.jpg", "c.jpg"),) * 8))
+    assert "16  are copies of others" in many and many.count("a.jpg = b.jpg = c.jpg") == 5
 
 
 @pytest.mark.parametrize(("columns", "more"), [(5, ""), (6, "\t-")])

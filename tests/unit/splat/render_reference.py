@@ -6,7 +6,7 @@ from torch import Tensor
 
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import Gaussians
-from tests.cpusplat.gsplat_on_cpu import rasterization, spherical_harmonics
+from tests.cpusplat.gsplat_on_cpu import rasterization_of_view, spherical_harmonics
 
 
 def render_reference(
@@ -22,8 +22,6 @@ def render_reference(
     channels = (spherical_harmonics(degree, means - centre, sh) + 0.5).clamp(min=0)
     if features is not None:
         channels = torch.cat([channels, features.double()], dim=1)
-    height, width = camera.size_hw
-    given = means, quats, log_scales.exp(), logits.sigmoid(), channels, pose[None], K[None], width, height
-    options = {"radius_clip": 0, "rasterize_mode": "classic", "packed": False, "sh_degree": None}
-    image, alpha, _ = rasterization(*given, near_plane=0.01, eps2d=0.3, **options)
+    given = means, quats, log_scales.exp(), logits.sigmoid(), channels
+    image, alpha, _ = rasterization_of_view(*given, pose, K, *camera.size_hw[::-1])
     return image[0], alpha[0, ..., 0]

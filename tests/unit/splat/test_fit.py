@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit
 
+from cpusplat.views import Parameters
 from hilsplat.base.artifacts import read_index, read_json, read_npz, write_arrays
 from hilsplat.base.errors import SceneError
 from hilsplat.scene.scene import Scene
@@ -26,7 +27,6 @@ from hilsplat.splat.gaussians import morton_order
 from hilsplat.splat.initial import RANDOM_POINTS, first_gaussians
 from hilsplat.splat.model import Model, means_rate, step_sizes
 from hilsplat.splat.ply import load_ply
-from hilsplat.splat.rasterise.drawn import Gradients
 from hilsplat.splat.steps import fit_steps
 from tests.unit.round_gaussians import round_gaussians
 from tests.unit.splat.three_gaussians_world import mean_psnr, three_gaussians_scene
@@ -197,11 +197,9 @@ def two_gaussians() -> dict[str, np.ndarray]:
     return two | {"log_scales": np.log(np.float32([[0.001] * 3, [0.1, 0.05, 0.05]]))}
 
 
-def gradients_of(model: Model, value: float) -> Gradients:
+def gradients_of(model: Model, value: float) -> Parameters:
     """Gradients that have one value everywhere."""
-    by_name = {name: np.full_like(values, value) for name, values in model.parameters.items()}
-    features, means_px = (np.zeros((len(model), width), np.float32) for width in (0, 2))
-    return Gradients(**by_name, features=features, means_px=means_px)
+    return Parameters(**{name: np.full_like(values, value) for name, values in model.parameters.items()})
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import logging
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
 from types import SimpleNamespace
 
@@ -12,7 +13,7 @@ import pytest
 from cpusplat import binning
 from hilsplat.base.errors import DeviceError
 from hilsplat.splat.gaussians import Gaussians
-from hilsplat.splat.rasterise import cuda, device
+from hilsplat.splat.rasterise import cuda, device, parity
 from hilsplat.splat.rasterise.api import draw, pixel_weights
 from hilsplat.splat.rasterise.device import choose_device
 from tests.unit.splat.rasterise_scenes import camera, random_gaussians
@@ -24,10 +25,10 @@ def everything(threads: int, order: str) -> list[np.ndarray]:
     gaussians = Gaussians(*(np.asarray(values, order=order) for values in vars(gaussians).values()))
     features = np.linspace(-1, 1, 1800, dtype=np.float32).reshape(300, 6)
     seen = draw(gaussians, view, 3, features=features, threads=threads)
-    gradients = seen.gradients(2 * seen.image, np.ones_like(seen.alpha))
+    by_parameter, by_mean_px = seen.gradients(2 * seen.image, np.ones_like(seen.alpha))
     matrix = pixel_weights(gaussians, view, min_weight=1e-3, threads=threads)
     sparse = [matrix.data, matrix.indices, matrix.indptr]
-    return [seen.image, seen.alpha, *vars(gradients).values(), *sparse]
+    return [seen.image, seen.alpha, *by_parameter, by_mean_px, *sparse]
 
 
 @pytest.mark.parametrize(
@@ -55,20 +56,49 @@ def test_weights_on_a_pixel_grid_are_rows_of_all_weights(step):
 
 
 @pytest.fixture
-def no_cuda(monkeypatch):
-    """Simulate a machine with gsplat but without CUDA."""
+def card(monkeypatch, tmp_path):
+    """Simulate a machine with a driver, a card and gsplat; return a function that sets gsplat's kernels.
+
+    An error instead of kernels is raised when they are loaded.
+    """
     monkeypatch.setattr(device, "find_spec", lambda name: name)
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.get_device_name", lambda: "a card")
     monkeypatch.setattr("ctypes.CDLL", lambda name: None)
-    device.cuda_problem.cache_clear()
-    device.CHOSEN.clear()
-    yield
+    monkeypatch.setattr("platformdirs.user_cache_path", lambda name: tmp_path)
+    monkeypatch.setattr(cuda, "DEVICE", "cpu")
+
+    def with_kernels(kernels: object, run: Callable[..., object] = lambda *arguments: None) -> list[object]:
+        loads: list[object] = []
+
+        class Backend:
+            @property
+            def _C(self) -> object:
+                loads.append(kernels)
+                if isinstance(kernels, Exception):
+                    raise kernels
+                return kernels
+
+        module = SimpleNamespace(__version__="1.5.3", spherical_harmonics=run)
+        monkeypatch.setitem(sys.modules, "gsplat", module)
+        monkeypatch.setitem(sys.modules, "gsplat.cuda", module)
+        monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", Backend())
+        device.forget_cuda()
+        return loads
+
+    yield with_kernels
+    device.forget_cuda()
+
+
+def in_another_process() -> None:
+    """Forget what a process remembers, but not what the user's cache holds."""
     device.cuda_problem.cache_clear()
     device.CHOSEN.clear()
 
 
-@pytest.mark.usefixtures("no_cuda")
-def test_without_cuda_auto_selects_the_cpu_and_cuda_is_an_error(caplog):
+def test_without_cuda_auto_selects_the_cpu_and_cuda_is_an_error(card, monkeypatch, caplog):
+    card(None)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     with caplog.at_level(logging.INFO):
         assert choose_device("auto") == choose_device("auto") == "cpu"
     assert caplog.text.count("rasterising on cpu (device: auto") == 1
@@ -77,76 +107,93 @@ def test_without_cuda_auto_selects_the_cpu_and_cuda_is_an_error(caplog):
         choose_device("cuda")
 
 
-@pytest.fixture
-def card(monkeypatch, tmp_path):
-    """Simulate a machine with an NVIDIA card and gsplat; return a function that sets gsplat's kernels."""
-    monkeypatch.setattr(device, "find_spec", lambda name: name)
-    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
-    monkeypatch.setattr("torch.cuda.get_device_name", lambda: "a card")
-    monkeypatch.setattr("ctypes.CDLL", lambda name: None)
-    monkeypatch.setattr("platformdirs.user_cache_path", lambda name: tmp_path)
-    monkeypatch.setattr(cuda, "DEVICE", "cpu")
-    monkeypatch.setattr("torch.utils.cpp_extension.CUDA_HOME", "/usr/local/cuda")
-
-    def with_kernels(spherical_harmonics: Callable[..., object]) -> None:
-        module = SimpleNamespace(__version__="1.5.3", spherical_harmonics=spherical_harmonics)
-        monkeypatch.setitem(sys.modules, "gsplat", module)
-        device.forget_cuda()
-
-    yield with_kernels
-    device.forget_cuda()
-
-
-def test_a_card_without_a_toolkit_selects_the_cpu_with_a_warning(card, caplog, monkeypatch):
-    monkeypatch.setattr("torch.utils.cpp_extension.CUDA_HOME", None)
-    card(None)
+@pytest.mark.parametrize(
+    ("kernels", "words"),
+    [
+        (None, "no CUDA toolkit (nvcc) is installed"),
+        (RuntimeError("Error building extension 'gsplat_cuda': [1/9] nvcc"), "Error building extension"),
+        (subprocess.CalledProcessError(1, "where cl"), "where cl"),
+        (ImportError("libcudart.so.12: cannot open shared object file"), "libcudart.so.12"),
+        (RuntimeError(), ""),
+    ],
+    ids=str,
+)
+def test_a_failing_build_of_gsplat_is_tried_once_and_selects_the_cpu(card, caplog, kernels, words):
+    loads = card(kernels)
     assert choose_device("auto") == "cpu"
     (line,) = [each.message for each in caplog.records if each.levelname == "WARNING"]
-    assert line.startswith("rasterising on cpu") and "no CUDA toolkit (nvcc) is installed" in line
-    with pytest.raises(DeviceError, match=r"nvcc(?s:.*)a CUDA toolkit on a machine"):
+    assert line.startswith("rasterising on cpu") and words in line
+    assert "the CUDA kernels of gsplat cannot be compiled" in line
+    in_another_process()
+    assert choose_device("auto") == "cpu" and len(loads) == 1
+    with pytest.raises(DeviceError, match=r"cannot be compiled(?s:.*)a CUDA toolkit on a machine"):
         choose_device("cuda")
-
-
-@pytest.mark.parametrize(
-    "error",
-    [
-        RuntimeError("Error building extension 'gsplat_cuda': [1/9] nvcc"),
-        subprocess.CalledProcessError(1, "where cl"),
-        ImportError("libcudart.so.12: cannot open shared object file"),
-        RuntimeError(),
-    ],
-)
-def test_a_failing_build_of_gsplat_is_tried_once_and_selects_the_cpu(card, caplog, error):
-    tries = []
-
-    def fail(*arguments: object) -> None:
-        tries.append(arguments)
-        raise error
-
-    card(fail)
-    assert choose_device("auto") == "cpu"
-    assert "the CUDA kernels of gsplat cannot be compiled: " in caplog.text
-    device.cuda_problem.cache_clear()  # as in the next stage's process
-    device.CHOSEN.clear()
-    assert choose_device("auto") == "cpu" and len(tries) == 1
     device.forget_cuda()  # as `hilsplat doctor` does
-    assert choose_device("auto") == "cpu" and len(tries) == 2
+    assert choose_device("auto") == "cpu" and len(loads) == 2
+
+
+def test_a_folder_of_cuda_without_a_compiler_is_no_toolkit(monkeypatch, tmp_path):
+    # such as /usr/local/cuda in images for running CUDA programs
+    monkeypatch.setenv("CUDA_HOME", str(tmp_path))
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.setitem(sys.modules, "gsplat.csrc", None)  # kernels that were compiled elsewhere
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", None)
+    del sys.modules["gsplat.cuda._backend"]
+    assert "no CUDA toolkit (nvcc) is installed" in device._build_failure()
+
+
+@pytest.mark.parametrize("requested", ["auto", "cuda"])
+def test_a_card_that_is_full_for_a_while_is_used_afterwards(card, monkeypatch, caplog, requested):
+    monkeypatch.setattr(parity, "disagreement", lambda *devices: None)
+    error: list[Exception] = [RuntimeError("CUDA error: out of memory\nCompile with TORCH_USE_CUDA_DSA")]
+
+    def run(*arguments: object) -> None:
+        if error:
+            raise error[0]
+
+    card(object(), run)
+    message = "the card cannot run gsplat's kernels: CUDA error: out of memory"
+    if requested == "auto":
+        assert choose_device("auto") == "cpu" and message in caplog.text
+    else:
+        with pytest.raises(DeviceError, match=message):
+            choose_device("cuda")
+    error.clear()
+    in_another_process()
+    assert choose_device(requested) == "cuda"
+
+
+def test_a_build_that_failed_for_one_card_is_tried_for_another(card, monkeypatch):
+    loads = card(RuntimeError("Unsupported gpu architecture 'compute_120'"))
+    for name in ("0", "0", "1"):
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", name)
+        in_another_process()
+        assert choose_device("auto") == "cpu"
+    assert len(loads) == 2
 
 
 def test_a_self_test_that_fails_selects_the_cpu(card, caplog):
-    card(lambda *arguments: None)
+    card(object())
     assert choose_device("auto") == "cpu"  # this gsplat cannot render
     assert "the self-test on CUDA failed: " in caplog.text
 
 
-def test_a_broken_driver_selects_the_cpu(card, monkeypatch, caplog):
-    card(lambda *arguments: None)
+def raised() -> bool:
+    raise RuntimeError("the driver is broken\nmore")
 
-    def fail() -> bool:
-        raise RuntimeError("Unexpected error from cudaGetDeviceCount()\ndriver too old")
 
-    monkeypatch.setattr("torch.cuda.is_available", fail)
-    assert choose_device("auto") == "cpu" and "Unexpected error from cudaGetDeviceCount()" in caplog.text
+def warned() -> bool:
+    warnings.warn("the driver is too old (found version 11040)\nmore", stacklevel=1)
+    return False
+
+
+@pytest.mark.parametrize("is_available", [raised, warned])
+def test_a_driver_that_cannot_be_used_selects_the_cpu_with_a_warning(card, monkeypatch, caplog, is_available):
+    card(object())
+    monkeypatch.setattr("torch.cuda.is_available", is_available)
+    assert choose_device("auto") == "cpu"
+    (line,) = [each.message for each in caplog.records if each.levelname == "WARNING"]
+    assert ": the driver is " in line and "more" not in line
 
 
 def test_the_cpu_is_selected_without_a_check_for_cuda(monkeypatch):

@@ -73,6 +73,7 @@ def test_a_library_that_is_missing_or_old_is_named(monkeypatch):
 def test_cuda_is_optional_but_must_agree_with_the_cpu(monkeypatch, problem, apart, state):
     monkeypatch.setattr("hilsplat.splat.rasterise.device.forget_cuda", lambda: None)
     monkeypatch.setattr("hilsplat.splat.rasterise.device.cuda_problem", lambda: problem)
+    monkeypatch.setattr("hilsplat.splat.rasterise.device.kernel_problem", lambda: None)
     monkeypatch.setattr("hilsplat.splat.rasterise.parity.cuda_disagreement", lambda: apart)
     assert [found.state for found in doctor.cuda()] == [state]
 
