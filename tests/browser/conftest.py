@@ -6,18 +6,25 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
+import uvicorn
 
 import hilsplat
+from hilsplat.annotate.app import Annotator, OpenedScene
 from hilsplat.base.images import write_png
 from hilsplat.scene.scene import Scene
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import save_ply
+from hilsplat.viewer.app import Viewer
+from hilsplat.viewer.viewer_scene import ViewerScene
+from hilsplat.web.guard import Guard
+from hilsplat.web.server import configured, listening_at
 from tests.conftest import PROJECT
 from tests.unit.evaluate.builders import cameras_of
 
@@ -25,7 +32,6 @@ HOW = "apt-get install chromium libgl1-mesa-dri libegl1; pip install -e '.[brows
 ARGUMENTS = ["--use-angle=gl-egl", "--ignore-gpu-blocklist", "--no-sandbox", "--disable-dev-shm-usage"]
 WIDTH, HEIGHT = 740, 420
 PANEL_PX, STRIP_PX = 336, 72
-START_S = 240
 
 
 @pytest.fixture(scope="session")
@@ -56,6 +62,20 @@ def serving(folder: Path, *words: str) -> Iterator[str]:
             yield re.search(r"http://127\.0\.0\.1:\d+/\?token=\S+", line).group()
         finally:
             server.send_signal(signal.SIGINT)
+
+
+@contextmanager
+def served_here(app: Callable[[str], Guard]) -> Iterator[str]:
+    """Address of a page that a thread of this process serves, which starts within milliseconds."""
+    listening = listening_at(0)
+    server = uvicorn.Server(configured(app("token-of-the-test")))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{listening.getsockname()[1]}/?token=token-of-the-test"
+    finally:
+        server.should_exit = True
+        thread.join()
 
 
 @pytest.fixture
@@ -140,12 +160,12 @@ def opened(browser) -> Iterator[Callable]:
 
 
 @pytest.fixture
-def served(opened) -> Iterator[Callable]:
-    """A function that serves a scene and opens its page, which is closed before its server: it polls it."""
+def opened_here(opened) -> Iterator[Callable]:
+    """A function that serves a page and opens it; it is closed before its server, which it polls."""
     with ExitStack() as stack:
 
-        def serve_and_open(folder: Path, *words: str, painter: str = "gl", **more):
-            page = opened(stack.enter_context(serving(folder, *words)), painter, **more)
+        def serve_and_open(app: Callable[[str], Guard], painter: str = "gl", **more):
+            page = opened(stack.enter_context(served_here(app)), painter, **more)
             stack.callback(page.close)
             return page
 
@@ -153,9 +173,18 @@ def served(opened) -> Iterator[Callable]:
 
 
 @pytest.fixture
-def annotating(served, tmp_path) -> Callable:
-    """A function that opens the annotation page of a scene, whose files are in `tmp_path`."""
-    return lambda folder, **more: served(folder, "annotate", "--data-root", str(tmp_path), **more)
+def served(opened_here) -> Callable:
+    """A function that opens the viewer of a scene."""
+    return lambda folder, *painter, **more: opened_here(Viewer(ViewerScene(folder)).app, *painter, **more)
+
+
+@pytest.fixture
+def annotating(opened_here, tmp_path) -> Callable:
+    """A function that opens the annotator of a scene, whose files are in `tmp_path`."""
+    labels = tmp_path / "annotated/photos/desk"
+    return lambda folder, **more: opened_here(
+        Annotator(OpenedScene(folder, labels, "default", 1)).app, **more
+    )
 
 
 def until(page, holds: Callable[[], object]) -> None:
@@ -209,11 +238,47 @@ def ask(page, text: str) -> None:
     page.keyboard.press("Enter")
 
 
+def press(page, *keys: str) -> None:
+    """Press keys in the view."""
+    for key in keys:
+        page.locator("#view").press(key)
+
+
+def drag(page, *places: tuple[float, float], held: str = "") -> None:
+    """Drag the mouse over positions on the page, with a key held."""
+    if held:
+        page.keyboard.down(held)
+    page.mouse.move(*places[0])
+    page.mouse.down()
+    for place in places[1:]:
+        page.mouse.move(*place, steps=4)
+    page.mouse.up()
+    if held:
+        page.keyboard.up(held)
+
+
+def reload(page) -> None:
+    page.reload()
+    page.locator("body[data-ready=yes]").wait_for()
+
+
+def beside(page, address: str = ""):
+    """Another page in the same browser: by default, the same page again."""
+    other = page.context.new_page()
+    other.goto(address or page.url)
+    other.locator("body[data-ready=yes]").wait_for()
+    return other
+
+
+def saved_page(page, path: Path):
+    """The saved page with answers, opened without a server."""
+    return beside(page, save(page, "Page with answers", path / "page.html").as_uri())
+
+
 def keep(page, text: str) -> None:
     """Query, and keep the answer with its key."""
     ask_and_wait(page, text)
-    page.locator("#view").focus()
-    page.keyboard.press("k")
+    press(page, "k")
     page.get_by_text(f"Kept “{text}”").wait_for()
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.browser.conftest import answers, ask, phone_fits
+from tests.browser.conftest import answers, ask, phone_fits, press
 
 SERIOUS = ("serious", "critical")
 
@@ -38,7 +38,7 @@ def test_the_viewer_has_no_serious_violation_in_the_colours_of_the_user(
     page.locator("#scene-list a").first.wait_for()
     page.locator("#save summary").click()
     assert violations(page) == []
-    page.locator("#view").press("?")
+    press(page, "?")
     assert violations(page) == []
 
 

@@ -1,6 +1,7 @@
 """Camera, history, pending pictures and refused queries of the viewer."""
 
 import shutil
+from urllib.parse import quote_plus
 
 import numpy as np
 import pytest
@@ -35,8 +36,7 @@ def test_zooming_out_is_limited_and_home_returns_to_the_start(opened, desk_addre
     page.keyboard.press("-")
     assert distance(page) == pytest.approx(far)
     page.keyboard.press("Home")
-    page.wait_for_timeout(300)
-    np.testing.assert_allclose(wire_camera(page)["cam_from_world"], begun["cam_from_world"])
+    until(page, lambda: np.allclose(wire_camera(page)["cam_from_world"], begun["cam_from_world"]))
 
 
 def test_a_held_key_moves_evenly(opened, desk_address):
@@ -62,22 +62,19 @@ def test_a_held_key_moves_evenly(opened, desk_address):
 
 def test_back_returns_to_the_previous_query(opened, desk_address):
     page = opened(desk_address)
-    page.wait_for_timeout(800)
+    until(page, lambda: "#" in page.url)
     for text in ("mug > handle", "book"):
         ask_and_wait(page, text)
-        page.wait_for_timeout(1200)  # until the address is updated
-    page.go_back()
-    page.wait_for_function("document.getElementById('text').value === 'mug > handle'")
-    answers(page).first.wait_for()
-    page.wait_for_timeout(1000)
-    page.go_forward()
-    page.wait_for_function("document.getElementById('text').value === 'book'")
-    page.wait_for_timeout(1000)
-    page.go_back()
-    page.wait_for_timeout(1000)
-    page.go_back()
-    page.wait_for_function("document.getElementById('text').value === ''")
-    assert not answers(page).count()
+        until(page, lambda text=text: f"q={quote_plus(text)}" in page.url)
+    for go, text in (
+        (page.go_back, "mug > handle"),
+        (page.go_forward, "book"),
+        (page.go_back, "mug > handle"),
+        (page.go_back, ""),
+    ):
+        go()
+        page.wait_for_function("(text) => document.getElementById('text').value === text", arg=text)
+        until(page, lambda text=text: answers(page).count() == bool(text))
 
 
 @pytest.mark.parametrize(("painter", "colour"), [("gl", "relevancy"), ("gl", "field"), ("server", "field")])

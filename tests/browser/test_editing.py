@@ -12,7 +12,21 @@ from plyfile import PlyData
 from hilsplat.splat.ply import load_ply
 from hilsplat.viewer.frames import within
 from hilsplat.viewer.wire import WireCamera
-from tests.browser.conftest import ask_and_wait, keep, late, on_page, phone_fits, save, until, wire_camera
+from tests.browser.conftest import (
+    ask_and_wait,
+    beside,
+    drag,
+    keep,
+    late,
+    on_page,
+    phone_fits,
+    press,
+    reload,
+    save,
+    saved_page,
+    until,
+    wire_camera,
+)
 from tests.unit.artifact_changes import loosen
 from tests.unit.splat.spz_reader import decoded
 
@@ -41,18 +55,9 @@ def use(page, tool: str) -> None:
     page.get_by_role("toolbar", name="Edit").get_by_text(tool, exact=True).click()
 
 
-def drag(page, *points: tuple[float, float], held: str = "") -> None:
+def drag_over(page, *points: tuple[float, float], held: str = "") -> None:
     """Drag over points of the desk's plane."""
-    places = on_page(page, *[(x, y, 0) for x, y in points])
-    if held:
-        page.keyboard.down(held)
-    page.mouse.move(*places[0])
-    page.mouse.down()
-    for place in places[1:]:
-        page.mouse.move(*place, steps=4)
-    page.mouse.up()
-    if held:
-        page.keyboard.up(held)
+    drag(page, *on_page(page, *[(x, y, 0) for x, y in points]), held=held)
 
 
 def colour(page, x: float, y: float) -> np.ndarray:
@@ -68,26 +73,20 @@ def shows(page, x: float, y: float, is_right: Callable[[np.ndarray], bool]) -> N
     until(page, lambda: is_right(colour(page, x, y)))
 
 
-def press(page, key: str) -> None:
-    page.locator("#view").focus()
-    page.keyboard.press(key)
-
-
 @pytest.mark.parametrize("painter", ["gl", "server"])
 def test_gaussians_in_a_box_are_selected_removed_and_restored(opened, desk_address, painter):
     page = opened(desk_address, painter)
     edit(page)
     use(page, "box")
-    drag(page, (21.5, 16.5), (29.5, 20.5))
+    drag_over(page, (21.5, 16.5), (29.5, 20.5))
     has(page, 8 * 4, 0)
     shows(page, 25, 18, lambda rgb: np.abs(rgb - (0.7 * 255, 0, 0.3 * 250 + 0.7 * 160)).max() < 40)
     press(page, "Delete")
     has(page, 0, 32)
     shows(page, 25, 18, lambda rgb: rgb.max() < 40)
-    drag(page, (19.5, 14.5), (29.5, 20.5))  # what is removed is not selected again
+    drag_over(page, (19.5, 14.5), (29.5, 20.5))  # what is removed is not selected again
     has(page, 10 * 6 - 32, 32)
-    press(page, "Control+z")
-    press(page, "Control+z")
+    press(page, "Control+z", "Control+z")
     has(page, 32, 0)
     press(page, "Control+z")
     has(page, 0, 0)
@@ -108,10 +107,10 @@ def test_the_brush_adds_and_subtracts(opened, desk_address, desk):
     places = on_page(page, (6, 8, 0), (26, 14, 0)) - (view["x"], view["y"])
     points = [tuple(place) for place in places.tolist()]
     expected = int(within(gaussians.means, camera, points, 30.0).sum())
-    selected = selected_after(page, lambda: drag(page, (6, 8), (26, 14)))
+    selected = selected_after(page, lambda: drag_over(page, (6, 8), (26, 14)))
     assert abs(selected - expected) <= 0.05 * expected and expected > 60
-    assert selected_after(page, lambda: drag(page, (6, 20), (8, 20), held="Shift")) > selected
-    fewer = selected_after(page, lambda: drag(page, (6, 20), (8, 20), held="Control"))
+    assert selected_after(page, lambda: drag_over(page, (6, 20), (8, 20), held="Shift")) > selected
+    fewer = selected_after(page, lambda: drag_over(page, (6, 20), (8, 20), held="Control"))
     assert fewer == pytest.approx(selected, abs=2)
     size = float(page.get_by_label("Size").input_value())
     press(page, "]")
@@ -120,7 +119,7 @@ def test_the_brush_adds_and_subtracts(opened, desk_address, desk):
     assert inverted == pytest.approx(len(gaussians) - selected, abs=2)
     press(page, "Escape")  # dragging moves the camera again
     before = wire_camera(page)
-    drag(page, (6, 8), (12, 8))
+    drag_over(page, (6, 8), (12, 8))
     assert wire_camera(page) != before
 
 
@@ -154,13 +153,10 @@ def test_only_the_selection_is_kept_in_the_saved_page(opened, desk_address, tmp_
     page = opened(desk_address)
     edit(page)
     press(page, "b")
-    drag(page, (-0.5, -0.5), (15.5, 23.5))
+    drag_over(page, (-0.5, -0.5), (15.5, 23.5))
     page.get_by_role("button", name="Keep only").click()
     has(page, 0, 864 - 16 * 24)
-    saved = save(page, "Page with answers", tmp_path / "page.html")
-    offline = page.context.new_page()
-    offline.goto(saved.as_uri())
-    offline.locator("body[data-ready=yes]").wait_for()
+    offline = saved_page(page, tmp_path)
     assert offline.evaluate("hilsplat.painter.count") == 16 * 24
     assert not offline.get_by_role("button", name="Edit", exact=True).is_visible()
 
@@ -186,18 +182,26 @@ def test_what_is_done_while_a_selection_is_on_its_way_acts_on_it(opened, desk_ad
     late(page, "api/within")
     edit(page)
     use(page, "box")
-    drag(page, (21.5, 16.5), (29.5, 20.5))
+    drag_over(page, (21.5, 16.5), (29.5, 20.5))
     press(page, "Delete")
-    saved = save(page, "Page with answers", tmp_path / "page.html")
+    offline = saved_page(page, tmp_path)
     has(page, 0, 32)
-    offline = page.context.new_page()
-    offline.goto(saved.as_uri())
-    offline.locator("body[data-ready=yes]").wait_for()
     assert offline.evaluate("hilsplat.painter.count") == 864 - 32
-    drag(page, (19.5, 14.5), (29.5, 20.5))
+    drag_over(page, (19.5, 14.5), (29.5, 20.5))
     press(page, "Control+z")  # the selection, not the removal
     page.get_by_role("button", name="Redo").click()  # once it can be
     has(page, 10 * 6 - 32, 32)
+
+
+def test_steps_that_take_much_memory_are_forgotten(opened, desk_address):
+    page = opened(desk_address)
+    edit(page)
+    click = "([id, times]) => { while (times--) document.getElementById(id).click(); }"
+    page.evaluate(click, ["edit-invert", 31])
+    has(page, 864, 0)
+    page.evaluate(click, ["edit-undo", 25])
+    until(page, page.get_by_role("button", name="Undo").is_disabled)  # after 20
+    has(page, 864, 0)
 
 
 @pytest.mark.parametrize("painter", ["gl", "server"])
@@ -205,11 +209,10 @@ def test_removed_gaussians_are_kept_over_a_reload_until_they_are_restored(opened
     page = opened(desk_address, painter)
     edit(page)
     use(page, "box")
-    drag(page, (21.5, 16.5), (29.5, 20.5))
+    drag_over(page, (21.5, 16.5), (29.5, 20.5))
     press(page, "Delete")
     has(page, 0, 32)
-    page.reload()
-    page.locator("body[data-ready=yes]").wait_for()
+    reload(page)
     has(page, 0, 32)
     shows(page, 25, 18, lambda rgb: rgb.max() < 40)
     page.get_by_role("button", name="Restore all").click()
@@ -221,18 +224,15 @@ def test_removed_gaussians_are_kept_over_a_reload_until_they_are_restored(opened
 
 def test_what_is_removed_in_one_tab_is_removed_in_another(opened, desk_address):
     page = opened(desk_address)
-    other = page.context.new_page()
-    other.goto(page.url)
-    other.locator("body[data-ready=yes]").wait_for()
+    other = beside(page)
     for tab, columns in ((page, (-0.5, 1.5)), (other, (1.5, 3.5))):
         edit(tab)
         use(tab, "box")
-        drag(tab, *[(column, row) for column, row in zip(columns, (-0.5, 23.5), strict=True)])
+        drag_over(tab, *[(column, row) for column, row in zip(columns, (-0.5, 23.5), strict=True)])
         press(tab, "Delete")
     for tab in (page, other):
         has(tab, 0, 4 * 24)
-    page.reload()
-    page.locator("body[data-ready=yes]").wait_for()
+    reload(page)
     has(page, 0, 4 * 24)
     page.get_by_role("button", name="Restore all").click()
     has(other, 0, 0)
@@ -243,7 +243,7 @@ def test_the_delete_key_removes_after_the_brush_size_was_set(opened, desk_addres
     page = opened(desk_address)
     edit(page)
     press(page, "c")
-    drag(page, (6, 8), (26, 14))
+    drag_over(page, (6, 8), (26, 14))
     until(page, lambda: page.get_by_role("button", name="Remove", exact=True).is_enabled())
     page.get_by_label("Size").press("Delete")
     until(page, lambda: page.get_by_role("button", name="Restore all").is_enabled())

@@ -19,7 +19,9 @@ from tests.browser.conftest import (
     keep,
     late,
     pixels,
+    press,
     save,
+    saved_page,
     until,
 )
 from tests.unit.many_nodes import add_nodes
@@ -91,19 +93,6 @@ def test_a_kept_query_is_edited_with_its_threshold_at_its_photograph(opened, des
     assert page.evaluate("hilsplat.camera.view") == view
 
 
-def test_kept_queries_are_saved_together(opened, desk_address, scene, tmp_path):
-    page = opened(desk_address)
-    keep(page, "book")
-    ask_and_wait(page, "mug > handle")
-    (book,), (handle,) = scene.query("book"), scene.query("mug > handle")
-    boxes = json.loads(save(page, "Boxes, JSON", tmp_path / "boxes.json").read_text())["boxes"]
-    found = [(box["group"], box["node"]) for box in boxes]
-    assert found == [("book", book.node), ("mug > handle", handle.node)]
-    size = save(page, "Masks in all photographs", tmp_path / "masks.zip").stat().st_size
-    page.get_by_role("status").get_by_text(f"Saved desk-masks.zip, {-(-size // 1000)} kB.").wait_for()
-    assert page.locator("#saving").is_hidden()
-
-
 def test_kept_queries_and_saved_files_have_scores_and_doubts(opened, desk_address, scene, tmp_path):
     page = opened(desk_address)
     keep(page, "book")
@@ -123,29 +112,41 @@ def test_kept_queries_and_saved_files_have_scores_and_doubts(opened, desk_addres
         for number, hit in enumerate((book, rim), 1)
     ]
     assert [line.partition(": ")[2] for line in header if "doubtful" in line] == [str(rim.doubts[0])]
-    with zipfile.ZipFile(save(page, "Masks in all photographs", tmp_path / "masks.zip")) as archive:
+    boxes = json.loads(save(page, "Boxes, JSON", tmp_path / "boxes.json").read_text())["boxes"]
+    found = [(box["group"], box["node"]) for box in boxes]
+    assert found == [("book", book.node), ("unicorn > rim", rim.node)]
+    masks = save(page, "Masks in all photographs", tmp_path / "masks.zip")
+    told = f"Saved desk-masks.zip, {-(-masks.stat().st_size // 1000)} kB."
+    page.get_by_role("status").get_by_text(told).wait_for()
+    assert page.locator("#saving").is_hidden()
+    with zipfile.ZipFile(masks) as archive:
         coco = json.loads(archive.read("coco.json"))
     assert [category["doubts"] for category in coco["categories"]] == [[], [str(rim.doubts[0])]]
     scores = {each["node"]: each["score"] for each in coco["annotations"]}
     assert scores == pytest.approx({book.node: book.score, rim.node: rim.score}, abs=1e-4)
-    offline = page.context.new_page()
-    offline.goto(save(page, "Page with answers", tmp_path / "page.html").as_uri())
-    offline.locator("body[data-ready=yes]").wait_for()
+    offline = saved_page(page, tmp_path)
     told = [[chip.locator(".words").inner_text() for chip in chips(each).all()] for each in (page, offline)]
     assert told[0] == told[1]
 
 
 @pytest.mark.parametrize("answerer", ["tree", "field"])
-def test_a_saved_page_has_the_answers_of_the_page(opened, desk_address, scene, tmp_path, answerer):
+def test_a_saved_page_has_the_answers_and_settings_of_the_page(
+    opened, desk_address, scene, tmp_path, answerer
+):
     page = opened(desk_address)
     page.get_by_label("Answers by").select_option(f"default|{answerer}")
+    keep(page, "mug")
+    page.get_by_role("radio", name="part", exact=True).check(force=True)
+    page.get_by_label("Others").select_option("ghost")
     ask_and_wait(page, "mug")
     shown = answers(page).first.inner_text()
-    assert f"{scene.query('mug', answerer=answerer)[0].score:.2f}" in shown
-    offline = page.context.new_page()
-    offline.goto(save(page, "Page with answers", tmp_path / "page.html").as_uri())
+    (part,), (whole,) = scene.query("mug", "part", answerer=answerer), scene.query("mug", answerer=answerer)
+    assert f"{part.score:.2f}" in shown and part.node != whole.node
+    offline = saved_page(page, tmp_path)
     answers(offline).first.wait_for()
     assert answers(offline).first.inner_text() == shown
+    assert offline.locator("#answers li").get_attribute("data-node") == str(part.node)
+    assert offline.get_by_label("Others").input_value() == "ghost"
 
 
 def test_a_kept_answer_has_the_present_name_of_its_node(served, own_desk):
@@ -156,64 +157,57 @@ def test_a_kept_answer_has_the_present_name_of_its_node(served, own_desk):
     choose_row(page, int(page.locator("#overlay path.kept").get_attribute("data-node")))
     page.get_by_role("textbox", name="Name").fill("atlas")
     page.keyboard.press("Enter")
-    page.locator("#view").press("Escape")
+    press(page, "Escape")
     page.locator("#overlay text", has_text=re.compile(r"^book atlas 0\.\d\d$")).wait_for()
-
-
-def test_a_saved_page_opens_with_the_settings_of_its_last_query(opened, desk_address, scene, tmp_path):
-    page = opened(desk_address)
-    keep(page, "mug")
-    page.get_by_role("radio", name="part", exact=True).check(force=True)
-    page.get_by_label("Others").select_option("ghost")
-    ask_and_wait(page, "mug")
-    (part,), (whole,) = scene.query("mug", "part"), scene.query("mug")
-    assert part.node != whole.node
-    offline = page.context.new_page()
-    offline.goto(save(page, "Page with answers", tmp_path / "page.html").as_uri())
-    answers(offline).first.wait_for()
-    assert offline.locator("#answers li").get_attribute("data-node") == str(part.node)
-    assert offline.get_by_label("Others").input_value() == "ghost"
 
 
 def test_a_link_and_back_restore_the_settings_of_a_query(opened, desk_address):
     page = opened(desk_address)
-    page.wait_for_timeout(800)
+    keep(page, "book")
+    keep(page, "mug")
+    page.get_by_role("button", name="Show book").click()  # hides it
     page.get_by_label("only what this photograph shows").check()
     page.get_by_label("score at least").check()
     page.get_by_label("Minimum score").fill("0.3")
     ask_and_wait(page, "mug > handle")
     view = page.evaluate("hilsplat.camera.view")
-    page.locator("#view").press("ArrowLeft")  # the answer remains that of the photograph
-    page.wait_for_timeout(1200)  # until the address is updated
+    press(page, "ArrowLeft")  # the answer remains that of the photograph
+    until(page, lambda: "q=mug" in page.url and "c=v" not in page.url)
     asked = []
+
+    def note(sent) -> None:
+        if "api/query" in sent.url and sent.post_data_json["text"] == "mug > handle":
+            asked.append(sent.post_data_json)
+
     again = opened(desk_address)
-    again.on("request", lambda sent: sent.url.find("api/query") > 0 and asked.append(sent.post_data_json))
-    again.goto(f"{again.url.partition('#')[0]}{page.url[page.url.index('#') :]}")
-    until(again, lambda: asked)  # the link was opened in the same tab
-    again.reload()
-    until(again, lambda: len(asked) > 1)
+    until(again, lambda: "#" in again.url)
+    again.on("request", note)
+    again.goto(f"{again.url.partition('#')[0]}{page.url[page.url.index('#') :]}")  # in the same tab
+    until(again, lambda: asked)
+    answers(again).first.wait_for()
     question = {"text": "mug > handle", "level": "auto", "threshold": 0.3, "view": view}
-    assert asked == [{"variant": "default", "answerer": "tree", **question}] * 2
+    assert asked == [{"variant": "default", "answerer": "tree", **question}]
     camera = [each.evaluate("hilsplat.camera.toText()") for each in (page, again)]
-    assert camera[0] == camera[1]
+    assert camera[0] == camera[1] and "token" not in page.url
+    assert chips(again).all_inner_texts() == chips(page).all_inner_texts()
+    shown = [button.get_attribute("aria-pressed") for button in again.locator("#kept .swatch").all()]
+    assert shown == ["false", "true"]
     page.get_by_label("only what this photograph shows").uncheck()
     ask_and_wait(page, "book")
     page.get_by_label("score at least").uncheck()
-    page.wait_for_timeout(1200)
-    page.on("request", lambda sent: sent.url.find("api/query") > 0 and asked.append(sent.post_data_json))
+    until(page, lambda: "q=book" in page.url and "least" not in page.url)
+    page.on("request", note)
     page.go_back()
-    until(page, lambda: len(asked) > 2)
-    assert asked[2] == asked[0] and page.get_by_label("score at least").is_checked()
+    until(page, lambda: len(asked) > 1)
+    assert asked[1] == asked[0] and page.get_by_label("score at least").is_checked()
 
 
 def test_a_film_follows_the_path_of_the_user(opened, desk_address, tmp_path):
     page = opened(desk_address, "server")
-    page.locator("#view").focus()
-    page.keyboard.press("v")
+    press(page, "v")
     page.get_by_text("The path begins here").wait_for()
     page.get_by_role("option", name="003.png").click()
-    page.locator("#view").focus()
-    page.keyboard.press("v")
+    press(page, "v")
     page.get_by_text("2 views in the path").wait_for()
     film = save(page, "Film, MP4", tmp_path / "film.mp4")
     with av.open(str(film)) as frames:
@@ -259,6 +253,13 @@ def test_similar_nodes_are_those_of_the_node_in_its_own_tree(served, own_desk, t
     page.get_by_role("status").get_by_text("most similar first").wait_for()
     assert not page.locator("#answers-beside li").count()
     assert page.locator("#answers li").count() == 24
-    page.locator("#view").press("Escape")
+    assert "The first 5 are highlighted." in page.get_by_role("status").inner_text()
+    table = page.evaluate("Array.from(hilsplat.painted()[0].style.table)")
+    assert sum(share > 0 for share in table[3::4]) == 6  # with the selected node
+    shown = (
+        "import('/static/styles.js').then((own) => own.shownHits({ route: 'tree', hits: Array(7) }).length)"
+    )
+    assert page.evaluate(shown) == 7  # of a query, all are
+    press(page, "Escape")
     boxes = json.loads(save(page, "Boxes, JSON", tmp_path / "boxes.json").read_text())["boxes"]
     assert len(boxes) == page.locator("#overlay path.answer").count() == 5  # as painted

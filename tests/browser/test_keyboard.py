@@ -1,7 +1,8 @@
 """Both pages used by the keyboard alone."""
 
-from hilsplat.annotate.labels import label_path, read_labels
+from hilsplat.annotate.labels import label_path
 from hilsplat.base.artifacts import read_json
+from tests.unit.annotate.label_files import read_labels
 
 MOST_STEPS = 80
 

@@ -13,7 +13,7 @@ from hilsplat.splat.rasterise.api import render
 from hilsplat.splat.spz import fractional_bits, spz_bytes
 from hilsplat.viewer.frames import Paint, faded, painted, within
 from hilsplat.viewer.wire import WireCamera
-from tests.browser.conftest import ask_and_wait, drawn, pixels, until, wire_camera
+from tests.browser.conftest import ask_and_wait, drag, drawn, pixels, press, save, until, wire_camera
 from tests.unit.splat.spz_reader import decoded
 
 
@@ -85,18 +85,14 @@ def test_a_photograph_is_aligned_with_its_view(opened, desk_address, painter):
 def test_selected_and_removed_gaussians_are_shown_by_both_painters(opened, cloud, cloud_address, painter):
     page = opened(cloud_address, painter)
     gaussians = load_ply(cloud / "gaussians.ply")
-    page.locator("#view").focus()
-    page.keyboard.press("x")
+    press(page, "x")
     page.keyboard.press("b")
     page.wait_for_timeout(600)
     view = page.locator("#view").bounding_box()
     camera = WireCamera.model_validate(wire_camera(page)).camera()
     found = []
     for left, right in ((90.0, 180.0), (200.0, 330.0)):
-        page.mouse.move(view["x"] + left, view["y"] + 100)
-        page.mouse.down()
-        page.mouse.move(view["x"] + right, view["y"] + 190, steps=3)
-        page.mouse.up()
+        drag(page, (view["x"] + left, view["y"] + 100), (view["x"] + right, view["y"] + 190))
         found.append(within(gaussians.means, camera, [(left, 100.0), (right, 190.0)], 0.0))
         if len(found) == 1:
             page.keyboard.press("Delete")
@@ -111,6 +107,14 @@ def test_selected_and_removed_gaussians_are_shown_by_both_painters(opened, cloud
     assert psnr(expected, painted(gaussians, camera)) < 20
     visible = np.s_[120:200]  # neither the tools nor the scale cover these rows
     assert psnr(np.asarray(picture)[visible], expected[visible]) > 30
+
+
+def test_the_server_renders_a_picture_of_a_large_screen(opened, desk_address, tmp_path):
+    page = opened(desk_address, "server", viewport={"width": 2500, "height": 500}, device_scale_factor=2)
+    box = page.locator("#view").bounding_box()
+    width, height = Image.open(save(page, "Picture, PNG", tmp_path / "picture.png")).size
+    assert 2 * box["width"] > width == 4096  # the largest that the server renders
+    assert height == pytest.approx(box["height"] * width / box["width"], abs=1)
 
 
 def test_the_server_renders_once_the_graphics_card_is_lost(opened, desk_address):

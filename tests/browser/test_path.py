@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilsplat.scene.scene import Scene
-from tests.browser.conftest import drawn, late, until, wire_camera
+from tests.browser.conftest import drawn, late, press, reload, until, wire_camera
 
 
 def steps(page):
@@ -21,8 +21,7 @@ def places(page) -> list[str]:
 def add(page, *photographs: str) -> None:
     for name in photographs:
         page.get_by_role("option", name=name).click()
-        page.locator("#view").focus()
-        page.keyboard.press("v")
+        press(page, "v")
 
 
 @pytest.mark.parametrize("painter", ["gl", "server"])
@@ -68,12 +67,10 @@ def test_the_views_of_a_path_are_reordered_replaced_removed_and_kept(opened, des
     assert page.evaluate("document.activeElement.getAttribute('aria-label')") == "Remove view 2"
     steps(page).nth(0).get_by_title("Go to this view").click()
     until(page, lambda: page.evaluate("hilsplat.camera.view") == 1)
-    page.reload()
-    page.locator("body[data-ready=yes]").wait_for()
+    reload(page)
     assert places(page) == ["001.png", "004.png"]
     page.get_by_role("button", name="Clear").click()
-    page.reload()
-    page.locator("body[data-ready=yes]").wait_for()
+    reload(page)
     assert not steps(page).count()
 
 
@@ -132,6 +129,9 @@ def test_a_path_is_saved_as_json_and_opened_again(opened, desk_address, tmp_path
     steps(page).nth(1).wait_for()
     drawn(page, steps(page).nth(1).get_by_title("Go to this view").click)
     np.testing.assert_allclose(wire_camera(page)["cam_from_world"], content["path"][1]["cam_from_world"])
+    (tmp_path / "other.json").write_text(json.dumps({**content, "scene": "photos/other"}))
+    page.locator("#path-file").set_input_files(tmp_path / "other.json")
+    page.get_by_text("This path was saved for photos/other").wait_for()
     (tmp_path / "wrong.json").write_text("[1]")
     page.locator("#path-file").set_input_files(tmp_path / "wrong.json")
     page.get_by_text("wrong.json is not a camera path").wait_for()
@@ -147,6 +147,5 @@ def test_a_kept_path_follows_its_photographs_when_others_are_left_out(opened, de
         route.fulfill(json={**described, "views": described["views"][1:]})
 
     page.route("**/api/scene?**", without_first)
-    page.reload()
-    page.locator("body[data-ready=yes]").wait_for()
+    reload(page)
     assert places(page) == ["003.png"]

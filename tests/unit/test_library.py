@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -73,15 +74,6 @@ def test_objects_are_one_line_each_and_cameras_are_found_by_name_and_row(desk, s
         with pytest.raises(SceneError, match="has no camera"):
             scene.cameras[wrong]
     assert scene.image("000.png").shape == (*scene.cameras[0].size_hw, 3)
-
-
-def test_scenes_opened_by_a_relative_path_are_found_from_another_folder(desk, tmp_path, monkeypatch):
-    monkeypatch.chdir(desk.parent)
-    scene, opened = hilsplat.load_scene(desk.name), hilsplat.open_scene(desk.name)
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / desk.name).mkdir()  # of the same name
-    assert scene.image("000.png").shape == (*scene.cameras["000.png"].size_hw, 3)
-    assert opened.query("mug")[0].mask("000.png").any()
 
 
 @pytest.mark.parametrize("iterations", [40, None])
@@ -377,17 +369,22 @@ def test_a_changed_camera_changes_no_other(scene):
     )
 
 
-def test_a_scene_keeps_its_photographs_if_the_working_folder_changes(desk_project, tmp_path, monkeypatch):
-    """Another project may have a scene of the same name."""
+def test_opened_scenes_do_not_follow_the_working_folder(desk_project, tmp_path, monkeypatch):
+    """Another project may have scenes of the same names."""
     shutil.copytree(desk_project / SCENE, other := tmp_path / SCENE)
     for image in (other / "scene/images").glob("*.png"):
         write_png(image, np.zeros((24, 42, 3), np.uint8))
+    shutil.rmtree(other / "default")
     monkeypatch.chdir(desk_project)
-    posed, opened = hilsplat.load_scene(SCENE), hilsplat.open_scene(SCENE)
-    before = posed.image("000.png")
+    posed, opened, shown = hilsplat.load_scene(SCENE), hilsplat.open_scene(SCENE), hilsplat.show(SCENE)
+    before, address = posed.image("000.png"), f"http://127.0.0.1:{shown.port}/api/photo/0?token={shown.token}"
     monkeypatch.chdir(tmp_path)
     for after in (posed.image("000.png"), opened.views.image("000.png")):
         np.testing.assert_array_equal(after, before)
+    with urlopen(address) as photograph:
+        assert photograph.read() == (desk_project / SCENE / "scene/images/000.png").read_bytes()
+    shown.close()
+    assert opened.query("mug")[0].mask("000.png").any()
 
 
 def test_levels_are_found_by_number_and_label(masks, linked):

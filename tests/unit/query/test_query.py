@@ -103,21 +103,30 @@ def test_automatic_level_is_the_coarsest_level_of_the_best_nodes(scene):
     assert automatic_level(scene.tree, margin, np.zeros(7, bool)) == Level.WHOLE
 
 
-def best_wholes(margin, threshold, vectors=None, visible=None) -> list[int]:
+def best_wholes(margin, threshold, vectors=None, hidden=()) -> list[int]:
     """Answers among wholes, whose vectors are orthogonal unless given."""
     num = len(margin)
     tree = plain_tree([1] * num, [-1] * num, [[-1, -1, -1]])
     vectors = np.eye(num, dtype=np.float32) if vectors is None else vectors
-    margins = np.array([margin], np.float32)
-    options = {"level": Level.WHOLE, "visible": np.ones(num, bool) if visible is None else visible}
-    return search(tree, margins, vectors, ("x",), threshold=threshold, ancestors=0.2, **options).ids.tolist()
+    margins, visible = np.array([margin], np.float32), ~np.isin(np.arange(num), hidden)
+    options = {"level": Level.WHOLE, "visible": visible, "threshold": threshold, "ancestors": 0.2}
+    return search(tree, margins, vectors, ("x",), **options).ids.tolist()
 
 
-def test_answers_are_within_a_share_of_the_range_of_the_level_below_the_best():
-    margin = [-0.22, 0.29, 0.39, 0.69]  # a range of 0.91: 0.15 of it is 0.14, a half 0.46
-    assert best_wholes(margin, 0.85) == [3]
-    assert best_wholes(margin, 0.5) == [3, 2, 1]
-    assert best_wholes([-0.1, 0.2, 0.2], 0.95) == [1, 2]
+@pytest.mark.parametrize(
+    ("margin", "threshold", "hidden", "found"),
+    [
+        ([-0.22, 0.29, 0.39, 0.69], 0.85, (), [3]),  # a range of 0.91, and 0.15 of it is 0.14
+        ([-0.22, 0.29, 0.39, 0.69], 0.5, (), [3, 2, 1]),  # a half is 0.46
+        ([-0.1, 0.2, 0.2], 0.95, (), [1, 2]),
+        ([0.0, 9.4, 9.7, 10.0], 0.95, (3,), [2, 1]),  # within 0.05 of the range of all four, 10
+        ([0.0, 9.4, 9.7, 10.0], 0.95, (0, 1, 2, 3), []),
+    ],
+)
+def test_answers_are_within_a_share_of_the_range_of_all_nodes_below_the_best_shown(
+    margin, threshold, hidden, found
+):
+    assert best_wholes(margin, threshold, hidden=hidden) == found
 
 
 @pytest.mark.parametrize(("cosine", "found"), [(0.91, [3, 2]), (0.89, [3])])
@@ -127,12 +136,6 @@ def test_nodes_similar_to_the_best_answer_may_be_three_times_as_far_below(cosine
         vectors[node] = cosine * vectors[3] + np.sqrt(1 - cosine**2) * np.eye(5)[4]
     # of a range of 10: 0.05 is 0.5, three times that 1.5
     assert best_wholes([0.0, 7.0, 8.6, 10.0], 0.95, vectors) == found
-
-
-def test_only_shown_nodes_are_answers_but_all_define_the_range():
-    margin, visible = [0.0, 9.4, 9.7, 10.0], np.array([True, True, True, False])
-    assert best_wholes(margin, 0.95, visible=visible) == [2, 1]  # within 0.05 of the range of all four, 10
-    assert best_wholes(margin, 0.95, visible=np.zeros(4, bool)) == []
 
 
 def test_parts_of_a_likely_thing_are_ranked_first(scene):
@@ -158,24 +161,20 @@ def test_parts_of_a_likely_thing_are_ranked_first(scene):
     assert (ancestor_margins(orphans, margin)[scene.tree.level > 1] == -1.0).all()
 
 
-def of_path(*named):
-    """Margins of a path's texts: -1 but for the nodes that are named."""
-    every = np.full((len(named), len(NAMES)), -1.0, np.float32)
-    for row, values in zip(every, named, strict=True):
+def search_path(tree, named, threshold=0.99, level=None, hidden=()):
+    """Search a path of one text for each of `named`: margins of named nodes; those of all others are -1."""
+    margin = np.full((len(named), len(NAMES)), -1.0, np.float32)
+    for row, values in zip(margin, named, strict=True):
         for name, value in values.items():
             row[NODE[name]] = value
-    return every
-
-
-def search_path(tree, margin, path, threshold, level=None, visible=None):
-    """Search a path of several texts."""
-    options = {"level": level, "visible": np.ones(len(tree), bool) if visible is None else visible}
-    return search(tree, margin, tree.clip, path, threshold=threshold, ancestors=0.2, **options)
+    visible = ~np.isin(NAMES, hidden)
+    options = {"level": level, "visible": visible, "threshold": threshold, "ancestors": 0.2}
+    return search(tree, margin, tree.clip, tuple("xyz"[: len(named)]), **options)
 
 
 def test_a_path_stays_inside_its_first_thing(scene):
-    margin = of_path({"A": 3.0}, {"A bottom": 2.0}, {"A top left": 0.4, "B corner": 2.2})
-    hits = search_path(scene.tree, margin, ("A", "A bottom", "x"), 0.95)
+    named = {"A": 3.0}, {"A bottom": 2.0}, {"A top left": 0.4, "B corner": 2.2}
+    hits = search_path(scene.tree, named, 0.95)
     # the one subpart of A hangs under its top; that of B answers better, but is no part of A
     assert (hits.ids.tolist(), hits.route) == ([NODE["A top left"]], "child")
 
@@ -188,10 +187,8 @@ def three_wholes(scene) -> SemanticTree:
     return replace(scene.tree, level=level, parent=parent)
 
 
-def orphaned(tree: SemanticTree, name: str) -> SemanticTree:
-    parent = tree.parent.copy()
-    parent[NODE[name]] = -1
-    return replace(tree, parent=parent)
+def orphaned(tree: SemanticTree, name: str | None) -> SemanticTree:
+    return replace(tree, parent=np.where(np.array(NAMES) == name, -1, tree.parent).astype(np.int32))
 
 
 @pytest.mark.parametrize(
@@ -211,18 +208,16 @@ def orphaned(tree: SemanticTree, name: str) -> SemanticTree:
     ],
 )
 def test_answers_of_a_path_depend_on_their_ancestors(three_wholes, first, last, orphan, found, route):
-    tree = orphaned(three_wholes, orphan) if orphan else three_wholes
-    hits = search_path(tree, of_path(first, last), ("x", "y"), 0.99, Level.SUBPART)
+    hits = search_path(orphaned(three_wholes, orphan), (first, last), level=Level.SUBPART)
     assert (hits.ids.tolist(), hits.route) == ([NODE[found]], route)
 
 
 def test_hidden_ancestors_do_not_compete_with_shown_ones(three_wholes):
     tree = orphaned(three_wholes, "B corner")
     # B top would leave A unlikely, and B corner, which nothing holds, the answer
-    margin = of_path({"A": 1.0, "B top": 4.0}, {}, {"A top left": 2.0, "B corner": 0.0})
+    named = {"A": 1.0, "B top": 4.0}, {}, {"A top left": 2.0, "B corner": 0.0}
     for hidden, found in (("B", "B corner"), ("B top", "A top left")):
-        visible = np.arange(7) != NODE[hidden]
-        hits = search_path(tree, margin, ("x", "y", "z"), 0.99, visible=visible)
+        hits = search_path(tree, named, hidden=hidden)
         assert hits.ids.tolist() == [NODE[found]]
 
 
@@ -255,9 +250,17 @@ def test_a_scene_opens_with_the_settings_of_its_evaluation_or_panel(tmp_path, ca
     assert "using the defaults" not in caplog.text
 
 
-def test_a_variant_uses_the_field_recorded_in_its_scores(tmp_path):
-    folder = bear_without(tmp_path)
+def test_a_variant_uses_the_parts_recorded_in_its_scores_or_those_that_exist(tmp_path):
+    later = ("default/semantic_tree", "default/autoencoder", "default/field.safetensors")
+    with pytest.raises(ArtifactError, match=r"hilsplat run .*default/semantic_tree"):
+        FinishedScene.locate(folder := bear_without(tmp_path, *later))
+    (folder / "default/semantic_tree").mkdir()
+    parts = FinishedScene.locate(folder).parts  # a tree can be queried before there is a field
+    assert (parts.field, parts.autoencoder) == (None, None)
+    assert list(parts.as_inputs()) == ["scene", "gaussians", "semantic_tree", "clip", "masks"]
     (folder / "lifted").mkdir()  # begun, and killed
+    (folder / "default/autoencoder").mkdir()
+    (folder / "default/field.safetensors").touch()
     with pytest.raises(ArtifactError, match=r"lifted/field\.safetensors is missing"):
         FinishedScene.locate(folder, "lifted")
     (folder / "theta").mkdir()
@@ -269,17 +272,6 @@ def test_a_variant_uses_the_field_recorded_in_its_scores(tmp_path):
     assert found.semantic_tree == folder / "default/semantic_tree"
     with pytest.raises(ArtifactError, match="no variant 'x'"):
         FinishedScene.locate(folder, "x")
-
-
-def test_a_tree_can_be_queried_before_there_is_a_field(tmp_path):
-    later = ("default/semantic_tree", "default/autoencoder", "default/field.safetensors")
-    folder = bear_without(tmp_path, *later)
-    with pytest.raises(ArtifactError, match=r"hilsplat run .*default/semantic_tree"):
-        FinishedScene.locate(folder)
-    (folder / "default/semantic_tree").mkdir()
-    parts = FinishedScene.locate(folder).parts
-    assert (parts.field, parts.autoencoder) == (None, None)
-    assert list(parts.as_inputs()) == ["scene", "gaussians", "semantic_tree", "clip", "masks"]
 
 
 def test_the_field_answers_through_the_same_interface(scene):
@@ -317,8 +309,7 @@ def test_a_path_finds_its_levels_unless_one_is_given(scene, path, level, found):
 
 def test_levels_at_which_every_ancestor_exists_are_preferred(scene):
     # B top has no subpart
-    margin = of_path({"A": 0.8, "B top": 0.9}, {"A top left": 0.6, "B corner": 0.9})
-    hits = search_path(scene.tree, margin, ("x", "y"), 0.95)
+    hits = search_path(scene.tree, ({"A": 0.8, "B top": 0.9}, {"A top left": 0.6, "B corner": 0.9}), 0.95)
     assert (hits.ids.tolist(), hits.route) == ([NODE["A top left"]], "descendant")
 
 

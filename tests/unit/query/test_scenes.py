@@ -131,6 +131,14 @@ def test_a_scene_changed_after_opening_does_not_answer(changed, change):
     assert [*scenes.skipped] == ["rooms/desk-49"]
 
 
+def test_scenes_opened_by_a_relative_path_do_not_follow_the_working_folder(changed, tmp_path, monkeypatch):
+    monkeypatch.chdir(changed.parents[2])
+    scenes = hilsplat.open_scenes()
+    monkeypatch.chdir(tmp_path.parent)
+    (hit, *_) = scenes.query("mug")
+    assert hit.picture.is_file() and hilsplat.open_scene(hit.folder).query("mug")[0].node == hit.node
+
+
 def test_a_name_given_by_hand_is_found_first(changed):
     scene = changed.parents[1] / "photos/desk-46"
     tree = scene / "default/semantic_tree"

@@ -21,7 +21,7 @@ from hilsplat.viewer.viewer_scene import ViewerScene
 from tests.unit.artifact_changes import loosen
 from tests.unit.finished_desk import SCENE
 from tests.unit.splat.spz_reader import decoded
-from tests.unit.viewer.conftest import browsing, in_steps, wire_camera
+from tests.unit.viewer.conftest import browsing, in_steps, table, wire_camera
 
 
 def bits(shown, marked: np.ndarray) -> str:
@@ -93,9 +93,7 @@ def test_gaussians_of_no_node_are_selected(own_desk):
 
 def test_gaussians_that_the_style_hides_are_not_selected(shown, client, camera):
     tree = shown.answering("default").tree
-    table = np.zeros((len(tree) + 1, 4), np.uint8)
-    table[1] = 255
-    style = {"table": base64.b64encode(table.tobytes()).decode(), "mode": "isolate"}
+    style = {"table": table(shown, {0: (255, 255, 255, 255)}), "mode": "isolate"}
     region = {"camera": wire_camera(camera), "points": [(0, 0), (42, 24)], "style": style}
     found = marked(shown, client.post("/api/within", json=region).content)
     np.testing.assert_array_equal(found, (tree.node_of_gaussian == 0).any(axis=1))
@@ -126,11 +124,10 @@ def test_pictures_picks_and_films_leave_out_removed_gaussians(shown, client, cam
 
 def test_a_pick_ignores_what_the_style_hides(shown, client, camera):
     (book,) = shown.answering("default").query("book")
-    table = np.zeros((1 + len(shown.answering("default").tree), 4), np.uint8)
-    table[1 + book.node] = 255
-    style = {"table": base64.b64encode(table.tobytes()).decode()}
+    of_book = table(shown, {book.node: (255, 255, 255, 255)})
     for mode, is_shown in (("isolate", False), ("tint", True), ("ghost", True)):
-        sent = {"camera": wire_camera(camera), "x": 8.5, "y": 8.5, "style": {**style, "mode": mode}}
+        style = {"table": of_book, "mode": mode}
+        sent = {"camera": wire_camera(camera), "x": 8.5, "y": 8.5, "style": style}
         assert (client.post("/api/pick", json=sent).json()["alpha"] > 0.9) == is_shown  # of the mug
         assert client.post("/api/pick", json={**sent, "x": 24.5}).json()["alpha"] > 0.9
 

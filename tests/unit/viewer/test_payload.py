@@ -1,6 +1,5 @@
 """Data of the page: chunks of Gaussians, their nodes, the initial focus point."""
 
-import base64
 import gzip
 from dataclasses import replace
 
@@ -16,6 +15,7 @@ from hilsplat.viewer.wire import Question, Style
 from tests.unit.evaluate.builders import cameras_of
 from tests.unit.many_nodes import add_nodes
 from tests.unit.round_gaussians import round_gaussians
+from tests.unit.viewer.conftest import table
 
 MANY = 70_000
 
@@ -83,17 +83,18 @@ def test_more_nodes_than_16_bits_can_number(own_desk, desk):
     assert hit == {**other, "node": other["node"] + MANY}
     pictures = []
     for each, chosen in ((shown, hit), (few, other)):
-        table = np.zeros((len(each.answering("default").tree) + 1, 4), np.uint8)
-        table[chosen["node"] + 1] = 255, 122, 0, 180
-        style = Style(table=base64.b64encode(table).decode(), mode="ghost")
+        style = Style(table=table(each, {chosen["node"]: (255, 122, 0, 180)}), mode="ghost")
         camera = each.scene.cameras[each.scene.cameras.names[0]]
         pictures.append(painted(each.gaussians, camera, each.paint("default", style)))
     np.testing.assert_array_equal(*pictures)
     assert (np.ptp(pictures[0], axis=2) > 90).any()
 
 
-def test_too_many_nodes_are_refused(desk, monkeypatch):
-    monkeypatch.setattr("hilsplat.viewer.viewer_scene.MAX_NODES", 4)
-    with pytest.raises(ArtifactError, match="is too large for the page") as caught:
+@pytest.mark.parametrize(
+    ("limit", "fix"),
+    [("MAX_NODES", "at most 4 nodes(.|\n)*hilsplat query"), ("MAX_GAUSSIANS", "max_gaussians")],
+)
+def test_a_scene_that_is_too_large_for_the_page_is_refused(desk, monkeypatch, limit, fix):
+    monkeypatch.setattr(f"hilsplat.viewer.viewer_scene.{limit}", 4)
+    with pytest.raises(ArtifactError, match=f"is too large for the page(.|\n)*{fix}"):
         ViewerScene(desk).answering("default")
-    assert "at most 4 nodes" in str(caught.value) and "hilsplat query" in str(caught.value)
