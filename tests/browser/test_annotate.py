@@ -292,9 +292,14 @@ def test_an_import_keeps_what_is_changed_while_it_runs(page, tmp_path):
     (tmp_path / "book.json").write_text(
         json.dumps(content | {"info": {**content["info"], "name": "000.png"}})
     )
-    late(page, "api/import")
+    held = []
+    page.route("**/api/import*", lambda route: held.append((route, route.fetch())), times=1)
     page.get_by_label("Files to import").set_input_files(tmp_path / "book.json")
+    until(page, lambda: held)
     name(page, "cup")
+    until(page, lambda: texts(tmp_path) == ["cup"])
+    ((route, reply),) = held
+    route.fulfill(response=reply)
     page.get_by_text("1 label imported into 1 photograph.").wait_for()
     saved(page)
     assert texts(tmp_path) == ["book", "cup"]
