@@ -102,14 +102,16 @@ def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[La
     twice = [number for number, count in Counter(label.id for label in labels).items() if count > 1]
     if twice:
         raise SettingsError(f"id {twice[0]} occurs twice", fix="reload the page")
-    by_number = {label.id: label for label in labels}
-    masks: dict[int, np.ndarray] = {}
+    by_number, parents = {label.id: label for label in labels}, {label.parent for label in labels}
+    masks: dict[int, np.ndarray] = {}  # of parents only: a photograph may have 100 million pixels
     cut: dict[int, Label] = {}
     for label in sorted(labels, key=lambda label: label.level):
-        masks[label.id] = mask = label.mask(size_hw)
+        mask = label.mask(size_hw)
         if not mask.any():
             raise SettingsError(f"{label.text!r} has no pixels inside the photograph", fix="draw it again")
         cut[label.id] = label
+        if label.id in parents:
+            masks[label.id] = mask
         if label.parent is None:
             continue
         parent = by_number.get(label.parent)
@@ -128,7 +130,9 @@ def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[La
                 fix="draw it inside, or choose a different parent",
             )
         if not np.array_equal(inside, mask):
-            masks[label.id], cut[label.id] = inside, label.model_copy(update={"polygons": traced(inside)})
+            cut[label.id] = label.model_copy(update={"polygons": traced(inside)})
+            if label.id in masks:
+                masks[label.id] = inside
     return [cut[label.id] for label in labels]
 
 

@@ -545,6 +545,14 @@ def test_annotations_of_another_tab_appear_and_ids_stay_apart(page, tmp_path):
     other.close()
 
 
+def test_a_very_large_photograph_is_not_enlarged_by_zooming_out(page):
+    page.evaluate("hilsplat.sheet.show(0, [9000, 12000])")
+    scale = page.evaluate("hilsplat.sheet.scale")
+    for factor, expected in ((0.8, scale), (1.25, 1.25 * scale)):
+        page.evaluate(f"hilsplat.sheet.zoom({factor})")
+        assert page.evaluate("hilsplat.sheet.scale") == pytest.approx(expected)
+
+
 def test_outlines_are_as_thin_on_a_small_photograph_as_on_a_large_one(page):
     draw_mug(page)
     press(page, "v", "Escape")

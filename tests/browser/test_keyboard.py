@@ -23,8 +23,8 @@ def press(page, *keys: str) -> None:
 
 def test_querying_choosing_naming_and_saving_in_the_viewer(served, own_desk, tmp_path):
     page = served(own_desk)
-    page.keyboard.type("o ? [")  # the text box has the focus: these keys do not act
-    assert page.locator("#text").input_value() == "o ? [" and not page.get_by_role("dialog").is_visible()
+    page.keyboard.type("/ o ? [")  # the text box has the focus: these keys do not act
+    assert page.locator("#text").input_value() == "/ o ? [" and not page.get_by_role("dialog").is_visible()
     press(page, "Control+a")
     page.keyboard.type("mug > handle")
     press(page, "Enter")

@@ -7,7 +7,7 @@ import { Sheet } from "./sheet.js";
 import { Store } from "./store.js";
 import { attachThings, fillForm, level, LEVEL, makeStrip, markStrip, setLevel, showTexts, showThings, under } from "./things.js";
 
-const UNNAMED = "unnamed", NEAR_PX = 8, ID_STEPS = 2 ** 16;
+const UNNAMED = "unnamed", NEAR_PX = 8, ID_STEPS = 2 ** 16, MOST_RADIUS = 500;
 const sheet = new Sheet(), start = new URLSearchParams(location.hash.slice(1));
 // The id of the chosen object, 0 for a new one, and the settings of a new one. A choice replaces this, so that a region
 // whose reply is late still goes to the object for which it was drawn.
@@ -76,7 +76,9 @@ function stand(to) {
   drop();
   number = (to + scene.views.length) % scene.views.length;
   aimAt(aim.id);
-  sheet.show(number, scene.views[number].size_hw);
+  const { size_hw } = scene.views[number];
+  sheet.show(number, size_hw);
+  $("radius").max = Math.min(MOST_RADIUS, Math.max(60, Math.max(...size_hw) / 20));
   $("picture").alt = scene.views[number].name;
   history.replaceState(null, "", `${location.pathname}#view=${number}`);
   refresh();

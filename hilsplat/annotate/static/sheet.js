@@ -34,7 +34,7 @@ export class Sheet {
   fit() {
     if (!this.size) return;
     const { clientWidth: w, clientHeight: h } = this.host;
-    this.scale = Math.min(w / this.size[0], h / this.size[1]);
+    this.scale = this.fitting = Math.min(w / this.size[0], h / this.size[1]);
     this.x = (w - this.scale * this.size[0]) / 2;
     this.y = (h - this.scale * this.size[1]) / 2;
     this.place();
@@ -49,7 +49,7 @@ export class Sheet {
   move(dx, dy) { this.x += dx; this.y += dy; this.place(); }
 
   zoom(factor, x = this.host.clientWidth / 2, y = this.host.clientHeight / 2) {
-    const scale = Math.min(40, Math.max(0.1, this.scale * factor)), by = scale / this.scale;
+    const scale = Math.min(40, Math.max(Math.min(0.1, this.fitting), this.scale * factor)), by = scale / this.scale;
     this.x = x - by * (x - this.x);
     this.y = y - by * (y - this.y);
     this.scale = scale;
