@@ -257,5 +257,5 @@ def show(
             machine, such as "/user/me/proxy/{port}/" on a JupyterHub.
     """
     return EmbeddedViewer(
-        Viewer(ViewerScene(Path(folder).absolute(), variant, threads), others=False), text, height, proxy
+        Viewer(ViewerScene(Path(folder), variant, threads), others=False), text, height, proxy
     )

@@ -94,6 +94,9 @@ def test_gaussians_in_a_box_are_selected_removed_and_restored(opened, desk_addre
     page.get_by_role("button", name="Redo").click()
     press(page, "Control+Shift+z")
     has(page, 0, 32)
+    drag_over(page, (-0.5, -0.5), (15.5, 23.5))
+    page.get_by_role("button", name="Keep only").click()
+    has(page, 0, 864 - 16 * 24)
 
 
 def test_the_brush_adds_and_subtracts(opened, desk_address, desk):
@@ -121,6 +124,10 @@ def test_the_brush_adds_and_subtracts(opened, desk_address, desk):
     before = wire_camera(page)
     drag_over(page, (6, 8), (12, 8))
     assert wire_camera(page) != before
+    press(page, "c")
+    page.get_by_label("Size").press("Delete")
+    has(page, 0, inverted)
+    assert phone_fits(page)
 
 
 def test_an_answer_is_removed_and_the_rest_is_saved(opened, desk_address, desk, scene, tmp_path):
@@ -149,24 +156,6 @@ def test_an_answer_is_removed_and_the_rest_is_saved(opened, desk_address, desk, 
     assert (desk / "gaussians.ply").read_bytes() == before
 
 
-def test_only_the_selection_is_kept_in_the_saved_page(opened, desk_address, tmp_path):
-    page = opened(desk_address)
-    edit(page)
-    press(page, "b")
-    drag_over(page, (-0.5, -0.5), (15.5, 23.5))
-    page.get_by_role("button", name="Keep only").click()
-    has(page, 0, 864 - 16 * 24)
-    offline = saved_page(page, tmp_path)
-    assert offline.evaluate("hilsplat.painter.count") == 16 * 24
-    assert not offline.get_by_role("button", name="Edit", exact=True).is_visible()
-
-
-def test_the_edit_bar_fits_on_a_phone(opened, desk_address):
-    page = opened(desk_address)
-    edit(page)
-    assert phone_fits(page)
-
-
 def test_loose_gaussians_are_selected_and_removed(own_desk, served):
     loosen(own_desk, np.arange(100, 140))
     page = served(own_desk)
@@ -187,6 +176,7 @@ def test_what_is_done_while_a_selection_is_on_its_way_acts_on_it(opened, desk_ad
     offline = saved_page(page, tmp_path)
     has(page, 0, 32)
     assert offline.evaluate("hilsplat.painter.count") == 864 - 32
+    assert not offline.get_by_role("button", name="Edit", exact=True).is_visible()
     drag_over(page, (19.5, 14.5), (29.5, 20.5))
     press(page, "Control+z")  # the selection, not the removal
     page.get_by_role("button", name="Redo").click()  # once it can be
@@ -237,13 +227,3 @@ def test_what_is_removed_in_one_tab_is_removed_in_another(opened, desk_address):
     page.get_by_role("button", name="Restore all").click()
     has(other, 0, 0)
     other.close()
-
-
-def test_the_delete_key_removes_after_the_brush_size_was_set(opened, desk_address):
-    page = opened(desk_address)
-    edit(page)
-    press(page, "c")
-    drag_over(page, (6, 8), (26, 14))
-    until(page, lambda: page.get_by_role("button", name="Remove", exact=True).is_enabled())
-    page.get_by_label("Size").press("Delete")
-    until(page, lambda: page.get_by_role("button", name="Restore all").is_enabled())

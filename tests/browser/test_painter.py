@@ -51,20 +51,17 @@ def test_the_server_painter_equals_the_pipeline(opened, cloud, cloud_address):
     assert psnr(found, rendered(load_ply(cloud / "gaussians.ply"), page)) > 30
 
 
-def test_the_server_paints_if_webgl_runs_in_software(opened, cloud_address):
-    page = opened(cloud_address, "")
-    assert "llvmpipe" in page.locator("#view").get_attribute("data-gl")
-    assert page.locator("#view").get_attribute("data-painter") == "server"
-
-
 def test_an_unfinished_scene_is_reported_and_not_redrawn_without_a_change(opened, cloud_address):
-    page = opened(cloud_address)
+    page = opened(cloud_address, "")
+    view = page.locator("#view")
+    assert "llvmpipe" in view.get_attribute("data-gl")
+    assert view.get_attribute("data-painter") == "server"  # because WebGL runs in software
     assert "The run is not finished" in page.get_by_role("status").inner_text()
     assert not page.get_by_role("tree").is_visible()
     page.wait_for_timeout(1000)
-    before = page.locator("#view").get_attribute("data-drawn")
+    before = view.get_attribute("data-drawn")
     page.wait_for_timeout(1500)
-    assert page.locator("#view").get_attribute("data-drawn") == before
+    assert view.get_attribute("data-drawn") == before
 
 
 @pytest.mark.parametrize("painter", ["gl", "server"])

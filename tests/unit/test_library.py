@@ -131,7 +131,7 @@ def test_the_tree_equals_that_of_the_stages_and_answers_alike(desk, desk_project
         _ = linked.field
 
 
-def test_an_answer_has_a_mask_in_any_camera(linked):
+def test_answers_have_masks_in_any_camera_and_are_nodes_of_the_tree(linked):
     hit, view = linked.query("mug > handle")[0], "002.png"
     camera = linked.camera(view)
     np.testing.assert_array_equal(hit.mask(camera), hit.mask(view))
@@ -141,9 +141,6 @@ def test_an_answer_has_a_mask_in_any_camera(linked):
     for call in (hit.mask, linked.camera, linked.render):
         with pytest.raises(SettingsError, match="has no view 'x'"):
             call("x")
-
-
-def test_nodes_are_those_of_the_tree(linked):
     assert [node.node for node in linked.nodes] == list(range(len(linked.tree)))
     hit = linked.query("mug > handle")[0]
     node = linked.nodes[hit.node]

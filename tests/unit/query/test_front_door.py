@@ -172,6 +172,8 @@ def test_query_reports_the_answer_and_saves_its_masks_and_compressed_gaussians(d
         run("query", str(desk), "mug", "--out", "answer", "--masks", "masks")
     run("query", str(desk), "book", "--out", "answer")  # replaces the compressed Gaussians, too
     assert len(decoded(compressed.read_bytes())) == len(scene.query("book")[0].gaussians)
+    run("query", str(desk), "mug", "--threshold", "0.99", "--view", "000.png", "--out", "a")
+    assert "or omit --view, or omit --threshold" in capsys.readouterr().out
 
 
 def test_export_leaves_out_or_keeps_what_matches_a_query_or_a_node(desk, elsewhere, capsys):
@@ -246,11 +248,6 @@ def test_masks_do_not_replace_the_picture_of_their_answer(desk, elsewhere, out, 
     assert {path.name for path in Path("a").iterdir()} >= {"panel.png", "selection.ply", "masks"}
 
 
-def test_an_empty_answer_names_the_options_that_made_it_empty(desk, elsewhere, capsys):
-    run("query", str(desk), "mug", "--threshold", "0.99", "--view", "000.png", "--out", "a")
-    assert "or omit --view, or omit --threshold" in capsys.readouterr().out
-
-
 def test_a_scene_is_found_by_its_name_alone(desk_project, tmp_path):
     results = desk_project / "results"
     assert scene_folder("desk", results) == scene_folder("photos/desk", results) == results / "photos/desk"
@@ -283,16 +280,13 @@ def test_a_wrong_scene_name_suggests_the_right_one_in_every_command(desk_project
             open_it()
 
 
-def test_export_writes_the_tree_to_any_folder(desk, elsewhere, capsys):
+def test_export_writes_the_tree_to_any_folder_without_files(desk, elsewhere, capsys):
     run("export", str(desk), "--out", "tree")
     assert "2 whole, 2 part, 1 subpart" in capsys.readouterr().out
     nodes = json.loads((elsewhere / "tree/tree.json").read_text())["nodes"]
     assert [node["level"] for node in nodes] == ["whole", "whole", "part", "part", "subpart"]
     assert (elsewhere / "tree/tree.png").is_file()
     assert (elsewhere / "tree/tree.ply").stat().st_size > (desk / "gaussians.ply").stat().st_size
-
-
-def test_an_export_does_not_replace_a_folder_with_files(desk, elsewhere):
     (elsewhere / "mine").mkdir()
     (elsewhere / "mine/thesis.txt").write_text("years of work")
     with pytest.raises(ArtifactError, match="--out mine exists"):

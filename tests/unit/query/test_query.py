@@ -172,11 +172,14 @@ def search_path(tree, named, threshold=0.99, level=None, hidden=()):
     return search(tree, margin, tree.clip, tuple("xyz"[: len(named)]), **options)
 
 
-def test_a_path_stays_inside_its_first_thing(scene):
+def test_a_path_stays_inside_its_first_thing_at_levels_at_which_every_ancestor_exists(scene):
     named = {"A": 3.0}, {"A bottom": 2.0}, {"A top left": 0.4, "B corner": 2.2}
     hits = search_path(scene.tree, named, 0.95)
     # the one subpart of A hangs under its top; that of B answers better, but is no part of A
     assert (hits.ids.tolist(), hits.route) == ([NODE["A top left"]], "child")
+    # B top has no subpart
+    hits = search_path(scene.tree, ({"A": 0.8, "B top": 0.9}, {"A top left": 0.6, "B corner": 0.9}), 0.95)
+    assert (hits.ids.tolist(), hits.route) == ([NODE["A top left"]], "descendant")
 
 
 @pytest.fixture
@@ -274,14 +277,11 @@ def test_a_variant_uses_the_parts_recorded_in_its_scores_or_those_that_exist(tmp
         FinishedScene.locate(folder, "x")
 
 
-def test_the_field_answers_through_the_same_interface(scene):
+def test_the_field_answers_through_the_same_interface_and_by_look_ups(scene):
     hits = scene.query("B", "whole", answerer="field")
     assert hits[0].node == NODE["B"]
     (hit,) = scene.query("A > A top", answerer="field")
     assert (hit.node, hit.route) == (NODE["A top"], "child")
-
-
-def test_look_ups_of_the_field_agree_with_decoding(scene):
     exact = scene.field.relevancy(["B", "A top"], "004.png")
     fast = scene.field.relevancy(["B", "A top"], "004.png", exact=False)
     assert fast == pytest.approx(exact, abs=2e-3)  # a network with d = 4: decoded as well
@@ -307,12 +307,6 @@ def test_a_path_finds_its_levels_unless_one_is_given(scene, path, level, found):
     assert hits.level == Level(int(scene.tree.level[NODE[found]]))
 
 
-def test_levels_at_which_every_ancestor_exists_are_preferred(scene):
-    # B top has no subpart
-    hits = search_path(scene.tree, ({"A": 0.8, "B top": 0.9}, {"A top left": 0.6, "B corner": 0.9}), 0.95)
-    assert (hits.ids.tolist(), hits.route) == ([NODE["A top left"]], "descendant")
-
-
 @pytest.mark.parametrize("text", ["A top left", "A > A top left"])
 def test_answers_in_a_view_are_nodes_that_it_shows(scene, text):
     assert scene.views.visible_nodes("000.png").all()
@@ -333,7 +327,7 @@ def test_a_view_shows_the_nodes_with_a_mask_there(scene, monkeypatch):
     assert np.flatnonzero(~visible).tolist() == [NODE["B corner"]]
 
 
-def test_hits_describe_a_node_and_its_place(scene):
+def test_hits_and_masks_describe_nodes_and_their_places(scene):
     (hit,) = scene.query("A > A top")
     assert (hit.node, hit.level, hit.route) == (NODE["A top"], Level.PART, "child")
     assert hit.score > 0.9 and hit.best_views == ("000.png", "001.png", "002.png")
@@ -343,6 +337,10 @@ def test_hits_describe_a_node_and_its_place(scene):
     assert np.array_equal(hit.mask("004.png"), np.roll(region_mask(5), 4, axis=1))
     # 2 columns and 4 rows of Gaussians one unit apart, in a plane
     assert hit.oriented_box.size == pytest.approx((2.88, 1, 0), abs=0.15)
+    mask = scene.views.node_masks("004.png", np.array([NODE["A bottom"]]))
+    assert np.array_equal(mask, np.roll(region_mask(3), 4, axis=1))
+    both = scene.views.node_masks("000.png", np.array([NODE["A bottom"], NODE["A top left"]]))
+    assert np.array_equal(both, region_mask(3) | region_mask(5))
 
 
 @pytest.mark.parametrize(
@@ -359,13 +357,6 @@ def test_hits_describe_a_node_and_its_place(scene):
 def test_impossible_queries_are_refused(scene, text, options, words):
     with pytest.raises(SettingsError, match=words):
         scene.query(text, **options)
-
-
-def test_node_masks_cover_their_region_in_an_unseen_view(scene):
-    mask = scene.views.node_masks("004.png", np.array([NODE["A bottom"]]))
-    assert np.array_equal(mask, np.roll(region_mask(3), 4, axis=1))
-    both = scene.views.node_masks("000.png", np.array([NODE["A bottom"], NODE["A top left"]]))
-    assert np.array_equal(both, region_mask(3) | region_mask(5))
 
 
 @pytest.mark.parametrize(("answerer", "ahead_by"), [("tree", 0), ("field", 0.05)])
@@ -425,18 +416,6 @@ def test_latents_are_means_over_the_gaussians_that_have_one(scene):
         assert pixels.tolist() == np.flatnonzero(share > 0.5).tolist()
         assert (share[pixels] < 0.99).any()
         assert latents.tobytes() == ((weights[pixels] @ own) / share[pixels, None]).tobytes()
-
-
-def test_a_forgotten_view_is_computed_again_with_the_same_answers(scene):
-    asked = []
-    weights = lambda view: asked.append(view) or scene.views.pixel_weights(view)  # noqa: E731
-    own = with_views(scene, weights=weights)
-    first = own.field.relevancy(["cup"], "000.png")
-    own.views.visible_nodes("001.png")
-    own.views.cache.forget("000.png")
-    assert np.array_equal(own.field.relevancy(["cup"], "000.png"), first)
-    own.views.visible_nodes("001.png")
-    assert asked == ["000.png", "001.png", "000.png"]
 
 
 def test_field_image_has_one_colour_per_region(scene):

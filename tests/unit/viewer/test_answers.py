@@ -298,18 +298,6 @@ def test_a_film_on_a_full_disk_reports_the_error(client, monkeypatch):
     assert "No space left on device" in json.loads(sent.content.splitlines()[-1])["error"]
 
 
-def test_a_file_is_not_continued_after_its_page_is_closed(shown):
-    files, steps = SavedFiles(SceneThread(shown), {}), ((made, 9) for made in range(1, 9))
-
-    async def leave() -> None:
-        parts = files._stepped(steps, (0, 9), files.films)
-        assert [json.loads(await anext(parts))["made"] for _ in range(3)] == [0, 1, 2]
-        await parts.aclose()
-
-    run_apart(leave)
-    assert next(steps) == (3, 9)
-
-
 def test_a_query_waits_for_at_most_one_crop(shown):
     thread, order = SceneThread(shown), []
     request = Request({"type": "http", "query_string": b""})
@@ -339,14 +327,11 @@ def test_a_crop_shows_the_node_and_dims_the_rest(client, scene):
     assert client.get("/api/crop/default/99").status_code == 422
 
 
-def test_photographs_are_requested_by_number(client, scene):
+def test_photographs_are_requested_by_number_and_gaussians_are_sent_once(client, scene, shown):
     image = Image.open(io.BytesIO(client.get("/api/photo/3").content))
     np.testing.assert_array_equal(np.asarray(image.convert("RGB")), scene.views.image(scene.views.names[3]))
     assert client.get("/api/thumb/3").headers["content-type"] == "image/jpeg"
     assert client.get("/api/photo/99").status_code == 422
-
-
-def test_gaussians_are_sent_once(client, shown):
     first = client.get("/api/splats/0")
     assert len(decoded(first.content)) == len(shown.gaussians)
     assert client.get("/api/splats/1").status_code == 422

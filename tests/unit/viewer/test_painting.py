@@ -80,9 +80,6 @@ def test_a_pick_returns_the_nodes_with_the_largest_shares_and_the_point(shown, c
             shares[0] = 0  # Gaussians without a node
             assert node == (shares.argmax() - 1 if shares.any() else NONE)
             assert share == pytest.approx(shares.max() / row.sum(), abs=1e-4)
-
-
-def test_nothing_is_picked_outside_the_picture(shown, camera):
     height, width = camera.size_hw
     for x, y in ((-1.0, 3.0), (float(width), 3.0), (3.0, float(height))):
         assert pick(shown.gaussians, None, camera, x, y) is None
