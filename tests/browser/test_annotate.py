@@ -13,7 +13,7 @@ from hilsplat.annotate.labels import Label, label_path, write_labels
 from hilsplat.base.tables import write_csv
 from hilsplat.datasets.registry import open_labelled
 from hilsplat.web.file_changes import version_of
-from tests.browser.conftest import beside, drag, late, phone_fits, press, reload, serving, until
+from tests.browser.conftest import serving
 from tests.conftest import PROJECT
 from tests.unit.annotate.label_files import read_labels
 from tests.unit.artifact_changes import change_index, write_again
@@ -61,7 +61,7 @@ def polygon(page, *corners: tuple[int, int]) -> None:
 
 
 def draw_polygon(page, *corners: tuple[int, int]) -> None:
-    press(page, "p")
+    page.press("p")
     click(page, *corners)
     page.keyboard.press("Enter")
 
@@ -76,7 +76,7 @@ MUG, BOOK = ((1, 1), (15, 1), (15, 20), (1, 20)), ((22, 2), (36, 2), (36, 20))
 
 def draw(page, text: str, corners: tuple[tuple[int, int], ...] = BOOK) -> None:
     """Draw a new thing."""
-    press(page, "Escape", "n")
+    page.press("Escape", "n")
     name(page, text)
     draw_polygon(page, *corners)
 
@@ -97,7 +97,7 @@ def texts(root: Path, view: str = "000.png") -> list[str]:
 
 def drag_over(page, *pixels: tuple[int, int]) -> None:
     """Drag over pixels of the photograph."""
-    drag(page, *[place(page, *pixel) for pixel in pixels])
+    page.drag(*[place(page, *pixel) for pixel in pixels])
 
 
 def things(page) -> list[str]:
@@ -108,7 +108,7 @@ def things(page) -> list[str]:
 
 def offers_at(page, x: int, y: int):
     """Click a pixel with the proposing tool, and return the buttons of its proposals."""
-    press(page, "x")
+    page.press("x")
     click(page, (x, y))
     offers = page.get_by_role("region", name="Proposals at this pixel").get_by_role("button")
     offers.first.wait_for()
@@ -117,7 +117,7 @@ def offers_at(page, x: int, y: int):
 
 def test_a_whole_and_its_part_are_drawn_cut_saved_and_scored(page, tmp_path):
     draw_mug(page)
-    press(page, "j")  # a part of it
+    page.press("j")  # a part of it
     name(page, "handle")
     polygon(page, (10, 4), (30, 4), (30, 10), (10, 10))
     assert things(page) == ["mug, whole", "handle, part"]
@@ -152,18 +152,18 @@ def test_changes_are_undone_and_redone_even_after_a_reload_and_each_is_saved(pag
     first = file.read_bytes()
     draw_book(page)
     both = file.read_bytes()
-    press(page, "Control+z")
+    page.press("Control+z")
     saved(page)
     assert file.read_bytes() == first and things(page) == ["mug, whole"]
-    reload(page)
+    page.reloaded()
     page.get_by_role("button", name="Undo").click()
     saved(page)
     assert not file.exists()
     for key in ("Control+Shift+z", "Control+y"):
-        press(page, key)
+        page.press(key)
         saved(page)
     assert file.read_bytes() == both
-    press(page, "]", "Control+z")
+    page.press("]", "Control+z")
     saved(page)
     assert file.read_bytes() == first and page.url.endswith("view=0")  # the photograph that changed
 
@@ -179,7 +179,7 @@ def test_a_proposed_node_is_scored_only_after_it_is_accepted(page, tmp_path):
     assert mug.origin == "proposed" and mug.text == "mug"
     assert open_labelled("annotated/photos/desk", tmp_path).views["000.png"] == ()
     assert things(page) == ["mug, whole, proposed"]
-    press(page, "a")
+    page.press("a")
     saved(page)
     assert kept(tmp_path)[0].origin == "accepted"
     polygon(page, (1, 1), (4, 1), (4, 4))  # adds to the chosen thing
@@ -190,21 +190,21 @@ def test_a_new_thing_has_neither_name_nor_parent(page, tmp_path):
     draw_mug(page)
     offers_at(page, 6, 6).get_by_text("subpart").first.click()
     page.get_by_text("Proposed without a parent: the parent of a subpart is a part").wait_for()
-    press(page, "Escape")
+    page.press("Escape")
     assert page.locator("#text").input_value() == "" and page.locator("#title").inner_text() == "New thing"
     offers_at(page, 26, 6).first.click()
     saved(page)
     assert [label.text for label in kept(tmp_path)] == ["mug", "unnamed", "unnamed"]
     assert {label.parent for label in kept(tmp_path)} == {None}
-    press(page, "a")
+    page.press("a")
     page.get_by_role("status").get_by_text("Accepted.").wait_for()
-    press(page, "Control+z")
+    page.press("Control+z")
     assert page.get_by_role("status").inner_text() == ""
 
 
 def test_things_are_transferred_to_the_next_photograph(page, tmp_path):
     draw_mug(page)
-    press(page, "]")
+    page.press("]")
     page.get_by_role("button", name="From others").click()
     page.get_by_text("1 proposed").first.wait_for()
     saved(page)
@@ -229,13 +229,13 @@ def test_unsaved_changes_stay_when_another_photograph_was_changed_elsewhere(page
     draw_mug(page)
     full = {"status": 507, "content_type": "application/json", "body": '{"error": "the disk is full"}'}
     page.route("**/api/labels/1*", lambda route: route.fulfill(**full))
-    press(page, "]")
+    page.press("]")
     draw(page, "cup", MUG)
     page.get_by_text("Not saved: the next change is saved with this one.").wait_for(state="attached")
     assert page.locator("body").get_attribute("data-saved") == "false"
     path = label_path(tmp_path / "annotated/photos/desk", "000.png")
     write_labels(path, "000.png", SIZE, [], version_of(path))
-    press(page, "[")
+    page.press("[")
     draw(page, "book")
     page.get_by_text(re.compile("have changed since they were read.*the disk is full", re.DOTALL)).wait_for()
     page.unroute("**/api/labels/1*")
@@ -252,7 +252,7 @@ def test_changes_are_saved_once_an_unreadable_file_is_repaired(page, opened, tmp
     draw(page, "book")
     page.get_by_text("000.json is not valid JSON").wait_for()
     path.write_text(whole)
-    press(page, "]")
+    page.press("]")
     draw_book(page)
     assert (texts(tmp_path), texts(tmp_path, "001.png")) == (["book", "mug"], ["book"])
 
@@ -266,7 +266,7 @@ def test_files_are_exported_and_imported_again(page, tmp_path):
     started.value.save_as(file)
     assert json.loads(file.read_text())["categories"] == [{"id": 1, "name": "mug"}]
     before = kept(tmp_path)[0].mask(SIZE)
-    press(page, "Control+z")
+    page.press("Control+z")
     saved(page)
     assert kept(tmp_path) == []
     page.get_by_label("Files to import").set_input_files(file)
@@ -295,9 +295,9 @@ def test_an_import_keeps_what_is_changed_while_it_runs(page, tmp_path):
     held = []
     page.route("**/api/import*", lambda route: held.append((route, route.fetch())), times=1)
     page.get_by_label("Files to import").set_input_files(tmp_path / "book.json")
-    until(page, lambda: held)
+    page.until(lambda: held)
     name(page, "cup")
-    until(page, lambda: texts(tmp_path) == ["cup"])
+    page.until(lambda: texts(tmp_path) == ["cup"])
     ((route, reply),) = held
     route.fulfill(response=reply)
     page.get_by_text("1 label imported into 1 photograph.").wait_for()
@@ -323,14 +323,14 @@ def test_a_refused_change_and_later_ones_are_undone(page, opened, tmp_path, wron
     later = {"id": 10, "level": 1, "parent": None, "text": "book", "polygons": [BOOK]}
     for label in (lid, later):  # two quick changes
         page.evaluate("(label) => hilsplat.store.change([[0, [...hilsplat.store.labels(0), label]]])", label)
-    until(page, lambda: held)
+    page.until(lambda: held)
     free.append(True)
     for route in held:
         route.continue_()
     page.get_by_text(message).wait_for()
     saved(page)
     assert kept(tmp_path) == first and things(page) == ["mug, whole"]
-    press(page, "Control+z")  # the mug, as before
+    page.press("Control+z")  # the mug, as before
     saved(page)
     assert kept(tmp_path) == [] and things(page) == []
 
@@ -343,7 +343,7 @@ def area(root: Path) -> int:
 def test_corners_of_the_chosen_outline_are_moved_added_and_removed(page, tmp_path):
     draw_mug(page)
     before = area(tmp_path)
-    press(page, "v")
+    page.press("v")
     drag_over(page, (15, 20), (20, 22), (25, 20))
     saved(page)
     wider = area(tmp_path)
@@ -362,7 +362,7 @@ def test_corners_of_the_chosen_outline_are_moved_added_and_removed(page, tmp_pat
 def test_sam_outlines_clicked_things(annotating, own_desk, tmp_path):
     change_index(own_desk / "default/masks", segmenter="sam", model=str(PROJECT / "models/sam-tiny"))
     page = annotating(own_desk)
-    press(page, "s")
+    page.press("s")
     click(page, (28, 20))
     page.get_by_text("Press Enter to accept this outline").wait_for()
     assert page.locator("#drawing .inside").count() == 1
@@ -371,11 +371,11 @@ def test_sam_outlines_clicked_things(annotating, own_desk, tmp_path):
     page.locator("#drawing .outside").wait_for(state="attached")
     page.get_by_text("Press Enter to accept this outline").wait_for()
     saved(page)
-    press(page, "Enter")
+    page.press("Enter")
     saved(page)
     (found,) = kept(tmp_path)
     assert found.origin == "proposed" and found.mask(SIZE)[20, 28] and not found.mask(SIZE)[20, 4]
-    press(page, "s")
+    page.press("s")
     drag_over(page, (1, 2), (14, 21))  # a box
     page.get_by_text("Press Enter to accept this outline").wait_for()
     page.keyboard.press("Escape")
@@ -419,7 +419,7 @@ def test_nothing_is_lost_while_the_server_is_stopped(opened, desk, tmp_path):
         page.context.close()
 
 
-def test_undo_works_in_the_text_box_once_its_text_is_saved(page, tmp_path):
+def test_a_text_is_undone_once_it_is_saved_and_not_replaced_by_a_late_reply(page, tmp_path):
     draw_mug(page)
     text = page.locator("#text")
     text.fill("cup")
@@ -432,20 +432,30 @@ def test_undo_works_in_the_text_box_once_its_text_is_saved(page, tmp_path):
     text.press("Control+z")
     saved(page)
     assert texts(tmp_path) == ["mug"]
+    page.press("]", "Escape")
+    page.late("api/labels")
+    draw_polygon(page, *MUG)
+    page.locator("#title", has_text="unnamed").wait_for()
+    page.keyboard.type("mug")
+    saved(page)
+    assert page.locator("#text").input_value() == "mug"
+    page.keyboard.press("Enter")
+    saved(page)
+    assert texts(tmp_path, "001.png") == ["mug"]
 
 
 def test_the_page_explains_the_first_steps_and_a_missing_sam(page):
     assert "First annotation: 1. type what you see" in page.get_by_role("status").text_content()
-    press(page, "s")
+    page.press("s")
     page.get_by_text("made by a SAM that is installed here").wait_for()
-    press(page, "?")
+    page.press("?")
     assert page.evaluate("document.activeElement.id") == "help-title"
     page.keyboard.press("Escape")
-    assert phone_fits(page) and not page.locator("#segment-label").is_visible()
+    assert page.phone_fits() and not page.locator("#segment-label").is_visible()
 
 
-def test_regions_go_to_the_objects_and_photographs_for_which_they_were_drawn(page, tmp_path):
-    late(page, "api/shape")
+def test_regions_and_corners_go_to_the_objects_and_photographs_for_which_they_were_drawn(page, tmp_path):
+    page.late("api/shape")
     draw(page, "mug", MUG)
     draw(page, "book")
     draw_polygon(page, (22, 4), (24, 20), (30, 20))  # more of the book
@@ -455,48 +465,29 @@ def test_regions_go_to_the_objects_and_photographs_for_which_they_were_drawn(pag
     assert mug.mask(SIZE)[:, :16].sum() == mug.mask(SIZE).sum() == 15 * 20
     assert book.mask(SIZE)[4, 35] and book.mask(SIZE)[19, 25] and not book.mask(SIZE)[:, :20].any()
     assert page.url.endswith("view=1") and things(page) == []
-
-
-def test_corners_moved_one_after_the_other_are_both_kept(page, tmp_path):
     draw_mug(page)
-    late(page, "api/shape")
-    press(page, "v")
+    page.press("v")
     drag_over(page, (15, 1), (20, 1))
     drag_over(page, (15, 20), (20, 20))
     page.keyboard.press("]")
     saved(page)
-    (mug,) = kept(tmp_path)
+    (mug,) = kept(tmp_path, "001.png")
     assert mug.mask(SIZE)[1:20, 17:20].all()
 
 
-def test_late_proposals_are_not_those_of_the_next_photograph(page, tmp_path):
-    late(page, "api/at")
-    press(page, "x")
+def test_late_proposals_and_photographs_are_not_shown_with_the_next_photograph(page):
+    page.late("api/at")
+    page.press("x")
     click(page, (8, 8))
     page.keyboard.press("]")
     saved(page)
     assert not page.get_by_role("region", name="Proposals at this pixel").is_visible()
     assert page.locator("#status").inner_text() == "001.png"
-
-
-def test_a_text_that_is_being_typed_is_not_replaced_by_a_late_reply(page, tmp_path):
-    late(page, "api/labels")
-    draw_polygon(page, *MUG)
-    page.locator("#title", has_text="unnamed").wait_for()
-    page.keyboard.type("mug")
-    saved(page)
-    assert page.locator("#text").input_value() == "mug"
-    page.keyboard.press("Enter")
-    saved(page)
-    assert texts(tmp_path) == ["mug"]
-
-
-def test_a_photograph_is_not_shown_below_the_outlines_of_the_next_one(page):
     held = []
-    page.route("**/api/photo/1*", lambda route: held.append(route))
-    press(page, "]")
-    page.wait_for_timeout(300)
-    assert held and not page.locator("#picture").is_visible()
+    page.route("**/api/photo/2*", lambda route: held.append(route))
+    page.press("]")
+    page.until(lambda: held)
+    assert not page.locator("#picture").is_visible()
     held[0].continue_()
     page.locator("#picture").wait_for()
 
@@ -504,9 +495,9 @@ def test_a_photograph_is_not_shown_below_the_outlines_of_the_next_one(page):
 def test_two_fingers_move_the_photograph_without_drawing(annotating, desk, tmp_path):
     page = annotating(desk, has_touch=True)
     name(page, "mug")
-    fingers = page.context.new_cdp_session(page)
+    fingers = page.context.new_cdp_session(page.page)
     for tool in "bp":
-        press(page, tool)
+        page.press(tool)
         scale = page.evaluate("hilsplat.sheet.scale")
         touches = {"Start": ([10], [10, 20]), "Move": ([8, 26],), "End": ([],)}
         for kind, columns in ((kind, columns) for kind, steps in touches.items() for columns in steps):
@@ -519,9 +510,9 @@ def test_two_fingers_move_the_photograph_without_drawing(annotating, desk, tmp_p
 
 def test_an_unfinished_polygon_is_kept_when_the_tool_or_the_photograph_changes(page, tmp_path):
     for text, key in (("mug", "b"), ("cup", "]")):
-        press(page, "Escape", "n")
+        page.press("Escape", "n")
         name(page, text)
-        press(page, "p")
+        page.press("p")
         click(page, *MUG[:3])
         page.keyboard.press(key)
         saved(page)
@@ -529,10 +520,10 @@ def test_an_unfinished_polygon_is_kept_when_the_tool_or_the_photograph_changes(p
 
 
 def test_annotations_of_another_tab_appear_and_ids_stay_apart(page, tmp_path):
-    other, held = beside(page), []
+    other, held = page.beside(), []
     page.route("**/api/changes*", lambda route: held.append(route))  # this tab has yet to learn about the mug
     draw_mug(other)
-    press(page, "]")
+    page.press("]")
     draw_book(page)
     page.unroute("**/api/changes*")
     for route in held:
@@ -555,7 +546,7 @@ def test_a_very_large_photograph_is_not_enlarged_by_zooming_out(page):
 
 def test_outlines_are_as_thin_on_a_small_photograph_as_on_a_large_one(page):
     draw_mug(page)
-    press(page, "v", "Escape")
+    page.press("v", "Escape")
     page.mouse.move(5, 5)
     for factor in (1, 2):
         page.evaluate(f"hilsplat.sheet.zoom({factor})")
@@ -569,9 +560,9 @@ def test_outlines_are_as_thin_on_a_small_photograph_as_on_a_large_one(page):
 
 def test_a_part_is_kept_in_a_photograph_without_its_whole(page, tmp_path):
     draw_mug(page)
-    press(page, "j")
+    page.press("j")
     name(page, "handle")
-    press(page, "]")
+    page.press("]")
     polygon(page, (1, 1), (15, 1), (15, 20))
     (handle,) = kept(tmp_path, "001.png")
     assert (handle.text, handle.level, handle.parent) == ("handle", 2, None)

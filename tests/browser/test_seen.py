@@ -4,12 +4,10 @@ import re
 
 import numpy as np
 
-from tests.browser.conftest import ask, choose_row, press, wire_camera
-
 
 def test_a_box_beside_the_picture_has_no_label_and_labels_stay_clear_of_the_tools(opened, desk_address):
     page = opened(desk_address, "server")
-    ask(page, "mug > handle")
+    page.ask("mug > handle")
     label = page.locator("#overlay text")
     label.first.wait_for(state="attached")
     tools = page.locator("#tools").bounding_box()
@@ -26,15 +24,15 @@ def test_a_box_beside_the_picture_has_no_label_and_labels_stay_clear_of_the_tool
 def test_a_flight_ends_with_the_whole_node_in_view_and_no_node_hovered(opened, desk_address, scene):
     page = opened(desk_address, "server")
     for text in ("mug", "mug > handle"):
-        choose_row(page, scene.query(text)[0].node)
+        page.choose_row(scene.query(text)[0].node)
         page.locator("[role=treeitem] > .row .label").last.hover()
         page.locator("#overlay path.hover").first.wait_for(state="attached")
-        press(page, "f")
+        page.press("f")
         page.locator("#overlay path.hover").first.wait_for(state="detached")
         page.wait_for_timeout(1500)
         box = page.locator("#overlay path.chosen")
         box.wait_for(state="attached")
         places = np.array(re.findall(r"[-\d.]+", box.get_attribute("d")), float).reshape(-1, 2)
-        wire = wire_camera(page)
+        wire = page.wire_camera()
         middle, half = np.array(wire["K"])[:2, 2], np.array(wire["size_hw"])[::-1] / 2
         assert (np.abs(places - middle) < half).all() and np.ptp(places, axis=0).max() > 0.3 * half.min()
