@@ -57,9 +57,7 @@ def test_the_chosen_level_is_visible_in_forced_colours(opened, desk_address):
     assert all((style == "solid") == checked for checked, style in page.evaluate(outlines))
 
 
-def test_the_picture_and_controls_are_large_enough_with_large_text_and_on_a_phone(
-    opened, desk_address
-):
+def test_the_picture_and_controls_are_large_enough_with_large_text_and_on_a_phone(opened, desk_address):
     page = opened(desk_address, viewport={"width": 640, "height": 360})
     box = page.locator("#view").bounding_box()
     assert box["height"] > 250 and box["width"] > 300
