@@ -24,6 +24,7 @@ MAX_STEP = 2**23 - 1
 HARMONIC_STEP = 8
 """Step of harmonics in units of 1/128 (5 bits). The usual 4 bits above degree 1 save 1 byte but lose 2 dB."""
 COLOUR_SCALE = 0.15
+GZIP_LEVEL = 6
 
 FLIPPED = np.array([1, -1, -1])
 """Signs that convert our axes (x right, y down, z forward) to those of SPZ."""
@@ -38,11 +39,11 @@ def fractional_bits(gaussians: Gaussians) -> int:
     return int(np.clip(np.ceil(np.log2(STEPS_PER_SPREAD / spread)), 0, 22))
 
 
-def spz_bytes(gaussians: Gaussians, rows: Int64[np.ndarray, " g"], bits: int, level: int = 6) -> bytes:
+def spz_bytes(gaussians: Gaussians, rows: Int64[np.ndarray, " g"], bits: int) -> bytes:
     """Return the given Gaussians as an SPZ file; identical Gaussians produce identical bytes.
 
     Positions beyond 2**(23 - bits), a thousand times the spread of the scene, are clipped. Spatially sorted
-    rows compress best. `bits` is from `fractional_bits`; `level` is gzip's.
+    rows compress best. `bits` is from `fractional_bits`.
     """
     sh = gaussians.sh[rows]
     steps = np.rint(gaussians.means[rows].astype(np.float64) * FLIPPED * 2**bits)
@@ -59,7 +60,7 @@ def spz_bytes(gaussians: Gaussians, rows: Int64[np.ndarray, " g"], bits: int, le
         _byte(harmonics * HARMONIC_STEP + 128),
     )
     head = HEADER.pack(MAGIC, VERSION, len(rows), gaussians.sh_degree, bits, 0, 0)
-    return gzip.compress(head + b"".join(column.tobytes() for column in columns), level, mtime=0)
+    return gzip.compress(head + b"".join(column.tobytes() for column in columns), GZIP_LEVEL, mtime=0)
 
 
 def _byte(values: np.ndarray) -> UInt8[np.ndarray, "..."]:
