@@ -79,7 +79,7 @@ def test_the_views_of_a_path_are_reordered_replaced_removed_and_kept(opened, des
     assert not steps(page).count()
 
 
-def test_the_preview_shows_the_cameras_of_the_film_and_returns(opened, desk_address):
+def test_the_preview_shows_the_cameras_of_the_film_until_it_is_stopped(opened, desk_address):
     page = opened(desk_address)
     add(page, "000.png", "004.png")
     page.locator("#save summary").click()
@@ -106,12 +106,6 @@ def test_the_preview_shows_the_cameras_of_the_film_and_returns(opened, desk_addr
     xs = shown[moving[0] + 1 : moving[-1] + 1, 1]  # the last is from the film's last camera
     assert (np.diff(xs) <= 1e-9).all() and np.ptp(xs) > 3  # from view 0 to view 4, never back
     assert page.wire_camera() == before
-
-
-def test_a_preview_is_stopped_before_it_has_begun(opened, desk_address):
-    page = opened(desk_address)
-    add(page, "000.png", "004.png")
-    before = page.wire_camera()
     page.late("api/path")
     with page.expect_response("**/api/path*"):
         page.get_by_role("button", name="Preview").click()

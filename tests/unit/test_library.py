@@ -92,7 +92,7 @@ def test_a_fit_equals_that_of_the_stage(scene, tmp_path, monkeypatch, iterations
     assert len(other) != len(found) or not np.array_equal(other.means, found.means)
 
 
-def test_masks_equal_those_of_the_stage(scene, tmp_path, temporary):
+def test_masks_equal_those_of_the_stage_and_the_automatic_segmenter_is_the_graph(scene, tmp_path, temporary):
     found = hilsplat.segment(scene, segmenter="graph", graph_scales=(0.3, 0.1, 0.05), threads=2)
     section = MasksSettings(segmenter="graph", graph_scales=(0.3, 0.1, 0.05))
     stages.masks(scene.folder, tmp_path / "masks", section, tmp_path / "cache")
@@ -106,9 +106,6 @@ def test_masks_equal_those_of_the_stage(scene, tmp_path, temporary):
     entries = sha256_of_path(kept)
     hilsplat.segment(scene, segmenter="graph", cache=kept)
     assert sha256_of_path(kept) == entries and len(list(kept.rglob("*.npz"))) == len(found)
-
-
-def test_the_automatic_segmenter_is_the_best_model_or_the_graph(scene, caplog):
     found = hilsplat.segment(scene)  # tests see the embedded models only, which are not for photographs
     assert found.origin == {"segmenter": "graph"}
     with pytest.raises(ModelError, match="nowhere"):

@@ -34,7 +34,7 @@ def label(number: int, level: int, parent: int | None, polygons, text: str = "",
     )
 
 
-def test_children_are_cut_to_their_parents_down_to_subparts():
+def test_children_are_cut_to_their_parents_down_to_subparts_and_keep_their_vertices_inside():
     whole, part = label(1, 1, None, box(5, 5, 20, 20)), label(2, 2, 1, box(0, 10, 12, 29))
     subpart = label(3, 3, 2, box(8, 18, 39, 25))
     cut = cut_to_parents([subpart, part, whole], SIZE)
@@ -43,16 +43,10 @@ def test_children_are_cut_to_their_parents_down_to_subparts():
     np.testing.assert_array_equal(part_mask, part.mask(SIZE) & whole.mask(SIZE))
     np.testing.assert_array_equal(subpart_mask, subpart.mask(SIZE) & part_mask)
     np.testing.assert_array_equal(whole_mask, whole.mask(SIZE))
-
-
-def test_children_inside_their_parents_keep_their_vertices():
     given = [label(1, 1, None, [[(3, 3), (20, 4), (9, 22)]]), label(2, 2, 1, [[(8, 6), (10, 6), (9, 9)]])]
     assert cut_to_parents(given, SIZE) == given
     once = cut_to_parents([label(1, 1, None, box(5, 5, 9, 9)), label(2, 2, 1, box(0, 0, 7, 7))], SIZE)
     assert cut_to_parents(once, SIZE) == once
-
-
-def test_a_child_around_a_hole_of_its_parent_is_cut_exactly():
     ring = np.zeros(SIZE, bool)
     ring[4:26, 4:36] = True
     ring[10:20, 12:28] = False

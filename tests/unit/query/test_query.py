@@ -380,7 +380,7 @@ def thin(scene) -> LanguageScene:
     return with_views(scene, weights=lambda view: weights.tocsr())
 
 
-def test_cosines_at_pixels_are_those_of_decoded_latents_and_of_nodes(thin):
+def test_cosines_at_pixels_are_those_of_latents_and_nodes_and_uncovered_ones_are_the_lowest(thin):
     texts, pixels = ["B", "A top"], np.arange(0, HEIGHT * WIDTH, 7)
     vectors, shares = thin.clip.embed_texts(texts), thin.views.view_weights("000.png").toarray()[pixels]
     by_field, by_node = (of(texts, "000.png", pixels) for of in (thin.field.cosine, thin.node_cosine))
@@ -396,9 +396,6 @@ def test_cosines_at_pixels_are_those_of_decoded_latents_and_of_nodes(thin):
         expected = np.where(shares.any(axis=1), expected, -np.inf)
         assert by_node[:, level.index] == pytest.approx(expected, abs=1e-5)
     assert np.isinf(by_node[:, :, 0]).all()
-
-
-def test_uncovered_pixels_get_the_lowest_relevancy(thin):
     for maps in (thin.field.relevancy(["A"], "000.png"), thin.node_relevancy_map(["A"], "000.png")):
         assert maps[0, 0, 0, 0] == maps[0, 0].min()
     assert not thin.views.node_masks("000.png", np.array([NODE["A"]]))[0, 0]

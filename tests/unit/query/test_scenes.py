@@ -65,7 +65,7 @@ def test_answers_are_those_of_each_scene_alone_best_scene_first(results, opened,
         assert found.picture.is_file() and found.picture.name == hit.best_views[0]
 
 
-def test_a_pattern_a_limit_and_a_threshold_restrict_the_answers(results):
+def test_a_pattern_a_limit_and_a_threshold_restrict_the_answers_of_a_small_index(results):
     rooms = hilsplat.open_scenes(results, "rooms/*")
     assert {hit.scene.partition("/")[0] for hit in rooms.query("mug", limit=SCENES)} == {"rooms"}
     assert len(rooms.query("mug", limit=3)) == 3
@@ -79,6 +79,11 @@ def test_a_pattern_a_limit_and_a_threshold_restrict_the_answers(results):
             rooms.query("mug", **{name: -1})
     with pytest.raises(ArtifactError, match="has no finished scene that matches 'cellar'"):
         hilsplat.open_scenes(results, "cellar")
+    names = results / "rooms/desk-7/default/names"
+    record = read_provenance(names)
+    assert record is not None and "nodes.safetensors" in record.outputs["names"].bytes
+    nodes, vector_bytes = len(read_json(names / "names.json")), 4 * 3
+    assert (names / "nodes.safetensors").stat().st_size < nodes * (vector_bytes + 200) + 3000
 
 
 def delete(scene: Path) -> None:
@@ -136,12 +141,16 @@ def test_scenes_opened_by_a_relative_path_do_not_follow_the_working_folder(chang
     assert hit.picture.is_file() and hilsplat.open_scene(hit.folder).query("mug")[0].node == hit.node
 
 
-def test_a_name_given_by_hand_is_found_first(changed):
+def test_a_name_given_by_hand_is_found_first_and_the_next_command_queries_the_same_variant(changed):
     scene = changed.parents[1] / "photos/desk-4"
     tree = scene / "default/semantic_tree"
     write_names(scene, tree, {2: "my mug"}, 5, hilsplat.open_scene(scene).names.version)
     (first, *_) = hilsplat.open_scenes(changed.parents[1]).query("My mug")
     assert (first.scene, first.node, first.name, first.doubts) == ("photos/desk-4", 2, "my mug", ())
+    scenes = hilsplat.open_scenes(changed.parents[1])
+    of_paper = [replace(scene, finished=replace(scene.finished, variant="paper")) for scene in scenes.found]
+    report = report_of(Scenes(tuple(of_paper), {}), "mug", scenes.query("mug", limit=1))
+    assert report.splitlines()[-1].endswith(" mug --variant paper")
 
 
 def test_the_command_prints_a_table_or_json(changed, capsys):
@@ -159,18 +168,3 @@ def test_the_command_prints_a_table_or_json(changed, capsys):
     assert row["doubts"] == ["'unicorn' may not be in the scene: the model's vocabulary lacks 'unicorn'"]
     with pytest.raises(SettingsError, match="there is no text to search for in mug"):
         app(["query", "mug", *place], standalone_mode=False)
-
-
-def test_the_next_command_queries_the_same_variant(changed):
-    scenes = hilsplat.open_scenes(changed.parents[1])
-    of_paper = [replace(scene, finished=replace(scene.finished, variant="paper")) for scene in scenes.found]
-    report = report_of(Scenes(tuple(of_paper), {}), "mug", scenes.query("mug", limit=1))
-    assert report.splitlines()[-1].endswith(" mug --variant paper")
-
-
-def test_the_index_is_recorded_and_small(results):
-    names = results / "rooms/desk-7/default/names"
-    record = read_provenance(names)
-    assert record is not None and "nodes.safetensors" in record.outputs["names"].bytes
-    nodes, vector_bytes = len(read_json(names / "names.json")), 4 * 3
-    assert (names / "nodes.safetensors").stat().st_size < nodes * (vector_bytes + 200) + 3000

@@ -166,7 +166,7 @@ def test_the_cleaned_scene_has_the_values_of_the_scene_and_its_files_do_not_chan
     assert ply.read_bytes() == before
 
 
-def test_selections_and_pages_leave_out_removed_gaussians(shown, client, left):
+def test_selections_and_pages_leave_out_removed_gaussians_and_wrong_marks_are_refused(shown, client, left):
     scene = shown.answering("default")
     (mug,) = scene.query("mug", "whole")
     rows = scene.views.gaussians_of([mug.node])
@@ -179,9 +179,6 @@ def test_selections_and_pages_leave_out_removed_gaussians(shown, client, left):
     assert client.post("/api/export/ply", json=gone).status_code == 422  # the mug is on the left
     _, page = in_steps(client, "page", removed=bits(shown, left))
     assert f'"gaussians":{(~left).sum()},'.encode() in page
-
-
-def test_wrong_marks_are_refused(shown, client):
     for removed in ("AAAA", "?", bits(shown, np.ones(len(shown.order), bool))):
         refused = client.post("/api/export/scene-ply", json={"removed": removed})
         assert refused.status_code == 422
