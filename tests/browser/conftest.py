@@ -1,4 +1,4 @@
-"""The real `hilsplat view` and a real browser: Debian's Chromium, headless, with WebGL by Mesa's llvmpipe."""
+"""The pages in a real browser: Debian's Chromium, headless, with WebGL by Mesa's llvmpipe."""
 
 import os
 import re
@@ -31,7 +31,7 @@ from tests.unit.evaluate.builders import cameras_of
 HOW = "apt-get install chromium libgl1-mesa-dri libegl1; pip install -e '.[browser-tests]'"
 ARGUMENTS = ["--use-angle=gl-egl", "--ignore-gpu-blocklist", "--no-sandbox", "--disable-dev-shm-usage"]
 WIDTH, HEIGHT = 740, 420
-PANEL_PX, STRIP_PX = 336, 72
+PANEL_PX = 336
 
 
 @pytest.fixture(scope="session")
