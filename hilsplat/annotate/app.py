@@ -316,7 +316,7 @@ def run_annotate(
 ) -> None:
     """Serve the annotation page of a scene until Ctrl-C.
 
-    For arguments and errors, see `OpenedScene`, `read_labels` and `serve`.
+    For arguments and errors, see `OpenedScene`, `known_labels` and `serve`.
     """
     opened = OpenedScene(folder, labels, variant, threads)
     annotator, annotated = Annotator(opened), len(opened.known())

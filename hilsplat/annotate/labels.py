@@ -25,7 +25,7 @@ from hilsplat.scene.cameras import MAX_SIDE_PX, Camera, Cameras
 from hilsplat.scene.layouts import read_json_object
 from hilsplat.scene.placement import placed
 from hilsplat.web.file_changes import replacing, version_of
-from hilsplat.web.messages import Message, Text
+from hilsplat.web.messages import Message
 
 Origin = Literal["drawn", "edited", "accepted", "proposed"]
 Place = Annotated[int, Field(ge=-MAX_SIDE_PX, le=2 * MAX_SIDE_PX)]
@@ -55,10 +55,10 @@ class Label(Message):
             proposed, or edited after it was proposed. Labels that are only proposed are not scored.
     """
 
-    id: Annotated[int, Field(ge=1, le=1_000_000)]
+    id: Annotated[int, Field(ge=1, lt=2**31)]
     level: Annotated[int, Field(ge=1, le=3)]
     parent: int | None = None
-    text: Annotated[Text, AfterValidator(_plain_text)]
+    text: Annotated[str, Field(max_length=200), AfterValidator(_plain_text)]
     polygons: Annotated[Rings, Field(min_length=1)]
     origin: Origin = "drawn"
 
@@ -102,14 +102,16 @@ def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[La
     twice = [number for number, count in Counter(label.id for label in labels).items() if count > 1]
     if twice:
         raise SettingsError(f"id {twice[0]} occurs twice", fix="reload the page")
-    by_number = {label.id: label for label in labels}
-    masks: dict[int, np.ndarray] = {}
+    by_number, parents = {label.id: label for label in labels}, {label.parent for label in labels}
+    masks: dict[int, np.ndarray] = {}  # of parents only: a photograph may have 100 million pixels
     cut: dict[int, Label] = {}
     for label in sorted(labels, key=lambda label: label.level):
-        masks[label.id] = mask = label.mask(size_hw)
+        mask = label.mask(size_hw)
         if not mask.any():
             raise SettingsError(f"{label.text!r} has no pixels inside the photograph", fix="draw it again")
         cut[label.id] = label
+        if label.id in parents:
+            masks[label.id] = mask
         if label.parent is None:
             continue
         parent = by_number.get(label.parent)
@@ -128,7 +130,9 @@ def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[La
                 fix="draw it inside, or choose a different parent",
             )
         if not np.array_equal(inside, mask):
-            masks[label.id], cut[label.id] = inside, label.model_copy(update={"polygons": traced(inside)})
+            cut[label.id] = label.model_copy(update={"polygons": traced(inside)})
+            if label.id in masks:
+                masks[label.id] = inside
     return [cut[label.id] for label in labels]
 
 
@@ -137,29 +141,22 @@ def label_path(folder: Path, view: str) -> Path:
     return Path(folder) / f"{Path(view).stem}.json"
 
 
-def read_labels(path: Path, camera: Camera | None = None) -> list[Label]:
-    """Read the annotations of a view; empty if there is no file.
-
-    With the view's camera, labels drawn on its photograph or on a scaled copy are transferred to the view;
-    labels outside the view are left out. Labels without levels (LERF-OVS) are wholes.
-
-    Raises:
-        SceneError: the file, an id or a level is invalid.
-        MisalignedArtifactError: the file's image size fits neither the camera nor the photograph.
-    """
-    return _labels_of(_with_ids(read_isat(path), {}), camera) if path.is_file() else []
-
-
 def known_labels(
     folder: Path, cameras: Cameras, views: Sequence[str], texts: dict[int, str] | None = None
 ) -> dict[str, list[Label]]:
-    """Return the annotations of all annotated views; for errors, see `read_labels`.
+    """Return the annotations of all annotated views.
 
-    An object in a file without ids gets the id of an object with the same text in other views, if any.
+    Labels drawn on a view's photograph or on a scaled copy are transferred to the view; labels outside the
+    view are left out. Labels without levels (LERF-OVS) are wholes. An object in a file without ids gets the
+    id of an object with the same text in other views, if any.
 
     Args:
         texts: the ids of wholes that an earlier call gave, with their casefolded texts, so that later calls
             give the same; updated.
+
+    Raises:
+        SceneError: a file, an id or a level is invalid.
+        MisalignedArtifactError: a file's image size fits neither the camera nor the photograph.
     """
     texts = {} if texts is None else texts
     files = {view: read_isat(path) for view in views if (path := label_path(folder, view)).is_file()}
@@ -195,14 +192,12 @@ def _with_ids(stored: IsatFile, texts: Mapping[int, str]) -> IsatFile:
     return replace(stored, objects=tuple(objects))
 
 
-def _labels_of(stored: IsatFile, camera: Camera | None) -> list[Label]:
+def _labels_of(stored: IsatFile, camera: Camera) -> list[Label]:
     objects = by_id(stored)
     parents = parents_of(stored, objects, [])
     labels = []
     for number, thing in objects.items():
-        polygons = [whole_pixels(polygon) for polygon in thing.polygons]
-        if camera is not None:
-            polygons = placed_rings(polygons, stored.size_hw, camera, f"label file {stored.path}")
+        polygons = placed_rings(thing.polygons, stored.size_hw, camera, f"label file {stored.path}")
         if polygons:
             label = Label.read(
                 str(stored.path),

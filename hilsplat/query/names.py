@@ -7,7 +7,6 @@ tree are meaningless in other trees. If a tree is rebuilt, the previous tree's n
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, NonNegativeInt, ValidationError
@@ -36,7 +35,7 @@ def checked_name(name: str) -> str:
 class NodeNames:
     """Names of one semantic tree's nodes, by row, and the version of the file they were read from."""
 
-    of_node: Mapping[int, str] = field(default_factory=lambda: MappingProxyType({}))
+    of_node: Mapping[int, str] = field(default_factory=dict)
     version: str = NO_FILE
 
     def nodes_of(self, text: str) -> list[int]:
@@ -67,7 +66,7 @@ def read_names(folder: Path, semantic_tree: Path) -> NodeNames:
             found=", ".join(map(str, beyond[:5])),
             fix="correct the file, or move it elsewhere to start without names",
         )
-    return NodeNames(MappingProxyType(names), version)
+    return NodeNames(names, version)
 
 
 def write_names(

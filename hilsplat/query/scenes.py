@@ -1,5 +1,6 @@
 """One query of all finished scenes in a results folder, from the index that the stage `names` writes."""
 
+import os
 import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -216,7 +217,7 @@ def open_scenes(results: Path | str = "results", pattern: str = "*", variant: st
     Raises:
         ArtifactError: no scene matches, or none is finished.
     """
-    results, skipped, found = Path(results), dict[str, str](), list[FoundScene]()
+    results, skipped, found = Path(results).absolute(), dict[str, str](), list[FoundScene]()
     models: dict[tuple[str, str], ClipModel] = {}
     names = scenes_in(results)
     for name in names:
@@ -259,14 +260,19 @@ def report_of(scenes: Scenes, text: str, hits: Sequence[SceneHit]) -> str:
         )
         lines += [
             f"{hit.score:>5.2f}  {hit.scene:<{width}}  {hit.node:>5}  {hit.level.label:<8} "
-            f"{hit.name or '?':<{names}}  {hit.picture}"
+            f"{hit.name or '?':<{names}}  {_shown(hit.picture)}"
             for hit in hits
         ]
         variant = scenes.found[0].finished.variant
         of_variant = [] if variant == "default" else ["--variant", variant]
-        command = shlex.join(["hilsplat", "query", str(hits[0].folder), text, *of_variant])
+        command = shlex.join(["hilsplat", "query", _shown(hits[0].folder), text, *of_variant])
         lines.append(f"more about the best: {command}")
     lines += [f"doubtful: {doubt}" for hit in hits[:1] for doubt in hit.doubts]
     lines += dict.fromkeys(hit.caution for hit in hits if hit.caution)
     lines += [f"{name} is skipped: {reason}" for name, reason in sorted(scenes.skipped.items())]
     return "\n".join(lines)
+
+
+def _shown(path: Path) -> str:
+    """Return a path as short as the working folder allows."""
+    return os.path.relpath(path) if path.is_relative_to(Path.cwd()) else str(path)

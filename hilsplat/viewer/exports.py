@@ -1,4 +1,4 @@
-"""Content of exported files (Gaussians, masks of all views, films)."""
+"""Content of exported files (labels of Gaussians, masks of all views, films)."""
 
 import io
 import zipfile
@@ -15,7 +15,6 @@ from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.mask_files import mask_files
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
-from hilsplat.semantic_tree.export import write_selection_ply
 from hilsplat.splat.flyaround import FRAMES_PER_S, closed_path, encoded_film, open_path
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.viewer.frames import Paint, painted
@@ -41,19 +40,6 @@ def labelled(
         label[members[number]] = number + 1
     rows = np.flatnonzero(label)
     return rows, label[rows]
-
-
-def ply(
-    gaussians_ply: Path,
-    rows: Int64[np.ndarray, " g"],
-    labels: Int32[np.ndarray, " g"] | None = None,
-    comments: Sequence[str] = (),
-) -> bytes:
-    """Return Gaussians as a 3DGS PLY; for labels and comments, see `write_selection_ply`."""
-    with TemporaryDirectory() as folder:
-        out = Path(folder) / "selection.ply"
-        write_selection_ply(gaussians_ply, rows, out, labels, comments)
-        return out.read_bytes()
 
 
 def masks_zip(scene: LanguageScene, groups: Sequence[NodeGroup]) -> Steps:

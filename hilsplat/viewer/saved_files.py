@@ -9,6 +9,8 @@ from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -21,6 +23,7 @@ from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.query.hits import NodeGroup, label_comments
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.scene_views import ViewStore
+from hilsplat.semantic_tree.export import write_selection_ply
 from hilsplat.splat.gaussians import morton_order
 from hilsplat.viewer import exports, payload, wire
 from hilsplat.viewer.html_page import html_page
@@ -54,24 +57,18 @@ class SavedFiles:
         self, path: str, kind: type[BaseModel], begin: Work, worker: ThreadPoolExecutor | None = None
     ) -> Route:
         """Return the route of a file; `begin` runs on the scene thread, later steps on a worker."""
-        return Route(path, partial(self._in_steps, kind=kind, begin=begin, worker=worker), methods=["POST"])
 
-    async def _in_steps(
-        self,
-        request: Request,
-        *,
-        kind: type[BaseModel],
-        begin: Work,
-        worker: ThreadPoolExecutor | None,
-    ) -> Response:
-        asked = await read(request, kind)
+        async def make(request: Request) -> Response:
+            asked = await read(request, kind)
 
-        def first(shown: ViewerScene) -> tuple[exports.Steps, tuple[int, int]]:
-            steps = begin(shown, asked)
-            return steps, next(steps)  # raises errors before the response starts
+            def first(shown: ViewerScene) -> tuple[exports.Steps, tuple[int, int]]:
+                steps = begin(shown, asked)
+                return steps, next(steps)  # raises errors before the response starts
 
-        begun = await self.thread.do(request, first)
-        return StreamingResponse(self._stepped(*begun, worker), headers={"cache-control": "no-store"})
+            begun = await self.thread.do(request, first)
+            return StreamingResponse(self._stepped(*begun, worker), headers={"cache-control": "no-store"})
+
+        return Route(path, make, methods=["POST"])
 
     async def _stepped(
         self, steps: exports.Steps, first: tuple[int, int], worker: ThreadPoolExecutor | None
@@ -95,8 +92,10 @@ def _ply(shown: ViewerScene, asked: wire.Edited) -> bytes:
     if isinstance(asked, wire.Selection):
         scene, groups = _selected(shown, asked)
         comments = label_comments(groups, scene.name_of)
-    with shown.unchanged():
-        return exports.ply(shown.ply, rows, labels, comments)
+    with shown.unchanged(), TemporaryDirectory() as folder:
+        out = Path(folder) / "selection.ply"
+        write_selection_ply(shown.ply, rows, out, labels, comments)
+        return out.read_bytes()
 
 
 def _spz(shown: ViewerScene, asked: wire.Edited) -> bytes:

@@ -62,7 +62,8 @@ class ViewerScene(ShownScene):
 
     def __init__(self, folder: Path, variant: str = "default", threads: int = 1) -> None:
         super().__init__()
-        self.folder, self.first, self.threads = Path(folder), variant, threads
+        self.folder, self.first, self.threads = Path(folder).absolute(), variant, threads
+        self.results = self.folder.parent.parent
         self.opened = Opened(VIEWS_MIB)
         self.ply = ply = self.folder / "gaussians.ply"
         require_scene_folder(self.folder)
@@ -91,11 +92,6 @@ class ViewerScene(ShownScene):
     def opened_again(self) -> "ViewerScene":
         return ViewerScene(self.folder, self.first, self.threads)
 
-    @property
-    def results(self) -> Path:
-        """The results folder."""
-        return self.folder.absolute().parent.parent
-
     def beside(self, name: str) -> "ViewerScene":
         """Open another scene of the results folder; raise SettingsError if it has no such scene."""
         if name not in (known := scenes_in(self.results)):  # reject anything but listed names, such as paths
@@ -106,17 +102,14 @@ class ViewerScene(ShownScene):
         """Return name, state and date of each scene of the results folder, and whether it can be shown."""
         scenes = []
         for name in scenes_in(self.results):
+            folder = self.results / name
             try:
-                state = SceneState.read(self.results / name)
+                state = SceneState.read(folder)
                 told = {"state": state.state, "date": state.date}
             except HilsplatError as error:
                 told = {"state": first_line(error), "date": ""}
-            folder = self.results / name
-            places = {
-                "can_open": (folder / self.ply.name).is_file(),
-                "current": folder == self.folder.absolute(),
-            }
-            scenes.append({"name": name, **told, **places})
+            can_open = (folder / self.ply.name).is_file()
+            scenes.append({"name": name, **told, "can_open": can_open, "current": folder == self.folder})
         return scenes
 
     def news(self) -> dict[str, Any]:

@@ -20,7 +20,7 @@ LevelName = Literal["auto", "whole", "part", "subpart"]
 Answerer = Literal["tree", "field"]
 
 MAX_NODES = 131_071
-"""Maximum number of nodes that the page shows: the table of a style must fit into a request of 1 MiB."""
+"""Maximum number of nodes that the page shows: the table of a style must fit into `MAX_BODY_BYTES`."""
 
 Nodes = Annotated[list[Annotated[int, Field(ge=0)]], Field(max_length=MAX_NODES)]
 

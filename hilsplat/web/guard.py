@@ -14,7 +14,6 @@ from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
-MAX_BODY_BYTES = 1 << 20
 MAX_PATH = 500
 """Maximum number of characters in a path; Python cannot parse numbers of thousands of digits."""
 CONTENT_POLICY = (
@@ -41,9 +40,7 @@ class Guard:
             are those of the other page. Scripts and styles need no token.
     """
 
-    def __init__(
-        self, app: ASGIApp, token: str, max_body: int = MAX_BODY_BYTES, *, embedded: bool = False
-    ) -> None:
+    def __init__(self, app: ASGIApp, token: str, max_body: int, *, embedded: bool = False) -> None:
         self.app, self.token, self.max_body, self.embedded = app, token, max_body, embedded
         self.headers = dict(HEADERS)
         if embedded:

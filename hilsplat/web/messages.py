@@ -1,11 +1,8 @@
 """Base class of both pages' request models, and limits shared by these models."""
 
-from typing import Annotated
-
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict
 
 MAX_SIDE_PX = 4096
-Text = Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class Message(BaseModel):

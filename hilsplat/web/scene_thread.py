@@ -208,9 +208,8 @@ class SceneThread(Generic[Shown]):
 def _photo(shown: ShownScene, path: Mapping[str, Any]) -> Response:
     """Return an undistorted photograph."""
     file = shown.scene.image_path(view_name(shown.scene, path["number"]))
-    kind = "image/png" if file.suffix.lower() == ".png" else "image/jpeg"
     with shown.unchanged(*shown.photographs):
-        return plain(file.read_bytes(), kind, cached=True)
+        return plain(file.read_bytes(), "image/png", cached=True)
 
 
 def _thumb(shown: ShownScene, path: Mapping[str, Any]) -> Response:

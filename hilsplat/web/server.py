@@ -21,7 +21,7 @@ from starlette.routing import Route
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.scene.scene import Scene
 from hilsplat.web.file_changes import StaleFileError, StaleSceneError
-from hilsplat.web.guard import MAX_BODY_BYTES, Guard
+from hilsplat.web.guard import Guard
 
 TYPES = {"html": "text/html; charset=utf-8", "js": "text/javascript", "css": "text/css"}
 BYTES = "application/octet-stream"
@@ -55,9 +55,7 @@ class Pages:
         return plain(self.static[name], TYPES[name.rpartition(".")[2]])
 
 
-def guarded(
-    routes: list[Route], token: str, max_body: int = MAX_BODY_BYTES, *, embedded: bool = False
-) -> Guard:
+def guarded(routes: list[Route], token: str, max_body: int, *, embedded: bool = False) -> Guard:
     """Return the guarded application; errors are sent as text."""
     handlers: dict[Any, Any] = dict.fromkeys(STATUS, _refused)
     return Guard(Starlette(routes=routes, exception_handlers=handlers), token, max_body, embedded=embedded)

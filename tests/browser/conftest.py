@@ -1,4 +1,4 @@
-"""The real `hilsplat view` and a real browser: Debian's Chromium, headless, with WebGL by Mesa's llvmpipe."""
+"""The pages in a real browser: Debian's Chromium, headless, with WebGL by Mesa's llvmpipe."""
 
 import os
 import re
@@ -6,26 +6,32 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
+import uvicorn
 
 import hilsplat
+from hilsplat.annotate.app import Annotator, OpenedScene
 from hilsplat.base.images import write_png
 from hilsplat.scene.scene import Scene
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import save_ply
+from hilsplat.viewer.app import Viewer
+from hilsplat.viewer.viewer_scene import ViewerScene
+from hilsplat.web.guard import Guard
+from hilsplat.web.server import configured, listening_at
 from tests.conftest import PROJECT
 from tests.unit.evaluate.builders import cameras_of
 
 HOW = "apt-get install chromium libgl1-mesa-dri libegl1; pip install -e '.[browser-tests]'"
 ARGUMENTS = ["--use-angle=gl-egl", "--ignore-gpu-blocklist", "--no-sandbox", "--disable-dev-shm-usage"]
 WIDTH, HEIGHT = 740, 420
-PANEL_PX, STRIP_PX = 336, 72
-START_S = 240
+PANEL_PX = 336
 
 
 @pytest.fixture(scope="session")
@@ -56,6 +62,20 @@ def serving(folder: Path, *words: str) -> Iterator[str]:
             yield re.search(r"http://127\.0\.0\.1:\d+/\?token=\S+", line).group()
         finally:
             server.send_signal(signal.SIGINT)
+
+
+@contextmanager
+def served_here(app: Callable[[str], Guard]) -> Iterator[str]:
+    """Address of a page that a thread of this process serves, which starts within milliseconds."""
+    listening = listening_at(0)
+    server = uvicorn.Server(configured(app("token-of-the-test")))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{listening.getsockname()[1]}/?token=token-of-the-test"
+    finally:
+        server.should_exit = True
+        thread.join()
 
 
 @pytest.fixture
@@ -103,6 +123,124 @@ def cloud_address(browser, cloud) -> Iterator[str]:
         yield address
 
 
+class ScenePage:
+    """A page of a scene in the browser: Playwright's page, with the steps that tests share."""
+
+    def __init__(self, page) -> None:
+        self.page = page
+
+    def __getattr__(self, name: str):
+        return getattr(self.page, name)
+
+    def until(self, holds: Callable[[], object]) -> None:
+        """Wait until a condition holds."""
+        for _ in range(600):
+            if holds():
+                return
+            self.wait_for_timeout(50)
+        raise AssertionError("the condition didn't become true")
+
+    def late(self, path: str) -> None:
+        """Delay the replies to requests whose address contains `path`."""
+        self.evaluate(LATE, path)
+
+    def drawn(self, act: Callable[[], object]) -> None:
+        """Run `act` and wait until the picture is redrawn."""
+        view = self.locator("#view")
+        before = int(view.get_attribute("data-drawn"))
+        act()
+        self.until(lambda: int(view.get_attribute("data-drawn")) > before)
+
+    def pixels(self) -> np.ndarray:
+        """The current WebGL picture, (height, width, 3) uint8."""
+        found = self.evaluate("hilsplat.pixels()")
+        values = np.array(found["data"], np.uint8).reshape(found["height"], found["width"], 4)
+        return values[::-1, :, :3]
+
+    def wire_camera(self) -> dict:
+        """The page's camera in the format of requests."""
+        code = "(() => { const v = document.getElementById('view'); "
+        return self.evaluate(code + "return hilsplat.camera.wire(v.clientWidth, v.clientHeight); })()")
+
+    def ask(self, text: str) -> None:
+        self.locator("#text").fill(text)
+        self.keyboard.press("Enter")
+
+    def press(self, *keys: str) -> None:
+        """Press keys in the view."""
+        for key in keys:
+            self.locator("#view").press(key)
+
+    def drag(self, *places: tuple[float, float], held: str = "") -> None:
+        """Drag the mouse over positions on the page, with a key held."""
+        if held:
+            self.keyboard.down(held)
+        self.mouse.move(*places[0])
+        self.mouse.down()
+        for place in places[1:]:
+            self.mouse.move(*place, steps=4)
+        self.mouse.up()
+        if held:
+            self.keyboard.up(held)
+
+    def reloaded(self) -> None:
+        self.reload()
+        self.locator("body[data-ready=yes]").wait_for()
+
+    def beside(self, address: str = "") -> "ScenePage":
+        """Another page in the same browser: by default, the same page again."""
+        other = self.context.new_page()
+        other.goto(address or self.url)
+        other.locator("body[data-ready=yes]").wait_for()
+        return ScenePage(other)
+
+    def saved_page(self, path: Path) -> "ScenePage":
+        """The saved page with answers, opened without a server."""
+        return self.beside(self.save("Page with answers", path / "page.html").as_uri())
+
+    def keep(self, text: str) -> None:
+        """Query, and keep the answer with its key."""
+        self.ask_and_wait(text)
+        self.press("k")
+        self.get_by_text(f"Kept “{text}”").wait_for()
+
+    def chips(self):
+        return self.get_by_label("Kept queries").get_by_role("listitem")
+
+    def phone_fits(self) -> bool:
+        """Whether a phone shows the view in its full width, with the panel below."""
+        self.set_viewport_size({"width": 390, "height": 780})
+        view, panel = self.locator("#view").bounding_box(), self.locator("#panel").bounding_box()
+        is_below = panel["y"] >= view["y"] + view["height"] and view["height"] > 150
+        is_wide = view["width"] == panel["width"] == 390
+        return is_below and is_wide and self.evaluate("document.documentElement.scrollWidth") <= 390
+
+    def answers(self):
+        return self.get_by_role("region", name="Answers").get_by_role("button")
+
+    def ask_and_wait(self, text: str) -> None:
+        """Query, and wait for the answers."""
+        self.ask(text)
+        self.answers().first.wait_for()
+
+    def choose_row(self, node: int) -> None:
+        """Click a node in the outline."""
+        self.locator(f"[role=treeitem][data-node='{node}'] > .row .label").click()
+
+    def save(self, name: str, path: Path) -> Path:
+        """Save a file with a button of the menu."""
+        self.locator("#save summary").click()
+        with self.expect_download() as started:
+            self.get_by_role("button", name=name).click()
+        started.value.save_as(path)
+        return path
+
+    def on_page(self, *points: tuple[float, float, float]) -> np.ndarray:
+        """Positions of points of the scene on the page, px."""
+        view = self.locator("#view").bounding_box()
+        return projected(self.wire_camera(), *points) + np.array([view["x"], view["y"]])
+
+
 @pytest.fixture
 def opened(browser) -> Iterator[Callable]:
     """A function that opens an address and waits until everything is loaded; errors fail the test at its end.
@@ -129,7 +267,7 @@ def opened(browser) -> Iterator[Callable]:
         page.goto(f"{address}&painter={painter}{fragment}")
         page.locator("body[data-ready=yes]").wait_for()
         page.evaluate("hilsplat.begun")  # the tree is loaded, and a query in the address is answered
-        return page
+        return ScenePage(page)
 
     open_page.expected = []
     yield open_page
@@ -140,12 +278,12 @@ def opened(browser) -> Iterator[Callable]:
 
 
 @pytest.fixture
-def served(opened) -> Iterator[Callable]:
-    """A function that serves a scene and opens its page, which is closed before its server: it polls it."""
+def opened_here(opened) -> Iterator[Callable]:
+    """A function that serves a page and opens it; it is closed before its server, which it polls."""
     with ExitStack() as stack:
 
-        def serve_and_open(folder: Path, *words: str, painter: str = "gl", **more):
-            page = opened(stack.enter_context(serving(folder, *words)), painter, **more)
+        def serve_and_open(app: Callable[[str], Guard], painter: str = "gl", **more):
+            page = opened(stack.enter_context(served_here(app)), painter, **more)
             stack.callback(page.close)
             return page
 
@@ -153,18 +291,18 @@ def served(opened) -> Iterator[Callable]:
 
 
 @pytest.fixture
-def annotating(served, tmp_path) -> Callable:
-    """A function that opens the annotation page of a scene, whose files are in `tmp_path`."""
-    return lambda folder, **more: served(folder, "annotate", "--data-root", str(tmp_path), **more)
+def served(opened_here) -> Callable:
+    """A function that opens the viewer of a scene."""
+    return lambda folder, *painter, **more: opened_here(Viewer(ViewerScene(folder)).app, *painter, **more)
 
 
-def until(page, holds: Callable[[], object]) -> None:
-    """Wait until a condition holds."""
-    for _ in range(600):
-        if holds():
-            return
-        page.wait_for_timeout(50)
-    raise AssertionError("the condition didn't become true")
+@pytest.fixture
+def annotating(opened_here, tmp_path) -> Callable:
+    """A function that opens the annotator of a scene, whose files are in `tmp_path`."""
+    labels = tmp_path / "annotated/photos/desk"
+    return lambda folder, **more: opened_here(
+        Annotator(OpenedScene(folder, labels, "default", 1)).app, **more
+    )
 
 
 LATE = """
@@ -176,88 +314,6 @@ LATE = """
   };
 }
 """
-
-
-def late(page, path: str) -> None:
-    """Delay the replies to requests whose address contains `path`."""
-    page.evaluate(LATE, path)
-
-
-def drawn(page, act: Callable[[], object]) -> None:
-    """Run `act` and wait until the picture is redrawn."""
-    view = page.locator("#view")
-    before = int(view.get_attribute("data-drawn"))
-    act()
-    until(page, lambda: int(view.get_attribute("data-drawn")) > before)
-
-
-def pixels(page) -> np.ndarray:
-    """The current WebGL picture, (height, width, 3) uint8."""
-    found = page.evaluate("hilsplat.pixels()")
-    values = np.array(found["data"], np.uint8).reshape(found["height"], found["width"], 4)
-    return values[::-1, :, :3]
-
-
-def wire_camera(page) -> dict:
-    """The page's camera in the format of requests."""
-    code = "(() => { const v = document.getElementById('view'); "
-    return page.evaluate(code + "return hilsplat.camera.wire(v.clientWidth, v.clientHeight); })()")
-
-
-def ask(page, text: str) -> None:
-    page.locator("#text").fill(text)
-    page.keyboard.press("Enter")
-
-
-def keep(page, text: str) -> None:
-    """Query, and keep the answer with its key."""
-    ask_and_wait(page, text)
-    page.locator("#view").focus()
-    page.keyboard.press("k")
-    page.get_by_text(f"Kept “{text}”").wait_for()
-
-
-def chips(page):
-    return page.get_by_label("Kept queries").get_by_role("listitem")
-
-
-def phone_fits(page) -> bool:
-    """Whether a phone shows the view in its full width, with the panel below."""
-    page.set_viewport_size({"width": 390, "height": 780})
-    view, panel = page.locator("#view").bounding_box(), page.locator("#panel").bounding_box()
-    is_below = panel["y"] >= view["y"] + view["height"] and view["height"] > 150
-    is_wide = view["width"] == panel["width"] == 390
-    return is_below and is_wide and page.evaluate("document.documentElement.scrollWidth") <= 390
-
-
-def answers(page):
-    return page.get_by_role("region", name="Answers").get_by_role("button")
-
-
-def ask_and_wait(page, text: str) -> None:
-    """Query, and wait for the answers."""
-    ask(page, text)
-    answers(page).first.wait_for()
-
-
-def choose_row(page, node: int) -> None:
-    """Click a node in the outline."""
-    page.locator(f"[role=treeitem][data-node='{node}'] > .row .label").click()
-
-
-def save(page, name: str, path: Path) -> Path:
-    """Save a file with a button of the menu."""
-    page.locator("#save summary").click()
-    with page.expect_download() as started:
-        page.get_by_role("button", name=name).click()
-    started.value.save_as(path)
-    return path
-
-
-def on_page(page, *points: tuple[float, float, float]) -> np.ndarray:
-    """Positions of points of the scene on the page, px."""
-    view = page.locator("#view").bounding_box()
-    return projected(wire_camera(page), *points) + np.array([view["x"], view["y"]])
 
 
 def projected(wire: dict, *points: tuple[float, float, float]) -> np.ndarray:

@@ -4,8 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.browser.conftest import answers, ask, phone_fits
-
 SERIOUS = ("serious", "critical")
 
 
@@ -30,15 +28,15 @@ def test_the_viewer_has_no_serious_violation_in_the_colours_of_the_user(
     colour = page.evaluate("getComputedStyle(document.getElementById('panel')).backgroundColor")
     assert brightness[0] <= sum(int(value) for value in colour[4:-1].split(",")) <= brightness[1]
     assert violations(page) == []
-    ask(page, "mug > handle")
-    answers(page).first.click()
+    page.ask("mug > handle")
+    page.answers().first.click()
     page.keyboard.press("x")
     page.keyboard.press("v")
     page.get_by_text("Scenes", exact=True).click()
     page.locator("#scene-list a").first.wait_for()
     page.locator("#save summary").click()
     assert violations(page) == []
-    page.locator("#view").press("?")
+    page.press("?")
     assert violations(page) == []
 
 
@@ -59,16 +57,12 @@ def test_the_chosen_level_is_visible_in_forced_colours(opened, desk_address):
     assert all((style == "solid") == checked for checked, style in page.evaluate(outlines))
 
 
-def test_the_picture_is_large_enough_at_twice_the_text_size_and_on_a_phone(opened, desk_address):
+def test_the_picture_and_controls_are_large_enough_with_large_text_and_on_a_phone(opened, desk_address):
     page = opened(desk_address, viewport={"width": 640, "height": 360})
     box = page.locator("#view").bounding_box()
     assert box["height"] > 250 and box["width"] > 300
     assert page.evaluate("document.documentElement.scrollWidth") <= 640
-    assert phone_fits(page)
-
-
-def test_controls_are_at_least_24_px_high(opened, desk_address):
-    page = opened(desk_address)
+    assert page.phone_fits()
     low = """[...document.querySelectorAll('#tools select, #tools summary, #tools button, #views button')]
         .filter((each) => each.getBoundingClientRect().height > 0 && each.getBoundingClientRect().height < 24)
         .map((each) => each.id || each.textContent)"""

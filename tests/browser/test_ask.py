@@ -10,26 +10,7 @@ from PIL import Image
 from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.images import write_png
 from hilsplat.query.names import read_names
-from tests.browser.conftest import (
-    HEIGHT,
-    PANEL_PX,
-    WIDTH,
-    answers,
-    ask,
-    ask_and_wait,
-    chips,
-    choose_row,
-    drawn,
-    keep,
-    late,
-    on_page,
-    pixels,
-    projected,
-    save,
-    serving,
-    until,
-    wire_camera,
-)
+from tests.browser.conftest import HEIGHT, PANEL_PX, WIDTH, ScenePage, projected, serving
 from tests.unit.artifact_changes import change_index
 from tests.unit.many_nodes import add_nodes
 
@@ -40,52 +21,55 @@ both = pytest.mark.parametrize("painter", ["gl", "server"])
 def test_a_query_typed_after_the_slash_key_paints_its_answer(opened, desk_address, scene, painter):
     page = opened(desk_address, painter)
     assert page.evaluate("document.activeElement.id") == "text"  # the text box is first
-    page.locator("#view").focus()
-    page.keyboard.press("/")
+    page.press("/")
     page.keyboard.type("mug > handle")
-    drawn(page, lambda: page.keyboard.press("Enter"))
-    answers(page).first.wait_for()
+    page.drawn(lambda: page.keyboard.press("Enter"))
+    page.answers().first.wait_for()
     (hit,) = scene.query("mug > handle")
     assert f"1 answer, best {hit.score:.2f}, part" in page.get_by_role("status").inner_text()
     assert page.locator("#overlay path.answer").get_attribute("data-node") == str(hit.node)
     page.wait_for_timeout(600)
     if painter == "gl":
-        picture = pixels(page).astype(int)
+        picture = page.pixels().astype(int)
         orange = (picture[..., 0] - picture[..., 2] > 90) & (picture[..., 0] > 120)
         assert 0.01 < orange.mean() < 0.4
         grey = (np.ptp(picture, axis=2) < 8) & (picture.max(axis=2) > 8)
         assert grey.mean() > 0.1 and (orange | grey | (picture.max(axis=2) <= 8)).mean() > 0.9
-    ask(page, "unicorn")
+    page.ask("unicorn")
     doubt = "'unicorn' may not be in the scene: the model's vocabulary lacks 'unicorn'."
-    page.get_by_role("status").get_by_text(doubt).wait_for()
+    status = page.get_by_role("status").filter(has_text=doubt).inner_text()
+    assert status.index(doubt) < status.index("answer")  # a doubt comes first
 
 
-def test_an_answer_outside_the_view_is_one_click_away(opened, desk_address):
+def test_an_answer_outside_the_view_is_one_click_away_until_it_is_cleared(opened, desk_address):
     page = opened(desk_address)
     page.locator("#colour").select_option("relevancy")
     page.get_by_text("Run a query first").wait_for()
     page.locator("#colour").select_option("answers")
     look = page.get_by_role("button", name="No answer is in view: fly to the best one")
-    ask_and_wait(page, "mug > handle")
+    page.ask_and_wait("mug > handle")
     assert look.is_hidden()
     page.evaluate("hilsplat.camera.orbit(3, 0); hilsplat.redraw()")
     look.click()
     look.wait_for(state="hidden")
-    ask(page, "unicorn")
-    status = page.get_by_role("status").filter(has_text="'unicorn' may not be in the scene").inner_text()
-    assert status.index("may not be in the scene") < status.index("answer")  # a doubt comes first
+    page.locator("#save summary").click()
+    page.keyboard.press("Escape")  # closes the menu
+    assert not page.get_by_role("button", name="Boxes, JSON").is_visible()
+    assert page.answers().count() == 1
+    page.keyboard.press("Escape")
+    assert not page.answers().count()
 
 
 @both
 def test_what_others_hides_is_not_chosen(opened, desk_address, painter):
     page = opened(desk_address, painter)
     page.get_by_label("Others").select_option("isolate")
-    ask_and_wait(page, "book")
-    mug, book = on_page(page, (6, 20, 0), (30, 20, 0)).tolist()
+    page.ask_and_wait("book")
+    mug, book = page.on_page((6, 20, 0), (30, 20, 0)).tolist()
     card = page.get_by_role("region", name="Chosen node")
     page.mouse.click(*book)
     card.wait_for()
-    page.locator("#view").press("Escape")
+    page.press("Escape")
     page.mouse.click(*mug)
     page.wait_for_timeout(500)
     assert not card.is_visible()
@@ -93,90 +77,64 @@ def test_what_others_hides_is_not_chosen(opened, desk_address, painter):
 
 def test_a_photograph_is_not_shown_over_the_view_of_another(opened, desk_address):
     page = opened(desk_address)
-    page.locator("#view").focus()
-    page.keyboard.press("o")
+    page.press("o")
     page.locator("#photo").wait_for()
     held = []
     page.route("**/api/photo/1*", lambda route: held.append(route))
     page.keyboard.press("]")
-    until(page, lambda: held)
+    page.until(lambda: held)
     page.locator("#photo").wait_for(state="hidden")
     held[0].continue_()
     page.locator("#photo").wait_for()
 
 
-def test_escape_closes_the_menu_and_leaves_the_answer(opened, desk_address):
-    page = opened(desk_address)
-    ask_and_wait(page, "mug > handle")
-    page.locator("#save summary").click()
-    page.keyboard.press("Escape")
-    assert not page.get_by_role("button", name="Boxes, JSON").is_visible()
-    assert answers(page).count() == 1
-    page.keyboard.press("Escape")
-    assert not answers(page).count()
-
-
-def test_the_picture_is_drawn_again_once_the_server_is_back(opened, desk_address):
-    opened.expected.append("ERR_FAILED")
-    page = opened(desk_address, "server")
-    page.route("**/api/**", lambda route: route.abort())
-    page.locator("#view").press("ArrowLeft")
-    notice = page.get_by_role("alert").filter(has_text="The server has stopped")
-    notice.wait_for()
-    page.wait_for_timeout(1000)
-    drawn(page, lambda: page.unroute("**/api/**"))
-    notice.wait_for(state="hidden")
-
-
 @pytest.mark.parametrize("path", ["splats/0", "variant/default", "nodes/default"])
-def test_what_a_lost_connection_interrupts_is_loaded_later(opened, desk_address, path):
+def test_what_a_lost_connection_interrupts_is_loaded_later_with_the_query_typed_meanwhile(
+    opened, desk_address, path
+):
     opened.expected.append("ERR_FAILED")
     page = opened(desk_address)
     lost = []
-    page.route(
-        f"**/api/{path}?**", lambda route: route.continue_() if lost else route.abort() or lost.append(1)
-    )
+    page.route(f"**/api/{path}?**", lambda route: route.abort() or lost.append(1), times=1)
     page.reload()
-    ask_and_wait(page, "mug > handle")
+    page.ask("mug > handle")
+    page.get_by_text("Your query runs as soon as the semantic tree is loaded").wait_for()
+    page.answers().first.wait_for()
     assert lost and page.locator("#view").get_attribute("data-painter") == "gl"
+    assert page.locator("#text").input_value() == "mug > handle"
 
 
-def test_long_labels_of_boxes_end_in_the_picture_of_a_phone(opened, desk_address):
+def test_labels_of_boxes_end_in_the_picture_of_a_phone_and_do_not_cover_each_other(opened, desk_address):
     page = opened(desk_address)
     page.set_viewport_size({"width": 390, "height": 780})
-    keep(page, "the book on the left side of the desk beside the mug near the window")
+    for text in (
+        "mug",
+        "mug > handle",
+        "the book on the left side of the desk beside the mug near the window",
+    ):
+        page.keep(text)
     label = page.locator("#overlay text", has_text="the book on")
     label.wait_for()
-    box = label.bounding_box()
-    assert box["x"] >= 0 and box["x"] + box["width"] <= 390
     assert re.fullmatch(r"the book on .*… 0\.\d\d", label.text_content())
-
-
-def test_labels_of_boxes_do_not_cover_each_other(opened, desk_address):
-    page = opened(desk_address)
-    for text in ("mug", "mug > handle", "book"):
-        keep(page, text)
-    page.wait_for_timeout(300)
     boxes = [label.bounding_box() for label in page.locator("#overlay text").all()]
     assert len(boxes) >= 3
     for number, one in enumerate(boxes):
+        assert one["x"] >= 0 and one["x"] + one["width"] <= 390
         for other in boxes[:number]:
             apart = abs(one["y"] - other["y"]) >= 12
-            beside = one["x"] >= other["x"] + other["width"] or other["x"] >= one["x"] + one["width"]
-            assert apart or beside
+            follows = one["x"] >= other["x"] + other["width"] or other["x"] >= one["x"] + one["width"]
+            assert apart or follows
 
 
-def test_a_name_given_in_one_tab_appears_in_another(served, own_desk, opened):
+def test_a_name_given_in_one_tab_appears_in_another(served, own_desk):
     page = served(own_desk)
-    other = page.context.new_page()
-    other.goto(page.url.partition("#")[0])
-    other.locator("body[data-ready=yes]").wait_for()
-    ask_and_wait(other, "mug")
-    ask_and_wait(page, "mug")
-    answers(page).first.click()
+    other = page.beside(page.url.partition("#")[0])
+    other.ask_and_wait("mug")
+    page.ask_and_wait("mug")
+    page.answers().first.click()
     page.get_by_role("textbox", name="Name").fill("frog")
     page.keyboard.press("Enter")
-    for name in (answers(other), other.get_by_role("tree", name="Outline")):
+    for name in (other.answers(), other.get_by_role("tree", name="Outline")):
         name.get_by_text("frog").first.wait_for()
     other.close()
 
@@ -184,49 +142,36 @@ def test_a_name_given_in_one_tab_appears_in_another(served, own_desk, opened):
 def test_a_stopped_server_is_reported_until_it_is_started_again(opened, desk):
     opened.expected += ["ERR_CONNECTION_REFUSED", "403"]
     with serving(desk) as address:
-        page = opened(address)
+        page = opened(address, "server")
         port = re.search(r":(\d+)/", address).group(1)
-    ask(page, "mug > handle")
+    page.press("ArrowLeft")
+    page.ask("mug > handle")
     notice = page.get_by_role("alert").filter(has_text="The server has stopped")
     notice.wait_for()
     assert f"hilsplat view {desk} --port {port}" in notice.text_content()
     with serving(desk, "view", "--port", port) as address:
-        page.context.new_page().goto(address)
+        page.drawn(lambda: page.context.new_page().goto(address))  # the picture that could not be rendered
         notice.wait_for(state="hidden")
-        ask_and_wait(page, "mug > handle")
+        page.ask_and_wait("mug > handle")
         page.context.close()
-
-
-def test_a_query_typed_before_the_tree_is_loaded_runs_later(opened, desk_address):
-    page = opened(desk_address)
-    held = []
-    page.route("**/api/nodes/**", lambda route: held.append(route))
-    page.reload()
-    page.locator("body[data-ready=yes]").wait_for()
-    ask(page, "mug > handle")
-    page.get_by_text("Your query runs as soon as the semantic tree is loaded").wait_for()
-    assert held and not answers(page).count()
-    held[0].continue_()
-    answers(page).first.wait_for()
-    assert page.locator("#text").input_value() == "mug > handle"
 
 
 @both
 def test_a_click_chooses_the_whole_and_the_next_click_its_part(opened, desk_address, scene, painter):
     page = opened(desk_address, painter)
-    (place,) = on_page(page, (6, 6, 0))  # a yellow pixel of the rim
+    (place,) = page.on_page((6, 6, 0))  # a yellow pixel of the rim
     for text in ("mug", "mug > handle", "mug > handle > rim", "mug"):
         page.mouse.click(*place.tolist())
         node = scene.query(text)[0].node
         page.locator(f"#overlay path.chosen[data-node='{node}']").first.wait_for(state="attached")
         assert page.locator(f"[role=treeitem][data-node='{node}']").get_attribute("aria-selected") == "true"
-    page.locator("#view").press("Escape")
+    page.press("Escape")
     page.locator("#overlay path.chosen").first.wait_for(state="detached")
 
 
 def test_quick_picks_agree_with_exact_ones(opened, desk_address, scene):
     page = opened(desk_address)
-    wire = wire_camera(page)
+    wire = page.wire_camera()
     height, width = wire["size_hw"]
     rng = np.random.default_rng(1)
     agree = []
@@ -268,16 +213,6 @@ def test_keys_move_in_the_outline(opened, desk_address, scene):
     page.locator(f"#overlay path.chosen[data-node='{child}']").wait_for(state="attached")
 
 
-def frame(page, start, end) -> None:
-    """Draw a frame with Alt held."""
-    page.keyboard.down("Alt")
-    page.mouse.move(*start)
-    page.mouse.down()
-    page.mouse.move(*end, steps=4)
-    page.mouse.up()
-    page.keyboard.up("Alt")
-
-
 def test_queries_with_an_image_a_framed_part_of_the_view_and_a_node(opened, desk_address, scene, tmp_path):
     page = opened(desk_address)
     book = scene.query("book", "whole")[0].node
@@ -285,27 +220,27 @@ def test_queries_with_an_image_a_framed_part_of_the_view_and_a_node(opened, desk
     page.get_by_label("Picture to look for").set_input_files(tmp_path / "blue.png")
     page.locator(f"#answers li[data-node='{book}']").first.wait_for()
     assert page.locator("#answers li").first.get_attribute("data-node") == str(book)
-    page.locator("#view").press("Escape")
-    low, high = on_page(page, (18, 18, 0), (34, 22, 0))  # corners of the book
-    frame(page, low, high)
-    answers(page).first.wait_for()
+    page.press("Escape")
+    low, high = page.on_page((18, 18, 0), (34, 22, 0))  # corners of the book
+    page.drag(low, high, held="Alt")
+    page.answers().first.wait_for()
     assert page.locator("#answers li").first.get_attribute("data-node") == str(book)
     page.get_by_label("Beside").select_option("default|field")
     for moved in (0, 0.01):  # from the photograph and from the rendered picture, both in the right half
-        page.locator("#view").press("Escape")
+        page.press("Escape")
         page.evaluate(f"{moved} && hilsplat.camera.orbit({moved}, 0); hilsplat.redraw()")
         width = page.locator("#view").bounding_box()["width"] / 2
         wire = page.evaluate(f"hilsplat.camera.wire({width}, document.getElementById('view').clientHeight)")
         low, high = projected(wire, (18, 18, 0), (34, 22, 0)) + np.array([PANEL_PX + width, 0])
-        frame(page, low, high)
-        answers(page).first.wait_for()
+        page.drag(low, high, held="Alt")
+        page.answers().first.wait_for()
         assert page.locator("#answers li").first.get_attribute("data-node") == str(book)
     page.get_by_label("Beside").select_option("")
-    page.locator("#view").press("Escape")
+    page.press("Escape")
     handle = scene.query("mug > handle")[0].node
-    choose_row(page, handle)
+    page.choose_row(handle)
     page.get_by_role("button", name="More like this").click()
-    answers(page).first.wait_for()
+    page.answers().first.wait_for()
     assert page.locator("#answers li").first.get_attribute("data-node") == str(
         scene.like_node(handle)[0].node
     )
@@ -313,34 +248,16 @@ def test_queries_with_an_image_a_framed_part_of_the_view_and_a_node(opened, desk
 
 def test_two_answerers_are_shown_side_by_side(opened, desk_address):
     page = opened(desk_address)
-    ask_and_wait(page, "mug")
-    drawn(page, lambda: page.get_by_label("Beside").select_option("default|field"))
+    page.ask_and_wait("mug")
+    page.drawn(lambda: page.get_by_label("Beside").select_option("default|field"))
     right = page.get_by_role("list", name="On the right, by default, field: 1 of 1 are on the left too")
     right.get_by_role("button").wait_for()  # exactly one
     page.locator("#overlay .split").wait_for(state="attached")
     page.wait_for_timeout(1500)
-    picture = pixels(page)
+    picture = page.pixels()
     half = picture.shape[1] // 2
     left, right = picture[:, :half].astype(int), picture[:, half : 2 * half].astype(int)
     assert left.std() > 10 and np.abs(left - right).mean() < 12  # both answer the mug, from one camera
-
-
-def test_an_address_opens_the_same_view_with_the_same_queries(opened, desk_address):
-    page = opened(desk_address)
-    keep(page, "book")
-    ask_and_wait(page, "mug > handle")
-    page.locator("#view").focus()
-    for key in ("ArrowLeft", "ArrowUp", "+"):
-        page.keyboard.press(key)
-    page.wait_for_timeout(1200)
-    assert "token" not in page.url
-    again = opened(desk_address, fragment="#" + page.url.partition("#")[2])
-    answers(again).first.wait_for()
-    assert again.locator("#text").input_value() == "mug > handle"
-    assert chips(again).all_inner_texts() == chips(page).all_inner_texts()
-    found, expected = wire_camera(again), wire_camera(page)
-    np.testing.assert_allclose(found["cam_from_world"], expected["cam_from_world"], atol=1e-3)
-    np.testing.assert_allclose(found["K"], expected["K"], rtol=1e-3)
 
 
 def test_films_show_progress_and_gifs_and_pictures_have_the_chosen_size(opened, desk_address, tmp_path):
@@ -349,8 +266,8 @@ def test_films_show_progress_and_gifs_and_pictures_have_the_chosen_size(opened, 
     page.get_by_label("Longer side of the GIF").select_option("240")
     page.get_by_label("Longer side of the picture").select_option("1280")
     page.locator("#save summary").click()
-    assert max(Image.open(save(page, "Picture, PNG", tmp_path / "picture.png")).size) == 1280
-    gif = Image.open(save(page, "Film, GIF", tmp_path / "flight.gif"))
+    assert max(Image.open(page.save("Picture, PNG", tmp_path / "picture.png")).size) == 1280
+    gif = Image.open(page.save("Film, GIF", tmp_path / "flight.gif"))
     assert max(gif.size) == 240 and gif.n_frames > 10
     page.get_by_role("progressbar", name="Film").wait_for(state="hidden")
     page.locator("#save summary").click()
@@ -364,25 +281,25 @@ def test_films_show_progress_and_gifs_and_pictures_have_the_chosen_size(opened, 
 
 def test_an_exported_page_opens_from_a_file_with_its_answers(opened, browser, desk_address, tmp_path, scene):
     page = opened(desk_address)
-    keep(page, "book")
-    ask_and_wait(page, "mug > handle")
-    page.locator("#view").press("ArrowLeft")
-    file = save(page, "Page with answers, HTML", tmp_path / "page.html")
+    page.keep("book")
+    page.ask_and_wait("mug > handle")
+    page.press("ArrowLeft")
+    file = page.save("Page with answers, HTML", tmp_path / "page.html")
     context = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT}, offline=True)
-    alone, wrong = context.new_page(), []
+    alone, wrong = ScenePage(context.new_page()), []
     alone.on("pageerror", lambda error: wrong.append(str(error)))
     alone.on("console", lambda said: said.type == "error" and wrong.append(said.text))
     alone.goto(file.as_uri())
     alone.locator("body[data-ready=yes]").wait_for()
-    answers(alone).first.wait_for()  # the page opens with its answer and the last camera
+    alone.answers().first.wait_for()  # the page opens with its answer and the last camera
     assert alone.locator("#text").input_value() == "mug > handle"
-    found, expected = wire_camera(alone), wire_camera(page)
+    found, expected = alone.wire_camera(), page.wire_camera()
     np.testing.assert_allclose(found["cam_from_world"], expected["cam_from_world"], atol=1e-3)
     (hit,) = scene.query("mug > handle")
     assert alone.locator("#answers li").get_attribute("data-node") == str(hit.node)
-    ask(alone, "spoon")
+    alone.ask("spoon")
     alone.get_by_text("This page contains only the answers to: book, mug > handle").wait_for()
-    assert [chip.inner_text().split("\n")[0] for chip in chips(alone).all()] == ["book"]
+    assert [chip.inner_text().split("\n")[0] for chip in alone.chips().all()] == ["book"]
     assert alone.locator("#overlay path.kept").count() == 1
     assert not wrong
     context.close()
@@ -392,10 +309,10 @@ def test_a_rewritten_scene_is_reported_and_reloaded_without_the_old_choice(opene
     opened.expected.append("409")  # the browser reports what was refused
     page = served(own_desk, painter="server")
     page.locator("#view").focus()
-    ask(page, "mug > handle")
-    answers(page).first.click()
+    page.ask("mug > handle")
+    page.answers().first.click()
     page.locator("#overlay path.chosen").first.wait_for(state="attached")
-    until(page, lambda: "node=" in page.url)
+    page.until(lambda: "node=" in page.url)
     assert not page.get_by_role("alert").is_visible()
     tree = own_desk / "default/semantic_tree"
     with np.load(tree / "tree.npz") as held:
@@ -408,7 +325,7 @@ def test_a_rewritten_scene_is_reported_and_reloaded_without_the_old_choice(opene
     page.locator("#overlay path.chosen").first.wait_for(state="attached")  # as it was
     page.get_by_role("button", name="Reload").click()
     page.get_by_role("alert").wait_for(state="hidden")
-    answers(page).first.wait_for()  # the question is asked again
+    page.answers().first.wait_for()  # the question is asked again
     assert page.locator("#text").input_value() == "mug > handle"
     assert not page.locator("#overlay path.chosen").count()
 
@@ -417,12 +334,12 @@ def test_a_tree_of_70000_nodes_looks_like_a_small_one(opened, served, own_desk, 
     add_nodes(own_desk, 70_000)
     found = []
     for page, unfold in ((served(own_desk), ("ArrowRight",)), (opened(desk_address), ())):
-        ask(page, "mug > handle")
-        answers(page).first.wait_for()
+        page.ask("mug > handle")
+        page.answers().first.wait_for()
         page.wait_for_timeout(800)
-        picture = pixels(page)
+        picture = page.pixels()
         items = page.locator("[role=treeitem]").count()
-        (place,) = on_page(page, (6, 6, 0))  # a yellow pixel of the rim
+        (place,) = page.on_page((6, 6, 0))  # a yellow pixel of the rim
         page.mouse.click(*place.tolist())
         chosen = page.locator("#overlay path.chosen").first
         chosen.wait_for(state="attached")
@@ -442,15 +359,15 @@ def test_a_tree_of_70000_nodes_looks_like_a_small_one(opened, served, own_desk, 
 def test_late_replies_do_not_undo_what_was_done_meanwhile(served, own_desk):
     page = served(own_desk)
     for path in ("api/pick", "api/names"):
-        late(page, path)
+        page.late(path)
     name = page.get_by_role("textbox", name="Name")
     for node, text in ((0, "frog"), (1, "hat")):
-        choose_row(page, node)
+        page.choose_row(node)
         name.fill(text)
         page.keyboard.press("Enter")
-    ((x, y),) = on_page(page, (6, 6, 0))
+    ((x, y),) = page.on_page((6, 6, 0))
     page.mouse.click(x, y)
-    choose_row(page, 3)
+    page.choose_row(3)
     page.get_by_text("Named “hat”").wait_for()
     page.wait_for_timeout(900)
     names = read_names(own_desk, own_desk / "default/semantic_tree").of_node
@@ -462,12 +379,12 @@ def test_the_field_of_an_earlier_query_is_not_painted(opened, desk_address):
     page = opened(desk_address)
     held = []
     page.route("**/api/field**", lambda route: route.continue_() if held else held.append(route))
-    ask_and_wait(page, "mug")
+    page.ask_and_wait("mug")
     page.locator("#colour").select_option("field")
-    until(page, lambda: held)
-    ask(page, "book")
+    page.until(lambda: held)
+    page.ask("book")
     field = "hilsplat.painted()[0].style.field?.text"
-    until(page, lambda: page.evaluate(field) == "book")
+    page.until(lambda: page.evaluate(field) == "book")
     held[0].continue_()
     page.wait_for_timeout(500)
     assert page.evaluate(field) == "book"

@@ -1,11 +1,11 @@
 """Camera, history, pending pictures and refused queries of the viewer."""
 
 import shutil
+from urllib.parse import quote_plus
 
 import numpy as np
 import pytest
 
-from tests.browser.conftest import answers, ask, ask_and_wait, until, wire_camera
 from tests.unit.finished_desk import SCENE
 
 
@@ -17,16 +17,16 @@ def distance(page) -> float:
 def test_a_refused_query_removes_the_previous_answers(opened, desk_address):
     opened.expected.append("422")
     page = opened(desk_address)
-    ask_and_wait(page, "mug > handle")
-    ask(page, "mug > ")
+    page.ask_and_wait("mug > handle")
+    page.ask("mug > ")
     page.locator("#status.error").wait_for()
-    assert not answers(page).count() and not page.locator("#overlay path.answer").count()
+    assert not page.answers().count() and not page.locator("#overlay path.answer").count()
     assert page.evaluate("hilsplat.painted()[0].style.table.every((value) => value === 0)")
 
 
 def test_zooming_out_is_limited_and_home_returns_to_the_start(opened, desk_address):
     page = opened(desk_address)
-    begun = wire_camera(page)
+    begun = page.wire_camera()
     page.locator("#view").focus()
     for _ in range(120):
         page.keyboard.press("-")
@@ -35,8 +35,7 @@ def test_zooming_out_is_limited_and_home_returns_to_the_start(opened, desk_addre
     page.keyboard.press("-")
     assert distance(page) == pytest.approx(far)
     page.keyboard.press("Home")
-    page.wait_for_timeout(300)
-    np.testing.assert_allclose(wire_camera(page)["cam_from_world"], begun["cam_from_world"])
+    page.until(lambda: np.allclose(page.wire_camera()["cam_from_world"], begun["cam_from_world"]))
 
 
 def test_a_held_key_moves_evenly(opened, desk_address):
@@ -62,28 +61,25 @@ def test_a_held_key_moves_evenly(opened, desk_address):
 
 def test_back_returns_to_the_previous_query(opened, desk_address):
     page = opened(desk_address)
-    page.wait_for_timeout(800)
+    page.until(lambda: "#" in page.url)
     for text in ("mug > handle", "book"):
-        ask_and_wait(page, text)
-        page.wait_for_timeout(1200)  # until the address is updated
-    page.go_back()
-    page.wait_for_function("document.getElementById('text').value === 'mug > handle'")
-    answers(page).first.wait_for()
-    page.wait_for_timeout(1000)
-    page.go_forward()
-    page.wait_for_function("document.getElementById('text').value === 'book'")
-    page.wait_for_timeout(1000)
-    page.go_back()
-    page.wait_for_timeout(1000)
-    page.go_back()
-    page.wait_for_function("document.getElementById('text').value === ''")
-    assert not answers(page).count()
+        page.ask_and_wait(text)
+        page.until(lambda text=text: f"q={quote_plus(text)}" in page.url)
+    for go, text in (
+        (page.go_back, "mug > handle"),
+        (page.go_forward, "book"),
+        (page.go_back, "mug > handle"),
+        (page.go_back, ""),
+    ):
+        go()
+        page.wait_for_function("(text) => document.getElementById('text').value === text", arg=text)
+        page.until(lambda text=text: page.answers().count() == bool(text))
 
 
 @pytest.mark.parametrize(("painter", "colour"), [("gl", "relevancy"), ("gl", "field"), ("server", "field")])
 def test_a_threshold_cuts_the_colours_and_counts_the_gaussians_above(opened, desk_address, painter, colour):
     page = opened(desk_address, painter)
-    ask_and_wait(page, "mug")
+    page.ask_and_wait("mug")
     page.locator("#colour").select_option(colour)
     scale = page.get_by_role("group", name="Colours of relevancy")
     scale.wait_for()
@@ -93,8 +89,8 @@ def test_a_threshold_cuts_the_colours_and_counts_the_gaussians_above(opened, des
     page.get_by_label("score at least").check()
     for least, count in (("0.5", 24 * 16), ("0.9", 0)):  # the mug's, whose score is 0.79
         page.get_by_role("slider", name="Minimum score").fill(least)
-        until(page, lambda count=count: scale.inner_text().split()[2:3] == [str(count)])
-    until(page, lambda: "least=0.9" in page.url)
+        page.until(lambda count=count: scale.inner_text().split()[2:3] == [str(count)])
+    page.until(lambda: "least=0.9" in page.url)
 
 
 def test_another_scene_opens_on_the_same_server(desk_project, tmp_path, served):
@@ -115,8 +111,8 @@ def test_another_scene_opens_on_the_same_server(desk_project, tmp_path, served):
     with page.expect_request(f"{origin}/api/scene?*scene=photos%2Fother*"):
         scenes.nth(1).locator("a").click()
     page.locator("body[data-ready=yes]").wait_for()
-    ask_and_wait(page, "mug")
-    until(page, lambda: "q=mug" in page.url)
+    page.ask_and_wait("mug")
+    page.until(lambda: "q=mug" in page.url)
     assert page.url.startswith(origin) and "scene=photos%2Fother" in page.url
     page.get_by_text("Scenes", exact=True).click()
     scenes.nth(1).wait_for()

@@ -12,7 +12,6 @@ from plyfile import PlyData
 from hilsplat.splat.ply import load_ply
 from hilsplat.viewer.frames import within
 from hilsplat.viewer.wire import WireCamera
-from tests.browser.conftest import ask_and_wait, keep, late, on_page, phone_fits, save, until, wire_camera
 from tests.unit.artifact_changes import loosen
 from tests.unit.splat.spz_reader import decoded
 
@@ -27,50 +26,36 @@ def selected_after(page, act: Callable[[], object]) -> int:
     told = page.locator("#edit-told")
     before = told.inner_text()
     act()
-    until(page, lambda: told.inner_text() != before)
+    page.until(lambda: told.inner_text() != before)
     return int(re.search(r"\d+", told.inner_text()).group())
 
 
 def has(page, selected: int, removed: int) -> None:
     """Wait until these numbers of Gaussians are selected and removed."""
     told = f"{selected} selected, {removed} removed"
-    until(page, lambda: told in page.locator("#edit-told").inner_text())
+    page.until(lambda: told in page.locator("#edit-told").inner_text())
 
 
 def use(page, tool: str) -> None:
     page.get_by_role("toolbar", name="Edit").get_by_text(tool, exact=True).click()
 
 
-def drag(page, *points: tuple[float, float], held: str = "") -> None:
+def drag_over(page, *points: tuple[float, float], held: str = "") -> None:
     """Drag over points of the desk's plane."""
-    places = on_page(page, *[(x, y, 0) for x, y in points])
-    if held:
-        page.keyboard.down(held)
-    page.mouse.move(*places[0])
-    page.mouse.down()
-    for place in places[1:]:
-        page.mouse.move(*place, steps=4)
-    page.mouse.up()
-    if held:
-        page.keyboard.up(held)
+    page.drag(*page.on_page(*[(x, y, 0) for x, y in points]), held=held)
 
 
 def colour(page, x: float, y: float) -> np.ndarray:
     """Colour of the picture at a point of the desk's plane."""
     page.mouse.move(5, 5)
-    ((left, top),) = on_page(page, (x, y, 0))
+    ((left, top),) = page.on_page((x, y, 0))
     picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
     return picture[round(top), round(left)]
 
 
 def shows(page, x: float, y: float, is_right: Callable[[np.ndarray], bool]) -> None:
     """Wait until a point of the desk's plane has the right colour."""
-    until(page, lambda: is_right(colour(page, x, y)))
-
-
-def press(page, key: str) -> None:
-    page.locator("#view").focus()
-    page.keyboard.press(key)
+    page.until(lambda: is_right(colour(page, x, y)))
 
 
 @pytest.mark.parametrize("painter", ["gl", "server"])
@@ -78,62 +63,68 @@ def test_gaussians_in_a_box_are_selected_removed_and_restored(opened, desk_addre
     page = opened(desk_address, painter)
     edit(page)
     use(page, "box")
-    drag(page, (21.5, 16.5), (29.5, 20.5))
+    drag_over(page, (21.5, 16.5), (29.5, 20.5))
     has(page, 8 * 4, 0)
     shows(page, 25, 18, lambda rgb: np.abs(rgb - (0.7 * 255, 0, 0.3 * 250 + 0.7 * 160)).max() < 40)
-    press(page, "Delete")
+    page.press("Delete")
     has(page, 0, 32)
     shows(page, 25, 18, lambda rgb: rgb.max() < 40)
-    drag(page, (19.5, 14.5), (29.5, 20.5))  # what is removed is not selected again
+    drag_over(page, (19.5, 14.5), (29.5, 20.5))  # what is removed is not selected again
     has(page, 10 * 6 - 32, 32)
-    press(page, "Control+z")
-    press(page, "Control+z")
+    page.press("Control+z", "Control+z")
     has(page, 32, 0)
-    press(page, "Control+z")
+    page.press("Control+z")
     has(page, 0, 0)
     shows(page, 25, 18, lambda rgb: rgb[2] > 150)
     page.get_by_role("button", name="Redo").click()
-    press(page, "Control+Shift+z")
+    page.press("Control+Shift+z")
     has(page, 0, 32)
+    drag_over(page, (-0.5, -0.5), (15.5, 23.5))
+    page.get_by_role("button", name="Keep only").click()
+    has(page, 0, 864 - 16 * 24)
 
 
 def test_the_brush_adds_and_subtracts(opened, desk_address, desk):
     page = opened(desk_address)
     gaussians = load_ply(desk / "gaussians.ply")
     edit(page)
-    press(page, "c")
+    page.press("c")
     page.get_by_label("Size").fill("60")
-    camera = WireCamera.model_validate(wire_camera(page)).camera()
+    camera = WireCamera.model_validate(page.wire_camera()).camera()
     view = page.locator("#view").bounding_box()
-    places = on_page(page, (6, 8, 0), (26, 14, 0)) - (view["x"], view["y"])
+    places = page.on_page((6, 8, 0), (26, 14, 0)) - (view["x"], view["y"])
     points = [tuple(place) for place in places.tolist()]
     expected = int(within(gaussians.means, camera, points, 30.0).sum())
-    selected = selected_after(page, lambda: drag(page, (6, 8), (26, 14)))
+    selected = selected_after(page, lambda: drag_over(page, (6, 8), (26, 14)))
     assert abs(selected - expected) <= 0.05 * expected and expected > 60
-    assert selected_after(page, lambda: drag(page, (6, 20), (8, 20), held="Shift")) > selected
-    fewer = selected_after(page, lambda: drag(page, (6, 20), (8, 20), held="Control"))
+    assert selected_after(page, lambda: drag_over(page, (6, 20), (8, 20), held="Shift")) > selected
+    fewer = selected_after(page, lambda: drag_over(page, (6, 20), (8, 20), held="Control"))
     assert fewer == pytest.approx(selected, abs=2)
     size = float(page.get_by_label("Size").input_value())
-    press(page, "]")
+    page.press("]")
     assert float(page.get_by_label("Size").input_value()) > size
-    inverted = selected_after(page, lambda: press(page, "i"))
+    inverted = selected_after(page, lambda: page.press("i"))
     assert inverted == pytest.approx(len(gaussians) - selected, abs=2)
-    press(page, "Escape")  # dragging moves the camera again
-    before = wire_camera(page)
-    drag(page, (6, 8), (12, 8))
-    assert wire_camera(page) != before
+    page.press("Escape")  # dragging moves the camera again
+    before = page.wire_camera()
+    drag_over(page, (6, 8), (12, 8))
+    assert page.wire_camera() != before
+    page.press("c")
+    page.get_by_label("Size").press("Delete")
+    has(page, 0, inverted)
+    assert page.phone_fits()
 
 
 def test_an_answer_is_removed_and_the_rest_is_saved(opened, desk_address, desk, scene, tmp_path):
     page = opened(desk_address)
-    keep(page, "book")
-    ask_and_wait(page, "mug > handle")
+    page.keep("book")
+    page.ask_and_wait("mug > handle")
     (book,), (handle,) = scene.query("book"), scene.query("mug > handle")
     edit(page)
     page.get_by_role("button", name="Select answers").click()
     both = scene.views.gaussians_of([book.node, handle.node])
     has(page, len(both), 0)
-    press(page, "Escape")  # clears the answer, but not the selection
+    page.press("Escape")  # clears the answer, but not the selection
     page.get_by_role("button", name="Show book").click()
     page.locator(f"[role=treeitem][data-node='{handle.node}'] > .row .label").click()
     page.get_by_label("Selection").select_option("subtract")
@@ -142,33 +133,12 @@ def test_an_answer_is_removed_and_the_rest_is_saved(opened, desk_address, desk, 
     has(page, len(rows), 0)
     page.get_by_role("button", name="Remove", exact=True).click()
     before = (desk / "gaussians.ply").read_bytes()
-    found = PlyData.read(save(page, "Whole scene, PLY", tmp_path / "scene.ply"))["vertex"].data
+    found = PlyData.read(page.save("Whole scene, PLY", tmp_path / "scene.ply"))["vertex"].data
     kept = np.setdiff1d(np.arange(864), rows)
     np.testing.assert_array_equal(found, PlyData.read(desk / "gaussians.ply")["vertex"].data[kept])
-    compressed = decoded(save(page, "Whole scene, SPZ", tmp_path / "scene.spz").read_bytes())
+    compressed = decoded(page.save("Whole scene, SPZ", tmp_path / "scene.spz").read_bytes())
     assert len(compressed) == len(kept)
     assert (desk / "gaussians.ply").read_bytes() == before
-
-
-def test_only_the_selection_is_kept_in_the_saved_page(opened, desk_address, tmp_path):
-    page = opened(desk_address)
-    edit(page)
-    press(page, "b")
-    drag(page, (-0.5, -0.5), (15.5, 23.5))
-    page.get_by_role("button", name="Keep only").click()
-    has(page, 0, 864 - 16 * 24)
-    saved = save(page, "Page with answers", tmp_path / "page.html")
-    offline = page.context.new_page()
-    offline.goto(saved.as_uri())
-    offline.locator("body[data-ready=yes]").wait_for()
-    assert offline.evaluate("hilsplat.painter.count") == 16 * 24
-    assert not offline.get_by_role("button", name="Edit", exact=True).is_visible()
-
-
-def test_the_edit_bar_fits_on_a_phone(opened, desk_address):
-    page = opened(desk_address)
-    edit(page)
-    assert phone_fits(page)
 
 
 def test_loose_gaussians_are_selected_and_removed(own_desk, served):
@@ -177,27 +147,36 @@ def test_loose_gaussians_are_selected_and_removed(own_desk, served):
     edit(page)
     page.get_by_role("button", name="Select loose").click()
     has(page, 40, 0)
-    press(page, "Delete")
+    page.press("Delete")
     has(page, 0, 40)
 
 
 def test_what_is_done_while_a_selection_is_on_its_way_acts_on_it(opened, desk_address, tmp_path):
     page = opened(desk_address)
-    late(page, "api/within")
+    page.late("api/within")
     edit(page)
     use(page, "box")
-    drag(page, (21.5, 16.5), (29.5, 20.5))
-    press(page, "Delete")
-    saved = save(page, "Page with answers", tmp_path / "page.html")
+    drag_over(page, (21.5, 16.5), (29.5, 20.5))
+    page.press("Delete")
+    offline = page.saved_page(tmp_path)
     has(page, 0, 32)
-    offline = page.context.new_page()
-    offline.goto(saved.as_uri())
-    offline.locator("body[data-ready=yes]").wait_for()
     assert offline.evaluate("hilsplat.painter.count") == 864 - 32
-    drag(page, (19.5, 14.5), (29.5, 20.5))
-    press(page, "Control+z")  # the selection, not the removal
+    assert not offline.get_by_role("button", name="Edit", exact=True).is_visible()
+    drag_over(page, (19.5, 14.5), (29.5, 20.5))
+    page.press("Control+z")  # the selection, not the removal
     page.get_by_role("button", name="Redo").click()  # once it can be
     has(page, 10 * 6 - 32, 32)
+
+
+def test_steps_that_take_much_memory_are_forgotten(opened, desk_address):
+    page = opened(desk_address)
+    edit(page)
+    click = "([id, times]) => { while (times--) document.getElementById(id).click(); }"
+    page.evaluate(click, ["edit-invert", 31])
+    has(page, 864, 0)
+    page.evaluate(click, ["edit-undo", 25])
+    page.until(page.get_by_role("button", name="Undo").is_disabled)  # after 20
+    has(page, 864, 0)
 
 
 @pytest.mark.parametrize("painter", ["gl", "server"])
@@ -205,45 +184,31 @@ def test_removed_gaussians_are_kept_over_a_reload_until_they_are_restored(opened
     page = opened(desk_address, painter)
     edit(page)
     use(page, "box")
-    drag(page, (21.5, 16.5), (29.5, 20.5))
-    press(page, "Delete")
+    drag_over(page, (21.5, 16.5), (29.5, 20.5))
+    page.press("Delete")
     has(page, 0, 32)
-    page.reload()
-    page.locator("body[data-ready=yes]").wait_for()
+    page.reloaded()
     has(page, 0, 32)
     shows(page, 25, 18, lambda rgb: rgb.max() < 40)
     page.get_by_role("button", name="Restore all").click()
     has(page, 0, 0)
     shows(page, 25, 18, lambda rgb: rgb[2] > 150)
-    press(page, "Control+z")
+    page.press("Control+z")
     has(page, 0, 32)
 
 
 def test_what_is_removed_in_one_tab_is_removed_in_another(opened, desk_address):
     page = opened(desk_address)
-    other = page.context.new_page()
-    other.goto(page.url)
-    other.locator("body[data-ready=yes]").wait_for()
+    other = page.beside()
     for tab, columns in ((page, (-0.5, 1.5)), (other, (1.5, 3.5))):
         edit(tab)
         use(tab, "box")
-        drag(tab, *[(column, row) for column, row in zip(columns, (-0.5, 23.5), strict=True)])
-        press(tab, "Delete")
+        drag_over(tab, *[(column, row) for column, row in zip(columns, (-0.5, 23.5), strict=True)])
+        tab.press("Delete")
     for tab in (page, other):
         has(tab, 0, 4 * 24)
-    page.reload()
-    page.locator("body[data-ready=yes]").wait_for()
+    page.reloaded()
     has(page, 0, 4 * 24)
     page.get_by_role("button", name="Restore all").click()
     has(other, 0, 0)
     other.close()
-
-
-def test_the_delete_key_removes_after_the_brush_size_was_set(opened, desk_address):
-    page = opened(desk_address)
-    edit(page)
-    press(page, "c")
-    drag(page, (6, 8), (26, 14))
-    until(page, lambda: page.get_by_role("button", name="Remove", exact=True).is_enabled())
-    page.get_by_label("Size").press("Delete")
-    until(page, lambda: page.get_by_role("button", name="Restore all").is_enabled())

@@ -9,62 +9,45 @@ import av
 import pytest
 from plyfile import PlyData
 
-from tests.browser.conftest import (
-    answers,
-    ask,
-    ask_and_wait,
-    chips,
-    choose_row,
-    drawn,
-    keep,
-    late,
-    pixels,
-    save,
-    until,
-)
 from tests.unit.many_nodes import add_nodes
 
 
 def greenish(page) -> float:
     """Share of the picture in the colour of the first kept query."""
-    picture = pixels(page).astype(int)
+    picture = page.pixels().astype(int)
     return float(((picture[..., 1] - picture[..., 0] > 60) & (picture[..., 2] > 60)).mean())
 
 
 def test_kept_queries_have_colours_and_can_be_hidden_and_dropped(opened, desk_address, scene):
     page = opened(desk_address)
-    keep(page, "book")
-    keep(page, "mug > handle")
-    assert page.evaluate("document.activeElement.id") == "text" and not answers(page).count()
-    assert [chip.inner_text().split("\n")[0] for chip in chips(page).all()] == ["book", "mug > handle"]
+    page.keep("book")
+    page.keep("mug > handle")
+    assert page.evaluate("document.activeElement.id") == "text" and not page.answers().count()
+    assert [chip.inner_text().split("\n")[0] for chip in page.chips().all()] == ["book", "mug > handle"]
     (book,), (handle,) = scene.query("book"), scene.query("mug > handle")
     painted = {int(path.get_attribute("data-node")) for path in page.locator("#overlay path.kept").all()}
     assert painted == {book.node, handle.node}
-    until(page, lambda: greenish(page) > 0.02)
-    drawn(page, page.get_by_role("button", name="Show book").click)
+    page.until(lambda: greenish(page) > 0.02)
+    page.drawn(page.get_by_role("button", name="Show book").click)
     assert page.get_by_role("button", name="Show book").get_attribute("aria-pressed") == "false"
-    until(page, lambda: greenish(page) < 0.005)
+    page.until(lambda: greenish(page) < 0.005)
     page.get_by_role("button", name="Remove book").click()
-    assert chips(page).count() == 1
-
-
-def test_kept_queries_can_be_used_while_they_are_sent_again(opened, desk_address):
-    page = opened(desk_address)
-    keep(page, "book")
-    late(page, "api/query")
-    page.get_by_label("Answers by").select_option("default|field")
-    page.get_by_role("button", name="Show book").click()
-    assert page.get_by_role("button", name="Show book").get_attribute("aria-pressed") == "false"
+    assert page.chips().count() == 1
+    page.late("api/query")
+    page.get_by_label("Answers by").select_option("default|field")  # they are sent again
+    show = page.get_by_role("button", name="Show mug > handle")
+    show.click()
+    assert show.get_attribute("aria-pressed") == "false"
     page.wait_for_timeout(900)
-    assert chips(page).count() == 1
+    assert page.chips().count() == 1
 
 
 def test_the_overlap_of_two_queries_is_reported(opened, desk_address):
     page = opened(desk_address)
-    keep(page, "mug")
-    ask(page, "mug > handle")
+    page.keep("mug")
+    page.ask("mug > handle")
     page.get_by_text("1 answer inside an answer to another query.").wait_for()
-    ask(page, "mug")
+    page.ask("mug")
     page.get_by_text("White: 1 node found by several queries.").wait_for()
     page.locator("#overlay text", has_text=re.compile(r"^mug 0\.\d\d \+ ")).wait_for()
 
@@ -78,144 +61,136 @@ def test_a_kept_query_is_edited_with_its_threshold_at_its_photograph(opened, des
         option.check()
     page.get_by_label("Minimum score").fill("0.3")
     view = page.evaluate("hilsplat.camera.view")
-    keep(page, "book")
-    assert "score at least 0.30" in chips(page).first.inner_text()
+    page.keep("book")
+    assert "score at least 0.30" in page.chips().first.inner_text()
     for option in options:
         option.uncheck()
     page.locator("#view").focus()
-    drawn(page, lambda: page.keyboard.press("ArrowLeft"))
-    chips(page).first.get_by_title("Edit").click()
-    answers(page).first.wait_for()
-    assert page.locator("#text").input_value() == "book" and not chips(page).count()
+    page.drawn(lambda: page.keyboard.press("ArrowLeft"))
+    page.chips().first.get_by_title("Edit").click()
+    page.answers().first.wait_for()
+    assert page.locator("#text").input_value() == "book" and not page.chips().count()
     assert all(option.is_checked() for option in options)
     assert page.evaluate("hilsplat.camera.view") == view
 
 
-def test_kept_queries_are_saved_together(opened, desk_address, scene, tmp_path):
-    page = opened(desk_address)
-    keep(page, "book")
-    ask_and_wait(page, "mug > handle")
-    (book,), (handle,) = scene.query("book"), scene.query("mug > handle")
-    boxes = json.loads(save(page, "Boxes, JSON", tmp_path / "boxes.json").read_text())["boxes"]
-    found = [(box["group"], box["node"]) for box in boxes]
-    assert found == [("book", book.node), ("mug > handle", handle.node)]
-    size = save(page, "Masks in all photographs", tmp_path / "masks.zip").stat().st_size
-    page.get_by_role("status").get_by_text(f"Saved desk-masks.zip, {-(-size // 1000)} kB.").wait_for()
-    assert page.locator("#saving").is_hidden()
-
-
 def test_kept_queries_and_saved_files_have_scores_and_doubts(opened, desk_address, scene, tmp_path):
     page = opened(desk_address)
-    keep(page, "book")
-    keep(page, "unicorn > rim")
+    page.keep("book")
+    page.keep("unicorn > rim")
     (book,), (rim,) = scene.query("book"), scene.query("unicorn > rim")
     assert rim.doubts and not book.doubts
-    sure, doubtful = chips(page).all()
+    sure, doubtful = page.chips().all()
     assert f"1 answer, best {book.score:.2f}" in sure.inner_text() and "doubtful" not in sure.inner_text()
     assert f"best {rim.score:.2f}" in doubtful.inner_text() and "doubtful" in doubtful.inner_text()
     assert str(rim.doubts[0]) in doubtful.locator(".words").get_attribute("title")
     assert page.locator("#overlay text", has_text=f"book {book.score:.2f}").count() == 1
     style = page.evaluate("Array.from(hilsplat.painted()[0].style.table)")
     assert style[4 * rim.node + 7] == pytest.approx(style[4 * book.node + 7] / 2, abs=1)
-    header = PlyData.read(save(page, "Gaussians, PLY", tmp_path / "found.ply")).comments
+    header = PlyData.read(page.save("Gaussians, PLY", tmp_path / "found.ply")).comments
     assert [line for line in header if "node" in line] == [
         f"label {number}, node {hit.node}: ?, score {hit.score:.4f}"
         for number, hit in enumerate((book, rim), 1)
     ]
     assert [line.partition(": ")[2] for line in header if "doubtful" in line] == [str(rim.doubts[0])]
-    with zipfile.ZipFile(save(page, "Masks in all photographs", tmp_path / "masks.zip")) as archive:
+    boxes = json.loads(page.save("Boxes, JSON", tmp_path / "boxes.json").read_text())["boxes"]
+    found = [(box["group"], box["node"]) for box in boxes]
+    assert found == [("book", book.node), ("unicorn > rim", rim.node)]
+    masks = page.save("Masks in all photographs", tmp_path / "masks.zip")
+    told = f"Saved desk-masks.zip, {-(-masks.stat().st_size // 1000)} kB."
+    page.get_by_role("status").get_by_text(told).wait_for()
+    assert page.locator("#saving").is_hidden()
+    with zipfile.ZipFile(masks) as archive:
         coco = json.loads(archive.read("coco.json"))
     assert [category["doubts"] for category in coco["categories"]] == [[], [str(rim.doubts[0])]]
     scores = {each["node"]: each["score"] for each in coco["annotations"]}
     assert scores == pytest.approx({book.node: book.score, rim.node: rim.score}, abs=1e-4)
-    offline = page.context.new_page()
-    offline.goto(save(page, "Page with answers", tmp_path / "page.html").as_uri())
-    offline.locator("body[data-ready=yes]").wait_for()
-    told = [[chip.locator(".words").inner_text() for chip in chips(each).all()] for each in (page, offline)]
+    offline = page.saved_page(tmp_path)
+    told = [[chip.locator(".words").inner_text() for chip in each.chips().all()] for each in (page, offline)]
     assert told[0] == told[1]
 
 
 @pytest.mark.parametrize("answerer", ["tree", "field"])
-def test_a_saved_page_has_the_answers_of_the_page(opened, desk_address, scene, tmp_path, answerer):
+def test_a_saved_page_has_the_answers_and_settings_of_the_page(
+    opened, desk_address, scene, tmp_path, answerer
+):
     page = opened(desk_address)
     page.get_by_label("Answers by").select_option(f"default|{answerer}")
-    ask_and_wait(page, "mug")
-    shown = answers(page).first.inner_text()
-    assert f"{scene.query('mug', answerer=answerer)[0].score:.2f}" in shown
-    offline = page.context.new_page()
-    offline.goto(save(page, "Page with answers", tmp_path / "page.html").as_uri())
-    answers(offline).first.wait_for()
-    assert answers(offline).first.inner_text() == shown
-
-
-def test_a_kept_answer_has_the_present_name_of_its_node(served, own_desk):
-    page = served(own_desk)
-    keep(page, "book")
-    page.get_by_role("treeitem").last.wait_for()
-    late(page, "api/names")
-    choose_row(page, int(page.locator("#overlay path.kept").get_attribute("data-node")))
-    page.get_by_role("textbox", name="Name").fill("atlas")
-    page.keyboard.press("Enter")
-    page.locator("#view").press("Escape")
-    page.locator("#overlay text", has_text=re.compile(r"^book atlas 0\.\d\d$")).wait_for()
-
-
-def test_a_saved_page_opens_with_the_settings_of_its_last_query(opened, desk_address, scene, tmp_path):
-    page = opened(desk_address)
-    keep(page, "mug")
+    page.keep("mug")
     page.get_by_role("radio", name="part", exact=True).check(force=True)
     page.get_by_label("Others").select_option("ghost")
-    ask_and_wait(page, "mug")
-    (part,), (whole,) = scene.query("mug", "part"), scene.query("mug")
-    assert part.node != whole.node
-    offline = page.context.new_page()
-    offline.goto(save(page, "Page with answers", tmp_path / "page.html").as_uri())
-    answers(offline).first.wait_for()
+    page.ask_and_wait("mug")
+    shown = page.answers().first.inner_text()
+    (part,), (whole,) = scene.query("mug", "part", answerer=answerer), scene.query("mug", answerer=answerer)
+    assert f"{part.score:.2f}" in shown and part.node != whole.node
+    offline = page.saved_page(tmp_path)
+    offline.answers().first.wait_for()
+    assert offline.answers().first.inner_text() == shown
     assert offline.locator("#answers li").get_attribute("data-node") == str(part.node)
     assert offline.get_by_label("Others").input_value() == "ghost"
 
 
+def test_a_kept_answer_has_the_present_name_of_its_node(served, own_desk):
+    page = served(own_desk)
+    page.keep("book")
+    page.get_by_role("treeitem").last.wait_for()
+    page.late("api/names")
+    page.choose_row(int(page.locator("#overlay path.kept").get_attribute("data-node")))
+    page.get_by_role("textbox", name="Name").fill("atlas")
+    page.keyboard.press("Enter")
+    page.press("Escape")
+    page.locator("#overlay text", has_text=re.compile(r"^book atlas 0\.\d\d$")).wait_for()
+
+
 def test_a_link_and_back_restore_the_settings_of_a_query(opened, desk_address):
     page = opened(desk_address)
-    page.wait_for_timeout(800)
+    page.keep("book")
+    page.keep("mug")
+    page.get_by_role("button", name="Show book").click()  # hides it
     page.get_by_label("only what this photograph shows").check()
     page.get_by_label("score at least").check()
     page.get_by_label("Minimum score").fill("0.3")
-    ask_and_wait(page, "mug > handle")
+    page.ask_and_wait("mug > handle")
     view = page.evaluate("hilsplat.camera.view")
-    page.locator("#view").press("ArrowLeft")  # the answer remains that of the photograph
-    page.wait_for_timeout(1200)  # until the address is updated
+    page.press("ArrowLeft")  # the answer remains that of the photograph
+    page.until(lambda: "q=mug" in page.url and "c=v" not in page.url)
     asked = []
+
+    def note(sent) -> None:
+        if "api/query" in sent.url and sent.post_data_json["text"] == "mug > handle":
+            asked.append(sent.post_data_json)
+
     again = opened(desk_address)
-    again.on("request", lambda sent: sent.url.find("api/query") > 0 and asked.append(sent.post_data_json))
-    again.goto(f"{again.url.partition('#')[0]}{page.url[page.url.index('#') :]}")
-    until(again, lambda: asked)  # the link was opened in the same tab
-    again.reload()
-    until(again, lambda: len(asked) > 1)
+    again.until(lambda: "#" in again.url)
+    again.on("request", note)
+    again.goto(f"{again.url.partition('#')[0]}{page.url[page.url.index('#') :]}")  # in the same tab
+    again.until(lambda: asked)
+    again.answers().first.wait_for()
     question = {"text": "mug > handle", "level": "auto", "threshold": 0.3, "view": view}
-    assert asked == [{"variant": "default", "answerer": "tree", **question}] * 2
+    assert asked == [{"variant": "default", "answerer": "tree", **question}]
     camera = [each.evaluate("hilsplat.camera.toText()") for each in (page, again)]
-    assert camera[0] == camera[1]
+    assert camera[0] == camera[1] and "token" not in page.url
+    assert again.chips().all_inner_texts() == page.chips().all_inner_texts()
+    shown = [button.get_attribute("aria-pressed") for button in again.locator("#kept .swatch").all()]
+    assert shown == ["false", "true"]
     page.get_by_label("only what this photograph shows").uncheck()
-    ask_and_wait(page, "book")
+    page.ask_and_wait("book")
     page.get_by_label("score at least").uncheck()
-    page.wait_for_timeout(1200)
-    page.on("request", lambda sent: sent.url.find("api/query") > 0 and asked.append(sent.post_data_json))
+    page.until(lambda: "q=book" in page.url and "least" not in page.url)
+    page.on("request", note)
     page.go_back()
-    until(page, lambda: len(asked) > 2)
-    assert asked[2] == asked[0] and page.get_by_label("score at least").is_checked()
+    page.until(lambda: len(asked) > 1)
+    assert asked[1] == asked[0] and page.get_by_label("score at least").is_checked()
 
 
 def test_a_film_follows_the_path_of_the_user(opened, desk_address, tmp_path):
     page = opened(desk_address, "server")
-    page.locator("#view").focus()
-    page.keyboard.press("v")
+    page.press("v")
     page.get_by_text("The path begins here").wait_for()
     page.get_by_role("option", name="003.png").click()
-    page.locator("#view").focus()
-    page.keyboard.press("v")
+    page.press("v")
     page.get_by_text("2 views in the path").wait_for()
-    film = save(page, "Film, MP4", tmp_path / "film.mp4")
+    film = page.save("Film, MP4", tmp_path / "film.mp4")
     with av.open(str(film)) as frames:
         assert sum(1 for _ in frames.decode(video=0)) == 120
     page.locator("#save summary").click()
@@ -235,15 +210,15 @@ def two_trees(own_desk):
 def test_kept_answers_of_another_tree_are_neither_painted_nor_saved(served, own_desk, tmp_path):
     two_trees(own_desk)
     page = served(own_desk)
-    keep(page, "book")
+    page.keep("book")
     book = int(page.locator("#overlay path.kept").get_attribute("data-node"))
     held, free = [], []
     page.route("**/api/query**", lambda route: route.continue_() if free else held.append(route))
     page.get_by_label("Answers by").select_option("other|tree")
-    until(page, lambda: held)
+    page.until(lambda: held)
     page.locator("#overlay path.kept").wait_for(state="detached")
     page.locator("#save summary").click()
-    until(page, page.get_by_role("button", name="Boxes, JSON").is_disabled)
+    page.until(page.get_by_role("button", name="Boxes, JSON").is_disabled)
     free.append(True)
     held[0].continue_()
     page.locator(f"#overlay path.kept[data-node='{book - 50}']").wait_for(state="attached")
@@ -253,12 +228,19 @@ def test_similar_nodes_are_those_of_the_node_in_its_own_tree(served, own_desk, t
     two_trees(own_desk)
     page = served(own_desk)
     page.get_by_label("Beside").select_option("other|tree")
-    ask_and_wait(page, "mug > handle")
-    answers(page).first.click()
+    page.ask_and_wait("mug > handle")
+    page.answers().first.click()
     page.get_by_role("button", name="More like this").click()
     page.get_by_role("status").get_by_text("most similar first").wait_for()
     assert not page.locator("#answers-beside li").count()
     assert page.locator("#answers li").count() == 24
-    page.locator("#view").press("Escape")
-    boxes = json.loads(save(page, "Boxes, JSON", tmp_path / "boxes.json").read_text())["boxes"]
+    assert "The first 5 are highlighted." in page.get_by_role("status").inner_text()
+    table = page.evaluate("Array.from(hilsplat.painted()[0].style.table)")
+    assert sum(share > 0 for share in table[3::4]) == 6  # with the selected node
+    shown = (
+        "import('/static/styles.js').then((own) => own.shownHits({ route: 'tree', hits: Array(7) }).length)"
+    )
+    assert page.evaluate(shown) == 7  # of a query, all are
+    page.press("Escape")
+    boxes = json.loads(page.save("Boxes, JSON", tmp_path / "boxes.json").read_text())["boxes"]
     assert len(boxes) == page.locator("#overlay path.answer").count() == 5  # as painted

@@ -1,7 +1,8 @@
 """Both pages used by the keyboard alone."""
 
-from hilsplat.annotate.labels import label_path, read_labels
+from hilsplat.annotate.labels import label_path
 from hilsplat.base.artifacts import read_json
+from tests.unit.annotate.label_files import read_labels
 
 MOST_STEPS = 80
 
@@ -22,8 +23,8 @@ def press(page, *keys: str) -> None:
 
 def test_querying_choosing_naming_and_saving_in_the_viewer(served, own_desk, tmp_path):
     page = served(own_desk)
-    page.keyboard.type("o ? [")  # the text box has the focus: these keys do not act
-    assert page.locator("#text").input_value() == "o ? [" and not page.get_by_role("dialog").is_visible()
+    page.keyboard.type("/ o ? [")  # the text box has the focus: these keys do not act
+    assert page.locator("#text").input_value() == "/ o ? [" and not page.get_by_role("dialog").is_visible()
     press(page, "Control+a")
     page.keyboard.type("mug > handle")
     press(page, "Enter")

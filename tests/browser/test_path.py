@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from hilsplat.scene.scene import Scene
-from tests.browser.conftest import drawn, late, until, wire_camera
 
 
 def steps(page):
@@ -21,8 +20,7 @@ def places(page) -> list[str]:
 def add(page, *photographs: str) -> None:
     for name in photographs:
         page.get_by_role("option", name=name).click()
-        page.locator("#view").focus()
-        page.keyboard.press("v")
+        page.press("v")
 
 
 @pytest.mark.parametrize("painter", ["gl", "server"])
@@ -37,9 +35,9 @@ def test_the_cameras_of_the_photographs_are_drawn_and_a_click_flies_there(
     page.keyboard.press("p")
     cameras = Scene.load(desk / "scene").cameras
     shown = page.locator("#overlay path.frustum")
-    until(page, lambda: shown.count() == len(cameras))
+    page.until(lambda: shown.count() == len(cameras))
     assert page.locator("#overlay path.test").count() == 1
-    wire, view = wire_camera(page), page.locator("#view").bounding_box()
+    wire, view = page.wire_camera(), page.locator("#view").bounding_box()
     centre = np.array(wire["cam_from_world"]) @ [*cameras[cameras.names[4]].centre, 1]
     x, y, z = np.array(wire["K"]) @ centre[:3]
     apex = [float(value) for value in shown.nth(4).get_attribute("d").split("M")[-1].split("L")[0].split()]
@@ -48,9 +46,9 @@ def test_the_cameras_of_the_photographs_are_drawn_and_a_click_flies_there(
     corners = np.array([[float(value) for value in corner.split()] for corner in rim])
     x, y = corners.mean(axis=0)
     page.mouse.click(view["x"] + x, view["y"] + y)
-    until(page, lambda: page.evaluate("hilsplat.camera.view") == 4)
+    page.until(lambda: page.evaluate("hilsplat.camera.view") == 4)
     page.get_by_role("button", name="cameras").click()
-    until(page, lambda: shown.count() == 0)
+    page.until(lambda: shown.count() == 0)
 
 
 def test_the_views_of_a_path_are_reordered_replaced_removed_and_kept(opened, desk_address):
@@ -67,17 +65,21 @@ def test_the_views_of_a_path_are_reordered_replaced_removed_and_kept(opened, des
     assert places(page) == ["001.png", "004.png"]
     assert page.evaluate("document.activeElement.getAttribute('aria-label')") == "Remove view 2"
     steps(page).nth(0).get_by_title("Go to this view").click()
-    until(page, lambda: page.evaluate("hilsplat.camera.view") == 1)
-    page.reload()
-    page.locator("body[data-ready=yes]").wait_for()
+    page.until(lambda: page.evaluate("hilsplat.camera.view") == 1)
+
+    def without_first(route):
+        described = route.fetch().json()
+        route.fulfill(json={**described, "views": described["views"][1:]})
+
+    page.route("**/api/scene?**", without_first, times=1)  # the path follows its photographs
+    page.reloaded()
     assert places(page) == ["001.png", "004.png"]
     page.get_by_role("button", name="Clear").click()
-    page.reload()
-    page.locator("body[data-ready=yes]").wait_for()
+    page.reloaded()
     assert not steps(page).count()
 
 
-def test_the_preview_shows_the_cameras_of_the_film_and_returns(opened, desk_address):
+def test_the_preview_shows_the_cameras_of_the_film_until_it_is_stopped(opened, desk_address):
     page = opened(desk_address)
     add(page, "000.png", "004.png")
     page.locator("#save summary").click()
@@ -85,7 +87,7 @@ def test_the_preview_shows_the_cameras_of_the_film_and_returns(opened, desk_addr
     page.locator("#save summary").click()
     page.get_by_role("option", name="002.png").click()
     page.wait_for_timeout(300)
-    before = wire_camera(page)
+    before = page.wire_camera()
     page.evaluate("""() => {
         window.places = [];
         const look = () => {
@@ -103,20 +105,14 @@ def test_the_preview_shows_the_cameras_of_the_film_and_returns(opened, desk_addr
     assert 1.5 < lasted < 3 and len(moving) > 8
     xs = shown[moving[0] + 1 : moving[-1] + 1, 1]  # the last is from the film's last camera
     assert (np.diff(xs) <= 1e-9).all() and np.ptp(xs) > 3  # from view 0 to view 4, never back
-    assert wire_camera(page) == before
-
-
-def test_a_preview_is_stopped_before_it_has_begun(opened, desk_address):
-    page = opened(desk_address)
-    add(page, "000.png", "004.png")
-    before = wire_camera(page)
-    late(page, "api/path")
+    assert page.wire_camera() == before
+    page.late("api/path")
     with page.expect_response("**/api/path*"):
         page.get_by_role("button", name="Preview").click()
         page.get_by_role("button", name="Stop").click()
         assert page.get_by_role("button", name="Preview").is_visible()
     page.wait_for_timeout(300)
-    assert wire_camera(page) == before
+    assert page.wire_camera() == before
 
 
 def test_a_path_is_saved_as_json_and_opened_again(opened, desk_address, tmp_path):
@@ -130,23 +126,12 @@ def test_a_path_is_saved_as_json_and_opened_again(opened, desk_address, tmp_path
     page.get_by_role("button", name="Clear").click()
     page.locator("#path-file").set_input_files(tmp_path / "path.json")
     steps(page).nth(1).wait_for()
-    drawn(page, steps(page).nth(1).get_by_title("Go to this view").click)
-    np.testing.assert_allclose(wire_camera(page)["cam_from_world"], content["path"][1]["cam_from_world"])
+    page.drawn(steps(page).nth(1).get_by_title("Go to this view").click)
+    np.testing.assert_allclose(page.wire_camera()["cam_from_world"], content["path"][1]["cam_from_world"])
+    (tmp_path / "other.json").write_text(json.dumps({**content, "scene": "photos/other"}))
+    page.locator("#path-file").set_input_files(tmp_path / "other.json")
+    page.get_by_text("This path was saved for photos/other").wait_for()
     (tmp_path / "wrong.json").write_text("[1]")
     page.locator("#path-file").set_input_files(tmp_path / "wrong.json")
     page.get_by_text("wrong.json is not a camera path").wait_for()
     assert steps(page).count() == 2
-
-
-def test_a_kept_path_follows_its_photographs_when_others_are_left_out(opened, desk_address):
-    page = opened(desk_address)
-    add(page, "003.png")
-
-    def without_first(route):
-        described = route.fetch().json()
-        route.fulfill(json={**described, "views": described["views"][1:]})
-
-    page.route("**/api/scene?**", without_first)
-    page.reload()
-    page.locator("body[data-ready=yes]").wait_for()
-    assert places(page) == ["003.png"]

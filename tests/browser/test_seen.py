@@ -4,18 +4,10 @@ import re
 
 import numpy as np
 
-from hilsplat.base.images import write_png
-from tests.browser.conftest import answers, ask, choose_row, wire_camera
-
-
-def painted_nodes(page) -> set[int]:
-    table = page.evaluate("Array.from(hilsplat.painted()[0].style.table)")
-    return {row - 1 for row, share in enumerate(table[3::4]) if share}
-
 
 def test_a_box_beside_the_picture_has_no_label_and_labels_stay_clear_of_the_tools(opened, desk_address):
     page = opened(desk_address, "server")
-    ask(page, "mug > handle")
+    page.ask("mug > handle")
     label = page.locator("#overlay text")
     label.first.wait_for(state="attached")
     tools = page.locator("#tools").bounding_box()
@@ -32,29 +24,15 @@ def test_a_box_beside_the_picture_has_no_label_and_labels_stay_clear_of_the_tool
 def test_a_flight_ends_with_the_whole_node_in_view_and_no_node_hovered(opened, desk_address, scene):
     page = opened(desk_address, "server")
     for text in ("mug", "mug > handle"):
-        choose_row(page, scene.query(text)[0].node)
+        page.choose_row(scene.query(text)[0].node)
         page.locator("[role=treeitem] > .row .label").last.hover()
         page.locator("#overlay path.hover").first.wait_for(state="attached")
-        page.locator("#view").press("f")
+        page.press("f")
         page.locator("#overlay path.hover").first.wait_for(state="detached")
         page.wait_for_timeout(1500)
         box = page.locator("#overlay path.chosen")
         box.wait_for(state="attached")
         places = np.array(re.findall(r"[-\d.]+", box.get_attribute("d")), float).reshape(-1, 2)
-        wire = wire_camera(page)
+        wire = page.wire_camera()
         middle, half = np.array(wire["K"])[:2, 2], np.array(wire["size_hw"])[::-1] / 2
         assert (np.abs(places - middle) < half).all() and np.ptp(places, axis=0).max() > 0.3 * half.min()
-
-
-def test_the_first_five_similar_nodes_are_painted(opened, desk_address, scene, tmp_path):
-    page = opened(desk_address, "server")
-    write_png(tmp_path / "blue.png", np.full((40, 30, 3), (0, 0, 250), np.uint8))
-    page.get_by_label("Picture to look for").set_input_files(tmp_path / "blue.png")
-    answers(page).first.wait_for()
-    listed = {int(item.get_attribute("data-node")) for item in page.locator("#answers li").all()}
-    assert len(listed) == 5 and painted_nodes(page) == listed
-    assert "The first 5 are highlighted." in page.get_by_role("status").inner_text()
-    answer = "{ route: ROUTE, hits: [9, 8, 7, 6, 5, 4, 3] }"
-    shown = f"import('/static/styles.js').then((own) => own.shownHits({answer}))"
-    assert page.evaluate(shown.replace("ROUTE", "'like'")) == [9, 8, 7, 6, 5]
-    assert len(page.evaluate(shown.replace("ROUTE", "'tree'"))) == 7

@@ -14,9 +14,10 @@ from pathlib import Path
 
 import httpx2
 
-from hilsplat.annotate.labels import label_path, read_labels
+from hilsplat.annotate.labels import label_path
 from tests.bad_inputs.conftest import snapshot
 from tests.conftest import PROJECT
+from tests.unit.annotate.label_files import read_labels
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, build_finished_desk
 
 COMMANDS = {
@@ -121,7 +122,7 @@ def kill_annotator(project: Path, chance: random.Random) -> Iterator[str]:
     server.wait()
     last = confirmed[0]
     path = label_path(project / "annotated/photos/desk", "000.png")
-    texts = [label.text for label in read_labels(path)] if path.is_file() else []
+    texts = [label.text for label in read_labels(path)]
     if last >= 0 and texts not in ([f"change {last}"], [f"change {last + 1}"]):
         yield f"annotate: after a kill {path.name} holds {texts}, and change {last} was confirmed"
 

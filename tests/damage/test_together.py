@@ -7,10 +7,10 @@ import sys
 import zipfile
 from pathlib import Path
 
-from hilsplat.annotate.labels import read_labels
 from hilsplat.query.names import read_names
 from hilsplat.scene.sheet import read_sheet
 from tests.conftest import PROJECT
+from tests.unit.annotate.label_files import read_labels
 from tests.unit.finished_desk import NUM_VIEWS
 
 NAME = """
@@ -32,8 +32,9 @@ while True:
 ANNOTATE = """
 import sys
 from pathlib import Path
-from hilsplat.annotate.labels import Label, label_path, read_labels, write_labels
+from hilsplat.annotate.labels import Label, label_path, write_labels
 from hilsplat.web.file_changes import StaleFileError, version_of
+from tests.unit.annotate.label_files import read_labels
 number, size = int(sys.argv[1]), (24, 42)
 path = label_path(Path("annotated/photos/desk"), "000.png")
 while True:

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -75,15 +76,6 @@ def test_objects_are_one_line_each_and_cameras_are_found_by_name_and_row(desk, s
     assert scene.image("000.png").shape == (*scene.cameras[0].size_hw, 3)
 
 
-def test_scenes_opened_by_a_relative_path_are_found_from_another_folder(desk, tmp_path, monkeypatch):
-    monkeypatch.chdir(desk.parent)
-    scene, opened = hilsplat.load_scene(desk.name), hilsplat.open_scene(desk.name)
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / desk.name).mkdir()  # of the same name
-    assert scene.image("000.png").shape == (*scene.cameras["000.png"].size_hw, 3)
-    assert opened.query("mug")[0].mask("000.png").any()
-
-
 @pytest.mark.parametrize("iterations", [40, None])
 def test_a_fit_equals_that_of_the_stage(scene, tmp_path, monkeypatch, iterations):
     monkeypatch.setattr("hilsplat.splat.steps.LEAST_FIT_STEPS", 20)
@@ -100,7 +92,7 @@ def test_a_fit_equals_that_of_the_stage(scene, tmp_path, monkeypatch, iterations
     assert len(other) != len(found) or not np.array_equal(other.means, found.means)
 
 
-def test_masks_equal_those_of_the_stage(scene, tmp_path, temporary):
+def test_masks_equal_those_of_the_stage_and_the_automatic_segmenter_is_the_graph(scene, tmp_path, temporary):
     found = hilsplat.segment(scene, segmenter="graph", graph_scales=(0.3, 0.1, 0.05), threads=2)
     section = MasksSettings(segmenter="graph", graph_scales=(0.3, 0.1, 0.05))
     stages.masks(scene.folder, tmp_path / "masks", section, tmp_path / "cache")
@@ -114,9 +106,6 @@ def test_masks_equal_those_of_the_stage(scene, tmp_path, temporary):
     entries = sha256_of_path(kept)
     hilsplat.segment(scene, segmenter="graph", cache=kept)
     assert sha256_of_path(kept) == entries and len(list(kept.rglob("*.npz"))) == len(found)
-
-
-def test_the_automatic_segmenter_is_the_best_model_or_the_graph(scene, caplog):
     found = hilsplat.segment(scene)  # tests see the embedded models only, which are not for photographs
     assert found.origin == {"segmenter": "graph"}
     with pytest.raises(ModelError, match="nowhere"):
@@ -139,7 +128,7 @@ def test_the_tree_equals_that_of_the_stages_and_answers_alike(desk, desk_project
         _ = linked.field
 
 
-def test_an_answer_has_a_mask_in_any_camera(linked):
+def test_answers_have_masks_in_any_camera_and_are_nodes_of_the_tree(linked):
     hit, view = linked.query("mug > handle")[0], "002.png"
     camera = linked.camera(view)
     np.testing.assert_array_equal(hit.mask(camera), hit.mask(view))
@@ -149,9 +138,6 @@ def test_an_answer_has_a_mask_in_any_camera(linked):
     for call in (hit.mask, linked.camera, linked.render):
         with pytest.raises(SettingsError, match="has no view 'x'"):
             call("x")
-
-
-def test_nodes_are_those_of_the_tree(linked):
     assert [node.node for node in linked.nodes] == list(range(len(linked.tree)))
     hit = linked.query("mug > handle")[0]
     node = linked.nodes[hit.node]
@@ -377,17 +363,22 @@ def test_a_changed_camera_changes_no_other(scene):
     )
 
 
-def test_a_scene_keeps_its_photographs_if_the_working_folder_changes(desk_project, tmp_path, monkeypatch):
-    """Another project may have a scene of the same name."""
+def test_opened_scenes_do_not_follow_the_working_folder(desk_project, tmp_path, monkeypatch):
+    """Another project may have scenes of the same names."""
     shutil.copytree(desk_project / SCENE, other := tmp_path / SCENE)
     for image in (other / "scene/images").glob("*.png"):
         write_png(image, np.zeros((24, 42, 3), np.uint8))
+    shutil.rmtree(other / "default")
     monkeypatch.chdir(desk_project)
-    posed, opened = hilsplat.load_scene(SCENE), hilsplat.open_scene(SCENE)
-    before = posed.image("000.png")
+    posed, opened, shown = hilsplat.load_scene(SCENE), hilsplat.open_scene(SCENE), hilsplat.show(SCENE)
+    before, address = posed.image("000.png"), f"http://127.0.0.1:{shown.port}/api/photo/0?token={shown.token}"
     monkeypatch.chdir(tmp_path)
     for after in (posed.image("000.png"), opened.views.image("000.png")):
         np.testing.assert_array_equal(after, before)
+    with urlopen(address) as photograph:
+        assert photograph.read() == (desk_project / SCENE / "scene/images/000.png").read_bytes()
+    shown.close()
+    assert opened.query("mug")[0].mask("000.png").any()
 
 
 def test_levels_are_found_by_number_and_label(masks, linked):

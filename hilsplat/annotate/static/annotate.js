@@ -7,7 +7,7 @@ import { Sheet } from "./sheet.js";
 import { Store } from "./store.js";
 import { attachThings, fillForm, level, LEVEL, makeStrip, markStrip, setLevel, showTexts, showThings, under } from "./things.js";
 
-const UNNAMED = "unnamed", NEAR_PX = 8;
+const UNNAMED = "unnamed", NEAR_PX = 8, ID_STEPS = 2 ** 16, MOST_RADIUS = 500;
 const sheet = new Sheet(), start = new URLSearchParams(location.hash.slice(1));
 // The id of the chosen object, 0 for a new one, and the settings of a new one. A choice replaces this, so that a region
 // whose reply is late still goes to the object for which it was drawn.
@@ -76,7 +76,9 @@ function stand(to) {
   drop();
   number = (to + scene.views.length) % scene.views.length;
   aimAt(aim.id);
-  sheet.show(number, scene.views[number].size_hw);
+  const { size_hw } = scene.views[number];
+  sheet.show(number, size_hw);
+  $("radius").max = Math.min(MOST_RADIUS, Math.max(60, Math.max(...size_hw) / 20));
   $("picture").alt = scene.views[number].name;
   history.replaceState(null, "", `${location.pathname}#view=${number}`);
   refresh();
@@ -96,11 +98,12 @@ function setTool(name) {
 const edited = (label) => label.origin === "drawn" ? "drawn" : "edited";
 const ringsOf = (view, id) => labelOf(view, id)?.polygons ?? null;
 
-// An object has the same id in all photographs.
+// An object has the same id in all photographs. A new id is larger than the others by a random number, because someone else
+// may just have added an object to another photograph, which this page has yet to read.
 function idFor(view, thing) {
   const same = (label) => label.text.toLowerCase() === thing.text.toLowerCase() && label.level === thing.level && label.parent === thing.parent;
   for (const [id, label] of store.things) if (thing.text !== UNNAMED && same(label) && !store.has(view, id)) return id;
-  return Math.max(0, ...store.things.keys()) + 1;
+  return Math.max(0, ...store.things.keys()) + 1 + Math.floor(ID_STEPS * Math.random());
 }
 
 // `mine` is what `aim` was when the object was drawn.
@@ -216,7 +219,7 @@ function take(each) {
 
 async function carry(view) {
   tell("Transferring things from other photographs…");
-  await store.saving;
+  await store.saved();
   const ids = [...store.things.keys()].filter((id) => !store.has(view, id));
   if (!ids.length) { tell("All things from other photographs are already in this one.", true); return; }
   const found = (await ask("/api/carry", { ids, view })).filter(({ id }) => !store.has(view, id));   // one may be drawn by now
@@ -276,9 +279,14 @@ function fresh(child = false) {
 }
 
 async function take_in(files) {
-  await store.saving;   // the server compares the files with the saved annotations
   const given = await Promise.all(files.map(async (file) => ({ name: file.name, text: await file.text() })));
-  const { views, added, known, notes } = await ask("/api/import", { files: given });
+  let before, reply;
+  do {   // the reply replaces all labels of a photograph, so it must contain what was changed meanwhile
+    await store.saved();
+    before = store.views.map(({ labels }) => labels);
+    reply = await ask("/api/import", { files: given });
+  } while (store.views.some(({ labels }, number) => labels !== before[number]));
+  const { views, added, known, notes } = reply;
   const after = Object.entries(views).map(([number, labels]) => [Number(number), labels]);
   if (after.length) store.change(after);
   tell(`${counted(added, "label")} imported into ${counted(after.length, "photograph")}${known ? `; already present: ${known}` : ""}.${notes.slice(0, 3).map((note) => ` ${note}.`).join("")}${notes.length > 3 ? ` ${notes.length - 3} more notes.` : ""}`);
@@ -417,7 +425,7 @@ async function begin() {
   setTool("choose");
   if (first < 0) tell("First annotation: 1. type what you see, 2. choose polygon (P) or brush (B) and draw around it, 3. press Enter. It is saved at once.");
   document.body.dataset.ready = "yes";
-  watch((versions) => store.follow(versions));
+  watch((versions) => store.follow(versions), (error) => tell(error.message, true));
 }
 
 globalThis.hilsplat = { store, sheet };   // for tests

@@ -23,10 +23,10 @@ export const thumbUrl = (number) => at(`/api/thumb/${number}`);
 export const exportUrl = (kind) => at(`/api/export/${kind}`);
 
 // Check regularly whether annotations or files of the scene changed; the page keeps its loaded state until a reload.
-export const watch = (labelled) => follow(async () => (await get("/api/changes")).json(), async (now) => {
+export const watch = (labelled, failed) => follow(async () => (await get("/api/changes")).json(), async (now) => {
   if (now.of !== state || now.changed.length) {
     $("changed-what").textContent = `The scene has changed${now.changed.length ? ` (${now.changed.join(", ")})` : ""}. Reload to use the new files.`;
     $("changed").hidden = false;
   }
   await labelled(now.labels);
-}, { more: unsaved });
+}, { failed, more: unsaved });

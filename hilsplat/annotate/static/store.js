@@ -54,6 +54,12 @@ export class Store {
     this.handlers.told("The annotations were changed elsewhere and have been reloaded.");
   }
 
+  // Wait until the server has every change.
+  async saved() {
+    while (this.waiting) await this.saving;
+    if (this.refused.size) throw new Error("Some changes could not be saved: change something to save them again, then repeat this.");
+  }
+
   get unsaved() { return this.waiting + this.refused.size; }
   labels(number) { return this.views[number].labels; }
   has(number, id) { return this.labels(number).some((label) => label.id === id); }
@@ -88,7 +94,7 @@ export class Store {
     for (const each of new Set([number, ...this.refused])) {
       this.waiting++;
       this.queued.add(each);
-      this.saving = this.saving.then(() => this.put(each)).finally(() => { this.waiting--; this.handlers.changed(); });
+      this.saving = this.saving.then(() => this.put(each)).catch((error) => this.keep(each, error)).finally(() => { this.waiting--; this.handlers.changed(); });
     }
   }
 
@@ -103,11 +109,18 @@ export class Store {
       if (view.labels === sent) view.labels = kept.labels;   // the server cuts labels to their parents
       for (const entry of entries) entry.unsaved.delete(number);
     } catch (error) {
-      this.handlers.told([...this.errors.add(error.message)].join("\n"), true);
-      if (error.status === 422) this.takeBack(number);
-      else if (error.status === 412) await this.load(number);
-      else this.refused.add(number);
+      if (![400, 412, 422].includes(error.status)) throw error;
+      this.report(error);
+      if (error.status === 412) await this.load(number); else this.takeBack(number);
     }
+  }
+
+  report(error) { this.handlers.told([...this.errors.add(error.message)].join("\n"), true); }
+
+  // The next change is saved with this one.
+  keep(number, error) {
+    this.refused.add(number);
+    this.report(error);
   }
 
   // The server refused a change: undo it and all later ones.

@@ -1,8 +1,8 @@
 // The objects of a photograph as a tree widget, the form of the chosen object, and the strip of photographs.
 
 import { thumbUrl } from "./api.js";
-import { $, attachArrows, counted, LEVELS, make } from "./elements.js";
-import { colour, element } from "./sheet.js";
+import { $, attachArrows, counted, LEVELS, make, shape } from "./elements.js";
+import { colour } from "./sheet.js";
 
 export const LEVEL = (label) => LEVELS[label.level - 1];
 export const under = (labels, id) => labels.filter((label) => label.parent === id).flatMap((label) => [label.id, ...under(labels, label.id)]);
@@ -11,8 +11,8 @@ export function showThings(labels, chosen, choose) {
   const here = new Set(labels.map((label) => label.id));
   const item = (label) => {
     const kids = labels.filter((each) => each.parent === label.id), proposed = label.origin === "proposed";
-    const swatch = element("svg", { viewBox: "0 0 12 12", "aria-hidden": "true" });
-    swatch.append(element("rect", { width: 12, height: 12, rx: 3, fill: colour(label.id) }));
+    const swatch = shape("svg", { viewBox: "0 0 12 12", "aria-hidden": "true" });
+    swatch.append(shape("rect", { width: 12, height: 12, rx: 3, fill: colour(label.id) }));
     const made = make("li", { role: "treeitem", tabindex: "-1", "data-id": label.id, "aria-selected": String(label.id === chosen), "aria-level": label.level,
       "aria-expanded": kids.length ? "true" : null, "aria-label": `${label.text}, ${LEVEL(label)}${proposed ? ", proposed" : ""}` },
     make("div", { class: "row", onclick: () => choose(label.id) }, swatch, make("span", { class: "label" }, label.text),

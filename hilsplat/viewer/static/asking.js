@@ -4,7 +4,7 @@ import { markChosen, showAnswers, summary } from "./answers.js";
 import * as api from "./api.js";
 import { acts, choose, paneAt } from "./choosing.js";
 import { overlay, redraw, restyle } from "./drawing.js";
-import { $, nameOf } from "./elements.js";
+import { $, nameOf, shape } from "./elements.js";
 import { asking, keep, showKept, whenReopened } from "./kept.js";
 import { answererOf, failed, level, main, outlines, page, panes, setQuery, tell, variantOf } from "./state.js";
 import { base64, styleOf } from "./styles.js";
@@ -132,10 +132,7 @@ export async function askPicture(source, part = null) {
 export async function framed(points, done) {
   const [from, to] = [points[0], points.at(-1)], [x0, x1] = [from[0], to[0]].sort((a, b) => a - b), [y0, y1] = [from[1], to[1]].sort((a, b) => a - b);
   overlay();
-  const svg = $("overlay"), path = document.createElementNS(svg.namespaceURI, "path");
-  path.setAttribute("class", "hover");
-  path.setAttribute("d", `M${x0} ${y0}H${x1}V${y1}H${x0}Z`);
-  svg.append(path);
+  $("overlay").append(shape("path", { class: "hover", d: `M${x0} ${y0}H${x1}V${y1}H${x0}Z` }));
   if (!done || x1 - x0 < 6 || y1 - y0 < 6 || api.offline) return;
   const { k, width, height } = paneAt(x0), left = x0 - k * width;
   if (page.camera.view >= 0) {

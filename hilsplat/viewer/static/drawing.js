@@ -87,7 +87,7 @@ export function drawn() {
 export function link() {
   const link = new URLSearchParams({ c: page.camera.toText() });
   const put = (key, value, usual) => { if (value && value !== usual) link.set(key, value); };
-  for (const query of page.kept) link.append("keep", JSON.stringify(query.asked));
+  for (const query of page.kept) link.append(query.shown ? "keep" : "hidden", JSON.stringify(query.asked));
   put("q", page.asked?.text); put("view", page.asked?.query?.view?.toString()); put("level", level(), "auto"); put("by", panes[0].by, `${page.scene.variants[0]}|tree`); put("beside", panes[1]?.by);
   put("node", page.chosen >= 0 ? `${page.chosen}.${main().tree}` : ""); put("colour", $("colour").value, "answers"); put("mode", $("mode").value, "tint"); put("least", threshold() === null ? "" : String(threshold()));
   return link;
@@ -101,7 +101,7 @@ function remember() {
   remembering = setTimeout(() => {
     const text = page.asked?.text ?? "", isNew = remembered !== null && text && text !== remembered;
     remembered = text || remembered || "";
-    history[isNew ? "pushState" : "replaceState"](null, "", `${location.pathname}${api.offline ? location.search : keptSearch()}#${link()}`);
+    history[isNew ? "pushState" : "replaceState"]({}, "", `${location.pathname}${api.offline ? location.search : keptSearch()}#${link()}`);
   }, 400);
 }
 function keptSearch() {

@@ -4,7 +4,7 @@
 import * as api from "./api.js";
 import { paneAt } from "./choosing.js";
 import { currentStyles, overlay, restyle } from "./drawing.js";
-import { $, counted } from "./elements.js";
+import { $, counted, shape } from "./elements.js";
 import { groups } from "./kept.js";
 import { inOrder } from "./latest.js";
 import { failed, host, page, panes, tell, variantOf } from "./state.js";
@@ -12,6 +12,7 @@ import { base64, wireStyle } from "./styles.js";
 
 const SELECTED = 1, REMOVED = 2;
 const LEAST_PX = 4, MOST_PX = 200;   // diameters of the brush
+const MOST_UNDONE = 20;   // marks that can be undone, in multiples of the number of Gaussians: 100 bytes for each
 let marks = new Uint8Array(0), done = [], undone = [], isKept = true;
 
 const key = () => `hilsplat removed of ${page.scene.name}`;
@@ -28,6 +29,7 @@ function become(markOf) {
   marks.forEach((mark, row) => { const next = markOf(mark, row); if (next !== mark) { rows.push(row); values.push(mark); marks[row] = next; } });
   if (!rows.length) return;
   done.push({ rows: Uint32Array.from(rows), values: Uint8Array.from(values) });
+  while (done.reduce((sum, step) => sum + step.rows.length, 0) > MOST_UNDONE * marks.length) done.shift();
   undone = [];
   changed();
 }
@@ -93,11 +95,8 @@ export function draw(points, finished, { shiftKey, ctrlKey, metaKey }) {
   overlay();
   placeBrush(...points.at(-1));
   if (!finished) {
-    const shape = document.createElementNS($("overlay").namespaceURI, "path");
-    shape.setAttribute("class", isBrush ? "brush" : "frame");
-    shape.setAttribute("d", isBrush ? `M${points.join("L")}L${points.at(-1)}` : `M${x0} ${y0}H${x1}V${y1}H${x0}Z`);
-    if (isBrush) shape.setAttribute("stroke-width", $("brush-size").value);
-    $("overlay").append(shape);
+    $("overlay").append(isBrush ? shape("path", { class: "brush", d: `M${points.join("L")}L${points.at(-1)}`, "stroke-width": $("brush-size").value })
+      : shape("path", { class: "frame", d: `M${x0} ${y0}H${x1}V${y1}H${x0}Z` }));
     return;
   }
   const region = { points: (isBrush ? points : [points[0], points.at(-1)]).map(([x, y]) => [x - left, y]), radius: isBrush ? Number($("brush-size").value) / 2 : 0 };

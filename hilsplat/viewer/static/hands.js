@@ -87,7 +87,8 @@ export function attachHands() {
   document.addEventListener("dragover", (event) => event.preventDefault());
   document.addEventListener("drop", (event) => { event.preventDefault(); const file = event.dataTransfer.files[0]; if (file?.type.startsWith("image/")) askPicture(file); });
   new ResizeObserver(redraw).observe(host);
-  window.addEventListener("popstate", () => {   // Back and Forward restore the query of that entry
+  window.addEventListener("popstate", (event) => {   // Back and Forward restore the query of that entry
+    if (!event.state) { location.reload(); return; }   // a link was opened in this tab
     const kept = new URLSearchParams(location.hash.slice(1)), text = kept.get("q") ?? "";
     clearAnswer();
     rememberedAs(text);

@@ -27,11 +27,11 @@ function freeColour() {
 }
 
 const next = inOrder(failed);   // of two at once, the second finds the first
-export const keep = (asked) => next(() => keepNext(asked));
+export const keep = (asked, shown = true) => next(() => keepNext(asked, shown));
 
-async function keepNext(asked) {
+async function keepNext(asked, shown) {
   if (page.kept.length >= MOST) { tell(`At most ${MOST} queries can be kept: remove one first.`, true); return false; }
-  const same = page.kept.findIndex((query) => JSON.stringify(query.asked) === JSON.stringify(asked)), query = same < 0 ? { asked, shown: true, colour: freeColour() } : page.kept[same];
+  const same = page.kept.findIndex((query) => JSON.stringify(query.asked) === JSON.stringify(asked)), query = same < 0 ? { asked, shown, colour: freeColour() } : page.kept[same];
   await answered(query);
   if (same < 0) page.kept.push(query);
   showKept();
@@ -40,8 +40,11 @@ async function keepNext(asked) {
 
 // Kept queries from the address or from an exported page.
 export async function keepFromStart() {
-  const kept = start.getAll("keep").map((text) => { try { return JSON.parse(text); } catch { return null; } });
-  for (const asked of kept) if (asked?.text) await keep(asked);
+  for (const [key, text] of start) {
+    let asked = null;
+    try { asked = ["keep", "hidden"].includes(key) && JSON.parse(text); } catch { /* a damaged link */ }
+    if (asked?.text) await keep(asked, key === "keep");
+  }
 }
 
 // Send all kept queries again after a change of answerer or tree.

@@ -1,16 +1,9 @@
 // Boxes and labels over the picture, as SVG.
 
+import { shape } from "./elements.js";
+
 const EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
 const LETTER_PX = 8, LINE_PX = 16;   // size of a label
-const NS = "http://www.w3.org/2000/svg";
-
-function element(name, attributes, text) {
-  const made = document.createElementNS(NS, name);
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-  if (text) made.textContent = text;
-  return made;
-}
-
 const isOutside = (at, width, height) => [width, height].some((side, axis) => at.every((point) => point[axis] < 0) || at.every((point) => point[axis] > side));
 
 // Whether a box is in the picture, or around the camera.
@@ -24,22 +17,22 @@ export function drawOverlay(svg, camera, panes, width, height, covered = 0) {
   svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
   const made = [], each = width / panes.length, k = camera.intrinsics(each, height);
   panes.forEach((pane, number) => {
-    const placed = [], group = element("g", { transform: `translate(${number * each} 0)` });
-    if (number) group.append(element("path", { class: "split", d: `M0 0V${height}` }));
+    const placed = [], group = shape("g", { transform: `translate(${number * each} 0)` });
+    if (number) group.append(shape("path", { class: "split", d: `M0 0V${height}` }));
     for (const { corners, kind, number, name, label } of pane.frustums) {
       const at = corners.map((corner) => camera.project(corner, k));
       if (at.some((point) => !point) || isOutside(at, each, height)) continue;
-      const [apex, ...rim] = at.map(([x, y]) => `${x.toFixed(1)} ${y.toFixed(1)}`), made = element("path", { class: kind, d: `M${rim.join("L")}Z${rim.map((corner) => `M${apex}L${corner}`).join("")}`, "data-view": number ?? "" });
-      if (name) made.append(element("title", {}, name));
+      const [apex, ...rim] = at.map(([x, y]) => `${x.toFixed(1)} ${y.toFixed(1)}`), made = shape("path", { class: kind, d: `M${rim.join("L")}Z${rim.map((corner) => `M${apex}L${corner}`).join("")}`, "data-view": number ?? "" });
+      if (name) made.append(shape("title", {}, name));
       group.append(made);
-      if (label) group.append(element("text", { x: at[0][0], y: at[0][1] }, label));
+      if (label) group.append(shape("text", { x: at[0][0], y: at[0][1] }, label));
     }
     for (const { corners, kind, label: whole, node, stroke = null } of pane.boxes) {
       const at = corners.map((corner) => camera.project(corner, k));
       if (at.some((point) => !point)) continue;   // a corner is behind the camera
       if (isOutside(at, each, height)) continue;
       const d = EDGES.map(([a, b]) => `M${at[a][0].toFixed(1)} ${at[a][1].toFixed(1)}L${at[b][0].toFixed(1)} ${at[b][1].toFixed(1)}`).join("");
-      group.append(element("path", { d, class: "shadow" }), element("path", { d, class: kind, "data-node": node, ...(stroke ? { stroke } : {}) }));
+      group.append(shape("path", { d, class: "shadow" }), shape("path", { d, class: kind, "data-node": node, stroke }));
       const top = at.reduce((best, point) => point[1] < best[1] ? point : best);
       if (!whole) continue;
       const most = Math.max(8, Math.floor(each / LETTER_PX) - 1), label = whole.length > most ? `${whole.slice(0, most - 6)}…${whole.slice(-5)}` : whole;   // ends with the score
@@ -47,9 +40,9 @@ export function drawOverlay(svg, camera, panes, width, height, covered = 0) {
       let y = Math.max(covered + 14, top[1] - 6);
       while (placed.some((other) => x < other.right && other.x < right && Math.abs(y - other.y) < LINE_PX)) y += LINE_PX;   // below other labels
       placed.push({ x, right, y });
-      group.append(element("text", { x, y }, label));
+      group.append(shape("text", { x, y }, label));
     }
-    if (pane.label) group.append(element("text", { x: 12, y: height - 12 }, pane.label));
+    if (pane.label) group.append(shape("text", { x: 12, y: height - 12 }, pane.label));
     made.push(group);
   });
   svg.replaceChildren(...made);

@@ -81,11 +81,12 @@ function saveJson() {
 
 async function openJson(file) {
   try {
-    const { format, frames, path } = JSON.parse(await file.text());
+    const { format, scene, frames, path } = JSON.parse(await file.text());
     if (format !== FORMAT) throw new Error();
     page.path = path.slice(0, MOST).map((wire) => page.camera.ofView(wire));
     $("seconds").value = Math.round(frames / FRAMES_PER_S);
     changed();
+    if (scene !== page.scene.name) tell(`This path was saved for ${scene}, so its views may miss ${page.scene.name}.`, true);
   } catch { tell(`${file.name} is not a camera path: choose a file that “Save JSON” wrote.`, true); }
 }
 

@@ -38,6 +38,9 @@ export class Photos {
   }
 
   mark(number, shows = []) {
+    const marked = `${number} ${shows}`;
+    if (marked === this.marked) return;   // a scene may have thousands of photographs
+    this.marked = marked;
     [...$("views").children].forEach((button, k) => {
       const chosen = k === number;
       if (chosen && button.getAttribute("aria-selected") !== "true") button.scrollIntoView({ block: "nearest", inline: "nearest" });

@@ -4,6 +4,8 @@ import * as api from "./api.js";
 import { latest } from "./latest.js";
 import { wireStyle } from "./styles.js";
 
+const MOST_PX = 4096;   // sides of pictures that the server renders
+
 const asked = (camera, pane, [width, height], quality, image) =>
   ({ variant: pane.variant || "default", camera: camera.wire(width, height), style: wireStyle(pane.style), removed: pane.removed, quality, image });
 const fetched = async (frame) => createImageBitmap(await api.frame(frame));
@@ -38,7 +40,7 @@ export class ServerPainter {
 
   draw(camera, panes, width, height) {
     this.resize(width, height);
-    const each = Math.floor(width / panes.length), scale = Math.min(this.moving ? 0.5 : 1, 4096 / Math.max(each, height));
+    const each = Math.floor(width / panes.length), scale = Math.min(this.moving ? 0.5 : 1, MOST_PX / Math.max(each, height));
     const size = [Math.max(1, Math.round(each * scale)), Math.max(1, Math.round(height * scale))];
     const frames = panes.map((pane) => asked(camera, pane, size, this.moving ? 60 : 85, "jpeg"));
     const key = JSON.stringify([width, height, frames]);
@@ -54,8 +56,9 @@ export class ServerPainter {
   }
 
   async capture(camera, panes, width, height) {
-    const canvas = new OffscreenCanvas(width, height), context = canvas.getContext("2d"), each = Math.floor(width / panes.length);
-    for (const [k, pane] of panes.entries()) context.drawImage(await fetched(asked(camera, pane, [each, height], 95, "png")), k * each, 0);
+    const scale = Math.min(1, MOST_PX * panes.length / width, MOST_PX / height), each = Math.floor(scale * width / panes.length);
+    const canvas = new OffscreenCanvas(each * panes.length, Math.round(scale * height)), context = canvas.getContext("2d");
+    for (const [k, pane] of panes.entries()) context.drawImage(await fetched(asked(camera, pane, [each, canvas.height], 95, "png")), k * each, 0);
     return canvas.convertToBlob({ type: "image/png" });
   }
 }

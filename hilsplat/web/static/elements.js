@@ -13,6 +13,14 @@ export function make(tag, attributes = {}, ...children) {
   return element;
 }
 
+// Create an SVG element.
+export function shape(tag, attributes, text = "") {
+  const made = document.createElementNS("http://www.w3.org/2000/svg", tag);
+  for (const [name, value] of Object.entries(attributes)) if (value !== null) made.setAttribute(name, value);
+  made.textContent = text;
+  return made;
+}
+
 // Let the arrow keys choose the next and previous item of a list of buttons.
 export function attachArrows(list) {
   list.addEventListener("keydown", (event) => {

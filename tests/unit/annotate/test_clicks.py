@@ -46,14 +46,11 @@ def clicks(scene, tmp_path_factory) -> Clicks:
     return Clicks(scene, masks)
 
 
-def test_a_click_outlines_the_thing_at_it(clicks):
+def test_a_click_or_a_box_outlines_the_thing_at_it(clicks):
     best, *others = clicks.outlines("000.png", [(*LEFT[0], True)], None)
     assert iou(fill_polygons(best.polygons, SIZE), disc(*LEFT)) > 0.8
     assert best.what == "by sam-tiny" and best.level == Level.WHOLE  # the three heads agree
     assert len(others) < 3
-
-
-def test_a_box_outlines_the_thing_that_fills_it(clicks):
     (x, y), (a, b) = RIGHT
     best, *_ = clicks.outlines("000.png", [], (x - a, y - b, x + a, y + b))
     assert iou(fill_polygons(best.polygons, SIZE), disc(*RIGHT)) > 0.8

@@ -121,7 +121,7 @@ def ids(found, view: str) -> dict[str, int]:
     return {label.text: label.id for label in found[view]}
 
 
-def test_shapes_without_ids_are_one_thing_only_if_their_texts_are_equal():
+def test_shapes_without_ids_are_matched_by_their_texts():
     files = [
         numbered("DSC_1.png", ("mug", 2, 2), ("cup", 20, 2)),
         numbered("DSC_2.png", ("lamp", 2, 2), ("mug", 20, 2)),
@@ -132,9 +132,6 @@ def test_shapes_without_ids_are_one_thing_only_if_their_texts_are_equal():
     assert (first["turtle"], added, known) == (1, 4, 0)
     assert first["mug"] == second["mug"]
     assert len({first["turtle"], first["mug"], first["cup"], second["lamp"]}) == 4
-
-
-def test_two_things_with_one_text_stay_separate():
     files = [numbered(view, ("mug", 2, 2), ("mug", 20, 2)) for view in SIZES]
     found, _, _ = merged({}, files, SIZES)
     assert [[label.id for label in found[view]] for view in SIZES] == [[1, 2], [1, 2]]

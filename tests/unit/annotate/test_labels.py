@@ -10,7 +10,6 @@ from hilsplat.annotate.labels import (
     cut_to_parents,
     known_labels,
     label_path,
-    read_labels,
     traced,
     write_labels,
 )
@@ -19,6 +18,7 @@ from hilsplat.datasets.images.hi import regions_of
 from hilsplat.datasets.images.isat import read_isat
 from hilsplat.scene.cameras import Cameras, Photo
 from hilsplat.web.file_changes import NO_FILE, version_of
+from tests.unit.annotate.label_files import read_labels
 
 SIZE = (30, 40)
 
@@ -34,7 +34,7 @@ def label(number: int, level: int, parent: int | None, polygons, text: str = "",
     )
 
 
-def test_children_are_cut_to_their_parents_down_to_subparts():
+def test_children_are_cut_to_their_parents_down_to_subparts_and_keep_their_vertices_inside():
     whole, part = label(1, 1, None, box(5, 5, 20, 20)), label(2, 2, 1, box(0, 10, 12, 29))
     subpart = label(3, 3, 2, box(8, 18, 39, 25))
     cut = cut_to_parents([subpart, part, whole], SIZE)
@@ -43,16 +43,10 @@ def test_children_are_cut_to_their_parents_down_to_subparts():
     np.testing.assert_array_equal(part_mask, part.mask(SIZE) & whole.mask(SIZE))
     np.testing.assert_array_equal(subpart_mask, subpart.mask(SIZE) & part_mask)
     np.testing.assert_array_equal(whole_mask, whole.mask(SIZE))
-
-
-def test_children_inside_their_parents_keep_their_vertices():
     given = [label(1, 1, None, [[(3, 3), (20, 4), (9, 22)]]), label(2, 2, 1, [[(8, 6), (10, 6), (9, 9)]])]
     assert cut_to_parents(given, SIZE) == given
     once = cut_to_parents([label(1, 1, None, box(5, 5, 9, 9)), label(2, 2, 1, box(0, 0, 7, 7))], SIZE)
     assert cut_to_parents(once, SIZE) == once
-
-
-def test_a_child_around_a_hole_of_its_parent_is_cut_exactly():
     ring = np.zeros(SIZE, bool)
     ring[4:26, 4:36] = True
     ring[10:20, 12:28] = False
@@ -113,17 +107,17 @@ def isat(name: str, size_hw: tuple[int, int], things: list[dict], **more) -> str
 
 def test_regions_outside_the_view_survive_a_change_and_the_removal_of_all_others(tmp_path):
     photo = Photo("PINHOLE", (30, 30, 40, 20), (40, 80))  # the view is its middle
-    camera = views_of("a.png", photos={"a.png": photo})["a.png"]
+    cameras = views_of("a.png", photos={"a.png": photo})
     keys = {"level": 1, "parent": None}
     lamp = {"id": 1, **keys, "category": "corner lamp", "segmentation": [[0, 0], [4, 0], [4, 4]]}
     table = {"id": 2, **keys, "category": "table", "segmentation": [[0, 20], [50, 20], [50, 39], [0, 39]]}
     path = tmp_path / "a.json"
     path.write_text(before := isat("a.png", photo.size_hw, [lamp, table]))
-    (shown,) = read_labels(path, camera)
+    (shown,) = known_labels(tmp_path, cameras, cameras.names)["a.png"]
     assert shown.text == "table"
     new = label(3, 1, None, box(1, 1, 5, 5))
     version = write_labels(path, "a.png", SIZE, [shown, new], version_of(path))
-    assert read_labels(path, camera) == [shown, new]
+    assert read_labels(path) == [shown, new]
     assert json.loads(path.read_text())["original"] == json.loads(before)
     version = write_labels(path, "a.png", SIZE, [new], version)
     write_labels(path, "a.png", SIZE, [], version)

@@ -149,6 +149,8 @@ def test_nodes_are_proposed_at_a_pixel_from_whole_to_subpart(client):
 
 def test_a_running_workflow_adds_proposals_of_masks_and_then_of_nodes(desk, labels, tmp_path):
     young = tmp_path / "results/photos/desk"
+    with pytest.raises(ArtifactError, match="has no photographs to annotate yet"):
+        opened(young, labels)
     shutil.copytree(desk / "scene", young / "scene")
     client = opened(young, labels)
     assert client.get("/api/scene").json()["proposes"] == ""
@@ -187,11 +189,6 @@ def test_things_are_transferred_by_their_gaussians_with_their_parts_inside(clien
     assert client.post("/api/carry", json={"ids": [5, 6], "view": 4}).json() == []  # they are there now
 
 
-def test_a_scene_without_poses_is_refused(tmp_path):
-    with pytest.raises(ArtifactError, match="has no photographs to annotate yet"):
-        OpenedScene(tmp_path, tmp_path / "labels", "default", 1)
-
-
 def test_files_that_cannot_be_imported_are_noted_beside_the_others(client):
     def file(name, *shapes):
         content = {
@@ -216,7 +213,7 @@ def test_files_that_cannot_be_imported_are_noted_beside_the_others(client):
 # -- a scene that is rebuilt ------------------------------------------------------------------------
 
 
-def test_a_rewritten_tree_is_reported_and_not_used_until_a_reload(own_desk, labels):
+def test_a_rewritten_tree_is_not_used_and_labels_of_rewritten_photographs_are_not_saved(own_desk, labels):
     client = opened(own_desk, labels)
     of = {"of": client.get("/api/scene").json()["of"]}
     assert client.get("/api/changes").json() == {**of, "changed": [], "labels": ["none"] * 6}
@@ -235,13 +232,9 @@ def test_a_rewritten_tree_is_reported_and_not_used_until_a_reload(own_desk, labe
     for path in ("photo/0", "thumb/0", "labels", "export/coco"):
         assert client.get(f"/api/{path}", params=of).status_code == 409
         assert client.get(f"/api/{path}", params={"of": again}).status_code == 200
-
-
-def test_labels_of_rewritten_photographs_are_not_saved(own_desk, labels):
-    client = opened(own_desk, labels)
     write_again(own_desk / "scene")
-    assert put(client, 0, [MUG], "none").status_code == 409
+    assert put(client, 1, [MUG], "none").status_code == 409
     assert client.get("/api/photo/0").status_code == 409
-    assert not labels.exists() or not list(labels.glob("*.json"))
+    assert [path.name for path in labels.glob("*.json")] == ["000.json"]
     client.get("/api/scene")
-    assert put(client, 0, [MUG], "none").status_code == 200
+    assert put(client, 1, [MUG], "none").status_code == 200

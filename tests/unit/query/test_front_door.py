@@ -70,20 +70,10 @@ def test_public_names_are_the_types_that_open_returns(desk, named_desk):
     made += (scene.scene, scene.camera("000.png"), scene.render("000.png"))
     assert {type(each).__name__ for each in made} <= set(hilsplat.__all__)
     assert all(getattr(hilsplat, name) for name in hilsplat.__all__)
+    assert dir(hilsplat) == sorted(hilsplat.__all__)
+    assert np.abs(255 * scene.render("000.png").colours - scene.views.image("000.png")).mean() < 40
     with pytest.raises(AttributeError, match="no attribute 'shut'"):
         hilsplat.shut  # noqa: B018
-
-
-def test_a_scene_is_one_line_and_renders_its_views_and_other_cameras(desk):
-    assert dir(hilsplat) == sorted(hilsplat.__all__)
-    scene = hilsplat.open_scene(desk)
-    assert repr(scene).startswith("LanguageScene(photos/desk: 6 views, ") and "\n" not in repr(scene)
-    colours, photograph = scene.render("000.png").colours, scene.views.image("000.png")
-    assert colours.dtype == np.float32 and colours.shape == photograph.shape
-    assert np.abs(255 * colours - photograph).mean() < 40
-    assert scene.render(scene.camera("000.png").scaled((12, 21))).colours.shape == (12, 21, 3)
-    with pytest.raises(SettingsError, match="no view 'x'"):
-        scene.render("x")
 
 
 def test_a_moved_results_folder_finds_its_clip_by_digest(desk, desk_project, elsewhere):
@@ -152,24 +142,18 @@ def test_the_example_of_the_docs_runs(named_desk, project, monkeypatch, capsys):
 # -- commands -----------------------------------------------------------------------------------------
 
 
-def test_query_takes_a_path_from_any_folder(desk, elsewhere, capsys):
-    run("query", str(desk), "mug > handle", "--out", "answer")
-    printed = capsys.readouterr().out
-    lines = printed.splitlines()
+def test_query_reports_the_answer_and_saves_its_masks_and_compressed_gaussians(desk, elsewhere, capsys):
+    run("query", str(desk), "mug > handle", "--out", "answer", "--masks", "masks", "--spz")
+    lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "1 answer to 'mug > handle' in photos/desk; lengths in scene units"
     assert lines[2].split()[1] == "part"
-    assert "doubtful" not in printed
-    assert lines[-1] == "wrote answer/panel.png and selection.ply"
-    for name in ("panel.png", "selection.ply"):
-        assert (elsewhere / "answer" / name).stat().st_size > 1000
-
-
-def test_query_saves_the_masks_and_the_compressed_gaussians_of_its_answer(desk, elsewhere, capsys):
-    run("query", str(desk), "mug > handle", "--out", "answer", "--masks", "masks", "--spz")
-    assert capsys.readouterr().out.splitlines()[-2:] == [
+    assert not any("doubtful" in line for line in lines)
+    assert lines[-3:] == [
+        "wrote answer/panel.png and selection.ply",
         "wrote answer/selection.spz",
         "wrote masks of 1 node to masks/<view>/<node>.png and coco.json",
     ]
+    assert (elsewhere / "answer/panel.png").stat().st_size > 1000
     (hit,) = (scene := hilsplat.open_scene(desk)).query("mug > handle")
     for view in scene.views.names:
         saved = read_mask(elsewhere / "masks" / Path(view).stem / f"{hit.node}.png") > 0
@@ -177,16 +161,19 @@ def test_query_saves_the_masks_and_the_compressed_gaussians_of_its_answer(desk, 
     coco = json.loads((elsewhere / "masks/coco.json").read_text())
     assert [each["name"] for each in coco["categories"]] == ["mug > handle"]
     assert len(coco["annotations"]) == len(scene.views.names)
-    assert {(each["node"], each["score"]) for each in coco["annotations"]} == {
-        (hit.node, round(hit.score, 4))
-    }
-    spz = decoded((elsewhere / "answer/selection.spz").read_bytes())
+    found = {(each["node"], each["score"]) for each in coco["annotations"]}
+    assert found == {(hit.node, round(hit.score, 4))}
     header = PlyData.read(elsewhere / "answer/selection.ply").comments
     assert header[0].startswith("source_from_scene ")
     assert header[1:] == ["label 1: mug > handle", f"label 1, node {hit.node}: ?, score {hit.score:.4f}"]
-    assert len(spz) == len(hit.gaussians)
+    compressed = elsewhere / "answer/selection.spz"
+    assert len(decoded(compressed.read_bytes())) == len(hit.gaussians)
     with pytest.raises(ArtifactError, match="--masks masks exists"):
         run("query", str(desk), "mug", "--out", "answer", "--masks", "masks")
+    run("query", str(desk), "book", "--out", "answer")  # replaces the compressed Gaussians, too
+    assert len(decoded(compressed.read_bytes())) == len(scene.query("book")[0].gaussians)
+    run("query", str(desk), "mug", "--threshold", "0.99", "--view", "000.png", "--out", "a")
+    assert "or omit --view, or omit --threshold" in capsys.readouterr().out
 
 
 def test_export_leaves_out_or_keeps_what_matches_a_query_or_a_node(desk, elsewhere, capsys):
@@ -229,27 +216,16 @@ def test_a_clean_export_leaves_out_gaussians_of_no_node(copied, elsewhere, capsy
 
 
 @pytest.mark.parametrize(
-    "words",
-    [
-        ("--all", "--masks", "m"),
-        ("--all", "--spz"),
-        ("--all", "--out", "o"),
-        ("--all", "--view", "0"),
-        ("--all", "--views", "2"),
-        ("--all", "--answerer", "tree"),
-        ("--json",),
-        ("--limit", "3"),
-    ],
-)
-def test_options_that_a_query_would_ignore_are_refused(desk, elsewhere, words):
-    with pytest.raises(SettingsError, match=f"{words[words[0] == '--all']} is for queries of"):
-        run("query", str(desk), "mug", *words)
-    assert not list(elsewhere.iterdir())
-
-
-@pytest.mark.parametrize(
     ("command", "option", "purpose"),
     [
+        (("query", "DESK", "mug", "--all", "--masks", "m"), "--masks", "queries of one scene"),
+        (("query", "DESK", "mug", "--all", "--spz"), "--spz", "queries of one scene"),
+        (("query", "DESK", "mug", "--all", "--out", "o"), "--out", "queries of one scene"),
+        (("query", "DESK", "mug", "--all", "--view", "0"), "--view", "queries of one scene"),
+        (("query", "DESK", "mug", "--all", "--views", "2"), "--views", "queries of one scene"),
+        (("query", "DESK", "mug", "--all", "--answerer", "tree"), "--answerer", "queries of one scene"),
+        (("query", "DESK", "mug", "--json"), "--json", "queries of all scenes"),
+        (("query", "DESK", "mug", "--limit", "3"), "--limit", "queries of all scenes"),
         (("export", "DESK", "--as", "colmap", "--variant", "nope"), "--variant", "--as tree, --as langsplat"),
         (("export", "DESK", "--as", "ply", "--variant", "nope"), "--variant", "--as tree, --as langsplat"),
         (("export", "DESK", "--as", "tree", "--data-root", "."), "--data-root", "--as labels"),
@@ -270,18 +246,6 @@ def test_masks_do_not_replace_the_picture_of_their_answer(desk, elsewhere, out, 
     assert not list(elsewhere.iterdir())
     run("query", str(desk), "mug", "--out", "a", "--masks", "a/masks")
     assert {path.name for path in Path("a").iterdir()} >= {"panel.png", "selection.ply", "masks"}
-
-
-def test_compressed_gaussians_are_those_of_the_last_answer(desk, elsewhere):
-    for words in (("--spz",), ("--level", "part")):
-        run("query", str(desk), "mug > handle" if "--spz" in words else "book", "--out", "a", *words)
-    saved = decoded(Path("a/selection.spz").read_bytes())
-    assert len(saved) == len(PlyData.read("a/selection.ply")["vertex"].data)
-
-
-def test_an_empty_answer_names_the_options_that_made_it_empty(desk, elsewhere, capsys):
-    run("query", str(desk), "mug", "--threshold", "0.99", "--view", "000.png", "--out", "a")
-    assert "or omit --view, or omit --threshold" in capsys.readouterr().out
 
 
 def test_a_scene_is_found_by_its_name_alone(desk_project, tmp_path):
@@ -316,16 +280,13 @@ def test_a_wrong_scene_name_suggests_the_right_one_in_every_command(desk_project
             open_it()
 
 
-def test_export_writes_the_tree_to_any_folder(desk, elsewhere, capsys):
+def test_export_writes_the_tree_to_any_folder_without_files(desk, elsewhere, capsys):
     run("export", str(desk), "--out", "tree")
     assert "2 whole, 2 part, 1 subpart" in capsys.readouterr().out
     nodes = json.loads((elsewhere / "tree/tree.json").read_text())["nodes"]
     assert [node["level"] for node in nodes] == ["whole", "whole", "part", "part", "subpart"]
     assert (elsewhere / "tree/tree.png").is_file()
     assert (elsewhere / "tree/tree.ply").stat().st_size > (desk / "gaussians.ply").stat().st_size
-
-
-def test_an_export_does_not_replace_a_folder_with_files(desk, elsewhere):
     (elsewhere / "mine").mkdir()
     (elsewhere / "mine/thesis.txt").write_text("years of work")
     with pytest.raises(ArtifactError, match="--out mine exists"):

@@ -111,15 +111,12 @@ def test_linear_codes_need_no_decoding(vectors, texts, latent):
     assert np.array_equal(two.fast(two.prepare(latents), texts[4:]), found)
 
 
-def test_linear_codes_keep_averages_and_at_full_rank_everything(vectors):
+def test_linear_codes_keep_averages_the_largest_spread_and_at_full_rank_everything(vectors):
     code, mean = LinearCode.fit(vectors, 4), vectors[:10].mean(axis=0, keepdims=True)
     assert code.encode_array(vectors[:10]).mean(axis=0) == pytest.approx(code.encode_array(mean)[0], abs=1e-5)
     full = LinearCode.fit(vectors, 32)
     assert full.decode_array(full.encode_array(vectors)) == pytest.approx(vectors, abs=1e-5)
     assert full.basis @ full.basis.T == pytest.approx(np.eye(32), abs=1e-5)
-
-
-def test_principal_directions_are_those_of_the_largest_spread():
     rng = np.random.default_rng(3)
     data = (rng.normal(size=(500, 3)) * [0.1, 3.0, 1.0]).astype(np.float32)
     basis = LinearCode.fit(data, 2).basis

@@ -149,13 +149,6 @@ def test_nodes_similar_to_a_node_are_ranked_by_cosine(desk):
         scene.like_node(99)
 
 
-def test_a_link_to_names_stays_a_link(desk, tmp_path):
-    shared = tmp_path / "names.json"
-    (desk / FILE).symlink_to(shared)
-    name_nodes(desk, {0: "mug"})
-    assert (desk / FILE).is_symlink() and "mug" in shared.read_text()
-
-
 def test_names_that_change_while_they_are_read_cannot_be_replaced(desk, monkeypatch):
     """The version is that of the names that were read, or an older one."""
     first = name_nodes(desk, {0: "mug"})

@@ -112,15 +112,12 @@ def test_names_of_another_tree_are_not_shown_and_damaged_ones_are_refused(desk, 
             NodeNaming.load(other, tree, clip)
 
 
-def test_a_word_missing_from_the_vocabulary_of_the_model_is_doubted(desk):
+def test_texts_that_the_model_does_not_know_or_that_match_by_chance_are_doubted(desk):
     scene = hilsplat.open_scene(desk)
     assert open_clip_of(desk / "default/clip").unknown_words("mug zebra, book") == ["zebra"]
     (doubt,) = scene.query("zebra")[0].doubts
     assert str(doubt) == "'zebra' may not be in the scene: the model's vocabulary lacks 'zebra'"
     assert scene.query("mug > handle")[0].doubts == ()
-
-
-def test_a_text_that_words_for_absent_things_match_as_well_is_doubted(desk):
     scene = hilsplat.open_scene(desk)
     blue, white = np.array([[0, 0, 1.0]], np.float32), np.full((1, 3), 3**-0.5, np.float32)
     rivals = np.concatenate([np.repeat(blue, 30, axis=0), np.repeat(white, 70, axis=0)])

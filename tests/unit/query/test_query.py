@@ -103,21 +103,30 @@ def test_automatic_level_is_the_coarsest_level_of_the_best_nodes(scene):
     assert automatic_level(scene.tree, margin, np.zeros(7, bool)) == Level.WHOLE
 
 
-def best_wholes(margin, threshold, vectors=None, visible=None) -> list[int]:
+def best_wholes(margin, threshold, vectors=None, hidden=()) -> list[int]:
     """Answers among wholes, whose vectors are orthogonal unless given."""
     num = len(margin)
     tree = plain_tree([1] * num, [-1] * num, [[-1, -1, -1]])
     vectors = np.eye(num, dtype=np.float32) if vectors is None else vectors
-    margins = np.array([margin], np.float32)
-    options = {"level": Level.WHOLE, "visible": np.ones(num, bool) if visible is None else visible}
-    return search(tree, margins, vectors, ("x",), threshold=threshold, ancestors=0.2, **options).ids.tolist()
+    margins, visible = np.array([margin], np.float32), ~np.isin(np.arange(num), hidden)
+    options = {"level": Level.WHOLE, "visible": visible, "threshold": threshold, "ancestors": 0.2}
+    return search(tree, margins, vectors, ("x",), **options).ids.tolist()
 
 
-def test_answers_are_within_a_share_of_the_range_of_the_level_below_the_best():
-    margin = [-0.22, 0.29, 0.39, 0.69]  # a range of 0.91: 0.15 of it is 0.14, a half 0.46
-    assert best_wholes(margin, 0.85) == [3]
-    assert best_wholes(margin, 0.5) == [3, 2, 1]
-    assert best_wholes([-0.1, 0.2, 0.2], 0.95) == [1, 2]
+@pytest.mark.parametrize(
+    ("margin", "threshold", "hidden", "found"),
+    [
+        ([-0.22, 0.29, 0.39, 0.69], 0.85, (), [3]),  # a range of 0.91, and 0.15 of it is 0.14
+        ([-0.22, 0.29, 0.39, 0.69], 0.5, (), [3, 2, 1]),  # a half is 0.46
+        ([-0.1, 0.2, 0.2], 0.95, (), [1, 2]),
+        ([0.0, 9.4, 9.7, 10.0], 0.95, (3,), [2, 1]),  # within 0.05 of the range of all four, 10
+        ([0.0, 9.4, 9.7, 10.0], 0.95, (0, 1, 2, 3), []),
+    ],
+)
+def test_answers_are_within_a_share_of_the_range_of_all_nodes_below_the_best_shown(
+    margin, threshold, hidden, found
+):
+    assert best_wholes(margin, threshold, hidden=hidden) == found
 
 
 @pytest.mark.parametrize(("cosine", "found"), [(0.91, [3, 2]), (0.89, [3])])
@@ -127,12 +136,6 @@ def test_nodes_similar_to_the_best_answer_may_be_three_times_as_far_below(cosine
         vectors[node] = cosine * vectors[3] + np.sqrt(1 - cosine**2) * np.eye(5)[4]
     # of a range of 10: 0.05 is 0.5, three times that 1.5
     assert best_wholes([0.0, 7.0, 8.6, 10.0], 0.95, vectors) == found
-
-
-def test_only_shown_nodes_are_answers_but_all_define_the_range():
-    margin, visible = [0.0, 9.4, 9.7, 10.0], np.array([True, True, True, False])
-    assert best_wholes(margin, 0.95, visible=visible) == [2, 1]  # within 0.05 of the range of all four, 10
-    assert best_wholes(margin, 0.95, visible=np.zeros(4, bool)) == []
 
 
 def test_parts_of_a_likely_thing_are_ranked_first(scene):
@@ -158,26 +161,25 @@ def test_parts_of_a_likely_thing_are_ranked_first(scene):
     assert (ancestor_margins(orphans, margin)[scene.tree.level > 1] == -1.0).all()
 
 
-def of_path(*named):
-    """Margins of a path's texts: -1 but for the nodes that are named."""
-    every = np.full((len(named), len(NAMES)), -1.0, np.float32)
-    for row, values in zip(every, named, strict=True):
+def search_path(tree, named, threshold=0.99, level=None, hidden=()):
+    """Search a path of one text for each of `named`: margins of named nodes; those of all others are -1."""
+    margin = np.full((len(named), len(NAMES)), -1.0, np.float32)
+    for row, values in zip(margin, named, strict=True):
         for name, value in values.items():
             row[NODE[name]] = value
-    return every
+    visible = ~np.isin(NAMES, hidden)
+    options = {"level": level, "visible": visible, "threshold": threshold, "ancestors": 0.2}
+    return search(tree, margin, tree.clip, tuple("xyz"[: len(named)]), **options)
 
 
-def search_path(tree, margin, path, threshold, level=None, visible=None):
-    """Search a path of several texts."""
-    options = {"level": level, "visible": np.ones(len(tree), bool) if visible is None else visible}
-    return search(tree, margin, tree.clip, path, threshold=threshold, ancestors=0.2, **options)
-
-
-def test_a_path_stays_inside_its_first_thing(scene):
-    margin = of_path({"A": 3.0}, {"A bottom": 2.0}, {"A top left": 0.4, "B corner": 2.2})
-    hits = search_path(scene.tree, margin, ("A", "A bottom", "x"), 0.95)
+def test_a_path_stays_inside_its_first_thing_at_levels_at_which_every_ancestor_exists(scene):
+    named = {"A": 3.0}, {"A bottom": 2.0}, {"A top left": 0.4, "B corner": 2.2}
+    hits = search_path(scene.tree, named, 0.95)
     # the one subpart of A hangs under its top; that of B answers better, but is no part of A
     assert (hits.ids.tolist(), hits.route) == ([NODE["A top left"]], "child")
+    # B top has no subpart
+    hits = search_path(scene.tree, ({"A": 0.8, "B top": 0.9}, {"A top left": 0.6, "B corner": 0.9}), 0.95)
+    assert (hits.ids.tolist(), hits.route) == ([NODE["A top left"]], "descendant")
 
 
 @pytest.fixture
@@ -188,10 +190,8 @@ def three_wholes(scene) -> SemanticTree:
     return replace(scene.tree, level=level, parent=parent)
 
 
-def orphaned(tree: SemanticTree, name: str) -> SemanticTree:
-    parent = tree.parent.copy()
-    parent[NODE[name]] = -1
-    return replace(tree, parent=parent)
+def orphaned(tree: SemanticTree, name: str | None) -> SemanticTree:
+    return replace(tree, parent=np.where(np.array(NAMES) == name, -1, tree.parent).astype(np.int32))
 
 
 @pytest.mark.parametrize(
@@ -211,18 +211,16 @@ def orphaned(tree: SemanticTree, name: str) -> SemanticTree:
     ],
 )
 def test_answers_of_a_path_depend_on_their_ancestors(three_wholes, first, last, orphan, found, route):
-    tree = orphaned(three_wholes, orphan) if orphan else three_wholes
-    hits = search_path(tree, of_path(first, last), ("x", "y"), 0.99, Level.SUBPART)
+    hits = search_path(orphaned(three_wholes, orphan), (first, last), level=Level.SUBPART)
     assert (hits.ids.tolist(), hits.route) == ([NODE[found]], route)
 
 
 def test_hidden_ancestors_do_not_compete_with_shown_ones(three_wholes):
     tree = orphaned(three_wholes, "B corner")
     # B top would leave A unlikely, and B corner, which nothing holds, the answer
-    margin = of_path({"A": 1.0, "B top": 4.0}, {}, {"A top left": 2.0, "B corner": 0.0})
+    named = {"A": 1.0, "B top": 4.0}, {}, {"A top left": 2.0, "B corner": 0.0}
     for hidden, found in (("B", "B corner"), ("B top", "A top left")):
-        visible = np.arange(7) != NODE[hidden]
-        hits = search_path(tree, margin, ("x", "y", "z"), 0.99, visible=visible)
+        hits = search_path(tree, named, hidden=hidden)
         assert hits.ids.tolist() == [NODE[found]]
 
 
@@ -255,9 +253,17 @@ def test_a_scene_opens_with_the_settings_of_its_evaluation_or_panel(tmp_path, ca
     assert "using the defaults" not in caplog.text
 
 
-def test_a_variant_uses_the_field_recorded_in_its_scores(tmp_path):
-    folder = bear_without(tmp_path)
+def test_a_variant_uses_the_parts_recorded_in_its_scores_or_those_that_exist(tmp_path):
+    later = ("default/semantic_tree", "default/autoencoder", "default/field.safetensors")
+    with pytest.raises(ArtifactError, match=r"hilsplat run .*default/semantic_tree"):
+        FinishedScene.locate(folder := bear_without(tmp_path, *later))
+    (folder / "default/semantic_tree").mkdir()
+    parts = FinishedScene.locate(folder).parts  # a tree can be queried before there is a field
+    assert (parts.field, parts.autoencoder) == (None, None)
+    assert list(parts.as_inputs()) == ["scene", "gaussians", "semantic_tree", "clip", "masks"]
     (folder / "lifted").mkdir()  # begun, and killed
+    (folder / "default/autoencoder").mkdir()
+    (folder / "default/field.safetensors").touch()
     with pytest.raises(ArtifactError, match=r"lifted/field\.safetensors is missing"):
         FinishedScene.locate(folder, "lifted")
     (folder / "theta").mkdir()
@@ -271,25 +277,11 @@ def test_a_variant_uses_the_field_recorded_in_its_scores(tmp_path):
         FinishedScene.locate(folder, "x")
 
 
-def test_a_tree_can_be_queried_before_there_is_a_field(tmp_path):
-    later = ("default/semantic_tree", "default/autoencoder", "default/field.safetensors")
-    folder = bear_without(tmp_path, *later)
-    with pytest.raises(ArtifactError, match=r"hilsplat run .*default/semantic_tree"):
-        FinishedScene.locate(folder)
-    (folder / "default/semantic_tree").mkdir()
-    parts = FinishedScene.locate(folder).parts
-    assert (parts.field, parts.autoencoder) == (None, None)
-    assert list(parts.as_inputs()) == ["scene", "gaussians", "semantic_tree", "clip", "masks"]
-
-
-def test_the_field_answers_through_the_same_interface(scene):
+def test_the_field_answers_through_the_same_interface_and_by_look_ups(scene):
     hits = scene.query("B", "whole", answerer="field")
     assert hits[0].node == NODE["B"]
     (hit,) = scene.query("A > A top", answerer="field")
     assert (hit.node, hit.route) == (NODE["A top"], "child")
-
-
-def test_look_ups_of_the_field_agree_with_decoding(scene):
     exact = scene.field.relevancy(["B", "A top"], "004.png")
     fast = scene.field.relevancy(["B", "A top"], "004.png", exact=False)
     assert fast == pytest.approx(exact, abs=2e-3)  # a network with d = 4: decoded as well
@@ -315,13 +307,6 @@ def test_a_path_finds_its_levels_unless_one_is_given(scene, path, level, found):
     assert hits.level == Level(int(scene.tree.level[NODE[found]]))
 
 
-def test_levels_at_which_every_ancestor_exists_are_preferred(scene):
-    # B top has no subpart
-    margin = of_path({"A": 0.8, "B top": 0.9}, {"A top left": 0.6, "B corner": 0.9})
-    hits = search_path(scene.tree, margin, ("x", "y"), 0.95)
-    assert (hits.ids.tolist(), hits.route) == ([NODE["A top left"]], "descendant")
-
-
 @pytest.mark.parametrize("text", ["A top left", "A > A top left"])
 def test_answers_in_a_view_are_nodes_that_it_shows(scene, text):
     assert scene.views.visible_nodes("000.png").all()
@@ -342,7 +327,7 @@ def test_a_view_shows_the_nodes_with_a_mask_there(scene, monkeypatch):
     assert np.flatnonzero(~visible).tolist() == [NODE["B corner"]]
 
 
-def test_hits_describe_a_node_and_its_place(scene):
+def test_hits_and_masks_describe_nodes_and_their_places(scene):
     (hit,) = scene.query("A > A top")
     assert (hit.node, hit.level, hit.route) == (NODE["A top"], Level.PART, "child")
     assert hit.score > 0.9 and hit.best_views == ("000.png", "001.png", "002.png")
@@ -352,6 +337,10 @@ def test_hits_describe_a_node_and_its_place(scene):
     assert np.array_equal(hit.mask("004.png"), np.roll(region_mask(5), 4, axis=1))
     # 2 columns and 4 rows of Gaussians one unit apart, in a plane
     assert hit.oriented_box.size == pytest.approx((2.88, 1, 0), abs=0.15)
+    mask = scene.views.node_masks("004.png", np.array([NODE["A bottom"]]))
+    assert np.array_equal(mask, np.roll(region_mask(3), 4, axis=1))
+    both = scene.views.node_masks("000.png", np.array([NODE["A bottom"], NODE["A top left"]]))
+    assert np.array_equal(both, region_mask(3) | region_mask(5))
 
 
 @pytest.mark.parametrize(
@@ -368,13 +357,6 @@ def test_hits_describe_a_node_and_its_place(scene):
 def test_impossible_queries_are_refused(scene, text, options, words):
     with pytest.raises(SettingsError, match=words):
         scene.query(text, **options)
-
-
-def test_node_masks_cover_their_region_in_an_unseen_view(scene):
-    mask = scene.views.node_masks("004.png", np.array([NODE["A bottom"]]))
-    assert np.array_equal(mask, np.roll(region_mask(3), 4, axis=1))
-    both = scene.views.node_masks("000.png", np.array([NODE["A bottom"], NODE["A top left"]]))
-    assert np.array_equal(both, region_mask(3) | region_mask(5))
 
 
 @pytest.mark.parametrize(("answerer", "ahead_by"), [("tree", 0), ("field", 0.05)])
@@ -398,7 +380,7 @@ def thin(scene) -> LanguageScene:
     return with_views(scene, weights=lambda view: weights.tocsr())
 
 
-def test_cosines_at_pixels_are_those_of_decoded_latents_and_of_nodes(thin):
+def test_cosines_at_pixels_are_those_of_latents_and_nodes_and_uncovered_ones_are_the_lowest(thin):
     texts, pixels = ["B", "A top"], np.arange(0, HEIGHT * WIDTH, 7)
     vectors, shares = thin.clip.embed_texts(texts), thin.views.view_weights("000.png").toarray()[pixels]
     by_field, by_node = (of(texts, "000.png", pixels) for of in (thin.field.cosine, thin.node_cosine))
@@ -414,9 +396,6 @@ def test_cosines_at_pixels_are_those_of_decoded_latents_and_of_nodes(thin):
         expected = np.where(shares.any(axis=1), expected, -np.inf)
         assert by_node[:, level.index] == pytest.approx(expected, abs=1e-5)
     assert np.isinf(by_node[:, :, 0]).all()
-
-
-def test_uncovered_pixels_get_the_lowest_relevancy(thin):
     for maps in (thin.field.relevancy(["A"], "000.png"), thin.node_relevancy_map(["A"], "000.png")):
         assert maps[0, 0, 0, 0] == maps[0, 0].min()
     assert not thin.views.node_masks("000.png", np.array([NODE["A"]]))[0, 0]
@@ -434,18 +413,6 @@ def test_latents_are_means_over_the_gaussians_that_have_one(scene):
         assert pixels.tolist() == np.flatnonzero(share > 0.5).tolist()
         assert (share[pixels] < 0.99).any()
         assert latents.tobytes() == ((weights[pixels] @ own) / share[pixels, None]).tobytes()
-
-
-def test_a_forgotten_view_is_computed_again_with_the_same_answers(scene):
-    asked = []
-    weights = lambda view: asked.append(view) or scene.views.pixel_weights(view)  # noqa: E731
-    own = with_views(scene, weights=weights)
-    first = own.field.relevancy(["cup"], "000.png")
-    own.views.visible_nodes("001.png")
-    own.views.cache.forget("000.png")
-    assert np.array_equal(own.field.relevancy(["cup"], "000.png"), first)
-    own.views.visible_nodes("001.png")
-    assert asked == ["000.png", "001.png", "000.png"]
 
 
 def test_field_image_has_one_colour_per_region(scene):

@@ -73,15 +73,12 @@ def three_mugs() -> LanguageScene:
     )
 
 
-def test_a_large_scale_saturates_scores_but_not_the_ranking(three_mugs):
+def test_a_large_scale_saturates_scores_but_neither_the_ranking_nor_doubts(three_mugs):
     scores = three_mugs.node_relevancy(["mug"])[0]
     assert scores.tolist() == [1.0, 1.0, 1.0]  # 1 / (1 + exp(-18)) in float32
     assert near(three_mugs, 0.0).select(["mug"]).ids.tolist() == [1, 0, 2]
     assert three_mugs.select(["mug"]).ids.tolist() == [1]
     assert three_mugs.query("mug")[0].score == pytest.approx(1.0)
-
-
-def test_a_text_without_a_match_is_doubtful(three_mugs):
     (doubt,) = three_mugs.query("unicorn", "whole")[0].doubts
     # cosine 0 with the text and 0.1 with the nearest phrase
     assert (doubt.text, doubt.level) == ("unicorn", None)

@@ -1,10 +1,12 @@
 """A finished desk and the server of its page, without a browser."""
 
 import asyncio
+import base64
 import json
 from collections.abc import Callable, Coroutine, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
@@ -54,6 +56,14 @@ def camera(shown):
 def wire_camera(camera) -> dict:
     pose, size_hw = camera.cam_from_world.tolist(), list(camera.size_hw)
     return {"cam_from_world": pose, "K": camera.K.tolist(), "size_hw": size_hw}
+
+
+def table(shown, colours: dict[int, tuple[int, int, int, int]]) -> str:
+    """The table of a style in which nodes have RGBA colours."""
+    rows = np.zeros((len(shown.answering("default").tree) + 1, 4), np.uint8)
+    for node, colour in colours.items():
+        rows[node + 1] = colour
+    return base64.b64encode(rows.tobytes()).decode()
 
 
 def in_steps(client, kind: str, **sent) -> tuple[list[tuple[int, int]], bytes]:

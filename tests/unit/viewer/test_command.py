@@ -20,11 +20,8 @@ def test_the_printed_address_opens_the_page_and_no_other_does(desk_project):
             urlopen(address.partition("?")[0], timeout=60)
 
 
-def test_a_taken_port_is_refused():
+def test_a_taken_port_is_refused_and_a_free_one_sends_without_delay():
     with listening_at(0) as taken, pytest.raises(SettingsError, match="choose a different port"):
         listening_at(taken.getsockname()[1])
-
-
-def test_the_socket_sends_without_delay():
     with listening_at(0) as listening:  # asyncio turns off Nagle's algorithm only for this protocol
         assert listening.proto == socket.IPPROTO_TCP

@@ -21,7 +21,7 @@ from hilsplat.viewer.viewer_scene import ViewerScene
 from tests.unit.artifact_changes import loosen
 from tests.unit.finished_desk import SCENE
 from tests.unit.splat.spz_reader import decoded
-from tests.unit.viewer.conftest import browsing, in_steps, wire_camera
+from tests.unit.viewer.conftest import browsing, in_steps, table, wire_camera
 
 
 def bits(shown, marked: np.ndarray) -> str:
@@ -43,11 +43,16 @@ def left(shown) -> np.ndarray:
     return shown.gaussians.means[:, 0] < 18
 
 
-def test_a_rectangle_selects_the_gaussians_whose_centres_are_projected_into_it(shown, client, camera):
+def test_a_rectangle_selects_the_visible_gaussians_whose_centres_are_projected_into_it(shown, client, camera):
     region = {"camera": wire_camera(camera), "points": [(20.5, 3), (4, 12.5)]}
     found = marked(shown, client.post("/api/within", json=region).content)
     x, y, _ = shown.gaussians.means.T  # the camera shows Gaussian (x, y) at pixel (x + 1, y)
     np.testing.assert_array_equal(found, (x + 1 >= 4) & (x + 1 <= 20) & (y >= 3) & (y <= 12))
+    tree = shown.answering("default").tree
+    style = {"table": table(shown, {0: (255, 255, 255, 255)}), "mode": "isolate"}
+    region = {"camera": wire_camera(camera), "points": [(0, 0), (42, 24)], "style": style}
+    found = marked(shown, client.post("/api/within", json=region).content)
+    np.testing.assert_array_equal(found, (tree.node_of_gaussian == 0).any(axis=1))
 
 
 def test_a_stroke_selects_what_is_within_its_radius():
@@ -91,16 +96,6 @@ def test_gaussians_of_no_node_are_selected(own_desk):
     np.testing.assert_array_equal(np.flatnonzero(found), np.arange(100, 140))
 
 
-def test_gaussians_that_the_style_hides_are_not_selected(shown, client, camera):
-    tree = shown.answering("default").tree
-    table = np.zeros((len(tree) + 1, 4), np.uint8)
-    table[1] = 255
-    style = {"table": base64.b64encode(table.tobytes()).decode(), "mode": "isolate"}
-    region = {"camera": wire_camera(camera), "points": [(0, 0), (42, 24)], "style": style}
-    found = marked(shown, client.post("/api/within", json=region).content)
-    np.testing.assert_array_equal(found, (tree.node_of_gaussian == 0).any(axis=1))
-
-
 def frame(client, camera, **more) -> np.ndarray:
     sent = client.post("/api/frame", json={"camera": wire_camera(camera), "image": "png", **more})
     return cv2.imdecode(np.frombuffer(sent.content, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
@@ -126,11 +121,10 @@ def test_pictures_picks_and_films_leave_out_removed_gaussians(shown, client, cam
 
 def test_a_pick_ignores_what_the_style_hides(shown, client, camera):
     (book,) = shown.answering("default").query("book")
-    table = np.zeros((1 + len(shown.answering("default").tree), 4), np.uint8)
-    table[1 + book.node] = 255
-    style = {"table": base64.b64encode(table.tobytes()).decode()}
+    of_book = table(shown, {book.node: (255, 255, 255, 255)})
     for mode, is_shown in (("isolate", False), ("tint", True), ("ghost", True)):
-        sent = {"camera": wire_camera(camera), "x": 8.5, "y": 8.5, "style": {**style, "mode": mode}}
+        style = {"table": of_book, "mode": mode}
+        sent = {"camera": wire_camera(camera), "x": 8.5, "y": 8.5, "style": style}
         assert (client.post("/api/pick", json=sent).json()["alpha"] > 0.9) == is_shown  # of the mug
         assert client.post("/api/pick", json={**sent, "x": 24.5}).json()["alpha"] > 0.9
 
@@ -172,7 +166,7 @@ def test_the_cleaned_scene_has_the_values_of_the_scene_and_its_files_do_not_chan
     assert ply.read_bytes() == before
 
 
-def test_selections_and_pages_leave_out_removed_gaussians(shown, client, left):
+def test_selections_and_pages_leave_out_removed_gaussians_and_wrong_marks_are_refused(shown, client, left):
     scene = shown.answering("default")
     (mug,) = scene.query("mug", "whole")
     rows = scene.views.gaussians_of([mug.node])
@@ -185,9 +179,6 @@ def test_selections_and_pages_leave_out_removed_gaussians(shown, client, left):
     assert client.post("/api/export/ply", json=gone).status_code == 422  # the mug is on the left
     _, page = in_steps(client, "page", removed=bits(shown, left))
     assert f'"gaussians":{(~left).sum()},'.encode() in page
-
-
-def test_wrong_marks_are_refused(shown, client):
     for removed in ("AAAA", "?", bits(shown, np.ones(len(shown.order), bool))):
         refused = client.post("/api/export/scene-ply", json={"removed": removed})
         assert refused.status_code == 422

@@ -20,7 +20,7 @@ def framed(shown):
         yield browser
 
 
-def test_each_request_needs_the_token_and_gets_no_cookie(framed):
+def test_each_request_needs_the_token_and_gets_no_cookie_under_any_path(framed):
     page = framed.get("/", params={"token": TOKEN, "embedded": 1})
     assert page.status_code == 200 and "set-cookie" not in page.headers
     assert "frame-ancestors *" in page.headers["content-security-policy"]
@@ -33,9 +33,6 @@ def test_each_request_needs_the_token_and_gets_no_cookie(framed):
     assert framed.post("/api/query", json={"text": "mug"}, params={"token": TOKEN}).json()["hits"]
     form = {"content": "text=mug", "headers": {"content-type": "application/x-www-form-urlencoded"}}
     assert framed.post("/api/query", params={"token": TOKEN}, **form).status_code == 403
-
-
-def test_the_page_has_no_absolute_paths(framed):
     page = framed.get("/", params={"token": TOKEN}).text
     assert re.findall(r'(?:src|href)="(/[^"]*)', page) == []
     for name in ("api.js", "main.js", "drawing.js"):

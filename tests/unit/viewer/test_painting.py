@@ -12,14 +12,7 @@ from hilsplat.base.levels import NONE
 from hilsplat.splat.rasterise.api import draw, pixel_weights, render
 from hilsplat.viewer.frames import GHOST, GREY, TINT, Paint, painted, pick
 from hilsplat.viewer.wire import Style
-from tests.unit.viewer.conftest import wire_camera
-
-
-def table(shown, **colours: tuple[int, int, int, int]) -> str:
-    rows = np.zeros((len(shown.answering("default").tree) + 1, 4), np.uint8)
-    for node, colour in colours.items():
-        rows[int(node[1:]) + 1] = colour
-    return base64.b64encode(rows.tobytes()).decode()
+from tests.unit.viewer.conftest import table, wire_camera
 
 
 def test_a_frame_without_a_style_equals_the_pipeline(shown, client, camera):
@@ -34,8 +27,8 @@ def test_a_frame_without_a_style_equals_the_pipeline(shown, client, camera):
 def test_the_finest_used_level_with_a_colour_decides(shown):
     nodes = shown.answering("default").tree.node_of_gaussian
     whole, part = nodes[nodes[:, 1] >= 0][0, :2]
-    colours = {f"n{whole}": (255, 0, 0, 255), f"n{part}": (0, 0, 255, 51)}
-    style = Style(table=table(shown, **colours), mode="tint")
+    colours = {whole: (255, 0, 0, 255), part: (0, 0, 255, 51)}
+    style = Style(table=table(shown, colours), mode="tint")
     num = len(shown.answering("default").tree)
     paint = Paint.of(style, nodes, num)
     inside_part, only_whole = nodes[:, 1] == part, (nodes[:, 0] == whole) & (nodes[:, 1] != part)
@@ -50,7 +43,7 @@ def test_the_finest_used_level_with_a_colour_decides(shown):
 def test_unselected_gaussians_are_unchanged_grey_faint_or_hidden(shown, camera, mode):
     nodes = shown.answering("default").tree.node_of_gaussian
     whole = int(nodes[0, 0])
-    style = Style(table=table(shown, **{f"n{whole}": (0, 255, 0, 255)}), mode=mode)
+    style = Style(table=table(shown, {whole: (0, 255, 0, 255)}), mode=mode)
     frame = painted(shown.gaussians, camera, Paint.of(style, nodes, len(shown.answering("default").tree)))
     chosen = (nodes[:, 0] == whole).astype(np.float32)
     own = draw(shown.gaussians, camera, 0, features=np.stack([chosen, 1 - chosen], axis=1)).image
@@ -87,9 +80,6 @@ def test_a_pick_returns_the_nodes_with_the_largest_shares_and_the_point(shown, c
             shares[0] = 0  # Gaussians without a node
             assert node == (shares.argmax() - 1 if shares.any() else NONE)
             assert share == pytest.approx(shares.max() / row.sum(), abs=1e-4)
-
-
-def test_nothing_is_picked_outside_the_picture(shown, camera):
     height, width = camera.size_hw
     for x, y in ((-1.0, 3.0), (float(width), 3.0), (3.0, float(height))):
         assert pick(shown.gaussians, None, camera, x, y) is None
