@@ -2,7 +2,7 @@
 
 import logging
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from threading import RLock
 from typing import Any, Literal, TypeVar
@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from jaxtyping import Int64
 
-from hilsplat.base.cards import has_driver, release_card
+from hilsplat.base.cards import cards, has_driver, release_card
 from hilsplat.base.errors import DeviceError, MemoryLimitError, first_line
 
 logger = logging.getLogger(__name__)
@@ -34,9 +34,32 @@ def card_problem() -> str | None:
     try:
         import torch
 
-        return None if torch.cuda.is_available() else f"torch {torch.__version__} finds no CUDA device"
+        if not torch.cuda.is_available():
+            return f"torch {torch.__version__} finds no CUDA device"
+        version, built_for = torch.cuda.get_device_capability(), torch.cuda.get_arch_list()
+        if not has_kernels(version, built_for):
+            return (
+                f"torch {torch.__version__} has no kernels for compute capability {version[0]}.{version[1]}, "
+                f"only {' '.join(built_for)}"
+            )
+        return None
     except Exception as error:  # a broken installation can raise anything
-        return f"torch cannot be imported: {first_line(error)}"
+        return f"torch cannot be used: {first_line(error)}"
+
+
+def has_kernels(version: tuple[int, int], built_for: Sequence[str]) -> bool:
+    """Return whether a card of a compute capability can run a build of torch for architectures (`sm_86`).
+
+    Machine code (`sm_`) runs on cards of the same major version and at least its minor version; the driver
+    compiles `compute_` for any later card.
+    """
+    for name in built_for:
+        kind, _, number = name.partition("_")
+        digits = number.rstrip("af")  # variants such as 90a, with instructions of one architecture
+        built = int(digits[:-1]), int(digits[-1])
+        if built <= version and (kind == "compute" or built[0] == version[0]):
+            return True
+    return not built_for
 
 
 def free_mib(device: str = "cuda") -> float:
@@ -50,35 +73,39 @@ def free_mib(device: str = "cuda") -> float:
 def network_device(requested: Literal["auto", "cpu", "cuda"], section: str, needed_mib: float) -> str:
     """Return the device for the networks of a section of the settings, and log it.
 
-    `auto` uses a card if torch finds one with enough free memory.
+    `auto` uses a card if torch finds one with enough free memory; otherwise, the reason is logged, as a
+    warning if there is a card.
 
     Raises:
         DeviceError: `cuda` was requested, but there is no usable card.
         MemoryLimitError: `cuda` was requested, but the card has less than `needed_mib` of free memory.
     """
-    problem = None if requested == CPU else card_problem()
+    problem = "device: cpu" if requested == CPU else card_problem()
+    free = needed_mib
+    if problem is None and needed_mib:  # 0: CUDA isn't started, because it takes memory itself
+        try:
+            free = free_mib()
+        except Exception as error:  # torch raises several types if another program uses the card
+            problem = f"CUDA cannot be started: {first_line(error)}"
     if requested == "cuda" and problem:
         raise DeviceError(
             f"{section}.device: cuda was requested but cannot be used",
-            expected="an NVIDIA card, its driver, and a CUDA build of torch",
+            expected="an NVIDIA card, its driver, and a CUDA build of torch for this card",
             found=problem,
             fix=f"set {section}.device: auto or cpu",
         )
-    # asking for the free memory starts CUDA, which takes memory itself
-    if requested != CPU and problem is None and needed_mib and (free := free_mib()) < needed_mib:
-        if requested == "cuda":
-            raise MemoryLimitError(
-                f"the model in {section}.model needs more memory than the GPU has free",
-                expected=f"about {needed_mib / 1024:.1f} GiB",
-                found=f"{free / 1024:.1f} GiB",
-                fix=_fix(section),
-            )
+    if requested == "cuda" and free < needed_mib:
+        raise MemoryLimitError(
+            f"the model in {section}.model needs more memory than the GPU has free",
+            expected=f"about {needed_mib / 1024:.1f} GiB",
+            found=f"{free / 1024:.1f} GiB",
+            fix=_fix(section),
+        )
+    if not problem and free < needed_mib:
         problem = f"the GPU has {free / 1024:.1f} GiB free, and about {needed_mib / 1024:.1f} are needed"
-        logger.warning("%s runs on the CPU: %s", section, problem)
-        release_card()
-        return CPU
-    if problem or requested == CPU:
-        logger.debug("%s runs on the CPU: %s", section, problem or "device: cpu")
+    if problem:
+        level = logging.WARNING if requested != CPU and cards() else logging.DEBUG
+        logger.log(level, "%s runs on the CPU: %s", section, problem)
         release_card()
         return CPU
     logger.info("%s runs on the GPU", section)

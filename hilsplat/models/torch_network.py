@@ -73,6 +73,7 @@ class TorchNetwork(Network):
     """
 
     half = False  # see `in_half`
+    remedy = f"{Network.remedy}, or run it on the CPU (device: cpu)"
 
     def __init__(self, *network: Any, device: str) -> None:
         self.device = torch.device(device)

@@ -19,7 +19,8 @@ def areas_above(
 ) -> Int64[np.ndarray, "2 K"]:
     """Count the logits (K, h, w) above each threshold in the top left `size_hw`."""
     visible = steps[:, : size_hw[0], : size_hw[1]]
-    areas = torch.stack([(visible > threshold).sum(dim=(1, 2)) for threshold in thresholds])
+    limits = np.clip(thresholds, -128, 127).tolist()  # torch converts other numbers to int8 modulo 256
+    areas = torch.stack([(visible > limit).sum(dim=(1, 2)) for limit in limits])
     return np.asarray(areas.cpu())
 
 

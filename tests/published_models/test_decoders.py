@@ -52,9 +52,9 @@ def test_the_published_sam_2_decoder_is_factored(sam2, photograph, caplog):
 
 
 @pytest.mark.parametrize("fixed_points", [True, False])
-def test_plain_torchscript_and_free_prompts_are_factored(changed, sam2_model, photograph, fixed_points):
+def test_plain_torchscript_and_free_prompts_are_factored(changed, sam2_parts, photograph, fixed_points):
     folder, answer = changed(
-        lambda path: exports.export_sam2_decoder(sam2_model, path, fixed_points=fixed_points)
+        lambda path: exports.export_sam2_decoder(sam2_parts[0], path, fixed_points=fixed_points)
     )
     model = SamModel.load(folder)
     assert (model.factored is not None, model.decoder.axis) == (True, 0 if fixed_points else 1)
@@ -95,9 +95,9 @@ def test_reduced_precisions_run_as_exported_with_a_warning(
 
 
 def test_the_dynamo_exporter_s_decoder_runs_as_exported_with_a_warning(
-    changed, sam2_model, photograph, caplog
+    changed, sam2_parts, photograph, caplog
 ):
-    folder, answer = changed(lambda path: exports.export_sam2_decoder(sam2_model, path, dynamo=True))
+    folder, answer = changed(lambda path: exports.export_sam2_decoder(sam2_parts[0], path, dynamo=True))
     model = SamModel.load(folder)
     assert model.factored is None and SLOWER in caplog.text
     assert_answers(model, photograph, answer, EXACT)

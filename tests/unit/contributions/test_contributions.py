@@ -25,6 +25,7 @@ from hilsplat.embed.vectors import mask_embeddings
 from hilsplat.segment.digests import index_entry
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ContributionsSettings
+from tests.unit.segment.handmade import pack
 from tests.unit.two_boxes_world import (
     HEIGHT,
     NUM_GAUSSIANS,
@@ -46,9 +47,8 @@ def random_view(seed: int, num_gaussians: int = 40) -> tuple[sp.csr_matrix, Hier
     weights = weights.multiply(1 / np.maximum(weights.sum(axis=1), 1e-9)).tocsr()
     weights = sp.diags(np.where(rng.random(PIXELS) < 0.2, 0.3, 0.98)) @ weights
     dense = rng.random((8, *SIZE)) < rng.uniform(0.1, 0.6, (8, 1, 1))
-    level = np.array([1, 1, 1, 2, 2, 3, 3, 3], np.uint8)
-    ones = np.ones(8, np.float32)
-    return weights.astype(np.float32).tocsr(), HierarchicalMasks.from_dense(dense, level, ones, ones)
+    level = [1, 1, 1, 2, 2, 3, 3, 3]
+    return weights.astype(np.float32).tocsr(), pack(dense, level)
 
 
 def labelled_part(seed: int) -> StackedWeights:
@@ -271,8 +271,7 @@ def test_a_killed_run_resumes_from_its_checkpoint_if_it_is_whole(two_boxes, monk
 
 def test_masks_of_another_size_are_refused(two_boxes):
     view = two_boxes.views[1]
-    ones = np.ones(1, np.float32)
-    wrong = HierarchicalMasks.from_dense(np.ones((1, 4, 4), bool), np.ones(1, np.uint8), ones, ones)
+    wrong = pack(np.ones((1, 4, 4)))
     wrong.save(two_boxes.masks / f"{view}.npz")
     index = read_index(two_boxes.masks)["views"]
     write_index(two_boxes.masks, {**index, view: index_entry(wrong)}, segmenter="sam")

@@ -1,7 +1,8 @@
-"""Contributions on a card, run on the CPU with gsplat's reference functions in torch."""
+"""Contributions on a simulated card, with gsplat's reference functions in torch."""
 
 from collections.abc import Callable
 
+import gsplat
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -19,18 +20,27 @@ from hilsplat.settings import ContributionsSettings
 from hilsplat.splat.rasterise import cuda
 from hilsplat.splat.rasterise import device as choice
 from hilsplat.splat.rasterise.api import pixel_weights
-from tests.unit.card_on_cpu import replace_kernels
+from tests.unit.card_on_cpu import KERNELS, replace_kernels
 from tests.unit.contributions.test_contributions import random_view
+from tests.unit.segment.handmade import pack
+from tests.unit.simulated_card import kernel, simulated_card
 from tests.unit.splat.rasterise_scenes import camera, random_gaussians
 from tests.unit.two_boxes_world import two_boxes_weights
 
 
 @pytest.fixture(autouse=True)
-def _card_on_the_cpu(monkeypatch, request):
-    if not request.node.get_closest_marker("gpu"):
-        replace_kernels(monkeypatch)
-    elif problem := choice.cuda_problem():
-        pytest.skip(f"no CUDA device: {problem}")
+def _card(monkeypatch, request):
+    if request.node.get_closest_marker("gpu"):
+        if problem := choice.cuda_problem():
+            pytest.skip(f"no CUDA device: {problem}")
+        yield
+        return
+    replace_kernels(monkeypatch)
+    for name in KERNELS:
+        monkeypatch.setattr(gsplat, name, kernel(getattr(gsplat, name)))
+    monkeypatch.setattr(cuda, "DEVICE", "cuda")
+    with simulated_card(monkeypatch):
+        yield
 
 
 def entries(weights: sp.csr_matrix) -> cuda.Entries:
@@ -74,8 +84,7 @@ def random_masks(size_hw: tuple[int, int]) -> HierarchicalMasks:
     for mask in dense:
         top, left = rng.integers(0, size_hw[0] - 12), rng.integers(0, size_hw[1] - 12)
         mask[top : top + rng.integers(4, 24), left : left + rng.integers(4, 24)] = True
-    ones = np.ones(12, np.float32)
-    return HierarchicalMasks.from_dense(dense, np.repeat([1, 2, 3], 4).astype(np.uint8), ones, ones)
+    return pack(dense, np.repeat([1, 2, 3], 4))
 
 
 @pytest.mark.parametrize("where", ["gsplat's reference", pytest.param("a card", marks=pytest.mark.gpu)])

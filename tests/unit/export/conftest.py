@@ -156,11 +156,11 @@ def siglip_parts(transformers, tmp_path_factory):
     return model, images, folder
 
 
-@pytest.fixture(scope="session")
-def open_clip_folder(clip_parts, tmp_path_factory):
+@pytest.fixture
+def open_clip_folder(clip_parts, tmp_path):
     """The CLIP of `clip_parts` in open_clip's two folders, with one picture and one text per call."""
     model, processor, exported = clip_parts
-    folder = tmp_path_factory.mktemp("open_clip")
+    folder = tmp_path / "open_clip"
     visual = Call(model, lambda image: torch.nn.functional.normalize(model.get_image_features(image)))
     trace(visual, {"image": torch.zeros(1, 3, 32, 32)}, ["embedding"], {}, folder / "visual/model.onnx")
     textual = Call(model, lambda text: torch.nn.functional.normalize(model.get_text_features(text)))

@@ -91,7 +91,9 @@ def test_siglip_gives_what_transformers_gives(siglip_parts, tmp_path, split):
     assert "kind       siglip" in check_model(tmp_path / "siglip")
 
 
-def test_open_clip_in_two_folders_gives_what_transformers_gives(open_clip_folder, clip_parts):
+def test_open_clip_in_two_folders_gives_what_transformers_gives_and_cleans_texts(
+    open_clip_folder, clip_parts
+):
     model, processor, _ = clip_parts
     ours = ClipModel.load(open_clip_folder)
 
@@ -102,3 +104,11 @@ def test_open_clip_in_two_folders_gives_what_transformers_gives(open_clip_folder
     assert ours.width == 12
     names = {path.relative_to(open_clip_folder).as_posix() for path in ours.model.files}
     assert {"visual/model.onnx", "textual/model.onnx", "textual/tokenizer.json"} < names
+    config = json.loads((open_clip_folder / "config.json").read_text())
+    config["text_cfg"]["tokenizer_kwargs"] = {"clean": "canonicalize"}  # of SigLIP
+    (open_clip_folder / "config.json").write_text(json.dumps(config))
+    vectors = ClipModel.load(open_clip_folder).embed_texts(
+        ["red mug", "A Red_Mug  (here)!", "a red mug here"]
+    )
+    np.testing.assert_array_equal(vectors[1], vectors[2])
+    assert (vectors[0] != vectors[1]).any()
