@@ -51,13 +51,31 @@ def test_the_published_sam_2_decoder_is_factored(sam2, photograph, caplog):
     assert_answers(model, photograph, answer, EXACT)
 
 
-@pytest.mark.parametrize("fixed_points", [True, False])
-def test_plain_torchscript_and_free_prompts_are_factored(changed, sam2_parts, photograph, fixed_points):
-    folder, answer = changed(
-        lambda path: exports.export_sam2_decoder(sam2_parts[0], path, fixed_points=fixed_points)
-    )
+def as_int32_labels(path: Path) -> None:
+    """Let a decoder accept labels of 32 bits."""
+    model = onnx.load(path)
+    for value in model.graph.input:
+        if value.name == "input_labels":
+            value.type.tensor_type.elem_type = onnx.TensorProto.INT32
+    for node in model.graph.node:
+        node.input[:] = ["labels" if name == "input_labels" else name for name in node.input]
+    model.graph.node.insert(0, onnx.helper.make_node("Cast", ["input_labels"], ["labels"], to=7))
+    onnx.save(model, path)
+
+
+@pytest.mark.parametrize(
+    ("change", "axis"),
+    [
+        (lambda model, path: exports.export_sam2_decoder(model, path), 0),
+        (lambda model, path: exports.export_sam2_decoder(model, path, fixed_points=False), 1),
+        (lambda model, path: as_int32_labels(path), 0),
+    ],
+    ids=["plain TorchScript", "free prompts", "int32 labels"],
+)
+def test_other_forms_are_factored(changed, sam2_parts, photograph, change, axis):
+    folder, answer = changed(lambda path: change(sam2_parts[0], path))
     model = SamModel.load(folder)
-    assert (model.factored is not None, model.decoder.axis) == (True, 0 if fixed_points else 1)
+    assert (model.factored is not None, model.decoder.axis) == (True, axis)
     assert_answers(model, photograph, answer, EXACT)
 
 
