@@ -10,9 +10,9 @@ import torch
 from torch import nn
 
 from tests.published_models import exports
-from tests.unit.export.conftest import clip_parts, photograph, sam2_parts, sam_parts, transformers
+from tests.unit.export.conftest import photograph, sam2_parts, sam_parts, transformers
 
-__all__ = ["clip_parts", "photograph", "sam2_parts", "sam_parts", "transformers"]
+__all__ = ["photograph", "sam2_parts", "sam_parts", "transformers"]
 
 Answer = Callable[..., tuple[np.ndarray, np.ndarray]]
 """Predicted IoUs and logits for features, points (P, K, 2) and whether each point is inside."""

@@ -13,6 +13,7 @@ from hilsplat.base.errors import ModelError
 from hilsplat.embed.clip import ClipModel
 from hilsplat.embed.model_check import check_model
 from hilsplat.models.onnx_graph import split_clip
+from tests.published_models.exports import Call, declared_axes, trace
 
 TOLERANCE = 1e-4
 TEXTS = ["red mug", "a Mug on red", "x" * 40, "object"]
@@ -67,6 +68,30 @@ def test_clip_gives_what_transformers_gives(ours, clip_parts):
         return inputs
 
     assert_same_vectors(ours, model, processor.image_processor, inputs_of)
+
+
+def test_the_published_clip_gives_what_transformers_gives(clip_parts, tmp_path):
+    """Its text network accepts only ids, of fixed length."""
+    model, processor, exported = clip_parts
+    for file in exported.glob("*.json"):
+        shutil.copy(file, tmp_path)
+    for name, network, inputs, output in (
+        (
+            "vision_model",
+            model.get_image_features,
+            {"pixel_values": torch.zeros(1, 3, 32, 32)},
+            "image_embeds",
+        ),
+        ("text_model", model.get_text_features, {"input_ids": torch.ones((1, 16)).long()}, "text_embeds"),
+    ):
+        dynamic = {each: {0: "batch_size"} for each in (*inputs, output)}
+        trace(Call(model, network), inputs, [output], dynamic, tmp_path / f"onnx/{name}.onnx")
+    assert declared_axes(tmp_path / "onnx/text_model.onnx") == {"input_ids": ["batch_size", 16]}
+
+    def inputs_of(text: str) -> dict:
+        return {"input_ids": processor.tokenizer([text], truncation=True, return_tensors="pt")["input_ids"]}
+
+    assert_same_vectors(ClipModel.load(tmp_path), model, processor.image_processor, inputs_of)
 
 
 def test_a_folder_without_an_export_cannot_be_split(tmp_path: Path):
