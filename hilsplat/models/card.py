@@ -1,6 +1,7 @@
 """An NVIDIA card for the networks: whether to use it, and how many items fit into a call."""
 
 import logging
+import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
@@ -37,12 +38,8 @@ def card_problem() -> str | None:
         if not torch.cuda.is_available():
             return f"torch {torch.__version__} finds no CUDA device"
         version, built_for = torch.cuda.get_device_capability(), torch.cuda.get_arch_list()
-        if not has_kernels(version, built_for):
-            return (
-                f"torch {torch.__version__} has no kernels for compute capability {version[0]}.{version[1]}, "
-                f"only {' '.join(built_for)}"
-            )
-        return None
+        problem = "no kernels for compute capability {}.{}, only {}".format(*version, " ".join(built_for))
+        return None if has_kernels(version, built_for) else f"torch {torch.__version__} has {problem}"
     except Exception as error:  # a broken installation can raise anything
         return f"torch cannot be used: {first_line(error)}"
 
@@ -53,13 +50,10 @@ def has_kernels(version: tuple[int, int], built_for: Sequence[str]) -> bool:
     Machine code (`sm_`) runs on cards of the same major version and at least its minor version; the driver
     compiles `compute_` for any later card.
     """
-    for name in built_for:
-        kind, _, number = name.partition("_")
-        digits = number.rstrip("af")  # variants such as 90a, with instructions of one architecture
-        built = int(digits[:-1]), int(digits[-1])
-        if built <= version and (kind == "compute" or built[0] == version[0]):
-            return True
-    return not built_for
+    built = [(name.startswith("compute"), divmod(int(re.sub(r"\D", "", name)), 10)) for name in built_for]
+    return not built or any(
+        each <= version and (is_compiled_later or each[0] == version[0]) for is_compiled_later, each in built
+    )
 
 
 def free_mib(device: str = "cuda") -> float:

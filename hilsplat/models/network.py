@@ -94,7 +94,6 @@ class Network:
 
     runs_on: Sequence[str] = (CPU,)
     version = onnxruntime.__version__
-    remedy = "check that preprocessor_config.json belongs to this network"  # of a call that fails
     inputs: Mapping[str, Any]  # with the attributes of `Declared`
     outputs: Mapping[str, Any]
 
@@ -179,7 +178,7 @@ class Network:
         return ModelError(
             f"network {self.path} failed: {error}",
             found=", ".join(f"{name} {tuple(value.shape)}" for name, value in feeds.items()),
-            fix=self.remedy,
+            fix="check that preprocessor_config.json belongs to this network; on a GPU, also try device: cpu",
         )
 
     def _with_right_axes(self, outputs: list[Any]) -> list[Any]:

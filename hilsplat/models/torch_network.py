@@ -73,7 +73,6 @@ class TorchNetwork(Network):
     """
 
     half = False  # see `in_half`
-    remedy = f"{Network.remedy}, or run it on the CPU (device: cpu)"
 
     def __init__(self, *network: Any, device: str) -> None:
         self.device = torch.device(device)
@@ -257,12 +256,8 @@ def _value(attribute: Any) -> Any:
 def tensor_of(value: np.ndarray | Tensor, dtype: type) -> Tensor:
     """Return a tensor, or a copy of an array as a tensor, with a NumPy type."""
     if isinstance(value, Tensor):
-        return value.to(host_type(dtype))
+        return value.to(torch.from_numpy(np.empty(0, dtype)).dtype)
     return torch.from_numpy(np.array(value, dtype))
-
-
-def host_type(dtype: type) -> torch.dtype:
-    return torch.from_numpy(np.empty(0, dtype)).dtype
 
 
 def _declared(values: Any) -> dict[str, Declared]:
