@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from unittest.mock import patch
+from unittest.mock import Mock, patch
 
 import numpy as np
 import pytest
@@ -13,8 +13,9 @@ from hilsplat.base.lineage import sha256_of_path
 from hilsplat.configuration import parse_section
 from hilsplat.embed.clip import ClipModel, open_clip_of, unit
 from hilsplat.embed.stage import chosen_masks, run_clip
+from hilsplat.models import int8
 from hilsplat.models.folder import open_model_folder
-from hilsplat.models.int8 import reduced_precision
+from hilsplat.models.int8 import reduced_precision, use_reduced
 from hilsplat.models.network import Network
 from hilsplat.segment.digests import digests_in, index_entry
 from hilsplat.settings import ClipSettings
@@ -163,6 +164,18 @@ def test_int8_is_used_only_if_it_agrees_on_crops_of_the_scene(
     assert read_index(tmp_path / "full")["precision"] == "fp32"
     same = sha256_of_path(tmp_path / "auto") == sha256_of_path(tmp_path / "full")
     assert same == (precision == "fp32")
+
+
+def test_an_agreement_is_measured_again_by_other_code_or_for_other_inputs(tmp_path, monkeypatch):
+    measure = Mock(side_effect=[{"cosine": 0.995}, {"cosine": 0.5}, {"cosine": 0.5}])
+
+    def is_used(model: str) -> bool:
+        return use_reduced("int8", "auto", "CLIP", tmp_path, {"model": model}, measure)
+
+    monkeypatch.setattr(int8, "code_digest", lambda *roots: "code")
+    assert [is_used("one"), is_used("one"), is_used("two")] == [True, True, False]
+    monkeypatch.setattr(int8, "code_digest", lambda *roots: "edited")
+    assert not is_used("one") and measure.call_count == 3
 
 
 def test_an_embedded_model_runs_in_float32_with_a_warning_if_int8_is_required(project, caplog):
