@@ -57,6 +57,8 @@ def test_splitting_replaces_only_the_same_halves(clip_parts, tmp_path: Path):
     with pytest.raises(ModelError, match=r"vision_model\.onnx exists, and is not the half"):
         split_clip(folder)
     assert vision.read_text() == "of the user" and not text.exists()
+    with pytest.raises(ModelError, match=r"has no model.onnx to split"):
+        split_clip(tmp_path)
 
 
 def test_clip_gives_what_transformers_gives(ours, clip_parts):
@@ -92,11 +94,6 @@ def test_the_published_clip_gives_what_transformers_gives(clip_parts, tmp_path):
         return {"input_ids": processor.tokenizer([text], truncation=True, return_tensors="pt")["input_ids"]}
 
     assert_same_vectors(ClipModel.load(tmp_path), model, processor.image_processor, inputs_of)
-
-
-def test_a_folder_without_an_export_cannot_be_split(tmp_path: Path):
-    with pytest.raises(ModelError, match=r"has no model.onnx to split"):
-        split_clip(tmp_path)
 
 
 @pytest.mark.parametrize("split", [False, True])

@@ -2,7 +2,6 @@
 
 import ctypes
 import sys
-from types import SimpleNamespace
 from unittest.mock import Mock
 
 import numpy as np
@@ -125,25 +124,17 @@ def test_a_single_item_or_a_fixed_number_that_does_not_fit_ends_with_the_setting
 
 
 @pytest.mark.parametrize("text", ["CUDA error: out of memory", "CUDA error: CUBLAS_STATUS_ALLOC_FAILED"])
-def test_libraries_that_find_no_memory_count(text):
+def test_libraries_that_find_no_memory_count_and_other_errors_are_not_retried(text):
     assert is_out_of_memory(RuntimeError(text)) and not is_out_of_memory(ValueError(text))
-
-
-def test_other_errors_are_not_retried():
-    def work(rows: np.ndarray, number: int) -> None:
-        raise RuntimeError("no kernel image is available")
-
+    work = Mock(side_effect=RuntimeError("no kernel image is available"))
     with pytest.raises(RuntimeError, match="no kernel image"):
         list(Batches(4, "cpu:0", 8)(9, work))
 
 
 def test_the_memory_of_the_first_call_determines_the_size_of_later_calls(monkeypatch, with_card):
-    fake = SimpleNamespace(
-        reset_peak_memory_stats=lambda device: None,
-        memory_allocated=lambda device: 100 * 2**20,
-        max_memory_allocated=lambda device: 740 * 2**20,
-    )
-    monkeypatch.setattr(torch, "cuda", fake)
+    monkeypatch.setattr(torch, "cuda", fake := Mock())
+    fake.memory_allocated.return_value = 100 * 2**20
+    fake.max_memory_allocated.return_value = 740 * 2**20
     # 640 MiB for 16 items; 80 % of 4096 MiB hold 81
     assert [number for _, number in calls_of(Batches(16, "cuda", 256), 200)] == [16, 81, 81, 22]
     assert [number for _, number in calls_of(Batches(16, "cuda", 50), 120)] == [16, 50, 50, 4]
