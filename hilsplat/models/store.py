@@ -40,7 +40,7 @@ class Release:
 
 def _releases() -> tuple[Release, ...]:
     with Path(__file__).with_name("releases.tsv").open(encoding="utf-8", newline="") as stream:
-        rows = list(csv.DictReader(stream, delimiter="\t"))
+        rows: list[dict[str, Any]] = list(csv.DictReader(stream, delimiter="\t"))
     return tuple(Release(**{**row, "megabytes": int(row["megabytes"])}) for row in rows)
 
 
