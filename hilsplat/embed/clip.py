@@ -240,8 +240,9 @@ class ClipModel:
         sentence = self.template.replace("{}", text)
         if self.siglip:  # trained on lower-case texts
             sentence = sentence.lower()
-        if self.canonicalizes:
-            sentence = canonical(sentence)
+        if self.canonicalizes:  # as open_clip's tokenizer
+            words = sentence.replace("_", " ").translate(NO_PUNCTUATION).lower().split()
+            sentence = " ".join(words)
         if self.tokenizer.encode(sentence).overflowing:
             logger.warning("text truncated after %d tokens: %r", self.max_tokens, text)
         (vector,) = self.text(**self._tokens(sentence))
@@ -264,11 +265,6 @@ class ClipModel:
         encoding = self.tokenizer.encode(sentence)
         mask = np.array([encoding.attention_mask], dtype=np.int64)
         return {self.ids: np.array([encoding.ids], dtype=np.int64), "attention_mask": mask}
-
-
-def canonical(text: str) -> str:
-    """Return a text in lower case, with single spaces and no punctuation, as open_clip's tokenizers do."""
-    return " ".join(text.replace("_", " ").translate(NO_PUNCTUATION).lower().split())
 
 
 def unit(vectors: Float32[np.ndarray, "N C"]) -> Float32[np.ndarray, "N C"]:

@@ -187,14 +187,11 @@ class Batches:
             before = torch.cuda.memory_allocated(self.device)
             result = work(rows, number)
             each = (torch.cuda.max_memory_allocated(self.device) - before) / MIB / len(rows)
-            self.size = self.fitting(free_mib(self.device), each)
+            fitting = int(USED_SHARE * free_mib(self.device) / max(each, 1e-3))
+            self.size = max(1, min(self.most, fitting))
             self._is_measured = True
             logger.debug("%s: %.0f MiB per item, %d items per call", self.section, each, self.size)
             return result
-
-    def fitting(self, free: float, each: float) -> int:
-        """Return the number of items that fit into a card's free memory, if each takes `each`; MiB."""
-        return max(1, min(self.most, int(USED_SHARE * free / max(each, 1e-3))))
 
     def _shrink(self, number: int, problem: str) -> None:
         if number == 1 or self._is_fixed:

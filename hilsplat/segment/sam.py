@@ -402,8 +402,7 @@ def read_logits(
     if not isinstance(logits, np.ndarray):
         from hilsplat.segment import torch_masks
 
-        on_card = torch_masks.stepped(logits, LOGIT_STEP)
-        areas = torch_masks.areas_above(on_card, (upper, lower), (height, width))
+        on_card, areas = torch_masks.steps_and_areas(logits, LOGIT_STEP, (upper, lower), (height, width))
         return on_card, (areas[0] / np.maximum(areas[1], 1)).astype(np.float32), positive_boxes(on_card)
     steps, stability = np.empty(logits.shape, np.int8), np.empty(len(logits), np.float32)
     for row, values in enumerate(logits):  # one by one, in the processor's cache

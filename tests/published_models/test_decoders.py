@@ -96,29 +96,22 @@ def test_the_decoder_of_edgetam_is_factored(changed, photograph):
 @pytest.mark.parametrize(
     ("change", "tolerance", "reason"),
     [
-        (exports.as_fp16, 0.01, "its weights are float16"),
-        (exports.as_int8, 0.1, "it has no node mask_decoder/"),
-        (exports.as_q4, 0.6, "it has no node mask_decoder/"),
+        (lambda model, path: exports.as_fp16(path), 0.01, "its weights are float16"),
+        (lambda model, path: exports.as_int8(path), 0.1, "it has no node mask_decoder/"),
+        (lambda model, path: exports.as_q4(path), 0.6, "it has no node mask_decoder/"),
+        (lambda model, path: exports.export_sam2_decoder(model, path, dynamo=True), EXACT, ""),
     ],
+    ids=["float16", "int8", "4 bits", "torch's dynamo exporter"],
 )
-def test_reduced_precisions_run_as_exported_with_a_warning(
-    changed, photograph, caplog, change, tolerance, reason
+def test_reduced_precisions_and_other_exporters_run_as_exported_with_a_warning(
+    changed, sam2_parts, photograph, caplog, change, tolerance, reason
 ):
-    folder, answer = changed(change)
+    folder, answer = changed(lambda path: change(sam2_parts[0], path))
     model = SamModel.load(folder)
     assert model.factored is None and model.as_exported
     (warning,) = [record.message for record in caplog.records if record.name.startswith("hilsplat")]
     assert SLOWER in warning and reason in warning
     assert_answers(model, photograph, answer, tolerance)
-
-
-def test_the_dynamo_exporter_s_decoder_runs_as_exported_with_a_warning(
-    changed, sam2_parts, photograph, caplog
-):
-    folder, answer = changed(lambda path: exports.export_sam2_decoder(sam2_parts[0], path, dynamo=True))
-    model = SamModel.load(folder)
-    assert model.factored is None and SLOWER in caplog.text
-    assert_answers(model, photograph, answer, EXACT)
 
 
 @pytest.mark.parametrize("slim", [True, False])

@@ -105,10 +105,9 @@ def photograph() -> np.ndarray:
 @pytest.fixture(scope="session")
 def sam2_parts(transformers, tmp_path_factory):
     """A SAM 2 for images of 64 px: transformers' model, and its folder with the published signature."""
-    kind, folder = small_sam2(), tmp_path_factory.mktemp("sam2")
-    model = kind.model()
+    model, folder = small_sam2(), tmp_path_factory.mktemp("sam2")
     enliven(model)
-    export_sam2(kind, model, folder)
+    export_sam2(model, folder)
     return model, folder
 
 

@@ -19,6 +19,9 @@ HERE = "cpu:0"
 """The CPU as a device of torch; `cpu` means onnxruntime."""
 TOLERANCE = 1e-5
 
+BRANCHES = (
+    "then_branch = g () => (float[] t) { t = Neg (x) }, else_branch = h () => (float[] e) { e = Exp (x) }"
+)
 GRAPHS = [
     "w = ConstantOfShape <value = float[1] {3}> (s) y = Conv <pads = [1, 0, 2, 1], strides = [2, 1]> (x, w)",
     "w = ConstantOfShape <value = float[1] {3}> (s) y = ConvTranspose <strides = [2, 2], "
@@ -48,8 +51,7 @@ GRAPHS = [
     "g = Sigmoid (f) y = Clip (g, half0)",
     "a = Reshape <allowzero = 0> (x, rows) b = Unsqueeze (a, outer) c = Squeeze (b, outer) y = Softmax (c)",
     "n = NonZero (tiles) s2 = Shape (n) z = Cast <to = 1> (s2) t = ReduceSum (z) y = Mul (x, t)",
-    "c = Equal (two, two) d = Squeeze (c) y = If <then_branch = g () => (float[] t) { t = Neg (x) }, "
-    "else_branch = h () => (float[] e) { e = Exp (x) }> (d)",
+    f"c = Equal (two, two) d = Squeeze (c) y = If <{BRANCHES}> (d)",
     "o = OneHot <axis = 1> (minus, four, zero_one) p = ReduceSum (o) y = Add (x, p)",
     "i = ScatterElements <axis = 3> (x, index, updates) y = Add (i, x)",
     "d = ScatterND (x, at, rows3) g = GatherND (d, at) r = ReduceSum (g) y = Add (d, r)",
@@ -126,9 +128,7 @@ def test_operators(tmp_path, text):
         ("y = ArgMax <axis = 1, select_last_index = 1> (x)", "ArgMax in an unknown form"),
         ("n = NonZero (x) y = Cast <to = 1> (n)", "NonZero depends on values of its inputs"),
         (
-            "r = ReduceMax <keepdims = 0> (x) c = Greater (r, three) "
-            "y = If <then_branch = g () => (float[] t) { t = Neg (x) }, "
-            "else_branch = h () => (float[] e) { e = Exp (x) }> (c)",
+            f"r = ReduceMax <keepdims = 0> (x) c = Greater (r, three) y = If <{BRANCHES}> (c)",
             "If depends on values of its inputs",
         ),
     ],
