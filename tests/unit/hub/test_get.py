@@ -379,11 +379,14 @@ def set_offline(monkeypatch) -> None:
     reset_sessions()
 
 
-def test_offline_the_error_lists_the_files_to_copy(hub, monkeypatch):
+@pytest.mark.parametrize(("variant", "ending"), [("", ""), ("fp16", "_fp16")])
+def test_offline_the_error_lists_the_files_to_copy(hub, monkeypatch, variant, ending):
     set_offline(monkeypatch)
-    files = "config.json, preprocessor_config.json, tokenizer.json, onnx/vision_model.onnx"
-    message = rf"HF_HUB_OFFLINE is set(.|\n)*into models/clip-vit-base-patch16: {files}"
-    refuse(message, "clip-vit-base-patch16")
+    files = f"config.json, preprocessor_config.json, tokenizer.json, onnx/vision_model{ending}.onnx"
+    message = (
+        rf"HF_HUB_OFFLINE is set(.|\n)*into models/clip-vit-base-patch16{ending.replace('_', '-')}: {files}"
+    )
+    refuse(message, "clip-vit-base-patch16", variant=variant)
     assert hub.asked == []
 
 
