@@ -72,12 +72,6 @@ def networks_of(kind: str) -> list[tuple[str, ...]]:
     return [spec.places[::-1] for spec in LAYOUTS[kind].networks.values()]
 
 
-def usual_files(kind: str, variant: str) -> list[str]:
-    """Return the usual paths of all files that a variant of a kind of model requires."""
-    ending = f"_{variant}.onnx" if variant else ".onnx"
-    return [*LAYOUTS[kind].described, *(f"{places[0]}{ending}" for places in networks_of(kind))]
-
-
 @dataclass(frozen=True)
 class HubFile:
     """A file as listed by the hub."""

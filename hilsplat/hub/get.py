@@ -35,9 +35,9 @@ from hilsplat.hub.catalogue import (
     Listing,
     ModelRequest,
     choose_files,
+    networks_of,
     read_cached_listing,
     read_listing,
-    usual_files,
 )
 from hilsplat.hub.pins import pins
 from hilsplat.hub.retries import WRONG_LENGTH, reason_of, repeated
@@ -363,7 +363,9 @@ def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
         if isinstance(answered, requests.HTTPError) and answered.response is not None:
             raise _refused(answered, answered.response, requested.repository, place) from error
         families = [requested.release.family] if requested.release else ["sam", "clip"]
-        files = [file for family in families for file in usual_files(family, requested.variant)]
+        ending = f"_{requested.variant}.onnx" if requested.variant else ".onnx"
+        networks = [f"{places[0]}{ending}" for family in families for places in networks_of(family)]
+        files = [*(file for family in families for file in LAYOUTS[family].described), *networks]
         raise DownloadError(
             f"{requested.repository} cannot be downloaded: {type(error).__name__}, {place} is unreachable",
             found="HF_HUB_OFFLINE is set" if constants.HF_HUB_OFFLINE else _innermost(error),
