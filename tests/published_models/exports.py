@@ -7,6 +7,7 @@ import json
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import onnx
 import torch
@@ -124,14 +125,14 @@ def export_sam_decoder_without_labels(model: nn.Module, path: Path) -> None:
     trace(Call(model, decode), inputs, ["iou_scores", "pred_masks"], dynamic, path, opset=13)
 
 
-def sam2_model(config: object) -> nn.Module:
+def sam2_model(config: object) -> Any:
     import transformers
 
     torch.manual_seed(0)
     return transformers.Sam2Model(config).eval()
 
 
-def small_sam2() -> nn.Module:
+def small_sam2() -> Any:
     """A SAM 2 for images of 64 px."""
     import transformers
 
@@ -157,7 +158,7 @@ def small_sam2() -> nn.Module:
     return sam2_model(transformers.Sam2Config(vision, prompts, decoder))
 
 
-def full_sam2() -> nn.Module:
+def full_sam2() -> Any:
     """SAM 2.1 small at its published size."""
     import transformers
 
@@ -221,7 +222,7 @@ def export_sam2_decoder(
     trace(Call(model, sam2_decoder(model)), inputs, outputs, dynamic, path, dynamo=dynamo)
 
 
-def export_sam2(model: nn.Module, folder: Path) -> None:
+def export_sam2(model: Any, folder: Path) -> None:
     """Export a SAM 2.1 as published: TorchScript, onnxslim, weights in separate files."""
     side_px = model.config.prompt_encoder_config.image_size
     pixels = torch.zeros(1, 3, side_px, side_px)
