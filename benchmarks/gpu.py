@@ -5,9 +5,9 @@
     python -m benchmarks.gpu --part steps     # one part
     python -m benchmarks.gpu --models FOLDER  # with full-size networks (benchmarks.real_size exports them)
 
-Each part runs in its own process and fails alone. `gpu.json` and `gpu.md` are written to results/benchmarks.
-Nothing is downloaded. On a card, the seconds that a dry run's estimate uses are written to
-hilsplat/workflow/gpu.json.
+Each part fails alone; on a card, it runs in its own process. `gpu.json` and `gpu.md` are written to
+results/benchmarks. Nothing is downloaded. On a card, the seconds that the estimate of a dry run uses are
+written to hilsplat/workflow/gpu.json.
 """
 
 import argparse
@@ -18,7 +18,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+import traceback
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -83,13 +84,13 @@ CARD = Sizes(
 TINY = Sizes(
     2**24,
     256,
-    ((300, (48, 64)), (300, (96, 128)), (600, (48, 64))),
-    (400, 6, 48, 60),
+    ((100, (24, 32)), (100, (48, 64)), (200, (24, 32))),
+    (200, 4, 32, 30),
     None,
     (2000, 2, 160, 30),
-    (1, 8),
-    (4, 16),
-    8,
+    (1, 4),
+    (4, 8),
+    4,
 )
 
 
@@ -99,15 +100,17 @@ def synchronise(device: str) -> None:
 
 
 def median_ms(work: Callable[[], object], device: str, rounds: int) -> float:
-    """Return the median duration of a call after a warm-up, ms."""
-    times = []
-    for _ in range(rounds + 2):
+    """Return the median duration of a call after a warm-up, ms; of one call if it isn't on a card."""
+    times, warm_ups = [], 2
+    if device != "cuda":
+        rounds, warm_ups = 1, 0
+    for _ in range(rounds + warm_ups):
         synchronise(device)
         begun = time.perf_counter()
         work()
         synchronise(device)
         times.append(time.perf_counter() - begun)
-    return 1e3 * statistics.median(times[2:])
+    return 1e3 * statistics.median(times[warm_ups:])
 
 
 # ---- parts ---------------------------------------------------------------------------------------
@@ -336,19 +339,28 @@ PARTS = (machine, parity, tests, steps, fit, networks, contributions, slots, ans
 # ---- results -------------------------------------------------------------------------------------
 
 
-def run_part(name: str, device: str, models: Path | None) -> dict[str, Any]:
-    """Run a part in its own process; the result has its seconds, and "failed" if it did."""
-    command = [sys.executable, "-m", "benchmarks.gpu", "--part", name, "--device", device]
+def run_parts(names: Sequence[str], device: str, models: Path | None) -> dict[str, Any]:
+    """Run parts in one new process; each result has its seconds, and "failed" if the part failed."""
+    command = [sys.executable, "-m", "benchmarks.gpu", "--part", *names, "--device", device]
     command += ["--models", str(models)] if models else []
+    limit_s = LIMIT_S * len(names)
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=limit_s, cwd=ROOT)
+        if not done.returncode:
+            return json.loads(done.stdout.splitlines()[-1])
+        problem = done.stderr[-4000:]
+    except subprocess.TimeoutExpired:
+        problem = f"it took more than {limit_s} s"
+    return {name: {"failed": problem, "part_s": 0.0} for name in names}
+
+
+def result_of(part: Callable[..., dict[str, Any]], *given: Any) -> dict[str, Any]:
+    """Run a part in this process; the result is that of `run_parts`."""
     begun, result = time.perf_counter(), dict[str, Any]()
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, cwd=ROOT)
-        if done.returncode:
-            result["failed"] = done.stderr[-4000:]
-        else:
-            result = json.loads(done.stdout.splitlines()[-1])
-    except subprocess.TimeoutExpired:
-        result["failed"] = f"it took more than {LIMIT_S} s"
+        result = part(*given)
+    except Exception:  # the other parts still run
+        result["failed"] = traceback.format_exc()[-4000:]
     return {**result, "part_s": time.perf_counter() - begun}
 
 
@@ -384,7 +396,8 @@ def main() -> int:
     """Run all parts or one, write the results, and return 1 if a part failed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
-    parser.add_argument("--part", choices=[part.__name__ for part in PARTS])
+    names = [part.__name__ for part in PARTS]
+    parser.add_argument("--part", nargs="+", choices=names)
     parser.add_argument("--models", type=Path, help="folder of model folders; default: the embedded models")
     parser.add_argument("--out", type=Path, default=OUT)
     given = parser.parse_args()
@@ -395,15 +408,18 @@ def main() -> int:
             from tests.unit.card_on_cpu import replace_kernels
 
             replace_kernels(pytest.MonkeyPatch())
-        (part,) = (part for part in PARTS if part.__name__ == given.part)
-        print(json.dumps(part(given.device, CARD if given.device == "cuda" else TINY, given.models)))
+        sizes = CARD if given.device == "cuda" else TINY
+        chosen = [part for part in PARTS if part.__name__ in given.part]
+        print(
+            json.dumps({each.__name__: result_of(each, given.device, sizes, given.models) for each in chosen})
+        )
         return 0
     results = {}
-    for part in PARTS:
-        name = part.__name__
-        results[name] = run_part(name, given.device, given.models)
-        state = "FAILED" if "failed" in results[name] else "passed"
-        print(f"{name:<14} {state} {results[name]['part_s']:6.1f} s", flush=True)
+    # a part that fails on a card may leave it unusable for its process
+    for together in [[name] for name in names] if given.device == "cuda" else [names]:
+        for name, found in run_parts(together, given.device, given.models).items():
+            results[name], state = found, "FAILED" if "failed" in found else "passed"
+            print(f"{name:<14} {state} {found['part_s']:6.1f} s", flush=True)
     write_json(given.out / "gpu.json", results)
     failed = {name: found["failed"] for name, found in results.items() if "failed" in found}
     rows: list[tuple[str, ...]] = [

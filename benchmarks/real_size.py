@@ -65,13 +65,12 @@ def export_sam2(out: Path) -> None:
 
     from tests.published_models.exports import export_sam2, full_sam2
 
-    kind = full_sam2()
-    model = kind.model()
+    model = full_sam2()
     with torch.no_grad():
         for parameter in model.parameters():
             if (parameter == parameter.flatten()[0]).all():  # onnxslim would merge equal weights
                 parameter.add_(torch.randn_like(parameter), alpha=0.02)
-    export_sam2(kind, model, out)
+    export_sam2(model, out)
 
 
 def export_clip(out: Path) -> None:

@@ -139,22 +139,6 @@ class Output:
         write_npz(self._folder / "rows.npz", **arrays)
 
 
-def view_key(camera: Camera, masks_sha256: str | None, inputs: dict[str, Any]) -> str:
-    """Return the cache key of a view's matrices; `inputs` are the same for all views."""
-    pose = sha256_of_bytes(camera.cam_from_world.tobytes(), camera.K.tobytes())
-    return sha256_of_json({**inputs, "masks": masks_sha256, "camera": pose, "view": camera.name})
-
-
-def views_at_once(cameras: list[Camera], threads: int) -> int:
-    """Return 2 if W of two views fits in memory, because half the work on a view uses one thread, else 1."""
-    return min(2, max(1, threads)) if weights_of_view(cameras) <= MAX_WEIGHTS_TOGETHER else 1
-
-
-def weights_of_view(cameras: list[Camera]) -> int:
-    """Return the typical number of weights of the largest view."""
-    return WEIGHTS_PER_PIXEL * max((math.prod(camera.size_hw) for camera in cameras), default=0)
-
-
 def drawn_weights(gaussians: Gaussians, camera: Camera, *, min_weight: float, threads: int) -> sp.csr_matrix:
     """Return the normalised weights of Gaussians in a view."""
     return normalised_weights(pixel_weights(gaussians, camera, min_weight=min_weight, threads=threads))
@@ -199,16 +183,22 @@ def run_contributions(
         "gaussians": gaussians_sha256,
         "min_weight": settings.min_weight,
     }
-    keys = [view_key(camera, digests.get(camera.name), inputs) for camera in cameras]
+    poses = [sha256_of_bytes(camera.cam_from_world.tobytes(), camera.K.tobytes()) for camera in cameras]
+    keys = [
+        sha256_of_json({**inputs, "masks": digests.get(camera.name), "camera": pose, "view": camera.name})
+        for camera, pose in zip(cameras, poses, strict=True)
+    ]
     fixed_mib = BASE_MIB + GAUSSIAN_BYTES * len(gaussians) / MIB
-    view_mib = WEIGHT_BYTES * weights_of_view(cameras) / MIB
+    weights_of_view = WEIGHTS_PER_PIXEL * max((math.prod(camera.size_hw) for camera in cameras), default=0)
+    view_mib = WEIGHT_BYTES * weights_of_view / MIB
     require_memory(
         fixed_mib + view_mib,
         memory_mib,
         f"contributions of {len(gaussians):,} Gaussians in a view of {scene.name}",
         "lower poses.max_side_px or gaussians.max_gaussians",
     )
-    together = views_at_once(cameras, threads)
+    # half the work on a view uses one thread
+    together = min(2, max(1, threads)) if weights_of_view <= MAX_WEIGHTS_TOGETHER else 1
     if fixed_mib + together * view_mib > limit_mib(memory_mib):
         together = 1
     sums_mib = limit_mib(memory_mib) - fixed_mib - together * view_mib

@@ -1,6 +1,7 @@
 """CLIP: unit vectors of mask crops and texts in a shared space."""
 
 import logging
+import string
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -30,6 +31,7 @@ SIGLIP_STATISTICS = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
 """Mean and deviation of pixels if `preprocessor_config.json` lacks them, as in transformers."""
 SIGLIP_TOKENS = 64
 """Text length (tokens) of a SigLIP model whose configuration does not specify it."""
+NO_PUNCTUATION = str.maketrans("", "", string.punctuation)
 CARD_CROPS, MOST_CROPS = 64, 256
 """Crops of a card's first call, and maximum of later calls."""
 MODEL_PATTERNS = ("*/config.json", "*/*/config.json")  # configurations of the models in `models/`
@@ -62,7 +64,9 @@ class ClipModel:
         if not self.tokenizer.get_vocab_size(with_added_tokens=False):
             raise ModelError(f"{path} contains no words", fix=WHOLE_COPY)
         fixed = self.text.fixed_axis(self.ids, 1)
-        text_config = model.config.get("text_config", {})
+        text_config = model.config.get("text_config", model.config.get("text_cfg", {}))
+        cleaning = (text_config.get("tokenizer_kwargs") or {}).get("clean")
+        self.canonicalizes = cleaning == "canonicalize"  # SigLIP in open_clip's layout
         declared = text_config.get("max_position_embeddings", SIGLIP_TOKENS if self.siglip else None)
         truncation = self.tokenizer.truncation or {}
         self.max_tokens: int | None = fixed or declared or truncation.get("max_length")
@@ -236,6 +240,9 @@ class ClipModel:
         sentence = self.template.replace("{}", text)
         if self.siglip:  # trained on lower-case texts
             sentence = sentence.lower()
+        if self.canonicalizes:  # as open_clip's tokenizer
+            words = sentence.replace("_", " ").translate(NO_PUNCTUATION).lower().split()
+            sentence = " ".join(words)
         if self.tokenizer.encode(sentence).overflowing:
             logger.warning("text truncated after %d tokens: %r", self.max_tokens, text)
         (vector,) = self.text(**self._tokens(sentence))
@@ -244,11 +251,12 @@ class ClipModel:
     def _unit(self, vectors: Float32[np.ndarray, "N C"]) -> Float32[np.ndarray, "N C"]:
         """Scale a network's vectors to length 1; raise ModelError if this is impossible."""
         if not (np.isfinite(vectors).all() and vectors.any(axis=1).all()):
+            precision = "" if self.precision == "fp32" else "set clip.precision: fp32, or "
             raise ModelError(
                 f"the CLIP model {self.model.folder} gives vectors without a direction",
                 expected="finite numbers that are not all 0",
                 found=f"{vectors.min()} to {vectors.max()}",
-                fix="use another variant (clip.variant), or another export of the model",
+                fix=f"{precision}use another variant (clip.variant), or another export of the model",
             )
         return unit(vectors)
 

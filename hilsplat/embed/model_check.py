@@ -10,10 +10,12 @@ from pydantic import Field
 
 from hilsplat.base.artifacts import read_memo, write_json
 from hilsplat.base.cache import writable
-from hilsplat.base.errors import HilsplatError
+from hilsplat.base.errors import HilsplatError, in_one_line
 from hilsplat.embed.clip import ClipModel
+from hilsplat.models.card import in_turn
 from hilsplat.models.folder import input_side_px, open_model_folder
 from hilsplat.models.int8 import int8_network, reduced_precision
+from hilsplat.models.layouts import SECTIONS
 from hilsplat.models.network import require_one_space
 from hilsplat.models.repeatable import random_pixels
 from hilsplat.models.store import broken_models, present_models
@@ -78,16 +80,19 @@ def check_models() -> tuple[str, int]:
 
 
 def card_disagreement(folder: Path, device: str = "cuda") -> str | None:
-    """Return how a model's image network differs between a card and the CPU, or None.
+    """Return how a model's image network differs between a card and the CPU, or why it fails on the card.
 
-    A ModelError is raised if a network cannot run on the card.
+    None means that both agree.
     """
     model = open_model_folder(folder)
-    on_card = (
-        SamModel(model, device).encoder if model.kind == "sam" else ClipModel(model, device=device).vision
-    )
-    pixels = random_pixels(on_card, input_side_px(model))
-    pairs = zip(model.network(IMAGE_NETWORKS[model.kind])(**pixels), on_card(**pixels), strict=True)
+    try:
+        is_sam = model.kind == "sam"
+        on_card = SamModel(model, device).encoder if is_sam else ClipModel(model, device=device).vision
+        pixels = random_pixels(on_card, input_side_px(model))
+        found = in_turn(device, SECTIONS[model.kind], lambda: on_card(**pixels))
+    except HilsplatError as error:
+        return f"{device}: {in_one_line(error)}"
+    pairs = zip(model.network(IMAGE_NETWORKS[model.kind])(**pixels), found, strict=True)
     difference = max(float(np.linalg.norm(a - b)) / max(float(np.linalg.norm(a)), 1e-12) for a, b in pairs)
     if difference <= MAX_CARD_DIFFERENCE:
         return None

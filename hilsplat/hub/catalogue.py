@@ -43,6 +43,7 @@ class ModelRequest:
     name: str  # name of the model folder
     repository: str  # owner/name on the hub
     release: Release | None
+    variant: str  # suffix of the networks; empty for full precision
 
     @staticmethod
     def named(name: str, variant: str) -> "ModelRequest":
@@ -50,7 +51,7 @@ class ModelRequest:
         ending = f"-{variant}" if variant else ""
         for release in RELEASES:
             if name in (release.name, release.repository):
-                return ModelRequest(f"{release.name}{ending}", release.repository, release)
+                return ModelRequest(f"{release.name}{ending}", release.repository, release, variant)
         try:
             validate_repo_id(name)
         except HFValidationError as error:
@@ -63,17 +64,12 @@ class ModelRequest:
                 expected=f"{names}, or owner/name on the hub",
                 fix="choose one from `hilsplat models list`, or write owner/name",
             )
-        return ModelRequest(f"{name.split('/')[1]}{ending}", name, None)
+        return ModelRequest(f"{name.split('/')[1]}{ending}", name, None, variant)
 
 
 def networks_of(kind: str) -> list[tuple[str, ...]]:
     """Return the possible paths of each network, without `.onnx`; the usual path is first."""
     return [spec.places[::-1] for spec in LAYOUTS[kind].networks.values()]
-
-
-def usual_files(kind: str) -> list[str]:
-    """Return the usual paths of all files that a kind of model requires."""
-    return [*LAYOUTS[kind].described, *(f"{places[0]}.onnx" for places in networks_of(kind))]
 
 
 @dataclass(frozen=True)

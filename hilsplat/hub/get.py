@@ -35,9 +35,9 @@ from hilsplat.hub.catalogue import (
     Listing,
     ModelRequest,
     choose_files,
+    networks_of,
     read_cached_listing,
     read_listing,
-    usual_files,
 )
 from hilsplat.hub.pins import pins
 from hilsplat.hub.retries import WRONG_LENGTH, reason_of, repeated
@@ -91,7 +91,6 @@ class Download:
     choice: Choice
     staging: Path  # folder of the download; kept after a failure, for resuming
     target: Path
-    variant: str  # suffix of the networks; empty for full precision
 
     def num_bytes(self, *, missing: bool = False) -> int:
         """Return the total size of the required files, or only of those not transferred yet."""
@@ -130,7 +129,7 @@ def get_models(
             if _is_present(requested, target, listing):
                 reports.append(f"{target} already exists, from {listing.repository} at {listing.revision}")
             else:
-                downloads.append(_prepare(requested, listing, target, variant))
+                downloads.append(_prepare(requested, listing, target))
     if downloads:
         missing = sum(download.num_bytes(missing=True) for download in downloads)
         exports = sum(download.num_bytes() for download in downloads if download.choice.exported)
@@ -197,15 +196,15 @@ def _listing(requested: ModelRequest, revision: str | None) -> Listing:
         return cached
 
 
-def _prepare(requested: ModelRequest, listing: Listing, target: Path, variant: str) -> Download:
+def _prepare(requested: ModelRequest, listing: Listing, target: Path) -> Download:
     """Choose the files to download according to the repository's config.json."""
     staging = target.with_name(STAGING.format(name=target.name))
     if staging.exists() and not is_tagged(staging):
         raise DownloadError(f"{staging} exists, but is not a download of this version", fix="remove it first")
     tag(staging)
     (config,) = listing.require("config.json")
-    choice = choose_files(listing, _fetch(listing, config, staging).read_bytes(), variant)
-    download = Download(requested, listing, choice, staging, target, variant)
+    choice = choose_files(listing, _fetch(listing, config, staging).read_bytes(), requested.variant)
+    download = Download(requested, listing, choice, staging, target)
     licence = requested.release.licence if requested.release else "not stated by the hub"
     source = f"{requested.name}: {requested.repository} at {listing.revision[:12]}"
     size = f"{download.num_bytes() / 1e6:.1f} MB in {len(choice.files)} files"
@@ -225,7 +224,7 @@ def _needs(download: Download) -> str:
     (file,) = download.listing.require(LAYOUTS[layout].preprocessing)
     preprocessing = preprocessing_of(_fetch(download.listing, file, download.staging))
     model = ModelFolder(download.staging, layout, config, preprocessing, {}, ())
-    num_bytes, is_reduced = download.num_bytes(), bool(download.variant)
+    num_bytes, is_reduced = download.num_bytes(), bool(download.requested.variant)
     memory = needs_of(model, BATCHES[model.kind], as_exported=is_reduced, num_bytes=num_bytes)
     memory_mib, has_int8 = memory.total_mib(1), not is_reduced and num_bytes <= LARGE_BYTES
     disk = f"needs {num_bytes * (1 + INT8_SHARE * has_int8) / 1e6:.0f} MB of disk space"
@@ -364,12 +363,15 @@ def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
         if isinstance(answered, requests.HTTPError) and answered.response is not None:
             raise _refused(answered, answered.response, requested.repository, place) from error
         families = [requested.release.family] if requested.release else ["sam", "clip"]
+        ending = f"_{requested.variant}.onnx" if requested.variant else ".onnx"
+        networks = [f"{places[0]}{ending}" for family in families for places in networks_of(family)]
+        files = [*(file for family in families for file in LAYOUTS[family].described), *networks]
         raise DownloadError(
             f"{requested.repository} cannot be downloaded: {type(error).__name__}, {place} is unreachable",
             found="HF_HUB_OFFLINE is set" if constants.HF_HUB_OFFLINE else _innermost(error),
             fix=f"run the command again when the hub is reachable ({KEPT}; HF_ENDPOINT sets a mirror, "
             f"HTTPS_PROXY a proxy), or download these files from {place} into {models / requested.name}: "
-            f"{', '.join(file for family in families for file in usual_files(family))}",
+            f"{', '.join(dict.fromkeys(files))}",
         ) from error
     except OSError as error:
         if str(error).startswith(WRONG_LENGTH):

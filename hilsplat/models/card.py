@@ -1,8 +1,9 @@
 """An NVIDIA card for the networks: whether to use it, and how many items fit into a call."""
 
 import logging
+import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from threading import RLock
 from typing import Any, Literal, TypeVar
@@ -10,7 +11,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from jaxtyping import Int64
 
-from hilsplat.base.cards import has_driver, release_card
+from hilsplat.base.cards import cards, has_driver, release_card
 from hilsplat.base.errors import DeviceError, MemoryLimitError, first_line
 
 logger = logging.getLogger(__name__)
@@ -34,9 +35,25 @@ def card_problem() -> str | None:
     try:
         import torch
 
-        return None if torch.cuda.is_available() else f"torch {torch.__version__} finds no CUDA device"
+        if not torch.cuda.is_available():
+            return f"torch {torch.__version__} finds no CUDA device"
+        version, built_for = torch.cuda.get_device_capability(), torch.cuda.get_arch_list()
+        problem = "no kernels for compute capability {}.{}, only {}".format(*version, " ".join(built_for))
+        return None if has_kernels(version, built_for) else f"torch {torch.__version__} has {problem}"
     except Exception as error:  # a broken installation can raise anything
-        return f"torch cannot be imported: {first_line(error)}"
+        return f"torch cannot be used: {first_line(error)}"
+
+
+def has_kernels(version: tuple[int, int], built_for: Sequence[str]) -> bool:
+    """Return whether a card of a compute capability can run a build of torch for architectures (`sm_86`).
+
+    Machine code (`sm_`) runs on cards of the same major version and at least its minor version; the driver
+    compiles `compute_` for any later card.
+    """
+    built = [(name.startswith("compute"), divmod(int(re.sub(r"\D", "", name)), 10)) for name in built_for]
+    return not built or any(
+        each <= version and (is_compiled_later or each[0] == version[0]) for is_compiled_later, each in built
+    )
 
 
 def free_mib(device: str = "cuda") -> float:
@@ -50,35 +67,39 @@ def free_mib(device: str = "cuda") -> float:
 def network_device(requested: Literal["auto", "cpu", "cuda"], section: str, needed_mib: float) -> str:
     """Return the device for the networks of a section of the settings, and log it.
 
-    `auto` uses a card if torch finds one with enough free memory.
+    `auto` uses a card if torch finds one with enough free memory; otherwise, the reason is logged, as a
+    warning if there is a card.
 
     Raises:
         DeviceError: `cuda` was requested, but there is no usable card.
         MemoryLimitError: `cuda` was requested, but the card has less than `needed_mib` of free memory.
     """
-    problem = None if requested == CPU else card_problem()
+    problem = "device: cpu" if requested == CPU else card_problem()
+    free = needed_mib
+    if problem is None and needed_mib:  # 0: CUDA isn't started, because it takes memory itself
+        try:
+            free = free_mib()
+        except Exception as error:  # torch raises several types if another program uses the card
+            problem = f"CUDA cannot be started: {first_line(error)}"
     if requested == "cuda" and problem:
         raise DeviceError(
             f"{section}.device: cuda was requested but cannot be used",
-            expected="an NVIDIA card, its driver, and a CUDA build of torch",
+            expected="an NVIDIA card, its driver, and a CUDA build of torch for this card",
             found=problem,
             fix=f"set {section}.device: auto or cpu",
         )
-    # asking for the free memory starts CUDA, which takes memory itself
-    if requested != CPU and problem is None and needed_mib and (free := free_mib()) < needed_mib:
-        if requested == "cuda":
-            raise MemoryLimitError(
-                f"the model in {section}.model needs more memory than the GPU has free",
-                expected=f"about {needed_mib / 1024:.1f} GiB",
-                found=f"{free / 1024:.1f} GiB",
-                fix=_fix(section),
-            )
+    if requested == "cuda" and free < needed_mib:
+        raise MemoryLimitError(
+            f"the model in {section}.model needs more memory than the GPU has free",
+            expected=f"about {needed_mib / 1024:.1f} GiB",
+            found=f"{free / 1024:.1f} GiB",
+            fix=_fix(section),
+        )
+    if not problem and free < needed_mib:
         problem = f"the GPU has {free / 1024:.1f} GiB free, and about {needed_mib / 1024:.1f} are needed"
-        logger.warning("%s runs on the CPU: %s", section, problem)
-        release_card()
-        return CPU
-    if problem or requested == CPU:
-        logger.debug("%s runs on the CPU: %s", section, problem or "device: cpu")
+    if problem:
+        level = logging.WARNING if requested != CPU and cards() else logging.DEBUG
+        logger.log(level, "%s runs on the CPU: %s", section, problem)
         release_card()
         return CPU
     logger.info("%s runs on the GPU", section)
@@ -166,14 +187,11 @@ class Batches:
             before = torch.cuda.memory_allocated(self.device)
             result = work(rows, number)
             each = (torch.cuda.max_memory_allocated(self.device) - before) / MIB / len(rows)
-            self.size = self.fitting(free_mib(self.device), each)
+            fitting = int(USED_SHARE * free_mib(self.device) / max(each, 1e-3))
+            self.size = max(1, min(self.most, fitting))
             self._is_measured = True
             logger.debug("%s: %.0f MiB per item, %d items per call", self.section, each, self.size)
             return result
-
-    def fitting(self, free: float, each: float) -> int:
-        """Return the number of items that fit into a card's free memory, if each takes `each`; MiB."""
-        return max(1, min(self.most, int(USED_SHARE * free / max(each, 1e-3))))
 
     def _shrink(self, number: int, problem: str) -> None:
         if number == 1 or self._is_fixed:

@@ -101,4 +101,4 @@ def _attention_mib(vision: dict[str, Any], side_px: int, default_heads: int = SA
 
 
 def _patch_px(vision: dict[str, Any]) -> int:
-    return vision.get("patch_size", 16)
+    return vision.get("patch_size") or 16  # open_clip's ResNets have null

@@ -178,7 +178,7 @@ class Network:
         return ModelError(
             f"network {self.path} failed: {error}",
             found=", ".join(f"{name} {tuple(value.shape)}" for name, value in feeds.items()),
-            fix="check that preprocessor_config.json belongs to this network",
+            fix="check that preprocessor_config.json belongs to this network; on a GPU, also try device: cpu",
         )
 
     def _with_right_axes(self, outputs: list[Any]) -> list[Any]:

@@ -40,18 +40,8 @@ class Release:
 
 def _releases() -> tuple[Release, ...]:
     with Path(__file__).with_name("releases.tsv").open(encoding="utf-8", newline="") as stream:
-        rows = list(csv.DictReader(stream, delimiter="\t"))
-    return tuple(
-        Release(
-            name=row["name"],
-            repository=row["repository"],
-            megabytes=int(row["megabytes"]),
-            family=row["family"],
-            licence=row["licence"],
-            use=row["use"],
-        )
-        for row in rows
-    )
+        rows: list[dict[str, Any]] = list(csv.DictReader(stream, delimiter="\t"))
+    return tuple(Release(**{**row, "megabytes": int(row["megabytes"])}) for row in rows)
 
 
 RELEASES = _releases()

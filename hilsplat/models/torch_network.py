@@ -256,12 +256,8 @@ def _value(attribute: Any) -> Any:
 def tensor_of(value: np.ndarray | Tensor, dtype: type) -> Tensor:
     """Return a tensor, or a copy of an array as a tensor, with a NumPy type."""
     if isinstance(value, Tensor):
-        return value.to(host_type(dtype))
+        return value.to(torch.from_numpy(np.empty(0, dtype)).dtype)
     return torch.from_numpy(np.array(value, dtype))
-
-
-def host_type(dtype: type) -> torch.dtype:
-    return torch.from_numpy(np.empty(0, dtype)).dtype
 
 
 def _declared(values: Any) -> dict[str, Declared]:

@@ -30,7 +30,7 @@ from jaxtyping import Float, Float32, Float64
 
 from cpusplat.lanes import WIDTH
 from hilsplat.base.errors import ModelError
-from hilsplat.models.network import Array, one_thread_session
+from hilsplat.models.network import DTYPES, Array, one_thread_session
 from hilsplat.models.onnx_graph import Graph
 from hilsplat.segment import decoder_kernels as kernels
 from hilsplat.segment.decoder_kernels import (
@@ -399,7 +399,8 @@ class FactoredDecoder:
     ) -> list[np.ndarray]:
         """Run a subgraph of the decoder for prompts of one point."""
         feeds = self._network.feeds(features, points_xy[:, None])
-        return session.run(None, {node.name: feeds[node.name] for node in session.get_inputs()})
+        types = {node.name: DTYPES[node.type] for node in session.get_inputs()}
+        return session.run(None, {name: np.asarray(feeds[name], dtype) for name, dtype in types.items()})
 
     def _sizes(self, image: ImageTerms, number: int, tokens: int) -> tuple[int, ...]:
         """Return the sizes that `decoder_kernels.read_image` documents."""

@@ -149,7 +149,8 @@ class SamModel:
             encoded, points = self.encode(image, encoder), grid * (image.shape[1], image.shape[0])
 
             def decode(rows: np.ndarray, number: int) -> np.ndarray:
-                return on_host(self.decode(encoded, points[rows])[1])[:number]
+                # without the check of `decode`: an overflow in lower precision only means disagreement
+                return on_host(self._decode(encoded, points[rows])[1])[:number]
 
             logits = np.concatenate(list(self.batches("masks", batch)(len(points), decode)))
             return logits.reshape(-1, *logits.shape[2:]) > 0
@@ -286,21 +287,26 @@ class SamModel:
         self, encoded: Encoded, points_xy: Float[np.ndarray, "P 2"]
     ) -> tuple[Float32[np.ndarray, "P 3"], Float32[Array, "P 3 h w"]]:
         """Return predicted IoUs and low-resolution logits (ordered as `HEADS`) for each image point, px."""
+        iou, logits = self._decode(encoded, points_xy)
+        return self._finite(iou), logits
+
+    def _decode(
+        self, encoded: Encoded, points_xy: Float[np.ndarray, "P 2"]
+    ) -> tuple[Float32[Array, "P 3"], Float32[Array, "P 3 h w"]]:
         points = in_input(points_xy, encoded.frame)
         if self.factored and encoded.terms:
-            iou, logits, _ = self.factored.decode(encoded.terms, points, fine=True)
-            return self._finite(iou), logits
-        iou, logits = self.decoder(encoded.features, points[:, None])
-        return self._finite(iou), logits
+            return self.factored.decode(encoded.terms, points, fine=True)[:2]
+        return self.decoder(encoded.features, points[:, None])
 
     def _finite(self, iou: Float32[Array, "*n"]) -> Float32[np.ndarray, "*n"]:
         """Return predicted IoUs; raise ModelError if they are not numbers, as otherwise no mask is kept."""
         iou = on_host(iou)
         if not np.isfinite(iou).all():
+            precision = "" if self.precision == "fp32" else "set masks.precision: fp32, or "
             raise ModelError(
                 f"the SAM model {self.model.folder} predicts {np.count_nonzero(~np.isfinite(iou))} IoUs of "
                 f"{iou.size} that are not finite",
-                fix="use another variant (masks.variant), or another export of the model",
+                fix=f"{precision}use another variant (masks.variant), or another export of the model",
             )
         return iou
 
@@ -396,8 +402,7 @@ def read_logits(
     if not isinstance(logits, np.ndarray):
         from hilsplat.segment import torch_masks
 
-        on_card = torch_masks.stepped(logits, LOGIT_STEP)
-        areas = torch_masks.areas_above(on_card, (upper, lower), (height, width))
+        on_card, areas = torch_masks.steps_and_areas(logits, LOGIT_STEP, (upper, lower), (height, width))
         return on_card, (areas[0] / np.maximum(areas[1], 1)).astype(np.float32), positive_boxes(on_card)
     steps, stability = np.empty(logits.shape, np.int8), np.empty(len(logits), np.float32)
     for row, values in enumerate(logits):  # one by one, in the processor's cache

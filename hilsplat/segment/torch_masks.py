@@ -8,19 +8,15 @@ from torch import Tensor
 
 
 @torch.inference_mode()
-def stepped(logits: Tensor, step: float) -> Tensor:
-    """Return logits (K, h, w) in steps, int8."""
-    return (logits / step).round().clamp(-127, 127).to(torch.int8)
-
-
-@torch.inference_mode()
-def areas_above(
-    steps: Tensor, thresholds: tuple[int, int], size_hw: tuple[int, int]
-) -> Int64[np.ndarray, "2 K"]:
-    """Count the logits (K, h, w) above each threshold in the top left `size_hw`."""
+def steps_and_areas(
+    logits: Tensor, step: float, thresholds: tuple[int, int], size_hw: tuple[int, int]
+) -> tuple[Tensor, Int64[np.ndarray, "2 K"]]:
+    """Return logits (K, h, w) as int8 steps, and the areas above each threshold in the top left `size_hw`."""
+    steps = (logits / step).round().clamp(-127, 127).to(torch.int8)
     visible = steps[:, : size_hw[0], : size_hw[1]]
-    areas = torch.stack([(visible > threshold).sum(dim=(1, 2)) for threshold in thresholds])
-    return np.asarray(areas.cpu())
+    limits = np.clip(thresholds, -128, 127).tolist()  # torch converts other numbers to int8 modulo 256
+    areas = torch.stack([(visible > limit).sum(dim=(1, 2)) for limit in limits])
+    return steps, np.asarray(areas.cpu())
 
 
 @torch.inference_mode()

@@ -243,8 +243,8 @@ def run_semantic_tree(
     with stage_log("semantic tree", scene) as counts:
         join_wholes = read_index(masks_folder, "segmenter")["segmenter"] == "graph"
         tree = build_tree(contributions, settings, threads, join_wholes, of_levels, memory_mib)
-        per_level = {level.label: len(tree.nodes_of(level)) for level in LEVELS}
-        counts |= {**per_level, "orphans": int(((tree.parent == NONE) & (tree.level > 1)).sum())}
+        counts |= {level.label: len(tree.nodes_of(level)) for level in LEVELS}
+        counts["orphans"] = int(((tree.parent == NONE) & (tree.level > 1)).sum())
         if not len(tree):
             logger.warning(
                 "the semantic tree of %s has no nodes: no group of linked masks spans %d views; "

@@ -31,7 +31,7 @@ DECAY_SHARE = 0.25  # final share of a budget, during which the learning rate de
 def has_fast_half(device: torch.device) -> bool:
     """Return whether the device has fast bfloat16 convolutions: some GPUs, and CPUs with AVX512-BF16."""
     if device.type == "cuda":
-        return torch.cuda.is_bf16_supported()
+        return torch.cuda.is_bf16_supported(including_emulation=False)
     supported = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
     return bool(supported and supported())
 

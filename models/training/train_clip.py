@@ -101,7 +101,7 @@ def train_clip(
     tokenizer = word_tokenizer([*captioner.phrases, *CANONICAL, *frames])
     vision, text = ClipVision(), ClipText(tokenizer.get_vocab_size())
     nn.utils.convert_conv2d_weight_memory_format(vision, torch.channels_last)
-    scale = Scale()
+    scale = nn.ParameterDict({"logarithm": torch.tensor(np.log(10.0), dtype=torch.float32)})  # of the cosines
     training = Training({"vision": vision, "text": text, "scale": scale}, tuning, state, name, where)
     drawer = CropDraw(crops, batch)
     quick = np.arange(0, len(validation), max(1, len(validation) // QUICK_CROPS))
@@ -125,7 +125,7 @@ def train_clip(
         with torch.autocast(where.type, torch.bfloat16, enabled=half):
             features = vision.layers(pixels)
         image = vision.projected(features.float())
-        loss = contrastive_loss(image, text(words, mask), valid, scale.logarithm.exp().clamp(max=60.0))
+        loss = contrastive_loss(image, text(words, mask), valid, scale["logarithm"].exp().clamp(max=60.0))
         return loss, {"contrastive": loss.item()}
 
     def measure() -> dict[str, float]:
@@ -134,11 +134,3 @@ def train_clip(
 
     curve = training.run(make, loss_of, measure, budget)
     return Clip(vision.cpu().eval(), text.cpu().eval(), tokenizer), curve
-
-
-class Scale(nn.Module):
-    """Logarithm of the factor on the cosines."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.logarithm = nn.Parameter(torch.tensor(np.log(10.0), dtype=torch.float32))

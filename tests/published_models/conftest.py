@@ -10,9 +10,9 @@ import torch
 from torch import nn
 
 from tests.published_models import exports
-from tests.unit.export.conftest import clip_parts, photograph, sam_parts, transformers
+from tests.unit.export.conftest import photograph, sam2_parts, sam_parts, transformers
 
-__all__ = ["clip_parts", "photograph", "sam_parts", "transformers"]
+__all__ = ["photograph", "sam2_parts", "sam_parts", "transformers"]
 
 Answer = Callable[..., tuple[np.ndarray, np.ndarray]]
 """Predicted IoUs and logits for features, points (P, K, 2) and whether each point is inside."""
@@ -21,42 +21,37 @@ Answer = Callable[..., tuple[np.ndarray, np.ndarray]]
 def sam2_answer(model: nn.Module) -> Answer:
     """Return the official decoder of SAM 2 without boxes: one image, prompts along axis 1."""
     decode = exports.sam2_decoder(model)
-
-    def answer(features, points, inside):
-        embeddings = [torch.from_numpy(features[name]) for name in exports.EMBEDDINGS]
-        with torch.no_grad():
-            scores, masks, _ = decode(points, inside, None, *embeddings)
-        return scores[0].numpy(), masks[0].numpy()
-
-    return lambda features, points, inside: answer(
-        features, torch.from_numpy(points).float()[None], torch.from_numpy(inside).long()[None]
-    )
+    return _answer(lambda features, points, inside: decode(points, inside, None, *features.values()))
 
 
 def sam_answer(model: nn.Module) -> Answer:
     """Return the official decoder of SAM."""
 
+    def decode(features, points, inside):
+        embeddings = features["image_embeddings"]
+        found = model(
+            image_embeddings=embeddings, input_points=points, input_labels=inside, multimask_output=True
+        )
+        return found.iou_scores, found.pred_masks
+
+    return _answer(decode)
+
+
+def _answer(decode: Callable) -> Answer:
     def answer(features, points, inside):
+        tensors = {name: torch.from_numpy(value) for name, value in features.items()}
+        prompts = torch.from_numpy(points).float()[None], torch.from_numpy(inside).long()[None]
         with torch.no_grad():
-            found = model(
-                image_embeddings=torch.from_numpy(features["image_embeddings"]),
-                input_points=torch.from_numpy(points).float()[None],
-                input_labels=torch.from_numpy(inside).long()[None],
-                multimask_output=True,
-            )
-        return found.iou_scores[0].numpy(), found.pred_masks[0].numpy()
+            scores, masks = decode(tensors, *prompts)[:2]
+        return scores[0].numpy(), masks[0].numpy()
 
     return answer
 
 
 @pytest.fixture(scope="session")
-def sam2(transformers, tmp_path_factory) -> tuple[Path, Answer]:
+def sam2(sam2_parts) -> tuple[Path, Answer]:
     """SAM 2.1 with the published signature."""
-    kind = exports.small_sam2()
-    model = kind.model()
-    exports.enliven(model)
-    folder = tmp_path_factory.mktemp("published") / "sam2"
-    exports.export_sam2(kind, model, folder)
+    model, folder = sam2_parts
     return folder, sam2_answer(model)
 
 
@@ -71,11 +66,3 @@ def changed(sam2, tmp_path) -> Callable[[Callable[[Path], None]], tuple[Path, An
         return tmp_path / "sam2", answer
 
     return change
-
-
-@pytest.fixture(scope="session")
-def sam2_model(sam2) -> nn.Module:
-    """The model of `sam2`."""
-    model = exports.small_sam2().model()
-    exports.enliven(model)
-    return model

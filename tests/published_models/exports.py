@@ -6,8 +6,8 @@ docs/models.md lists the published models and what is known of their signatures.
 import json
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import onnx
 import torch
@@ -125,21 +125,14 @@ def export_sam_decoder_without_labels(model: nn.Module, path: Path) -> None:
     trace(Call(model, decode), inputs, ["iou_scores", "pred_masks"], dynamic, path, opset=13)
 
 
-@dataclass(frozen=True)
-class Sam2:
-    """Sizes of a SAM 2.1."""
+def sam2_model(config: object) -> Any:
+    import transformers
 
-    side_px: int
-    config: object
-
-    def model(self) -> nn.Module:
-        import transformers
-
-        torch.manual_seed(0)
-        return transformers.Sam2Model(self.config).eval()
+    torch.manual_seed(0)
+    return transformers.Sam2Model(config).eval()
 
 
-def small_sam2() -> Sam2:
+def small_sam2() -> Any:
     """A SAM 2 for images of 64 px."""
     import transformers
 
@@ -162,10 +155,10 @@ def small_sam2() -> Sam2:
     )
     prompts = {"hidden_size": 16, "image_size": 64, "patch_size": 16, "mask_input_channels": 4}
     decoder = {"hidden_size": 16, "mlp_dim": 32, "num_attention_heads": 2, "iou_head_hidden_dim": 16}
-    return Sam2(64, transformers.Sam2Config(vision, prompts, decoder))
+    return sam2_model(transformers.Sam2Config(vision, prompts, decoder))
 
 
-def full_sam2() -> Sam2:
+def full_sam2() -> Any:
     """SAM 2.1 small at its published size."""
     import transformers
 
@@ -174,7 +167,7 @@ def full_sam2() -> Sam2:
         global_attention_blocks=[7, 10, 13],
         window_positional_embedding_background_size=[7, 7],
     )
-    return Sam2(1024, transformers.Sam2Config(transformers.Sam2VisionConfig(backbone)))
+    return sam2_model(transformers.Sam2Config(transformers.Sam2VisionConfig(backbone)))
 
 
 def sam2_decoder(model: nn.Module) -> Callable:
@@ -229,9 +222,10 @@ def export_sam2_decoder(
     trace(Call(model, sam2_decoder(model)), inputs, outputs, dynamic, path, dynamo=dynamo)
 
 
-def export_sam2(kind: Sam2, model: nn.Module, folder: Path) -> None:
+def export_sam2(model: Any, folder: Path) -> None:
     """Export a SAM 2.1 as published: TorchScript, onnxslim, weights in separate files."""
-    pixels = torch.zeros(1, 3, kind.side_px, kind.side_px)
+    side_px = model.config.prompt_encoder_config.image_size
+    pixels = torch.zeros(1, 3, side_px, side_px)
     encode = Call(model, lambda pixels: tuple(model.get_image_embeddings(pixels)))
     encoder, decoder = folder / "onnx" / ENCODER, folder / "onnx" / DECODER
     trace(encode, {"pixel_values": pixels}, EMBEDDINGS, {}, encoder)
@@ -239,10 +233,10 @@ def export_sam2(kind: Sam2, model: nn.Module, folder: Path) -> None:
     for path in (encoder, decoder):
         slim(path)
         move_weights(path)
-    kind.config.save_pretrained(folder)
+    model.config.save_pretrained(folder)
     preprocessing = {
         "image_processor_type": "Sam2ImageProcessorFast",
-        "size": {"height": kind.side_px, "width": kind.side_px},
+        "size": {"height": side_px, "width": side_px},
         "image_mean": [0.485, 0.456, 0.406],
         "image_std": [0.229, 0.224, 0.225],
         "resample": 2,

@@ -51,13 +51,31 @@ def test_the_published_sam_2_decoder_is_factored(sam2, photograph, caplog):
     assert_answers(model, photograph, answer, EXACT)
 
 
-@pytest.mark.parametrize("fixed_points", [True, False])
-def test_plain_torchscript_and_free_prompts_are_factored(changed, sam2_model, photograph, fixed_points):
-    folder, answer = changed(
-        lambda path: exports.export_sam2_decoder(sam2_model, path, fixed_points=fixed_points)
-    )
+def as_int32_labels(path: Path) -> None:
+    """Let a decoder accept labels of 32 bits."""
+    model = onnx.load(path)
+    for value in model.graph.input:
+        if value.name == "input_labels":
+            value.type.tensor_type.elem_type = onnx.TensorProto.INT32
+    for node in model.graph.node:
+        node.input[:] = ["labels" if name == "input_labels" else name for name in node.input]
+    model.graph.node.insert(0, onnx.helper.make_node("Cast", ["input_labels"], ["labels"], to=7))
+    onnx.save(model, path)
+
+
+@pytest.mark.parametrize(
+    ("change", "axis"),
+    [
+        (lambda model, path: exports.export_sam2_decoder(model, path), 0),
+        (lambda model, path: exports.export_sam2_decoder(model, path, fixed_points=False), 1),
+        (lambda model, path: as_int32_labels(path), 0),
+    ],
+    ids=["plain TorchScript", "free prompts", "int32 labels"],
+)
+def test_other_forms_are_factored(changed, sam2_parts, photograph, change, axis):
+    folder, answer = changed(lambda path: change(sam2_parts[0], path))
     model = SamModel.load(folder)
-    assert (model.factored is not None, model.decoder.axis) == (True, 0 if fixed_points else 1)
+    assert (model.factored is not None, model.decoder.axis) == (True, axis)
     assert_answers(model, photograph, answer, EXACT)
 
 
@@ -78,29 +96,22 @@ def test_the_decoder_of_edgetam_is_factored(changed, photograph):
 @pytest.mark.parametrize(
     ("change", "tolerance", "reason"),
     [
-        (exports.as_fp16, 0.01, "its weights are float16"),
-        (exports.as_int8, 0.1, "it has no node mask_decoder/"),
-        (exports.as_q4, 0.6, "it has no node mask_decoder/"),
+        (lambda model, path: exports.as_fp16(path), 0.01, "its weights are float16"),
+        (lambda model, path: exports.as_int8(path), 0.1, "it has no node mask_decoder/"),
+        (lambda model, path: exports.as_q4(path), 0.6, "it has no node mask_decoder/"),
+        (lambda model, path: exports.export_sam2_decoder(model, path, dynamo=True), EXACT, ""),
     ],
+    ids=["float16", "int8", "4 bits", "torch's dynamo exporter"],
 )
-def test_reduced_precisions_run_as_exported_with_a_warning(
-    changed, photograph, caplog, change, tolerance, reason
+def test_reduced_precisions_and_other_exporters_run_as_exported_with_a_warning(
+    changed, sam2_parts, photograph, caplog, change, tolerance, reason
 ):
-    folder, answer = changed(change)
+    folder, answer = changed(lambda path: change(sam2_parts[0], path))
     model = SamModel.load(folder)
     assert model.factored is None and model.as_exported
     (warning,) = [record.message for record in caplog.records if record.name.startswith("hilsplat")]
     assert SLOWER in warning and reason in warning
     assert_answers(model, photograph, answer, tolerance)
-
-
-def test_the_dynamo_exporter_s_decoder_runs_as_exported_with_a_warning(
-    changed, sam2_model, photograph, caplog
-):
-    folder, answer = changed(lambda path: exports.export_sam2_decoder(sam2_model, path, dynamo=True))
-    model = SamModel.load(folder)
-    assert model.factored is None and SLOWER in caplog.text
-    assert_answers(model, photograph, answer, EXACT)
 
 
 @pytest.mark.parametrize("slim", [True, False])

@@ -8,7 +8,9 @@ grey.
 import json
 import logging
 import os
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +24,7 @@ from hilsplat.cli.main import app
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import index_entry
 from hilsplat.splat.coordinates import write_coordinates
+from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import save_ply
 from tests.unit.evaluate.builders import cameras_of, masks_of
 from tests.unit.round_gaussians import round_gaussians
@@ -39,6 +42,36 @@ REGIONS = (
     ("rim", 3, (4, 8), (2, 12), (250, 250, 0)),
 )
 SCENE = Path("results/photos/desk")
+
+
+def painted(regions: Sequence[tuple], size_hw: tuple[int, int]) -> np.ndarray:
+    canvas = np.zeros((*size_hw, 3), np.uint8)
+    for _, _, rows, columns, colour in regions:
+        canvas[slice(*rows), slice(*columns)] = colour
+    return canvas
+
+
+def plate(canvas: np.ndarray) -> Gaussians:
+    """A Gaussian at (column, row, 0) for each pixel, in its colour."""
+    rows, columns = np.divmod(np.arange(canvas[..., 0].size), canvas.shape[1])
+    colours = (canvas.reshape(-1, 3) / 255 - 0.5) / 0.28209479177387814
+    means = np.stack([columns, rows, np.zeros(len(rows))], axis=1)
+    plain = round_gaussians(means, log_scale=np.log(0.25), opacity_logit=5.0)
+    return replace(plain, sh=colours.astype(np.float32)[:, None])
+
+
+def run_stage(
+    places: Mapping[str, Path],
+    command: str,
+    out: Path,
+    *inputs: str,
+    settings: object = None,
+    more: tuple = (),
+) -> None:
+    """Run a stage by its command, with the paths of its inputs."""
+    options = [word for name in inputs for word in (f"--{name.replace('_', '-')}", str(places[name]))]
+    words = [command, *options, "--out", str(out), "--settings", json.dumps(settings or {}), *more]
+    app(words, standalone_mode=False)
 
 
 def region_mask(name: str, shift: int = 0) -> np.ndarray:
@@ -88,10 +121,8 @@ def build_finished_desk(project: Path) -> Path:
 
 
 def _write_scene() -> None:
-    """Photographs, cameras and Gaussians; a Gaussian at (column, row, 0) is a pixel of every view."""
-    canvas = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    for _, _, rows, columns, colour in REGIONS:
-        canvas[slice(*rows), slice(*columns)] = colour
+    """Photographs, cameras and Gaussians; a Gaussian is a pixel of every view."""
+    canvas = painted(REGIONS, (HEIGHT, WIDTH))
     names = tuple(f"{view:03d}.png" for view in range(NUM_VIEWS))
     distance = 30.0
     poses = np.tile(np.eye(4), (NUM_VIEWS, 1, 1))
@@ -109,12 +140,7 @@ def _write_scene() -> None:
     scene = Scene(SCENE / "scene", "photos/desk", "arbitrary", cameras, split, points, colours, np.eye(4))
     scene.save()
     write_json(SCENE / "scene/registration.json", {"poses": "given", "views": {}})
-    rows, columns = np.divmod(np.arange(HEIGHT * WIDTH), WIDTH)
-    count = len(rows)
-    colours = (canvas.reshape(-1, 3) / 255 - 0.5) / 0.28209479177387814
-    means = np.stack([columns, rows, np.zeros(count)], axis=1)
-    plain = round_gaussians(means, log_scale=np.log(0.25), opacity_logit=5.0)
-    gaussians = replace(plain, sh=colours.astype(np.float32)[:, None])
+    gaussians = plate(canvas)
     save_ply(SCENE / "gaussians.ply", gaussians)
     write_coordinates(SCENE / "gaussians.ply", scene, gaussians, {"kind": "fitted"})
     masks, entries = SCENE / "default/masks", {}
@@ -139,11 +165,7 @@ def _run_stages() -> None:
     places |= {"scene": SCENE / "scene", "gaussians": SCENE / "gaussians.ply"}
     places |= {"field": SCENE / "default/field.safetensors"}
 
-    def run(command: str, out: Path, *inputs: str, settings: dict | None = None, more: tuple = ()) -> None:
-        options = [word for name in inputs for word in (f"--{name.replace('_', '-')}", str(places[name]))]
-        words = [command, *options, "--out", str(out), "--settings", json.dumps(settings or {}), *more]
-        app(words, standalone_mode=False)
-
+    run = partial(run_stage, places)
     cache = ("--cache", "results/.cache")
     model = {"model": "models/colours"}
     run("coverage-tree", places["coverage_tree"], "masks")

@@ -25,6 +25,7 @@ from hilsplat.embed.vectors import mask_embeddings
 from hilsplat.segment.digests import index_entry
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ContributionsSettings
+from tests.unit.segment.handmade import pack
 from tests.unit.two_boxes_world import (
     HEIGHT,
     NUM_GAUSSIANS,
@@ -46,9 +47,8 @@ def random_view(seed: int, num_gaussians: int = 40) -> tuple[sp.csr_matrix, Hier
     weights = weights.multiply(1 / np.maximum(weights.sum(axis=1), 1e-9)).tocsr()
     weights = sp.diags(np.where(rng.random(PIXELS) < 0.2, 0.3, 0.98)) @ weights
     dense = rng.random((8, *SIZE)) < rng.uniform(0.1, 0.6, (8, 1, 1))
-    level = np.array([1, 1, 1, 2, 2, 3, 3, 3], np.uint8)
-    ones = np.ones(8, np.float32)
-    return weights.astype(np.float32).tocsr(), HierarchicalMasks.from_dense(dense, level, ones, ones)
+    level = [1, 1, 1, 2, 2, 3, 3, 3]
+    return weights.astype(np.float32).tocsr(), pack(dense, level)
 
 
 def labelled_part(seed: int) -> StackedWeights:
@@ -95,18 +95,21 @@ def test_mask_means_equal_their_definition(seed):
         assert all(arrays[name].tobytes() == again[name].tobytes() for name in arrays)
 
 
-def built(parts: list[StackedWeights], threads: int = 1, keep: str | None = None) -> Gram | StackedWeights:
+def built(
+    parts: list[StackedWeights], threads: int = 1, keep: str | None = None, arrays: Scratch = IN_MEMORY
+) -> Gram | StackedWeights:
     """Build G, or with `keep` G or W."""
-    more = threads, IN_MEMORY
+    more = threads, arrays
     builder = QuadraticBuilder(40, keep, len(parts), *more) if keep else GramBuilder(40, *more)
     for part in parts:
         builder.add(part)
     return builder.finish()
 
 
-def assert_same_gram(one: Gram, other: Gram) -> None:
-    for name in ("indptr", "indices", "values"):
-        assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
+def assert_same(one: Gram | StackedWeights, other: Gram | StackedWeights) -> None:
+    arrays = ("values", one, other) if isinstance(one, Gram) else ("data", one.weights, other.weights)
+    for name in ("indptr", "indices", arrays[0]):
+        assert getattr(arrays[1], name).tobytes() == getattr(arrays[2], name).tobytes()
 
 
 @pytest.mark.parametrize("channels", [1, 4, 16, 17])
@@ -144,12 +147,12 @@ def test_gram_depends_neither_on_threads_nor_on_how_the_pixels_are_divided(merge
     monkeypatch.setattr(quadratic_builder, "MERGE_AT", merge_at)
     parts = [labelled_part(seed) for seed in range(4)]
     one = built([stack_weights(list(parts), IN_MEMORY)])
-    assert_same_gram(built(parts), one)
-    assert_same_gram(built(parts, threads=2), one)
-    assert_same_gram(built(parts, keep="gram"), one)
+    assert_same(built(parts), one)
+    assert_same(built(parts, threads=2), one)
+    assert_same(built(parts, keep="gram"), one)
     # too many weights to hold: G of any size
     monkeypatch.setattr(quadratic_builder, "MAX_WEIGHTS", parts[0].nonzeros)
-    assert_same_gram(built(parts, keep="auto"), one)
+    assert_same(built(parts, keep="auto"), one)
 
 
 @pytest.mark.parametrize("memory_bytes", [0.0, 10_000.0])
@@ -157,13 +160,7 @@ def test_sums_in_files_are_the_same(memory_bytes, tmp_path):
     parts = [labelled_part(seed) for seed in range(4)]
     arrays = Scratch(tmp_path, memory_bytes)
     for keep in ("gram", "weights"):
-        builder, one = QuadraticBuilder(40, keep, len(parts), 2, arrays), built(parts, keep=keep)
-        for part in parts:
-            builder.add(part)
-        found = builder.finish()
-        matrices = (found, one) if keep == "gram" else (found.weights, one.weights)
-        for name in ("indptr", "indices", "values" if keep == "gram" else "data"):
-            assert getattr(matrices[0], name).tobytes() == getattr(matrices[1], name).tobytes()
+        assert_same(built(parts, 2, keep, arrays), built(parts, keep=keep))
     assert not list(tmp_path.iterdir())
 
 
@@ -197,8 +194,7 @@ def test_a_builder_resumes_from_its_state(keep):
     second.add(parts[2])
     whole, resumed = built(parts, keep=keep), second.finish()
     assert type(whole) is type(resumed)
-    columns = np.repeat(np.eye(40, dtype=np.float32)[:, None], 3, axis=1)
-    assert whole.product(columns).tobytes() == resumed.product(columns).tobytes()
+    assert_same(whole, resumed)
 
 
 def test_a_view_that_needs_more_memory_is_refused(two_boxes):
@@ -271,8 +267,7 @@ def test_a_killed_run_resumes_from_its_checkpoint_if_it_is_whole(two_boxes, monk
 
 def test_masks_of_another_size_are_refused(two_boxes):
     view = two_boxes.views[1]
-    ones = np.ones(1, np.float32)
-    wrong = HierarchicalMasks.from_dense(np.ones((1, 4, 4), bool), np.ones(1, np.uint8), ones, ones)
+    wrong = pack(np.ones((1, 4, 4)))
     wrong.save(two_boxes.masks / f"{view}.npz")
     index = read_index(two_boxes.masks)["views"]
     write_index(two_boxes.masks, {**index, view: index_entry(wrong)}, segmenter="sam")

@@ -1,7 +1,8 @@
-"""Contributions on a card, run on the CPU with gsplat's reference functions in torch."""
+"""Contributions on a simulated card, with gsplat's reference functions in torch."""
 
 from collections.abc import Callable
 
+import gsplat
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -19,18 +20,27 @@ from hilsplat.settings import ContributionsSettings
 from hilsplat.splat.rasterise import cuda
 from hilsplat.splat.rasterise import device as choice
 from hilsplat.splat.rasterise.api import pixel_weights
-from tests.unit.card_on_cpu import replace_kernels
+from tests.unit.card_on_cpu import KERNELS, replace_kernels
 from tests.unit.contributions.test_contributions import random_view
+from tests.unit.segment.handmade import pack
+from tests.unit.simulated_card import kernel, simulated_card
 from tests.unit.splat.rasterise_scenes import camera, random_gaussians
 from tests.unit.two_boxes_world import two_boxes_weights
 
 
 @pytest.fixture(autouse=True)
-def _card_on_the_cpu(monkeypatch, request):
-    if not request.node.get_closest_marker("gpu"):
-        replace_kernels(monkeypatch)
-    elif problem := choice.cuda_problem():
-        pytest.skip(f"no CUDA device: {problem}")
+def _card(monkeypatch, request):
+    if request.node.get_closest_marker("gpu"):
+        if problem := choice.cuda_problem():
+            pytest.skip(f"no CUDA device: {problem}")
+        yield
+        return
+    replace_kernels(monkeypatch)
+    for name in KERNELS:
+        monkeypatch.setattr(gsplat, name, kernel(getattr(gsplat, name)))
+    monkeypatch.setattr(cuda, "DEVICE", "cuda")
+    with simulated_card(monkeypatch):
+        yield
 
 
 def entries(weights: sp.csr_matrix) -> cuda.Entries:
@@ -39,33 +49,24 @@ def entries(weights: sp.csr_matrix) -> cuda.Entries:
     return cuda.Entries(*(torch.tensor(array, device=cuda.DEVICE) for array in arrays), weights.shape[1])
 
 
-def assert_same(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
-    assert list(found) == list(expected)
-    for name, values in expected.items():
-        assert found[name].dtype == values.dtype, name
-        np.testing.assert_allclose(found[name], values, rtol=1e-6, err_msg=name)
-
-
 @pytest.mark.parametrize("most", [1, 60, 2**24])
-@pytest.mark.parametrize("seed", range(3))
-def test_matrices_of_a_view_equal_those_of_the_cpu(monkeypatch, seed, most):
+@pytest.mark.parametrize(
+    ("seed", "rows", "covered"),
+    [*((seed, range(8), 1.0) for seed in range(3)), (0, [], 0.0), (0, [], 1.0), (0, [2], 0.0), (0, [2], 1.0)],
+)
+def test_matrices_of_a_view_equal_those_of_the_cpu(monkeypatch, seed, rows, covered, most):
     monkeypatch.setattr(card, "MAX_LISTED", most)
     raw, masks = random_view(seed)
+    raw, masks = (raw * covered).tocsr(), masks.take(np.array(rows, np.int64))
     on_card = card.normalised_entries(entries(raw))
     weights = normalised_weights(raw)
     np.testing.assert_array_equal(on_card.on_host().toarray(), weights.toarray())
     expected = view_matrices.view_contributions("v", weights, masks)
-    assert_same(card.view_contributions("v", on_card, masks), expected)
-
-
-@pytest.mark.parametrize("rows", [[], [2]])
-@pytest.mark.parametrize("covered", [0.0, 1.0])
-def test_views_without_masks_or_without_gaussians(rows, covered):
-    raw, masks = random_view(0)
-    masks, weights = masks.take(np.array(rows, np.int64)), normalised_weights((raw * covered).tocsr())
-    expected = view_matrices.view_contributions("v", weights, masks)
-    on_card = card.normalised_entries(entries((raw * covered).tocsr()))
-    assert_same(card.view_contributions("v", on_card, masks), expected)
+    found = card.view_contributions("v", on_card, masks)
+    assert list(found) == list(expected)
+    for name, values in expected.items():
+        assert found[name].dtype == values.dtype, name
+        np.testing.assert_allclose(found[name], values, rtol=1e-6, err_msg=name)
 
 
 def random_masks(size_hw: tuple[int, int]) -> HierarchicalMasks:
@@ -74,8 +75,7 @@ def random_masks(size_hw: tuple[int, int]) -> HierarchicalMasks:
     for mask in dense:
         top, left = rng.integers(0, size_hw[0] - 12), rng.integers(0, size_hw[1] - 12)
         mask[top : top + rng.integers(4, 24), left : left + rng.integers(4, 24)] = True
-    ones = np.ones(12, np.float32)
-    return HierarchicalMasks.from_dense(dense, np.repeat([1, 2, 3], 4).astype(np.uint8), ones, ones)
+    return pack(dense, np.repeat([1, 2, 3], 4))
 
 
 @pytest.mark.parametrize("where", ["gsplat's reference", pytest.param("a card", marks=pytest.mark.gpu)])

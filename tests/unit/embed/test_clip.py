@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from unittest.mock import patch
+from unittest.mock import Mock, patch
 
 import numpy as np
 import pytest
@@ -13,8 +13,9 @@ from hilsplat.base.lineage import sha256_of_path
 from hilsplat.configuration import parse_section
 from hilsplat.embed.clip import ClipModel, open_clip_of, unit
 from hilsplat.embed.stage import chosen_masks, run_clip
+from hilsplat.models import int8
 from hilsplat.models.folder import open_model_folder
-from hilsplat.models.int8 import reduced_precision
+from hilsplat.models.int8 import reduced_precision, use_reduced
 from hilsplat.models.network import Network
 from hilsplat.segment.digests import digests_in, index_entry
 from hilsplat.settings import ClipSettings
@@ -163,6 +164,45 @@ def test_int8_is_used_only_if_it_agrees_on_crops_of_the_scene(
     assert read_index(tmp_path / "full")["precision"] == "fp32"
     same = sha256_of_path(tmp_path / "auto") == sha256_of_path(tmp_path / "full")
     assert same == (precision == "fp32")
+
+
+@pytest.mark.parametrize(
+    ("vectors", "problem"),
+    [
+        ("Identity (zero)", "vectors without a direction"),
+        ("Div (zero, zero)", "vectors without a direction"),
+        ("Div (one, zero)", "vectors without a direction"),
+        ("Identity (one)", "the same vector for all crops"),
+    ],
+)
+def test_a_model_that_computes_no_usable_vectors_is_named(own_desk, colour_clip, tmp_path, vectors, problem):
+    graph = f"""broken (float[batch,3,4,4] pixel_values) => (float[batch,3] image_embeds) {{
+        mean = ReduceMean <axes = [2, 3], keepdims = 0> (pixel_values)
+        zero = Sub (mean, mean) one = Exp (zero) image_embeds = {vectors} }}"""
+    save_network(colour_clip / "vision_model.onnx", graph)
+    inputs = own_desk / "scene", own_desk / "default/masks", None, tmp_path / "broken", tmp_path / "cache"
+    with pytest.raises(ModelError, match=rf"clip gives {problem}(.|\n)*another export"):
+        run_clip(*inputs, ClipSettings(model=str(colour_clip)), threads=1)
+    assert not (tmp_path / "broken").exists()
+
+
+def test_a_text_without_a_vector_names_the_model(colour_clip, monkeypatch):
+    model = ClipModel.load(colour_clip)
+    monkeypatch.setattr(model, "text", lambda **_: (np.zeros((1, 3), np.float32),))
+    with pytest.raises(ModelError, match="vectors without a direction"):
+        model.embed_texts(["book"])
+
+
+def test_an_agreement_is_measured_again_by_other_code_or_for_other_inputs(tmp_path, monkeypatch):
+    measure = Mock(side_effect=[{"cosine": 0.995}, {"cosine": 0.5}, {"cosine": 0.5}])
+
+    def is_used(model: str) -> bool:
+        return use_reduced("int8", "auto", "CLIP", tmp_path, {"model": model}, measure)
+
+    monkeypatch.setattr(int8, "code_digest", lambda *roots: "code")
+    assert [is_used("one"), is_used("one"), is_used("two")] == [True, True, False]
+    monkeypatch.setattr(int8, "code_digest", lambda *roots: "edited")
+    assert not is_used("one") and measure.call_count == 3
 
 
 def test_an_embedded_model_runs_in_float32_with_a_warning_if_int8_is_required(project, caplog):

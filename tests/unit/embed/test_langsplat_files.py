@@ -18,7 +18,6 @@ from hilsplat.settings import ClipSettings, MasksSettings
 from tests.unit.segment.handmade import assert_equal_masks, pack, save_scene
 
 SIZE = (6, 8)
-BY_TREE = MasksSettings(levels="tree", theta=0.9)
 
 
 def camera(size_hw: tuple[int, int], name: str = "a.png") -> Camera:
@@ -79,33 +78,27 @@ def test_maps_by_hand():
     assert (set(np.unique(maps[2])), set(np.unique(maps[3])), maps[3, 0, 0]) == ({-1, 6}, {-1, 7}, -1)
 
 
-def test_exported_files_are_read_back(ours, files, scene, model, tmp_path):
+@pytest.mark.parametrize(
+    ("order", "levels"),
+    [([0, 1, 2, 3], MasksSettings(levels="head")), ([0, 3, 2, 1], MasksSettings(levels="tree", theta=0.9))],
+    ids=["levels of the maps", "subparts in the map of wholes, levels by the tree"],
+)
+def test_exported_files_are_read_back(ours, files, scene, model, tmp_path, order, levels):
     maps, vectors = (np.load(files / f"a_{kind}.npy", allow_pickle=False) for kind in "sf")
     assert (maps.shape, maps.dtype) == ((4, *SIZE), np.float32)
     assert (vectors.shape, vectors.dtype) == ((8, model.width), np.float32)
     np.save(files / "a_f.npy", 3 * vectors)  # lengths are normalised
-    run_imported_masks(scene, files, tmp_path / "masks again")
+    for path in files.glob("*_s.npy"):
+        np.save(path, np.load(path)[order])
+    run_imported_masks(scene, files, tmp_path / "masks again", levels)
     found = HierarchicalMasks.load(tmp_path / "masks again" / "a.png.npz")
     assert_equal_masks(found, nested())  # masks of a level do not overlap, so nothing was painted over
     assert read_index(tmp_path / "masks again")["views"]["a.png"] == index_entry(found)
     settings = ClipSettings(model=str(model.model.folder))
-    run_imported_clip(scene, files, tmp_path / "clip again", settings)
+    run_imported_clip(scene, files, tmp_path / "clip again", settings, levels)
     index = read_index(tmp_path / "clip again")
     assert (index["dim"], index["model"]) == (model.width, settings.model)
     assert index["views"]["a.png"] == {"masks_sha256": digest_of(found), "masks": 4}
-    again = read_npy(tmp_path / "clip again" / "a.png.npy").astype(float)
-    np.testing.assert_allclose(again, read_npy(ours[1] / "a.png.npy").astype(float), atol=1e-3)
-
-
-def test_levels_by_the_tree_replace_those_of_the_maps(ours, files, scene, model, tmp_path):
-    for path in files.glob("*_s.npy"):
-        np.save(path, np.load(path)[[0, 3, 2, 1]])  # subparts in the map of wholes
-    run_imported_masks(scene, files, tmp_path / "masks again", BY_TREE)
-    found = HierarchicalMasks.load(tmp_path / "masks again" / "a.png.npz")
-    assert_equal_masks(found, nested())
-    settings = ClipSettings(model=str(model.model.folder))
-    run_imported_clip(scene, files, tmp_path / "clip again", settings, BY_TREE)
-    assert read_index(tmp_path / "clip again")["views"]["a.png"]["masks_sha256"] == digest_of(found)
     again = read_npy(tmp_path / "clip again" / "a.png.npy").astype(float)
     np.testing.assert_allclose(again, read_npy(ours[1] / "a.png.npy").astype(float), atol=1e-3)
 
@@ -154,16 +147,22 @@ def test_missing_files_are_reported_and_half_of_the_views_need_them(files, scene
     assert not (tmp_path / "other").exists()
 
 
-def test_views_that_differ_only_after_a_dot_are_refused(ours, tmp_path):
-    for folder in ours:
-        write_index(folder, dict.fromkeys(("a.1.png", "a.2.png"), index_entry(nested())), scene="set/scene")
-    with pytest.raises(ArtifactError, match=r"a.1.png, a.2.png"):
-        write_langsplat(*ours, tmp_path / "files")
-
-
-def test_vectors_of_other_masks_are_refused(ours, tmp_path):
-    write_index(ours[1], {"a.png": index_entry(nested())}, scene="set/scene")
-    with pytest.raises(MisalignedArtifactError, match=r"clip was not made from the masks of view b\.png in "):
+@pytest.mark.parametrize(
+    ("masks", "clip", "error", "words"),
+    [
+        (("a.1.png", "a.2.png"), ("a.1.png", "a.2.png"), ArtifactError, r"a.1.png, a.2.png"),
+        (
+            ("a.png", "b.png"),
+            ("a.png",),
+            MisalignedArtifactError,
+            "was not made from the masks of view b",
+        ),
+    ],
+)
+def test_views_of_one_stem_and_vectors_of_other_masks_are_refused(ours, tmp_path, masks, clip, error, words):
+    for folder, views in zip(ours, (masks, clip), strict=True):
+        write_index(folder, dict.fromkeys(views, index_entry(nested())), scene="set/scene")
+    with pytest.raises(error, match=words):
         write_langsplat(*ours, tmp_path / "files")
 
 

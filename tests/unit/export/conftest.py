@@ -105,10 +105,9 @@ def photograph() -> np.ndarray:
 @pytest.fixture(scope="session")
 def sam2_parts(transformers, tmp_path_factory):
     """A SAM 2 for images of 64 px: transformers' model, and its folder with the published signature."""
-    kind, folder = small_sam2(), tmp_path_factory.mktemp("sam2")
-    model = kind.model()
+    model, folder = small_sam2(), tmp_path_factory.mktemp("sam2")
     enliven(model)
-    export_sam2(kind, model, folder)
+    export_sam2(model, folder)
     return model, folder
 
 
@@ -156,11 +155,11 @@ def siglip_parts(transformers, tmp_path_factory):
     return model, images, folder
 
 
-@pytest.fixture(scope="session")
-def open_clip_folder(clip_parts, tmp_path_factory):
+@pytest.fixture
+def open_clip_folder(clip_parts, tmp_path):
     """The CLIP of `clip_parts` in open_clip's two folders, with one picture and one text per call."""
     model, processor, exported = clip_parts
-    folder = tmp_path_factory.mktemp("open_clip")
+    folder = tmp_path / "open_clip"
     visual = Call(model, lambda image: torch.nn.functional.normalize(model.get_image_features(image)))
     trace(visual, {"image": torch.zeros(1, 3, 32, 32)}, ["embedding"], {}, folder / "visual/model.onnx")
     textual = Call(model, lambda text: torch.nn.functional.normalize(model.get_text_features(text)))

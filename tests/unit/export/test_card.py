@@ -1,10 +1,13 @@
 """SAM and CLIP in torch, as on a card, give what they give on the CPU in onnxruntime and numba.
 
-torch's device is the CPU, named `cpu:0`, because `cpu` means onnxruntime; in tests marked `gpu`, a card.
+The card is simulated, and real in tests marked `gpu`. `cpu:0` is the CPU in torch; `cpu` means onnxruntime.
 """
 
+import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -25,18 +28,23 @@ from hilsplat.segment.stage import run_masks
 from hilsplat.segment.torch_decoder import TorchDecoder
 from hilsplat.settings import ClipSettings, MasksSettings
 from tests.conftest import PROJECT
-from tests.unit.segment.handmade import save_scene, smooth_logits
+from tests.unit.segment.handmade import pack, save_scene, smooth_logits
+from tests.unit.simulated_card import simulated_card
 
 TOLERANCE = 2e-5
 """Of predicted IoUs and of logits, relative to the largest logit."""
 LOOSE = {"predicted_iou_min": 0, "stability_min": 0.1, "nms_score": 0}
 
 
-@pytest.fixture(params=["cpu:0", pytest.param("cuda", marks=pytest.mark.gpu)])
-def device(request) -> str:
-    if request.param == "cuda" and (problem := card_problem()):
+@pytest.fixture(params=["simulated", pytest.param("real", marks=pytest.mark.gpu)])
+def device(request, monkeypatch) -> Iterator[str]:
+    if request.param == "simulated":
+        with simulated_card(monkeypatch):
+            yield "cuda"
+    elif problem := card_problem():
         pytest.skip(problem)
-    return request.param
+    else:
+        yield "cuda"
 
 
 @pytest.fixture(params=["sam", "sam2", "sam-tiny"])
@@ -87,15 +95,15 @@ def test_candidates_agree(folder, photograph, device, official):
     np.testing.assert_allclose(other[in_band], one[in_band], atol=5e-3 if official else 1)
 
 
-@pytest.mark.parametrize("exact", [False, True])
-def test_masks_are_read_from_the_same_logits_exactly(device, exact):
+@pytest.mark.parametrize(("exact", "offset"), [(False, 1.0), (True, 20.0)])
+def test_masks_are_read_from_the_same_logits_exactly(device, exact, offset):
     frame = Frame((48, 64), (96, 128), (128, 128))
     logits = smooth_logits(20, 32, seed=1)
     logits[3] = -1  # an empty mask
     logits[4, -5:, -5:] = 30  # touches the border
     on_device = torch.from_numpy(logits).to(device)
-    steps, stability, boxes = read_logits(logits, 1.0, frame)
-    found = read_logits(on_device, 1.0, frame)
+    steps, stability, boxes = read_logits(logits, offset, frame)
+    found = read_logits(on_device, offset, frame)
     np.testing.assert_array_equal(found[0].cpu(), steps)
     np.testing.assert_array_equal(found[1], stability)
     np.testing.assert_array_equal(found[2], boxes)
@@ -108,22 +116,11 @@ def test_masks_are_read_from_the_same_logits_exactly(device, exact):
         np.testing.assert_array_equal(other, one)
 
 
-def test_the_number_of_prompts_per_call_does_not_change_masks(sam_parts, photograph):
+def test_calls_that_do_not_fit_into_memory_are_made_smaller_or_name_the_setting(
+    sam_parts, photograph, monkeypatch
+):
     model = SamModel(open_model_folder(sam_parts[-1]), "cpu:0")
     settings = MasksSettings(points_per_side=6, **LOOSE)
-    expected = decode_candidates(photograph, model, settings)
-    for calls in model._batches.values():
-        calls.size = 5
-    found = decode_candidates(photograph, model, settings)
-    np.testing.assert_array_equal(found.window_xyxy, expected.window_xyxy)
-    np.testing.assert_array_equal(found.logits, expected.logits)
-
-
-def test_masks_that_do_not_fit_into_memory_are_decoded_in_smaller_calls(sam_parts, photograph, monkeypatch):
-    model, settings = (
-        SamModel(open_model_folder(sam_parts[-1]), "cpu:0"),
-        MasksSettings(points_per_side=6, **LOOSE),
-    )
     expected, decode = decode_candidates(photograph, model, settings), TorchDecoder.decode
 
     def limited(self, image, points, *, fine):
@@ -133,19 +130,13 @@ def test_masks_that_do_not_fit_into_memory_are_decoded_in_smaller_calls(sam_part
 
     monkeypatch.setattr(TorchDecoder, "decode", limited)
     most = 3
-    np.testing.assert_array_equal(decode_candidates(photograph, model, settings).logits, expected.logits)
+    found = decode_candidates(photograph, model, settings)
+    np.testing.assert_array_equal(found.window_xyxy, expected.window_xyxy)
+    np.testing.assert_array_equal(found.logits, expected.logits)
     most = 0
     with pytest.raises(MemoryLimitError, match=r"1.00 GiB(.|\n)*masks.device: cpu"):
         decode_candidates(photograph, model, settings)
-
-
-def test_an_encoder_that_does_not_fit_into_memory_names_the_setting(sam_parts, photograph, monkeypatch):
-    model = SamModel(open_model_folder(sam_parts[-1]), "cpu:0")
-
-    def fail(*given: object, **feeds: object) -> None:
-        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 3.00 GiB.")
-
-    monkeypatch.setattr(TorchNetwork, "run", fail)
+    monkeypatch.setattr(TorchNetwork, "run", Mock(side_effect=torch.OutOfMemoryError("Tried 3.00 GiB.")))
     with pytest.raises(MemoryLimitError, match=r"3.00 GiB(.|\n)*masks.device: cpu"):
         model.encode(photograph)
 
@@ -170,10 +161,7 @@ def test_the_stage_masks(sam2_parts, photograph, tmp_path, monkeypatch, device):
 
 
 def test_the_stage_clip(clip_parts, photograph, tmp_path, monkeypatch, device):
-    folder = tmp_path / "clip"
-    folder.mkdir()
-    for path in clip_parts[2].iterdir():
-        (folder / path.name).write_bytes(path.read_bytes())
+    folder = shutil.copytree(clip_parts[2], tmp_path / "clip")
     split_clip(folder)
     scene = save_scene(tmp_path / "scene", {"0.png": photograph})
     masks = MasksSettings(segmenter="graph")
@@ -196,13 +184,9 @@ def test_the_stage_clip(clip_parts, photograph, tmp_path, monkeypatch, device):
 def test_crops_that_do_not_fit_into_memory_are_embedded_in_smaller_calls(photograph, monkeypatch):
     folder = open_model_folder(PROJECT / "models/clip-tiny")
     model, run, sizes = ClipModel(folder, device="cpu:0"), TorchNetwork.run, list[int]()
-    masks = HierarchicalMasks.from_dense(
-        np.random.default_rng(0).random((70, 60, 100)) > 0.5,
-        np.ones(70, np.uint8),
-        np.ones(70, np.float32),
-        np.ones(70, np.float32),
-    )
-    expected = model.embed_masks(photograph, masks)
+    _ = model.vision  # its check also calls it
+    masks = pack(np.random.default_rng(0).random((70, 60, 100)) > 0.5)
+    expected = ClipModel(folder).embed_masks(photograph, masks)
 
     def limited(self, **feeds):
         (pixels,) = feeds.values()
@@ -216,7 +200,7 @@ def test_crops_that_do_not_fit_into_memory_are_embedded_in_smaller_calls(photogr
     assert sizes == [64, 32, 16, 16, 16, 16, 6]
 
 
-@pytest.mark.parametrize(("shift", "precision"), [(0.0, "fp16"), (0.3, "fp32")])
+@pytest.mark.parametrize(("shift", "precision"), [(0.0, "fp16"), (0.3, "fp32"), (np.inf, "fp32")])
 def test_half_precision_is_used_if_the_masks_agree(
     sam_parts, photograph, tmp_path, monkeypatch, shift, precision
 ):
@@ -224,7 +208,7 @@ def test_half_precision_is_used_if_the_masks_agree(
     run = TorchNetwork.run
 
     def shifted(self, **feeds):
-        return [out + shift * self.half * out.flip(-1) for out in run(self, **feeds)]
+        return [out + shift * out.flip(-1) if self.half and shift else out for out in run(self, **feeds)]
 
     monkeypatch.setattr(TorchNetwork, "run", shifted)
     model.choose_precision("auto", [photograph], tmp_path)

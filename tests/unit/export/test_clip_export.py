@@ -13,6 +13,7 @@ from hilsplat.base.errors import ModelError
 from hilsplat.embed.clip import ClipModel
 from hilsplat.embed.model_check import check_model
 from hilsplat.models.onnx_graph import split_clip
+from tests.published_models.exports import Call, declared_axes, trace
 
 TOLERANCE = 1e-4
 TEXTS = ["red mug", "a Mug on red", "x" * 40, "object"]
@@ -56,6 +57,8 @@ def test_splitting_replaces_only_the_same_halves(clip_parts, tmp_path: Path):
     with pytest.raises(ModelError, match=r"vision_model\.onnx exists, and is not the half"):
         split_clip(folder)
     assert vision.read_text() == "of the user" and not text.exists()
+    with pytest.raises(ModelError, match=r"has no model.onnx to split"):
+        split_clip(tmp_path)
 
 
 def test_clip_gives_what_transformers_gives(ours, clip_parts):
@@ -69,9 +72,28 @@ def test_clip_gives_what_transformers_gives(ours, clip_parts):
     assert_same_vectors(ours, model, processor.image_processor, inputs_of)
 
 
-def test_a_folder_without_an_export_cannot_be_split(tmp_path: Path):
-    with pytest.raises(ModelError, match=r"has no model.onnx to split"):
-        split_clip(tmp_path)
+def test_the_published_clip_gives_what_transformers_gives(clip_parts, tmp_path):
+    """Its text network accepts only ids, of fixed length."""
+    model, processor, exported = clip_parts
+    for file in exported.glob("*.json"):
+        shutil.copy(file, tmp_path)
+    for name, network, inputs, output in (
+        (
+            "vision_model",
+            model.get_image_features,
+            {"pixel_values": torch.zeros(1, 3, 32, 32)},
+            "image_embeds",
+        ),
+        ("text_model", model.get_text_features, {"input_ids": torch.ones((1, 16)).long()}, "text_embeds"),
+    ):
+        dynamic = {each: {0: "batch_size"} for each in (*inputs, output)}
+        trace(Call(model, network), inputs, [output], dynamic, tmp_path / f"onnx/{name}.onnx")
+    assert declared_axes(tmp_path / "onnx/text_model.onnx") == {"input_ids": ["batch_size", 16]}
+
+    def inputs_of(text: str) -> dict:
+        return {"input_ids": processor.tokenizer([text], truncation=True, return_tensors="pt")["input_ids"]}
+
+    assert_same_vectors(ClipModel.load(tmp_path), model, processor.image_processor, inputs_of)
 
 
 @pytest.mark.parametrize("split", [False, True])
@@ -91,7 +113,9 @@ def test_siglip_gives_what_transformers_gives(siglip_parts, tmp_path, split):
     assert "kind       siglip" in check_model(tmp_path / "siglip")
 
 
-def test_open_clip_in_two_folders_gives_what_transformers_gives(open_clip_folder, clip_parts):
+def test_open_clip_in_two_folders_gives_what_transformers_gives_and_cleans_texts(
+    open_clip_folder, clip_parts
+):
     model, processor, _ = clip_parts
     ours = ClipModel.load(open_clip_folder)
 
@@ -102,3 +126,11 @@ def test_open_clip_in_two_folders_gives_what_transformers_gives(open_clip_folder
     assert ours.width == 12
     names = {path.relative_to(open_clip_folder).as_posix() for path in ours.model.files}
     assert {"visual/model.onnx", "textual/model.onnx", "textual/tokenizer.json"} < names
+    config = json.loads((open_clip_folder / "config.json").read_text())
+    config["text_cfg"]["tokenizer_kwargs"] = {"clean": "canonicalize"}  # of SigLIP
+    (open_clip_folder / "config.json").write_text(json.dumps(config))
+    vectors = ClipModel.load(open_clip_folder).embed_texts(
+        ["red mug", "A Red_Mug  (here)!", "a red mug here"]
+    )
+    np.testing.assert_array_equal(vectors[1], vectors[2])
+    assert (vectors[0] != vectors[1]).any()

@@ -1,4 +1,4 @@
-"""The factored decoder gives the numbers of the plain network."""
+"""Previews of the factored decoder; its results are compared in `tests/published_models`."""
 
 import numpy as np
 import pytest
@@ -8,9 +8,6 @@ from hilsplat.segment.generate import decode_candidates
 from hilsplat.segment.sam import SamModel, in_input, point_grid
 from hilsplat.settings import MasksSettings
 
-TOLERANCE = 2e-5
-"""Of logits up to 10, and of IoUs. The network itself differs by 1e-5 between numbers of prompts per call."""
-
 
 @pytest.fixture(params=["sam", "sam2"])
 def model(request) -> SamModel:
@@ -18,15 +15,11 @@ def model(request) -> SamModel:
     return SamModel.load(parts[-1])
 
 
-def test_scores_logits_and_previews_agree(model, photograph):
+def test_previews_are_every_fourth_row_and_column_and_can_be_finished(model, photograph):
     encoded, points = model.encode(photograph), point_grid(5) * (100, 60)
     in_square = in_input(points, encoded.frame)
-    expected_iou, expected = model.decoder(encoded.features, in_square[:, None])
-    iou, logits, _ = model.factored.decode(encoded.terms, in_square, fine=True)
-    assert expected.std() > 0.1
-    np.testing.assert_allclose(iou, expected_iou, atol=TOLERANCE)
-    np.testing.assert_allclose(logits, expected, atol=TOLERANCE * np.abs(expected).max())
-    iou, coarse, kept = model.factored.decode(encoded.terms, in_square, fine=False)
+    _, logits, _ = model.factored.decode(encoded.terms, in_square, fine=True)
+    _, coarse, kept = model.factored.decode(encoded.terms, in_square, fine=False)
     np.testing.assert_array_equal(coarse, logits[..., ::4, ::4])
     some = {name: rows[3:20:4] for name, rows in kept.items()}
     np.testing.assert_array_equal(model.factored.logits(encoded.terms, some), logits[3:20:4])

@@ -53,7 +53,6 @@ def hub(repositories, monkeypatch, tmp_path) -> Iterator[LoopbackHub]:
         served.repositories.update(repositories)
         point_at(served.endpoint, monkeypatch)
         monkeypatch.setattr("hilsplat.hub.pins.TABLE", write_pins(tmp_path / "pins.tsv"))
-        pins.cache_clear()
         monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", False)
         monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
         monkeypatch.setattr(huggingface_hub.constants, "DOWNLOAD_CHUNK_SIZE", 2**16)
@@ -80,4 +79,5 @@ def write_pins(path: Path, *rows: tuple[str, str, str, str]) -> Path:
     """Write a table of pinned commits and digests, by default an empty one."""
     lines = [("repository", "commit", "path", "sha256"), *rows]
     path.write_text("".join("\t".join(line) + "\n" for line in lines))
+    pins.cache_clear()
     return path

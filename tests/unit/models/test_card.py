@@ -2,7 +2,7 @@
 
 import ctypes
 import sys
-from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -18,6 +18,7 @@ def with_card(monkeypatch):
     """A card with 4 GiB of free memory."""
     monkeypatch.setattr(card, "card_problem", lambda: None)
     monkeypatch.setattr(card, "free_mib", lambda device="cuda": 4096.0)
+    monkeypatch.setattr(card, "cards", lambda: ["0"])
 
 
 def test_a_card_is_used_if_it_has_enough_memory(with_card, caplog):
@@ -30,13 +31,50 @@ def test_a_card_is_used_if_it_has_enough_memory(with_card, caplog):
         network_device("cuda", "masks", 5000.0)
 
 
-def test_without_a_card_auto_means_the_cpu_and_cuda_is_an_error(monkeypatch):
-    monkeypatch.setattr(card, "card_problem", lambda: "no NVIDIA driver is installed")
+@pytest.mark.parametrize("cards", [[], ["0"]])
+def test_without_a_usable_card_auto_means_the_cpu_and_cuda_is_an_error(monkeypatch, caplog, cards):
+    monkeypatch.setattr(card, "card_problem", lambda: "torch 2.9.1+cpu finds no CUDA device")
+    monkeypatch.setattr(card, "cards", lambda: cards)
     assert network_device("auto", "clip", 1.0) == CPU
+    assert caplog.messages == ["clip runs on the CPU: torch 2.9.1+cpu finds no CUDA device"] * len(cards)
     with pytest.raises(
-        DeviceError, match=r"clip.device: cuda(.|\n)*no NVIDIA driver(.|\n)*clip.device: auto or cpu"
+        DeviceError, match=r"clip.device: cuda(.|\n)*finds no CUDA device(.|\n)*clip.device: auto or cpu"
     ):
         network_device("cuda", "clip", 1.0)
+
+
+def test_a_card_that_another_program_fills_or_locks_is_not_used(with_card, monkeypatch, caplog):
+    busy = RuntimeError("CUDA error: CUDA-capable device(s) is/are busy or unavailable\nmore")
+    monkeypatch.setattr(card, "free_mib", Mock(side_effect=busy))
+    assert network_device("auto", "masks", 100.0) == CPU
+    assert "masks runs on the CPU: CUDA cannot be started: CUDA error: CUDA-capable" in caplog.text
+    with pytest.raises(DeviceError, match=r"masks.device: cuda(.|\n)*busy or unavailable\n"):
+        network_device("cuda", "masks", 100.0)
+    assert network_device("cuda", "masks", 0.0) == "cuda"  # a plan doesn't start CUDA
+
+
+@pytest.mark.parametrize(
+    ("version", "built_for", "works"),
+    [
+        ((8, 9), "sm_75 sm_80 sm_86 sm_90", True),  # RTX 4090: code for 8.6
+        ((6, 1), "sm_75 sm_80 sm_86 sm_90", False),  # GTX 1080 and torch's builds for CUDA 12.8
+        ((12, 0), "sm_75 sm_80 sm_86 sm_90", False),  # RTX 5090 and builds for CUDA 12.4
+        ((12, 0), "sm_75 sm_90a compute_90", True),  # compiled by the driver
+        ((8, 0), "sm_86 compute_86", False),
+        ((8, 6), "", True),  # unknown
+    ],
+)
+def test_a_build_of_torch_without_kernels_for_the_card_is_not_used(monkeypatch, version, built_for, works):
+    monkeypatch.setattr(card, "has_driver", lambda: True)
+    for name, value in {
+        "is_available": True, "get_device_capability": version, "get_arch_list": built_for.split()
+    }.items():  # fmt: skip
+        monkeypatch.setattr(torch.cuda, name, lambda value=value: value)
+    card.card_problem.cache_clear()
+    problem = card.card_problem()
+    card.card_problem.cache_clear()
+    words = f"has no kernels for compute capability {version[0]}.{version[1]}, only {built_for}"
+    assert problem is None if works else problem.endswith(words)
 
 
 def test_a_missing_driver_is_found_without_importing_torch(monkeypatch):
@@ -49,7 +87,7 @@ def test_a_missing_driver_is_found_without_importing_torch(monkeypatch):
     assert card.card_problem() == "no NVIDIA driver is installed"
     monkeypatch.setattr(ctypes, "CDLL", lambda name: None)
     card.card_problem.cache_clear()
-    assert "torch cannot be imported" in card.card_problem()
+    assert "torch cannot be used" in card.card_problem()
     card.card_problem.cache_clear()
 
 
@@ -86,25 +124,17 @@ def test_a_single_item_or_a_fixed_number_that_does_not_fit_ends_with_the_setting
 
 
 @pytest.mark.parametrize("text", ["CUDA error: out of memory", "CUDA error: CUBLAS_STATUS_ALLOC_FAILED"])
-def test_libraries_that_find_no_memory_count(text):
+def test_libraries_that_find_no_memory_count_and_other_errors_are_not_retried(text):
     assert is_out_of_memory(RuntimeError(text)) and not is_out_of_memory(ValueError(text))
-
-
-def test_other_errors_are_not_retried():
-    def work(rows: np.ndarray, number: int) -> None:
-        raise RuntimeError("no kernel image is available")
-
+    work = Mock(side_effect=RuntimeError("no kernel image is available"))
     with pytest.raises(RuntimeError, match="no kernel image"):
         list(Batches(4, "cpu:0", 8)(9, work))
 
 
 def test_the_memory_of_the_first_call_determines_the_size_of_later_calls(monkeypatch, with_card):
-    fake = SimpleNamespace(
-        reset_peak_memory_stats=lambda device: None,
-        memory_allocated=lambda device: 100 * 2**20,
-        max_memory_allocated=lambda device: 740 * 2**20,
-    )
-    monkeypatch.setattr(torch, "cuda", fake)
+    monkeypatch.setattr(torch, "cuda", fake := Mock())
+    fake.memory_allocated.return_value = 100 * 2**20
+    fake.max_memory_allocated.return_value = 740 * 2**20
     # 640 MiB for 16 items; 80 % of 4096 MiB hold 81
     assert [number for _, number in calls_of(Batches(16, "cuda", 256), 200)] == [16, 81, 81, 22]
     assert [number for _, number in calls_of(Batches(16, "cuda", 50), 120)] == [16, 50, 50, 4]

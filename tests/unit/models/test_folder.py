@@ -40,19 +40,13 @@ def test_the_digest_covers_external_weights_in_a_file_of_any_name(sam, location)
     assert open_model_folder(sam).digest != before and Graph.read(network).digest != source
 
 
-def test_external_weights_of_constants_are_found(tmp_path):
-    path = tmp_path / "constant.onnx"
-    constant = helper.make_node("Constant", [], ["y"], value=numpy_helper.from_array(np.ones(99, np.float32)))
-    output = helper.make_tensor_value_info("y", TensorProto.FLOAT, [99])
-    onnx.save(helper.make_model(helper.make_graph([constant], "constant", [], [output])), path)
-    move_weights(path, "elsewhere")
-    assert external_weights(path) == [tmp_path / "elsewhere"]
-
-
 @pytest.mark.parametrize("location", ["../weights.bin", "/weights.bin", "weights.bin"])
-def test_missing_weights_and_paths_that_lead_out_of_the_folder_are_refused(sam, location):
+def test_short_or_missing_weights_and_paths_that_lead_out_of_the_folder_are_refused(sam, location):
     path, weights = sam / "onnx/vision_encoder.onnx", sam / "onnx/weights.bin"
     move_weights(path, weights.name)
+    weights.write_bytes(weights.read_bytes()[:-1])
+    with pytest.raises(ModelError, match=r"its weights file weights.bin is too short(.|\n)*complete copy"):
+        SamModel.load(sam)
     weights.rename(sam / "weights.bin")
     graph = onnx.load(path, load_external_data=False)
     for tensor in tensors_of(graph.graph):
@@ -74,23 +68,17 @@ def test_a_folder_of_links_as_in_the_cache_of_the_hub_works(sam, tmp_path):
         np.testing.assert_array_equal(value, expected[name])
 
 
-def test_a_truncated_weights_file_is_refused(sam):
-    path, weights = sam / "onnx/vision_encoder.onnx", sam / "onnx/weights.bin"
-    move_weights(path, weights.name)
-    weights.write_bytes(weights.read_bytes()[:-1])
-    with pytest.raises(ModelError, match=r"its weights file weights.bin is too short(.|\n)*complete copy"):
-        SamModel.load(sam)
-
-
-def test_external_weights_of_packed_and_other_types_are_read(tmp_path):
+def test_external_weights_of_constants_and_of_packed_and_other_types_are_read(tmp_path):
     path, rng = tmp_path / "network.onnx", np.random.default_rng(0)
     packed = helper.make_tensor("packed", TensorProto.INT4, [4000], rng.integers(-8, 8, 4000))
     brain = helper.make_tensor("brain", TensorProto.BFLOAT16, [4000], rng.standard_normal(4000))
     plain = numpy_helper.from_array(rng.standard_normal(4000).astype(np.float32), "plain")
+    constant = numpy_helper.from_array(rng.standard_normal(4000).astype(np.float32))
     nodes = [
+        helper.make_node("Constant", [], ["constant"], value=constant),
         helper.make_node("Cast", ["packed"], ["a"], to=TensorProto.FLOAT),
         helper.make_node("Cast", ["brain"], ["b"], to=TensorProto.FLOAT),
-        helper.make_node("Sum", ["a", "b", "plain", "x"], ["y"]),
+        helper.make_node("Sum", ["a", "b", "plain", "constant", "x"], ["y"]),
     ]
     values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [4000]) for name in "xy"]
     graph = helper.make_graph(nodes, "types", values[:1], values[1:], [packed, brain, plain])
@@ -98,6 +86,7 @@ def test_external_weights_of_packed_and_other_types_are_read(tmp_path):
     spec, x = NetworkSpec({"x": (None,)}, {"y": (None,)}), np.ones(4000, np.float32)
     expected = Network(path, spec)(x=x)[0]
     move_weights(path, "weights.bin")
+    assert external_weights(path) == [tmp_path / "weights.bin"]
     np.testing.assert_array_equal(Network(path, spec)(x=x)[0], expected)
 
 

@@ -43,6 +43,8 @@ def test_the_estimates_for_vit_b_agree_with_the_measurements(tmp_path):
     assert edgetam - 250 == pytest.approx((exported.view_mib - 512) * 4 / 12, rel=0.01)
     clip = needs_of(folder(tmp_path, "clip", {"vision_config": {}}, 224), batch=64)
     assert clip.view_mib == pytest.approx(521, rel=0.25)
+    resnet = {"vision_cfg": {"image_size": 224, "patch_size": None}}  # open_clip's RN50
+    assert needs_of(folder(tmp_path, "open_clip", resnet, 224), batch=64) == clip
 
 
 @pytest.mark.parametrize(("megabytes", "auto"), [(400, True), (1300, False)])

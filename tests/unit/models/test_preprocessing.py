@@ -78,33 +78,21 @@ def test_a_folder_with_unusable_values_is_not_opened(sam, change, words):
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "side"),
+    ("content", "side"),
     [
-        # CLIP of 2021 and of today, SigLIP, SAM 2 and open_clip, as published
-        ("preprocessor_config.json", {"size": 224, "crop_size": 224, "resample": 3}, 224),
-        (
-            "preprocessor_config.json",
-            {"size": {"shortest_edge": 224}, "crop_size": {"height": 224, "width": 224}},
-            224,
-        ),
-        ("preprocessor_config.json", {"do_convert_rgb": None, "size": {"height": 512, "width": 512}}, 512),
-        (
-            "preprocessor_config.json",
-            {"crop_size": None, "do_pad": None, "size": {"height": 1024, "width": 1024}},
-            1024,
-        ),
-        (
-            "preprocess_cfg.json",
-            {"size": [256, 256], "mean": [0.5] * 3, "std": [0.5] * 3, "mode": "RGB"},
-            256,
-        ),
-        ("preprocess_cfg.json", {"size": 256, "interpolation": "bicubic", "resize_mode": "shortest"}, 256),
-        ("preprocess_cfg.json", {}, None),
+        # CLIP of 2021 and of today, SigLIP, SAM 2, and open_clip in two versions, as published
+        ({"size": 224, "crop_size": 224, "resample": 3}, 224),
+        ({"size": {"shortest_edge": 224}, "crop_size": {"height": 224, "width": 224}}, 224),
+        ({"do_convert_rgb": None, "size": {"height": 512, "width": 512}}, 512),
+        ({"crop_size": None, "do_pad": None, "size": {"height": 1024, "width": 1024}}, 1024),
+        ({"size": [256, 256], "mean": [0.5] * 3, "std": [0.5] * 3, "mode": "RGB"}, 256),
+        ({"size": 256, "interpolation": "bicubic", "resize_mode": "shortest"}, 256),
+        ({}, None),
     ],
 )
-def test_published_forms_are_accepted(tmp_path, name, content, side):
-    (tmp_path / name).write_text(json.dumps(content))
-    found = preprocessing_of(tmp_path / name)
+def test_published_forms_are_accepted(tmp_path, content, side):
+    (tmp_path / "preprocessing.json").write_text(json.dumps(content))
+    found = preprocessing_of(tmp_path / "preprocessing.json")
     assert found.get("crop_size", found.get("size")) == side
     assert found.get("image_mean") == content.get("mean")
 

@@ -1,7 +1,10 @@
 """Errors for a model folder that is incomplete, damaged or of another kind."""
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +15,7 @@ from hilsplat.base.errors import ModelError
 from hilsplat.models.layouts import NetworkSpec
 from hilsplat.models.network import Network, require_one_space
 from hilsplat.segment.sam import SamModel
+from tests.conftest import PROJECT
 from tests.unit.segment.handmade import save_network
 
 ENCODER, CONFIG, PREPROCESSOR = "onnx/vision_encoder.onnx", "config.json", "preprocessor_config.json"
@@ -97,3 +101,14 @@ def test_a_decoder_whose_ious_are_not_numbers_is_named(disc_sam, monkeypatch, va
     monkeypatch.setattr(model, "decoder", lambda *_: (np.full_like(iou, value), logits))
     with pytest.raises(ModelError, match=r"predicts 6 IoUs of 6 that are not finite(.|\n)*masks.variant"):
         model.decode(encoded, np.full((2, 2), 8.0))
+
+
+@pytest.mark.parametrize("content", ["", "raise ImportError('libonnxruntime.so.1: cannot open')"])
+def test_an_onnxruntime_that_lost_its_files_is_named(tmp_path, content):
+    (tmp_path / "onnxruntime").mkdir()
+    (tmp_path / "onnxruntime/__init__.py").write_text(content)
+    environment = {**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{PROJECT}"}
+    words = [sys.executable, "-c", "import hilsplat.models.network"]
+    done = subprocess.run(words, env=environment, cwd=tmp_path, capture_output=True, text=True)
+    assert "ModelError: onnxruntime cannot be imported" in done.stderr
+    assert "--force-reinstall onnxruntime" in done.stderr

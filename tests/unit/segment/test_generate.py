@@ -75,19 +75,6 @@ def test_crops_by_hand():
     assert layers.tolist() == [0, 1, 1, 1, 1]
 
 
-def test_crops_find_finer_masks_and_truncated_ones_are_dropped(model):
-    image = np.zeros((128, 128, 3), dtype=np.uint8)
-    settings = changed(crop_layers=1, nms_inner=0.0)
-    masks, plain = generate(model, settings, image), generate(model, SETTINGS, image)
-    # whole image: 12 px of radius 3 at 128 px; crops of 86 px: 8 px
-    smallest = masks.area_px[masks.rows_of(Level.SUBPART)].min()
-    assert smallest < 0.6 * plain.area_px[plain.rows_of(Level.SUBPART)].min()
-    for box in masks.box_xyxy:
-        for crop in crop_boxes((128, 128), 1)[0][1:]:
-            cut = np.abs(box - crop) <= 0
-            assert not (cut & ~(np.abs(box - [0, 0, 128, 128]) <= 20)).any()
-
-
 @given(hnp.arrays(bool, st.tuples(st.integers(1, 9), st.integers(1, 9))), st.integers(1, 12))
 def test_small_islands_holes_and_masks_are_removed(mask, min_area_px):
     if not mask.any():

@@ -94,8 +94,3 @@ def test_result_does_not_depend_on_the_order_of_masks(masks, data):
         for order in (np.arange(number), shuffle)
     )
     assert_equal_masks(second, first)
-
-
-def test_levels_do_not_suppress_each_other():
-    masks = pack(np.ones((3, 2, 2)), [1, 2, 3])
-    assert len(suppress_masks(masks, iou_max=0.8, score_min=0.0, inner=0.5)) == 3

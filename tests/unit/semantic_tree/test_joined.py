@@ -1,10 +1,9 @@
 """Queries of two joined blocks of a long shelf give the same answers as queries of the whole scene."""
 
-import json
 import os
 import shlex
 import shutil
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +24,7 @@ from hilsplat.splat.coordinates import move_gaussians, write_coordinates
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.ply import save_ply
 from tests.unit.evaluate.builders import cameras_of, masks_of
-from tests.unit.finished_desk import WORDS, write_colour_clip
-from tests.unit.round_gaussians import round_gaussians
+from tests.unit.finished_desk import WORDS, painted, plate, run_stage, write_colour_clip
 
 HEIGHT, LENGTH, WINDOW, STEP = 24, 120, 48, 6
 REGIONS = (
@@ -42,6 +40,7 @@ REGIONS = (
     ("handle 2", 2, (6, 16), (90, 100), (20, 220, 0)),
 )
 """A shelf: a pixel of its picture is a Gaussian, and each view is a window of the picture."""
+PICTURE = painted(REGIONS, (HEIGHT, LENGTH))
 
 BORDER = 58
 OTHERWISE = {"pen": (56, 80)}
@@ -73,21 +72,6 @@ def window(picture: np.ndarray, view: str) -> np.ndarray:
     return picture[:, start : start + WINDOW]
 
 
-def picture() -> np.ndarray:
-    painted = np.zeros((HEIGHT, LENGTH, 3), np.uint8)
-    for _, _, rows, columns, colour in REGIONS:
-        painted[slice(*rows), slice(*columns)] = colour
-    return painted
-
-
-def shelf_gaussians() -> Gaussians:
-    rows, columns = np.divmod(np.arange(HEIGHT * LENGTH), LENGTH)
-    means = np.stack([columns, rows, np.zeros(len(rows))], axis=1)
-    plain = round_gaussians(means, log_scale=np.log(0.25), opacity_logit=5.0)
-    colours = (picture().reshape(-1, 3) / 255 - 0.5) / 0.28209479177387814
-    return replace(plain, sh=colours.astype(np.float32)[:, None])
-
-
 def write_whole_scene(folder: Path) -> None:
     poses = np.tile(np.eye(4), (len(VIEWS), 1, 1))
     poses[:, 2, 3] = DISTANCE
@@ -95,8 +79,8 @@ def write_whole_scene(folder: Path) -> None:
     poses[:, 1, 3] = 0.5 - HEIGHT / 2
     K = np.array([[DISTANCE, 0, WINDOW / 2], [0, DISTANCE, HEIGHT / 2], [0, 0, 1]])
     for view in VIEWS:
-        write_png(folder / "images" / view, np.ascontiguousarray(window(picture(), view)))
-    points = shelf_gaussians().means[::7]
+        write_png(folder / "images" / view, np.ascontiguousarray(window(PICTURE, view)))
+    points = plate(PICTURE).means[::7]
     split = {view: "test" if view == VIEWS[4] else "train" for view in VIEWS}
     cameras = cameras_of(poses, K, (HEIGHT, WINDOW))
     colours = np.zeros((len(points), 3), np.uint8)
@@ -107,7 +91,7 @@ def write_whole_scene(folder: Path) -> None:
 def finish(place: Path) -> None:
     """Make the Gaussians and masks of a perfect fit and segmenter for a posed scene, and run later stages."""
     scene, out = Scene.load(place / "scene"), place / "default"
-    gaussians, ply = shelf_gaussians(), place / "gaussians.ply"
+    gaussians, ply = plate(PICTURE), place / "gaussians.ply"
     starts = [VIEWS.index(view) * STEP for view in scene.views()]
     is_seen = (gaussians.means[:, 0] >= min(starts)) & (gaussians.means[:, 0] < max(starts) + WINDOW)
     seen = Gaussians(*(getattr(gaussians, name)[is_seen] for name in FIELDS))
@@ -123,22 +107,14 @@ def finish(place: Path) -> None:
     identity = {"segmenter": "sam", "model": None, "model_sha256": None}
     write_index(out / "masks", entries, scene=scene.name, **identity)
 
-    def run(command: str, name: str, *inputs: str, settings: dict | None = None, more: tuple = ()) -> None:
-        places = {"scene": place / "scene", "gaussians": ply}
-        options = [
-            word
-            for each in inputs
-            for word in (f"--{each.replace('_', '-')}", str(places.get(each, out / each)))
-        ]
-        words = [command, *options, "--out", str(out / name), "--settings", json.dumps(settings or {}), *more]
-        app(words, standalone_mode=False)
-
-    cache = ("--cache", "results/.cache")
-    run("contributions", "contributions", "scene", "gaussians", "masks", more=cache)
-    run("semantic-tree", "semantic_tree", "contributions", "masks")
+    names = "masks", "contributions", "semantic_tree", "clip", "names"
+    places = {"scene": place / "scene", "gaussians": ply, **{name: out / name for name in names}}
+    run, cache = partial(run_stage, places), ("--cache", "results/.cache")
+    run("contributions", out / "contributions", "scene", "gaussians", "masks", more=cache)
+    run("semantic-tree", out / "semantic_tree", "contributions", "masks")
     model = {"model": "models/colours"}
-    run("clip", "clip", "scene", "masks", "semantic_tree", settings=model, more=cache)
-    run("names", "names", "semantic_tree", "clip", more=cache)
+    run("clip", out / "clip", "scene", "masks", "semantic_tree", settings=model, more=cache)
+    run("names", out / "names", "semantic_tree", "clip", more=cache)
 
 
 @pytest.fixture(scope="module")

@@ -80,23 +80,21 @@ def test_evidence_of_two_masks(shares, visible, view, min_covisible, expected):
     assert pair(evidence, 0, 1) == pair(evidence, 1, 0) == pytest.approx(expected)
 
 
-def test_linkage_pools_intersections_over_unions():
-    # 0 and 1 agree by 0.8; together they agree with 2 by (3 + 0) / (10 + 5) = 0.2
-    intersection = np.array([[0, 8, 3], [8, 0, 0], [3, 0, 0]], float)
-    union = np.array([[0, 10, 10], [10, 0, 5], [10, 5, 0]], float)
-    cluster, quality = pooled_linkage(dense_evidence(intersection, union), 0.21)()
-    assert cluster.tolist() == [0, 0, 1]
-    assert quality.tolist() == pytest.approx([0.8, 0.0])
-    cluster, quality = pooled_linkage(dense_evidence(intersection, union), 0.19)()
-    assert cluster.tolist() == [0, 0, 0]
-    assert quality.tolist() == pytest.approx([11 / 25])
-
-
-def test_linkage_of_equal_pairs_takes_the_lowest_rows():
-    # 0-1 and 1-2 are equally good; joining 0-1 leaves 2 at 1 / 4 with the pair
-    intersection = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], float)
-    union = np.array([[0, 2, 2], [2, 0, 2], [2, 2, 0]], float)
-    assert pooled_linkage(dense_evidence(intersection, union), 0.3)()[0].tolist() == [0, 0, 1]
+@pytest.mark.parametrize(
+    ("intersection", "union", "threshold", "cluster", "quality"),
+    [
+        # 0 and 1 agree by 0.8; together they agree with 2 by (3 + 0) / (10 + 5) = 0.2
+        ([[0, 8, 3], [8, 0, 0], [3, 0, 0]], [[0, 10, 10], [10, 0, 5], [10, 5, 0]], 0.21, [0, 0, 1], [0.8, 0]),
+        ([[0, 8, 3], [8, 0, 0], [3, 0, 0]], [[0, 10, 10], [10, 0, 5], [10, 5, 0]], 0.19, [0] * 3, [11 / 25]),
+        # 0-1 and 1-2 are equally good: the lowest rows join, and leave 2 at 1 / 4 with the pair
+        ([[0, 1, 0], [1, 0, 1], [0, 1, 0]], [[0, 2, 2], [2, 0, 2], [2, 2, 0]], 0.3, [0, 0, 1], [0.5, 0]),
+    ],
+)
+def test_linkage_pools_intersections_over_unions(intersection, union, threshold, cluster, quality):
+    evidence = dense_evidence(np.array(intersection, float), np.array(union, float))
+    found, qualities = pooled_linkage(evidence, threshold)()
+    assert found.tolist() == cluster
+    assert qualities.tolist() == pytest.approx(quality)
 
 
 def brute_linkage(intersection, union, threshold):

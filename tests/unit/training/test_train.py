@@ -1,5 +1,7 @@
 """Training lowers its losses, is deterministic and resumes; its measurements are correct."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,7 @@ import torch
 from models.training.batches import CropStage
 from models.training.clip import contrastive_loss
 from models.training.crops import list_crops
-from models.training.loop import Budget, Tuning
+from models.training.loop import Budget, Tuning, has_fast_half
 from models.training.measure_clip import measure_clip, measure_queries
 from models.training.measure_sam import measure_everything
 from models.training.train_clip import train_clip
@@ -63,6 +65,15 @@ def test_a_budget_in_minutes_schedules_the_decay_from_the_speed():
     assert budget.decay_steps(1000, 100.0) == 100
     with pytest.raises(ValueError, match="minutes or steps"):
         Budget()
+
+
+@pytest.mark.parametrize(("major", "fast"), [(7, False), (8, True)])
+def test_a_card_that_emulates_bfloat16_trains_in_float32(monkeypatch, major, fast):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: SimpleNamespace(major=major))
+    monkeypatch.setattr(torch.cuda, "_check_bf16_tensor_supported", lambda device: True)  # by emulation
+    assert has_fast_half(torch.device("cuda")) == fast
 
 
 def test_segmentation_loss_is_near_zero_for_the_ground_truth_and_ignores_unknown_heads():

@@ -5,8 +5,10 @@ import json
 import os
 import shutil
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
+import torch
 from typer.testing import CliRunner
 
 from hilsplat.base.errors import ModelError
@@ -97,6 +99,9 @@ def test_a_model_must_give_the_same_on_a_card(project, monkeypatch, shift, state
     )
     findings = [finding for finding in doctor.models() if finding.state != "note"]
     assert {finding.state for finding in findings} == {state} and len(findings) == 2
+    monkeypatch.setattr(TorchNetwork, "run", Mock(side_effect=torch.OutOfMemoryError("Tried to allocate")))
+    findings = [finding for finding in doctor.models() if finding.state != "note"]
+    assert all("Tried to allocate" in each.found and "clip.device: cpu" in each.fix for each in findings)
 
 
 @pytest.mark.parametrize(("what", "value"), [("disk", 2**20), ("memory", 100.0)])
