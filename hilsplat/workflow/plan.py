@@ -35,7 +35,7 @@ from hilsplat.workflow.models import (
     describe_models,
     doubt_about_photographs,
 )
-from hilsplat.workflow.scene_data import Job, SceneData, VariantJob, of_variant
+from hilsplat.workflow.scene_data import Job, SceneData, VariantJob, of_variant, portable
 
 MIN_PHOTOGRAPHS = 16
 """Minimum number of photographs for key views; with fewer, the key views (half) would link too few masks."""
@@ -157,9 +157,9 @@ class Plan:
         self.stages_of = functools.cache(lambda *which: run.stages(*which).resolve_auto())
         self.defaults = {name: getattr(self.stages_of("default", ()), name) for name in SECTIONS}
         self.options: dict[str, Option] = {
-            "unit": self.data.unit,
-            "render": self.data.is_render,
-            "poses": self.data.poses,
+            "unit": lambda job: self.row(job).unit,
+            "render": lambda job: self.row(job).generated is not None,
+            "poses": lambda job: portable(self.row(job).poses),
             "source": self.data.generated_source,
             "dataset": lambda job: job.dataset,
             "variant": lambda job: job.variant,

@@ -101,16 +101,6 @@ class SceneData:
 
         return digest
 
-    def is_render(self, job: Job) -> bool:
-        return self.row(job).generated is not None
-
-    def poses(self, job: Job) -> str:
-        """Return the option of `poses`: the file of known poses, if the sheet names one."""
-        return portable(self.row(job).poses)
-
-    def unit(self, job: Job) -> str:
-        return self.row(job).unit
-
     def require_no_braces(self, row: SceneRow) -> None:
         """Raise SettingsError for file names with braces, which Snakemake interprets as wildcards."""
         files = self.image_files(row) if row.folder is not None else []
@@ -212,12 +202,6 @@ class SceneData:
                 fix="choose another segmenter, or run the variant on generated scenes only",
             )
         return self.truth(job)
-
-    def name(self, job: Job) -> str:
-        return self.row(job).name
-
-    def scene_name(self, job: Job) -> str:
-        return job.scene
 
     def generated_source(self, job: Job) -> str:
         row = self.row(job)

@@ -6,7 +6,6 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -78,9 +77,7 @@ LABELS = ("datasets", "check", "annotated", "--data-root", "data")
         (no_models, ("run",), r"\x1b]0;x\x07"),
     ],
 )
-def test_the_terminal_gets_only_printable_text(
-    lay: Callable[[], object], command: tuple[str, ...], part: str, project: Path
-) -> None:
+def test_the_terminal_gets_only_printable_text(lay, command, part, project):
     lay()
     _, output = printed(project, *command)
     text = output.decode()

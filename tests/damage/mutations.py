@@ -8,36 +8,11 @@ from random import Random
 from typing import Any
 
 ODD_NUMBERS = (
-    "nan",
-    "inf",
-    "-inf",
-    "1e400",
-    "-1",
-    "0",
-    "1e38",
-    "99999999999999999999",
-    "x",
-    "",
-    "0x1",
-    "1,5",
+    *("nan", "inf", "-inf", "1e400", "-1", "0", "1e38", "99999999999999999999", "x", "", "0x1", "1,5"),
 )
 ODD_VALUES = (
-    None,
-    True,
-    False,
-    -1,
-    0,
-    0.5,
-    1e308,
-    float("inf"),
-    float("nan"),
-    2**70,
-    "",
-    "x",
-    "5",
-    [],
-    {},
-    [[1]],
+    *(None, True, False, -1, 0, 0.5, 1e308, float("inf"), float("nan"), 2**70),
+    *("", "x", "5", [], {}, [[1]]),
 )
 
 
@@ -187,13 +162,8 @@ def mutated_bytes(rnd: Random, content: bytes) -> bytes:
         return head + tail[length:]
     if kind == 7:
         second = content[other : other + length]
-        return (
-            head
-            + second
-            + content[place + len(second) : other]
-            + content[place : place + len(second)]
-            + (content[other + len(second) :])
-        )
+        between, after = content[place + len(second) : other], content[other + len(second) :]
+        return head + second + between + tail[: len(second)] + after
     number = rnd.choice((float("nan"), float("inf"), -1.0, 0.0, 1e30))
     odd = rnd.choice((struct.pack("<f", number), struct.pack("<d", number), b"\xff" * 8, b"\xff" * 4))
     place -= place % 4

@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import pytest
 from jsonschema import Draft202012Validator
@@ -51,14 +51,13 @@ def test_shipped_configurations_are_valid(project: Path, name: str) -> None:
         ),
         ({"evaluate": {"canonical": []}}, r"evaluate\.canonical"),
         ({"evaluate": {"canonical": ["object", " "]}}, r"evaluate\.canonical"),
+        ({"labels": {"default": "a\0b"}}, "null byte"),
         ({"seed": 2**31}, "less than or equal to 2000000000"),
         ({"poses": {"single_camera": True}}, "YAML reads yes, no, on and off"),
         ({"masks": {"points_per_batch": True}}, "YAML reads yes, no, on and off"),
     ],
 )
-def test_a_configuration_that_cannot_be_used_is_refused_with_its_place(
-    config: dict[str, Any], message: str
-) -> None:
+def test_a_configuration_that_cannot_be_used_is_refused_with_its_place(config, message):
     with pytest.raises(SettingsError, match=message):
         parse_run(config)
 
@@ -125,9 +124,7 @@ def test_the_manual_lists_the_choices_or_the_range_of_a_setting() -> None:
     assert "method.codebook = (64, 10)" in manual and "    opengaussian: number of groups" in manual
 
 
-def test_the_schema_for_editors_accepts_the_shipped_configuration_and_refuses_a_misspelt_key(
-    project: Path,
-) -> None:
+def test_the_schema_for_editors_accepts_the_shipped_configuration_and_refuses_a_misspelt_key(project):
     validator = Draft202012Validator(json.loads(json.dumps(config_schema())))
     config = read_config(project / "config/config.yaml")
     validator.validate(config)

@@ -67,9 +67,7 @@ def copy_artifact(source: Path, target: Path) -> None:
 
 
 @pytest.mark.parametrize("rule", OUTPUTS)
-def test_declared_inputs_are_enough(
-    rule: str, jobs: Mapping[str, Job], finished: Project, empty: Project
-) -> None:
+def test_declared_inputs_are_enough(rule, jobs, finished, empty):
     job = jobs[rule]
     shutil.rmtree(empty.root / "results", ignore_errors=True)
     for path in job.inputs:

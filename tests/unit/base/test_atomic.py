@@ -59,17 +59,13 @@ def test_outputs_have_the_permissions_of_other_new_files(tmp_path: Path) -> None
     assert found == files | {"new": folder, "inner": folder}
 
 
-def test_a_file_is_flushed_before_it_replaces_the_former_one_and_its_folder_after_that(
-    tmp_path: Path, flushed: list[str]
-) -> None:
+def test_a_file_is_flushed_before_it_replaces_the_former_one_and_its_folder_after_that(tmp_path, flushed):
     write_text(tmp_path / "a.txt", "text")
     file, folder = flushed
     assert is_unfinished(Path(file)) and folder == str(tmp_path)
 
 
-def test_the_files_of_a_folder_are_flushed_once_before_it_replaces_the_former_one(
-    tmp_path: Path, flushed: list[str]
-) -> None:
+def test_the_files_of_a_folder_are_flushed_once_before_it_replaces_the_former_one(tmp_path, flushed):
     with atomic_folder(tmp_path / "out") as new:
         write_text(new / "a.txt", "text")
         with atomic_folder(new / "inner") as inner:
@@ -118,9 +114,7 @@ def free_mib(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     ids=repr,
 )
 @pytest.mark.parametrize("writer", [atomic_path, atomic_folder, work_folder])
-def test_errors_on_a_full_disk_name_the_disk_and_the_fix(
-    tmp_path, free_mib, writer, error, free, is_full
-) -> None:
+def test_errors_on_a_full_disk_name_the_disk_and_the_fix(tmp_path, free_mib, writer, error, free, is_full):
     free_mib(free)
     with pytest.raises(DiskSpaceError if is_full else type(error)) as raised, writer(tmp_path / "new/a.txt"):
         raise error
