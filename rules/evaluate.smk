@@ -44,7 +44,9 @@ use rule stage as table with:
     input:
         scores=lambda wildcards: targets.scores(PLAN, wildcards.table),
         times=lambda wildcards: targets.scores(PLAN, wildcards.table, "times.csv"),
-        instances=lambda wildcards: targets.scores(PLAN, wildcards.table, "instances.npz"),
+        instances=lambda wildcards: targets.scores(
+            PLAN, wildcards.table, "instances.npz"
+        ),
         published=lambda wildcards: str(published_values(wildcards.table)),
     output:
         out="<results>/tables/{table}.csv",
