@@ -24,8 +24,7 @@ from hilsplat.query.answer import answer, file_name
 from hilsplat.query.names import tree_digest
 from hilsplat.splat.ply import load_ply
 from tests.bad_inputs.conftest import snapshot
-from tests.damage.damages import damaged_bytes
-from tests.unit.artifact_changes import write_record
+from tests.unit.artifact_changes import flip_bit, write_record
 from tests.unit.finished_desk import SCENE
 
 MASKS, TREE, CLIP = SCENE / "default/masks", SCENE / "default/coverage_tree", SCENE / "default/clip"
@@ -67,11 +66,6 @@ def write(path: Path | str, content: str | bytes) -> Callable[[], object]:
         Path(path).write_bytes(content if isinstance(content, bytes) else content.encode())
 
     return lay
-
-
-def damage(path: Path, kind: str, share: float) -> Callable[[], object]:
-    """Damage a file at a share of its length."""
-    return lambda: path.write_bytes(damaged_bytes(path.read_bytes(), (kind, share, 2)))
 
 
 def changed(artifact: Path) -> tuple[str, str]:
@@ -177,7 +171,7 @@ ROWS = {
     "a field that is a folder": row(as_folder(FIELD), ASK, "field.safetensors cannot be read", "--verify"),
     "a code that is a folder": row(as_folder(CODE / "autoencoder.safetensors"), SOLVE, *changed(CODE)),
     "one bit of a field": row(
-        damage(FIELD, "flip", 0.7), ASK, "field.safetensors cannot be read", "changed after"
+        lambda: flip_bit(FIELD, 0.7), ASK, "field.safetensors cannot be read", "changed after"
     ),
     "a field of nan": row(field_of_nan, ASK, "array features contains an impossible value", "finite"),
     "Gaussians of another scene beside a tree": row(

@@ -3,6 +3,7 @@
 import copy
 import json
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -109,8 +110,8 @@ def _other_digit(rnd: Random, text: str) -> str:
     return text[:place] + str(rnd.randint(1, 9)) + text[place + 1 :]
 
 
-def mutated_lines(rnd: Random, lines: list[str]) -> list[str]:
-    """Drop, repeat, swap, join or change lines."""
+def mutated_lines(rnd: Random, lines: list[str], odd: Sequence[str] = ODD_NUMBERS) -> list[str]:
+    """Drop, repeat, swap, join or change lines; words are replaced by odd ones."""
     lines = list(lines)
     place, other = rnd.randrange(len(lines)), rnd.randrange(len(lines))
     kind = rnd.randrange(10)
@@ -132,7 +133,7 @@ def mutated_lines(rnd: Random, lines: list[str]) -> list[str]:
         elif kind == 6:
             words[word], words[second] = words[second], words[word]
         elif kind == 7:
-            words[word] = rnd.choice(ODD_NUMBERS)
+            words[word] = rnd.choice(odd)
         elif kind == 8:
             words[word] = _other_digit(rnd, words[word])
         else:

@@ -38,10 +38,13 @@ from hilsplat.splat.ply import import_ply, load_ply, save_ply
 from hilsplat.workflow.plan import Plan
 from tests.conftest import PROJECT
 from tests.damage import oracles
-from tests.damage.damages import byte_damages, damaged_bytes, damaged_texts
-from tests.damage.mutations import mutated, mutated_json
+from tests.damage.mutations import mutated, mutated_bytes, mutated_json, mutated_lines
 from tests.unit.round_gaussians import round_gaussians
 
+ODD_YAML = (
+    *("", "{", "]", "\t", ": ", "- ", "&a ", "*a", "!!binary "),
+    *("1e999", ".nan", "null", "yes", "\0", "é", "'"),
+)
 ANY = settings(suppress_health_check=list(HealthCheck))
 
 
@@ -58,12 +61,14 @@ def accepted(read: Callable[[], Any]) -> Any:
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "paper.yaml", "demo.yaml"])
-@given(data=st.data())
+@given(rnd=st.randoms(use_true_random=True))
 @ANY
-def test_configurations(name: str, data: st.DataObject, tmp_path, monkeypatch):
+def test_configurations(name: str, rnd: Random, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    path = tmp_path / name
-    path.write_text(data.draw(damaged_texts((PROJECT / "config" / name).read_text())), encoding="utf-8")
+    path, lines = tmp_path / name, (PROJECT / "config" / name).read_text().splitlines()
+    for _ in range(rnd.randint(1, 3)):
+        lines = mutated_lines(rnd, lines, ODD_YAML)
+    path.write_text("\n".join(lines), encoding="utf-8")
     found = accepted(lambda: read_config(path))
     if found is not None:
         accepted(lambda: Plan({"groups": ["ci"], "only": [], **found, "scenes": "config/scenes.tsv"}))
@@ -585,12 +590,12 @@ def test_what_is_accepted_is_right(case: Case, rnd: Random):
         note(f"{path}:\n{damaged!r}\ninstead of\n{original!r}")
 
 
-@given(damage=byte_damages())
+@given(rnd=st.randoms(use_true_random=True))
 @ANY
-def test_gaussians(damage: tuple[str, float, int], tmp_path_factory):
-    path = tmp_path_factory.mktemp("ply") / "gaussians.ply"
+def test_gaussians(rnd: Random, tmp_path):
+    path = tmp_path / "gaussians.ply"
     save_ply(path, round_gaussians(np.arange(15.0).reshape(5, 3), log_scale=-1.0, opacity_logit=1.0))
-    path.write_bytes(damaged_bytes(path.read_bytes(), damage))
+    path.write_bytes(mutated_bytes(rnd, path.read_bytes()))
     found = accepted(lambda: load_ply(path))
     assert found is None or all(np.isfinite(array).all() for array in vars(found).values())
 
