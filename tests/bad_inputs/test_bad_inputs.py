@@ -189,6 +189,12 @@ ROWS = {
     "a scene that does not exist": row(
         nothing, ("query", "photos/none", "mug"), "results/photos/none is missing"
     ),
+    "a results folder in place of a scene": row(
+        nothing, ("query", "results", "mug"), "results is a folder of scenes, not a scene", "photos/desk"
+    ),
+    "a data set in place of a scene": row(
+        nothing, ("query", "photos", "mug"), "results/photos is a folder of scenes", "photos/desk"
+    ),
     "a scene that is not finished": row(
         lambda: Path("results/photos/later/default").mkdir(parents=True),
         ("query", "photos/later", "mug"),

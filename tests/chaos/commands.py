@@ -8,7 +8,6 @@ import subprocess
 import sys
 import threading
 import time
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,7 +16,7 @@ import httpx2
 from hilsplat.annotate.labels import label_path, read_labels
 from tests.bad_inputs.conftest import snapshot
 from tests.conftest import PROJECT
-from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, build_finished_desk
+from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, WIDTH, build_finished_desk, pack_photographs
 
 COMMANDS = {
     "new": ("new", "chair", "photos.zip"),
@@ -31,10 +30,7 @@ POLYGON = [[1, 1], [15, 1], [15, 20], [1, 20]]
 def prepare(root: Path) -> Path:
     """Return a project with a finished scene and an archive of photographs."""
     project = build_finished_desk(root)
-    shutil.copytree(PROJECT / "config", project / "config")
-    with zipfile.ZipFile(project / "photos.zip", "w") as archive:
-        for path in sorted((project / SCENE / "scene/images").iterdir()):
-            archive.write(path, path.name)
+    pack_photographs(project)
     return project
 
 

@@ -4,7 +4,6 @@ import os
 import shutil
 import subprocess
 import sys
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import typer
 from hilsplat.base.errors import HilsplatError
 from hilsplat.cli.main import app
 from tests.conftest import PROJECT
-from tests.unit.finished_desk import SCENE
+from tests.unit.finished_desk import SCENE, pack_photographs
 
 VARIANT = SCENE / "default"
 VALUES = {
@@ -108,12 +107,9 @@ PLACES = (
 def project(desk_project: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished scene, the configuration, and the user's folder `mine` with links out of it."""
     copy = Path(shutil.copytree(desk_project, tmp_path_factory.mktemp("users") / "project"))
-    shutil.copytree(PROJECT / "config", copy / "config")
     (copy / "words.txt").write_text("mug\nbook\n")
     (copy / "table.csv").write_text("a,b\n")
-    with zipfile.ZipFile(copy / "photos.zip", "w") as archive:
-        for path in sorted((copy / SCENE / "scene/images").iterdir()):
-            archive.write(path, path.name)
+    pack_photographs(copy)
     mine, theirs = copy / "mine", copy / "theirs"
     for name in NAMES:
         (mine / name).parent.mkdir(parents=True, exist_ok=True)

@@ -1,17 +1,15 @@
 """Twenty commands at once in one project: nothing is lost, and none disturbs another."""
 
 import os
-import shutil
 import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
 from hilsplat.annotate.labels import read_labels
 from hilsplat.query.names import read_names
 from hilsplat.scene.sheet import read_sheet
 from tests.conftest import PROJECT
-from tests.unit.finished_desk import NUM_VIEWS
+from tests.unit.finished_desk import NUM_VIEWS, pack_photographs
 
 NAME = """
 import sys
@@ -50,10 +48,7 @@ while True:
 
 def test_twenty_commands_at_once_lose_nothing(own_desk: Path) -> None:
     project = own_desk.parents[2]
-    shutil.copytree(PROJECT / "config", project / "config")
-    with zipfile.ZipFile(project / "photos.zip", "w") as archive:
-        for path in sorted((own_desk / "scene/images").iterdir()):
-            archive.write(path, path.name)
+    pack_photographs(project)
     hilsplat = ["-P", "-m", "hilsplat"]
     commands = [[*hilsplat, "new", f"scene-{number}", "photos.zip"] for number in range(5)]
     commands += [[*hilsplat, "new", "twin", "photos.zip"]] * 2
