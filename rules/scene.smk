@@ -16,7 +16,7 @@ use rule stage as source with:
         **PLAN.params(
             "source",
             files=PLAN.data.source_files,
-            plugins=PLAN.data.source_reader,
+            plugins=lambda wildcards: readers_of([PLAN.data.source_name(wildcards)]),
             name=PLAN.data.source_name,
         ),
 

@@ -46,8 +46,8 @@ PARTS = ("semantic_tree", "field", "autoencoder", "clip", "masks")
 SCORED = "evaluate"
 """The stage that reads everything that a variant may change."""
 
-Option = Callable[[Any], Any] | str
-"""An option of a stage's command: its value, or a function of the wildcards."""
+Option = Callable[[Any], Any]
+"""An option of a stage's command: a function of the wildcards."""
 
 
 LINKING = ("contributions", "coverage_tree", "semantic_tree")
@@ -163,7 +163,7 @@ class Plan:
             "source": self.data.generated_source,
             "dataset": lambda job: job.dataset,
             "variant": lambda job: job.variant,
-            "labels": self.data.label_names,
+            "labels": lambda job: self.data.labels(self.row(job)),
             "data_root": self.data.root,
             "names": self.names,
             "queries": self.queries,
@@ -294,7 +294,7 @@ class Plan:
         values: dict[str, Any] = {}
         for name in stage.hints:
             if (option := options.get(name, self.options.get(name))) is not None:
-                values[name] = option(job) if callable(option) else option
+                values[name] = option(job)
             elif name in stage.sections:
                 values[name] = self.settings(stage.sections[name], job)
             elif name == "seed":

@@ -119,10 +119,6 @@ class SceneData:
     def source_name(self, job: Job) -> str:
         return self.row(job).source.removeprefix(DATA_PREFIX)
 
-    def source_reader(self, job: Job) -> tuple[str, ...]:
-        """Return the reader of the data set from which a scene's images are exported."""
-        return readers_of([self.source_name(job)])
-
     def gaussians(self, name: str) -> Callable[[Job], list[str]]:
         """Return the input function of `gaussians` for a file that replaces the fit (`_gaussians`)."""
         return lambda job: [self._gaussians(job)[name]] if name in self._gaussians(job) else []
@@ -152,9 +148,6 @@ class SceneData:
         """Return LangSplat's files, which replace SAM and CLIP, if any."""
         folder = self.row(job).features
         return sorted(portable(path) for path in folder.glob("*_[sf].npy")) if folder is not None else []
-
-    def features_folder(self, job: Job) -> str:
-        return portable(self.row(job).features)
 
     def labels(self, row: SceneRow) -> tuple[str, ...]:
         """Return the labels of a scene, as `data set/scene`: published labels and your own annotations."""
@@ -206,10 +199,6 @@ class SceneData:
     def generated_source(self, job: Job) -> str:
         row = self.row(job)
         return row.source if row.generated else ""
-
-    def label_names(self, job: Job) -> tuple[str, ...]:
-        """Return the labels that a scene is scored against."""
-        return self.labels(self.row(job))
 
     def figure_labels(self, job: Job) -> str:
         """Return the labels for queries and outlines in figures, which must be on images, if any."""

@@ -178,7 +178,7 @@ def test_photographs_that_you_annotated_are_scored_without_replacing_the_tables(
     assert targets.default(found) == [*alone, "results/photos/desk/scores.md"]
     assert targets.compared_means(found, job) == ["results/photos/desk/default/scores.csv"]
     assert found.data.label_files(job) == [str(file)] and str(file) not in found.data.image_files(job)
-    assert found.data.label_names(job) == ("annotated/photos/desk",)
+    assert found.data.labels(found.row(job)) == ("annotated/photos/desk",)
     assert found.data.label_readers(job) == ("hilsplat.datasets.images.hi:ANNOTATED",)
     both = plan(tmp_path, groups=["photos", "benchmark"], data_root=str(tmp_path))
     assert "results/tables/lerf.csv" in targets.default(both)
@@ -357,11 +357,11 @@ def test_labels_of_a_published_scene_determine_reader_and_options(tmp_path):
     job = Job("lerf", "figurines")
     assert found.data.label_readers(job) == ("hilsplat.datasets.images.lerf_ovs:DATASET",)
     assert [Path(file).name for file in found.data.label_files(job)] == ["frame_1.json"]
-    assert found.data.label_names(job) == ("lerf_ovs/figurines",) and found.data.truth(job) == []
+    assert found.data.labels(found.row(job)) == ("lerf_ovs/figurines",) and found.data.truth(job) == []
     room = Job("rooms", "room")
     assert found.data.truth(room) == ["results/rooms/room/world/truth"]
     assert found.data.generated_source(room) == "world:room:1"
-    assert found.data.label_names(room) == found.data.label_readers(room) == ()
+    assert found.data.labels(found.row(room)) == found.data.label_readers(room) == ()
 
 
 def test_tables_have_their_own_scenes_and_variants(tmp_path):
