@@ -102,7 +102,7 @@ def test_a_run_of_files_describes_their_scenes_only(project):
 
 @pytest.fixture
 def ended(project, monkeypatch, caplog) -> Callable[..., str]:
-    """A function that runs a scene, of which Snakemake makes nothing, and returns the log."""
+    """A function that runs a scene without Snakemake, and returns the log."""
     plan_of(project, ROWS, groups=["photos"])
     Path("config/config.yaml").write_text("groups: [photos]\n")
     Path("Snakefile").write_text("")
