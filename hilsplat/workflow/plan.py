@@ -307,7 +307,6 @@ class Plan:
         paths: dict[str, Any] = {
             "images": lambda: self.data.images(job, input),
             "folder": lambda: str(Path(input.gaussians).parent),
-            "results": lambda: str(parents[0]),
             "cache": lambda: str(parents[{"run": 0, "scene": 2, "variant": 3}[stage.scope]] / ".cache"),
         }
         values: dict[str, Any] = {}

@@ -22,11 +22,6 @@ from hilsplat.settings import LARGEST
 from hilsplat.stage import Seed
 
 
-@pytest.mark.parametrize("name", ["config.yaml", "paper.yaml", "ci.yaml", "comparison.yaml"])
-def test_shipped_configurations_are_valid(project: Path, name: str) -> None:
-    parse_run(merged_config([project / "config" / name]))
-
-
 @pytest.mark.parametrize(
     ("config", "message"),
     [
