@@ -40,9 +40,6 @@ from hilsplat.workflow.scene_data import Job, SceneData, VariantJob, of_variant,
 MIN_PHOTOGRAPHS = 16
 """Minimum number of photographs for key views; with fewer, the key views (half) would link too few masks."""
 
-PARTS = ("semantic_tree", "field", "autoencoder", "clip", "masks")
-"""Artifacts of a variant that queries read."""
-
 SCORED = "evaluate"
 """The stage that reads everything that a variant may change."""
 
@@ -351,10 +348,7 @@ class Plan:
 
     def inputs(self, name: str) -> dict[str, Callable[[VariantJob], str]]:
         """Return input functions for the artifacts of a variant that a stage needs (`shared_path`)."""
-        stage = stage_of(name)
-        kinds = {artifact: kinds_of(artifact) for artifact in stage.needs}
-        names = [artifact for artifact, found in kinds.items() if found and found[-1].scope == "variant"]
-        return {artifact: functools.partial(self.shared_path, artifact) for artifact in names}
+        return {artifact: functools.partial(self.shared_path, artifact) for artifact in _of_variant(name)}
 
     def compared(self, *artifacts: str) -> dict[str, Callable[[Job], list[str]]]:
         """Return input functions for the artifacts of all variants in the main tables."""
@@ -560,6 +554,16 @@ class Plan:
         of_dataset = self.run.queries.get(job.dataset, ())
         queries = self.run.queries.get(f"{job.dataset}/{job.scene}", of_dataset)
         return escape_json_for_report(json.dumps(queries))
+
+
+def _of_variant(name: str) -> list[str]:
+    """Return the artifacts of a variant that a stage needs."""
+    kinds = {artifact: kinds_of(artifact) for artifact in stage_of(name).needs}
+    return [artifact for artifact, found in kinds.items() if found and found[-1].scope == "variant"]
+
+
+PARTS = _of_variant(SCORED)
+"""Artifacts of a variant that queries read."""
 
 
 def _first_kind(kinds: list[Stage[..., Any]], facts: Facts) -> Stage[..., Any]:
