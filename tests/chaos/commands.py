@@ -15,7 +15,6 @@ import httpx2
 
 from hilsplat.annotate.labels import label_path, read_labels
 from tests.bad_inputs.conftest import snapshot
-from tests.conftest import PROJECT
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, WIDTH, build_finished_desk, pack_photographs
 
 COMMANDS = {
@@ -36,11 +35,9 @@ def prepare(root: Path) -> Path:
 
 def started(project: Path, *words: str) -> subprocess.Popen[str]:
     """Start a command in a project, in its own session."""
-    environment = {**os.environ, "PYTHONPATH": str(PROJECT), "HILSPLAT_MODELS": "models"}
     return subprocess.Popen(
         [sys.executable, "-m", "hilsplat", *words],
         cwd=project,
-        env=environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

@@ -1,6 +1,5 @@
 """Every option that names an output or a cache, pointed at files of a user: none of them changes."""
 
-import os
 import shutil
 import subprocess
 import sys
@@ -164,7 +163,6 @@ def test_no_option_changes_a_users_file(project: Path, monkeypatch, name: str, o
 def test_neither_a_log_nor_pruning_changes_a_users_file(project: Path, monkeypatch) -> None:
     monkeypatch.chdir(project)
     before = files_of_user(project)
-    environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
     for place in PLACES:
         with suppress(HilsplatError):
             app(
@@ -172,7 +170,7 @@ def test_neither_a_log_nor_pruning_changes_a_users_file(project: Path, monkeypat
                 standalone_mode=False,
             )
         command = [sys.executable, "-m", "hilsplat", "--log", f"mine/{place}", "settings"]
-        done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        done = subprocess.run(command, capture_output=True, text=True)
         assert done.returncode != 2 and "Traceback" not in done.stderr, (place, done.stderr)
     assert files_of_user(project) == before
 
@@ -217,12 +215,11 @@ def test_an_export_can_be_repeated_after_a_kill_and_until_then_the_former_one_is
     monkeypatch.chdir(own_desk.parents[2])
     words, folder = ["export", "photos/desk", "--as", form], SCENE / "export" / form
     killed = [sys.executable, "-c", KILLED.format(moment), *words]
-    environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
-    assert subprocess.run(killed, env=environment).returncode == 9
+    assert subprocess.run(killed).returncode == 9
     app(words, standalone_mode=False)
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     assert before and not any(".writing" in str(path) for path in before)
-    assert subprocess.run(killed, env=environment).returncode == 9
+    assert subprocess.run(killed).returncode == 9
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
     app(words, standalone_mode=False)
 

@@ -1,6 +1,5 @@
 """Twenty commands at once in one project: nothing is lost, and none disturbs another."""
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -8,7 +7,6 @@ from pathlib import Path
 from hilsplat.annotate.labels import read_labels
 from hilsplat.query.names import read_names
 from hilsplat.scene.sheet import read_sheet
-from tests.conftest import PROJECT
 from tests.unit.finished_desk import NUM_VIEWS, pack_photographs
 
 NAME = """
@@ -60,8 +58,7 @@ def test_twenty_commands_at_once_lose_nothing(own_desk: Path) -> None:
     ]
     commands += [[*hilsplat, "cache", "--folder", "results/.cache", "prune", "--days", "0"]] * 2
     assert len(commands) == 20
-    environment = {**os.environ, "PYTHONPATH": str(PROJECT), "HILSPLAT_MODELS": "models"}
-    how = {"cwd": project, "env": environment, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    how = {"cwd": project, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     running = [subprocess.Popen([sys.executable, *words], text=True, **how) for words in commands]
     said = [process.communicate(timeout=300)[0] for process in running]
     failed = [number for number, process in enumerate(running) if process.returncode]
