@@ -308,7 +308,9 @@ ROWS = {
 
 
 @pytest.mark.parametrize("what", ROWS)
-def test_bad_input_is_reported_and_nothing_is_lost(what, project, told):
+def test_bad_input_is_reported_and_nothing_is_lost(
+    what: str, project: Path, told: Callable[..., str]
+) -> None:
     lay, command, words = ROWS[what]
     lay()
     before = snapshot(project)

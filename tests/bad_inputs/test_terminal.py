@@ -5,6 +5,7 @@ import logging
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -75,7 +76,9 @@ LABELS = ("datasets", "check", "annotated", "--data-root", "data")
         (no_models, ("run",), r"\x1b]0;x\x07"),
     ],
 )
-def test_the_terminal_gets_only_printable_text(lay, command, part, project):
+def test_the_terminal_gets_only_printable_text(
+    lay: Callable[[], object], command: tuple[str, ...], part: str, project: Path
+) -> None:
     lay()
     _, output = printed(project, *command)
     text = output.decode()

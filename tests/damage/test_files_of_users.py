@@ -209,8 +209,8 @@ app(sys.argv[1:])
     ],
 )
 def test_an_export_can_be_repeated_after_a_kill_and_until_then_the_former_one_is_kept(
-    own_desk, monkeypatch, form, moment
-):
+    own_desk: Path, monkeypatch, form: str, moment: str
+) -> None:
     """It is killed after all files are written: before or after their sizes and times are recorded."""
     monkeypatch.chdir(own_desk.parents[2])
     words, folder = ["export", "photos/desk", "--as", form], SCENE / "export" / form

@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 from jsonschema import Draft202012Validator
@@ -52,7 +52,9 @@ from hilsplat.stage import Seed
         ({"masks": {"points_per_batch": True}}, "YAML reads yes, no, on and off"),
     ],
 )
-def test_a_configuration_that_cannot_be_used_is_refused_with_its_place(config, message):
+def test_a_configuration_that_cannot_be_used_is_refused_with_its_place(
+    config: dict[str, Any], message: str
+) -> None:
     with pytest.raises(SettingsError, match=message):
         parse_run(config)
 
@@ -119,7 +121,9 @@ def test_the_manual_lists_the_choices_or_the_range_of_a_setting() -> None:
     assert "method.codebook = (64, 10)" in manual and "    opengaussian: number of groups" in manual
 
 
-def test_the_schema_for_editors_accepts_the_shipped_configuration_and_refuses_a_misspelt_key(project):
+def test_the_schema_for_editors_accepts_the_shipped_configuration_and_refuses_a_misspelt_key(
+    project: Path,
+) -> None:
     validator = Draft202012Validator(json.loads(json.dumps(config_schema())))
     config = read_config(project / "config/config.yaml")
     validator.validate(config)

@@ -3,6 +3,7 @@
 import json
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -70,8 +71,8 @@ def is_done(place: Project) -> bool:
     ("write", "inside", "source"), [(write_flat, ".", "."), (write_colmap, "my project", "..")]
 )
 def test_a_project_among_its_photographs_finishes_and_has_nothing_left_to_do(
-    project, tmp_path, write, inside, source
-):
+    project: Path, tmp_path: Path, write: Callable[[Path], None], inside: str, source: str
+) -> None:
     write(tmp_path / "desk")
     (tmp_path / "desk" / inside).mkdir(exist_ok=True)
     place = start(tmp_path / "desk" / inside, project, source)

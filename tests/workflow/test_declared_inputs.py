@@ -67,7 +67,9 @@ def copy_artifact(source: Path, target: Path) -> None:
 
 
 @pytest.mark.parametrize("rule", OUTPUTS)
-def test_declared_inputs_are_enough(rule, jobs, finished, empty):
+def test_declared_inputs_are_enough(
+    rule: str, jobs: Mapping[str, Job], finished: Project, empty: Project
+) -> None:
     job = jobs[rule]
     shutil.rmtree(empty.root / "results", ignore_errors=True)
     for path in job.inputs:

@@ -64,7 +64,12 @@ def test_verify_finds_a_flipped_bit_in_every_file(results: Path) -> None:
     assert {path for path in rest if not NO_ARTIFACTS & set(path.parts) and path.suffix != ".log"} == set()
 
 
-def test_every_stage_refuses_an_input_with_a_flipped_bit(copy_of_finished, results, capfd, monkeypatch):
+def test_every_stage_refuses_an_input_with_a_flipped_bit(
+    copy_of_finished: Project,
+    results: Path,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     tried, targets = [], set()
     for artifact in artifacts_in(results):
         if artifact.parent.parent == SCENE and artifact.parent.name != "default":

@@ -35,7 +35,9 @@ def theirs(finished: Project, tmp_path: Path) -> Path:
     return folder
 
 
-def test_a_scene_of_langsplat_answers_after_two_commands(theirs, finished, plain):
+def test_a_scene_of_langsplat_answers_after_two_commands(
+    theirs: Path, finished: Project, plain: Project
+) -> None:
     project = plain
     said = project.hilsplat("new", "theirs", str(theirs))
     assert "iteration_30000/point_cloud.ply" in said and "language_features" in said

@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import hilsplat
 from hilsplat.base.lineage import read_provenance
@@ -43,7 +44,9 @@ def test_each_step_gives_the_bytes_of_the_workflow(finished: Project, tmp_path: 
             np.testing.assert_array_equal(getattr(tree, name), values, err_msg=name)
 
 
-def test_the_example_of_the_page_runs(finished, project, tmp_path, monkeypatch, capsys):
+def test_the_example_of_the_page_runs(
+    finished: Project, project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
     shutil.copytree(finished.root / SCENE / "world/images", tmp_path / "photos")
     monkeypatch.chdir(tmp_path)
     example = re.findall(r"```python\n(.*?)```", (project / "docs/python.md").read_text(), re.DOTALL)[0]

@@ -46,7 +46,9 @@ def written_files(root: Path) -> dict[Path, int]:
     }
 
 
-def test_another_directory_takes_configuration_sheet_and_models_from_a_read_only_clone(clone, tmp_path):
+def test_another_directory_takes_configuration_sheet_and_models_from_a_read_only_clone(
+    clone: Project, tmp_path: Path
+) -> None:
     (tmp_path / "work").mkdir()
     before, paths = written_files(clone.root), [clone.root, *clone.root.rglob("*")]
     for path in paths:
@@ -64,7 +66,9 @@ def test_another_directory_takes_configuration_sheet_and_models_from_a_read_only
     assert written_files(clone.root) == before
 
 
-def test_a_module_with_a_prefix_gives_the_same_bytes_on_one_core(finished, clone, tmp_path):
+def test_a_module_with_a_prefix_gives_the_same_bytes_on_one_core(
+    finished: Project, clone: Project, tmp_path: Path
+) -> None:
     outer = tmp_path / "outer"
     outer.mkdir()
     (outer / "Snakefile").write_text(

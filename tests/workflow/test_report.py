@@ -2,12 +2,16 @@
 
 import json
 
+from tests.workflow.conftest import Project
+
 NAMES = ("hierarchy.html", "waymo.html", "panel.webp", "registration.webp", "fit.webp", "comparison.webp")
 NAMES += ("views.webp", "features.webp", "sweep-theta.png")
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>--><!-- {{ alert(3) }}"
 
 
-def test_the_report_holds_tables_and_panels_and_runs_no_text_of_a_configuration(copy_of_finished):
+def test_the_report_holds_tables_and_panels_and_runs_no_text_of_a_configuration(
+    copy_of_finished: Project,
+) -> None:
     project = copy_of_finished
     project.snakemake("--report", "report.html")
     text = (project.root / "report.html").read_text()

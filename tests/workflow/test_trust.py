@@ -6,6 +6,7 @@ import shlex
 import signal
 import sys
 import time
+from collections.abc import Callable
 
 import pytest
 
@@ -37,7 +38,9 @@ def change_file(project: Project) -> None:
 
 
 @pytest.mark.parametrize("damage", [damage_file, damage_provenance, change_file])
-def test_damage_is_repaired_even_without_snakemakes_records(drawn, damage):
+def test_damage_is_repaired_even_without_snakemakes_records(
+    drawn: Project, damage: Callable[[Project], None]
+) -> None:
     before = drawn.files(IMAGES)
     damage(drawn)
     for record in (drawn.root / ".snakemake/metadata").iterdir():

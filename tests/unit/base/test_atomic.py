@@ -59,13 +59,17 @@ def test_outputs_have_the_permissions_of_other_new_files(tmp_path: Path) -> None
     assert found == files | {"new": folder, "inner": folder}
 
 
-def test_a_file_is_flushed_before_it_replaces_the_former_one_and_its_folder_after_that(tmp_path, flushed):
+def test_a_file_is_flushed_before_it_replaces_the_former_one_and_its_folder_after_that(
+    tmp_path: Path, flushed: list[str]
+) -> None:
     write_text(tmp_path / "a.txt", "text")
     file, folder = flushed
     assert is_unfinished(Path(file)) and folder == str(tmp_path)
 
 
-def test_the_files_of_a_folder_are_flushed_once_before_it_replaces_the_former_one(tmp_path, flushed):
+def test_the_files_of_a_folder_are_flushed_once_before_it_replaces_the_former_one(
+    tmp_path: Path, flushed: list[str]
+) -> None:
     with atomic_folder(tmp_path / "out") as new:
         write_text(new / "a.txt", "text")
         with atomic_folder(new / "inner") as inner:

@@ -168,8 +168,8 @@ def test_cache_computes_once_and_recovers_from_a_damaged_entry(tmp_path: Path) -
 
 @pytest.mark.parametrize("compressed", [True, False])
 def test_entries_that_a_power_failure_cut_or_filled_with_zeros_are_computed_again(
-    tmp_path, flushed, compressed
-):
+    tmp_path: Path, flushed: list[str], compressed: bool
+) -> None:
     cache = ViewCache(tmp_path, compressed=compressed)
     arrays = {"x": np.arange(60.0), "none": np.zeros((0, 3)), "is": np.arange(100) % 3 == 0}
     cache.get("key", lambda: arrays)

@@ -33,7 +33,9 @@ TEXTS = st.text(st.characters(exclude_categories=["Cs"]) | st.sampled_from("'=+-
         (-0.25, "-0.25"),
     ],
 )
-def test_formulas_are_stored_as_text_and_numbers_as_numbers(tmp_path, cell, stored):
+def test_formulas_are_stored_as_text_and_numbers_as_numbers(
+    tmp_path: Path, cell: object, stored: str
+) -> None:
     write_csv(tmp_path / "a.csv", ["x", "y"], [[cell, 1]])
     with (tmp_path / "a.csv").open(newline="") as stream:
         assert list(csv.reader(stream))[1] == [stored, "1"]
