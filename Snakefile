@@ -28,6 +28,7 @@ from hilsplat.workflow.plan import PARTS, Plan, any_of
 from hilsplat.workflow.progress import estimates
 from hilsplat.workflow.resources import JobResources
 from hilsplat.workflow.run import mark_run, prepare_process, record_run, unmark_run
+from hilsplat.workflow.scene_data import portable
 
 min_version("9.20")
 
@@ -66,7 +67,10 @@ for line in PLAN.absent_lines():
 LABELS = {"files": PLAN.data.label_files, "plugins": PLAN.data.label_readers}
 SCORED = {**LABELS, "plugins": PLAN.data.scorers}
 READERS = readers_of(DATASETS)
-FEATURES = {"files": PLAN.data.features, "features": PLAN.data.features_folder}
+FEATURES = {
+    "files": PLAN.data.features,
+    "features": lambda job: portable(PLAN.row(job).features),
+}
 
 
 pathvars:

@@ -9,7 +9,7 @@ from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import yaml
-from pydantic import BaseModel, ValidationError, create_model, field_validator
+from pydantic import BaseModel, Field, ValidationError, create_model, field_validator
 from pydantic.fields import FieldInfo
 
 from hilsplat import settings
@@ -31,24 +31,24 @@ LONGEST_SHOWN = 120  # maximum number of characters of a value in a message
 class CoreSettings(Section):
     """The sections of the pipeline by name; plugins add their own."""
 
-    poses: settings.PosesSettings = settings.PosesSettings()
-    gaussians: settings.GaussiansSettings = settings.GaussiansSettings()
-    masks: settings.MasksSettings = settings.MasksSettings()
-    coverage_tree: settings.CoverageTreeSettings = settings.CoverageTreeSettings()
-    clip: settings.ClipSettings = settings.ClipSettings()
-    contributions: settings.ContributionsSettings = settings.ContributionsSettings()
-    semantic_tree: settings.SemanticTreeSettings = settings.SemanticTreeSettings()
-    autoencoder: settings.AutoencoderSettings = settings.AutoencoderSettings()
-    field: settings.FieldSettings = settings.FieldSettings()
-    method: MethodSettings = MethodSettings()
-    evaluate: settings.EvaluateSettings = settings.EvaluateSettings()
-    query: settings.QuerySettings = settings.QuerySettings()
-    figures: settings.FiguresSettings = settings.FiguresSettings()
+    poses: settings.PosesSettings = Field(default_factory=settings.PosesSettings)
+    gaussians: settings.GaussiansSettings = Field(default_factory=settings.GaussiansSettings)
+    masks: settings.MasksSettings = Field(default_factory=settings.MasksSettings)
+    coverage_tree: settings.CoverageTreeSettings = Field(default_factory=settings.CoverageTreeSettings)
+    clip: settings.ClipSettings = Field(default_factory=settings.ClipSettings)
+    contributions: settings.ContributionsSettings = Field(default_factory=settings.ContributionsSettings)
+    semantic_tree: settings.SemanticTreeSettings = Field(default_factory=settings.SemanticTreeSettings)
+    autoencoder: settings.AutoencoderSettings = Field(default_factory=settings.AutoencoderSettings)
+    field: settings.FieldSettings = Field(default_factory=settings.FieldSettings)
+    method: MethodSettings = Field(default_factory=MethodSettings)
+    evaluate: settings.EvaluateSettings = Field(default_factory=settings.EvaluateSettings)
+    query: settings.QuerySettings = Field(default_factory=settings.QuerySettings)
+    figures: settings.FiguresSettings = Field(default_factory=settings.FiguresSettings)
 
     @field_validator("method", mode="before")
     @classmethod
     def _of_named_method(cls, value: Any) -> Any:
-        return value if isinstance(value, MethodSettings) else validated("method", value, "method")
+        return value if isinstance(value, MethodSettings) else validated("method", value)
 
     def resolve_auto(self) -> "CoreSettings":
         """Return all sections after resolving values that depend on others: models, crops, theta."""
@@ -66,11 +66,11 @@ _PLUGIN_SECTIONS: dict[str, type[Section]] = dict(entry_points("hilsplat.setting
 if TYPE_CHECKING:
     StageSettings = CoreSettings
 else:
-    _fields = {name: (section, section()) for name, section in _PLUGIN_SECTIONS.items()}
+    _fields = {name: (section, Field(default_factory=section)) for name, section in _PLUGIN_SECTIONS.items()}
     StageSettings = create_model("StageSettings", __base__=CoreSettings, **_fields)
 
 
-SECTIONS: dict[str, type[Section]] = _PLUGIN_SECTIONS | {name: type(part) for name, part in StageSettings()}
+SECTIONS: dict[str, type[Section]] = _PLUGIN_SECTIONS | CoreSettings.__annotations__
 """Section -> its class; those of plugins first, because they make what the pipeline reads."""
 
 
@@ -80,16 +80,16 @@ def parse_section(name: str, text: str) -> Any:
         values = parse_json(text or "{}")
     except ValueError as error:
         raise SettingsError(f"{name}: the settings are not valid JSON: {error}", found=text[:80]) from error
-    return validated(name, values, name)
+    return validated(name, values)
 
 
-def validated(name: str, values: Any, where: str) -> Section:
-    """Validate a section, that of the named method for `method`; `where` is its place in messages."""
+def validated(name: str, values: Any, where: str = "") -> Any:
+    """Validate a section, that of the named method for `method`; `where` is its place, if not at the top."""
     section = settings_class(values) if name == "method" else SECTIONS[name]
     try:
         return section.model_validate(values)
     except ValidationError as error:
-        raise settings_error(error, where, section) from error
+        raise settings_error(error, where or name, section) from error
 
 
 Settings = TypeVar("Settings", bound=Section)

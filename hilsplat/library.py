@@ -146,7 +146,7 @@ def _posed(
     progress: bool,
 ) -> Scene:
     """Run the stage `poses`; without a folder, the scene's files are deleted with the returned object."""
-    source, section = source.resolve(), _section("poses", settings)
+    source, section = source.resolve(), validated("poses", settings)
     _require_seed(seed)
     _require_own(folder)
     with ExitStack() as files:
@@ -189,7 +189,7 @@ def fit(
     """
     _require_seed(seed)
     steps = {} if iterations is None else {"iterations": iterations, "steps_per_view": iterations}
-    section = _section("gaussians", steps | settings)
+    section = validated("gaussians", steps | settings)
     with _running(progress):
         return fit_gaussians(scene, section, seed=seed, threads=_threads(threads))[0]
 
@@ -231,7 +231,7 @@ def segment(
         ModelError: the model is missing or incomplete.
     """
     segmenter = AUTO if model == AUTO else "sam"
-    chosen = _section("masks", {"segmenter": segmenter, "model": str(model), **settings})
+    chosen = validated("masks", {"segmenter": segmenter, "model": str(model), **settings})
     section, views = resolve_auto(chosen), train_views(scene)
     with _running(progress), _folder(cache) as folder:
         views_and_masks, origin = segment_views(
@@ -272,8 +272,8 @@ def link(
         MisalignedArtifactError: there are no masks, or some are not those of the scene's training views.
         ModelError: the model is missing or incomplete.
     """
-    section, number = _section("semantic_tree", settings), _threads(threads)
-    clip = resolve_auto(_section("clip", {"model": str(model), "crops": "nodes"}))
+    section, number = validated("semantic_tree", settings), _threads(threads)
+    clip = resolve_auto(validated("clip", {"model": str(model), "crops": "nodes"}))
     views = train_views(scene)
     if not (isinstance(masks, SceneMasks) and masks and set(masks) <= set(views)):
         raise MisalignedArtifactError(
@@ -334,10 +334,6 @@ def _folder(path: Path | str | None) -> Iterator[Path]:
     """Yield the folder, or a temporary one."""
     with nullcontext(path) if path else TemporaryDirectory(prefix="hilsplat-") as folder:
         yield Path(folder).absolute()
-
-
-def _section(name: str, values: Mapping[str, Any]) -> Any:
-    return validated(name, values, name)
 
 
 def _require_seed(seed: int) -> None:

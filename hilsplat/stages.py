@@ -655,15 +655,16 @@ def sweep_plot(
 
 @stage(scope="run", beside=lambda out: (out.with_suffix(".md"),))
 def efficiency(
-    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
-    out: Annotated[Path, typer.Option(help="CSV, with .md beside it"), Role.OUTPUT] = Path(
-        "results/efficiency.csv"
-    ),
+    out: Annotated[
+        Path,
+        typer.Option(help="CSV to write to the results folder of a run, with .md beside it"),
+        Role.OUTPUT,
+    ] = Path("results/efficiency.csv"),
 ) -> str:
     """Print the time of each stage, from the benchmark files of a run."""
     from hilsplat.evaluate.costs import run_efficiency
 
-    return run_efficiency(results, out)
+    return run_efficiency(out.parent, out)
 
 
 def kinds_of(artifact: str) -> list[Stage[..., Any]]:

@@ -19,12 +19,12 @@ use rule stage as evaluate with:
     resources:
         **RESOURCES.of("evaluate"),
     params:
-        **PLAN.params("evaluate", **SCORED, name=PLAN.data.scene_name),
+        **PLAN.params("evaluate", **SCORED, name=lambda wildcards: wildcards.scene),
 
 
 use rule stage as score_means with:
     input:
-        scores=targets.means_of(PLAN),
+        scores=lambda wildcards: targets.compared_means(PLAN, wildcards),
     output:
         out="<results>/{dataset}/{scene}/scores.md",
         csv="<results>/{dataset}/{scene}/scores.csv",
@@ -42,9 +42,11 @@ use rule stage as score_means with:
 
 use rule stage as table with:
     input:
-        scores=targets.scores_of(PLAN, "scores.csv"),
-        times=targets.scores_of(PLAN, "times.csv"),
-        instances=targets.scores_of(PLAN, "instances.npz"),
+        scores=lambda wildcards: targets.scores(PLAN, wildcards.table),
+        times=lambda wildcards: targets.scores(PLAN, wildcards.table, "times.csv"),
+        instances=lambda wildcards: targets.scores(
+            PLAN, wildcards.table, "instances.npz"
+        ),
         published=lambda wildcards: str(published_values(wildcards.table)),
     output:
         out="<results>/tables/{table}.csv",
@@ -64,9 +66,9 @@ use rule stage as table with:
         **PLAN.params(
             "table",
             plugins=lambda wildcards: READERS,
-            name=targets.table_name,
+            name=lambda wildcards: wildcards.table,
             labels=PLAN.names,
-            absent=targets.absent_of(PLAN),
+            absent=lambda wildcards: targets.absent(PLAN, wildcards.table),
         ),
 
 

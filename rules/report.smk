@@ -60,4 +60,4 @@ use rule stage as sweep_plot with:
     resources:
         **RESOURCES.of("sweep_plot"),
     params:
-        **PLAN.params("sweep_plot", name=targets.sweep_name),
+        **PLAN.params("sweep_plot", name=lambda wildcards: wildcards.sweep),

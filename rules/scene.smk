@@ -16,7 +16,7 @@ use rule stage as source with:
         **PLAN.params(
             "source",
             files=PLAN.data.source_files,
-            plugins=PLAN.data.source_reader,
+            plugins=lambda wildcards: readers_of([PLAN.data.source_name(wildcards)]),
             name=PLAN.data.source_name,
         ),
 
@@ -34,4 +34,8 @@ use rule stage as poses with:
     resources:
         **RESOURCES.of("poses"),
     params:
-        **PLAN.params("poses", files=PLAN.data.image_files, name=PLAN.data.name),
+        **PLAN.params(
+            "poses",
+            files=PLAN.data.image_files,
+            name=lambda wildcards: PLAN.row(wildcards).name,
+        ),

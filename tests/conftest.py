@@ -38,6 +38,8 @@ if os.environ.get(CHECKED):
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[name] = "1"  # as in hilsplat.cli.main
 os.environ.setdefault("MPLBACKEND", "Agg")
+# Processes that tests start run the code of this checkout.
+os.environ["PYTHONPATH"] = os.pathsep.join([str(PROJECT), *filter(None, [os.environ.get("PYTHONPATH")])])
 os.environ["HILSPLAT_MODELS"] = "models"  # whatever the user of this machine has fetched
 
 # No test fails for being slow on a busy machine, and every run tries the same examples.

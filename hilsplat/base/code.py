@@ -131,9 +131,18 @@ def _facts(module: str, path: Path, known: Facts | None) -> Facts:
         return known
     tree = _Bare().visit(ast.parse(text, str(path)))
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-    return Facts(
-        contents, sha256_of_bytes(ast.dump(tree).encode(), *data), sorted({*_imported(tree, package)})
-    )
+    code = json.dumps(_structure(tree)).encode()
+    return Facts(contents, sha256_of_bytes(code, *data), sorted({*_imported(tree, package)}))
+
+
+def _structure(node: Any) -> Any:
+    """Return a syntax tree as nested lists; `ast.dump` depends on the version of Python."""
+    if isinstance(node, ast.AST):
+        filled = ((name, value) for name, value in ast.iter_fields(node) if value not in (None, []))
+        return [type(node).__name__, {name: _structure(value) for name, value in filled}]
+    if isinstance(node, list):
+        return [_structure(part) for part in node]
+    return [node] if isinstance(node, str) else repr(node)
 
 
 def _imported(tree: ast.AST, package: str) -> Iterator[str]:
@@ -150,7 +159,12 @@ class _Bare(ast.NodeTransformer):
 
     def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
         is_text = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
-        return None if is_text else node
+        return None if is_text else self.generic_visit(node)
+
+    def visit_JoinedStr(self, node: ast.JoinedStr) -> ast.AST:
+        self.generic_visit(node)
+        node.values = [part for part in node.values if getattr(part, "value", None) != ""]  # of Python 3.12
+        return node
 
     def visit_If(self, node: ast.If) -> ast.AST | list[ast.stmt]:
         self.generic_visit(node)

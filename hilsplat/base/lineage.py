@@ -25,7 +25,7 @@ from hilsplat.base.artifacts import (
     write_json,
 )
 from hilsplat.base.errors import ArtifactError, HilsplatError, MisalignedArtifactError
-from hilsplat.base.files import regular
+from hilsplat.base.files import files_below, regular
 
 CONVERTED = ".made_from.json"
 """Hidden file in a folder of extracted frames or unpacked photographs that records their source."""
@@ -126,6 +126,13 @@ def sizes_of(path: Path) -> dict[str, int]:
     """Map the relative path of each file of an artifact ("." for a single file) to its size in bytes."""
     path = Path(path)
     return {file.relative_to(path).as_posix(): file.stat().st_size for file in files_of(path)}
+
+
+def artifacts_in(results: Path) -> list[Path]:
+    """Return the artifacts in a results folder that have provenance, sorted."""
+    records = (path for path in files_below(results) if path.name.endswith(RECORD))
+    artifacts = (path.with_name(path.name.removesuffix(RECORD)) for path in records)
+    return sorted(path for path in artifacts if ".cache" not in path.relative_to(results).parts)
 
 
 class Inputs:

@@ -39,7 +39,10 @@ class Plugins(Mapping[str, Part], Generic[Part]):
         return name in self.places  # without importing the component
 
 
+_all_entry_points = cache(metadata.entry_points)  # it reads files of every installed package
+
+
 @cache
 def entry_points(group: str) -> Plugins[Any]:
     """Return the components that installed packages offer as Python entry points of a group, by name."""
-    return Plugins({point.name: point.value for point in metadata.entry_points(group=group)})
+    return Plugins({point.name: point.value for point in _all_entry_points().select(group=group)})

@@ -12,6 +12,8 @@ import warnings
 from pathlib import Path
 from typing import Annotated
 
+gc.set_threshold(50_000)  # imports create many permanent objects, which are not searched for garbage so often
+
 _interrupt = signal.getsignal(signal.SIGINT)
 if _interrupt is signal.default_int_handler:  # until all is imported, Ctrl-C would print a traceback
     signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -58,7 +60,6 @@ def main() -> None:
     """Run the command; for errors that the user can fix, print a message without a traceback."""
     end_with_workflow()
     keep_freed_memory()
-    gc.set_threshold(5_000)  # imports create many permanent objects: a tenth less time to start
     try:
         require_working_directory()
         start_logging()

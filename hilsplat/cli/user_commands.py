@@ -1,6 +1,5 @@
 """Commands that use a finished scene, check results or the machine, or print all settings."""
 
-import gc
 import json
 from dataclasses import asdict
 from pathlib import Path
@@ -70,27 +69,23 @@ def query(
         raise SettingsError(f"there is no text to search for in {scene}", fix="hilsplat query SCENE TEXT")
     if masks is not None:
         require_new_folder(masks, "--masks")
-    gc.disable()  # garbage collection would take two seconds, a tenth of the query time
-    try:
-        from hilsplat.query.answer import answer
+    from hilsplat.query.answer import answer
 
-        for found in answer(
-            scene_folder(scene, results),
-            text,
-            level=level,
-            variant=variant,
-            views=views,
-            answerer=answerer,
-            view=view,
-            threshold=threshold,
-            out=out,
-            masks=masks,
-            spz=spz,
-            threads=threads,
-        ):
-            echo(found)
-    finally:
-        gc.enable()
+    for found in answer(
+        scene_folder(scene, results),
+        text,
+        level=level,
+        variant=variant,
+        views=views,
+        answerer=answerer,
+        view=view,
+        threshold=threshold,
+        out=out,
+        masks=masks,
+        spz=spz,
+        threads=threads,
+    ):
+        echo(found)
 
 
 def scene_folder(scene: str, results: Path) -> Path:

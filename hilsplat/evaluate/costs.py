@@ -11,7 +11,7 @@ from pathlib import Path
 
 from hilsplat.base.artifacts import parse_json, write_text
 from hilsplat.base.errors import ArtifactError
-from hilsplat.base.lineage import read_provenance, require_as_written, sha256_of_file
+from hilsplat.base.lineage import artifacts_in, read_provenance, require_as_written, sha256_of_file
 from hilsplat.base.ownership import require_beginning
 from hilsplat.base.tables import markdown_table, read_csv, write_csv
 from hilsplat.configuration import SECTIONS
@@ -46,6 +46,7 @@ class Cost:
     train_s: float  # wall-clock time of contributions, semantic tree, autoencoder and field
     peak_mib: float  # peak resident memory of the training jobs
     query_s: Mapping[str, float]  # per method, seconds from a text to a mask in a view
+    unrecorded: tuple[str, ...] = ()  # stages whose times are missing from the results folder
 
 
 def write_times(scores: Path, dataset: str, scene: str, variant: str, seconds: Mapping[str, float]) -> None:
@@ -68,7 +69,8 @@ def read_costs(scores: Iterable[Path]) -> list[Cost]:
         training = [jobs[stage] for stage in TRAINING if stage in jobs]
         peak_mib = 0.0 if None in training else max((job.peak_mib for job in training if job), default=0.0)
         query_s = {row["method"]: float(row["seconds"]) for row in rows}
-        costs.append(Cost(*place, *times, peak_mib or math.nan, query_s))
+        unrecorded = tuple(stage for stage, job in jobs.items() if job is None)
+        costs.append(Cost(*place, *times, peak_mib or math.nan, query_s, unrecorded))
     return costs
 
 
@@ -105,6 +107,8 @@ def _seconds(jobs: Mapping[str, Job | None], stages: tuple[str, ...]) -> float:
 def run_efficiency(results: Path, out: Path) -> str:
     """Write a CSV of all jobs below `results` and, beside it, a Markdown table of stages; return the table.
 
+    A line below the table counts artifacts whose jobs have no record.
+
     Raises:
         ArtifactError: there is no benchmark file, one is unreadable, or an output path has an unrelated file.
     """
@@ -129,6 +133,12 @@ def run_efficiency(results: Path, out: Path) -> str:
         peak_mib = f"{max(job.peak_mib for job in of_row):.0f}"
         lines.append([name, len(of_row), *(f"{value:.1f}" for value in seconds), peak_mib])
     text, beside = markdown_table(headings, lines, 1) + "\n", Path(out).with_suffix(".md")
+    artifacts = artifacts_in(Path(results))
+    if len(artifacts) > len(files):
+        missing = f"{len(artifacts) - len(files)} of {len(artifacts)}"
+        text += (
+            f"\nThe jobs of {missing} artifacts are not in this table: their benchmark files are missing.\n"
+        )
     for path, begin in ((Path(out), ",".join(columns)), (beside, text.partition("\n")[0])):
         require_beginning(path, begin)
     write_csv(Path(out), columns, rows)

@@ -132,14 +132,17 @@ def command_name(folder: Path) -> str:
 
 
 def require_scene_folder(folder: Path) -> None:
-    """Raise ArtifactError, with the scenes of its results folder, if the folder of a scene does not exist."""
-    if folder.is_dir():
-        return
+    """Raise ArtifactError, with known scenes, if a folder does not exist or contains scenes."""
     parents = folder.absolute().parents
-    known = scenes_in(parents[0]) or scenes_in(parents[1])  # results/desk, or results/photos/desk
+    inside = scenes_in(folder) or [
+        name for name in scenes_in(parents[0]) if name.startswith(f"{folder.name}/")
+    ]
+    if folder.is_dir() and not inside:
+        return
+    known = inside or scenes_in(parents[0]) or scenes_in(parents[1])  # results/desk, or results/photos/desk
     name = f"{folder.parent.name}/{folder.name}"
     raise ArtifactError(
-        f"scene folder {folder} is missing",
+        f"{folder} is a folder of scenes, not a scene" if inside else f"scene folder {folder} is missing",
         expected=nearest(name, known) if known else "a run's folder results/<dataset>/<scene>, or a copy",
         fix="correct the name, or make the scene: hilsplat run SCENE; to list all: hilsplat scenes",
     )

@@ -35,19 +35,16 @@ from hilsplat.workflow.models import (
     describe_models,
     doubt_about_photographs,
 )
-from hilsplat.workflow.scene_data import Job, SceneData, VariantJob, of_variant
+from hilsplat.workflow.scene_data import Job, SceneData, VariantJob, of_variant, portable
 
 MIN_PHOTOGRAPHS = 16
 """Minimum number of photographs for key views; with fewer, the key views (half) would link too few masks."""
 
-PARTS = ("semantic_tree", "field", "autoencoder", "clip", "masks")
-"""Artifacts of a variant that queries read."""
-
 SCORED = "evaluate"
 """The stage that reads everything that a variant may change."""
 
-Option = Callable[[Any], Any] | str
-"""An option of a stage's command: its value, or a function of the wildcards."""
+Option = Callable[[Any], Any]
+"""An option of a stage's command: a function of the wildcards."""
 
 
 LINKING = ("contributions", "coverage_tree", "semantic_tree")
@@ -157,13 +154,13 @@ class Plan:
         self.stages_of = functools.cache(lambda *which: run.stages(*which).resolve_auto())
         self.defaults = {name: getattr(self.stages_of("default", ()), name) for name in SECTIONS}
         self.options: dict[str, Option] = {
-            "unit": self.data.unit,
-            "render": self.data.is_render,
-            "poses": self.data.poses,
+            "unit": lambda job: self.row(job).unit,
+            "render": lambda job: self.row(job).generated is not None,
+            "poses": lambda job: portable(self.row(job).poses),
             "source": self.data.generated_source,
             "dataset": lambda job: job.dataset,
             "variant": lambda job: job.variant,
-            "labels": self.data.label_names,
+            "labels": lambda job: self.data.labels(self.row(job)),
             "data_root": self.data.root,
             "names": self.names,
             "queries": self.queries,
@@ -294,7 +291,7 @@ class Plan:
         values: dict[str, Any] = {}
         for name in stage.hints:
             if (option := options.get(name, self.options.get(name))) is not None:
-                values[name] = option(job) if callable(option) else option
+                values[name] = option(job)
             elif name in stage.sections:
                 values[name] = self.settings(stage.sections[name], job)
             elif name == "seed":
@@ -307,7 +304,6 @@ class Plan:
         paths: dict[str, Any] = {
             "images": lambda: self.data.images(job, input),
             "folder": lambda: str(Path(input.gaussians).parent),
-            "results": lambda: str(parents[0]),
             "cache": lambda: str(parents[{"run": 0, "scene": 2, "variant": 3}[stage.scope]] / ".cache"),
         }
         values: dict[str, Any] = {}
@@ -352,10 +348,7 @@ class Plan:
 
     def inputs(self, name: str) -> dict[str, Callable[[VariantJob], str]]:
         """Return input functions for the artifacts of a variant that a stage needs (`shared_path`)."""
-        stage = stage_of(name)
-        kinds = {artifact: kinds_of(artifact) for artifact in stage.needs}
-        names = [artifact for artifact, found in kinds.items() if found and found[-1].scope == "variant"]
-        return {artifact: functools.partial(self.shared_path, artifact) for artifact in names}
+        return {artifact: functools.partial(self.shared_path, artifact) for artifact in _of_variant(name)}
 
     def compared(self, *artifacts: str) -> dict[str, Callable[[Job], list[str]]]:
         """Return input functions for the artifacts of all variants in the main tables."""
@@ -561,6 +554,16 @@ class Plan:
         of_dataset = self.run.queries.get(job.dataset, ())
         queries = self.run.queries.get(f"{job.dataset}/{job.scene}", of_dataset)
         return escape_json_for_report(json.dumps(queries))
+
+
+def _of_variant(name: str) -> list[str]:
+    """Return the artifacts of a variant that a stage needs."""
+    kinds = {artifact: kinds_of(artifact) for artifact in stage_of(name).needs}
+    return [artifact for artifact, found in kinds.items() if found and found[-1].scope == "variant"]
+
+
+PARTS = _of_variant(SCORED)
+"""Artifacts of a variant that queries read."""
 
 
 def _first_kind(kinds: list[Stage[..., Any]], facts: Facts) -> Stage[..., Any]:

@@ -20,7 +20,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from hilsplat.base.artifacts import parse_json
+from hilsplat import stages
+from hilsplat.base.artifacts import INDEX, parse_json
 from hilsplat.base.errors import KILLED, KILLED_FIX, visible
 from hilsplat.base.progress import last_error, last_progress, warnings_in
 from hilsplat.scene.finished import KEY_VIEWS, command_name, refining
@@ -41,6 +42,9 @@ COMMAND_FAILED = "CalledProcessError"
 """Part of an error that quotes the command of a failed job, just before the event of its failure."""
 
 TARGETS = ("all", "everything", "tables", "total")  # entries of the job counts that are not jobs
+
+QUERIED = (stages.semantic_tree.file, stages.clip.file)
+"""Artifacts of a variant that queries need."""
 
 SIGKILL = ("died with <Signals.SIGKILL", "exit status 137")
 """How Snakemake reports a job that was killed."""
@@ -225,11 +229,11 @@ class RunProgress:
 
     def _hint(self, job: RunningJob) -> list[str]:
         """Return a line when a scene is ready to query, with the query commands once per run."""
-        variant = job.wildcards.get("variant")
-        needed = {"clip": "semantic_tree", "semantic_tree": "clip"}.get(job.rule)
-        if needed is None or job.log is None or variant not in ("default", KEY_VIEWS):
+        variant, stage = job.wildcards.get("variant"), all_stages().get(job.rule)
+        if stage is None or stage.file not in QUERIED or variant not in ("default", KEY_VIEWS):
             return []
-        if not (job.log.parents[1] / needed / "index.json").is_file():
+        others = [name for name in QUERIED if name != stage.file]
+        if job.log is None or not all((job.log.parents[1] / name / INDEX).is_file() for name in others):
             return []
         folder = job.log.parents[2]
         scene = command_name(folder)

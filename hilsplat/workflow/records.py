@@ -12,8 +12,14 @@ from pathlib import Path
 from hilsplat.base.artifacts import provenance_path, run_command
 from hilsplat.base.atomic import was_interrupted
 from hilsplat.base.errors import ArtifactError, HilsplatError
-from hilsplat.base.files import files_below
-from hilsplat.base.lineage import Provenance, files_of, read_provenance, sha256_of_path, sizes_of
+from hilsplat.base.lineage import (
+    Provenance,
+    artifacts_in,
+    files_of,
+    read_provenance,
+    sha256_of_path,
+    sizes_of,
+)
 from hilsplat.base.progress import track
 from hilsplat.models.store import model_digest
 from hilsplat.stages import all_stages
@@ -23,15 +29,6 @@ from hilsplat.workflow.scene_data import VariantJob, of_variant
 WHOLE, STALE, DAMAGED = "whole", "stale", "damaged"
 
 
-def records_in(results: Path) -> list[Path]:
-    """Return the artifacts in a results folder that have provenance, sorted."""
-    suffix = ".provenance.json"
-    paths = (
-        path for path in files_below(results) if path.name.endswith(suffix) and ".cache" not in path.parts
-    )
-    return sorted(path.with_name(path.name.removesuffix(suffix)) for path in paths)
-
-
 def outdated(plan: Plan, *, every_byte: bool = False) -> dict[str, str]:
     """Map each artifact of the run that must be rebuilt to the reason.
 
@@ -39,7 +36,7 @@ def outdated(plan: Plan, *, every_byte: bool = False) -> dict[str, str]:
     damage. Without `every_byte`, contents are compared only if a job did not finish or a file is newer than
     its record; otherwise, sizes are compared.
     """
-    records, artifacts = Records(plan.results, plan, every_byte=every_byte), records_in(plan.results)
+    records, artifacts = Records(plan.results, plan, every_byte=every_byte), artifacts_in(plan.results)
     declared = [path for row in plan.scenes for path in plan.artifacts(row)]
     names = [Path(stage.file).name for stage in all_stages().values()]  # inputs come before what reads them
     order = {name: number for number, name in enumerate(names)}
@@ -61,7 +58,7 @@ def verify(results: Path) -> tuple[str, bool]:
         ArtifactError: the folder contains no artifacts.
     """
     results = Path(results)
-    artifacts = records_in(results)
+    artifacts = artifacts_in(results)
     if not artifacts:
         raise ArtifactError(
             f"{results} contains no artifacts", expected="a results folder with *.provenance.json files"

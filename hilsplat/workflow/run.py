@@ -159,6 +159,9 @@ def run(
     parser.add_argument("--cores", "-c")
     parser.add_argument("--forcerun", "-R", nargs="*", action="extend", default=[])
     given, others = parser.parse_known_args(list(options))
+    if _has(others, "--directory", "-d"):  # results of this folder would be checked, locked and described
+        fix = "change to that folder first (cd), or pass --config results=FOLDER"
+        raise HilsplatError("hilsplat run works in the current folder; --directory is refused", fix=fix)
     configs = [_config_file(path) for path in (*configs, *given.configfile)]
     try:
         overrides = {

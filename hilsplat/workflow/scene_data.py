@@ -101,16 +101,6 @@ class SceneData:
 
         return digest
 
-    def is_render(self, job: Job) -> bool:
-        return self.row(job).generated is not None
-
-    def poses(self, job: Job) -> str:
-        """Return the option of `poses`: the file of known poses, if the sheet names one."""
-        return portable(self.row(job).poses)
-
-    def unit(self, job: Job) -> str:
-        return self.row(job).unit
-
     def require_no_braces(self, row: SceneRow) -> None:
         """Raise SettingsError for file names with braces, which Snakemake interprets as wildcards."""
         files = self.image_files(row) if row.folder is not None else []
@@ -128,10 +118,6 @@ class SceneData:
 
     def source_name(self, job: Job) -> str:
         return self.row(job).source.removeprefix(DATA_PREFIX)
-
-    def source_reader(self, job: Job) -> tuple[str, ...]:
-        """Return the reader of the data set from which a scene's images are exported."""
-        return readers_of([self.source_name(job)])
 
     def gaussians(self, name: str) -> Callable[[Job], list[str]]:
         """Return the input function of `gaussians` for a file that replaces the fit (`_gaussians`)."""
@@ -162,9 +148,6 @@ class SceneData:
         """Return LangSplat's files, which replace SAM and CLIP, if any."""
         folder = self.row(job).features
         return sorted(portable(path) for path in folder.glob("*_[sf].npy")) if folder is not None else []
-
-    def features_folder(self, job: Job) -> str:
-        return portable(self.row(job).features)
 
     def labels(self, row: SceneRow) -> tuple[str, ...]:
         """Return the labels of a scene, as `data set/scene`: published labels and your own annotations."""
@@ -213,19 +196,9 @@ class SceneData:
             )
         return self.truth(job)
 
-    def name(self, job: Job) -> str:
-        return self.row(job).name
-
-    def scene_name(self, job: Job) -> str:
-        return job.scene
-
     def generated_source(self, job: Job) -> str:
         row = self.row(job)
         return row.source if row.generated else ""
-
-    def label_names(self, job: Job) -> tuple[str, ...]:
-        """Return the labels that a scene is scored against."""
-        return self.labels(self.row(job))
 
     def figure_labels(self, job: Job) -> str:
         """Return the labels for queries and outlines in figures, which must be on images, if any."""

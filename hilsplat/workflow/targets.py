@@ -1,8 +1,5 @@
 """Targets of a run: tables, their scores, and pictures."""
 
-from collections.abc import Callable
-from typing import Any
-
 from hilsplat.base.errors import shorten_list
 from hilsplat.datasets.generators import GENERATORS
 from hilsplat.datasets.registry import DATASETS
@@ -22,24 +19,6 @@ PICTURES = {
     "features": "features at three levels",
 }
 """Picture of a scene -> its title in the report."""
-
-
-def table_name(wildcards: Any) -> str:
-    return str(wildcards.table)
-
-
-def sweep_name(wildcards: Any) -> str:
-    return str(wildcards.sweep)
-
-
-def scores_of(plan: Plan, name: str) -> Callable[[Any], list[str]]:
-    """Return the input function of `table` for the files `name` of its scenes and variants."""
-    return lambda wildcards: scores(plan, wildcards.table, name)
-
-
-def absent_of(plan: Plan) -> Callable[[Any], list[str]]:
-    """Return the option of `table` that lists what was not measured."""
-    return lambda wildcards: absent(plan, wildcards.table)
 
 
 def scores(plan: Plan, table: str, name: str = "scores.csv") -> list[str]:
@@ -126,21 +105,14 @@ def default(plan: Plan) -> list[str]:
     return [*figures(plan), *answers, *means, *(tables(plan) + plots if has_tables else [])]
 
 
-def means_of(plan: Plan) -> Callable[[Job], list[str]]:
-    """Return the input function of `score_means`: the scores of `default` and, if comparable, of LangSplat.
+def compared_means(plan: Plan, job: Job) -> list[str]:
+    """Return the input of `score_means`: the scores of `default` and, if comparable, of LangSplat.
 
     A scene with LangSplat's features is compared with LangSplat on the same Gaussians, masks and vectors.
     """
-
-    def paths(job: Job) -> list[str]:
-        variants = ["default"]
-        if plan.row(job).features:
-            variants += [
-                name for name in plan.run.main_variants if plan.stages_of(name).method.name == "langsplat"
-            ]
-        return [plan.path(job, name, "scores.csv") for name in dict.fromkeys(variants)]
-
-    return paths
+    others = [of_variant(job, name) for name in plan.run.main_variants if plan.row(job).features]
+    names = [other.variant for other in others if plan.stages(other).method.name == "langsplat"]
+    return [plan.path(job, name, "scores.csv") for name in dict.fromkeys(["default", *names])]
 
 
 def figures(plan: Plan) -> list[str]:

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from PIL import Image
 
 from hilsplat.base.arrays import read_tensors, write_tensors
@@ -24,10 +23,8 @@ from hilsplat.configuration import read_config
 from hilsplat.query.answer import answer, file_name
 from hilsplat.query.names import tree_digest
 from hilsplat.splat.ply import load_ply
-from hilsplat.workflow.plan import Plan
 from tests.bad_inputs.conftest import snapshot
-from tests.damage.damages import damaged_bytes
-from tests.unit.artifact_changes import write_record
+from tests.unit.artifact_changes import flip_bit, write_record
 from tests.unit.finished_desk import SCENE
 
 MASKS, TREE, CLIP = SCENE / "default/masks", SCENE / "default/coverage_tree", SCENE / "default/clip"
@@ -69,11 +66,6 @@ def write(path: Path | str, content: str | bytes) -> Callable[[], object]:
         Path(path).write_bytes(content if isinstance(content, bytes) else content.encode())
 
     return lay
-
-
-def damage(path: Path, kind: str, share: float) -> Callable[[], object]:
-    """Damage a file at a share of its length."""
-    return lambda: path.write_bytes(damaged_bytes(path.read_bytes(), (kind, share, 2)))
 
 
 def changed(artifact: Path) -> tuple[str, str]:
@@ -158,23 +150,8 @@ def png_of(width: int, height: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + checked + b"\0\0\0\0IDAT"
 
 
-def plan(**config: object) -> Callable[[], object]:
-    """Return a function that parses the configuration with these settings, as `snakemake` does first."""
-
-    def parse() -> None:
-        shipped = yaml.safe_load(Path("config/config.yaml").read_text())
-        Plan({**shipped, "groups": ["ci"], **config}).require_usable(devices=True)
-
-    return parse
-
-
 ROWS = {
     # ---- damaged artifacts: the message has the command that rebuilds them
-    "masks with bytes that do not unpack": row(
-        damage(MASKS / "000.png.npz", "zero", 0.5), COVERAGE, *changed(MASKS)
-    ),
-    "an index that is a list": row(write(MASKS / "index.json", "[]"), COVERAGE, *changed(MASKS)),
-    "an index 100,000 deep": row(write(MASKS / "index.json", DEEP), COVERAGE, *changed(MASKS)),
     "an index of a copy without provenance": row(
         without_provenance(MASKS, "[]"), COVERAGE, "index.json is not an artifact index"
     ),
@@ -194,19 +171,9 @@ ROWS = {
     "a field that is a folder": row(as_folder(FIELD), ASK, "field.safetensors cannot be read", "--verify"),
     "a code that is a folder": row(as_folder(CODE / "autoencoder.safetensors"), SOLVE, *changed(CODE)),
     "one bit of a field": row(
-        damage(FIELD, "flip", 0.7), ASK, "field.safetensors cannot be read", "changed after"
+        lambda: flip_bit(FIELD, 0.7), ASK, "field.safetensors cannot be read", "changed after"
     ),
     "a field of nan": row(field_of_nan, ASK, "array features contains an impossible value", "finite"),
-    "an index with another number": row(
-        lambda: INDEX.write_text(INDEX.read_text().replace('"num_gaussians": 8', '"num_gaussians": 9')),
-        SOLVE,
-        *changed(CONTRIBUTIONS),
-    ),
-    "one number of G": row(
-        damage(CONTRIBUTIONS / "G/values.npy", "flip", 0.5),
-        SOLVE,
-        *changed(CONTRIBUTIONS),
-    ),
     "Gaussians of another scene beside a tree": row(
         lambda: GAUSSIANS.write_bytes(GAUSSIANS.read_bytes()[:-4] + b"\0\0\x80?"),
         ASK,
@@ -221,6 +188,12 @@ ROWS = {
     # ---- queries
     "a scene that does not exist": row(
         nothing, ("query", "photos/none", "mug"), "results/photos/none is missing"
+    ),
+    "a results folder in place of a scene": row(
+        nothing, ("query", "results", "mug"), "results is a folder of scenes, not a scene", "photos/desk"
+    ),
+    "a data set in place of a scene": row(
+        nothing, ("query", "photos", "mug"), "results/photos is a folder of scenes", "photos/desk"
     ),
     "a scene that is not finished": row(
         lambda: Path("results/photos/later/default").mkdir(parents=True),
@@ -302,10 +275,6 @@ ROWS = {
         nothing, ("coverage-tree", "--masks", str(MASKS), "--out", "n" * 260), "too long for this file system"
     ),
     # ---- numbers and JSON on the command line
-    "settings that are no JSON": row(nothing, (*COVERAGE, "--settings", "{"), "coverage_tree", "JSON"),
-    "settings with a duplicate key": row(
-        nothing, (*COVERAGE, "--settings", '{"theta": 0.5, "theta": 0.9}'), "key 'theta' is duplicated"
-    ),
     "names that are no JSON": row(
         nothing,
         ("table", "lerf", "--published", "config/published/lerf.csv", "--labels", "[1", *OUT),
@@ -322,37 +291,6 @@ ROWS = {
         "no word",
     ),
     # ---- configuration, refused while the workflow is parsed
-    "a misspelt group in overrides": row(
-        nothing, plan(overrides={"photo": {}}), "overrides.photo", "'photos'"
-    ),
-    "a misspelt scene in overrides": row(
-        nothing,
-        plan(overrides={"synthetic/tabel-1": {}}),
-        "synthetic/tabel-1",
-        "did you mean 'synthetic/table-1'",
-    ),
-    "a misspelt scene in sweep_scenes": row(
-        nothing,
-        plan(sweep_scenes=["table-1", "tabel-2"]),
-        "sweep_scenes",
-        "tabel-2",
-        "did you mean 'table-2'",
-    ),
-    "a misspelt group": row(nothing, plan(groups=["ci", "bechmark"]), "groups.bechmark", "'benchmark'"),
-    "variants that differ only in case": row(
-        nothing, plan(variants={"big": {}, "Big": {}}), "variants.Big", "by the variant big"
-    ),
-    "a variant named like a folder in other case": row(
-        nothing, plan(variants={"Scene": {}}), "variants.Scene", "for files in a scene folder"
-    ),
-    "a variant named like the default in other case": row(
-        nothing, plan(variants={"DEFAULT": {}}), "variants.DEFAULT", "by the variant default"
-    ),
-    "a panel query of a separator alone": row(
-        nothing, plan(queries={"photos": [">"]}), "contains an empty text", "queries.photos"
-    ),
-    "a null byte in a label": row(nothing, plan(labels={"default": "a\0b"}), "null byte"),
-    "a misspelt data set in queries": row(nothing, plan(queries={"foto": ["a"]}), "queries.foto", "photos"),
     "YAML with a bracket left open": row(
         write("config/config.yaml", "seed: 0\nonly: [a\nseeds: 1\n"),
         OWN_CONFIG,

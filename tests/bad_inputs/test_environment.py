@@ -25,6 +25,7 @@ STAGE = " ".join(CONTRIBUTE)
         ("export photos/desk --out /proc/x", "/proc/x is missing or cannot be created"),
         (f"--log config/config.yaml coverage-tree --masks {MASKS} --out new", "is not a .log file"),
         ("run -- --cores 0", "with --cores 0, no job can start"),
+        ("run -- --directory elsewhere", "hilsplat run works in the current folder"),
         ("run -- --config 'only=[1'", "--config is not valid YAML"),
         ("run -- -n --config results=config/config.yaml groups=[ci]", "config.yaml is not a folder"),
     ],

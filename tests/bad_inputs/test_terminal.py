@@ -2,7 +2,6 @@
 
 import json
 import logging
-import os
 import shutil
 import subprocess
 import sys
@@ -27,7 +26,6 @@ def printed(project: Path, *words: str) -> tuple[int, bytes]:
     ended = subprocess.run(
         [sys.executable, "-m", "hilsplat", *words],
         cwd=project,
-        env={**os.environ, "HILSPLAT_MODELS": "models"},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         timeout=300,

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import threading
 import time
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,9 +15,8 @@ import httpx2
 
 from hilsplat.annotate.labels import label_path
 from tests.bad_inputs.conftest import snapshot
-from tests.conftest import PROJECT
 from tests.unit.annotate.label_files import read_labels
-from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, build_finished_desk
+from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, WIDTH, build_finished_desk, pack_photographs
 
 COMMANDS = {
     "new": ("new", "chair", "photos.zip"),
@@ -32,20 +30,15 @@ POLYGON = [[1, 1], [15, 1], [15, 20], [1, 20]]
 def prepare(root: Path) -> Path:
     """Return a project with a finished scene and an archive of photographs."""
     project = build_finished_desk(root)
-    shutil.copytree(PROJECT / "config", project / "config")
-    with zipfile.ZipFile(project / "photos.zip", "w") as archive:
-        for path in sorted((project / SCENE / "scene/images").iterdir()):
-            archive.write(path, path.name)
+    pack_photographs(project)
     return project
 
 
 def started(project: Path, *words: str) -> subprocess.Popen[str]:
     """Start a command in a project, in its own session."""
-    environment = {**os.environ, "PYTHONPATH": str(PROJECT), "HILSPLAT_MODELS": "models"}
     return subprocess.Popen(
         [sys.executable, "-m", "hilsplat", *words],
         cwd=project,
-        env=environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

@@ -3,41 +3,17 @@
 import copy
 import json
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from random import Random
 from typing import Any
 
 ODD_NUMBERS = (
-    "nan",
-    "inf",
-    "-inf",
-    "1e400",
-    "-1",
-    "0",
-    "1e38",
-    "99999999999999999999",
-    "x",
-    "",
-    "0x1",
-    "1,5",
+    *("nan", "inf", "-inf", "1e400", "-1", "0", "1e38", "99999999999999999999", "x", "", "0x1", "1,5"),
 )
 ODD_VALUES = (
-    None,
-    True,
-    False,
-    -1,
-    0,
-    0.5,
-    1e308,
-    float("inf"),
-    float("nan"),
-    2**70,
-    "",
-    "x",
-    "5",
-    [],
-    {},
-    [[1]],
+    *(None, True, False, -1, 0, 0.5, 1e308, float("inf"), float("nan"), 2**70),
+    *("", "x", "5", [], {}, [[1]]),
 )
 
 
@@ -134,8 +110,8 @@ def _other_digit(rnd: Random, text: str) -> str:
     return text[:place] + str(rnd.randint(1, 9)) + text[place + 1 :]
 
 
-def mutated_lines(rnd: Random, lines: list[str]) -> list[str]:
-    """Drop, repeat, swap, join or change lines."""
+def mutated_lines(rnd: Random, lines: list[str], odd: Sequence[str] = ODD_NUMBERS) -> list[str]:
+    """Drop, repeat, swap, join or change lines; words are replaced by odd ones."""
     lines = list(lines)
     place, other = rnd.randrange(len(lines)), rnd.randrange(len(lines))
     kind = rnd.randrange(10)
@@ -157,7 +133,7 @@ def mutated_lines(rnd: Random, lines: list[str]) -> list[str]:
         elif kind == 6:
             words[word], words[second] = words[second], words[word]
         elif kind == 7:
-            words[word] = rnd.choice(ODD_NUMBERS)
+            words[word] = rnd.choice(odd)
         elif kind == 8:
             words[word] = _other_digit(rnd, words[word])
         else:
@@ -187,13 +163,8 @@ def mutated_bytes(rnd: Random, content: bytes) -> bytes:
         return head + tail[length:]
     if kind == 7:
         second = content[other : other + length]
-        return (
-            head
-            + second
-            + content[place + len(second) : other]
-            + content[place : place + len(second)]
-            + (content[other + len(second) :])
-        )
+        between, after = content[place + len(second) : other], content[other + len(second) :]
+        return head + second + between + tail[: len(second)] + after
     number = rnd.choice((float("nan"), float("inf"), -1.0, 0.0, 1e30))
     odd = rnd.choice((struct.pack("<f", number), struct.pack("<d", number), b"\xff" * 8, b"\xff" * 4))
     place -= place % 4

@@ -1,4 +1,4 @@
-"""What a damaged file of another program means: a second reading, by json, struct and numpy alone.
+"""What a damaged file of another program means: a second reading, by json, struct, numpy and scipy alone.
 
 Each oracle returns the content that a reader may report, or raises `Meaningless` if a reader must refuse the
 file. Oracles are strict about structure, because programs that write these files are, and take numbers as
@@ -19,6 +19,7 @@ import numpy as np
 import pycolmap
 from PIL import Image, ImageDraw
 from pycocotools import mask as coco
+from scipy.spatial.transform import Rotation
 
 
 class Meaningless(Exception):
@@ -118,16 +119,8 @@ def colmap_lens(model: str, width: int, height: int, params: list[float]) -> tup
 
 def rotation(w: float, x: float, y: float, z: float) -> np.ndarray:
     """Return the rotation of a quaternion; it may be 2 % too long."""
-    length = math.sqrt(w * w + x * x + y * y + z * z)
-    require(abs(length - 1) < 0.02, "quaternion")
-    w, x, y, z = (value / length for value in (w, x, y, z))
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    require(abs(math.sqrt(w * w + x * x + y * y + z * z) - 1) < 0.02, "quaternion")
+    return Rotation.from_quat([x, y, z, w]).as_matrix()
 
 
 def rigid(matrix: np.ndarray) -> np.ndarray:

@@ -1,11 +1,10 @@
 """Every option that names an output or a cache, pointed at files of a user: none of them changes."""
 
-import os
 import shutil
 import subprocess
 import sys
-import zipfile
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import typer
 from hilsplat.base.errors import HilsplatError
 from hilsplat.cli.main import app
 from tests.conftest import PROJECT
-from tests.unit.finished_desk import SCENE
+from tests.unit.finished_desk import SCENE, pack_photographs
 
 VARIANT = SCENE / "default"
 VALUES = {
@@ -108,12 +107,9 @@ PLACES = (
 def project(desk_project: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished scene, the configuration, and the user's folder `mine` with links out of it."""
     copy = Path(shutil.copytree(desk_project, tmp_path_factory.mktemp("users") / "project"))
-    shutil.copytree(PROJECT / "config", copy / "config")
     (copy / "words.txt").write_text("mug\nbook\n")
     (copy / "table.csv").write_text("a,b\n")
-    with zipfile.ZipFile(copy / "photos.zip", "w") as archive:
-        for path in sorted((copy / SCENE / "scene/images").iterdir()):
-            archive.write(path, path.name)
+    pack_photographs(copy)
     mine, theirs = copy / "mine", copy / "theirs"
     for name in NAMES:
         (mine / name).parent.mkdir(parents=True, exist_ok=True)
@@ -154,31 +150,29 @@ def test_no_option_changes_a_users_file(project: Path, monkeypatch, name: str, o
         given = [chosen.opts[0], path] if chosen.param_type_name == "option" else [path]
         words += [*given, *FAST.get(name, ()), *WORDS.get(name, ())]
         try:
-            app(words)
-        except HilsplatError:
-            pass
+            with suppress(HilsplatError):
+                app(words)
         except SystemExit as ended:
             assert ended.code != 2, f"not the arguments of the command: {words}"
         except OSError as error:  # reported by `main`
             assert error.errno is not None
         shutil.rmtree("made", ignore_errors=True)
-        after = files_of_user(project)
-        assert after == before, words
+        assert files_of_user(project) == before, words
 
 
-def test_neither_a_log_nor_pruning_changes_a_users_file(project: Path) -> None:
+def test_neither_a_log_nor_pruning_changes_a_users_file(project: Path, monkeypatch) -> None:
+    monkeypatch.chdir(project)
     before = files_of_user(project)
     for place in PLACES:
-        for words in (
-            ["--log", f"mine/{place}", "settings"],
-            ["cache", "--folder", f"mine/{place}", "prune", "--days", "0", "--max-mib", "0"],
-        ):
-            command = [sys.executable, "-m", "hilsplat", *words]
-            environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
-            done = subprocess.run(command, cwd=project, capture_output=True, text=True, env=environment)
-            assert done.returncode != 2 and "Traceback" not in done.stderr, (words, done.stderr)
-    after = files_of_user(project)
-    assert after == before
+        with suppress(HilsplatError):
+            app(
+                ["cache", "--folder", f"mine/{place}", "prune", "--days", "0", "--max-mib", "0"],
+                standalone_mode=False,
+            )
+        command = [sys.executable, "-m", "hilsplat", "--log", f"mine/{place}", "settings"]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert done.returncode != 2 and "Traceback" not in done.stderr, (place, done.stderr)
+    assert files_of_user(project) == before
 
 
 @pytest.mark.parametrize("form", ["tree", "colmap"])
@@ -221,12 +215,11 @@ def test_an_export_can_be_repeated_after_a_kill_and_until_then_the_former_one_is
     monkeypatch.chdir(own_desk.parents[2])
     words, folder = ["export", "photos/desk", "--as", form], SCENE / "export" / form
     killed = [sys.executable, "-c", KILLED.format(moment), *words]
-    environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
-    assert subprocess.run(killed, env=environment).returncode == 9
+    assert subprocess.run(killed).returncode == 9
     app(words, standalone_mode=False)
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     assert before and not any(".writing" in str(path) for path in before)
-    assert subprocess.run(killed, env=environment).returncode == 9
+    assert subprocess.run(killed).returncode == 9
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
     app(words, standalone_mode=False)
 

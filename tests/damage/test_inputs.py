@@ -38,10 +38,13 @@ from hilsplat.splat.ply import import_ply, load_ply, save_ply
 from hilsplat.workflow.plan import Plan
 from tests.conftest import PROJECT
 from tests.damage import oracles
-from tests.damage.damages import byte_damages, damaged_bytes, damaged_texts
-from tests.damage.mutations import mutated, mutated_json
+from tests.damage.mutations import mutated, mutated_bytes, mutated_json, mutated_lines
 from tests.unit.round_gaussians import round_gaussians
 
+ODD_YAML = (
+    *("", "{", "]", "\t", ": ", "- ", "&a ", "*a", "!!binary "),
+    *("1e999", ".nan", "null", "yes", "\0", "é", "'"),
+)
 ANY = settings(suppress_health_check=list(HealthCheck))
 
 
@@ -58,12 +61,14 @@ def accepted(read: Callable[[], Any]) -> Any:
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "paper.yaml", "demo.yaml"])
-@given(data=st.data())
+@given(rnd=st.randoms(use_true_random=True))
 @ANY
-def test_configurations(name: str, data: st.DataObject, tmp_path, monkeypatch):
+def test_configurations(name: str, rnd: Random, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    path = tmp_path / name
-    path.write_text(data.draw(damaged_texts((PROJECT / "config" / name).read_text())), encoding="utf-8")
+    path, lines = tmp_path / name, (PROJECT / "config" / name).read_text().splitlines()
+    for _ in range(rnd.randint(1, 3)):
+        lines = mutated_lines(rnd, lines, ODD_YAML)
+    path.write_text("\n".join(lines), encoding="utf-8")
     found = accepted(lambda: read_config(path))
     if found is not None:
         accepted(lambda: Plan({"groups": ["ci"], "only": [], **found, "scenes": "config/scenes.tsv"}))
@@ -168,15 +173,16 @@ def write_transforms(folder: Path, kind: str) -> None:
     (folder / "transforms.json").write_text(json.dumps(content))
 
 
-def write_points(path: Path, form: str = "ascii", colours: str = "uchar") -> None:
+def write_points(path: Path) -> None:
     kinds = [
         ("x", "float"),
         ("y", "float"),
         ("z", "double"),
-        *((name, colours) for name in ("red", "green", "blue")),
+        ("red", "uchar"),
+        ("green", "uchar"),
+        ("blue", "uchar"),
     ]
-    rows = POINTS / ([1, 1, 1, 255, 255, 255] if colours == "float" else 1)
-    write_ply(path, form, kinds, rows)
+    write_ply(path, "ascii", kinds, POINTS)
 
 
 def write_ply(path: Path, form: str, kinds: list[tuple[str, str]], rows: np.ndarray) -> None:
@@ -584,40 +590,57 @@ def test_what_is_accepted_is_right(case: Case, rnd: Random):
         note(f"{path}:\n{damaged!r}\ninstead of\n{original!r}")
 
 
-@given(damage=byte_damages())
+@given(rnd=st.randoms(use_true_random=True))
 @ANY
-def test_gaussians(damage: tuple[str, float, int], tmp_path_factory):
-    path = tmp_path_factory.mktemp("ply") / "gaussians.ply"
+def test_gaussians(rnd: Random, tmp_path):
+    path = tmp_path / "gaussians.ply"
     save_ply(path, round_gaussians(np.arange(15.0).reshape(5, 3), log_scale=-1.0, opacity_logit=1.0))
-    path.write_bytes(damaged_bytes(path.read_bytes(), damage))
+    path.write_bytes(mutated_bytes(rnd, path.read_bytes()))
     found = accepted(lambda: load_ply(path))
     assert found is None or all(np.isfinite(array).all() for array in vars(found).values())
 
 
-ACCEPTED_BEFORE = [
-    ("points", "points.ply", b"vertex 3", b"vertex 2", "1 rows follow"),
-    ("Gaussians ASCII", "point_cloud.ply", b"vertex 40", b"vertex 39", "1 rows follow"),
-    ("Gaussians ASCII", "point_cloud.ply", b"\n0.126 ", b"\n0.1_6 ", "underscore"),
-    ("Gaussians binary", "point_cloud.ply", b"vertex 40", b"vertex 39", "bytes follow"),
-    ("Gaussians binary", "point_cloud.ply", b"filter_3D", b"Filter_3D", "parameters that 3DGS does not have"),
-    ("COLMAP text", "sparse/0/points3D.txt", b" 40 50 60", b" 40 2.5 60", r"points3D\.txt has colours"),
-    ("COLMAP text", "sparse/0/points3D.txt", b" 40 50 60", b" 40 500 60", r"points3D\.txt, line 2"),
-    ("COLMAP text", "sparse/0/cameras.txt", b"\n5 SIMPLE", b"\n1 SIMPLE", "same id"),
-    ("COLMAP text", "sparse/0/cameras.txt", b" 40 30 ", b" 4_0 30 ", r"cameras\.txt, line 2"),
-    ("transforms", "transforms.json", b'"points.ply"', b"16", "with the points, cannot be read"),
-    ("dataparser", "dataparser_transforms.json", b'"scale"', b'"Scale"', "scale is not a positive number"),
-    ("dataparser", "transforms.json", b"[0, 1, 0, 0.5]", b"[0, 2, 0, 0.5]", "not a rotation"),
-    ("LangSplat", "000_f.npy", b"(6, 8)", b"(5, 8)", "bytes follow"),
-    ("LLFF", "poses_bounds.npy", b"(3, 17)", b"(2, 17)", "bytes follow"),
-]
+def with_change(folder: Path, kind: str, file: str, intact: bytes, damaged: bytes) -> Case:
+    """Write the files of a format, and replace a part of one of them."""
+    case, path = FORMATS[kind](folder), folder / file
+    assert intact in path.read_bytes()
+    path.write_bytes(path.read_bytes().replace(intact, damaged))
+    return case
 
 
-@pytest.mark.parametrize(("kind", "file", "intact", "damaged", "message"), ACCEPTED_BEFORE)
+@pytest.mark.parametrize(
+    ("kind", "file", "intact", "damaged", "message"),
+    [
+        ("points", "points.ply", b"vertex 3", b"vertex 2", "1 rows follow"),
+        ("Gaussians ASCII", "point_cloud.ply", b"vertex 40", b"vertex 39", "1 rows follow"),
+        ("Gaussians ASCII", "point_cloud.ply", b"\n0.126 ", b"\n0.1_6 ", "underscore"),
+        ("Gaussians binary", "point_cloud.ply", b"vertex 40", b"vertex 39", "bytes follow"),
+        (
+            "Gaussians binary",
+            "point_cloud.ply",
+            b"filter_3D",
+            b"Filter_3D",
+            "parameters that 3DGS does not have",
+        ),
+        ("COLMAP text", "sparse/0/points3D.txt", b" 40 50 60", b" 40 2.5 60", r"points3D\.txt has colours"),
+        ("COLMAP text", "sparse/0/points3D.txt", b" 40 50 60", b" 40 500 60", r"points3D\.txt, line 2"),
+        ("COLMAP text", "sparse/0/cameras.txt", b"\n5 SIMPLE", b"\n1 SIMPLE", "same id"),
+        ("COLMAP text", "sparse/0/cameras.txt", b" 40 30 ", b" 4_0 30 ", r"cameras\.txt, line 2"),
+        ("transforms", "transforms.json", b'"points.ply"', b"16", "with the points, cannot be read"),
+        (
+            "dataparser",
+            "dataparser_transforms.json",
+            b'"scale"',
+            b'"Scale"',
+            "scale is not a positive number",
+        ),
+        ("dataparser", "transforms.json", b"[0, 1, 0, 0.5]", b"[0, 2, 0, 0.5]", "not a rotation"),
+        ("LangSplat", "000_f.npy", b"(6, 8)", b"(5, 8)", "bytes follow"),
+        ("LLFF", "poses_bounds.npy", b"(3, 17)", b"(2, 17)", "bytes follow"),
+    ],
+)
 def test_a_damaged_file_is_refused(kind, file, intact, damaged, message, tmp_path):
-    case = FORMATS[kind](tmp_path)
-    content = (tmp_path / file).read_bytes()
-    assert intact in content
-    (tmp_path / file).write_bytes(content.replace(intact, damaged))
+    case = with_change(tmp_path, kind, file, intact, damaged)
     with pytest.raises(HilsplatError, match=message):
         case.read()
 
@@ -632,33 +655,24 @@ def test_a_damaged_file_is_refused(kind, file, intact, damaged, message, tmp_pat
     ],
 )  # fmt: skip
 def test_a_damaged_view_is_left_out(kind, file, intact, damaged, reason, tmp_path):
-    case = FORMATS[kind](tmp_path)
-    content = (tmp_path / file).read_bytes()
-    assert intact in content
-    (tmp_path / file).write_bytes(content.replace(intact, damaged))
-    source = case.read()
+    source = with_change(tmp_path, kind, file, intact, damaged).read()
     assert source.left_out and all(reason in why for why in source.left_out.values())
 
 
 @pytest.mark.parametrize(
-    ("intact", "damaged", "reason"), [("938]", "938.25]", "not whole numbers"), ('"rim"', "{}", "categories")]
+    ("intact", "damaged", "reason"),
+    [(b"938]", b"938.25]", "not whole numbers"), (b'"rim"', b"{}", "categories")],
 )
 def test_a_damaged_annotation_is_left_out(intact, damaged, reason, tmp_path):
-    case = annotations("coco")(tmp_path)
-    text = case.files[0].read_text()
-    assert intact in text
-    case.files[0].write_text(text.replace(intact, damaged))
-    labels, (sentence,) = case.read()
-    assert (
-        len(labels["000.png"]) == 2 and "1 of 3 annotations are left out" in sentence and reason in sentence
-    )
+    labels, (sentence,) = with_change(tmp_path, "COCO", "000.json", intact, damaged).read()
+    assert len(labels["000.png"]) == 2
+    assert "1 of 3 annotations are left out" in sentence and reason in sentence
 
 
 def test_a_list_of_names_that_is_none_is_reported(tmp_path):
-    write_transforms(tmp_path, "frames")
-    content = json.loads((tmp_path / "transforms.json").read_text())
-    (tmp_path / "transforms.json").write_text(json.dumps({**content, "train_filenames": "images/b.png"}))
-    source = read_source(find_known_poses(tmp_path))
+    names = b'"train_filenames": ["images/cam2/a.png", "images/b.png"]'
+    change = "transforms per frame", "transforms.json", names, b'"train_filenames": "images/b.png"'
+    source = with_change(tmp_path, *change).read()
     assert source.notes == ["train_filenames is not a list of names, and is not used"]
 
 

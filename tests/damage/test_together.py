@@ -1,17 +1,13 @@
 """Twenty commands at once in one project: nothing is lost, and none disturbs another."""
 
-import os
-import shutil
 import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
 from hilsplat.query.names import read_names
 from hilsplat.scene.sheet import read_sheet
-from tests.conftest import PROJECT
 from tests.unit.annotate.label_files import read_labels
-from tests.unit.finished_desk import NUM_VIEWS
+from tests.unit.finished_desk import NUM_VIEWS, pack_photographs
 
 NAME = """
 import sys
@@ -51,10 +47,7 @@ while True:
 
 def test_twenty_commands_at_once_lose_nothing(own_desk: Path) -> None:
     project = own_desk.parents[2]
-    shutil.copytree(PROJECT / "config", project / "config")
-    with zipfile.ZipFile(project / "photos.zip", "w") as archive:
-        for path in sorted((own_desk / "scene/images").iterdir()):
-            archive.write(path, path.name)
+    pack_photographs(project)
     hilsplat = ["-P", "-m", "hilsplat"]
     commands = [[*hilsplat, "new", f"scene-{number}", "photos.zip"] for number in range(5)]
     commands += [[*hilsplat, "new", "twin", "photos.zip"]] * 2
@@ -66,8 +59,7 @@ def test_twenty_commands_at_once_lose_nothing(own_desk: Path) -> None:
     ]
     commands += [[*hilsplat, "cache", "--folder", "results/.cache", "prune", "--days", "0"]] * 2
     assert len(commands) == 20
-    environment = {**os.environ, "PYTHONPATH": str(PROJECT), "HILSPLAT_MODELS": "models"}
-    how = {"cwd": project, "env": environment, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    how = {"cwd": project, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     running = [subprocess.Popen([sys.executable, *words], text=True, **how) for words in commands]
     said = [process.communicate(timeout=300)[0] for process in running]
     failed = [number for number, process in enumerate(running) if process.returncode]

@@ -26,6 +26,15 @@ def write_again(artifact: Path) -> None:
         artifact.with_name("new").replace(artifact)
 
 
+def flip_bit(path: Path, share: float, number: int = 0) -> bytes:
+    """Flip a bit of a file at a share of its length, and return its former content."""
+    content = path.read_bytes()
+    changed = bytearray(content)
+    changed[int(share * len(content))] ^= 1 << number % 8
+    path.write_bytes(changed)
+    return content
+
+
 def change_index(folder: Path, **entries: Any) -> None:
     """Change entries of a folder's index, and update its seal."""
     index = {**read_index(folder), **entries}

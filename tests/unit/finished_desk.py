@@ -8,6 +8,8 @@ grey.
 import json
 import logging
 import os
+import shutil
+import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -26,6 +28,7 @@ from hilsplat.segment.digests import index_entry
 from hilsplat.splat.coordinates import write_coordinates
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import save_ply
+from tests.conftest import PROJECT
 from tests.unit.evaluate.builders import cameras_of, masks_of
 from tests.unit.round_gaussians import round_gaussians
 
@@ -118,6 +121,14 @@ def build_finished_desk(project: Path) -> Path:
         os.chdir(before)
         logging.getLogger().handlers[:] = handlers
     return project
+
+
+def pack_photographs(project: Path) -> None:
+    """Write the photographs of the scene to `photos.zip`, and copy the shipped configuration."""
+    shutil.copytree(PROJECT / "config", project / "config")
+    with zipfile.ZipFile(project / "photos.zip", "w") as archive:
+        for path in sorted((project / SCENE / "scene/images").iterdir()):
+            archive.write(path, path.name)
 
 
 def _write_scene() -> None:

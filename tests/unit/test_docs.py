@@ -163,16 +163,20 @@ def test_the_architecture_lists_the_arrays_that_are_checked() -> None:
     assert not missing, "write these lines:\n" + "\n".join(missing)
 
 
-def test_every_place_in_the_architecture_exists() -> None:
-    """`path` is a file or folder, `path:name` a definition in it; `path:Class.method` likewise."""
-    places = [code for code in inline_code(PROJECT / "docs/architecture.md") if code.startswith(ROOTS)]
-    assert len(places) > 60
-    for place in places:
+@of_every_page
+def test_every_place_in_the_code_exists(page: Path) -> None:
+    """`path.py` is a file, `folder/` a folder, and `path.py:name` or `path.py:Class.method` a definition."""
+    form = rf"({'|'.join(ROOTS)})[\w./-]*(/|\.(py|smk|json|tsv|txt|yaml|sh)(:[\w.]+)?)"
+    places = [code for code in inline_code(page) if re.fullmatch(form, code)]
+    assert places or page.stem not in ("architecture", "SECURITY", "paper")
+    for place in places if page.name != "CHANGELOG.md" else ():
         path, _, name = place.partition(":")
         assert (PROJECT / path).exists(), f"{path} is missing"
-        scope: ast.AST | None = ast.parse((PROJECT / path).read_text()) if name else None
+        scope: ast.AST = ast.parse((PROJECT / path).read_text()) if name else ast.Module()
         for part in name.split(".") if name else ():
-            definitions = {each.name: each for each in ast.iter_child_nodes(scope) if hasattr(each, "name")}
+            parts = [*ast.iter_child_nodes(scope)]
+            definitions = {ast.unparse(name): each for each in parts for name in getattr(each, "targets", ())}
+            definitions |= {each.name: each for each in parts if hasattr(each, "name")}
             assert part in definitions, f"{place}: {path} does not define {part}"
             scope = definitions[part]
 

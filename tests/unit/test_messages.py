@@ -1,7 +1,6 @@
 """Commands in messages are commands of this version, with options that they have."""
 
 import ast
-import os
 import re
 import signal
 import subprocess
@@ -134,9 +133,8 @@ print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)
 """
 
 
-def test_ctrl_c_while_a_command_starts_prints_no_traceback(project):
-    environment = {**os.environ, "PYTHONPATH": str(project)}
+def test_ctrl_c_while_a_command_starts_prints_no_traceback():
     for name, expected in (("hilsplat.cli.group_commands", (-signal.SIGINT, "")), ("none", (0, "True\n"))):
         command = [sys.executable, "-c", EARLY, name]
-        done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        done = subprocess.run(command, capture_output=True, text=True)
         assert (done.returncode, done.stdout, done.stderr) == (*expected, "")

@@ -40,8 +40,7 @@ def test_every_equation_and_table_has_a_row():
     assert not unknown
 
 
-def test_named_tests_and_protocols_exist():
-    assert all((PROJECT / name).is_file() for name in NAMES if name.startswith("tests/"))
+def test_named_protocols_exist():
     protocols = {name for name in NAMES if re.fullmatch(r"(lerf|world|hierarchy|3d-ovs)/[\w-]+", name)}
     assert protocols and protocols <= {card.name for card in CARDS}
 

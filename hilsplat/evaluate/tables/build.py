@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from hilsplat.base.artifacts import write_text
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.errors import ArtifactError, shorten_list
 from hilsplat.base.files import project_path
 from hilsplat.base.tables import write_csv
 from hilsplat.evaluate.costs import read_costs
@@ -82,7 +82,10 @@ def table_of(name: str, sources: Sources, absent: Sequence[str]) -> Table:
     if kind.shows_costs and not name.endswith(SECONDS):
         measured = [block for block in map(without_costs, measured) if block.columns]
     blocks = tuple(block for block in (*reported, *measured) if block.rows)
-    not_measured = [f"Not measured: {sentence}" for sentence in absent]
+    costs = sources.costs if name.endswith(SECONDS) else ()
+    jobs = {f"{stage} of {cost.dataset}/{cost.scene}": None for cost in costs for stage in cost.unrecorded}
+    times = f"{shorten_list([*jobs])}, whose benchmark files are missing; --forcerun runs the stages again."
+    not_measured = [f"Not measured: {sentence}" for sentence in (*absent, *([times] if jobs else []))]
     return Table(name, kind.title, blocks, (*_warnings(blocks), *kind.footnotes, *not_measured))
 
 

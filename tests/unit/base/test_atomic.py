@@ -118,9 +118,7 @@ def free_mib(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     ids=repr,
 )
 @pytest.mark.parametrize("writer", [atomic_path, atomic_folder, work_folder])
-def test_errors_on_a_full_disk_name_the_disk_and_the_fix(
-    tmp_path, free_mib, writer, error, free, is_full
-) -> None:
+def test_errors_on_a_full_disk_name_the_disk_and_the_fix(tmp_path, free_mib, writer, error, free, is_full):
     free_mib(free)
     with pytest.raises(DiskSpaceError if is_full else type(error)) as raised, writer(tmp_path / "new/a.txt"):
         raise error

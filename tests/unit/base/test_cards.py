@@ -11,7 +11,6 @@ import pytest
 
 from hilsplat.base import cards as module
 from hilsplat.base.cards import cards, release_card, take_card
-from tests.conftest import PROJECT
 
 HOLD = """
 import os, sys
@@ -67,7 +66,7 @@ def test_under_slurm_the_scheduler_has_chosen(monkeypatch, tmp_path):
 
 
 def holder(folder: Path, visible: str) -> subprocess.Popen:
-    environment = {**os.environ, "CUDA_VISIBLE_DEVICES": visible, "PYTHONPATH": str(PROJECT)}
+    environment = {**os.environ, "CUDA_VISIBLE_DEVICES": visible}
     command = [sys.executable, "-P", "-c", HOLD, str(folder)]
     return subprocess.Popen(
         command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True

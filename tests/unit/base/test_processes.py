@@ -15,7 +15,6 @@ import pytest
 
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.processes import in_order, in_own_process, in_processes
-from tests.conftest import PROJECT
 
 
 def square(base: int, number: int) -> tuple[int, int]:
@@ -160,8 +159,7 @@ def test_a_spawned_process_imports_nothing_from_the_working_folder(tmp_path):
     )
     for name in ("pickle", "socket", "random", "numpy"):
         (tmp_path / f"{name}.py").write_text("raise SystemExit('a file of the user ran')")
-    environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
-    environment.pop("PYTHONSAFEPATH", None)
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}
     done = subprocess.run(
         [sys.executable, str(script)], cwd=tmp_path, env=environment, capture_output=True, text=True
     )

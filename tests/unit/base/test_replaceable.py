@@ -17,7 +17,6 @@ from hilsplat.base.ownership import (
     require_replaceable,
 )
 from hilsplat.cli.common import require_new_folder
-from hilsplat.cli.main import app
 from hilsplat.stage import PathIn, PathOut, Registry
 from tests.unit.artifact_changes import write_record
 
@@ -49,10 +48,6 @@ def photographs(tmp_path) -> Path:
 def record(out: Path, stage: str, *names: str) -> None:
     written = {"sha256": "", "bytes": {}}
     write_record(out, stage=stage, outputs=dict.fromkeys((out.name, *names), written))
-
-
-def files(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_missing_or_empty_outputs_may_be_written(tmp_path):
@@ -111,28 +106,6 @@ def test_the_working_and_the_home_folder_are_never_outputs(tmp_path, monkeypatch
     for out, name in ((Path(), "working"), (tmp_path.parent, "working"), (Path.home(), "home")):
         with pytest.raises(ArtifactError, match=f"is or contains the {name} folder"):
             require_replaceable([out], "masks", [])
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["poses", "--images", "photographs", "--out", "photographs"],
-        ["masks", "--scene", "scene", "--out", "photographs"],
-        ["coverage-tree", "--masks", "scene", "--out", "photographs"],
-        ["coverage-tree", "--masks", "scene", "--out", "."],
-        ["clip", "--scene", "scene", "--masks", "scene", "--out", "thesis.md"],
-        ["gaussians", "--scene", "scene", "--out", "gaussians.ply", "--report", "photographs"],
-    ],
-)
-def test_commands_do_not_replace_unrelated_files(photographs, tmp_path, monkeypatch, words):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "scene").mkdir()
-    (tmp_path / "scene/index.json").write_text("{}")
-    (tmp_path / "thesis.md").write_text("ten years")
-    before = files(tmp_path)
-    with pytest.raises(ArtifactError, match="output"):
-        app(words, standalone_mode=False)
-    assert files(tmp_path) == before
 
 
 def test_an_input_that_changes_during_a_stage_leaves_no_provenance(tmp_path, photographs):

@@ -81,21 +81,22 @@ def test_segments_of_waymo_are_run_without_a_row(tmp_path):
     assert "incomplete" in found.absent["waymo/one"]  # the test has no other component
 
 
-def test_a_run_without_scenes_lists_the_known_scenes(tmp_path):
-    with pytest.raises(SettingsError, match=r"no scenes to run(.|\n)*such as (.|\n)*rooms/room"):
-        plan(tmp_path, groups=["ci"])
-
-
-@pytest.mark.parametrize("name", ["lifted", "in-no-table"])
-def test_an_unknown_method_stops_at_once(tmp_path, name):
-    variants = {**VARIANTS, name: {"method": {"name": "magic"}}}
-    with pytest.raises(HilsplatError, match="method 'magic' is unknown"):
-        plan(tmp_path, main_variants=list(VARIANTS), variants=variants)
-
-
-def test_a_variant_cannot_change_what_all_share(tmp_path):
-    with pytest.raises(SettingsError, match=r"variants\.x\.poses: variants share this section"):
-        plan(tmp_path, variants={"x": {"poses": {"mapper": "global"}}}, main_variants=["default"])
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"groups": ["ci"]}, r"no scenes to run(.|\n)*such as (.|\n)*rooms/room"),
+        ({"variants": {"lifted": {"method": {"name": "magic"}}}}, "method 'magic' is unknown"),
+        ({"variants": {"in-no-table": {"method": {"name": "magic"}}}}, "method 'magic' is unknown"),
+        (
+            {"variants": {"x": {"poses": {"mapper": "global"}}}},
+            r"variants\.x\.poses: variants share this section",
+        ),
+    ],
+)
+def test_a_configuration_without_scenes_or_with_an_impossible_variant_is_refused(tmp_path, config, message):
+    variants = {**VARIANTS, **config.get("variants", {})}
+    with pytest.raises(HilsplatError, match=message):
+        plan(tmp_path, main_variants=list(VARIANTS), **{**config, "variants": variants})
 
 
 def test_only_random_variants_are_repeated_per_seed(tmp_path):
@@ -175,9 +176,9 @@ def test_photographs_that_you_annotated_are_scored_without_replacing_the_tables(
     found = plan(tmp_path, groups=["photos"], data_root=str(tmp_path))
     job = Job("photos", "desk")
     assert targets.default(found) == [*alone, "results/photos/desk/scores.md"]
-    assert targets.means_of(found)(job) == ["results/photos/desk/default/scores.csv"]
+    assert targets.compared_means(found, job) == ["results/photos/desk/default/scores.csv"]
     assert found.data.label_files(job) == [str(file)] and str(file) not in found.data.image_files(job)
-    assert found.data.label_names(job) == ("annotated/photos/desk",)
+    assert found.data.labels(found.row(job)) == ("annotated/photos/desk",)
     assert found.data.label_readers(job) == ("hilsplat.datasets.images.hi:ANNOTATED",)
     both = plan(tmp_path, groups=["photos", "benchmark"], data_root=str(tmp_path))
     assert "results/tables/lerf.csv" in targets.default(both)
@@ -191,7 +192,7 @@ def test_the_folder_of_data_sets_counts_for_scenes_that_read_it(tmp_path):
     plans = [plan(tmp_path, groups=["photos", "benchmark"], data_root=root) for root in roots]
     for name in ("evaluate", "figures"):
         for job, is_read in ((Job(), False), (Job("photos", "desk"), True)):
-            here, moved = (each.params(name, name=each.data.scene_name)["settings"](job) for each in plans)
+            here, moved = (each.params(name)["settings"](job) for each in plans)
             assert (here == moved) is not is_read and ("--data-root" in here) is is_read
 
 
@@ -341,9 +342,11 @@ def test_each_photograph_is_an_input_and_hidden_files_are_not(tmp_path):
     found = plan(tmp_path, groups=["photos"])
     files = found.data.image_files(Job("photos", "desk"))
     assert [Path(file).name for file in files] == ["0.jpg", "1.jpg"]
-    assert not found.data.is_render(Job("photos", "desk")) and not found.data.poses(Job("photos", "desk"))
+    outputs = SimpleNamespace(out="results/photos/desk/scene")
+    command = found.params("poses")["command"](Job("photos", "desk"), files, outputs)
+    assert "--render" not in command and "--poses" not in command
     assert found.data.image_files(Job()) == "results/synthetic/one/world/images"
-    assert found.data.is_render(Job())
+    assert "--render" in found.params("poses")["settings"](Job())
 
 
 def test_labels_of_a_published_scene_determine_reader_and_options(tmp_path):
@@ -354,11 +357,11 @@ def test_labels_of_a_published_scene_determine_reader_and_options(tmp_path):
     job = Job("lerf", "figurines")
     assert found.data.label_readers(job) == ("hilsplat.datasets.images.lerf_ovs:DATASET",)
     assert [Path(file).name for file in found.data.label_files(job)] == ["frame_1.json"]
-    assert found.data.label_names(job) == ("lerf_ovs/figurines",) and found.data.truth(job) == []
+    assert found.data.labels(found.row(job)) == ("lerf_ovs/figurines",) and found.data.truth(job) == []
     room = Job("rooms", "room")
     assert found.data.truth(room) == ["results/rooms/room/world/truth"]
     assert found.data.generated_source(room) == "world:room:1"
-    assert found.data.label_names(room) == found.data.label_readers(room) == ()
+    assert found.data.labels(found.row(room)) == found.data.label_readers(room) == ()
 
 
 def test_tables_have_their_own_scenes_and_variants(tmp_path):
@@ -403,18 +406,34 @@ def test_names_that_match_no_scene_are_reported(tmp_path):
     ]
 
 
-@pytest.mark.parametrize("name", ["lerf_ovs", "hi_lerf", "scannet200", "annotated"])
-@pytest.mark.parametrize("where", ["groups", "overrides", "queries"])
-def test_label_sets_that_are_no_group_are_refused(where, name, tmp_path):
+LABEL_SETS = ("lerf_ovs", "hi_lerf", "scannet200", "annotated")  # no groups and no data sets
+
+
+@pytest.mark.parametrize(
+    ("where", "name", "message"),
+    [
+        *(
+            (where, name, "(one of|did you mean)")
+            for name in LABEL_SETS
+            for where in ("groups", "overrides", "queries")
+        ),
+        ("groups", "bechmark", "did you mean 'benchmark'"),
+        ("overrides", "photo", "did you mean 'photos'"),
+        ("overrides", "synthetic/tow", "did you mean 'synthetic/two'"),
+        ("queries", "foto", "did you mean 'photos'"),
+        ("queries", "benchmark", "unknown name"),  # panels take the queries of data sets, not of groups
+        ("sweep_scenes", "tabel-2", "did you mean 'table-2'"),
+    ],
+)
+def test_a_name_that_would_have_no_effect_is_refused(where, name, message, tmp_path):
     config = {"groups": ["benchmark", name], "overrides": {name: {}}, "queries": {name: ["mug"]}}
-    with pytest.raises(SettingsError, match=rf"{where}\.{name}: unknown name(.|\n)*(one of|did you mean)"):
+    config["sweep_scenes"] = [name]
+    with pytest.raises(SettingsError, match=rf"{where}.*{name}(.|\n)*{message}"):
         plan(tmp_path, **{where: config[where]})
 
 
-def test_queries_of_a_group_are_refused_because_panels_take_those_of_data_sets(tmp_path):
-    with pytest.raises(SettingsError, match=r"queries\.benchmark: unknown name"):
-        plan(tmp_path, queries={"benchmark": ["mug"]})
-    plan(tmp_path, queries={"waymo": ["car"]}, overrides={"waymo": {}})  # its scenes are those on the disk
+def test_names_of_a_data_set_whose_scenes_are_those_on_the_disk_are_accepted(tmp_path):
+    plan(tmp_path, queries={"waymo": ["car"]}, overrides={"waymo": {}})
 
 
 @pytest.mark.parametrize("path", sorted((PROJECT / "config").glob("*.yaml")), ids=lambda path: path.name)

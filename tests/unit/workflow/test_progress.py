@@ -11,7 +11,7 @@ import pytest
 
 from hilsplat.base.artifacts import write_index
 from hilsplat.base.progress import LOG_FORMAT
-from hilsplat.stages import all_stages
+from hilsplat.stages import all_stages, stage_of
 from hilsplat.workflow import progress
 from hilsplat.workflow.progress import Estimates, ProgressDisplay, RunProgress, duration
 from hilsplat.workflow.resources import JobResources
@@ -131,15 +131,17 @@ def test_texts_from_logs_and_jobs_cannot_control_the_terminal(run, tmp_path):
     assert lines.text.startswith("job \\x9b31m failed\nimage \\x1b]0;x\\x07\n")
 
 
-@pytest.mark.parametrize("order", [("semantic_tree", "clip"), ("clip", "semantic_tree")])
+@pytest.mark.parametrize(
+    "order", [("semantic_tree", "clip"), ("clip", "feature_tree"), ("semantic_tree", "imported_clip")]
+)
 def test_the_query_commands_are_printed_once_tree_and_vectors_exist(screen, tmp_path, order, monkeypatch):
     monkeypatch.chdir(tmp_path)
     variant = Path("results/photos/desk/default")
-    for rule in (*order, *order):
-        assert "ready" not in screen.text or (variant / rule).exists()
-        write_index(variant / rule, {})
+    for number, rule in enumerate((*order, *order)):
+        write_index(variant / stage_of(rule).file, {})
         screen.start(2, rule, variant / f"logs/{rule}.log")
         screen.end(2)
+        assert ("ready" in screen.text) == (number > 0)
     assert screen.text.count("photos/desk is ready to query:") == 1
     assert screen.text.count('hilsplat query photos/desk "..."') == 1
 

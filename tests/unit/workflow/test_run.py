@@ -89,6 +89,8 @@ def test_scenes_become_a_configuration_and_other_targets_stay(folder, started):
     assert 'only=["synthetic/two"]' in started[-1]
     runs.run(["synthetic/*", "tables"], [], [])
     assert 'only=["synthetic/*"]' in started[-1] and started[-1][-2:] == ["--", "tables"]
+    runs.run(["models/the-two"], [], [])  # a file, although it ends like the name of a scene
+    assert started[-1][-2:] == ["--", "models/the-two"]
 
 
 def test_a_misspelt_scene_is_refused(folder, started):
@@ -102,17 +104,18 @@ def test_a_misspelt_scene_is_refused(folder, started):
     assert started == []
 
 
-def test_needed_outputs_that_do_not_match_their_provenance_are_rebuilt(folder, started, monkeypatch):
-    folder = Path("results/synthetic/one")
-    folder.mkdir(parents=True)
-    (folder / "gaussians.ply").write_text("")
-    (folder / "scene").mkdir()
-    summary = f"output_file\tdate\n{folder}/gaussians.ply\t-\n"
-    answer = subprocess.CompletedProcess([], 0, summary, "")
+def test_needed_outputs_that_do_not_match_their_provenance_are_rebuilt_with_forced_stages(
+    folder, started, monkeypatch
+):
+    ply = Path("results/synthetic/one/gaussians.ply")
+    (ply.parent / "scene").mkdir(parents=True)  # it is not needed
+    ply.write_text("")
+    answer = subprocess.CompletedProcess([], 0, f"output_file\tdate\n{ply}\t-\n", "")
     monkeypatch.setattr(runs.subprocess, "run", lambda words, **kwargs: answer)
-    runs.run([f"{folder}/gaussians.ply"], [], [])
-    file = f"{folder}/gaussians.ply"
-    assert started[0][-4:] == ["--forcerun", file, "--", file]
+    runs.run([str(ply)], [], [])
+    runs.run([], [], ["--forcerun", "field"])
+    assert started[0][-4:] == ["--forcerun", str(ply), "--", str(ply)]
+    assert started[1][-3:] == ["--forcerun", "field", str(ply)]
 
 
 def test_a_second_run_with_the_same_results_is_refused(folder, started, tmp_path, monkeypatch):
@@ -174,11 +177,6 @@ def test_the_locks_of_another_machine_stay(folder, started, unlocked, caplog):
     assert unlocked == [] and "another machine may be running" in caplog.text
 
 
-def test_a_path_with_the_name_of_a_scene_at_its_end_may_be_a_file(folder, started):
-    runs.run(["models/the-two"], [], ["-n"])
-    assert started[0][-2:] == ["--", "models/the-two"]
-
-
 def test_options_of_the_command_need_no_separator(folder, started, monkeypatch):
     words = ["run", "two", "-n", "--cores", "1", "--forcerun", "field", "-R", "clip", "--verbose"]
     monkeypatch.setattr(sys, "argv", ["hilsplat", *words])
@@ -186,16 +184,6 @@ def test_options_of_the_command_need_no_separator(folder, started, monkeypatch):
     [command] = started
     assert {"--dry-run", "--verbose"} <= set(command) and value(command, "--cores") == "1"
     assert command[-3:] == ["--forcerun", "field", "clip"]
-
-
-def test_a_forced_stage_is_run_again_together_with_damaged_artifacts(folder, started, monkeypatch):
-    ply = Path("results/synthetic/one/gaussians.ply")
-    (ply.parent / "scene").mkdir(parents=True)
-    ply.write_text("")
-    answer = subprocess.CompletedProcess([], 0, f"output_file\tdate\n{ply}\t-\n", "")
-    monkeypatch.setattr(runs.subprocess, "run", lambda words, **kwargs: answer)
-    runs.run([], [], ["--forcerun", "field"])
-    assert started[0][-3:] == ["--forcerun", "field", str(ply)]
 
 
 def test_a_configuration_is_found_by_its_name(folder, project, started):

@@ -1,6 +1,7 @@
 """The summary at the end of a run."""
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -99,23 +100,29 @@ def test_a_run_of_files_describes_their_scenes_only(project):
     assert [line for line in lines if line.endswith(":")] == ["photos/chair:"]
 
 
-def test_damage_is_reported_after_a_run_that_succeeded(project, monkeypatch, caplog):
+@pytest.fixture
+def ended(project, monkeypatch, caplog) -> Callable[..., str]:
+    """A function that runs a scene without Snakemake, and returns the log."""
     plan_of(project, ROWS, groups=["photos"])
     Path("config/config.yaml").write_text("groups: [photos]\n")
     Path("Snakefile").write_text("")
-    Path("results/photos/desk/scene/index.json").write_text("{}")
-    monkeypatch.setattr(runs, "_run", lambda command: 0)
-    assert runs.run(["desk"], [], []) == 0
-    assert "results/photos/desk/scene/index.json is not an artifact index" in caplog.text
-
-
-def test_every_run_that_succeeds_ends_with_the_summary(project, monkeypatch, caplog):
-    plan_of(project, ROWS, groups=["photos"])
-    Path("config/config.yaml").write_text("groups: [photos]\n")
-    Path("Snakefile").write_text("")
+    monkeypatch.setattr(runs, "outdated", lambda *_, **__: {})
     caplog.set_level("INFO")
-    for status, options, is_printed in ((0, [], True), (1, [], False), (0, ["-n"], False)):
-        monkeypatch.setattr(runs, "_run", lambda command, status=status: status)
+
+    def run(status: int, *options: str) -> str:
         caplog.clear()
+        monkeypatch.setattr(runs, "_run", lambda command: status)
         assert runs.run(["desk"], [], options) == status
-        assert ("hilsplat view photos/desk" in caplog.text) == is_printed
+        return caplog.text
+
+    return run
+
+
+def test_damage_is_reported_after_a_run_that_succeeded(ended):
+    Path("results/photos/desk/scene/index.json").write_text("{}")
+    assert "results/photos/desk/scene/index.json is not an artifact index" in ended(0)
+
+
+def test_every_run_that_succeeds_ends_with_the_summary(ended):
+    for status, options, is_printed in ((0, [], True), (1, [], False), (0, ["-n"], False)):
+        assert ("hilsplat view photos/desk" in ended(status, *options)) == is_printed

@@ -56,7 +56,7 @@ def test_shared_stages_count_in_full_and_own_ones_alone(scene):
     assert first.query_s == {"field": 0.25}
 
 
-def test_missing_records_and_unread_stages(scene):
+def test_missing_records_and_unread_stages(scene, tmp_path):
     field = scene[0].with_name("field.safetensors")
     inputs = read_json(provenance_path(field))["inputs"]
     del inputs["coverage_tree"]
@@ -67,8 +67,12 @@ def test_missing_records_and_unread_stages(scene):
     record(scene[0].parent, "contributions", 30, 512)
     (scene[0].parent / "benchmarks" / "masks.jsonl").unlink()
     first, _ = read_costs(scene)
-    assert math.isnan(first.prepare_s)
+    assert math.isnan(first.prepare_s) and first.unrecorded == ("masks",)
     assert first.train_s == 60
+    for name, is_told in (("cost-seconds", True), ("cost", False)):
+        run_table(name, scene, PROJECT / published_values(name), {}, tmp_path / f"{name}.csv")
+        text = (tmp_path / f"{name}.md").read_text()
+        assert ("Not measured: masks of synthetic/table-1, whose benchmark files" in text) is is_told
     scene[0].with_name("times.csv").unlink()
     with pytest.raises(ArtifactError, match=r"times\.csv is missing"):
         read_costs(scene)
@@ -157,6 +161,12 @@ def test_stages_follow_the_order_of_the_workflow_with_a_total(tmp_path):
     assert lines[1] == "poses,synthetic,one,,10.00,0.00,0"
     assert lines[2] == "field,synthetic,one,default,2.50,2.00,400"
     assert (tmp_path / "efficiency.md").read_text() == text
+    for number in range(5):
+        write_record(results / f"synthetic/one/default/{number}")
+    text = run_efficiency(results, tmp_path / "efficiency.csv")
+    assert text.endswith(
+        "\nThe jobs of 1 of 5 artifacts are not in this table: their benchmark files are missing.\n"
+    )
 
 
 def test_missing_and_damaged_benchmarks_are_named(tmp_path):
