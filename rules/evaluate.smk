@@ -42,12 +42,10 @@ use rule stage as score_means with:
 
 use rule stage as table with:
     input:
-        scores=lambda wildcards: targets.scores(PLAN, wildcards.table),
-        times=lambda wildcards: targets.scores(PLAN, wildcards.table, "times.csv"),
-        instances=lambda wildcards: targets.scores(
-            PLAN, wildcards.table, "instances.npz"
-        ),
-        published=lambda wildcards: str(published_values(wildcards.table)),
+        scores=lambda job: targets.scores(PLAN, job.table),
+        times=lambda job: targets.scores(PLAN, job.table, "times.csv"),
+        instances=lambda job: targets.scores(PLAN, job.table, "instances.npz"),
+        published=lambda job: str(published_values(job.table)),
     output:
         out="<results>/tables/{table}.csv",
         md="<results>/tables/{table}.md",

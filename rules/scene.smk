@@ -34,8 +34,4 @@ use rule stage as poses with:
     resources:
         **RESOURCES.of("poses"),
     params:
-        **PLAN.params(
-            "poses",
-            files=PLAN.data.image_files,
-            name=lambda wildcards: PLAN.row(wildcards).name,
-        ),
+        **PLAN.params("poses", files=PLAN.data.image_files, name=PLAN.data.name),

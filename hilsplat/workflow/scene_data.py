@@ -196,6 +196,9 @@ class SceneData:
             )
         return self.truth(job)
 
+    def name(self, job: Job) -> str:
+        return self.row(job).name
+
     def generated_source(self, job: Job) -> str:
         row = self.row(job)
         return row.source if row.generated else ""
