@@ -73,9 +73,8 @@ def measured_blocks(
                 cells = mean_over_seeds(seeds) | over_seeds(scores, part)
                 is_ranked = method != "truth" and not made_from_truth(masks)
                 group = (label if kind.ranked_by_protocol else "") if is_ranked else None
-                protocol = list(PROTOCOLS).index(label) if label in PROTOCOLS else -1
                 order = row_place(variant, method, sources.labels)
-                place = made_from_truth(masks), protocol, *order, masks, label
+                place = made_from_truth(masks), _protocol_place(label), *order, masks, label
                 scenes = part["scene"], selected["scene"], kind.averaged
                 rows.append((place, row_of(names, cells, str(data), *scenes, group)))
             if rows:
@@ -97,11 +96,17 @@ def _row_names(
 ) -> dict[str, str]:
     is_truth = method == "truth"
     warning = "diagnostic, true masks: " if made_from_truth(masks) and not is_truth else ""
+    card, space, departures = label.partition(" ")
     return {
         "Method": warning + row_name(variant, method, labels),
         "Masks": "-" if is_truth else masks,
-        "Protocol": PROTOCOLS.get(label, label),
+        "Protocol": PROTOCOLS.get(card, card) + space + departures,
     }
+
+
+def _protocol_place(label: str) -> int:
+    card, _, _ = label.partition(" ")  # before its departures
+    return list(PROTOCOLS).index(card) if card in PROTOCOLS else -1
 
 
 def row_of(

@@ -78,9 +78,11 @@ def cells(row, *names):
     return [row[name] for name in names]
 
 
-def test_hierarchy_means_go_over_pairs_then_scenes_then_levels(tmp_path):
-    rows, forms = built(tmp_path, "hierarchy")
-    row = measured(rows, protocol="level given")
+@pytest.mark.parametrize("departures", ["", " (regions from 30 px)"])
+def test_hierarchy_means_go_over_pairs_then_scenes_then_levels(tmp_path, departures):
+    scores = [replace(row, protocol=row.protocol + departures) for row in SCORES]
+    rows, forms = built(tmp_path, "hierarchy", scores)
+    row = measured(rows, protocol=f"level given{departures}")
     # L1: (0.7 + 0.3) / 2, L2: 0.5, L3: 0.1; Avg (0.5 + 0.5 + 0.1) / 3; HC: (0.8 + 0.4) / 2
     found = cells(row, "L1", "L2", "L3", "Avg", "HC containment")
     assert found == ["50.00", "50.00", "10.00", "36.67", "60.00"]
