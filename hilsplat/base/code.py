@@ -126,13 +126,19 @@ def _file(module: str) -> Path | None:
 def _facts(module: str, path: Path, known: Facts | None) -> Facts:
     files = [path, *filter(Path.is_file, map(path.with_suffix, (".json", ".tsv", ".txt")))]
     text, *data = (file.read_bytes() for file in files)
-    contents = sha256_of_bytes(path.name.encode(), text, *data)  # relative imports depend on the name
+    # relative imports depend on the name, and the digest on this module
+    contents = sha256_of_bytes(_own_code(), path.name.encode(), text, *data)
     if known is not None and known.files == contents:
         return known
     tree = _Bare().visit(ast.parse(text, str(path)))
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     code = json.dumps(_structure(tree)).encode()
     return Facts(contents, sha256_of_bytes(code, *data), sorted({*_imported(tree, package)}))
+
+
+@functools.cache
+def _own_code() -> bytes:
+    return Path(__file__).read_bytes()
 
 
 def _structure(node: Any) -> Any:

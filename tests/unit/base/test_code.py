@@ -155,6 +155,16 @@ def test_unchanged_modules_are_parsed_once_whatever_is_in_the_memo(tmp_path, for
     assert code_digest("plug.a") == digest
 
 
+def test_the_memo_of_another_version_of_the_digest_is_not_used(tmp_path, forget, monkeypatch):
+    write(tmp_path, a="")
+    with monkeypatch.context() as patch:
+        patch.setattr(code, "_own_code", lambda: b"older")
+        patch.setattr(code, "_structure", lambda tree: "as older versions do")
+        older = code_digest("plug.a")
+    forget()
+    assert code_digest("plug.a") != older
+
+
 def test_every_stage_and_plugin_has_its_code_and_nothing_else_is_imported_by_string(project):
     for place in (*DATASETS.places.values(), *(method.fit for method in BASELINES.values())):
         assert place.partition(":")[0] in modules_of(place)
