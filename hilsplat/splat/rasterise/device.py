@@ -55,30 +55,47 @@ def cuda_problem() -> str | None:
         known = [os.environ.get(name, "") for name in ("PATH", "CUDA_HOME", "CUDA_VISIBLE_DEVICES")]
         return remembered(KIND, ["build", *versions, *known, socket.gethostname()], _build_failure) or None
     except Exception as error:  # a broken installation can raise anything
-        return f"gsplat cannot be imported: {first_line(error)}"
+        # a card may only be busy or full (`kernel_problem`)
+        return None if _is_of_card(error) else f"gsplat cannot be imported: {first_line(error)}"
 
 
 def _build_failure() -> str:
-    """Load gsplat's kernels, which compiles them on first use; return why it fails, or an empty text."""
+    """Run one of gsplat's kernels, which compiles all on first use; return why it fails, or an empty text.
+
+    Errors of the card, such as a full one, are raised.
+    """
     logger.info("loading the CUDA kernels of gsplat, which are compiled on first use, in several minutes")
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # it prints what is reported here
-            from gsplat.cuda._backend import _C as kernels
+            _run_a_kernel()
     except Exception as error:  # compilers, linkers and torch raise several types
+        if _is_of_card(error):
+            raise
+        if isinstance(error, AttributeError):  # without a compiler, gsplat has None instead of its kernels
+            return f"{UNBUILT}, because no CUDA toolkit (nvcc) is installed"
         return f"{UNBUILT}: {first_line(error)}"
-    return "" if kernels is not None else f"{UNBUILT}, because no CUDA toolkit (nvcc) is installed"
+    return ""
 
 
-def kernel_problem() -> str | None:
-    """Return why the card cannot run one of gsplat's kernels, or None; the card may only be busy or full."""
+def _is_of_card(error: Exception) -> bool:
+    return is_out_of_memory(error) or "CUDA error" in str(error)
+
+
+def _run_a_kernel() -> None:
+    """Evaluate spherical harmonics of one Gaussian."""
     import gsplat
     import torch
 
     from hilsplat.splat.rasterise import cuda
 
+    direction, harmonics = (torch.ones(shape, device=cuda.DEVICE) for shape in ((1, 3), (1, 1, 3)))
+    gsplat.spherical_harmonics(0, direction, harmonics)
+
+
+def kernel_problem() -> str | None:
+    """Return why the card cannot run one of gsplat's kernels, or None; the card may only be busy or full."""
     try:
-        direction, harmonics = (torch.ones(shape, device=cuda.DEVICE) for shape in ((1, 3), (1, 1, 3)))
-        gsplat.spherical_harmonics(0, direction, harmonics)
+        _run_a_kernel()
     except Exception as error:  # torch, the driver and gsplat raise several types
         return f"the card cannot run gsplat's kernels: {first_line(error)}"
     return None
