@@ -32,7 +32,7 @@ from hilsplat.baselines import HiLSplatSettings, TrainedSettings
 from hilsplat.contributions.view_matrices import painted_indicator, random_half
 from hilsplat.field.adam import Adam, in_random_order
 from hilsplat.field.contrast import ViewRelations, instance_term, part_term, read_parents, view_relations
-from hilsplat.methods.kernels import WIDTH, rendered_gradient
+from hilsplat.methods.kernels import WIDTH, padded_rows, rendered_gradient, weighted_sums
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 
 
@@ -114,7 +114,10 @@ class HierarchyTerms:
         """
         settings, view = self.settings, self.views[number]
         relations, latents = [view.relations[level.index]], view.latents
-        rendered = view.sums @ features.reshape(-1, features.shape[2])
+        wide, sums = features.shape[2], view.sums
+        rendered = np.empty((2 * len(view.pixels), wide), np.float32)
+        matrix = sums.indptr, sums.indices, sums.data
+        weighted_sums(*matrix, wide, features.reshape(-1), rendered.reshape(-1))
         halves = rendered[:, : latents.shape[1]].astype(np.float64).reshape(len(view.pixels), 2, -1)
         by_pixel = 1 / np.maximum(view.pixels, 1)[:, :, None]
         by_mask = 1 / np.maximum(view.pixels.sum(axis=1), 1)[:, None]
@@ -140,7 +143,7 @@ class HierarchyTerms:
 
 
 def train(
-    views: list[LabelledView],  # at least one
+    views: list[LabelledView],  # at least one; their weights are replaced by padded rows
     latents: Float32[np.ndarray, "M D"],
     num_gaussians: int,
     settings: TrainedSettings,
@@ -168,8 +171,11 @@ def train(
             levels.append((level, Adam(features[level.index], settings.rate), order, len(labelled)))
     repeats = 1 if terms is None else 2
     codes = [padded(np.repeat(latents[view.rows], repeats, axis=0)) for view in views]
-    labels = [np.ascontiguousarray(view.labels.T) for view in (views if terms is None else terms.views)]
-    labelled_px = [np.count_nonzero(of_view >= 0, axis=1) for of_view in labels]
+    painted = []  # labelled pixels and their labels, by view and level
+    for number, view in enumerate(views):
+        views[number] = replace(view, weights=padded_rows(view.weights))
+        labels = view.labels if terms is None else terms.views[number].labels
+        painted.append([(rows := view.at(level), labels[rows, level.index]) for level in LEVELS])
     by_l1 = terms is None or terms.settings.language == "l1"
     # Levels that don't interact are trained one after the other, because their arrays then stay in the cache.
     groups = [[own] for own in levels] if terms is None else [levels]
@@ -180,9 +186,10 @@ def train(
         if terms is not None:
             attraction, of_rows = terms.gradient(number, level, features, num_views)
             offsets = padded(of_rows)
-        share = by_l1 / (labelled_px[number][level.index] * channels)
+        pixels, labels = painted[number][level.index]
+        share = by_l1 / (len(pixels) * channels)
         rendered_gradient(
-            *(weights.indptr, weights.indices, weights.data, labels[number][level.index]),
+            *(weights.indptr, weights.indices, weights.data, pixels, labels),
             *(codes[number], np.float32(share), np.float32(attraction), offsets),
             *(wide, features[level.index].reshape(-1), gradient),
         )

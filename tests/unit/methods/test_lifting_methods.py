@@ -13,6 +13,7 @@ from hilsplat.baselines import BASELINES, MethodSettings, TrainedSettings
 from hilsplat.field.adam import Adam, in_random_order
 from hilsplat.field.code import Autoencoder, LinearCode
 from hilsplat.methods import dr_splat, langsplat_v2, lifted, occam
+from hilsplat.methods.kernels import weighted_sums
 from hilsplat.methods.langsplat import train
 from hilsplat.methods.langsplat_v2 import as_vectors, cosine_loss, largest_shares
 from hilsplat.methods.method import LabelledView, MethodInputs, run_method
@@ -43,7 +44,7 @@ def test_lifted_averages_masks_by_their_weight_in_a_gaussian():
 # ---- LangSplat ----
 
 
-@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("channels", [1, 3, 5])
 def test_training_has_the_bytes_of_products_in_scipy(channels):
     rng = np.random.default_rng(channels)
     latents = rng.normal(size=(5, channels)).astype(np.float32)
@@ -61,6 +62,15 @@ def test_training_has_the_bytes_of_products_in_scipy(channels):
         apart = weights @ features - latents[view.labels[pixels, Level.PART.index]]
         adam.step(weights.T @ (np.sign(apart) * np.float32(1 / apart.size)))
     assert np.array_equal(train(views, latents, 9, settings, seed=3)[:, Level.PART.index], features)
+
+
+def test_weighted_sums_have_the_bytes_of_a_product_in_scipy():
+    rng = np.random.default_rng(0)
+    weights, features = sp.random(40, 9, 0.4, "csr", np.float32, rng), np.zeros((9, 8), np.float32)
+    features[:, :5] = rng.normal(size=(9, 5))
+    out = np.full((40, 8), np.nan, np.float32)
+    weighted_sums(weights.indptr, weights.indices, weights.data, 8, features.reshape(-1), out.reshape(-1))
+    assert np.array_equal(out, weights @ features)
 
 
 def test_views_are_drawn_in_random_order_each_once_before_any_is_repeated():
