@@ -105,11 +105,11 @@ def location_of(tensor: Any) -> str | None:
 
 def external_files(path: Path) -> list[str]:
     """Return the names of the files to which a network refers; empty for a damaged network."""
-    import onnx
-    from google.protobuf.message import DecodeError
-
     if not has_external_weights(path):
         return []
+    import onnx  # takes longer than opening a small network
+    from google.protobuf.message import DecodeError
+
     try:
         graph = onnx.load(str(path), load_external_data=False).graph
     except DecodeError:
