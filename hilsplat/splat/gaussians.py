@@ -8,6 +8,9 @@ from jaxtyping import Float, Float32, Int64, UInt64
 from hilsplat.base.arrays import require_arrays
 from hilsplat.base.errors import SettingsError
 
+SH_0 = 0.28209479177387814
+"""Value of the constant harmonic."""
+
 
 @dataclass(frozen=True)
 class Gaussians:
@@ -44,6 +47,11 @@ class Gaussians:
         from scipy.special import expit  # slow import
 
         return expit(self.opacity_logits)
+
+    @property
+    def base_rgb(self) -> Float32[np.ndarray, "N 3"]:
+        """Colours without their dependence on the direction, in [0, 1]."""
+        return np.clip(0.5 + SH_0 * self.sh[:, 0], 0, 1)
 
     @property
     def sh_degree(self) -> int:

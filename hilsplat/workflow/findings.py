@@ -8,7 +8,7 @@ from PIL import Image
 
 from hilsplat.base.errors import HilsplatError, ImageError, SceneError, in_one_line, shorten_list
 from hilsplat.base.files import list_images
-from hilsplat.base.images import image_size_hw, read_image
+from hilsplat.base.images import image_size_hw, read_image, to_uint8
 from hilsplat.configuration import StageSettings
 from hilsplat.datasets.images.hi import annotated_regions
 from hilsplat.embed.clip import ClipModel
@@ -16,7 +16,8 @@ from hilsplat.embed.langsplat_files import read_view, read_views, require_model
 from hilsplat.scene.assemble import photo_of, pinhole_of
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.colmap import is_pinhole
-from hilsplat.scene.importers.importing import fitted_camera
+from hilsplat.scene.importers.importing import fitted_camera, misfit_notes
+from hilsplat.scene.importers.known_views import KnownView
 from hilsplat.scene.importers.reading import read_source
 from hilsplat.scene.layouts import (
     DATAPARSER,
@@ -33,10 +34,11 @@ from hilsplat.scene.layouts import (
     photo_folder,
     ply_header,
     trained_gaussians,
+    transforms_of,
 )
 from hilsplat.scene.placement import placement
 from hilsplat.scene.view_names import match_names, view_names
-from hilsplat.splat.coordinates import read_gaussians
+from hilsplat.splat.coordinates import read_gaussians, source_from_ply
 
 MAX_UNDISTORTION = 0.1
 """Relative change of the aspect ratio by undistortion, above which a drawing is of another picture. It is a
@@ -70,11 +72,13 @@ class Views:
         photos: photographs, by view.
         cameras: cameras after undistortion, by view; empty if the poses are unknown.
         held_out: views that the source of the poses holds out.
+        posed: the views as their source describes them, with their images as stored.
     """
 
     photos: dict[str, Path] = field(default_factory=dict)
     cameras: dict[str, Camera] = field(default_factory=dict)
     held_out: set[str] = field(default_factory=set)
+    posed: list[KnownView] = field(default_factory=list)
 
 
 def find_parts(folder: Path, named: dict[str, Path | None], settings: StageSettings) -> Parts:
@@ -90,7 +94,7 @@ def find_parts(folder: Path, named: dict[str, Path | None], settings: StageSetti
             raise SceneError(f"--{what} {path} is missing", fix="correct the path, or pass `none`")
     parts = Parts()
     views = _poses(folder, named["poses"], settings, parts)
-    _gaussians(folder, named, parts)
+    _gaussians(folder, named, views, parts)
     _features(folder, named["features"], views, settings, parts)
     _labels(folder, named["labels"], views, parts)
     if skipped := [path.name for path in sorted(folder.rglob("*.pth"))[:3]]:
@@ -126,6 +130,7 @@ def _poses(folder: Path, named: Path | None, settings: StageSettings, parts: Par
         K, size_hw = lens.calibration_matrix(), (lens.height, lens.width)
         views.cameras[name] = Camera(name, np.eye(4), K, size_hw, photo)
     source.require_most(settings.poses.min_registered_share, known.files[0], images=True)
+    views.posed = source.views
     parts.lines.append(f"poses: {', '.join(map(str, known.files))}: {len(views.cameras)} views with an image")
     if missing := source.without_image:
         parts.lines.append(f"  left out: {len(missing)} views without an image: {shorten_list(missing, 5)}")
@@ -135,11 +140,12 @@ def _poses(folder: Path, named: Path | None, settings: StageSettings, parts: Par
     if views.held_out:
         parts.lines.append(f"  {len(views.held_out)} views are held out for tests by the source's own split")
     count = "none; they are triangulated" if source.points is None else f"{len(source.points[0])}"
+    source.notes += misfit_notes(source.views, source.points, "points") if source.points is not None else []
     parts.lines += [f"  points: {count}", *(f"  {note}" for note in source.notes)]
     return views
 
 
-def _gaussians(folder: Path, named: dict[str, Path | None], parts: Parts) -> None:
+def _gaussians(folder: Path, named: dict[str, Path | None], views: Views, parts: Parts) -> None:
     plys = [named["gaussians"]] if named["gaussians"] is not None else trained_gaussians(folder)
     if not plys:
         others = [path for path in folder.glob("*.ply") if b" f_dc_0\n" in ply_header(path)]
@@ -159,11 +165,16 @@ def _gaussians(folder: Path, named: dict[str, Path | None], parts: Parts) -> Non
         parts.lines.append(f"  not used: {shorten_list(names, 5)}")
     if langsplat_level(ply):
         parts.lines.append("  the three levels of LangSplat share their geometry, so one is enough")
-    if dataparser := dataparser_of(ply, folder):
-        parts.lines.append(f"  coordinates: nerfstudio's, from {dataparser}")
-    elif is_from_nerfstudio(ply):
-        problem = f"unknown, because the {DATAPARSER} of nerfstudio's run was not found"
-        parts.lines.append(f"  coordinates: {problem}; those of the poses are assumed")
+    dataparser = dataparser_of(ply, folder)
+    transform, taken_as = source_from_ply(ply, dataparser, transforms_of(folder, named["poses"]))
+    if dataparser is None and is_from_nerfstudio(ply):
+        taken_as = f"coordinates: unknown, because the {DATAPARSER} of nerfstudio's run was not found; "
+        taken_as += "those of the poses are assumed"
+    is_solid = gaussians.opacity_logits > 0
+    xyz = gaussians.means[is_solid] @ transform[:3, :3].T + transform[:3, 3]
+    points = xyz, to_uint8(gaussians.base_rgb[is_solid])
+    notes = [taken_as, *misfit_notes(views.posed, points, "Gaussians")]
+    parts.lines += [f"  {note}" for note in notes]
 
 
 def _name_unused(paths: list[Path], advice: str, parts: Parts) -> None:
