@@ -36,7 +36,7 @@ from hilsplat.scene.layouts import (
     trained_gaussians,
     transforms_of,
 )
-from hilsplat.scene.placement import placement
+from hilsplat.scene.placement import SHAPE_TOLERANCE, placement
 from hilsplat.scene.view_names import match_names, view_names
 from hilsplat.splat.coordinates import read_gaussians, source_from_ply
 
@@ -229,7 +229,7 @@ def _labels(folder: Path, named: Path | None, views: Views, parts: Parts) -> Non
         else:
             try:
                 if regions := annotated_regions(path, warnings):
-                    _require_shape(views, view, regions[0].size_hw, path)
+                    warnings += _shape_notes(views, view, regions[0].size_hw, path)
                 num_regions, parts.labels[path] = num_regions + len(regions), copy
             except HilsplatError as error:
                 lost.append(in_one_line(error))
@@ -245,15 +245,23 @@ def _labels(folder: Path, named: Path | None, views: Views, parts: Parts) -> Non
     parts.lines += [f"  {shorten_list(warnings, 5)}"] if warnings else []
 
 
-def _require_shape(views: Views, view: str, drawn_hw: tuple[int, int], path: Path) -> None:
-    """Raise HilsplatError if labels don't have the shape of their photograph or undistorted view."""
+def _shape_notes(views: Views, view: str, drawn_hw: tuple[int, int], path: Path) -> list[str]:
+    """Return a note on labels that only fit an undistorted view whose shape is not yet known.
+
+    Raises:
+        HilsplatError: labels don't have the shape of their photograph or undistorted view.
+    """
     if view in views.cameras:
         placement(views.cameras[view], drawn_hw, f"label file {path}")
-        return
+        return []
     height, width = image_size_hw(views.photos[view], upright=True)
-    if abs(drawn_hw[0] * width / (drawn_hw[1] * height) - 1) > MAX_UNDISTORTION:
+    misfit = abs(drawn_hw[0] * width / (drawn_hw[1] * height) - 1)
+    if misfit > MAX_UNDISTORTION:
         raise SceneError(
             f"label file {path} does not match the size of its photograph",
             expected=f"{width} x {height} px (width x height), or a scaled copy",
             found=f"{drawn_hw[1]} x {drawn_hw[0]} px",
         )
+    drawn = f"{path.name} ({drawn_hw[1]} x {drawn_hw[0]} px) is not of the shape of its photograph"
+    unless = "evaluation refuses it unless the undistorted view has its shape"
+    return [f"{drawn}; {unless}"] if misfit > SHAPE_TOLERANCE else []

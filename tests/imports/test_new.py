@@ -176,10 +176,13 @@ def test_labels_of_another_shape_are_left_out(lens, tmp_path):
     if lens is not None:
         poses = {f"{name}.jpg": pose for name, pose in zip(PICTURES, POSES, strict=True)}
         world.write_colmap(folder / "sparse/0", lens, (WIDTH, HEIGHT), poses, POINTS)
-    for name, size in (("001", (2 * WIDTH, 2 * HEIGHT)), ("002", (HEIGHT, WIDTH)), ("003", (WIDTH, 36))):
-        label_file(folder / f"label/{name}.json", [thing("mug")], *size)
+    sizes = (2 * WIDTH, 2 * HEIGHT), (HEIGHT, WIDTH), (WIDTH, 36), (1000, 710), (WIDTH, HEIGHT)
+    for number, size in enumerate(sizes, 1):
+        label_file(folder / f"label/00{number}.json", [thing("mug")], *size)
     output = new(folder, tmp_path / "p", "--dry-run").output
-    assert "labels: 2 regions in 2 photographs" in output, output
+    count = 4 if lens is None else 3  # undistorted views without known poses may have the last shape
+    assert f"labels: {count} regions in {count} photographs" in output, output
+    assert ("004.json (1000 x 710 px) is not of the shape of its photograph" in output) == (lens is None)
     for name in ("002", "003"):
         assert f"{name}.json does not match the size of its" in output
 
