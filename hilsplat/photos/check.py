@@ -39,7 +39,7 @@ FAULTS = (
     "blurred: omit them, or retake them with more light, a steady hand and correct focus",
     "too dark: retake them with more light",
     "more than half white: retake them with less exposure, unless the background is white",
-    "exactly twice as wide as high: if they are 360-degree panoramas, cut them into views of about 90 degrees",
+    "exactly twice as wide as high: cut 360-degree panoramas into views of about 90 degrees",
 )
 """Faults of a photograph, and what to do."""
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pycolmap
 import pytest
+from plyfile import PlyData, PlyElement
 
 from hilsplat.base.errors import HilsplatError
 from hilsplat.scene.importers.colmap_model import read_model
@@ -243,6 +244,19 @@ def test_without_points_they_are_triangulated(tmp_path, imported):
     world.write_colmap(folder / "sparse/0", LENS, (WIDTH, HEIGHT), {"000.png": POSES[0]}, [])
     source = read_source(find_known_poses(folder))
     assert source.points is None
+
+
+@pytest.mark.parametrize("is_alone", [True, False])
+def test_points_in_a_ply_beside_the_model_are_read_if_it_has_no_others(is_alone, tmp_path):
+    folder = write(tmp_path)
+    cloud = np.zeros(
+        1, [(name, "f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+    )
+    PlyData([PlyElement.describe(cloud, "vertex")]).write(folder / "sparse/0/points3D.ply")
+    if is_alone:
+        (folder / "sparse/0/points3D.txt").unlink()
+    assert len(read_source(find_known_poses(folder)).points[0]) == (1 if is_alone else len(POINTS))
+    assert (folder / "sparse/0/points3D.ply" in photo_files(folder)) == is_alone
 
 
 def test_colours_from_0_to_1_become_bytes(tmp_path):

@@ -18,6 +18,7 @@ from jaxtyping import Float64, Int64, UInt8
 from hilsplat.base.errors import SceneError, foreign
 from hilsplat.base.files import regular
 from hilsplat.scene.colmap import pycolmap, rotation_matrix
+from hilsplat.scene.importers.ply_file import read_ply_points
 from hilsplat.scene.layouts import model_files
 
 FIX = "copy it again, or export the model again with COLMAP"
@@ -69,6 +70,7 @@ class ColmapModel:
 def read_model(folder: Path) -> ColmapModel:
     """Read a model; raise SceneError with file and record or line if a file is damaged."""
     cameras, images, *points = model_files(folder)
+    cloud = points.pop() if points and points[0].suffix == ".ply" else None
     if cameras.suffix == ".bin":
         lenses, records = _binary(cameras, _binary_lens), _binary(images, _binary_image)
         rows = _binary(points[0], _binary_point) if points else []
@@ -85,7 +87,10 @@ def read_model(folder: Path) -> ColmapModel:
             raise SceneError(f"{points[0]} has colours that are neither whole numbers nor at most 1", fix=FIX)
         table[:, 4:] = np.rint(255 * table[:, 4:])
     arrays = table[:, 0].astype(np.int64), table[:, 1:4], table[:, 4:].astype(np.uint8)
-    return ColmapModel(dict(lenses), records, arrays if points else None)
+    if cloud is not None:
+        xyz, rgb = read_ply_points(cloud)
+        arrays = np.arange(-len(xyz), 0), xyz, rgb  # no image observes these ids
+    return ColmapModel(dict(lenses), records, arrays if points or cloud else None)
 
 
 def _image(

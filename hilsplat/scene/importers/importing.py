@@ -21,7 +21,7 @@ from hilsplat.base.images import (
 )
 from hilsplat.base.processes import in_own_process
 from hilsplat.base.progress import track
-from hilsplat.scene.assemble import Posed, PosedView, photo_of, split_views, undistort
+from hilsplat.scene.assemble import Posed, PosedView, few_points_doubt, photo_of, split_views, undistort
 from hilsplat.scene.cameras import Photo
 from hilsplat.scene.colmap import Points, pycolmap, sparse_points
 from hilsplat.scene.features import find_matches, incremental_options
@@ -37,9 +37,6 @@ CHECKED_VIEWS, CHECKED_POINTS, MIN_INSIDE = 8, 100_000, 100
 MAX_MISFIT = 0.75
 """Median difference between the colours of points and pixels, relative to that of other points' colours.
 Measured: 0.08 to 0.43 with right poses; 0.80 or more in other axes, or with inverted poses."""
-
-MIN_TRIANGULATED = 10
-"""Number of points per view. Measured: 107 with right poses; 0.5 or fewer in other axes, or if inverted."""
 
 
 def import_poses(
@@ -67,11 +64,11 @@ def import_poses(
     missing = source.without_image
     views = [view for _, view in posed]
     points = source.points or triangulate(views, work, settings, seed, threads)
+    points_per_view = round(len(points[0]) / len(views), 1)
     if source.points is not None:
         source.notes += misfit_notes([view for view, _ in posed], points, "points")
-    elif len(points[0]) < MIN_TRIANGULATED * len(views):
-        few = f"only {len(points[0])} points could be triangulated from the poses of {len(views)} images"
-        source.notes.append(f"{few}: are the poses in the axes of their format, and those of these images?")
+    else:
+        source.notes += few_points_doubt(points_per_view)
     beside = known.root / "images"
     images = list_images(beside) if known.kind == "colmap" and beside.is_dir() else []
     unposed = [path.name for path in images if path not in files]
@@ -99,7 +96,7 @@ def import_poses(
         "models": [len(views)],
         "points": len(points[0]),
         "points_from": "source" if source.points is not None else "triangulated from the known poses",
-        "points_per_view": round(len(points[0]) / len(views), 1),
+        "points_per_view": points_per_view,
         "mean_reprojection_error_px": _mean_error_px(source),
         "warnings": warnings,
         "views": _view_entries(posed, source, missing, unposed),

@@ -12,9 +12,9 @@ import numpy as np
 
 from hilsplat.base.errors import SceneError, foreign
 from hilsplat.base.images import image_size_hw
-from hilsplat.scene.colmap import Points, pycolmap
+from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.importers.known_views import Keys, KnownView, Source, find_images, require_inside
-from hilsplat.scene.importers.ply_file import read_ply
+from hilsplat.scene.importers.ply_file import read_ply_points
 from hilsplat.scene.layouts import KnownPoses, read_json_object
 from hilsplat.scene.posed_images import OPENGL_TO_OPENCV, rigid_pose
 
@@ -31,9 +31,6 @@ MODELS = dict.fromkeys(PERSPECTIVES, "OPENCV") | dict.fromkeys(FISHEYES, "OPENCV
 """COLMAP's lens model with the distortion coefficients of a `camera_model`."""
 
 COEFFICIENTS = {"OPENCV": ("k1", "k2", "p1", "p2", "k3"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4")}
-
-COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
-"""Names of the columns with a point's colour."""
 
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 
@@ -177,20 +174,3 @@ def _focal(frame: Mapping[str, Any], axis: str, side_px: int, notes: list[str]) 
         if abs(stated[key] - stated[first]) > FOCAL_TOLERANCE * abs(stated[first]):
             notes.append(f"{key} contradicts {first}, which is used")
     return stated[first]
-
-
-def read_ply_points(path: Path) -> Points:
-    """Read the points of a PLY file, and their colours: integers, or floats from 0 to 1; grey without any."""
-    fix = "put the file there, or remove ply_file_path from the transforms file to triangulate points"
-    with foreign(f"{path}, with the points,", fix=fix):
-        vertex = read_ply(path)["vertex"].data
-        xyz = np.stack([vertex[axis] for axis in ("x", "y", "z")], axis=1).astype(np.float64)
-        names = next((names for names in COLOURS if set(names) <= set(vertex.dtype.names)), None)
-        if names is None:
-            return xyz, np.full(xyz.shape, 128, dtype=np.uint8)
-        rgb = np.stack([vertex[name] for name in names], axis=1)
-        largest = float(np.nanmax(rgb)) if rgb.size else 0.0
-        # Floats are usually in [0, 1], up to rounding; 16-bit colours of laser scanners may use only 8 bits.
-        limit = 1 if rgb.dtype.kind == "f" and largest < 2 else 255 if largest <= 255 else 65535
-        rgb = np.nan_to_num(rgb.astype(np.float64) * (255 / limit), nan=128.0)
-    return xyz, np.clip(np.rint(rgb), 0, 255).astype(np.uint8)

@@ -89,7 +89,7 @@ def test_faulty_photographs_are_named(moving, photos):
     (white,) = with_third(lambda picture: np.clip(picture * 4.0, 0, 255).astype(np.uint8))
     assert white.startswith("1 of 12 photographs (2.jpg) is more than half white")
     (wide, *_) = with_third(lambda picture: picture[: len(picture) // 2])
-    assert wide.startswith("1 of 12 photographs (2.jpg) is exactly twice as wide as high: if they are 360-")
+    assert wide.startswith("1 of 12 photographs (2.jpg) is exactly twice as wide as high: cut 360-")
 
 
 def test_photographs_from_one_place_are_named(moving):
