@@ -165,16 +165,16 @@ def _gaussians(folder: Path, named: dict[str, Path | None], views: Views, parts:
         parts.lines.append(f"  not used: {shorten_list(names, 5)}")
     if langsplat_level(ply):
         parts.lines.append("  the three levels of LangSplat share their geometry, so one is enough")
-    dataparser = dataparser_of(ply, folder)
-    transform, taken_as = source_from_ply(ply, dataparser, transforms_of(folder, named["poses"]))
-    if dataparser is None and is_from_nerfstudio(ply):
-        taken_as = f"coordinates: unknown, because the {DATAPARSER} of nerfstudio's run was not found; "
-        taken_as += "those of the poses are assumed"
+    if (dataparser := dataparser_of(ply, folder)) is not None:
+        parts.lines.append(f"  coordinates: nerfstudio's, from {dataparser}")
+    elif is_from_nerfstudio(ply):
+        problem = f"unknown, because the {DATAPARSER} of nerfstudio's run was not found"
+        parts.lines.append(f"  coordinates: {problem}; those of the poses are assumed")
+    transform, _ = source_from_ply(ply, dataparser, transforms_of(folder, named["poses"]))
     is_solid = gaussians.opacity_logits > 0
     xyz = gaussians.means[is_solid] @ transform[:3, :3].T + transform[:3, 3]
     points = xyz, to_uint8(gaussians.base_rgb[is_solid])
-    notes = [taken_as, *misfit_notes(views.posed, points, "Gaussians")]
-    parts.lines += [f"  {note}" for note in notes]
+    parts.lines += [f"  {note}" for note in misfit_notes(views.posed, points, "Gaussians")]
 
 
 def _name_unused(paths: list[Path], advice: str, parts: Parts) -> None:

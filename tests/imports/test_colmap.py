@@ -86,7 +86,7 @@ def test_text_models_are_read(form, tmp_path):
 @pytest.mark.parametrize("form", ["text", "binary"])
 def test_names_with_spaces_and_signs_are_read(name, form, tmp_path):
     folder = write(tmp_path, name)
-    if form == "binary":  # the text is read by hand here, because pycolmap ends names at spaces
+    if form == "binary":
         rewrite_as_binary(folder / "sparse/0", name)
     views = {view.image: view for view in read_source(find_known_poses(folder)).views}
     for number, pose in enumerate(POSES):
@@ -95,19 +95,12 @@ def test_names_with_spaces_and_signs_are_read(name, form, tmp_path):
     assert not views
 
 
-def rewrite_as_binary(folder, name):
-    model = pycolmap.Reconstruction()
-    lens, *params = LENS.split()
-    camera = pycolmap.Camera(
-        model=lens, width=WIDTH, height=HEIGHT, params=list(map(float, params)), camera_id=1
-    )
-    model.add_camera_with_trivial_rig(camera)
-    for number, pose in enumerate(POSES):
-        image = pycolmap.Image(name=name.format(number), camera_id=1, image_id=number + 1)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.linalg.inv(pose)[:3]))
-    for *xyz, red, green, blue in POINTS:
-        model.add_point3D(np.array(xyz), pycolmap.Track(), np.array([red, green, blue], np.uint8))
-    for path in folder.iterdir():
+def rewrite_as_binary(folder, name="{}"):
+    """Rewrite a text model; images may get names with spaces, at which pycolmap's reader ends names."""
+    model = pycolmap.Reconstruction(folder)
+    for number, image in model.images.items():
+        image.name = image.name if name == "{}" else name.format(number - 1)
+    for path in folder.glob("*.txt"):
         path.unlink()
     model.write_binary(folder)
 
@@ -126,7 +119,7 @@ def test_models_with_observations_are_read_as_by_pycolmap(write_model, tmp_path)
         (theirs,) = [other for other in again.images.values() if other.name == image.name]
         np.testing.assert_allclose(image.cam_from_world[:3], theirs.cam_from_world().matrix(), atol=1e-12)
         lens, camera = read.lenses[image.camera_id], theirs.camera
-        assert (lens.model, lens.width, lens.height) == (camera.model_name, camera.width, camera.height)
+        assert (lens.model, lens.size_hw) == (camera.model_name, (camera.height, camera.width))
         np.testing.assert_array_equal(lens.params, camera.params)
         seen = theirs.get_observation_points2D()
         np.testing.assert_array_equal(image.seen[0], [point.xy for point in seen])
@@ -192,10 +185,7 @@ def test_the_model_with_the_most_images_is_taken_and_others_are_named(models, ch
     for model, count in models.items():
         write(tmp_path, model=model, count=count)
         if form == "binary":
-            read = pycolmap.Reconstruction(tmp_path / model)
-            for path in (tmp_path / model).glob("*.txt"):
-                path.unlink()
-            read.write_binary(tmp_path / model)
+            rewrite_as_binary(tmp_path / model)
     known = find_known_poses(tmp_path)
     assert known.files == (tmp_path / chosen,)
     source = read_source(known)

@@ -8,15 +8,15 @@ import struct
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
 from hilsplat.base.errors import SceneError, foreign
 from hilsplat.base.files import regular
+from hilsplat.scene.cameras import Photo
 from hilsplat.scene.colmap import pycolmap, rotation_matrix
 from hilsplat.scene.importers.ply_file import read_ply_points
 from hilsplat.scene.layouts import model_files
@@ -28,20 +28,6 @@ PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
 
 
 Row = TypeVar("Row")
-
-
-class Lens(NamedTuple):
-    """A camera in a model: COLMAP's name of the lens model, image size and parameters, px."""
-
-    model: str
-    width: int
-    height: int
-    params: tuple[float, ...]
-
-    def camera(self) -> pycolmap.Camera:
-        return pycolmap.Camera(
-            model=self.model, width=self.width, height=self.height, params=list(self.params)
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +48,7 @@ class ModelImage:
 class ColmapModel:
     """A COLMAP model; points are sorted by id, and None if the model has no file of points."""
 
-    lenses: dict[int, Lens]
+    lenses: dict[int, Photo]
     images: list[ModelImage]
     points: tuple[Int64[np.ndarray, " P"], Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]] | None
 
@@ -152,12 +138,12 @@ def _binary(path: Path, record: Callable[[_Bytes], Row]) -> list[Row]:
     return rows
 
 
-def _binary_lens(data: _Bytes) -> tuple[int, Lens]:
+def _binary_lens(data: _Bytes) -> tuple[int, Photo]:
     number, model, width, height = data.take("IiQQ")
     if not 0 <= model < len(PARAMETERS):
         raise ValueError(f"unknown camera model {model}")
     params = data.take(f"{PARAMETERS[model]}d")
-    return number, Lens(pycolmap.CameraModelId(model).name, width, height, params)
+    return number, Photo(pycolmap.CameraModelId(model).name, params, (height, width))
 
 
 def _binary_image(data: _Bytes) -> ModelImage:
@@ -198,14 +184,14 @@ def _text(path: Path, expected: str, record: Callable[[str], Row | None]) -> lis
     return rows
 
 
-def _text_lens(line: str) -> tuple[int, Lens] | None:
+def _text_lens(line: str) -> tuple[int, Photo] | None:
     if not line:
         return None
     number, model, width, height, *params = line.split()
     model_id = int(pycolmap.CameraModelId.__members__.get(model, pycolmap.CameraModelId.INVALID))
     if model_id < 0 or len(params) != PARAMETERS[model_id] or "_" in "".join(params):
         raise ValueError
-    return int(number), Lens(model, int(width), int(height), tuple(map(float, params)))
+    return int(number), Photo(model, tuple(map(float, params)), (int(height), int(width)))
 
 
 def _text_point(line: str) -> tuple[float, ...] | None:
@@ -218,34 +204,30 @@ def _text_point(line: str) -> tuple[float, ...] | None:
     return float(int(number)), x, y, z, *rgb
 
 
-class _TextImages:
-    """The state between the two lines of an image; the second one, its points, may be missing."""
-
-    def __init__(self) -> None:
-        self.may_be_points = False
-
-    def __call__(self, line: str) -> Any:
-        cells = line.split()
-        if self.may_be_points and len(cells) % 3 == 0:
-            with suppress(ValueError):
-                points = np.array(cells, np.float64).reshape(-1, 3)
-                self.may_be_points = False
-                return points
-        self.may_be_points = bool(line)
-        if not line:
-            return None
-        *numbers, name = line.split(maxsplit=9)
-        int(numbers[0])
-        return name, int(numbers[8]), tuple(map(float, numbers[1:8]))
-
-
 def _text_images(path: Path) -> list[ModelImage]:
+    """Read images.txt; the second line of an image, its points, may be missing."""
     expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line with X Y POINT3D_ID for each point"
-    images: list[ModelImage] = []
-    rows = _text(path, expected, _TextImages())
-    for row, after in pairwise([*rows, None]):
-        if isinstance(row, tuple):
-            seen = after if isinstance(after, np.ndarray) else np.zeros((0, 3))
-            name, camera_id, pose = row
-            images.append(_image(name, camera_id, pose, seen[:, :2], seen[:, 2].astype(np.int64)))
-    return images
+    images: list[tuple[str, int, tuple[float, ...]]] = []
+    points: dict[int, np.ndarray] = {}  # by number of the image
+    may_be_points = False
+
+    def read(line: str) -> None:
+        nonlocal may_be_points
+        cells = line.split()
+        if may_be_points and len(cells) % 3 == 0:
+            with suppress(ValueError):
+                points[len(images) - 1] = np.array(cells, np.float64).reshape(-1, 3)
+                may_be_points = False
+                return
+        may_be_points = bool(line)
+        if line:
+            *numbers, name = line.split(maxsplit=9)
+            int(numbers[0])
+            images.append((name, int(numbers[8]), tuple(map(float, numbers[1:8]))))
+
+    _text(path, expected, read)
+    seen = (points.get(number, np.zeros((0, 3))) for number in range(len(images)))
+    return [
+        _image(*image, table[:, :2], table[:, 2].astype(np.int64))
+        for image, table in zip(images, seen, strict=True)
+    ]

@@ -13,7 +13,7 @@ from hilsplat.base.files import IMAGE_SUFFIXES, is_outside, list_images, regular
 from hilsplat.base.images import image_size_hw
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.cameras import MAX_SIDE_PX
-from hilsplat.scene.colmap import Points, pycolmap
+from hilsplat.scene.colmap import Points, as_camera, pycolmap
 from hilsplat.scene.importers.colmap_model import ModelImage, read_model
 from hilsplat.scene.layouts import KnownPoses, used_images
 from hilsplat.scene.posed_images import rigid_pose
@@ -132,13 +132,11 @@ class Keys:
     """The keys of a format.
 
     Attributes:
-        used: keys that the reader understands.
-        harmless: keys that don't change the meaning of others, and are skipped.
+        known: keys that the reader understands, or skips because they don't change the meaning of others.
         refused: what a key means that the reader cannot apply.
     """
 
-    used: Set[str]
-    harmless: Set[str]
+    known: Set[str]
     refused: Mapping[str, str]
 
     def check(self, objects: Iterable[Mapping[str, Any]], file: Path) -> list[str]:
@@ -152,7 +150,7 @@ class Keys:
                         found=f"{key}: {str(content[key])[:60]}",
                         fix="export undistorted images of ordinary cameras, in the usual axes",
                     )
-            unknown |= content.keys() - self.used - self.harmless - self.refused.keys()
+            unknown |= content.keys() - self.known - self.refused.keys()
         return [f"keys of {file.name} that are not used: {', '.join(sorted(unknown))}"] if unknown else []
 
 
@@ -266,7 +264,7 @@ def read_colmap(known: KnownPoses) -> Source:
     def described(image: ModelImage) -> KnownView:
         if image.camera_id not in model.lenses:
             raise SceneError(f"view {image.name} has camera {image.camera_id}, which the model lacks")
-        camera = model.lenses[image.camera_id].camera()
+        camera = as_camera(model.lenses[image.camera_id])
         is_test = image.name in held_out
         return KnownView(image.name, files[image.name], camera, image.cam_from_world, is_test)
 

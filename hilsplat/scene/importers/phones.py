@@ -31,20 +31,16 @@ Z_UP_FROM_Y_UP = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0,
 
 POLYCAM_HARMLESS = """angular_velocity blur_score center_depth exposure_duration iso manual_keyframe neighbors
 neighbors_2 timestamp version lens white_balance"""
+POLYCAM_USED = "fx fy cx cy width height t_00 t_01 t_02 t_03 t_10 t_11 t_12 t_13 t_20 t_21 t_22 t_23"
 POLYCAM_KEYS = Keys(
-    used={
-        *(f"t_{row}{column}" for row in range(3) for column in range(4)),
-        *["fx", "fy", "cx", "cy", "width", "height"],
-    },
-    harmless=set(POLYCAM_HARMLESS.split()),
-    refused=dict.fromkeys(["k1", "k2", "k3", "p1", "p2", "distortion"], "lens distortion"),
+    {*POLYCAM_USED.split(), *POLYCAM_HARMLESS.split()},
+    dict.fromkeys(["k1", "k2", "k3", "p1", "p2", "distortion"], "lens distortion"),
 )
 RECORD3D_HARMLESS = """fps dw dh initPose cameraType frameTimestamps confidenceWidth confidenceHeight
 userComment rangeOfInterest hardwareModel"""
 RECORD3D_KEYS = Keys(
-    used={"K", "w", "h", "poses", "perFrameIntrinsicCoeffs"},
-    harmless=set(RECORD3D_HARMLESS.split()),
-    refused=dict.fromkeys(("lensDistortionLookupTable", "distortion"), "lens distortion"),
+    {"K", "w", "h", "poses", "perFrameIntrinsicCoeffs", *RECORD3D_HARMLESS.split()},
+    dict.fromkeys(("lensDistortionLookupTable", "distortion"), "lens distortion"),
 )
 
 

@@ -51,9 +51,8 @@ REFUSED = {
     "k5 k6 p3 p4 s1 s2 s3 s4 b1 b2 distortion distortion_params": "more lens distortion",
 }
 KEYS = Keys(
-    used={*USED.split(), *FOCAL_KEYS, *SPLITS},
-    harmless=set(HARMLESS.split()),
-    refused={key: meaning for keys, meaning in REFUSED.items() for key in keys.split()},
+    {*USED.split(), *FOCAL_KEYS, *SPLITS, *HARMLESS.split()},
+    {key: meaning for keys, meaning in REFUSED.items() for key in keys.split()},
 )
 
 

@@ -209,7 +209,7 @@ def test_nerfstudios_export_is_found_with_the_record_of_its_coordinates(tmp_path
     gaussians(folder / "exports/splat/splat.ply", 1)
     for run in runs:
         (folder / run).parent.mkdir(parents=True)
-        (folder / run).touch()
+        (folder / run).write_text(json.dumps({"transform": np.eye(4).tolist(), "scale": 1}))
     frames = [{"file_path": "images/0.png", "transform_matrix": np.eye(4).tolist()}]
     (folder / "transforms.json").write_text(json.dumps({"fl_x": 50, "frames": frames}))
     sheet = write_sheet(tmp_path)
