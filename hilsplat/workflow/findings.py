@@ -6,7 +6,14 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from hilsplat.base.errors import HilsplatError, ImageError, SceneError, in_one_line, shorten_list
+from hilsplat.base.errors import (
+    HilsplatError,
+    ImageError,
+    MisalignedArtifactError,
+    SceneError,
+    in_one_line,
+    shorten_list,
+)
 from hilsplat.base.files import list_images
 from hilsplat.base.images import image_size_hw, read_image, to_uint8
 from hilsplat.configuration import StageSettings
@@ -36,7 +43,7 @@ from hilsplat.scene.layouts import (
     trained_gaussians,
     transforms_of,
 )
-from hilsplat.scene.placement import SHAPE_TOLERANCE, placement
+from hilsplat.scene.placement import placement
 from hilsplat.scene.view_names import match_names, view_names
 from hilsplat.splat.coordinates import read_gaussians, source_from_ply
 
@@ -246,22 +253,19 @@ def _labels(folder: Path, named: Path | None, views: Views, parts: Parts) -> Non
 
 
 def _shape_notes(views: Views, view: str, drawn_hw: tuple[int, int], path: Path) -> list[str]:
-    """Return a note on labels that only fit an undistorted view whose shape is not yet known.
+    """Return a note on labels that can only fit the undistorted view, whose shape is not yet known.
 
     Raises:
         HilsplatError: labels don't have the shape of their photograph or undistorted view.
     """
-    if view in views.cameras:
-        placement(views.cameras[view], drawn_hw, f"label file {path}")
-        return []
-    height, width = image_size_hw(views.photos[view], upright=True)
-    misfit = abs(drawn_hw[0] * width / (drawn_hw[1] * height) - 1)
-    if misfit > MAX_UNDISTORTION:
-        raise SceneError(
-            f"label file {path} does not match the size of its photograph",
-            expected=f"{width} x {height} px (width x height), or a scaled copy",
-            found=f"{drawn_hw[1]} x {drawn_hw[0]} px",
-        )
-    drawn = f"{path.name} ({drawn_hw[1]} x {drawn_hw[0]} px) is not of the shape of its photograph"
-    unless = "evaluation refuses it unless the undistorted view has its shape"
-    return [f"{drawn}; {unless}"] if misfit > SHAPE_TOLERANCE else []
+    if (camera := views.cameras.get(view)) is None:
+        photo_hw = image_size_hw(views.photos[view], upright=True)
+        camera = Camera(view, np.eye(4), np.eye(3), photo_hw)
+    try:
+        placement(camera, drawn_hw, f"label file {path}")
+    except MisalignedArtifactError as error:
+        misfit = abs(drawn_hw[0] * camera.size_hw[1] / (drawn_hw[1] * camera.size_hw[0]) - 1)
+        if view in views.cameras or misfit > MAX_UNDISTORTION:
+            raise
+        return [f"{in_one_line(error)}; evaluation refuses it unless the undistorted view has its shape"]
+    return []

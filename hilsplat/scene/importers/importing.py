@@ -168,26 +168,20 @@ def misfit_notes(views: Sequence[KnownView], points: Points, what: str) -> list[
     The colours of points are compared with the pixels at their projections, and these with the colours of
     other points. If all points have one colour, they only need to be inside the images.
     """
-    every = 1 + len(points[0]) // CHECKED_POINTS
-    xyz, rgb = points[0][::every], points[1][::every].astype(np.float32)
+    xyz, rgb = (column[:: 1 + len(column) // CHECKED_POINTS] for column in points)
     usable = [view for view in views if view.image is not None]
     rows = np.linspace(0, len(usable) - 1, min(CHECKED_VIEWS, len(usable))).astype(int)
     if len(xyz) < MIN_INSIDE or not usable:
         return []
-    pairs = [_colours_in(usable[row], xyz, rgb) for row in rows]
-    pixels, colours = (np.concatenate(column) for column in zip(*pairs, strict=True))
-    if len(pixels) < MIN_INSIDE:
-        problem = f"only {len(pixels)} of {len(xyz)} are inside {len(rows)} images"
-    elif np.ptp(rgb, axis=0).any():
-        own, other = (
-            np.median(np.abs(pixels - np.roll(colours, shift, axis=0)).mean(axis=1))
-            for shift in (0, len(colours) // 2)
-        )
-        if own < MAX_MISFIT * other:
+    pairs = [_colours_in(usable[row], xyz, rgb.astype(np.float32)) for row in rows]
+    pixels, colours = map(np.concatenate, zip(*pairs, strict=True))
+    others = np.roll(colours, len(colours) // 2, axis=0)
+    problem = f"only {len(pixels)} of {len(xyz)} are inside {len(rows)} images"
+    if len(pixels) >= MIN_INSIDE:
+        own, other = (np.median(np.abs(pixels - each).mean(axis=1)) for each in (colours, others))
+        if own < MAX_MISFIT * other or not np.ptp(rgb, axis=0).any():
             return []
         problem = "their colours are not those of their pixels"
-    else:
-        return []
     return [f"the {what} don't match the images: {problem}. Are poses and {what} in the same coordinates?"]
 
 
