@@ -226,14 +226,12 @@ def test_images_of_nearly_the_camera_s_size_or_stretched_are_noted(size, is_note
     assert all("are they the images that the poses were computed from?" in note for note in notes)
 
 
-def test_without_points_they_are_triangulated(tmp_path, imported):
+def test_a_model_without_points_or_without_their_file_has_none(tmp_path):
     folder = write(tmp_path / "in")
-    (folder / "sparse/0/points3D.txt").unlink()
-    *_, report = imported(folder)
-    assert report["points_from"] == "triangulated from the known poses"
     world.write_colmap(folder / "sparse/0", LENS, (WIDTH, HEIGHT), {"000.png": POSES[0]}, [])
-    source = read_source(find_known_poses(folder))
-    assert source.points is None
+    assert read_source(find_known_poses(folder)).points is None
+    (folder / "sparse/0/points3D.txt").unlink()
+    assert read_source(find_known_poses(folder)).points is None
 
 
 @pytest.mark.parametrize("is_alone", [True, False])
