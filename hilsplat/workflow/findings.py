@@ -46,6 +46,7 @@ from hilsplat.scene.layouts import (
 from hilsplat.scene.placement import placement
 from hilsplat.scene.view_names import match_names, view_names
 from hilsplat.splat.coordinates import read_gaussians, source_from_ply
+from hilsplat.splat.gaussians import base_rgb
 
 MAX_UNDISTORTION = 0.1
 """Relative change of the aspect ratio by undistortion, above which a drawing is of another picture. It is a
@@ -180,7 +181,7 @@ def _gaussians(folder: Path, named: dict[str, Path | None], views: Views, parts:
     transform, _ = source_from_ply(ply, dataparser, transforms_of(folder, named["poses"]))
     is_solid = gaussians.opacity_logits > 0
     xyz = gaussians.means[is_solid] @ transform[:3, :3].T + transform[:3, 3]
-    points = xyz, to_uint8(gaussians.base_rgb[is_solid])
+    points = xyz, to_uint8(base_rgb(gaussians.sh[is_solid]))
     parts.lines += [f"  {note}" for note in misfit_notes(views.posed, points, "Gaussians")]
 
 
