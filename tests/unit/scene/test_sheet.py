@@ -182,8 +182,6 @@ def test_found_files_can_be_ignored_or_replaced(tmp_path):
     plain, mixed = read_sheet(sheet)
     assert (plain.gaussians, plain.features, plain.poses) == (None, None, None)
     assert (mixed.gaussians, mixed.features, mixed.poses) == (tmp_path / "other.ply", None, None)
-    with pytest.raises(SceneError, match="contains no label file"):
-        add_scene(sheet, "lost", folder, labels=tmp_path / "config")
     with pytest.raises(SceneError, match="--features gone is missing"):
         add_scene(sheet, "lost", folder, features=Path("gone"))
 
