@@ -167,15 +167,13 @@ def _require_parameters(path: Path, values: Float32[np.ndarray, "N P"], fix: str
     if len(values) < MIN_JUDGED:
         return
     opacities, scales = values[:, -8], values[:, -7:-4]
-    is_plain = {
-        "scale_*": scales.min() > 0 and np.median(scales) < 1,
-        "opacity": 0 <= opacities.min() < opacities.max() <= 1,
-    }
-    if plain := [f"{name} is always positive" for name, found in is_plain.items() if found]:
+    has_alphas = 0 <= opacities.min() < opacities.max() <= 1
+    if has_alphas or (scales.min() > 0 and np.median(scales) < 1):
+        limits = *(scales.min(), scales.max()), *(opacities.min(), opacities.max())
         raise ArtifactError(
             f"{path} does not contain the parameters of 3DGS",
             expected="natural logarithms of scales, and logits of opacities",
-            found=", ".join(plain),
+            found="scale_* from {:.3g} to {:.3g}, opacity from {:.3g} to {:.3g}".format(*limits),
             fix=fix,
         )
 
