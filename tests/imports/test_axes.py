@@ -34,8 +34,7 @@ PICTURES = {name: world.picture(RAYS, WIDTH, HEIGHT, pose) for name, pose in POS
 def scene(folder, change=None, xyz=XYZ, colours=RGB):
     world.save(folder / "images", PICTURES, "")
     poses = {name: change(pose) if change else pose for name, pose in POSES.items()}
-    points = np.column_stack([xyz, colours]).tolist()
-    points = [(*point[:3], *map(int, point[3:])) for point in points]
+    points = [(*place, *colour) for place, colour in zip(xyz.tolist(), colours.tolist(), strict=True)]
     world.write_colmap(folder / "sparse/0", "PINHOLE 150 150 80 60", (WIDTH, HEIGHT), poses, points)
     return folder
 

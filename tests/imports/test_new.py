@@ -155,7 +155,7 @@ def test_poses_that_the_run_would_refuse_are_refused(tmp_path):
     ("files", "reason"),
     [
         ({"001": [thing("mug")], "0badcafe-001": [thing("cup")]}, "another file has the labels of 001.png"),
-        ({"001": [thing("mug")], "zzz": [thing("cup")]}, "zzz.json: no view with an image and a pose"),
+        ({"0badcafe-001": [thing("mug")], "zzz": [thing("cup")]}, "zzz.json: no view with an image"),
         ({"001": [thing("mug")], "002": [{"category": "mug"}]}, "segmentation is not a polygon"),
         ({"001": [thing("mug")], "002": [thing("mug", level=4)]}, "invalid level"),
         ({"001": [thing("mug")], "002": [thing("mug", segmentation=[[99, 9], [98, 9], [98, 8]])]}, "outside"),
@@ -313,16 +313,6 @@ def test_poses_and_gaussians_that_are_not_used_are_named_with_what_to_do(tmp_pat
         f"  not used: {folder}/Scan.ply; to use Gaussians in the coordinates of the poses, pass --gaussians",
         f"  not used: {folder}/scene.spz; for Gaussians, export an uncompressed 3DGS PLY",
     ]
-
-
-def test_label_files_are_copied_under_the_names_of_their_views(tmp_path):
-    folder = photographs(tmp_path / "theirs/images").parent
-    model(folder)
-    labels = {"info": {"width": WIDTH, "height": HEIGHT}, "objects": []}
-    (folder / "label").mkdir()
-    (folder / "label/90fbb0c7-003.json").write_text(json.dumps(labels))
-    add_scene(tmp_path / "p/config/scenes.tsv", "a", folder)
-    assert [path.name for path in (tmp_path / "p/annotated/photos/a").iterdir()] == ["003.json"]
 
 
 def test_the_next_commands_name_the_setting_of_another_sheet(tmp_path, monkeypatch):

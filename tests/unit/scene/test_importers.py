@@ -55,14 +55,6 @@ def test_colmap_model_keeps_intrinsics_and_metric_poses(tmp_path):
     assert scene.unit == "metre"
 
 
-def test_colmap_images_are_shrunk_with_their_intrinsics(tmp_path):
-    write_colmap(tmp_path / "in")
-    write_images(tmp_path / "in" / "images", ["a.jpg", "b.jpg", "c.jpg"], size_hw=(90, 120))  # 3 x the model
-    scene = import_scene(tmp_path / "in", tmp_path / "scene", max_side_px=80)
-    assert scene.image("a.png").shape == (60, 80, 3)
-    np.testing.assert_allclose(scene.cameras["a.png"].K, [[100, 0, 38], [0, 102, 32], [0, 0, 1]])
-
-
 def test_images_and_poses_without_a_partner_are_named(tmp_path):
     write_colmap(tmp_path / "in")
     (tmp_path / "in" / "images" / "c.jpg").unlink()
