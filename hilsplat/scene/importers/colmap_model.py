@@ -4,6 +4,7 @@ pycolmap's reader allocates unlimited memory for wrong counts, ends names at the
 every detail of the text format. Rigs and frames are not read, because images have their own poses.
 """
 
+import io
 import struct
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -92,72 +93,50 @@ def _image(
 # -- binary ---------------------------------------------------------------------------------------
 
 
-class _Bytes:
-    """The bytes of a file, read in order."""
-
-    def __init__(self, path: Path) -> None:
-        self.data, self.at = regular(path).read_bytes(), 0
-
-    def take(self, form: str) -> tuple[Any, ...]:
-        """Read numbers laid out as `form`; raise struct.error past the end."""
-        numbers = struct.unpack_from(f"<{form}", self.data, self.at)
-        self.at += struct.calcsize(f"<{form}")
-        return numbers
-
-    def name(self) -> str:
-        """Read a name that ends with a zero byte."""
-        end = self.data.index(b"\0", self.at)
-        name = self.data[self.at : end].decode("utf-8", "surrogateescape")
-        self.at = end + 1
-        return name
-
-    def skip(self, count: int) -> int:
-        """Pass over bytes, and return where they begin; raise struct.error past the end."""
-        if count > len(self.data) - self.at:
-            raise struct.error
-        self.at += count
-        return self.at - count
+def _take(file: io.BytesIO, form: str) -> tuple[Any, ...]:
+    """Read numbers laid out as `form`; raise struct.error past the end."""
+    return struct.unpack(f"<{form}", file.read(struct.calcsize(f"<{form}")))
 
 
-def _binary(path: Path, record: Callable[[_Bytes], Row]) -> list[Row]:
+def _binary(path: Path, record: Callable[[io.BytesIO], Row]) -> list[Row]:
     """Read each record of a file, which must end after the last one."""
     rows: list[Row] = []
     with foreign(path, fix=FIX):
-        data = _Bytes(path)
-        (count,) = data.take("Q")
-        if count > len(data.data):
-            raise ValueError(f"it declares {count} records but has only {len(data.data)} bytes")
+        file = io.BytesIO(regular(path).read_bytes())
+        (count,) = _take(file, "Q")
+        if count > (size := len(file.getvalue())):
+            raise ValueError(f"it declares {count} records but has only {size} bytes")
         for number in range(count):
             try:
-                rows.append(record(data))
+                rows.append(record(file))
             except (struct.error, ValueError) as error:
                 reason = "it ends" if isinstance(error, struct.error) else f"{error}"
                 raise ValueError(f"{reason} within record {number + 1} of {count}") from error
-        if num_more := len(data.data) - data.at:
+        if num_more := len(file.read()):
             raise ValueError(f"{num_more} bytes follow its {count} records")
     return rows
 
 
-def _binary_lens(data: _Bytes) -> tuple[int, Photo]:
-    number, model, width, height = data.take("IiQQ")
+def _binary_lens(file: io.BytesIO) -> tuple[int, Photo]:
+    number, model, width, height = _take(file, "IiQQ")
     if not 0 <= model < len(PARAMETERS):
         raise ValueError(f"unknown camera model {model}")
-    params = data.take(f"{PARAMETERS[model]}d")
+    params = _take(file, f"{PARAMETERS[model]}d")
     return number, Photo(pycolmap.CameraModelId(model).name, params, (height, width))
 
 
-def _binary_image(data: _Bytes) -> ModelImage:
-    _, *pose, camera_id = data.take("I7dI")
-    name = data.name()
-    (count,) = data.take("Q")
-    start = data.skip(24 * count)
-    seen = np.frombuffer(data.data, [("xy", "<f8", 2), ("id", "<i8")], count, start)
-    return _image(name, camera_id, pose, seen["xy"], seen["id"])
+def _binary_image(file: io.BytesIO) -> ModelImage:
+    _, *pose, camera_id = _take(file, "I7dI")
+    (name,) = _take(file, f"{file.getvalue().index(0, file.tell()) - file.tell()}sx")
+    (count,) = _take(file, "Q")
+    (points,) = _take(file, f"{24 * count}s")
+    seen = np.frombuffer(points, [("xy", "<f8", 2), ("id", "<i8")])
+    return _image(name.decode("utf-8", "surrogateescape"), camera_id, pose, seen["xy"], seen["id"])
 
 
-def _binary_point(data: _Bytes) -> tuple[float, ...]:
-    *point, _, length = data.take("Q3d3BdQ")
-    data.skip(8 * length)
+def _binary_point(file: io.BytesIO) -> tuple[float, ...]:
+    *point, _, length = _take(file, "Q3d3BdQ")
+    _take(file, f"{8 * length}x")
     return tuple(map(float, point))
 
 
