@@ -113,6 +113,28 @@ class Source:
             self.notes.append(f"{num_lost} names in {where} belong to no view")
         return {name for name in matches if name is not None}
 
+    def check_keys(
+        self, objects: Iterable[Mapping[str, Any]], file: Path, known: Set[str], refused: Mapping[str, str]
+    ) -> None:
+        """Note the keys of a file that are not known; raise SceneError if one is refused.
+
+        Args:
+            known: keys that are used, or that don't change the meaning of others.
+            refused: what a key means that cannot be applied.
+        """
+        unknown: set[str] = set()
+        for content in objects:
+            for key in content.keys() & refused.keys():
+                if np.any(content[key]):
+                    raise SceneError(
+                        f"{file} describes {refused[key]}, which is not supported",
+                        found=f"{key}: {str(content[key])[:60]}",
+                        fix="export undistorted images of ordinary cameras, in the usual axes",
+                    )
+            unknown |= content.keys() - known - refused.keys()
+        if unknown:
+            self.notes.append(f"keys of {file.name} that are not used: {', '.join(sorted(unknown))}")
+
     def require_most(self, min_share: float, files: object, *, images: bool = False) -> None:
         """Raise SceneError if fewer than this share of the views can be used; `images`: and have an image."""
         total, missing = len(self.views) + len(self.left_out), self.without_image if images else []
@@ -125,33 +147,6 @@ class Source:
                 found="\n            ".join(reasons[:3]) + more,
                 fix="export the poses again, with their images in the same folder or its images/ folder",
             )
-
-
-@dataclass(frozen=True)
-class Keys:
-    """The keys of a format.
-
-    Attributes:
-        known: keys that the reader understands, or skips because they don't change the meaning of others.
-        refused: what a key means that the reader cannot apply.
-    """
-
-    known: Set[str]
-    refused: Mapping[str, str]
-
-    def check(self, objects: Iterable[Mapping[str, Any]], file: Path) -> list[str]:
-        """Return a note about the keys of a file that are unknown; raise SceneError if one is refused."""
-        unknown: set[str] = set()
-        for content in objects:
-            for key in content.keys() & self.refused.keys():
-                if np.any(content[key]):
-                    raise SceneError(
-                        f"{file} describes {self.refused[key]}, which is not supported",
-                        found=f"{key}: {str(content[key])[:60]}",
-                        fix="export undistorted images of ordinary cameras, in the usual axes",
-                    )
-            unknown |= content.keys() - self.known - self.refused.keys()
-        return [f"keys of {file.name} that are not used: {', '.join(sorted(unknown))}"] if unknown else []
 
 
 def require_valid(view: KnownView) -> None:

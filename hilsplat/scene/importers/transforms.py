@@ -13,7 +13,7 @@ import numpy as np
 from hilsplat.base.errors import SceneError, foreign
 from hilsplat.base.images import image_size_hw
 from hilsplat.scene.colmap import pycolmap
-from hilsplat.scene.importers.known_views import Keys, KnownView, Source, find_images, require_inside
+from hilsplat.scene.importers.known_views import KnownView, Source, find_images, require_inside
 from hilsplat.scene.importers.ply_file import read_ply_points
 from hilsplat.scene.layouts import KnownPoses, read_json_object
 from hilsplat.scene.posed_images import OPENGL_TO_OPENCV, rigid_pose
@@ -41,7 +41,7 @@ HARMLESS = """aabb_scale scale offset n_frames up sharpness rotation render_aabb
 colmap_im_id depth_file_path depth_path depth_unit_scale_factor integer_depth_scale enable_depth_loading
 normal_file_path sharpen white_transparent black_transparent timestamp auto_scale_poses_override center_method
 version"""
-REFUSED = {
+UNSUPPORTED = {
     "ortho is_ortho orthographic": "orthographic pictures",
     "latlong equirectangular": "panoramas",
     "rolling_shutter transform_matrix_start transform_matrix_end": "a rolling shutter",
@@ -50,10 +50,8 @@ REFUSED = {
     "from_na from_mitsuba normal_mts_args": "camera axes other than OpenGL's",  # NeuS2, Mitsuba
     "k5 k6 p3 p4 s1 s2 s3 s4 b1 b2 distortion distortion_params": "more lens distortion",
 }
-KEYS = Keys(
-    {*USED.split(), *FOCAL_KEYS, *SPLITS, *HARMLESS.split()},
-    {key: meaning for keys, meaning in REFUSED.items() for key in keys.split()},
-)
+KNOWN = {*USED.split(), *FOCAL_KEYS, *SPLITS, *HARMLESS.split()}
+REFUSED = {key: meaning for keys, meaning in UNSUPPORTED.items() for key in keys.split()}
 
 
 def read_transforms(known: KnownPoses) -> Source:
@@ -75,7 +73,7 @@ def read_transforms(known: KnownPoses) -> Source:
                 problem = f"{file}: `{key}` is missing, or is not a list of objects"
                 raise SceneError(problem, fix="export it again")
             frames += rows
-        source.notes += KEYS.check([content, *frames], file)
+        source.check_keys([content, *frames], file, KNOWN, REFUSED)
         names = [str(frame.get("file_path", f"frame {number}")) for number, frame in enumerate(frames)]
         contents.append((file, content, frames, names))
     images = find_images(known.root, [name for *_, names in contents for name in names])
