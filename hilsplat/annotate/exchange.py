@@ -41,7 +41,7 @@ from hilsplat.datasets.images.isat import (
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.scene.placement import placed, placement
 from hilsplat.scene.scene import Scene
-from hilsplat.scene.view_names import match_name, match_names
+from hilsplat.scene.view_names import match_names
 from hilsplat.web.coco import coco_content, coco_region
 
 logger = logging.getLogger(__name__)
@@ -459,7 +459,7 @@ def _matched(files: Iterable[str], cameras: Cameras, photos: Photos) -> dict[str
     views = match_names(files, cameras.names)
     for file, view in views.items():
         photo = str(photos.get(view or "", {}).get("file", view))
-        if view and Path(photo).stem == Path(view).stem and match_name(file, [photo]) is None:
+        if view and Path(photo).stem == Path(view).stem and match_names([file], [photo])[file] is None:
             views[file] = None
     return views
 

@@ -39,6 +39,7 @@ FAULTS = (
     "blurred: omit them, or retake them with more light, a steady hand and correct focus",
     "too dark: retake them with more light",
     "more than half white: retake them with less exposure, unless the background is white",
+    "exactly twice as wide as high: cut 360-degree panoramas into views of about 90 degrees",
 )
 """Faults of a photograph, and what to do."""
 
@@ -92,10 +93,11 @@ def checked_photo(
     """Measure a photograph; only if it `is_matched`, its features are computed and kept."""
     grey = cv2.cvtColor(resize_to_fit(pixels, CHECK_SIDE_PX), cv2.COLOR_RGB2GRAY)
     is_dark, is_white = np.percentile(grey, 95) < DARK_LEVEL, (grey >= WHITE_LEVEL).mean() > WHITE_SHARE
-    found = zip(FAULTS, (blur(grey) > BLURRED, is_dark, is_white), strict=True)
-    faults = tuple(fault for fault, is_found in found if is_found)
+    height, width = pixels.shape[:2]
+    found = (blur(grey) > BLURRED, is_dark, is_white, width == 2 * height)
+    faults = tuple(fault for fault, is_found in zip(FAULTS, found, strict=True) if is_found)
     features = _features(resize_to_fit(grey, FEATURE_SIDE_PX)) if is_matched else None
-    return CheckedPhoto(name, (pixels.shape[0], pixels.shape[1]), focal_px, faults, features)
+    return CheckedPhoto(name, (height, width), focal_px, faults, features)
 
 
 def matched_rows(number: int) -> set[int]:

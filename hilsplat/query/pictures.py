@@ -15,13 +15,11 @@ from hilsplat.base.levels import Level
 from hilsplat.base.ownership import SOFTWARE
 from hilsplat.query.scene_views import upright
 from hilsplat.scene.cameras import Cameras
-from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.gaussians import Gaussians, base_rgb
 
 ANSWER_RGB = (255, 122, 0)
 TRUTH_RGB = (0, 230, 255)
 RELEVANCY_COLOURS = "inferno"
-SH_CONSTANT = 0.28209479177387814
-"""Value of the constant spherical harmonic; a colour is 0.5 plus this value times row 0 of `sh`."""
 
 DPI = 110
 TITLE_LETTERS = 110
@@ -98,7 +96,7 @@ def show_from_above(
     flat, flat_cameras = means @ rotation.T, centres @ rotation.T
     low, high = np.percentile(flat[:, :2], (1, 99), axis=0)
     low, high = np.minimum(low, flat_cameras[:, :2].min(0)), np.maximum(high, flat_cameras[:, :2].max(0))
-    colours = 0.5 * np.clip(0.5 + SH_CONSTANT * gaussians.sh[:, 0], 0, 1) + 0.45
+    colours = 0.5 * base_rgb(gaussians.sh) + 0.45
     visible = np.flatnonzero((gaussians.opacities > 0.3) & ~selected)
     shown = visible[:: max(1, len(visible) // MAX_POINTS)]
     shown = shown[np.argsort(flat[shown, 2], kind="stable")]

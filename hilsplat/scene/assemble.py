@@ -24,6 +24,9 @@ CHECKED_DIRECTIONS = 33
 MAX_SHIFT_PX = 1.0
 """Directions per side at which a lens must be invertible, and the tolerance."""
 
+WEAK_POINTS_PER_VIEW = 13
+"""Fewest points per registered view in any good run on renders; unusable runs had 4 to 18."""
+
 MIN_LEVELNESS_GAP = 3.0
 """Minimum ratio of the second-smallest to the smallest eigenvalue for the cameras' x axes to define up."""
 
@@ -99,6 +102,12 @@ def pinhole_of(view: str, lens: pycolmap.Camera, max_side_px: int) -> pycolmap.C
             fix="correct the lens, or undistort the image with the program that calibrated it",
         )
     return pinhole
+
+
+def few_points_doubt(per_view: float) -> list[str]:
+    """Return a warning if few points fit the poses, from structure from motion or known."""
+    warning = f"only {per_view} points per registered view (good runs: {WEAK_POINTS_PER_VIEW} or more)"
+    return [f"{warning}: the poses may be wrong"] if per_view < WEAK_POINTS_PER_VIEW else []
 
 
 def up_direction(cam_from_source: Float64[np.ndarray, "V 4 4"]) -> Float64[np.ndarray, " 3"]:

@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 from PIL import Image  # noqa: F401
 
+from hilsplat.scene.cameras import Photo
+
 # isort: split
 import pycolmap as pycolmap
 
@@ -18,9 +20,8 @@ Points = tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]
 
 
 def pose_matrix(pose: pycolmap.Rigid3d) -> Float64[np.ndarray, "4 4"]:
-    """Return a COLMAP pose as a 4 x 4 matrix; NaN if its quaternion is 0, which COLMAP takes for no turn."""
-    has_rotation = np.any(pose.rotation.quat)
-    return np.vstack([pose.matrix() if has_rotation else np.full((3, 4), np.nan), [0.0, 0.0, 0.0, 1.0]])
+    """Return a pose of COLMAP's mappers as a 4 x 4 matrix."""
+    return np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]])
 
 
 LENGTH_TOLERANCE = 0.01
@@ -44,6 +45,13 @@ def is_pinhole(camera: pycolmap.Camera) -> bool:
     if camera.model_name in ("PINHOLE", "SIMPLE_PINHOLE"):
         return True
     return camera.model_name in PERSPECTIVE and not any(camera.params[i] for i in camera.extra_params_idxs())
+
+
+def as_camera(photo: Photo) -> pycolmap.Camera:
+    """Return a photograph's camera. Parameters beyond those of its model are ignored."""
+    camera = pycolmap.Camera.create_from_model_name(1, photo.model, 1.0, *photo.size_hw[::-1])
+    camera.params = photo.params[: len(camera.params)]
+    return camera
 
 
 def camera_of(image: pycolmap.Image) -> pycolmap.Camera:

@@ -286,11 +286,15 @@ def _named_poses(folder: Path, named: Path) -> KnownPoses:
 
 
 def model_files(folder: Path) -> list[Path]:
-    """Return the files of the COLMAP model in a folder: cameras, images and, if present, points."""
+    """Return the files of the COLMAP model in a folder: cameras, images and, if present, points.
+
+    Points may also be in a PLY, where 3DGS looks for them.
+    """
     for suffix in (".bin", ".txt"):
-        cameras, images, points = (folder / f"{name}{suffix}" for name in ("cameras", "images", "points3D"))
+        cameras, images = (folder / f"{name}{suffix}" for name in ("cameras", "images"))
         if cameras.is_file() and images.is_file():
-            return [cameras, images, *([points] if points.is_file() else [])]
+            points = (folder / f"points3D{end}" for end in (suffix, ".ply"))
+            return [cameras, images, *[path for path in points if path.is_file()][:1]]
     return []
 
 

@@ -71,10 +71,9 @@ def _pixels_of_photo(
     photo: Photo, K: tuple[float, ...], size_hw: tuple[int, int], drawn_hw: tuple[int, int]
 ) -> Int64[np.ndarray, "h w"]:
     """Return for each pixel of the view the pixel of the drawing (row * width + column), or `OUTSIDE`."""
-    from hilsplat.scene.colmap import pycolmap
+    from hilsplat.scene.colmap import as_camera
 
-    lens = pycolmap.Camera.create_from_model_name(1, photo.model, 1.0, *photo.size_hw[::-1])
-    lens.params = photo.params[: len(lens.params)]
+    lens = as_camera(photo)
     columns, rows = np.meshgrid(np.arange(size_hw[1]) + 0.5, np.arange(size_hw[0]) + 0.5)
     seen = np.stack([columns.ravel(), rows.ravel(), np.ones(rows.size)], axis=1)
     xy = lens.img_from_cam(seen @ np.linalg.inv(np.reshape(K, (3, 3))).T)

@@ -19,7 +19,7 @@ from hilsplat.base.ownership import SOFTWARE, require_own_picture
 from hilsplat.base.processes import in_own_process
 from hilsplat.base.progress import stage_log
 from hilsplat.base.removal import delete
-from hilsplat.scene.assemble import Posed, PosedView, split_views, write_scene
+from hilsplat.scene.assemble import Posed, PosedView, few_points_doubt, split_views, write_scene
 from hilsplat.scene.colmap import camera_of, pose_matrix, pycolmap, reprojection_errors, sparse_points
 from hilsplat.scene.features import (
     MIN_INLIERS,
@@ -39,9 +39,6 @@ logger = logging.getLogger(__name__)
 
 LOST_PICTURE = "not_registered.png"
 """Picture written beside the scene folder if too few photographs were registered."""
-
-WEAK_POINTS_PER_VIEW = 13
-"""Fewest points per registered view in any good run on renders; unusable runs had 4 to 18."""
 
 FEW_FEATURES = 30
 """With fewer features, a photograph rarely has `MIN_INLIERS` verified matches."""
@@ -212,11 +209,7 @@ def registration_report(
     if len(members) > 1:
         sizes = ", ".join(str(len(names)) for names in members)
         warnings.append(f"the views form {len(members)} separate models ({sizes} views); the largest is used")
-    if errors and points_per_view < WEAK_POINTS_PER_VIEW:
-        warnings.append(
-            f"only {points_per_view} points per registered view (good runs: {WEAK_POINTS_PER_VIEW} or more): "
-            "the poses may be wrong"
-        )
+    warnings += few_points_doubt(points_per_view) if errors else []
     return {
         "images": len(images),
         "registered": len(errors),

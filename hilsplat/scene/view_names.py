@@ -82,11 +82,6 @@ def match_names(names: Iterable[str], candidates: Iterable[str]) -> dict[str, st
     return {name: match(name) for name in names}
 
 
-def match_name(name: str, candidates: Iterable[str]) -> str | None:
-    """Return the candidate that a single name means; see `match_names`."""
-    return match_names([name], candidates)[name]
-
-
 def view_names(sources: Sequence[Path]) -> list[str]:
     """Return the view names of image files: the file names with the suffix .png ("DSC_1.jpg" -> "DSC_1.png").
 

@@ -220,14 +220,27 @@ def read_gaussians(ply: Path) -> tuple[Gaussians, list[str]]:
     return gaussians, notes
 
 
+def source_from_ply(
+    ply: Path, dataparser: Path | None, transforms: Path | None
+) -> tuple[Float64[np.ndarray, "4 4"], str]:
+    """Return the transform from a PLY's coordinates to those of the source's poses, and what it is based on.
+
+    A PLY written by this package is transformed with the JSON file beside it, or with the comment in its
+    header. A PLY in nerfstudio's training coordinates needs its `dataparser_transforms.json`, and the
+    `transforms.json` that contains the source's poses.
+    """
+    if (recorded := read_source_from_scene(ply)) is not None:
+        return recorded, "in the coordinates that its header or the JSON file beside it describes"
+    if dataparser is not None:
+        matrix = source_from_dataparser(dataparser, transforms)
+        return matrix, f"in nerfstudio's training coordinates, from {dataparser.name}"
+    return np.eye(4), "in the coordinates of the scene's source"
+
+
 def import_gaussians(
     ply: Path, scene: Scene, dataparser: Path | None = None, transforms: Path | None = None
 ) -> tuple[Gaussians, dict[str, Any]]:
-    """Read a 3DGS PLY, which by default uses the coordinates of the scene's source poses.
-
-    A PLY written by this package is transformed to the source's coordinates with the JSON file beside it, or
-    with the comment in its header. A PLY in nerfstudio's training coordinates needs its
-    `dataparser_transforms.json`, and the `transforms.json` that contains the source's poses.
+    """Read a 3DGS PLY, whose coordinates are those that `source_from_ply` finds.
 
     Returns:
         The Gaussians in the scene's coordinates, and their origin for the report.
@@ -236,15 +249,8 @@ def import_gaussians(
         ArtifactError: if the file cannot be used.
     """
     gaussians, notes = read_gaussians(ply)
-    source_from_ply = read_source_from_scene(ply)
-    moved = "in the coordinates of the scene's source"
-    transform = scene.scene_from_source
-    if source_from_ply is not None:
-        transform = transform @ source_from_ply
-        moved = "in the coordinates that its header or the JSON file beside it describes"
-    elif dataparser is not None:
-        transform = transform @ source_from_dataparser(dataparser, transforms)
-        moved = f"in nerfstudio's training coordinates, from {dataparser.name}"
+    matrix, moved = source_from_ply(ply, dataparser, transforms)
+    transform = scene.scene_from_source @ matrix
     logger.info("%s: %d Gaussians from %s, %s", scene.name, len(gaussians), ply, "; ".join([moved, *notes]))
     origin = {
         "kind": "imported",
@@ -252,7 +258,7 @@ def import_gaussians(
         "sha256": sha256_of_file(ply),
         "taken_as": moved,
         "notes": notes,
-        "scene_from_ply": np.asarray(transform).tolist(),
+        "scene_from_ply": transform.tolist(),
     }
     return move_gaussians(gaussians, transform), origin
 

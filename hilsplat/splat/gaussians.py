@@ -8,6 +8,9 @@ from jaxtyping import Float, Float32, Int64, UInt64
 from hilsplat.base.arrays import require_arrays
 from hilsplat.base.errors import SettingsError
 
+SH_0 = 0.28209479177387814
+"""Value of the constant harmonic."""
+
 
 @dataclass(frozen=True)
 class Gaussians:
@@ -49,6 +52,11 @@ class Gaussians:
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics: 0, 1, 2 or 3 for K = 1, 4, 9 or 16."""
         return round(self.sh.shape[1] ** 0.5) - 1
+
+
+def base_rgb(sh: Float32[np.ndarray, "N K 3"]) -> Float32[np.ndarray, "N 3"]:
+    """Return colours without their dependence on the direction, in [0, 1]."""
+    return np.clip(0.5 + SH_0 * sh[:, 0], 0, 1)
 
 
 FIELDS = tuple(field.name for field in fields(Gaussians))  # names of the parameter fields

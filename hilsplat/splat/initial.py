@@ -13,10 +13,10 @@ from hilsplat.base.images import to_float
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
+from hilsplat.splat.gaussians import SH_0
 
 logger = logging.getLogger(__name__)
 
-SH_0 = 0.28209479177387814
 FIRST_OPACITY = 0.1  # 3DGS
 MIN_POINTS = 200
 """If there are fewer sparse points than this, random points in front of the cameras are added."""

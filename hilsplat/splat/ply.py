@@ -16,6 +16,7 @@ from hilsplat.splat.gaussians import Gaussians
 SATURATED_LOGIT = 16.0  # replaces infinite opacity logits; a float32 sigmoid of 17 is 1
 MAX_VALUE = 1e15  # values and scales above it overflow when squared in float32
 MAX_UNUSABLE = 0.5  # share of unusable Gaussians above which a PLY is not imported
+MIN_JUDGED = 100  # number of Gaussians from which their scales and opacities are recognised as such
 UNUSABLE = "contain a non-finite or huge number, or have no rotation (rot_0..3 are zero)"
 
 HARMLESS = re.compile(
@@ -33,6 +34,9 @@ REFUSED = {
     r"(scale|rot|opacity|f_dc)(_\w+)?|\w*filter\w*": "contains parameters that 3DGS does not have",
 }
 """Properties and elements that change the meaning of 3DGS's properties -> what is wrong with the PLY."""
+
+ANTIALIASED = re.compile("SplatRenderMode: *mip", re.IGNORECASE)
+"""Comment of Brush, and of gsplat and nerfstudio where they follow it."""
 
 
 def _names(num_bases: int) -> list[str]:
@@ -94,13 +98,12 @@ def import_ply(path: Path, fix: str) -> tuple[Gaussians, list[str], list[str]]:
     unusable Gaussians are left out.
 
     Raises:
-        ArtifactError: if the file is missing, damaged or not a 3DGS PLY, contains anything in `REFUSED`, or
-            more than `MAX_UNUSABLE` of its Gaussians are unusable.
+        ArtifactError: if the file is missing, damaged or not a 3DGS PLY, contains anything in `REFUSED`, more
+            than `MAX_UNUSABLE` of its Gaussians are unusable, or its scales or opacities are plain numbers.
     """
     if not path.exists():
         raise ArtifactError(f"{path} is missing", fix=fix)
-    values, others, is_smoothed = _values(path, fix)
-    notes = ["filter_3D was applied to scales and opacities"] if is_smoothed else []
+    values, others, notes = _values(path, fix)
     infinite = np.isinf(values[:, -8])
     if infinite.any():
         values[infinite, -8] = np.copysign(SATURATED_LOGIT, values[infinite, -8])
@@ -110,12 +113,15 @@ def import_ply(path: Path, fix: str) -> tuple[Gaussians, list[str], list[str]]:
         notes.append(f"left out: {unusable.sum()} of {len(values)} Gaussians {UNUSABLE}")
     if unusable.sum() > MAX_UNUSABLE * len(values):
         raise ArtifactError(f"{path}: {notes[-1].removeprefix('left out: ')}", fix=fix)
+    values = values[~unusable] if unusable.any() else values
+    _require_parameters(path, values, fix)
     unknown = {re.sub(r"\d+$", "*", name) for name in others if not HARMLESS.fullmatch(name)}
-    return _gaussians(values[~unusable] if unusable.any() else values), notes, sorted(unknown)
+    return _gaussians(values), notes, sorted(unknown)
 
 
-def _values(path: Path, fix: str) -> tuple[Float32[np.ndarray, "N P"], list[str], bool]:
-    """Read 3DGS's properties (`_columns`), the names of others, and whether `filter_3D` was applied."""
+def _values(path: Path, fix: str) -> tuple[Float32[np.ndarray, "N P"], list[str], list[str]]:
+    """Read 3DGS's properties (`_columns`) and the names of others; also return notes."""
+    notes = []
     with foreign(path, ArtifactError, expected="a 3DGS PLY", fix=fix), np.errstate(over="ignore"):
         ply = read_ply(path)
         vertex = ply["vertex"]
@@ -130,7 +136,10 @@ def _values(path: Path, fix: str) -> tuple[Float32[np.ndarray, "N P"], list[str]
             values[:, column] = vertex[name]
         if "filter_3D" in kinds:
             _smooth(values, np.asarray(vertex["filter_3D"], np.float64))
-    return values, others, "filter_3D" in kinds
+            notes.append("filter_3D was applied to scales and opacities")
+        if any(ANTIALIASED.fullmatch(comment.strip()) for comment in ply.comments):
+            notes.append("they were trained with antialiasing, which is not applied: thin parts look thicker")
+    return values, others, notes
 
 
 def _columns(path: Path, kinds: dict[str, str], fix: str) -> list[str]:
@@ -148,6 +157,25 @@ def _columns(path: Path, kinds: dict[str, str], fix: str) -> list[str]:
             fix=fix,
         )
     return names
+
+
+def _require_parameters(path: Path, values: Float32[np.ndarray, "N P"], fix: str) -> None:
+    """Raise ArtifactError for scales or opacities as scripts write them, without logarithm or logit.
+
+    Trained scales have a long tail towards 0, so if all are positive logarithms, most are far above 1.
+    """
+    if len(values) < MIN_JUDGED:
+        return
+    opacities, scales = values[:, -8], values[:, -7:-4]
+    has_alphas = 0 <= opacities.min() < opacities.max() <= 1
+    if has_alphas or (scales.min() > 0 and np.median(scales) < 1):
+        limits = *(scales.min(), scales.max()), *(opacities.min(), opacities.max())
+        raise ArtifactError(
+            f"{path} does not contain the parameters of 3DGS",
+            expected="natural logarithms of scales, and logits of opacities",
+            found="scale_* from {:.3g} to {:.3g}, opacity from {:.3g} to {:.3g}".format(*limits),
+            fix=fix,
+        )
 
 
 def _gaussians(values: Float32[np.ndarray, "N P"]) -> Gaussians:

@@ -6,9 +6,16 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from hilsplat.base.errors import HilsplatError, ImageError, SceneError, in_one_line, shorten_list
+from hilsplat.base.errors import (
+    HilsplatError,
+    ImageError,
+    MisalignedArtifactError,
+    SceneError,
+    in_one_line,
+    shorten_list,
+)
 from hilsplat.base.files import list_images
-from hilsplat.base.images import image_size_hw, read_image
+from hilsplat.base.images import image_size_hw, read_image, to_uint8
 from hilsplat.configuration import StageSettings
 from hilsplat.datasets.images.hi import annotated_regions
 from hilsplat.embed.clip import ClipModel
@@ -16,7 +23,8 @@ from hilsplat.embed.langsplat_files import read_view, read_views, require_model
 from hilsplat.scene.assemble import photo_of, pinhole_of
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.colmap import is_pinhole
-from hilsplat.scene.importers.importing import fitted_camera
+from hilsplat.scene.importers.importing import fitted_camera, misfit_notes
+from hilsplat.scene.importers.known_views import KnownView
 from hilsplat.scene.importers.reading import read_source
 from hilsplat.scene.layouts import (
     DATAPARSER,
@@ -33,10 +41,12 @@ from hilsplat.scene.layouts import (
     photo_folder,
     ply_header,
     trained_gaussians,
+    transforms_of,
 )
 from hilsplat.scene.placement import placement
 from hilsplat.scene.view_names import match_names, view_names
-from hilsplat.splat.coordinates import read_gaussians
+from hilsplat.splat.coordinates import read_gaussians, source_from_ply
+from hilsplat.splat.gaussians import base_rgb
 
 MAX_UNDISTORTION = 0.1
 """Relative change of the aspect ratio by undistortion, above which a drawing is of another picture. It is a
@@ -70,11 +80,13 @@ class Views:
         photos: photographs, by view.
         cameras: cameras after undistortion, by view; empty if the poses are unknown.
         held_out: views that the source of the poses holds out.
+        posed: the views as their source describes them, with their images as stored.
     """
 
     photos: dict[str, Path] = field(default_factory=dict)
     cameras: dict[str, Camera] = field(default_factory=dict)
     held_out: set[str] = field(default_factory=set)
+    posed: list[KnownView] = field(default_factory=list)
 
 
 def find_parts(folder: Path, named: dict[str, Path | None], settings: StageSettings) -> Parts:
@@ -90,7 +102,7 @@ def find_parts(folder: Path, named: dict[str, Path | None], settings: StageSetti
             raise SceneError(f"--{what} {path} is missing", fix="correct the path, or pass `none`")
     parts = Parts()
     views = _poses(folder, named["poses"], settings, parts)
-    _gaussians(folder, named, parts)
+    _gaussians(folder, named, views, parts)
     _features(folder, named["features"], views, settings, parts)
     _labels(folder, named["labels"], views, parts)
     if skipped := [path.name for path in sorted(folder.rglob("*.pth"))[:3]]:
@@ -126,6 +138,7 @@ def _poses(folder: Path, named: Path | None, settings: StageSettings, parts: Par
         K, size_hw = lens.calibration_matrix(), (lens.height, lens.width)
         views.cameras[name] = Camera(name, np.eye(4), K, size_hw, photo)
     source.require_most(settings.poses.min_registered_share, known.files[0], images=True)
+    views.posed = source.views
     parts.lines.append(f"poses: {', '.join(map(str, known.files))}: {len(views.cameras)} views with an image")
     if missing := source.without_image:
         parts.lines.append(f"  left out: {len(missing)} views without an image: {shorten_list(missing, 5)}")
@@ -135,11 +148,12 @@ def _poses(folder: Path, named: Path | None, settings: StageSettings, parts: Par
     if views.held_out:
         parts.lines.append(f"  {len(views.held_out)} views are held out for tests by the source's own split")
     count = "none; they are triangulated" if source.points is None else f"{len(source.points[0])}"
+    source.notes += misfit_notes(source.views, source.points, "points") if source.points is not None else []
     parts.lines += [f"  points: {count}", *(f"  {note}" for note in source.notes)]
     return views
 
 
-def _gaussians(folder: Path, named: dict[str, Path | None], parts: Parts) -> None:
+def _gaussians(folder: Path, named: dict[str, Path | None], views: Views, parts: Parts) -> None:
     plys = [named["gaussians"]] if named["gaussians"] is not None else trained_gaussians(folder)
     if not plys:
         others = [path for path in folder.glob("*.ply") if b" f_dc_0\n" in ply_header(path)]
@@ -159,11 +173,16 @@ def _gaussians(folder: Path, named: dict[str, Path | None], parts: Parts) -> Non
         parts.lines.append(f"  not used: {shorten_list(names, 5)}")
     if langsplat_level(ply):
         parts.lines.append("  the three levels of LangSplat share their geometry, so one is enough")
-    if dataparser := dataparser_of(ply, folder):
+    if (dataparser := dataparser_of(ply, folder)) is not None:
         parts.lines.append(f"  coordinates: nerfstudio's, from {dataparser}")
     elif is_from_nerfstudio(ply):
         problem = f"unknown, because the {DATAPARSER} of nerfstudio's run was not found"
         parts.lines.append(f"  coordinates: {problem}; those of the poses are assumed")
+    transform, _ = source_from_ply(ply, dataparser, transforms_of(folder, named["poses"]))
+    is_solid = gaussians.opacity_logits > 0
+    xyz = gaussians.means[is_solid] @ transform[:3, :3].T + transform[:3, 3]
+    points = xyz, to_uint8(base_rgb(gaussians.sh[is_solid]))
+    parts.lines += [f"  {note}" for note in misfit_notes(views.posed, points, "Gaussians")]
 
 
 def _name_unused(paths: list[Path], advice: str, parts: Parts) -> None:
@@ -218,7 +237,7 @@ def _labels(folder: Path, named: Path | None, views: Views, parts: Parts) -> Non
         else:
             try:
                 if regions := annotated_regions(path, warnings):
-                    _require_shape(views, view, regions[0].size_hw, path)
+                    warnings += _shape_notes(views, view, regions[0].size_hw, path)
                 num_regions, parts.labels[path] = num_regions + len(regions), copy
             except HilsplatError as error:
                 lost.append(in_one_line(error))
@@ -234,15 +253,20 @@ def _labels(folder: Path, named: Path | None, views: Views, parts: Parts) -> Non
     parts.lines += [f"  {shorten_list(warnings, 5)}"] if warnings else []
 
 
-def _require_shape(views: Views, view: str, drawn_hw: tuple[int, int], path: Path) -> None:
-    """Raise HilsplatError if labels don't have the shape of their photograph or undistorted view."""
-    if view in views.cameras:
-        placement(views.cameras[view], drawn_hw, f"label file {path}")
-        return
-    height, width = image_size_hw(views.photos[view], upright=True)
-    if abs(drawn_hw[0] * width / (drawn_hw[1] * height) - 1) > MAX_UNDISTORTION:
-        raise SceneError(
-            f"label file {path} does not match the size of its photograph",
-            expected=f"{width} x {height} px (width x height), or a scaled copy",
-            found=f"{drawn_hw[1]} x {drawn_hw[0]} px",
-        )
+def _shape_notes(views: Views, view: str, drawn_hw: tuple[int, int], path: Path) -> list[str]:
+    """Return a note on labels that can only fit the undistorted view, whose shape is not yet known.
+
+    Raises:
+        HilsplatError: labels don't have the shape of their photograph or undistorted view.
+    """
+    if (camera := views.cameras.get(view)) is None:
+        photo_hw = image_size_hw(views.photos[view], upright=True)
+        camera = Camera(view, np.eye(4), np.eye(3), photo_hw)
+    try:
+        placement(camera, drawn_hw, f"label file {path}")
+    except MisalignedArtifactError as error:
+        misfit = abs(drawn_hw[0] * camera.size_hw[1] / (drawn_hw[1] * camera.size_hw[0]) - 1)
+        if view in views.cameras or misfit > MAX_UNDISTORTION:
+            raise
+        return [f"{in_one_line(error)}; evaluation refuses it unless the undistorted view has its shape"]
+    return []

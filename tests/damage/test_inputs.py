@@ -89,6 +89,7 @@ POSES = (
     ((0.36, 0.48, 0.64, 0.48), (2.75, 3.5, -0.5)),
 )
 """Quaternion (wxyz) and translation of three poses with short decimal fractions."""
+CENTRE = {"cx": 19.5, "cy": 16.25}
 IMAGES = ("cam1/a.png", "cam2/a.png", "b.png")
 POINTS = np.array([[0.5, 1.25, 4, 10, 20, 30], [2.5, -1, 6, 40, 50, 60], [-1.5, 0.75, 5, 70, 80, 90]])
 
@@ -152,7 +153,7 @@ def world_from_camera(row: int) -> np.ndarray:
 
 def write_transforms(folder: Path, kind: str) -> None:
     write_pictures(folder / "images", IMAGES)
-    lens = {"fl_x": 50.5, "fl_y": 51.25, "cx": 19.5, "cy": 16.25, "w": 40, "h": 30}
+    lens = {"fl_x": 50.5, "fl_y": 51.25, **CENTRE, "w": 40, "h": 30}
     frames = [
         {"file_path": f"images/{name}", "transform_matrix": world_from_camera(row).tolist()}
         for row, name in enumerate(IMAGES)
@@ -174,14 +175,8 @@ def write_transforms(folder: Path, kind: str) -> None:
 
 
 def write_points(path: Path) -> None:
-    kinds = [
-        ("x", "float"),
-        ("y", "float"),
-        ("z", "double"),
-        ("red", "uchar"),
-        ("green", "uchar"),
-        ("blue", "uchar"),
-    ]
+    kinds = [("x", "float"), ("y", "float"), ("z", "double")]
+    kinds += [(channel, "uchar") for channel in ("red", "green", "blue")]
     write_ply(path, "ascii", kinds, POINTS)
 
 
@@ -209,15 +204,7 @@ def write_polycam(folder: Path) -> None:
     for row, name in enumerate(names):
         matrix = world_from_camera(row)
         content = {f"t_{i}{j}": matrix[i, j] for i in range(3) for j in range(4)}
-        content |= {
-            "fx": 50.5,
-            "fy": 51.25,
-            "cx": 19.5,
-            "cy": 16.25,
-            "width": 40,
-            "height": 30,
-            "timestamp": 5,
-        }
+        content |= {"fx": 50.5, "fy": 51.25, **CENTRE, "width": 40, "height": 30, "timestamp": 5}
         (folder / f"keyframes/cameras/{Path(name).stem}.json").write_text(json.dumps(content))
 
 

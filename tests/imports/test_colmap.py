@@ -3,6 +3,7 @@
 import numpy as np
 import pycolmap
 import pytest
+from plyfile import PlyData, PlyElement
 
 from hilsplat.base.errors import HilsplatError
 from hilsplat.scene.importers.colmap_model import read_model
@@ -85,7 +86,7 @@ def test_text_models_are_read(form, tmp_path):
 @pytest.mark.parametrize("form", ["text", "binary"])
 def test_names_with_spaces_and_signs_are_read(name, form, tmp_path):
     folder = write(tmp_path, name)
-    if form == "binary":  # the text is read by hand here, because pycolmap ends names at spaces
+    if form == "binary":
         rewrite_as_binary(folder / "sparse/0", name)
     views = {view.image: view for view in read_source(find_known_poses(folder)).views}
     for number, pose in enumerate(POSES):
@@ -94,19 +95,12 @@ def test_names_with_spaces_and_signs_are_read(name, form, tmp_path):
     assert not views
 
 
-def rewrite_as_binary(folder, name):
-    model = pycolmap.Reconstruction()
-    lens, *params = LENS.split()
-    camera = pycolmap.Camera(
-        model=lens, width=WIDTH, height=HEIGHT, params=list(map(float, params)), camera_id=1
-    )
-    model.add_camera_with_trivial_rig(camera)
-    for number, pose in enumerate(POSES):
-        image = pycolmap.Image(name=name.format(number), camera_id=1, image_id=number + 1)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.linalg.inv(pose)[:3]))
-    for *xyz, red, green, blue in POINTS:
-        model.add_point3D(np.array(xyz), pycolmap.Track(), np.array([red, green, blue], np.uint8))
-    for path in folder.iterdir():
+def rewrite_as_binary(folder, name="{}"):
+    """Rewrite a text model; images may get names with spaces, at which pycolmap's reader ends names."""
+    model = pycolmap.Reconstruction(folder)
+    for number, image in model.images.items():
+        image.name = image.name if name == "{}" else name.format(number - 1)
+    for path in folder.glob("*.txt"):
         path.unlink()
     model.write_binary(folder)
 
@@ -125,7 +119,7 @@ def test_models_with_observations_are_read_as_by_pycolmap(write_model, tmp_path)
         (theirs,) = [other for other in again.images.values() if other.name == image.name]
         np.testing.assert_allclose(image.cam_from_world[:3], theirs.cam_from_world().matrix(), atol=1e-12)
         lens, camera = read.lenses[image.camera_id], theirs.camera
-        assert (lens.model, lens.width, lens.height) == (camera.model_name, camera.width, camera.height)
+        assert (lens.model, lens.size_hw) == (camera.model_name, (camera.height, camera.width))
         np.testing.assert_array_equal(lens.params, camera.params)
         seen = theirs.get_observation_points2D()
         np.testing.assert_array_equal(image.seen[0], [point.xy for point in seen])
@@ -191,10 +185,7 @@ def test_the_model_with_the_most_images_is_taken_and_others_are_named(models, ch
     for model, count in models.items():
         write(tmp_path, model=model, count=count)
         if form == "binary":
-            read = pycolmap.Reconstruction(tmp_path / model)
-            for path in (tmp_path / model).glob("*.txt"):
-                path.unlink()
-            read.write_binary(tmp_path / model)
+            rewrite_as_binary(tmp_path / model)
     known = find_known_poses(tmp_path)
     assert known.files == (tmp_path / chosen,)
     source = read_source(known)
@@ -235,14 +226,25 @@ def test_images_of_nearly_the_camera_s_size_or_stretched_are_noted(size, is_note
     assert all("are they the images that the poses were computed from?" in note for note in notes)
 
 
-def test_without_points_they_are_triangulated(tmp_path, imported):
+def test_a_model_without_points_or_without_their_file_has_none(tmp_path):
     folder = write(tmp_path / "in")
-    (folder / "sparse/0/points3D.txt").unlink()
-    *_, report = imported(folder)
-    assert report["points_from"] == "triangulated from the known poses"
     world.write_colmap(folder / "sparse/0", LENS, (WIDTH, HEIGHT), {"000.png": POSES[0]}, [])
-    source = read_source(find_known_poses(folder))
-    assert source.points is None
+    assert read_source(find_known_poses(folder)).points is None
+    (folder / "sparse/0/points3D.txt").unlink()
+    assert read_source(find_known_poses(folder)).points is None
+
+
+@pytest.mark.parametrize("is_alone", [True, False])
+def test_points_in_a_ply_beside_the_model_are_read_if_it_has_no_others(is_alone, tmp_path):
+    folder = write(tmp_path)
+    cloud = np.zeros(
+        1, [(name, "f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+    )
+    PlyData([PlyElement.describe(cloud, "vertex")]).write(folder / "sparse/0/points3D.ply")
+    if is_alone:
+        (folder / "sparse/0/points3D.txt").unlink()
+    assert len(read_source(find_known_poses(folder)).points[0]) == (1 if is_alone else len(POINTS))
+    assert (folder / "sparse/0/points3D.ply" in photo_files(folder)) == is_alone
 
 
 def test_colours_from_0_to_1_become_bytes(tmp_path):

@@ -137,6 +137,13 @@ def test_unknown_properties_and_elements_are_named_once(tmp_path):
     assert (notes, unknown) == ([], ["albedo_*", "layers", "roughness"])
 
 
+@pytest.mark.parametrize(("mode", "noted"), [("mip", True), ("default", False)])
+def test_antialiased_training_is_noted(tmp_path, mode, noted):
+    comments = ["Exported from Brush", f"SplatRenderMode: {mode}"]
+    _, notes, _ = import_ply(write(tmp_path / "g.ply", columns(), comments=comments), "")
+    assert ["antialiasing, which is not applied" in note for note in notes] == [True] * noted
+
+
 REFUSED = {
     "4DGS": (added("t", "scale_t_0", "rot_r_0"), "changes over time"),
     "SpacetimeGaussians": (added("trbf_center", "trbf_scale_0", "motion_0", "omega_0"), "changes over time"),
@@ -235,6 +242,27 @@ def test_more_than_half_unusable_rows_refuse_the_file(tmp_path, bad, is_read):
     else:
         with pytest.raises(ArtifactError, match=rf"{bad} of 8 Gaussians(.|\n)*export again"):
             import_ply(path, "export again")
+
+
+def sizes_and_opacities(scales=np.log, opacities=lambda alpha: np.log(alpha / (1 - alpha)), unit=0.02):
+    """Columns of Gaussians of usual sizes, in a unit."""
+    rng, table = np.random.default_rng(2), columns(400)
+    for k in range(3):
+        table[f"scale_{k}"] = scales(unit * rng.lognormal(sigma=1.2, size=400))
+    return {**table, "opacity": opacities(rng.uniform(0.01, 0.99, 400))}
+
+
+@pytest.mark.parametrize(
+    ("how", "is_read"),
+    [({"scales": np.array}, False), ({"opacities": np.array}, False), ({"unit": 20.0}, True), ({}, True)],
+)
+def test_scales_and_opacities_without_logarithm_and_logit_are_refused(tmp_path, how, is_read):
+    path = write(tmp_path / "g.ply", sizes_and_opacities(**how))
+    if is_read:
+        assert len(import_ply(path, "")[0]) == 400
+    else:
+        with pytest.raises(ArtifactError, match=r"g\.ply does not contain(.|\n)*scale_\* from .*, opacity"):
+            import_ply(path, "")
 
 
 # ---- damage ------------------------------------------------------------------------------------------

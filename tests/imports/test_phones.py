@@ -26,7 +26,7 @@ ARKIT = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 @pytest.fixture(autouse=True)
 def no_points(monkeypatch):
     """Phone exports have no points; `test_colmap.py` triangulates them."""
-    points = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    points = np.zeros((99, 3)), np.zeros((99, 3), np.uint8)
     monkeypatch.setattr("hilsplat.scene.importers.importing.triangulate", lambda *args: points)
 
 

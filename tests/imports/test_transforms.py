@@ -8,8 +8,8 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from hilsplat.base.errors import HilsplatError, SceneError
+from hilsplat.scene.importers.ply_file import read_ply_points
 from hilsplat.scene.importers.reading import read_source
-from hilsplat.scene.importers.transforms import read_ply_points
 from hilsplat.scene.layouts import find_known_poses
 from tests.imports import analytic_world as world
 

@@ -27,26 +27,11 @@ def picture(size, turn=0.0):
 
 def write(path, *streams):
     """Write streams of equal pictures: dicts of size (height, width) and options."""
-    with av.open(str(path), "w") as container:
-        opened = []
-        for form in streams:
-            stream = container.add_stream(form.get("codec", "libx264"), rate=10)
-            stream.height, stream.width = form["size"]
-            stream.pix_fmt = form.get("format", "yuv420p")
-            stream.options = form.get("options", {"crf": "8", "preset": "ultrafast"})
-            if "aspect" in form:
-                stream.codec_context.sample_aspect_ratio = form["aspect"]
-            if "rotation" in form:
-                stream.set_display_rotation(form["rotation"])
-            if "disposition" in form:
-                stream.disposition = form["disposition"]
-            opened.append(stream)
-        for form, stream in zip(streams, opened, strict=True):
-            frame = av.VideoFrame.from_ndarray(picture(form["size"], form.get("turn", 0)), "rgb24")
-            for _ in range(form.get("frames", 6)):
-                container.mux(stream.encode(frame.reformat(format=stream.pix_fmt)))
-            container.mux(stream.encode())
-    return path
+    same = {"rate": 10, "options": {"crf": "8", "preset": "ultrafast"}, "turn": 0, "frames": 6}
+    forms = (same | form for form in streams)
+    return write_video(
+        path, *(f | {"pictures": [picture(f["size"], f["turn"])] * f["frames"]} for f in forms)
+    )
 
 
 def extracted(path, count=2):
@@ -178,7 +163,8 @@ def test_times_start_at_the_first_frame_that_is_shown(tmp_path, suffix, start_ms
     times = [0, 200, 650, 2000]
     # pictures without a common corner, so that each is selected
     pictures = list(np.random.default_rng(2).integers(0, 256, (len(times), HEIGHT, 128, 3), np.uint8))
-    path = write_video(tmp_path / f"a.{suffix}", pictures, [start_ms + time_ms for time_ms in times])
+    stream = {"pictures": pictures, "times": [start_ms + time_ms for time_ms in times]}
+    path = write_video(tmp_path / f"a.{suffix}", stream)
     times = times if start_ms >= 0 else [0, 1350]
     notes = extract_frames([path], tmp_path, len(times))
     assert notes == []

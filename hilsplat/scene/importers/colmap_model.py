@@ -4,20 +4,22 @@ pycolmap's reader allocates unlimited memory for wrong counts, ends names at the
 every detail of the text format. Rigs and frames are not read, because images have their own poses.
 """
 
+import io
 import struct
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
 from hilsplat.base.errors import SceneError, foreign
 from hilsplat.base.files import regular
+from hilsplat.scene.cameras import Photo
 from hilsplat.scene.colmap import pycolmap, rotation_matrix
+from hilsplat.scene.importers.ply_file import read_ply_points
 from hilsplat.scene.layouts import model_files
 
 FIX = "copy it again, or export the model again with COLMAP"
@@ -27,20 +29,6 @@ PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
 
 
 Row = TypeVar("Row")
-
-
-class Lens(NamedTuple):
-    """A camera in a model: COLMAP's name of the lens model, image size and parameters, px."""
-
-    model: str
-    width: int
-    height: int
-    params: tuple[float, ...]
-
-    def camera(self) -> pycolmap.Camera:
-        return pycolmap.Camera(
-            model=self.model, width=self.width, height=self.height, params=list(self.params)
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +49,7 @@ class ModelImage:
 class ColmapModel:
     """A COLMAP model; points are sorted by id, and None if the model has no file of points."""
 
-    lenses: dict[int, Lens]
+    lenses: dict[int, Photo]
     images: list[ModelImage]
     points: tuple[Int64[np.ndarray, " P"], Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]] | None
 
@@ -69,6 +57,7 @@ class ColmapModel:
 def read_model(folder: Path) -> ColmapModel:
     """Read a model; raise SceneError with file and record or line if a file is damaged."""
     cameras, images, *points = model_files(folder)
+    cloud = points.pop() if points and points[0].suffix == ".ply" else None
     if cameras.suffix == ".bin":
         lenses, records = _binary(cameras, _binary_lens), _binary(images, _binary_image)
         rows = _binary(points[0], _binary_point) if points else []
@@ -85,7 +74,10 @@ def read_model(folder: Path) -> ColmapModel:
             raise SceneError(f"{points[0]} has colours that are neither whole numbers nor at most 1", fix=FIX)
         table[:, 4:] = np.rint(255 * table[:, 4:])
     arrays = table[:, 0].astype(np.int64), table[:, 1:4], table[:, 4:].astype(np.uint8)
-    return ColmapModel(dict(lenses), records, arrays if points else None)
+    if cloud is not None:
+        xyz, rgb = read_ply_points(cloud)
+        arrays = np.arange(-len(xyz), 0), xyz, rgb  # no image observes these ids
+    return ColmapModel(dict(lenses), records, arrays if points or cloud else None)
 
 
 def _image(
@@ -101,72 +93,50 @@ def _image(
 # -- binary ---------------------------------------------------------------------------------------
 
 
-class _Bytes:
-    """The bytes of a file, read in order."""
-
-    def __init__(self, path: Path) -> None:
-        self.data, self.at = regular(path).read_bytes(), 0
-
-    def take(self, form: str) -> tuple[Any, ...]:
-        """Read numbers laid out as `form`; raise struct.error past the end."""
-        numbers = struct.unpack_from(f"<{form}", self.data, self.at)
-        self.at += struct.calcsize(f"<{form}")
-        return numbers
-
-    def name(self) -> str:
-        """Read a name that ends with a zero byte."""
-        end = self.data.index(b"\0", self.at)
-        name = self.data[self.at : end].decode("utf-8", "surrogateescape")
-        self.at = end + 1
-        return name
-
-    def skip(self, count: int) -> int:
-        """Pass over bytes, and return where they begin; raise struct.error past the end."""
-        if count > len(self.data) - self.at:
-            raise struct.error
-        self.at += count
-        return self.at - count
+def _take(file: io.BytesIO, form: str) -> tuple[Any, ...]:
+    """Read numbers laid out as `form`; raise struct.error past the end."""
+    return struct.unpack(f"<{form}", file.read(struct.calcsize(f"<{form}")))
 
 
-def _binary(path: Path, record: Callable[[_Bytes], Row]) -> list[Row]:
+def _binary(path: Path, record: Callable[[io.BytesIO], Row]) -> list[Row]:
     """Read each record of a file, which must end after the last one."""
     rows: list[Row] = []
     with foreign(path, fix=FIX):
-        data = _Bytes(path)
-        (count,) = data.take("Q")
-        if count > len(data.data):
-            raise ValueError(f"it declares {count} records but has only {len(data.data)} bytes")
+        file = io.BytesIO(regular(path).read_bytes())
+        (count,) = _take(file, "Q")
+        if count > (size := len(file.getvalue())):
+            raise ValueError(f"it declares {count} records but has only {size} bytes")
         for number in range(count):
             try:
-                rows.append(record(data))
+                rows.append(record(file))
             except (struct.error, ValueError) as error:
                 reason = "it ends" if isinstance(error, struct.error) else f"{error}"
                 raise ValueError(f"{reason} within record {number + 1} of {count}") from error
-        if num_more := len(data.data) - data.at:
+        if num_more := len(file.read()):
             raise ValueError(f"{num_more} bytes follow its {count} records")
     return rows
 
 
-def _binary_lens(data: _Bytes) -> tuple[int, Lens]:
-    number, model, width, height = data.take("IiQQ")
+def _binary_lens(file: io.BytesIO) -> tuple[int, Photo]:
+    number, model, width, height = _take(file, "IiQQ")
     if not 0 <= model < len(PARAMETERS):
         raise ValueError(f"unknown camera model {model}")
-    params = data.take(f"{PARAMETERS[model]}d")
-    return number, Lens(pycolmap.CameraModelId(model).name, width, height, params)
+    params = _take(file, f"{PARAMETERS[model]}d")
+    return number, Photo(pycolmap.CameraModelId(model).name, params, (height, width))
 
 
-def _binary_image(data: _Bytes) -> ModelImage:
-    _, *pose, camera_id = data.take("I7dI")
-    name = data.name()
-    (count,) = data.take("Q")
-    start = data.skip(24 * count)
-    seen = np.frombuffer(data.data, [("xy", "<f8", 2), ("id", "<i8")], count, start)
-    return _image(name, camera_id, pose, seen["xy"], seen["id"])
+def _binary_image(file: io.BytesIO) -> ModelImage:
+    _, *pose, camera_id = _take(file, "I7dI")
+    (name,) = _take(file, f"{file.getvalue().index(0, file.tell()) - file.tell()}sx")
+    (count,) = _take(file, "Q")
+    (points,) = _take(file, f"{24 * count}s")
+    seen = np.frombuffer(points, [("xy", "<f8", 2), ("id", "<i8")])
+    return _image(name.decode("utf-8", "surrogateescape"), camera_id, pose, seen["xy"], seen["id"])
 
 
-def _binary_point(data: _Bytes) -> tuple[float, ...]:
-    *point, _, length = data.take("Q3d3BdQ")
-    data.skip(8 * length)
+def _binary_point(file: io.BytesIO) -> tuple[float, ...]:
+    *point, _, length = _take(file, "Q3d3BdQ")
+    _take(file, f"{8 * length}x")
     return tuple(map(float, point))
 
 
@@ -193,14 +163,14 @@ def _text(path: Path, expected: str, record: Callable[[str], Row | None]) -> lis
     return rows
 
 
-def _text_lens(line: str) -> tuple[int, Lens] | None:
+def _text_lens(line: str) -> tuple[int, Photo] | None:
     if not line:
         return None
     number, model, width, height, *params = line.split()
     model_id = int(pycolmap.CameraModelId.__members__.get(model, pycolmap.CameraModelId.INVALID))
     if model_id < 0 or len(params) != PARAMETERS[model_id] or "_" in "".join(params):
         raise ValueError
-    return int(number), Lens(model, int(width), int(height), tuple(map(float, params)))
+    return int(number), Photo(model, tuple(map(float, params)), (int(height), int(width)))
 
 
 def _text_point(line: str) -> tuple[float, ...] | None:
@@ -213,34 +183,30 @@ def _text_point(line: str) -> tuple[float, ...] | None:
     return float(int(number)), x, y, z, *rgb
 
 
-class _TextImages:
-    """The state between the two lines of an image; the second one, its points, may be missing."""
-
-    def __init__(self) -> None:
-        self.may_be_points = False
-
-    def __call__(self, line: str) -> Any:
-        cells = line.split()
-        if self.may_be_points and len(cells) % 3 == 0:
-            with suppress(ValueError):
-                points = np.array(cells, np.float64).reshape(-1, 3)
-                self.may_be_points = False
-                return points
-        self.may_be_points = bool(line)
-        if not line:
-            return None
-        *numbers, name = line.split(maxsplit=9)
-        int(numbers[0])
-        return name, int(numbers[8]), tuple(map(float, numbers[1:8]))
-
-
 def _text_images(path: Path) -> list[ModelImage]:
+    """Read images.txt; the second line of an image, its points, may be missing."""
     expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line with X Y POINT3D_ID for each point"
-    images: list[ModelImage] = []
-    rows = _text(path, expected, _TextImages())
-    for row, after in pairwise([*rows, None]):
-        if isinstance(row, tuple):
-            seen = after if isinstance(after, np.ndarray) else np.zeros((0, 3))
-            name, camera_id, pose = row
-            images.append(_image(name, camera_id, pose, seen[:, :2], seen[:, 2].astype(np.int64)))
-    return images
+    images: list[tuple[str, int, tuple[float, ...]]] = []
+    points: dict[int, np.ndarray] = {}  # by number of the image
+    may_be_points = False
+
+    def read(line: str) -> None:
+        nonlocal may_be_points
+        cells = line.split()
+        if may_be_points and len(cells) % 3 == 0:
+            with suppress(ValueError):
+                points[len(images) - 1] = np.array(cells, np.float64).reshape(-1, 3)
+                may_be_points = False
+                return
+        may_be_points = bool(line)
+        if line:
+            *numbers, name = line.split(maxsplit=9)
+            int(numbers[0])
+            images.append((name, int(numbers[8]), tuple(map(float, numbers[1:8]))))
+
+    _text(path, expected, read)
+    seen = (points.get(number, np.zeros((0, 3))) for number in range(len(images)))
+    return [
+        _image(*image, table[:, :2], table[:, 2].astype(np.int64))
+        for image, table in zip(images, seen, strict=True)
+    ]

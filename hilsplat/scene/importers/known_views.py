@@ -13,7 +13,7 @@ from hilsplat.base.files import IMAGE_SUFFIXES, is_outside, list_images, regular
 from hilsplat.base.images import image_size_hw
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.cameras import MAX_SIDE_PX
-from hilsplat.scene.colmap import Points, pycolmap
+from hilsplat.scene.colmap import Points, as_camera, pycolmap
 from hilsplat.scene.importers.colmap_model import ModelImage, read_model
 from hilsplat.scene.layouts import KnownPoses, used_images
 from hilsplat.scene.posed_images import rigid_pose
@@ -113,6 +113,28 @@ class Source:
             self.notes.append(f"{num_lost} names in {where} belong to no view")
         return {name for name in matches if name is not None}
 
+    def check_keys(
+        self, objects: Iterable[Mapping[str, Any]], file: Path, known: Set[str], refused: Mapping[str, str]
+    ) -> None:
+        """Note the keys of a file that are not known; raise SceneError if one is refused.
+
+        Args:
+            known: keys that are used, or that don't change the meaning of others.
+            refused: what a key means that cannot be applied.
+        """
+        unknown: set[str] = set()
+        for content in objects:
+            for key in content.keys() & refused.keys():
+                if np.any(content[key]):
+                    raise SceneError(
+                        f"{file} describes {refused[key]}, which is not supported",
+                        found=f"{key}: {str(content[key])[:60]}",
+                        fix="export undistorted images of ordinary cameras, in the usual axes",
+                    )
+            unknown |= content.keys() - known - refused.keys()
+        if unknown:
+            self.notes.append(f"keys of {file.name} that are not used: {', '.join(sorted(unknown))}")
+
     def require_most(self, min_share: float, files: object, *, images: bool = False) -> None:
         """Raise SceneError if fewer than this share of the views can be used; `images`: and have an image."""
         total, missing = len(self.views) + len(self.left_out), self.without_image if images else []
@@ -125,35 +147,6 @@ class Source:
                 found="\n            ".join(reasons[:3]) + more,
                 fix="export the poses again, with their images in the same folder or its images/ folder",
             )
-
-
-@dataclass(frozen=True)
-class Keys:
-    """The keys of a format.
-
-    Attributes:
-        used: keys that the reader understands.
-        harmless: keys that don't change the meaning of others, and are skipped.
-        refused: what a key means that the reader cannot apply.
-    """
-
-    used: Set[str]
-    harmless: Set[str]
-    refused: Mapping[str, str]
-
-    def check(self, objects: Iterable[Mapping[str, Any]], file: Path) -> list[str]:
-        """Return a note about the keys of a file that are unknown; raise SceneError if one is refused."""
-        unknown: set[str] = set()
-        for content in objects:
-            for key in content.keys() & self.refused.keys():
-                if np.any(content[key]):
-                    raise SceneError(
-                        f"{file} describes {self.refused[key]}, which is not supported",
-                        found=f"{key}: {str(content[key])[:60]}",
-                        fix="export undistorted images of ordinary cameras, in the usual axes",
-                    )
-            unknown |= content.keys() - self.used - self.harmless - self.refused.keys()
-        return [f"keys of {file.name} that are not used: {', '.join(sorted(unknown))}"] if unknown else []
 
 
 def require_valid(view: KnownView) -> None:
@@ -266,7 +259,7 @@ def read_colmap(known: KnownPoses) -> Source:
     def described(image: ModelImage) -> KnownView:
         if image.camera_id not in model.lenses:
             raise SceneError(f"view {image.name} has camera {image.camera_id}, which the model lacks")
-        camera = model.lenses[image.camera_id].camera()
+        camera = as_camera(model.lenses[image.camera_id])
         is_test = image.name in held_out
         return KnownView(image.name, files[image.name], camera, image.cam_from_world, is_test)
 

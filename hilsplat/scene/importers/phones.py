@@ -13,7 +13,7 @@ from hilsplat.base.errors import SceneError, foreign
 from hilsplat.base.files import list_images
 from hilsplat.base.images import image_size_hw
 from hilsplat.scene.colmap import pycolmap, rotation_matrix
-from hilsplat.scene.importers.known_views import Keys, KnownView, Source
+from hilsplat.scene.importers.known_views import KnownView, Source
 from hilsplat.scene.layouts import KnownPoses, read_json_object
 from hilsplat.scene.posed_images import OPENGL_TO_OPENCV, rigid_pose
 
@@ -29,23 +29,15 @@ POLYCAM_BORDER_PX = 15
 Z_UP_FROM_Y_UP = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """ARKit's world has y up; scenes here have z up. This is a cyclic permutation, so nothing is mirrored."""
 
+POLYCAM_USED = "fx fy cx cy width height t_00 t_01 t_02 t_03 t_10 t_11 t_12 t_13 t_20 t_21 t_22 t_23"
 POLYCAM_HARMLESS = """angular_velocity blur_score center_depth exposure_duration iso manual_keyframe neighbors
 neighbors_2 timestamp version lens white_balance"""
-POLYCAM_KEYS = Keys(
-    used={
-        *(f"t_{row}{column}" for row in range(3) for column in range(4)),
-        *["fx", "fy", "cx", "cy", "width", "height"],
-    },
-    harmless=set(POLYCAM_HARMLESS.split()),
-    refused=dict.fromkeys(["k1", "k2", "k3", "p1", "p2", "distortion"], "lens distortion"),
-)
+POLYCAM_KEYS = {*POLYCAM_USED.split(), *POLYCAM_HARMLESS.split()}
 RECORD3D_HARMLESS = """fps dw dh initPose cameraType frameTimestamps confidenceWidth confidenceHeight
 userComment rangeOfInterest hardwareModel"""
-RECORD3D_KEYS = Keys(
-    used={"K", "w", "h", "poses", "perFrameIntrinsicCoeffs"},
-    harmless=set(RECORD3D_HARMLESS.split()),
-    refused=dict.fromkeys(("lensDistortionLookupTable", "distortion"), "lens distortion"),
-)
+RECORD3D_KEYS = {"K", "w", "h", "poses", "perFrameIntrinsicCoeffs", *RECORD3D_HARMLESS.split()}
+REFUSED_KEYS = ("k1", "k2", "k3", "p1", "p2", "distortion", "lensDistortionLookupTable")
+REFUSED = dict.fromkeys(REFUSED_KEYS, "lens distortion")
 
 
 def read_polycam(known: KnownPoses) -> Source:
@@ -76,7 +68,7 @@ def read_polycam(known: KnownPoses) -> Source:
         file = cameras / f"{image.stem}.json"
         if file.is_file():  # Polycam omits cameras that it could not correct
             source.add(image.name, described, image, file)
-    source.notes += POLYCAM_KEYS.check(contents, cameras)
+    source.check_keys(contents, cameras, POLYCAM_KEYS, REFUSED)
     return source
 
 
@@ -111,7 +103,8 @@ def read_record3d(known: KnownPoses) -> Source:
         pose = _phone_pose(matrix, f"{file}, pose {number}")
         return KnownView(images[number].name, images[number], camera, pose)
 
-    source = Source(notes=RECORD3D_KEYS.check([content], file))
+    source = Source()
+    source.check_keys([content], file, RECORD3D_KEYS, REFUSED)
     for number in _spread(sorted(images), source):
         source.add(images[number].name, described, number)
     return source

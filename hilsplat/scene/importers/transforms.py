@@ -12,9 +12,9 @@ import numpy as np
 
 from hilsplat.base.errors import SceneError, foreign
 from hilsplat.base.images import image_size_hw
-from hilsplat.scene.colmap import Points, pycolmap
-from hilsplat.scene.importers.known_views import Keys, KnownView, Source, find_images, require_inside
-from hilsplat.scene.importers.ply_file import read_ply
+from hilsplat.scene.colmap import pycolmap
+from hilsplat.scene.importers.known_views import KnownView, Source, find_images, require_inside
+from hilsplat.scene.importers.ply_file import read_ply_points
 from hilsplat.scene.layouts import KnownPoses, read_json_object
 from hilsplat.scene.posed_images import OPENGL_TO_OPENCV, rigid_pose
 
@@ -32,9 +32,6 @@ MODELS = dict.fromkeys(PERSPECTIVES, "OPENCV") | dict.fromkeys(FISHEYES, "OPENCV
 
 COEFFICIENTS = {"OPENCV": ("k1", "k2", "p1", "p2", "k3"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4")}
 
-COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
-"""Names of the columns with a point's colour."""
-
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 
 # applied_transform and applied_scale are used for Gaussians, see `splat/coordinates.py`.
@@ -44,7 +41,7 @@ HARMLESS = """aabb_scale scale offset n_frames up sharpness rotation render_aabb
 colmap_im_id depth_file_path depth_path depth_unit_scale_factor integer_depth_scale enable_depth_loading
 normal_file_path sharpen white_transparent black_transparent timestamp auto_scale_poses_override center_method
 version"""
-REFUSED = {
+UNSUPPORTED = {
     "ortho is_ortho orthographic": "orthographic pictures",
     "latlong equirectangular": "panoramas",
     "rolling_shutter transform_matrix_start transform_matrix_end": "a rolling shutter",
@@ -53,11 +50,8 @@ REFUSED = {
     "from_na from_mitsuba normal_mts_args": "camera axes other than OpenGL's",  # NeuS2, Mitsuba
     "k5 k6 p3 p4 s1 s2 s3 s4 b1 b2 distortion distortion_params": "more lens distortion",
 }
-KEYS = Keys(
-    used={*USED.split(), *FOCAL_KEYS, *SPLITS},
-    harmless=set(HARMLESS.split()),
-    refused={key: meaning for keys, meaning in REFUSED.items() for key in keys.split()},
-)
+KNOWN = {*USED.split(), *FOCAL_KEYS, *SPLITS, *HARMLESS.split()}
+REFUSED = {key: meaning for keys, meaning in UNSUPPORTED.items() for key in keys.split()}
 
 
 def read_transforms(known: KnownPoses) -> Source:
@@ -79,7 +73,7 @@ def read_transforms(known: KnownPoses) -> Source:
                 problem = f"{file}: `{key}` is missing, or is not a list of objects"
                 raise SceneError(problem, fix="export it again")
             frames += rows
-        source.notes += KEYS.check([content, *frames], file)
+        source.check_keys([content, *frames], file, KNOWN, REFUSED)
         names = [str(frame.get("file_path", f"frame {number}")) for number, frame in enumerate(frames)]
         contents.append((file, content, frames, names))
     images = find_images(known.root, [name for *_, names in contents for name in names])
@@ -177,20 +171,3 @@ def _focal(frame: Mapping[str, Any], axis: str, side_px: int, notes: list[str]) 
         if abs(stated[key] - stated[first]) > FOCAL_TOLERANCE * abs(stated[first]):
             notes.append(f"{key} contradicts {first}, which is used")
     return stated[first]
-
-
-def read_ply_points(path: Path) -> Points:
-    """Read the points of a PLY file, and their colours: integers, or floats from 0 to 1; grey without any."""
-    fix = "put the file there, or remove ply_file_path from the transforms file to triangulate points"
-    with foreign(f"{path}, with the points,", fix=fix):
-        vertex = read_ply(path)["vertex"].data
-        xyz = np.stack([vertex[axis] for axis in ("x", "y", "z")], axis=1).astype(np.float64)
-        names = next((names for names in COLOURS if set(names) <= set(vertex.dtype.names)), None)
-        if names is None:
-            return xyz, np.full(xyz.shape, 128, dtype=np.uint8)
-        rgb = np.stack([vertex[name] for name in names], axis=1)
-        largest = float(np.nanmax(rgb)) if rgb.size else 0.0
-        # Floats are usually in [0, 1], up to rounding; 16-bit colours of laser scanners may use only 8 bits.
-        limit = 1 if rgb.dtype.kind == "f" and largest < 2 else 255 if largest <= 255 else 65535
-        rgb = np.nan_to_num(rgb.astype(np.float64) * (255 / limit), nan=128.0)
-    return xyz, np.clip(np.rint(rgb), 0, 255).astype(np.uint8)

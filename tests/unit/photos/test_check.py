@@ -77,7 +77,7 @@ def test_a_camera_that_turns_in_place_is_reported_with_its_evidence(moving):
     assert doubts_of([*turning(moving[0], np.linspace(-4, 4, 5)), *moving]) == []
 
 
-def test_blurred_dark_and_white_photographs_are_named(moving, photos):
+def test_faulty_photographs_are_named(moving, photos):
     def with_third(change):
         third = replace(checked([change(moving[2])])[0], name="2.jpg")
         return photo_doubts([*photos[:2], third, *photos[3:]], have_poses=False)
@@ -88,6 +88,8 @@ def test_blurred_dark_and_white_photographs_are_named(moving, photos):
     assert dark.startswith("1 of 12 photographs (2.jpg) is too dark")
     (white,) = with_third(lambda picture: np.clip(picture * 4.0, 0, 255).astype(np.uint8))
     assert white.startswith("1 of 12 photographs (2.jpg) is more than half white")
+    (wide, *_) = with_third(lambda picture: picture[: len(picture) // 2])
+    assert wide.startswith("1 of 12 photographs (2.jpg) is exactly twice as wide as high: cut 360-")
 
 
 def test_photographs_from_one_place_are_named(moving):

@@ -34,23 +34,32 @@ def pan(steps, size=(320, 240)):
     return [wall()[: size[1], x : x + size[0]].copy() for x in left]
 
 
-def write_video(path, pictures, times=None, rotation=None, **options):
-    """Encode pictures, at 30 per second or at given times in milliseconds."""
+def write_video(path, *streams, **options):
+    """Encode streams: lists of pictures, or dicts of such a list, their times in ms, and options."""
+    forms = [form if isinstance(form, dict) else {"pictures": form} for form in streams]
     with av.open(str(path), "w", options=options) as container:
-        stream = container.add_stream("libx264", rate=30)
-        height, width = pictures[0].shape[:2]
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        stream.options = {"crf": "12", "g": "15", "preset": "ultrafast"}
-        if rotation is not None:
-            stream.set_display_rotation(rotation)
-        if times is not None:
-            stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
-        for number, picture in enumerate(pictures):
-            frame = av.VideoFrame.from_ndarray(picture, "rgb24")
-            if times is not None:
-                frame.pts, frame.time_base = times[number], Fraction(1, 1000)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+        opened = []
+        for form in forms:
+            stream = container.add_stream(form.get("codec", "libx264"), rate=form.get("rate", 30))
+            stream.height, stream.width = form["pictures"][0].shape[:2]
+            stream.pix_fmt = form.get("format", "yuv420p")
+            stream.options = form.get("options", {"crf": "12", "g": "15", "preset": "ultrafast"})
+            if "aspect" in form:
+                stream.codec_context.sample_aspect_ratio = form["aspect"]
+            if "rotation" in form:
+                stream.set_display_rotation(form["rotation"])
+            if "disposition" in form:
+                stream.disposition = form["disposition"]
+            if "times" in form:
+                stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
+            opened.append(stream)
+        for form, stream in zip(forms, opened, strict=True):
+            for number, pixels in enumerate(form["pictures"]):
+                frame = av.VideoFrame.from_ndarray(pixels, "rgb24").reformat(format=stream.pix_fmt)
+                if "times" in form:
+                    frame.pts, frame.time_base = form["times"][number], Fraction(1, 1000)
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode())
     return path
 
 

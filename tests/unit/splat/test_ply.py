@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from plyfile import PlyData
 
 from benchmarks.scenes import random_scene
 from hilsplat.base.errors import ArtifactError
@@ -44,16 +43,6 @@ def test_a_ply_is_read_back_unchanged(tmp_path, n, degree):
         np.testing.assert_array_equal(getattr(gaussians, name), getattr(again, name))
     save_ply(tmp_path / "again.ply", again)
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "g.ply").read_bytes()
-
-
-def test_rest_is_stored_channel_by_channel(tmp_path):
-    gaussians = random_gaussians(2, degree=1)
-    save_ply(tmp_path / "g.ply", gaussians)
-    vertex = PlyData.read(tmp_path / "g.ply")["vertex"]
-    # three rest rows of red come first, then green: f_rest_3 is row 1 of green
-    assert vertex["f_rest_3"][1] == gaussians.sh[1, 1, 1].item()
-    assert vertex["f_rest_2"][1] == gaussians.sh[1, 3, 0].item()
-    assert [prop.name for prop in vertex.properties][:7] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0"]
 
 
 def test_missing_and_truncated_files_are_refused(tmp_path):
