@@ -323,4 +323,5 @@ def run_annotate(
     first = opened.scene.cameras.names[0]
     annotator.drawing.submit(opened.proposals.at, first, 0, 0)  # compiles the loops before the first click
     about = f"{opened.scene.name}: {annotated} photographs annotated in {labels}; page"
-    serve(annotator.app, about, port=port, browser=browser, on_ready=on_ready)
+    page = f"annotate {labels.resolve()}"
+    serve(annotator.app, about, page=page, port=port, browser=browser, on_ready=on_ready)

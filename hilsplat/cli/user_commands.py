@@ -282,7 +282,9 @@ def _export(
     return f"wrote {what} of {views} views to {out}"
 
 
-Port = Annotated[int, typer.Option(min=0, max=65535, help="port of the page; 0: any free port")]
+Port = Annotated[
+    int, typer.Option(min=0, max=65535, help="port of the page; 0: its own, or else any free port")
+]
 Browser = Annotated[bool, typer.Option(help="open the page in a browser")]
 
 

@@ -202,7 +202,8 @@ def run_view(
     viewer = Viewer(shown)
     viewer.thread.worker.submit(shown.warm_up).result()
     about = f"{shown.scene.name}: {len(shown.gaussians)} Gaussians"
-    serve(viewer.app, about, port=port, browser=browser, on_ready=on_ready)
+    page = f"view {shown.results.resolve()}"  # which also opens the other scenes of the folder
+    serve(viewer.app, about, page=page, port=port, browser=browser, on_ready=on_ready)
 
 
 class EmbeddedViewer:

@@ -4,6 +4,7 @@ import json
 import secrets
 import socket
 import webbrowser
+import zlib
 from collections.abc import Callable
 from importlib.resources import files
 from typing import Any, TypeVar
@@ -32,6 +33,9 @@ STATUS: dict[type, int] = {
     ValidationError: 400,
 }
 """HTTP status of each error that is sent to the page."""
+
+OWN_PORTS = range(20_000, 30_000)
+"""Ports of pages, below those that Linux and macOS assign to other programs."""
 
 Sent = TypeVar("Sent", bound=BaseModel)
 
@@ -134,23 +138,39 @@ def listening_at(port: int) -> socket.socket:
     return listening
 
 
+def _listening_for(page: str) -> socket.socket:
+    # What a browser keeps for a page, such as removed Gaussians, belongs to the port.
+    try:
+        return listening_at(OWN_PORTS[zlib.crc32(page.encode()) % len(OWN_PORTS)])
+    except SettingsError:
+        return listening_at(0)
+
+
 def configured(app: Guard) -> uvicorn.Config:
     """Return the configuration of a server that logs only warnings, through the handlers of this process."""
     return uvicorn.Config(app, log_config=None, log_level="warning", access_log=False, server_header=False)
 
 
 def serve(
-    app: Callable[[str], Guard], about: str, *, port: int, browser: bool, on_ready: Callable[[str], None]
+    app: Callable[[str], Guard],
+    about: str,
+    *,
+    page: str,
+    port: int,
+    browser: bool,
+    on_ready: Callable[[str], None],
 ) -> None:
-    """Serve an application on this machine until Ctrl-C; for `port` and errors, see `listening_at`.
+    """Serve an application on this machine until Ctrl-C; for errors, see `listening_at`.
 
     Args:
         app: creates the application from its access token.
         about: description of the page for the printed line.
+        page: identifies the page among those of this user.
+        port: 0 uses the page's own port, or any free port if that is taken.
         browser: whether to open the page in a browser.
         on_ready: called once the page can be opened, with the text to print, which contains the address.
     """
-    token, listening = secrets.token_urlsafe(24), listening_at(port)
+    token, listening = secrets.token_urlsafe(24), listening_at(port) if port else _listening_for(page)
     address = f"http://127.0.0.1:{listening.getsockname()[1]}/?token={token}"
     config = configured(app(token))
     on_ready(f"{about} at {address}\nPress Ctrl-C to stop")
