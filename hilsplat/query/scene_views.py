@@ -48,6 +48,10 @@ class ViewStore:
         self._max_bytes = max_mib * 2**20
         self._values: dict[tuple[Any, ...], tuple[Any, int]] = {}
 
+    def __reduce__(self) -> tuple[type["ViewStore"], tuple[float]]:
+        """Start with an empty cache in another process."""
+        return ViewStore, (self._max_bytes / 2**20,)
+
     def get(self, key: tuple[Any, ...], compute: Callable[[], Any]) -> Any:
         """Return the cached value, or compute and cache it; the second item of a key is the view."""
         # Single operations on a dict are atomic, so several threads may read a scene.

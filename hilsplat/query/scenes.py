@@ -60,6 +60,10 @@ class SceneHit:
     doubts: tuple[Doubt, ...]
     caution: str
 
+    def __repr__(self) -> str:
+        answer = f"{self.node}, {self.level.label}, {self.name!r}, score {self.score:.2f}"
+        return f"SceneHit({self.scene}: {answer})"
+
     def as_json(self) -> dict[str, Any]:
         """Return the fields as JSON values."""
         plain = {"folder": str(self.folder), "picture": str(self.picture), "level": self.level.label}
@@ -99,6 +103,9 @@ class FoundScene:
     clip: ClipModel
     settings: EvaluateSettings
 
+    def __repr__(self) -> str:
+        return f"FoundScene({self.name})"
+
     @property
     def index(self) -> Path:
         """The artifact of the stage `names`."""
@@ -129,6 +136,9 @@ class Scenes:
 
     found: tuple[FoundScene, ...]
     skipped: dict[str, str]
+
+    def __repr__(self) -> str:
+        return f"Scenes({len(self.found)} found, {len(self.skipped)} skipped)"
 
     def query(
         self,

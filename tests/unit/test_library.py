@@ -3,6 +3,7 @@
 import logging
 import math
 import os
+import pickle
 import shutil
 import subprocess
 import sys
@@ -379,6 +380,17 @@ def test_opened_scenes_do_not_follow_the_working_folder(desk_project, tmp_path, 
         assert photograph.read() == (desk_project / SCENE / "scene/images/000.png").read_bytes()
     shown.close()
     assert opened.query("mug")[0].mask("000.png").any()
+
+
+def test_a_scene_can_be_sent_to_another_process_without_its_cache(desk):
+    scene = hilsplat.open_scene(desk)
+    size, hits = len(pickle.dumps(scene)), scene.query("mug > handle", answerer="field", view="000.png")
+    mask = hits[0].mask("000.png")
+    sent = pickle.loads(pickle.dumps(scene))
+    found = sent.query("mug > handle", answerer="field", view="000.png")
+    assert found == hits and sent.like_picture(sent.views.image("000.png"))
+    np.testing.assert_array_equal(found[0].mask("000.png"), mask)
+    assert len(pickle.dumps(scene)) < 1.1 * size
 
 
 def test_levels_are_found_by_number_and_label(masks, linked):

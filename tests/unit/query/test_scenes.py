@@ -52,7 +52,9 @@ def changed(results, tmp_path) -> Path:
     ("text", "level"), [("mug", "auto"), ("handle", "part"), ("book", "subpart"), ("mug > handle", "auto")]
 )
 def test_answers_are_those_of_each_scene_alone_best_scene_first(results, opened, text, level):
-    hits = hilsplat.open_scenes(results).query(text, level, limit=SCENES, each=2)
+    scenes = hilsplat.open_scenes(results)
+    hits = scenes.query(text, level, limit=SCENES, each=2)
+    assert all(len(repr(each)) < 100 for each in (scenes, *scenes.found, *hits))
     alone = {name: scene.query(text, level, limit=2) for name, scene in opened.items()}
     assert len(alone) == SCENES and sum(map(len, alone.values())) == len(hits)
     best = sorted(alone, key=lambda name: (-alone[name][0].score, name))
