@@ -13,7 +13,7 @@ from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import Level
 from hilsplat.evaluate.figures import comparison
 from hilsplat.evaluate.figures.panel import annotated_rows, draw_panel, free_rows, shown_truths
-from hilsplat.evaluate.figures.sweep_plot import read_curves, run_sweep_plot
+from hilsplat.evaluate.figures.sweep_plot import draw_sweep, read_curves, run_sweep_plot
 from hilsplat.query.answer import report, views_of
 from hilsplat.query.pictures import ANSWER_RGB, TRUTH_RGB, outline, paint_answer, save_figure
 from hilsplat.query.query_panel import query_panel
@@ -218,6 +218,16 @@ def test_a_curve_joins_rows_of_one_data_set_and_reading(tmp_path):
     }
     run_sweep_plot("theta", tmp_path / "theta.csv", tmp_path / "theta.png")
     assert (tmp_path / "theta.pdf").is_file()
+
+
+def test_a_column_has_the_same_colour_in_every_panel_and_lines_of_its_own_for_more_curves():
+    points = [(0.6, 1.0), (0.9, 2.0)]
+    reported = {"Hi-LERF mIoU": points, "LERF mIoU": points}
+    measured = {"3D-OVS mIoU, sam": points, "LERF mIoU, sam": points, "LERF mIoU, by head, sam": points}
+    left, right = draw_sweep("theta", {"reported: LERF": reported, "stand-in": measured}).get_axes()
+    (_, one), (other, two, three) = left.get_lines(), right.get_lines()
+    assert one.get_color() == two.get_color() == three.get_color() != other.get_color()
+    assert two.get_linestyle() != three.get_linestyle()
 
 
 def test_an_unknown_sweep_is_an_error_that_lists_the_sweeps(tmp_path):
