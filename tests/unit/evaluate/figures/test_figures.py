@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.text import Text
 from PIL import Image
 
 from hilsplat.base.artifacts import write_index
@@ -94,6 +96,23 @@ def test_a_query_is_reported_and_drawn(block_world, tmp_path):
     assert (tmp_path / "panel.png").stat().st_size > 10_000
 
 
+def test_long_texts_stay_inside_the_pictures(block_world, rows, tmp_path, monkeypatch):
+    text = " ".join(["unicorn"] * 30)
+    drawn = []
+    monkeypatch.setattr("hilsplat.query.query_panel.save_figure", lambda figure, out: drawn.append(figure))
+    query_panel(block_world.answers, text, block_world.answers.select(text), ["000.png"], tmp_path / "x.png")
+    shown = [replace(row, text=text, truth=None) for row in rows[1]]
+    drawn.append(comparison.draw_methods(block_world.scene, block_world.answers.views.image, [], shown))
+    for figure in drawn:
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        width, height = canvas.get_width_height()
+        texts = [each for each in figure.findobj(Text) if each.get_text()]
+        assert any("unicorn unicorn" in each.get_text() for each in texts)
+        for extent in (each.get_window_extent(canvas.get_renderer()) for each in texts):
+            assert min(extent.p0) >= 0 and extent.x1 <= width and extent.y1 <= height
+
+
 def test_reports_state_what_was_not_found(block_world):
     answers = block_world.answers
     empty = replace(answers.select("bear"), ids=np.zeros(0, np.int64), values=np.zeros(0))
@@ -149,14 +168,32 @@ def test_equal_nodes_have_equal_colours_and_other_pixels_are_black(block_world):
 
 @pytest.fixture
 def compare(block_world, tmp_path, monkeypatch):
-    """Function that draws the figures of the block world into a folder."""
-    monkeypatch.setattr(comparison, "open_variant", lambda *how: block_world.answers)
+    """Function that draws the figures of the block world into a folder; variants are named like a method."""
+
+    def opened(folder, variant, *how):
+        methods = (variant,) if variant in ("tree", "field") else EVALUATE.methods
+        return replace(block_world.answers, settings=EVALUATE.model_copy(update={"methods": methods}))
+
+    monkeypatch.setattr(comparison, "open_variant", opened)
 
     def run(name, variants, names, **more):
         out, settings = tmp_path / name / "comparison.webp", FiguresSettings(queries_per_level=1)
         comparison.run_comparison(block_world.folder, variants, names, out, settings, EVALUATE, **more)
 
     return run
+
+
+def test_a_variant_shows_the_methods_that_its_settings_evaluate(compare, monkeypatch):
+    shown, draw = [], comparison.draw_methods
+    monkeypatch.setattr(
+        comparison,
+        "draw_methods",
+        lambda scene, image, columns, rows: (
+            shown.extend(column.title for column in columns) or draw(scene, image, columns, rows)
+        ),
+    )
+    compare("one", ["default", "tree", "field"], {"tree": "my tree"}, queries=["bear"])
+    assert shown == ["hilsplat (tree)", "hilsplat (field)", "my tree, tree", "field"]
 
 
 def test_all_figures_are_written_as_webp_and_pdf_twice_the_same(block_world, tmp_path, compare):
