@@ -139,7 +139,7 @@ def test_a_kept_answer_has_the_present_name_of_its_node(served, own_desk):
     page.get_by_role("textbox", name="Name").fill("atlas")
     page.keyboard.press("Enter")
     page.press("Escape")
-    page.locator("#overlay text", has_text=re.compile(r"^book atlas 0\.\d\d$")).wait_for()
+    page.locator("#overlay text", has_text=re.compile(r"^book: atlas 0\.\d\d$")).wait_for()
 
 
 def test_a_link_and_back_restore_the_settings_of_a_query(opened, desk_address):
