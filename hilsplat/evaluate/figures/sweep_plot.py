@@ -57,13 +57,13 @@ def draw_sweep(name: str, curves: Curves) -> Figure:
     figure = Figure(figsize=(4.6 * len(curves), 3.4), layout="constrained")
     all_axes = figure.subplots(1, len(curves), squeeze=False)[0]
     for axes, (panel, points_of) in zip(all_axes, curves.items(), strict=True):
-        drawn = dict.fromkeys(COLUMNS, 0)
+        drawn: list[str] = []
         for label, points in points_of.items():
             values, shares = zip(*sorted(points), strict=True)
             column = label.partition(", ")[0]
-            line, colour = LINES[drawn[column] % len(LINES)], f"C{COLUMNS.index(column)}"
+            line, colour = LINES[drawn.count(column) % len(LINES)], f"C{COLUMNS.index(column)}"
             axes.plot(values, shares, marker="o", label=label, linestyle=line, color=colour)
-            drawn[column] += 1
+            drawn.append(column)
         if name == "omega":
             axes.set_xscale("log")
         axes.set_xlabel(SWEEPS[name])
