@@ -42,8 +42,8 @@ app.add_typer(blocks_app, name="blocks")
 def sort_into_panels() -> None:
     """Sort the commands and groups of `app` into the panels of its help."""
     panels = {name: panel for panel, names in PANELS.items() for name in names}
-    infos: list[Any]
-    for infos in (app.registered_commands, app.registered_groups):
+    every: list[Any] = [app.registered_commands, app.registered_groups]
+    for infos in every:
         for info in infos:
             info.name = info.name or info.callback.__name__
             info.rich_help_panel = panels.get(info.name, STAGES)

@@ -123,16 +123,15 @@ def report(
         other = "".join(f", or omit {name}" for name, value in given.items() if value is not None)
         return f"nothing in {searched} matches {text!r} at level {nodes.level.label}; try {levels}{other}"
     lengths = "metres" if scene.scene.unit == "metre" else "scene units"
-    rows: list[tuple[object, ...]] = [
-        ("node", "level", "score", "position", "box size", "name", "best views")
-    ]
+    words = "level", "position", "box size", "name", "best views"
+    rows = [("node", "level", "score", *words[1:])]
     for hit in hits:
         position = ", ".join(f"{value:.2f}" for value in hit.centroid)
         size = " x ".join(f"{side:.2f}" for side in hit.oriented_box.size)
-        own = hit.node, hit.level.label, f"{hit.score:.2f}", position, size, hit.name or "?"
+        own = str(hit.node), hit.level.label, f"{hit.score:.2f}", position, size, hit.name or "?"
         rows.append((*own, ", ".join(hit.best_views)))
     lines = [f"{counted(len(hits), 'answer')} to {text!r} in {searched}; lengths in {lengths}"]
-    lines += aligned_table(rows, {*rows[0]} - {"node", "score"})
+    lines += aligned_table(rows, words)
     if more := len(nodes.ids) - len(hits):
         lines.append(f"and {counted(more, 'weaker answer')}, also shown in the pictures")
     lines.append('a score of 0.5 means that the query fits no better than a generic word such as "object"')
