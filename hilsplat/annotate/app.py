@@ -37,18 +37,7 @@ from hilsplat.web.file_changes import version_of
 from hilsplat.web.guard import Guard
 from hilsplat.web.messages import Message
 from hilsplat.web.scene_thread import SceneThread, ShownScene
-from hilsplat.web.server import (
-    BYTES,
-    Ready,
-    answer,
-    guarded,
-    page_files,
-    plain,
-    read,
-    serve,
-    version_sent,
-    view_name,
-)
+from hilsplat.web.server import Ready, answer, files_of, guarded, plain, read, serve, version_sent, view_name
 
 SCORES = 3
 """Maximum number of mean scores that the page shows."""
@@ -201,7 +190,7 @@ class Annotator:
 
     def __init__(self, opened: OpenedScene) -> None:
         self.thread = SceneThread(opened)
-        _, self.files = page_files("annotate.html", "hilsplat.annotate")
+        _, self.files = files_of("annotate.html", "hilsplat.annotate")
         self.drawing = ThreadPoolExecutor(1, thread_name_prefix="drawing")  # so that saving doesn't wait
 
     def app(self, token: str) -> Guard:
@@ -312,7 +301,7 @@ def _export(opened: OpenedScene, of: Mapping[str, Any]) -> Response:
     if kind not in get_args(Kind):
         raise SettingsError(f"unknown format {kind!r}", expected=", ".join(get_args(Kind)))
     data = exported(kind, opened.known(), opened.scene.cameras)
-    return plain(data, "application/json" if kind == "coco" else BYTES)
+    return plain(data, "application/json") if kind == "coco" else answer(data)
 
 
 def run_annotate(

@@ -33,9 +33,9 @@ from hilsplat.web.server import (
     answer,
     configured,
     encoded,
+    files_of,
     guarded,
     listening_at,
-    page_files,
     plain,
     read,
     serve,
@@ -53,7 +53,7 @@ class Viewer:
 
     def __init__(self, shown: ViewerScene, *, others: bool = True) -> None:
         self.thread = SceneThread(shown, shown.beside if others else None)
-        self.static, self.files = page_files("index.html", "hilsplat.viewer")
+        self.static, self.files = files_of("index.html", "hilsplat.viewer")
 
     def app(self, token: str, *, embedded: bool = False) -> Guard:
         """Return the guarded application, for a standalone page or a frame in another page."""

@@ -43,7 +43,7 @@ Ready = Callable[[str], None]
 Sent = TypeVar("Sent", bound=BaseModel)
 
 
-def page_files(page: str, package: str) -> tuple[dict[str, bytes], list[Route]]:
+def files_of(page: str, package: str) -> tuple[dict[str, bytes], list[Route]]:
     """Return the static files of a page's package and of `hilsplat.web` by name, and routes to them."""
     paths = [*(files("hilsplat.web") / "static").iterdir(), *(files(package) / "static").iterdir()]
     static = {path.name: path.read_bytes() for path in paths if path.name.endswith(tuple(TYPES))}
