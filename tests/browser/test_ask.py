@@ -301,7 +301,8 @@ def test_an_exported_page_opens_from_a_file_with_its_answers(opened, browser, de
     alone.get_by_text("This page contains only the answers to: book, mug > handle").wait_for()
     assert [chip.inner_text().split("\n")[0] for chip in alone.chips().all()] == ["book"]
     assert alone.locator("#overlay path.kept").count() == 1
-    assert not wrong
+    alone.locator("#save summary").click()
+    assert alone.locator("#save > div").inner_text().startswith("Picture, PNG") and not wrong
     context.close()
 
 
