@@ -74,6 +74,17 @@ def own_desk(desk_project, tmp_path) -> Path:
     return shutil.copytree(desk_project, tmp_path / "project") / "results/photos/desk"
 
 
+@pytest.fixture
+def three_scenes(desk_project, tmp_path) -> Path:
+    """Results with the desk, a copy of it, and a scene with poses only; the desk's model is beside them."""
+    shutil.copytree(desk_project / "models", tmp_path / "models")
+    desk, photos = desk_project / "results/photos/desk", tmp_path / "results/photos"
+    for name in ("desk", "other"):
+        shutil.copytree(desk, photos / name)
+    shutil.copytree(desk / "scene", photos / "posed/scene")
+    return tmp_path / "results"
+
+
 @pytest.fixture(autouse=True)
 def own_log() -> Iterator[None]:
     """Remove the log handlers that a command added: they write to the captured output of its test."""

@@ -4,7 +4,7 @@ All geometry is computed here, with the polygon filling used in evaluation; the 
 """
 
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated, Any, get_args
@@ -37,7 +37,7 @@ from hilsplat.web.file_changes import version_of
 from hilsplat.web.guard import Guard
 from hilsplat.web.messages import Message
 from hilsplat.web.scene_thread import SceneThread, ShownScene
-from hilsplat.web.server import BYTES, Pages, answer, guarded, plain, read, serve, version_sent, view_name
+from hilsplat.web.server import Ready, answer, files_of, guarded, plain, read, serve, version_sent, view_name
 
 SCORES = 3
 """Maximum number of mean scores that the page shows."""
@@ -190,14 +190,14 @@ class Annotator:
 
     def __init__(self, opened: OpenedScene) -> None:
         self.thread = SceneThread(opened)
-        self.pages = Pages("annotate.html", "hilsplat.annotate")
+        _, self.files = files_of("annotate.html", "hilsplat.annotate")
         self.drawing = ThreadPoolExecutor(1, thread_name_prefix="drawing")  # so that saving doesn't wait
 
     def app(self, token: str) -> Guard:
         """Return the guarded application."""
         get, post = self.thread.get, self.thread.post
         routes = [
-            *self.pages.routes(),
+            *self.files,
             *self.thread.routes(),
             get("/api/labels", _all_labels),
             Route("/api/labels/{number:int}", self._save, methods=["PUT"]),
@@ -301,18 +301,11 @@ def _export(opened: OpenedScene, of: Mapping[str, Any]) -> Response:
     if kind not in get_args(Kind):
         raise SettingsError(f"unknown format {kind!r}", expected=", ".join(get_args(Kind)))
     data = exported(kind, opened.known(), opened.scene.cameras)
-    return plain(data, "application/json" if kind == "coco" else BYTES)
+    return plain(data, "application/json") if kind == "coco" else answer(data)
 
 
 def run_annotate(
-    folder: Path,
-    labels: Path,
-    *,
-    variant: str,
-    port: int,
-    browser: bool,
-    threads: int,
-    on_ready: Callable[[str], None],
+    folder: Path, labels: Path, *, variant: str, port: int, browser: bool, threads: int, on_ready: Ready
 ) -> None:
     """Serve the annotation page of a scene until Ctrl-C.
 
@@ -323,4 +316,5 @@ def run_annotate(
     first = opened.scene.cameras.names[0]
     annotator.drawing.submit(opened.proposals.at, first, 0, 0)  # compiles the loops before the first click
     about = f"{opened.scene.name}: {annotated} photographs annotated in {labels}; page"
-    serve(annotator.app, about, port=port, browser=browser, on_ready=on_ready)
+    page = f"annotate {labels.resolve()}"
+    serve(annotator.app, about, page=page, port=port, browser=browser, on_ready=on_ready)

@@ -41,16 +41,13 @@ app.add_typer(blocks_app, name="blocks")
 
 def sort_into_panels() -> None:
     """Sort the commands and groups of `app` into the panels of its help."""
-    listed = {name: panel for panel, names in PANELS.items() for name in names}
-    order = [*listed]
-
-    def name_of(info: Any) -> str:
-        return info.name or info.callback.__name__
-
-    for infos in (app.registered_commands, app.registered_groups):
+    panels = {name: panel for panel, names in PANELS.items() for name in names}
+    every: list[Any] = [app.registered_commands, app.registered_groups]
+    for infos in every:
         for info in infos:
-            info.rich_help_panel = listed.get(name_of(info), STAGES)
-        infos.sort(key=lambda info: order.index(name) if (name := name_of(info)) in listed else len(order))
+            info.name = info.name or info.callback.__name__
+            info.rich_help_panel = panels.get(info.name, STAGES)
+        infos.sort(key=lambda info: [*panels, info.name].index(info.name))
 
 
 Results = Annotated[Path, typer.Option(help="results folder")]

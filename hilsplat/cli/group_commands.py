@@ -197,7 +197,6 @@ def blocks_split(
 def blocks_join(
     folder: Annotated[Path, typer.Argument(help="folder that `hilsplat blocks split` wrote")],
     results: Results = Path("results"),
-    cache: Annotated[Path, typer.Option(help="cache folder of text vectors")] = DEFAULT_CACHE,
 ) -> None:
     """Join the finished blocks of a scene to a scene that accepts queries, in RESULTS/joined."""
     from hilsplat.base.lineage import read_provenance
@@ -213,7 +212,8 @@ def blocks_join(
     joined(folder, scene, [block.folder for block in finished], out / "semantic_tree")
     record = read_provenance(finished[0].folder / "default" / "names")
     queries = QuerySettings(**(record.settings["query"] if record else {}))
-    names(out / "semantic_tree", out / "clip", out / "names", queries, finished[0].evaluate_settings(), cache)
+    cache, evaluate = results / DEFAULT_CACHE.name, finished[0].evaluate_settings()
+    names(out / "semantic_tree", out / "clip", out / "names", queries, evaluate, cache)
     echo(
         f"joined {len(finished)} blocks:\n  hilsplat query joined/{name} TEXT\n  hilsplat view joined/{name}"
     )

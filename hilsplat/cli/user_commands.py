@@ -126,14 +126,11 @@ def scenes(
     pattern: Annotated[str, typer.Argument(help="scenes to list, such as 'photos/*'")] = "*",
     results: Results = Path("results"),
     out: Annotated[Path | None, typer.Option(help="CSV to write as well")] = None,
-    protocol: Annotated[
-        str, typer.Option(help="protocol of the IoU of the tree's answers; default: lerf/tree-nodes")
-    ] = "",
 ) -> None:
     """Print a table of all scenes: state, views, PSNR, IoU, size, date, models; the CSV has more columns."""
-    from hilsplat.evaluate.scenes import PROTOCOL, run_scenes
+    from hilsplat.evaluate.scenes import run_scenes
 
-    echo(run_scenes(results, pattern, out, protocol or PROTOCOL))
+    echo(run_scenes(results, pattern, out))
 
 
 @app.command()
@@ -282,7 +279,9 @@ def _export(
     return f"wrote {what} of {views} views to {out}"
 
 
-Port = Annotated[int, typer.Option(min=0, max=65535, help="port of the page; 0: any free port")]
+Port = Annotated[
+    int, typer.Option(min=0, max=65535, help="port of the page; 0: its own, or else any free port")
+]
 Browser = Annotated[bool, typer.Option(help="open the page in a browser")]
 
 

@@ -78,6 +78,10 @@ class ClipModel:
             self.tokenizer.no_padding()
         require_repeatable_once(model, self.text, "as exported", self._tokens("object, things, stuff"))
 
+    def __reduce__(self) -> tuple[type["ClipModel"], tuple[ModelFolder, str, str]]:
+        """Reopen the folder's networks in another process: sessions of onnxruntime cannot be pickled."""
+        return ClipModel, (self.model, self.template, self.device)
+
     @cached_property
     def vision(self) -> Network:
         """Vision network, opened on first use because it is large and not needed for texts."""

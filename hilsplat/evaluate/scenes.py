@@ -4,11 +4,11 @@ import logging
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError, nearest
+from hilsplat.base.errors import ArtifactError, HilsplatError, nearest
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.ownership import require_beginning
 from hilsplat.base.tables import aligned_table, write_csv
-from hilsplat.evaluate.protocols.cards import BY_NAME, card_of
+from hilsplat.evaluate.protocols.cards import card_of
 from hilsplat.evaluate.scores import read_scores
 from hilsplat.evaluate.tables.means import metric_means
 from hilsplat.query.scene_state import SceneState
@@ -29,24 +29,18 @@ SHOWN = ("scene", "state", "views", "PSNR", "mIoU", "MB", "date", "models")
 WORDS = ("scene", "state", "date", "models")
 
 PROTOCOL = "lerf/tree-nodes"
-"""Default protocol of the scores: the tree's answers in views, against regions annotated with a text."""
+"""Protocol of the scores: the tree's answers in views, against regions annotated with a text."""
 
 
-def run_scenes(results: Path, pattern: str, out: Path | None, protocol: str = PROTOCOL) -> str:
+def run_scenes(results: Path, pattern: str, out: Path | None) -> str:
     """Return a table of the scenes that match a pattern, and write all columns to `out` as CSV, if given.
 
     Cells of what a scene's run has not computed, such as scores without labels, are empty, as are those of
     a scene with a damaged artifact, which a warning names.
 
-    Args:
-        protocol: name of the protocol whose mean IoU of the tree's answers is shown.
-
     Raises:
         ArtifactError: no scene matches, or `out` is another file.
-        SettingsError: the protocol is unknown.
     """
-    if protocol not in BY_NAME:
-        raise SettingsError(f"protocol {protocol!r} is unknown", expected=nearest(protocol, list(BY_NAME)))
     names = scenes_in(results)
     chosen = [name for name in names if any(fnmatchcase(each, pattern) for each in (name, Path(name).name))]
     if not chosen:
@@ -55,23 +49,21 @@ def run_scenes(results: Path, pattern: str, out: Path | None, protocol: str = PR
             expected=nearest(pattern, names) if names else None,
             fix="correct the name, or specify the results folder" if names else "run a scene: hilsplat run",
         )
-    lines, rows = scene_lines(results, chosen, protocol)
+    lines, rows = scene_lines(results, chosen)
     if out is not None:
         require_beginning(out, ",".join(COLUMNS))
         write_csv(out, COLUMNS, rows)
     return "\n".join(lines)
 
 
-def scene_lines(
-    results: Path, names: list[str], protocol: str = PROTOCOL
-) -> tuple[list[str], list[list[object]]]:
+def scene_lines(results: Path, names: list[str]) -> tuple[list[str], list[list[object]]]:
     """Return the lines of a table of scenes, and the rows of its CSV."""
     rows: list[list[object]] = []
     shown: list[tuple[object, ...]] = [SHOWN]
     for name in names:
         try:
             scene = SceneState.read(results / name)
-            iou = _tree_iou(results / name / "default/scores.csv", protocol)
+            iou = _tree_iou(results / name / "default/scores.csv")
         except HilsplatError as error:
             logger.warning("%s: %s", name, error)
             rows.append([name, "damaged", *[""] * (len(COLUMNS) - 2)])
@@ -88,11 +80,11 @@ def scene_lines(
     return aligned_table(shown, WORDS), rows
 
 
-def _tree_iou(scores: Path, protocol: str) -> str:
-    """Return the mean IoU of the tree under the protocol and data set with the most labelled queries."""
+def _tree_iou(scores: Path) -> str:
+    """Return the mean IoU of the tree under `PROTOCOL`, for the data set with the most labelled queries."""
     table = read_scores([scores] if scores.is_file() else [])
     is_shown = (table["method"] == "tree") & (table["metric"] == "iou")
-    is_of_protocol = table["protocol"].str.split("@").str[0] == BY_NAME[protocol].name
+    is_of_protocol = table["protocol"].str.split("@").str[0] == PROTOCOL
     groups = table[is_shown & is_of_protocol].groupby(["dataset", "protocol"])
     parts = [(name, part) for (_, name), part in groups]
     name, most = max(parts, key=lambda named: len(named[1]), default=("", table))

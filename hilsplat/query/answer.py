@@ -13,7 +13,7 @@ from hilsplat.base.levels import LEVELS, PATH_SEPARATOR, path_of
 from hilsplat.base.lineage import sha256_of_bytes
 from hilsplat.base.ownership import replaced_files
 from hilsplat.base.progress import track
-from hilsplat.base.tables import counted
+from hilsplat.base.tables import aligned_table, counted
 from hilsplat.query.hits import Hit, NodeGroup, doubts_of, label_comments
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.mask_files import mask_files
@@ -123,20 +123,15 @@ def report(
         other = "".join(f", or omit {name}" for name, value in given.items() if value is not None)
         return f"nothing in {searched} matches {text!r} at level {nodes.level.label}; try {levels}{other}"
     lengths = "metres" if scene.scene.unit == "metre" else "scene units"
-    width = max(len(hit.name or "?") for hit in hits)
-    lines = [
-        f"{counted(len(hits), 'answer')} to {text!r} in {searched}; lengths in {lengths}",
-        f"{'node':>5}  {'level':<8} {'score':>5}  {'position':<24} {'box size':<20} "
-        f"{'name':<{width}}  best views",
-    ]
+    words = "level", "position", "box size", "name", "best views"
+    rows = [("node", "level", "score", *words[1:])]
     for hit in hits:
         position = ", ".join(f"{value:.2f}" for value in hit.centroid)
         size = " x ".join(f"{side:.2f}" for side in hit.oriented_box.size)
-        views = ", ".join(hit.best_views)
-        lines.append(
-            f"{hit.node:>5}  {hit.level.label:<8} {hit.score:>5.2f}  {position:<24} {size:<20} "
-            f"{hit.name or '?':<{width}}  {views}"
-        )
+        own = str(hit.node), hit.level.label, f"{hit.score:.2f}", position, size, hit.name or "?"
+        rows.append((*own, ", ".join(hit.best_views)))
+    lines = [f"{counted(len(hits), 'answer')} to {text!r} in {searched}; lengths in {lengths}"]
+    lines += aligned_table(rows, words)
     if more := len(nodes.ids) - len(hits):
         lines.append(f"and {counted(more, 'weaker answer')}, also shown in the pictures")
     lines.append('a score of 0.5 means that the query fits no better than a generic word such as "object"')

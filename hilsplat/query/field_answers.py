@@ -39,7 +39,7 @@ class FieldAnswers:
             exact: whether a network decodes every pixel at every call. If not, it decodes each view once, and
                 results differ by at most 2e-3 (see `LatentRelevancy`). This has no effect for a linear code.
         """
-        height, width = self.views.size_hw(view)
+        height, width = self.views.camera(view).size_hw
         relevancy, levels = self._latent_relevancy, self.latents(view)
         vectors, prepared = self.clip.embed_texts(texts), None
         if isinstance(self.code, LinearCode) or not exact:
@@ -90,7 +90,8 @@ class FieldAnswers:
     def image(self, view: View, level: Level | str) -> UInt8[np.ndarray, "H W 3"]:
         """Render the field of a level as colours (see `field_colours`); uncovered pixels are black."""
         colours = field_colours(self.language.features[:, Level.of(level).index])
-        return to_uint8((self.views.view_weights(view) @ colours).reshape(*self.views.size_hw(view), 3))
+        size_hw = self.views.camera(view).size_hw
+        return to_uint8((self.views.view_weights(view) @ colours).reshape(*size_hw, 3))
 
     @cached_property
     def node_vectors(self) -> Float32[np.ndarray, "n C"]:

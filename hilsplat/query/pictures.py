@@ -1,6 +1,7 @@
 """Parts of figures: answer overlays, relevancy colours, and a top-down map of the scene."""
 
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -81,9 +82,10 @@ def show(axes: Axes, picture: UInt8[np.ndarray, "H W 3"], title: str = "", bold:
     axes.set_title(title, fontsize=8, pad=3, fontweight="bold" if bold else "normal", parse_math=False)
 
 
-def label_left(axes: Axes, text: str, level: Level | None = None) -> None:
-    """Write the name of a row of pictures along the left side of its first picture."""
-    axes.set_ylabel(f"{text}\n{level.label}" if level else text, fontsize=8, parse_math=False)
+def label_left(axes: Axes, text: str, level: Level | None = None, letters: int = 40) -> None:
+    """Write the name of a row of pictures along the left side of its first picture, `letters` to a line."""
+    lines = [*wrap(text, letters), *([level.label] if level else [])]
+    axes.set_ylabel("\n".join(lines), fontsize=8, parse_math=False)
 
 
 def show_from_above(

@@ -54,8 +54,8 @@ def query_panel(
     names = list(dict.fromkeys(scene.name_of(int(node)) or "?" for node in hits.ids))
     called = f" ({', '.join([*names[:NAMED], *(['…'] if names[NAMED:] else [])])})" if names else ""
     title = f"“{text}” in {scene.scene.name}: {count}{called}{note}"
-    caution = wrap(scene.caution_about(text), TITLE_LETTERS)
-    heading = [*wrap(title, TITLE_LETTERS), *caution, *map(str, doubts_of(hits))]
+    texts = [title, scene.caution_about(text), *map(str, doubts_of(hits))]
+    heading = [line for each in texts for line in wrap(each, TITLE_LETTERS)]
     height, width = scene.scene.cameras[views[0]].size_hw
     row_px = TITLE_PX + round(CELL_PX * height / width) + GAP_PX
     upper_px = HEADING_PX * len(heading) + GAP_PX + len(views) * row_px

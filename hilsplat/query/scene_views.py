@@ -48,6 +48,10 @@ class ViewStore:
         self._max_bytes = max_mib * 2**20
         self._values: dict[tuple[Any, ...], tuple[Any, int]] = {}
 
+    def __reduce__(self) -> tuple[type["ViewStore"], tuple[float]]:
+        """Start with an empty cache in another process."""
+        return ViewStore, (self._max_bytes / 2**20,)
+
     def get(self, key: tuple[Any, ...], compute: Callable[[], Any]) -> Any:
         """Return the cached value, or compute and cache it; the second item of a key is the view."""
         # Single operations on a dict are atomic, so several threads may read a scene.
@@ -104,17 +108,13 @@ class SceneViews:
             )
         return self.scene.cameras[view]
 
-    def size_hw(self, view: View) -> tuple[int, int]:
-        """Return the image size of a view; errors as in `camera`."""
-        return self.camera(view).size_hw
-
     def cached(self, kind: str, view: View, compute: Callable[[], Any], *more: Any) -> Any:
         """Return the cached result for a view of the scene; those of other cameras aren't cached."""
         return self.cache.get((kind, view, *more), compute) if isinstance(view, str) else compute()
 
     def image(self, view: str) -> UInt8[np.ndarray, "H W 3"]:
         """Return a view's undistorted photograph, a cached read-only array: copy it to change pixels."""
-        self.size_hw(view)
+        self.camera(view)
 
         def read() -> np.ndarray:
             pixels = self.scene.image(view)
@@ -142,7 +142,7 @@ class SceneViews:
 
     def visible_nodes(self, view: str) -> Bool[np.ndarray, " n"]:
         """Return whether each node's mask covers at least `MIN_VISIBLE_SHARE` of a view."""
-        height, width = self.size_hw(view)
+        height, width = self.camera(view).size_hw
 
         def measure() -> np.ndarray:
             num = len(self.tree)
@@ -161,7 +161,7 @@ class SceneViews:
 
     def existing_pixels(self, view: View, pixels: Any) -> Int64[np.ndarray, " P"]:
         """Return pixels (row * width + column) as an array; raise SettingsError if one does not exist."""
-        return _within(pixels, math.prod(self.size_hw(view)), f"pixel of {view}:")
+        return _within(pixels, math.prod(self.camera(view).size_hw), f"pixel of {view}:")
 
     @property
     def loose(self) -> Bool[np.ndarray, " N"]:
@@ -174,7 +174,7 @@ class SceneViews:
         Errors are those of `camera` and `existing`.
         """
         ids = self.existing(ids)
-        size_hw = self.size_hw(view)
+        size_hw = self.camera(view).size_hw
         if not len(ids):
             return np.zeros(size_hw, np.bool_)
         levels = np.unique(self.tree.level[ids])
@@ -192,7 +192,7 @@ class SceneViews:
         pixels get the covered pixels' lowest value, so that they are never selected and do not extend the
         range.
         """
-        height, width = self.size_hw(view)
+        height, width = self.camera(view).size_hw
         maps = np.zeros((len(scores), len(LEVELS), height * width), np.float32)
         for level in LEVELS:
             nodes = self.tree.nodes_of(level)

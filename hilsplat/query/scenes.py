@@ -15,7 +15,7 @@ from jaxtyping import Float32
 from hilsplat.base.artifacts import read_index, run_command
 from hilsplat.base.errors import ArtifactError, HilsplatError, first_line, nearest
 from hilsplat.base.levels import Level
-from hilsplat.base.tables import counted
+from hilsplat.base.tables import aligned_table, counted
 from hilsplat.embed.clip import ClipModel, open_clip_of
 from hilsplat.query.hits import Doubt, checked_count, doubts_of
 from hilsplat.query.names import NodeNames, read_names
@@ -60,6 +60,10 @@ class SceneHit:
     doubts: tuple[Doubt, ...]
     caution: str
 
+    def __repr__(self) -> str:
+        answer = f"{self.node}, {self.level.label}, {self.name!r}, score {self.score:.2f}"
+        return f"SceneHit({self.scene}: {answer})"
+
     def as_json(self) -> dict[str, Any]:
         """Return the fields as JSON values."""
         plain = {"folder": str(self.folder), "picture": str(self.picture), "level": self.level.label}
@@ -95,9 +99,9 @@ class FoundScene:
     """A finished scene whose index matches its artifacts; the index is read at each query."""
 
     name: str
-    finished: FinishedScene
-    clip: ClipModel
-    settings: EvaluateSettings
+    finished: FinishedScene = field(repr=False)
+    clip: ClipModel = field(repr=False)
+    settings: EvaluateSettings = field(repr=False)
 
     @property
     def index(self) -> Path:
@@ -129,6 +133,9 @@ class Scenes:
 
     found: tuple[FoundScene, ...]
     skipped: dict[str, str]
+
+    def __repr__(self) -> str:
+        return f"Scenes({len(self.found)} found, {len(self.skipped)} skipped)"
 
     def query(
         self,
@@ -253,16 +260,12 @@ def report_of(scenes: Scenes, text: str, hits: Sequence[SceneHit]) -> str:
     asked = counted(len(scenes.found), "scene")
     lines = [f"{counted(len(hits), 'answer')} to {text!r} in {asked}"]
     if hits:
-        names = max(len(hit.name or "?") for hit in hits)
-        width = max(len(hit.scene) for hit in hits)
-        lines.append(
-            f"{'score':>5}  {'scene':<{width}}  {'node':>5}  {'level':<8} {'name':<{names}}  picture"
-        )
-        lines += [
-            f"{hit.score:>5.2f}  {hit.scene:<{width}}  {hit.node:>5}  {hit.level.label:<8} "
-            f"{hit.name or '?':<{names}}  {_shown(hit.picture)}"
+        columns = "score", "scene", "node", "level", "name", "picture"
+        rows = [
+            (f"{hit.score:.2f}", hit.scene, hit.node, hit.level.label, hit.name or "?", _shown(hit.picture))
             for hit in hits
         ]
+        lines += aligned_table([columns, *rows], {"scene", "level", "name", "picture"})
         variant = scenes.found[0].finished.variant
         of_variant = [] if variant == "default" else ["--variant", variant]
         command = shlex.join(["hilsplat", "query", _shown(hits[0].folder), text, *of_variant])

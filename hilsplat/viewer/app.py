@@ -4,7 +4,7 @@ import base64
 import io
 import secrets
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -29,10 +29,11 @@ from hilsplat.web.guard import Guard
 from hilsplat.web.messages import MAX_SIDE_PX
 from hilsplat.web.scene_thread import SceneThread
 from hilsplat.web.server import (
-    Pages,
+    Ready,
     answer,
     configured,
     encoded,
+    files_of,
     guarded,
     listening_at,
     plain,
@@ -52,13 +53,13 @@ class Viewer:
 
     def __init__(self, shown: ViewerScene, *, others: bool = True) -> None:
         self.thread = SceneThread(shown, shown.beside if others else None)
-        self.pages = Pages("index.html", "hilsplat.viewer")
+        self.static, self.files = files_of("index.html", "hilsplat.viewer")
 
     def app(self, token: str, *, embedded: bool = False) -> Guard:
         """Return the guarded application, for a standalone page or a frame in another page."""
         get, post = self.thread.get, self.thread.post
         routes = [
-            *self.pages.routes(),
+            *self.files,
             *self.thread.routes(),
             get("/api/scenes", _scenes),
             get("/api/variant/{variant}", _variant),
@@ -74,7 +75,7 @@ class Viewer:
             post("/api/frame", wire.Frame, _frame),
             post("/api/path", wire.Film, _path),
             Route("/api/names", self._names, methods=["PUT"]),
-            *SavedFiles(self.thread, self.pages.static).routes(),
+            *SavedFiles(self.thread, self.static).routes(),
         ]
         routes.append(Route("/openapi.json", lambda request: answer(description(routes))))
         return guarded(routes, token, wire.MAX_BODY_BYTES, embedded=embedded)
@@ -161,7 +162,7 @@ def _members(shown: ViewerScene, asked: wire.Members) -> bytes:
     """Return one bit for each Gaussian: whether it belongs to one of the nodes, or to none."""
     scene = shown.answering(asked.variant)
     members = scene.views.loose if asked.loose else np.zeros(len(shown.gaussians), np.bool_)
-    members[scene.views.gaussians_of([scene.existing_node(node) for node in asked.nodes])] = True
+    members[scene.views.gaussians_of(asked.nodes)] = True
     return shown.bits_of(members)
 
 
@@ -194,15 +195,14 @@ def _picture(text: str) -> np.ndarray:
         raise SettingsError("the picture cannot be read", expected=expected) from error
 
 
-def run_view(
-    folder: Path, *, variant: str, port: int, browser: bool, threads: int, on_ready: Callable[[str], None]
-) -> None:
+def run_view(folder: Path, *, variant: str, port: int, browser: bool, threads: int, on_ready: Ready) -> None:
     """Serve the page of a scene until Ctrl-C; for arguments and errors, see `ViewerScene` and `serve`."""
     shown = ViewerScene(folder, variant, threads)
     viewer = Viewer(shown)
     viewer.thread.worker.submit(shown.warm_up).result()
     about = f"{shown.scene.name}: {len(shown.gaussians)} Gaussians"
-    serve(viewer.app, about, port=port, browser=browser, on_ready=on_ready)
+    page = f"view {shown.results.resolve()}"  # which also opens the other scenes of the folder
+    serve(viewer.app, about, page=page, port=port, browser=browser, on_ready=on_ready)
 
 
 class EmbeddedViewer:

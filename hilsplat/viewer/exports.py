@@ -3,6 +3,7 @@
 import io
 import zipfile
 from collections.abc import Generator, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -23,7 +24,7 @@ from hilsplat.viewer.wire import Film
 STEP = {"mp4": 1, "gif": 2}
 """Frame step of each format. GIFs use every second frame; with all frames, they are far larger than MP4s."""
 
-Steps = Generator[tuple[int, int], None, bytes]
+Steps = Generator[tuple[int, int], None, bytes | partial[bytes]]
 """Generator that creates a file: it yields (steps done, total), starting at 0, and returns the file."""
 
 

@@ -6,6 +6,8 @@ The file is the viewer page: its scripts are data URLs in an import map, with `o
 
 import base64
 import re
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from hilsplat.base.images import resize_to_fit
@@ -59,6 +61,11 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
         with shown.unchanged():
             described["crops"][node] = _text(encoded(crop(scene, node)))
         yield done, len(nodes)
+    packed = payload.packed_nodes(scene.tree, rows)
+    return partial(_assembled, described, partial(shown.spz, rows), packed, static)
+
+
+def _assembled(data: Any, splats: Callable[[], bytes], nodes: bytes, static: Mapping[str, bytes]) -> bytes:
     # Data URLs have no relative paths, so the scripts import each other by name.
     scripts = {
         name: re.sub(r'from "\./', 'from "hilsplat/', text.decode())
@@ -72,12 +79,12 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
         for name, text in scripts.items()
     }
     parts = {
-        "data": as_json(described).decode(),
+        "data": as_json(data).decode(),
         "sorter": sorter,
-        "splats": _text(shown.spz(rows)),
-        "nodes": _text(payload.packed_nodes(scene.tree, rows)),
+        "splats": _text(splats()),
+        "nodes": _text(nodes),
     }
-    data = "\n".join(
+    embedded = "\n".join(
         f'<script type="text/plain" id="{name}">{_inert(text)}</script>' for name, text in parts.items()
     )
     page = static["index.html"].decode()
@@ -88,7 +95,7 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
     )
     page = re.sub(r'<link rel="stylesheet"[^>]*>', lambda _: head, page)
     page = re.sub(r'<script type="module"[^>]*></script>\n', "", page)
-    last = f'{data}\n<script type="module">import "hilsplat/main.js";</script>\n</body>'
+    last = f'{embedded}\n<script type="module">import "hilsplat/main.js";</script>\n</body>'
     return page.replace("</body>", last).encode()
 
 

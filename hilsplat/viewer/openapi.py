@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 from pydantic import TypeAdapter
@@ -10,9 +11,10 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from hilsplat.viewer.payload import Answer
+from hilsplat.web.server import BYTES
 
 JSON = "application/json"
-CONTENT = {bytes: "application/octet-stream", Response: "image/jpeg"}
+CONTENT = {bytes: BYTES, partial[bytes]: BYTES, Response: "image/jpeg"}
 """Content type of each type that a request's function returns; other types are sent as JSON."""
 
 

@@ -62,11 +62,7 @@ def described_scene(scene: Scene, gaussians: Gaussians) -> dict[str, Any]:
         "focus": focus.tolist(),
         "reach": float(np.linalg.norm(centres - focus, axis=1).mean()),
         "views": [
-            {
-                "name": name,
-                "split": scene.split[name],
-                **described_camera(cameras[name]),
-            }
+            {"name": name, "split": scene.split[name], **described_camera(cameras[name])}
             for name in cameras.names
         ],
     }

@@ -73,7 +73,7 @@ class SavedFiles:
     async def _stepped(
         self, steps: exports.Steps, first: tuple[int, int], worker: ThreadPoolExecutor | None
     ) -> AsyncIterator[bytes]:
-        result: tuple[int, int] | bytes = first
+        result = first
         while isinstance(result, tuple):
             yield _line(made=result[0], of=result[1])
             try:
@@ -98,10 +98,10 @@ def _ply(shown: ViewerScene, asked: wire.Edited) -> bytes:
         return out.read_bytes()
 
 
-def _spz(shown: ViewerScene, asked: wire.Edited) -> bytes:
+def _spz(shown: ViewerScene, asked: wire.Edited) -> partial[bytes]:
     """Return the scene, or nodes, without removed Gaussians as SPZ."""
     rows, _ = _rows(shown, asked)
-    return shown.spz(rows[morton_order(shown.gaussians.means[rows])])
+    return partial(shown.spz, rows[morton_order(shown.gaussians.means[rows])])
 
 
 def _boxes(shown: ViewerScene, asked: wire.Selection) -> dict[str, Any]:
@@ -143,13 +143,12 @@ def _selected(shown: ViewerScene, asked: wire.Selection) -> tuple[LanguageScene,
     return scene, [group.group() for group in asked.groups]
 
 
-def _step(steps: exports.Steps) -> tuple[int, int] | bytes:
-    """Run the next step; return the progress, or the finished file."""
+def _step(steps: exports.Steps) -> Any:
+    """Run the next step; return the progress, or the finished file (`SceneThread.run`)."""
     try:
         return next(steps)
     except StopIteration as finished:
-        file: bytes = finished.value
-        return file
+        return finished.value
 
 
 def _line(**values: int | str) -> bytes:

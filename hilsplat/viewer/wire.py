@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import UInt8
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import MAX_TEXT
@@ -42,23 +42,8 @@ class WireCamera(Message):
     K: tuple[Row3, Row3, Row3]
     size_hw: tuple[Annotated[int, Field(ge=1, le=MAX_SIDE_PX)], Annotated[int, Field(ge=1, le=MAX_SIDE_PX)]]
 
-    @field_validator("cam_from_world")
-    @classmethod
-    def _rotation(cls, value: tuple[Row4, ...]) -> tuple[Row4, ...]:
-        rotation = np.array(value)[:3, :3]
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
-            raise ValueError("the upper-left 3 x 3 block of cam_from_world is not a rotation")
-        return value
-
-    @field_validator("K")
-    @classmethod
-    def _focal(cls, value: tuple[Row3, ...]) -> tuple[Row3, ...]:
-        if value[0][0] <= 0 or value[1][1] <= 0:
-            raise ValueError("a focal length is not positive")
-        return value
-
     def camera(self) -> Camera:
-        """Return the camera as the package's type."""
+        """Return the camera as the package's type; raise SceneError if it is impossible."""
         return Camera("page", np.array(self.cam_from_world), np.array(self.K), self.size_hw)
 
 
@@ -80,12 +65,6 @@ class Style(Message):
     text: str = ""
     level: LevelName = "auto"
     marked: Bits = ""
-
-    @model_validator(mode="after")
-    def _ramp_has_text(self) -> "Style":
-        if self.ramp and not self.text:
-            raise ValueError("colouring by relevancy requires a text, but the text is empty")
-        return self
 
 
 def rows_of(text: str, width: int, count: int) -> UInt8[np.ndarray, "count width"]:

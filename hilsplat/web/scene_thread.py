@@ -2,6 +2,7 @@
 
 The caches of an opened scene are not thread-safe, so all code that uses them runs on one worker. Its loops
 release the GIL, so the server stays responsive. The annotator's proposals have their own worker and caches.
+Slow work that only needs arrays is returned as a `partial`, and then runs on another thread.
 """
 
 import asyncio
@@ -182,8 +183,12 @@ class SceneThread(Generic[Shown]):
         return await self.run(run, worker)
 
     async def run(self, work: Callable[[], Result], worker: ThreadPoolExecutor | None = None) -> Result:
-        """Run `work` on the scene thread (or `worker`), regardless of the scene's state."""
-        return await asyncio.get_running_loop().run_in_executor(worker or self.worker, work)
+        """Run `work` on the scene thread (or `worker`), regardless of the scene's state.
+
+        If the result is a `partial`, run it on another thread, and return its result.
+        """
+        result = await asyncio.get_running_loop().run_in_executor(worker or self.worker, work)
+        return await asyncio.to_thread(result) if isinstance(result, partial) else result
 
     def _shown(self, request: Request) -> Shown:
         """Return the scene that a request names; raise SettingsError if there is no such scene."""

@@ -4,6 +4,7 @@ import json
 import secrets
 import socket
 import webbrowser
+import zlib
 from collections.abc import Callable
 from importlib.resources import files
 from typing import Any, TypeVar
@@ -33,26 +34,27 @@ STATUS: dict[type, int] = {
 }
 """HTTP status of each error that is sent to the page."""
 
+OWN_PORTS = range(20_000, 30_000)
+"""Ports of pages, below those that Linux and macOS assign to other programs."""
+
+Ready = Callable[[str], None]
+"""Called once a page can be opened, with the text to print, which contains the address."""
+
 Sent = TypeVar("Sent", bound=BaseModel)
 
 
-class Pages:
-    """A page's HTML file, and the static files of its package and of `hilsplat.web`."""
+def files_of(page: str, package: str) -> tuple[dict[str, bytes], list[Route]]:
+    """Return the static files of a page's package and of `hilsplat.web` by name, and routes to them."""
+    paths = [*(files("hilsplat.web") / "static").iterdir(), *(files(package) / "static").iterdir()]
+    static = {path.name: path.read_bytes() for path in paths if path.name.endswith(tuple(TYPES))}
 
-    def __init__(self, page: str, package: str) -> None:
-        paths = [*(files("hilsplat.web") / "static").iterdir(), *(files(package) / "static").iterdir()]
-        self.first = page
-        self.static = {path.name: path.read_bytes() for path in paths if path.name.endswith(tuple(TYPES))}
-
-    def routes(self) -> list[Route]:
-        """Return the routes of the page and its files."""
-        return [Route("/", self._file), Route("/static/{name}", self._file)]
-
-    async def _file(self, request: Request) -> Response:
-        name = request.path_params.get("name", self.first)
-        if name not in self.static:
+    async def send(request: Request) -> Response:
+        name = request.path_params.get("name", page)
+        if name not in static:
             return plain(b"no such file", "text/plain", 404)
-        return plain(self.static[name], TYPES[name.rpartition(".")[2]])
+        return plain(static[name], TYPES[name.rpartition(".")[2]])
+
+    return static, [Route("/", send), Route("/static/{name}", send)]
 
 
 def guarded(routes: list[Route], token: str, max_body: int, *, embedded: bool = False) -> Guard:
@@ -140,17 +142,24 @@ def configured(app: Guard) -> uvicorn.Config:
 
 
 def serve(
-    app: Callable[[str], Guard], about: str, *, port: int, browser: bool, on_ready: Callable[[str], None]
+    app: Callable[[str], Guard], about: str, *, page: str, port: int, browser: bool, on_ready: Ready
 ) -> None:
-    """Serve an application on this machine until Ctrl-C; for `port` and errors, see `listening_at`.
+    """Serve an application on this machine until Ctrl-C; for errors, see `listening_at`.
 
     Args:
         app: creates the application from its access token.
         about: description of the page for the printed line.
+        page: identifies the page among those of this user.
+        port: 0 uses the page's own port, or any free port if that is taken.
         browser: whether to open the page in a browser.
-        on_ready: called once the page can be opened, with the text to print, which contains the address.
     """
-    token, listening = secrets.token_urlsafe(24), listening_at(port)
+    try:  # what a browser keeps for a page, such as removed Gaussians, belongs to the port
+        listening = listening_at(port or OWN_PORTS[zlib.crc32(page.encode()) % len(OWN_PORTS)])
+    except SettingsError:
+        if port:
+            raise
+        listening = listening_at(0)
+    token = secrets.token_urlsafe(24)
     address = f"http://127.0.0.1:{listening.getsockname()[1]}/?token={token}"
     config = configured(app(token))
     on_ready(f"{about} at {address}\nPress Ctrl-C to stop")

@@ -297,7 +297,7 @@ def served(opened_here) -> Callable:
 
 
 @pytest.fixture
-def annotating(opened_here, tmp_path) -> Callable:
+def annotating(tmp_path, opened_here) -> Callable:
     """A function that opens the annotator of a scene, whose files are in `tmp_path`."""
     labels = tmp_path / "annotated/photos/desk"
     return lambda folder, **more: opened_here(

@@ -444,13 +444,23 @@ def test_a_text_is_undone_once_it_is_saved_and_not_replaced_by_a_late_reply(page
     assert texts(tmp_path, "001.png") == ["mug"]
 
 
-def test_the_page_explains_the_first_steps_and_a_missing_sam(page):
+def test_a_message_stays_until_it_no_longer_applies_and_a_menu_until_something_else_is_done(page):
     assert "First annotation: 1. type what you see" in page.get_by_role("status").text_content()
     page.press("s")
     page.get_by_text("made by a SAM that is installed here").wait_for()
     page.press("?")
     assert page.evaluate("document.activeElement.id") == "help-title"
     page.keyboard.press("Escape")
+    page.press("e")
+    click(page, (30, 10))
+    page.get_by_text("Select the thing to erase from").wait_for()
+    draw_mug(page)
+    assert not page.get_by_role("status").text_content()
+    for close in (lambda: page.keyboard.press("Escape"), lambda: click(page, (2, 22))):
+        page.get_by_text("Files", exact=True).click()
+        page.get_by_role("button", name="Import").wait_for()
+        close()
+        page.get_by_role("button", name="Import").wait_for(state="hidden")
     assert page.phone_fits() and not page.locator("#segment-label").is_visible()
 
 

@@ -139,17 +139,17 @@ def test_a_name_given_in_one_tab_appears_in_another(served, own_desk):
     other.close()
 
 
-def test_a_stopped_server_is_reported_until_it_is_started_again(opened, desk):
+def test_a_stopped_server_is_reported_until_it_is_started_again_at_its_own_port(opened, own_desk):
     opened.expected += ["ERR_CONNECTION_REFUSED", "403"]
-    with serving(desk) as address:
+    with serving(own_desk) as address:
         page = opened(address, "server")
         port = re.search(r":(\d+)/", address).group(1)
     page.press("ArrowLeft")
     page.ask("mug > handle")
     notice = page.get_by_role("alert").filter(has_text="The server has stopped")
     notice.wait_for()
-    assert f"hilsplat view {desk} --port {port}" in notice.text_content()
-    with serving(desk, "view", "--port", port) as address:
+    assert f"hilsplat view {own_desk} --port {port}" in notice.text_content()
+    with serving(own_desk) as address:
         page.drawn(lambda: page.context.new_page().goto(address))  # the picture that could not be rendered
         notice.wait_for(state="hidden")
         page.ask_and_wait("mug > handle")
@@ -301,7 +301,8 @@ def test_an_exported_page_opens_from_a_file_with_its_answers(opened, browser, de
     alone.get_by_text("This page contains only the answers to: book, mug > handle").wait_for()
     assert [chip.inner_text().split("\n")[0] for chip in alone.chips().all()] == ["book"]
     assert alone.locator("#overlay path.kept").count() == 1
-    assert not wrong
+    alone.locator("#save summary").click()
+    assert alone.locator("#save > div").inner_text().startswith("Picture, PNG") and not wrong
     context.close()
 
 

@@ -1,12 +1,9 @@
 """Camera, history, pending pictures and refused queries of the viewer."""
 
-import shutil
 from urllib.parse import quote_plus
 
 import numpy as np
 import pytest
-
-from tests.unit.finished_desk import SCENE
 
 
 def distance(page) -> float:
@@ -93,12 +90,8 @@ def test_a_threshold_cuts_the_colours_and_counts_the_gaussians_above(opened, des
     page.until(lambda: "least=0.9" in page.url)
 
 
-def test_another_scene_opens_on_the_same_server(desk_project, tmp_path, served):
-    shutil.copytree(desk_project / "models", tmp_path / "models")
-    for name in ("desk", "other"):
-        shutil.copytree(desk_project / SCENE, tmp_path / "results/photos" / name)
-    shutil.copytree(desk_project / SCENE / "scene", tmp_path / "results/photos/posed/scene")
-    page = served(tmp_path / "results/photos/desk")
+def test_another_scene_opens_on_the_same_server(three_scenes, served):
+    page = served(three_scenes / "photos/desk")
     page.get_by_text("Scenes", exact=True).click()
     scenes = page.locator("#scene-list li")
     scenes.nth(2).wait_for()

@@ -3,6 +3,7 @@
 import logging
 import math
 import os
+import pickle
 import shutil
 import subprocess
 import sys
@@ -279,10 +280,10 @@ def test_a_script_without_a_guard_is_not_run_again_by_child_processes(desk, tmp_
     assert read_provenance(tmp_path / "kept/scene").command == ()  # not that of the script
 
 
-def test_arrays_and_arguments_that_do_not_fit_are_refused(scene, masks, linked):
+def test_arrays_and_arguments_that_do_not_fit_are_refused(desk, scene, masks, linked):
     """Compiled loops would read beyond the end of a short array, and indices wrap around."""
     gaussians, camera = linked.gaussians, linked.camera("000.png")
-    red = np.zeros((4, 6, 3), np.uint8)
+    red, field = np.zeros((4, 6, 3), np.uint8), hilsplat.open_scene(desk).field
     count, pixels = len(gaussians), math.prod(camera.size_hw)
     calls = {
         r"array quats (.|\n)*of shape \(9, 4\)": lambda: replace(gaussians, quats=gaussians.quats[:9]),
@@ -325,29 +326,17 @@ def test_arrays_and_arguments_that_do_not_fit_are_refused(scene, masks, linked):
         "no Gaussians": lambda: hilsplat.link(
             scene, hilsplat.Gaussians(*(array[:0] for array in vars(gaussians).values())), masks
         ),
+        "level 'piece' is unknown": lambda: field.gaussian_relevancy("mug", "piece"),
+        "level 'bit' is unknown": lambda: field.image("000.png", "bit"),
+        r"\[3, 1\] does not exist": lambda: field.cosine(["mug"], camera, np.array([[3, 1]])),
+        "-7 does not exist": lambda: field.cosine(["mug"], "000.png", np.array([-7])),
+        "'book' is not a list": lambda: field.relevancy("book", "000.png"),
+        "'rim' is not a list": lambda: field.cosine("rim", "000.png", np.array([0])),
         "not a colour": lambda: hilsplat.render(gaussians, camera, background=(0, 0, 0, 1)),
     }
     for message, call in calls.items():
         with pytest.raises(HilsplatError, match=message):
             call()
-
-
-def test_the_field_refuses_pixels_outside_the_view_and_a_text_that_is_no_list(desk):
-    scene = hilsplat.open_scene(desk)
-    field, camera = scene.field, scene.camera("000.png")
-    np.testing.assert_array_equal(field.relevancy(["mug"], camera), field.relevancy(["mug"], "000.png"))
-    with pytest.raises(SettingsError, match="level 'piece' is unknown"):
-        field.gaussian_relevancy("mug", "piece")
-    with pytest.raises(SettingsError, match=r"\[3, 1\] does not exist"):
-        field.cosine(["mug"], camera, np.array([[3, 1]]))
-    np.testing.assert_array_equal(field.image("000.png", "part"), field.image("000.png", hilsplat.Level.PART))
-    with pytest.raises(SettingsError, match="level 'piece' is unknown"):
-        field.image("000.png", "piece")
-    with pytest.raises(SettingsError, match="-1 does not exist"):
-        field.cosine(["mug"], "000.png", np.array([-1]))
-    for call in (field.relevancy, lambda text, view: field.cosine(text, view, np.array([0]))):
-        with pytest.raises(SettingsError, match="'mug' is not a list"):
-            call("mug", "000.png")
 
 
 def test_a_changed_camera_changes_no_other(scene):
@@ -381,12 +370,25 @@ def test_opened_scenes_do_not_follow_the_working_folder(desk_project, tmp_path, 
     assert opened.query("mug")[0].mask("000.png").any()
 
 
-def test_levels_are_found_by_number_and_label(masks, linked):
+def test_a_scene_can_be_sent_to_another_process_without_its_cache(desk):
+    scene = hilsplat.open_scene(desk)
+    size, hits = len(pickle.dumps(scene)), scene.query("mug > handle", answerer="field", view="000.png")
+    mask = hits[0].mask("000.png")
+    sent = pickle.loads(pickle.dumps(scene))
+    found = sent.query("mug > handle", answerer="field", view="000.png")
+    assert found == hits and sent.like_picture(sent.views.image("000.png"))
+    np.testing.assert_array_equal(found[0].mask("000.png"), mask)
+    assert len(pickle.dumps(scene)) < 1.1 * size
+
+
+def test_levels_are_found_by_number_and_label(desk, masks, linked):
+    field = hilsplat.open_scene(desk).field
     for level in hilsplat.Level:
         expected = masks["000.png"].label_map(level)
         for same in (int(level), level.label):
             np.testing.assert_array_equal(masks["000.png"].label_map(same), expected)
             assert linked.query("mug", level=same) == linked.query("mug", level=level)
+            np.testing.assert_array_equal(field.image("000.png", same), field.image("000.png", level))
 
 
 def test_threads_may_read_one_scene():

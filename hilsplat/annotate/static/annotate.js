@@ -1,7 +1,7 @@
 // The annotation page; the server computes all regions.
 
 import { ask, exportUrl, scene as described, tellUnsaved, watch } from "./api.js";
-import { $, counted, LEVELS, make } from "./elements.js";
+import { $, attachMenu, counted, LEVELS, make } from "./elements.js";
 import { attachHands } from "./hands.js";
 import { Sheet } from "./sheet.js";
 import { Store } from "./store.js";
@@ -259,7 +259,6 @@ function accept() {
 
 function step(way) {
   if (way === "undo" && draft.length) { draft = draft.slice(0, -1); draw(); return; }
-  tell("");   // the last message no longer applies
   const before = store[way === "undo" ? "past" : "future"].at(-1)?.before ?? [];
   store[way]();
   if (before.length && !before.some(([view]) => view === number)) stand(before[0][0]);
@@ -353,6 +352,7 @@ function grabbed(event) {
 
 attachHands(sheet, { drawing: (event) => tool() !== "choose" || grabbed(event), down, drag, up, cancel, close: closePolygon, hover: (at) => { cross = at; draw(); } });
 attachThings(choose);
+attachMenu($("save"));
 
 function escape() {
   if (draft.length) draft = [];

@@ -83,6 +83,7 @@ export class Store {
 
   // Return a history entry: the previous labels, and the photographs whose change the server has not accepted yet.
   swap(after) {
+    this.handlers.told("");   // the last message no longer applies
     const before = after.map(([number]) => [number, this.labels(number)]);
     for (const [number, labels] of after) { this.views[number].labels = labels; this.save(number); }
     this.handlers.changed();

@@ -90,8 +90,8 @@ def run_comparison(
 
     Args:
         folder: `results/<dataset>/<scene>`, in which every variant is finished.
-        variants: variants to compare, each under its own evaluation settings. "default" has rows for
-            its tree and its field, other variants only for the field.
+        variants: variants to compare, each under its own evaluation settings, whose `methods` decide
+            whether its tree, its field or both are shown.
         names: variant -> its name in tables.
         out: WebP of the comparison; `views.webp` and `features.webp` are written beside it.
         evaluate: settings for ground-truth regions and for converting maps to masks.
@@ -116,7 +116,7 @@ def run_comparison(
         columns = []
         for variant in track(list(variants), "variants compared"):  # one in memory at a time
             answers = open_variant(folder, variant, opened, threads)
-            for method in ("tree", "field") if variant == "default" else ("field",):
+            for method in [each for each in ("tree", "field") if each in answers.settings.methods]:
                 one = Answerer(row_name(variant, method, names), method, answers)
                 shown = one.masks(rows, evaluate), one.masks(several, evaluate), one.features(view)
                 columns.append(Column(one.title, *shown))
@@ -173,7 +173,7 @@ def draw_methods(
         query = f"“{row.text}” ({row.level.label})\n" if many and row.level else ""
         show(axes[0], paint_answer(photograph, None, row.truth), query + row.title)
         if not many:
-            label_left(axes[0], row.text, row.level)
+            label_left(axes[0], row.text, row.level, letters=24)
         for place, column in zip(axes[1:], columns, strict=True):
             mask = column.answers[number]
             score = row.score(mask)

@@ -215,7 +215,7 @@ def draw_queries(
             pictures.append(("tree, path", row.tree_mask(answers, by_path=True)))
         pictures.append(("field", field_mask))
         show(axes[0], paint_answer(image, None, row.truth), row.title)
-        label_left(axes[0], "\n".join(textwrap.wrap(row.text, 20)), level)
+        label_left(axes[0], row.text, level, letters=20)
         for place, (name, mask) in zip(axes[1:], pictures, strict=False):
             score = row.score(mask)
             show(place, paint_answer(image, mask, row.truth), f"{name}: {score}" if score else name)

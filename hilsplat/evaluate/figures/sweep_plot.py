@@ -14,6 +14,9 @@ SWEEPS = {"theta": "coverage threshold theta", "omega": "similarity degree Omega
 """Sweep -> axis label."""
 
 COLUMNS = ("Hi-LERF mIoU", "Hi-LERF HC", "3D-OVS mIoU", "LERF mIoU")
+"""Columns that are plotted, each in a colour of its own."""
+LINES = ("-", "--", ":", "-.")
+"""Lines of several curves of a column."""
 
 Curves = Mapping[str, Mapping[str, list[tuple[float, float]]]]
 
@@ -54,9 +57,13 @@ def draw_sweep(name: str, curves: Curves) -> Figure:
     figure = Figure(figsize=(4.6 * len(curves), 3.4), layout="constrained")
     all_axes = figure.subplots(1, len(curves), squeeze=False)[0]
     for axes, (panel, points_of) in zip(all_axes, curves.items(), strict=True):
+        drawn: list[str] = []
         for label, points in points_of.items():
             values, shares = zip(*sorted(points), strict=True)
-            axes.plot(values, shares, marker="o", label=label)
+            column = label.partition(", ")[0]
+            line, colour = LINES[drawn.count(column) % len(LINES)], f"C{COLUMNS.index(column)}"
+            axes.plot(values, shares, marker="o", label=label, linestyle=line, color=colour)
+            drawn.append(column)
         if name == "omega":
             axes.set_xscale("log")
         axes.set_xlabel(SWEEPS[name])

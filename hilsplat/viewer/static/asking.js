@@ -161,8 +161,7 @@ function showNothing() {
 }
 
 export function clear() {
-  if ($("save").open) $("save").open = false;
-  else if (page.chosen >= 0) choose(-1); else clearAnswer();
+  if (page.chosen >= 0) choose(-1); else clearAnswer();
 }
 
 acts.like = like;

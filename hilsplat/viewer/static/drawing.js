@@ -56,7 +56,7 @@ function frustums() {
     ...(page.previewing ? [] : page.path).map((camera, k) => ({ kind: "frustum path", label: String(k + 1), corners: camera.corners(depth) }))];
 }
 
-const labelOf = ({ name, called }, { score }, text = "") => [...new Set([text, name || called].filter((words) => words && words !== "?")), score.toFixed(2)].join(" ");
+const labelOf = ({ name, called }, { score }, text = "") => [[...new Set([text, name || called].filter((words) => words && words !== "?"))].join(": "), score.toFixed(2)].filter(Boolean).join(" ");
 
 function boxes(pane, k) {
   const own = outlines.get(variantOf(pane));

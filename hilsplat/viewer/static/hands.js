@@ -7,7 +7,7 @@ import { choose, pointed, tapped } from "./choosing.js";
 import { attach } from "./controls.js";
 import { attachEditing, draw, edit, edited, leaveTool, placeBrush, pressed, redo, resizeBrush, tool, undo } from "./editing.js";
 import { currentStyles, link, painted, redraw, rememberedAs, restyle } from "./drawing.js";
-import { $, counted, nameOf } from "./elements.js";
+import { $, attachMenu, counted, nameOf } from "./elements.js";
 import { flyTo, nearestView, setMoving, stand, step, touched } from "./flights.js";
 import { groups, scoreOf } from "./kept.js";
 import { attachKeys } from "./keyboard.js";
@@ -97,6 +97,7 @@ export function attachHands() {
   });
 
   const selected = () => page.chosen >= 0 ? [{ name: nameOf(main(), page.chosen), nodes: [page.chosen], ...scoreOf(page.chosen) }] : groups();
+  attachMenu($("save"));
   $("save").addEventListener("toggle", () => {
     const chosen = selected(), count = chosen.reduce((sum, group) => sum + group.nodes.length, 0);
     $("save-what").textContent = page.chosen >= 0 ? `For ${chosen[0].name}` : chosen.length ? `For ${counted(count, "answer")} to ${chosen.map((group) => group.name).join(", ")}` : "Run a query or select a node to save its Gaussians, boxes and masks.";

@@ -77,8 +77,9 @@ export function showKept() {
   $("keep").hidden = !page.asked?.text || !panes[0].answer?.hits.length || api.offline;
   $("kept").replaceChildren(...page.kept.map((query) => {
     const { text, level: at, threshold: least } = query.asked, answer = query.answers.get(panes[0].by), doubts = answer ? doubtsOf(answer) : [];
-    const swatch = make("button", { type: "button", class: `swatch kept-${query.colour}`, "aria-pressed": String(query.shown), "aria-label": `Show ${text}`, title: query.shown ? "Hide" : "Show",
+    const swatch = make("button", { type: "button", class: "swatch", "aria-pressed": String(query.shown), "aria-label": `Show ${text}`, title: query.shown ? "Hide" : "Show",
       onclick: () => { query.shown = !query.shown; showKept(); } });
+    swatch.style.setProperty("--kept", `rgb(${KEPT[query.colour].join(" ")})`);
     return make("li", {}, swatch,
       make("button", { type: "button", class: "words", title: ["Edit", ...doubts].join("\n"), disabled: api.offline, onclick: () => { drop(query); reopen(query.asked); } },
         text, make("small", {}, [...(doubts.length ? ["doubtful"] : []), ...(answer ? [at === "auto" ? answer.level : at, counted(answer.hits.length, "answer")] : ["…"]), ...(answer?.hits.length ? [`best ${answer.hits[0].score.toFixed(2)}`] : []), ...(least ? [`score at least ${least.toFixed(2)}`] : [])].join(", "))),

@@ -76,14 +76,10 @@ async function begin() {
 
 function arriving(here, chunks) { Object.assign($("arriving"), { value: here, max: chunks, hidden: here === chunks }); }
 
-// Hide everything that needs a server: an exported page has only its stored answers.
+// Hide what needs a server (`data-server`): an exported page has only its stored answers.
 function onlyWhatIsHere() {
-  for (const element of [$("picture-button"), $("here").parentElement, $("left").parentElement, $("right").parentElement, $("edit-button"), $("path-add")]) element.hidden = true;
-  for (const button of $("save").querySelectorAll("[data-save]:not([data-save=still])")) button.hidden = true;
-  for (const row of $("save").querySelectorAll(".sized:not(:has([data-save=still]))")) row.hidden = true;
-  for (const line of $("save").querySelectorAll("hr")) line.hidden = true;
+  for (const element of document.querySelectorAll("[data-server]")) element.hidden = true;
   $("colour").querySelector("[value=field]").remove();
-  $("levels").hidden = $("threshold").hidden = true;
   $("text").setAttribute("list", "texts");
   document.body.append(make("datalist", { id: "texts" }, ...api.texts.map((text) => make("option", { value: text }))));
   $("text").placeholder = api.texts[0] ?? "";

@@ -21,6 +21,17 @@ export function shape(tag, attributes, text = "") {
   return made;
 }
 
+// Close a menu on Esc, or when something else is clicked.
+export function attachMenu(menu) {
+  document.addEventListener("pointerdown", (event) => { if (!menu.contains(event.target)) menu.open = false; });
+  document.addEventListener("keydown", (event) => {
+    if (event.key !== "Escape" || !menu.open) return;
+    menu.open = false;
+    menu.querySelector("summary").focus();
+    event.stopPropagation();
+  }, true);
+}
+
 // Let the arrow keys choose the next and previous item of a list of buttons.
 export function attachArrows(list) {
   list.addEventListener("keydown", (event) => {

@@ -3,7 +3,7 @@
 export const ANSWER = [255, 122, 0], CHOSEN = [58, 150, 255], HOVER = [255, 225, 70], SHARED = [255, 255, 255];
 // Gaussians selected for editing, and the weight of their colour.
 export const MARKED = [255, 0, 160], MARKED_SHARE = 0.7;
-// Colours of kept queries; style.css has the same colours for the query chips.
+// Colours of kept queries.
 export const KEPT = [[0, 200, 140], [235, 120, 200], [70, 215, 235], [180, 215, 50], [160, 120, 255], [235, 80, 80]];
 const STOPS = [[0, 0, 4], [31, 12, 72], [85, 15, 109], [136, 34, 106], [186, 54, 85], [227, 89, 51], [249, 140, 10], [249, 201, 50], [252, 255, 164]];
 

@@ -8,16 +8,12 @@ from pathlib import Path
 import pytest
 
 from hilsplat.base.artifacts import write_json
-from hilsplat.base.errors import ArtifactError, SettingsError
+from hilsplat.base.errors import ArtifactError
 from hilsplat.cli.main import app
 from hilsplat.evaluate.scenes import COLUMNS
-from hilsplat.evaluate.scores import Score, write_scores
+from hilsplat.evaluate.scores import write_scores
 from hilsplat.query.scene_state import SceneState
 from tests.unit.evaluate.builders import score
-
-
-def of_protocol(protocol: str, value: float, method: str = "tree", level: str = "") -> Score:
-    return score("iou", value, method=method, query=f"text {value}", level=level, protocol=protocol)
 
 
 @pytest.fixture
@@ -27,17 +23,12 @@ def results(desk, tmp_path) -> Path:
         shutil.copytree(desk, tmp_path / name)
     one = tmp_path / "rooms/one"
     write_json(one / "gaussians/report.json", {"psnr_db": 21.456, "gaussians": 864})
-    values = {
-        "lerf/tree-nodes@5": (0.5, 0.8),
-        "lerf/langsplat@2 (wholes)": (0.2,),
-        "lerf/langsplat-v2@2": (0.6,),
-    }
-    scores = [of_protocol(name, value) for name, of_name in values.items() for value in of_name]
-    scores.append(of_protocol("lerf/langsplat@2", 0.1, "field"))
-    of_levels = {"whole": (0.5, 0.7), "part": (0.1, 0.1, 0.1, 0.1), "subpart": (0.2,)}
-    for level, of_level in of_levels.items():
-        scores += [of_protocol("hierarchy/level-auto@6", value, level=level) for value in of_level]
-    write_scores(one / "default/scores.csv", scores)
+    scores = [("lerf/tree-nodes@5", 0.5), ("lerf/tree-nodes@5", 0.8), ("lerf/langsplat@2 (wholes)", 0.2)]
+    of_tree = [
+        score("iou", value, method="tree", query=f"text {value}", protocol=name) for name, value in scores
+    ]
+    of_field = score("iou", 0.1, method="field", protocol="lerf/tree-nodes@5")
+    write_scores(one / "default/scores.csv", [*of_tree, of_field])
     for part in ("clip", "semantic_tree", "masks"):
         shutil.copytree(desk / "default" / part, tmp_path / "rooms/early/key-views" / part)
     for name in ("early", "posed"):
@@ -65,13 +56,6 @@ def test_each_scene_has_a_row_with_what_its_run_has_computed(results, capsys):
     assert printed[0].split() == ["scene", "state", "views", "PSNR", "mIoU", "MB", "date", "models"]
     assert printed[3].split()[:6] == ["rooms/one", "tree,", "field", "6", "21.46", "0.6500"]
     assert printed[3].endswith(f"{date}  graph, colours")
-    # of all levels, the mean of 0.6, 0.1 and 0.2, as in the tables
-    for protocol, iou in {"hierarchy/level-auto": "0.3000", "lerf/langsplat": "0.2000"}.items():
-        options = ("--results", str(results), "--protocol", protocol)
-        app(["scenes", "rooms/o*", *options], standalone_mode=False)
-        assert iou in capsys.readouterr().out.splitlines()[1]
-    with pytest.raises(SettingsError, match=r"'lerf/tree' is unknown(.|\n)*did you mean 'lerf/tree-nodes'"):
-        app(["scenes", "--results", str(results), "--protocol", "lerf/tree"], standalone_mode=False)
 
 
 @pytest.mark.parametrize("file", ["gaussians/report.json", "default/scores.csv", "scene/index.json"])

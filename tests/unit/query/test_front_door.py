@@ -218,12 +218,10 @@ def test_a_clean_export_leaves_out_gaussians_of_no_node(copied, elsewhere, capsy
 @pytest.mark.parametrize(
     ("command", "option", "purpose"),
     [
-        (("query", "DESK", "mug", "--all", "--masks", "m"), "--masks", "queries of one scene"),
-        (("query", "DESK", "mug", "--all", "--spz"), "--spz", "queries of one scene"),
-        (("query", "DESK", "mug", "--all", "--out", "o"), "--out", "queries of one scene"),
-        (("query", "DESK", "mug", "--all", "--view", "0"), "--view", "queries of one scene"),
-        (("query", "DESK", "mug", "--all", "--views", "2"), "--views", "queries of one scene"),
-        (("query", "DESK", "mug", "--all", "--answerer", "tree"), "--answerer", "queries of one scene"),
+        *(
+            (("query", "DESK", "mug", "--all", *option.split()), option.split()[0], "queries of one scene")
+            for option in ("--masks m", "--spz", "--out o", "--view 0", "--views 2", "--answerer tree")
+        ),
         (("query", "DESK", "mug", "--json"), "--json", "queries of all scenes"),
         (("query", "DESK", "mug", "--limit", "3"), "--limit", "queries of all scenes"),
         (("export", "DESK", "--as", "colmap", "--variant", "nope"), "--variant", "--as tree, --as langsplat"),

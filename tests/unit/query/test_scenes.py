@@ -52,7 +52,9 @@ def changed(results, tmp_path) -> Path:
     ("text", "level"), [("mug", "auto"), ("handle", "part"), ("book", "subpart"), ("mug > handle", "auto")]
 )
 def test_answers_are_those_of_each_scene_alone_best_scene_first(results, opened, text, level):
-    hits = hilsplat.open_scenes(results).query(text, level, limit=SCENES, each=2)
+    scenes = hilsplat.open_scenes(results)
+    hits = scenes.query(text, level, limit=SCENES, each=2)
+    assert all(len(repr(each)) < 100 for each in (scenes, *scenes.found, *hits))
     alone = {name: scene.query(text, level, limit=2) for name, scene in opened.items()}
     assert len(alone) == SCENES and sum(map(len, alone.values())) == len(hits)
     best = sorted(alone, key=lambda name: (-alone[name][0].score, name))
@@ -86,38 +88,18 @@ def test_a_pattern_a_limit_and_a_threshold_restrict_the_answers_of_a_small_index
     assert (names / "nodes.safetensors").stat().st_size < nodes * (vector_bytes + 200) + 3000
 
 
-def delete(scene: Path) -> None:
-    shutil.rmtree(scene)
-
-
-def begin_to_rebuild_the_masks(scene: Path) -> None:
-    shutil.rmtree(scene / "default/masks")
-
-
-def rebuild_the_masks(scene: Path) -> None:
-    outputs = {"masks": {"sha256": "another", "bytes": {}}}
-    write_record(scene / "default/masks", outputs=outputs)
-
-
-def rebuild_the_gaussians(scene: Path) -> None:
-    write_record(scene / "gaussians.ply", outputs={"gaussians.ply": {"sha256": "another", "bytes": {}}})
-
-
-def lose_the_index(scene: Path) -> None:
-    (scene / "default/names/nodes.safetensors").unlink()
-
-
-def replace_the_tree(scene: Path) -> None:
-    tree = scene / "default/semantic_tree/tree.npz"
-    tree.write_bytes(tree.read_bytes() + b"0")
-
-
-def damage_the_index(scene: Path) -> None:
-    (scene / "default/names/nodes.safetensors").write_bytes(b"nothing")
-
-
-BEFORE = (delete, begin_to_rebuild_the_masks, rebuild_the_masks, rebuild_the_gaussians, lose_the_index)
-AFTER = (delete, lose_the_index, replace_the_tree, damage_the_index)
+INDEX, OTHER = "default/names/nodes.safetensors", {"sha256": "another", "bytes": {}}
+CHANGES = {
+    "deletion": shutil.rmtree,
+    "masks being rebuilt": lambda scene: shutil.rmtree(scene / "default/masks"),
+    "other masks": lambda scene: write_record(scene / "default/masks", outputs={"masks": OTHER}),
+    "other Gaussians": lambda scene: write_record(scene / "gaussians.ply", outputs={"gaussians.ply": OTHER}),
+    "lost index": lambda scene: (scene / INDEX).unlink(),
+    "other tree": lambda scene: (scene / "default/semantic_tree/tree.npz").write_bytes(b"0"),
+    "damaged index": lambda scene: (scene / INDEX).write_bytes(b"nothing"),
+}
+BEFORE = ("deletion", "masks being rebuilt", "other masks", "other Gaussians", "lost index")
+AFTER = ("deletion", "lost index", "other tree", "damaged index")
 
 
 @pytest.mark.parametrize(
@@ -127,7 +109,7 @@ def test_a_scene_changed_before_or_after_opening_does_not_answer(changed, change
     scenes = hilsplat.open_scenes(changed.parents[1])
     if not after:
         assert scenes.query("mug")[0].scene == "rooms/desk-7"
-    change(changed)
+    CHANGES[change](changed)
     scenes = scenes if after else hilsplat.open_scenes(changed.parents[1])
     assert [hit.scene for hit in scenes.query("mug", limit=2)] == ["photos/desk-6", "photos/desk-4"]
     assert [*scenes.skipped] == (["rooms/desk-7"] if after or changed.exists() else [])

@@ -25,6 +25,7 @@ from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.query.names import FILE
 from hilsplat.splat.ply import load_ply
 from hilsplat.viewer import exports
+from hilsplat.viewer.app import Viewer
 from hilsplat.viewer.exports import encoded_gif
 from hilsplat.viewer.frames import painted
 from hilsplat.viewer.saved_files import SavedFiles
@@ -34,7 +35,7 @@ from tests.unit.base.test_untrusted_files import png, write_eps
 from tests.unit.finished_desk import SCENE
 from tests.unit.many_nodes import add_nodes
 from tests.unit.splat.spz_reader import decoded
-from tests.unit.viewer.conftest import browsing, in_steps, run_apart, wire_camera
+from tests.unit.viewer.conftest import TOKEN, browser_of, browsing, in_steps, run_apart, wire_camera
 
 
 @pytest.fixture
@@ -256,6 +257,14 @@ def test_queries_run_between_the_steps_of_a_file(shown):
 
     run_apart(both)
     assert order == ["step 0", "click", "step 1", "step 2"]
+
+
+@pytest.mark.parametrize("kind", ["scene-spz", "page"])
+def test_the_scene_thread_is_free_while_gaussians_are_compressed(shown, monkeypatch, kind):
+    viewer = Viewer(shown)
+    monkeypatch.setattr(shown, "spz", lambda rows: viewer.thread.worker.submit(bytes, 3).result(timeout=10))
+    with browser_of(viewer.app(TOKEN)) as client:
+        assert b"error" not in client.post(f"/api/export/{kind}", json={}).content[:200]
 
 
 def test_a_film_follows_a_path_whose_cameras_are_sent_for_its_preview(client, shown, camera):

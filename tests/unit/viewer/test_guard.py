@@ -5,7 +5,7 @@ from starlette.testclient import TestClient
 
 from hilsplat.viewer.app import Viewer
 from hilsplat.viewer.wire import MAX_BODY_BYTES
-from hilsplat.web.server import Pages
+from hilsplat.web.server import files_of
 from tests.unit.viewer.conftest import ADDRESS, TOKEN
 
 QUERY = {"text": "mug"}
@@ -74,7 +74,7 @@ def test_unknown_variants_are_refused(client, variant):
     ("page", "package"), [("index.html", "hilsplat.viewer"), ("annotate.html", "hilsplat.annotate")]
 )
 def test_pages_are_small_and_request_no_other_address(page, package):
-    texts = {name: data.decode() for name, data in Pages(page, package).static.items()}
+    texts = {name: data.decode() for name, data in files_of(page, package)[0].items()}
     assert sum(len(text) for name, text in texts.items() if name.endswith(".js")) < 200_000
     for name, text in texts.items():
         found = text.replace("http://www.w3.org/2000/svg", "")

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.text import Text
 from PIL import Image
 
 from hilsplat.base.artifacts import write_index
@@ -13,7 +15,7 @@ from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import Level
 from hilsplat.evaluate.figures import comparison
 from hilsplat.evaluate.figures.panel import annotated_rows, draw_panel, free_rows, shown_truths
-from hilsplat.evaluate.figures.sweep_plot import read_curves, run_sweep_plot
+from hilsplat.evaluate.figures.sweep_plot import draw_sweep, read_curves, run_sweep_plot
 from hilsplat.query.answer import report, views_of
 from hilsplat.query.pictures import ANSWER_RGB, TRUTH_RGB, outline, paint_answer, save_figure
 from hilsplat.query.query_panel import query_panel
@@ -94,6 +96,23 @@ def test_a_query_is_reported_and_drawn(block_world, tmp_path):
     assert (tmp_path / "panel.png").stat().st_size > 10_000
 
 
+def test_long_texts_stay_inside_the_pictures(block_world, rows, tmp_path, monkeypatch):
+    text = " ".join(["unicorn"] * 30)
+    drawn = []
+    monkeypatch.setattr("hilsplat.query.query_panel.save_figure", lambda figure, out: drawn.append(figure))
+    query_panel(block_world.answers, text, block_world.answers.select(text), ["000.png"], tmp_path / "x.png")
+    shown = [replace(row, text=text, truth=None) for row in rows[1]]
+    drawn.append(comparison.draw_methods(block_world.scene, block_world.answers.views.image, [], shown))
+    for figure in drawn:
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        width, height = canvas.get_width_height()
+        texts = [each for each in figure.findobj(Text) if each.get_text()]
+        assert any("unicorn unicorn" in each.get_text() for each in texts)
+        for extent in (each.get_window_extent(canvas.get_renderer()) for each in texts):
+            assert min(extent.p0) >= 0 and extent.x1 <= width and extent.y1 <= height
+
+
 def test_reports_state_what_was_not_found(block_world):
     answers = block_world.answers
     empty = replace(answers.select("bear"), ids=np.zeros(0, np.int64), values=np.zeros(0))
@@ -149,14 +168,26 @@ def test_equal_nodes_have_equal_colours_and_other_pixels_are_black(block_world):
 
 @pytest.fixture
 def compare(block_world, tmp_path, monkeypatch):
-    """Function that draws the figures of the block world into a folder."""
-    monkeypatch.setattr(comparison, "open_variant", lambda *how: block_world.answers)
+    """Function that draws the figures of the block world into a folder; variants are named like a method."""
+
+    def opened(folder, variant, *how):
+        methods = (variant,) if variant in ("tree", "field") else EVALUATE.methods
+        return replace(block_world.answers, settings=EVALUATE.model_copy(update={"methods": methods}))
+
+    monkeypatch.setattr(comparison, "open_variant", opened)
 
     def run(name, variants, names, **more):
         out, settings = tmp_path / name / "comparison.webp", FiguresSettings(queries_per_level=1)
         comparison.run_comparison(block_world.folder, variants, names, out, settings, EVALUATE, **more)
 
     return run
+
+
+def test_a_variant_shows_the_methods_that_its_settings_evaluate(compare, monkeypatch):
+    shown, made = [], comparison.Answerer
+    monkeypatch.setattr(comparison, "Answerer", lambda *of: shown.append(of[0]) or made(*of))
+    compare("one", ["default", "tree", "field"], {"tree": "my tree"}, queries=["bear"])
+    assert shown == ["hilsplat (tree)", "hilsplat (field)", "my tree, tree", "field"]
 
 
 def test_all_figures_are_written_as_webp_and_pdf_twice_the_same(block_world, tmp_path, compare):
@@ -218,6 +249,16 @@ def test_a_curve_joins_rows_of_one_data_set_and_reading(tmp_path):
     }
     run_sweep_plot("theta", tmp_path / "theta.csv", tmp_path / "theta.png")
     assert (tmp_path / "theta.pdf").is_file()
+
+
+def test_a_column_has_the_same_colour_in_every_panel_and_lines_of_its_own_for_more_curves():
+    points = [(0.6, 1.0), (0.9, 2.0)]
+    reported = {"Hi-LERF mIoU": points, "LERF mIoU": points}
+    measured = {"3D-OVS mIoU, sam": points, "LERF mIoU, sam": points, "LERF mIoU, by head, sam": points}
+    left, right = draw_sweep("theta", {"reported: LERF": reported, "stand-in": measured}).get_axes()
+    (_, one), (other, two, three) = left.get_lines(), right.get_lines()
+    assert one.get_color() == two.get_color() == three.get_color() != other.get_color()
+    assert two.get_linestyle() != three.get_linestyle()
 
 
 def test_an_unknown_sweep_is_an_error_that_lists_the_sweeps(tmp_path):
