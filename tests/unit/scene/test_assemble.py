@@ -1,14 +1,20 @@
-"""Scene coordinates and the split."""
+"""Scene coordinates, the split, and images without distortion."""
 
 import numpy as np
+import pytest
+from PIL import Image
 
+from hilsplat.base.images import read_image
 from hilsplat.scene.assemble import (
+    PosedView,
     move_cameras,
     normalising_similarity,
     rotation_to_z_up,
     split_views,
+    undistort,
     up_direction,
 )
+from hilsplat.scene.colmap import pycolmap
 from tests.unit.splat.three_gaussians_world import ring
 
 
@@ -55,3 +61,13 @@ def test_scene_coordinates_centre_the_points_and_put_cameras_at_distance_one():
     similarity = normalising_similarity(poses, np.array([[1.0, 2, 3]]), metric=True, turn=False)
     np.testing.assert_array_equal(similarity[:3, :3], np.eye(3))
     np.testing.assert_array_equal(similarity[:3, 3], [-1, -2, -3])
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_PINHOLE", "SIMPLE_RADIAL"])
+def test_images_without_distortion_keep_every_pixel(tmp_path, model):
+    pixels = np.random.default_rng(0).integers(0, 256, (30, 40, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    camera = pycolmap.Camera.create_from_model_name(1, model, 50.0, 40, 30)  # k = 0
+    view = undistort(PosedView("a.png", tmp_path / "a.png", camera, np.eye(4)), tmp_path / "out")
+    np.testing.assert_array_equal(read_image(tmp_path / "out" / "a.png"), pixels)
+    np.testing.assert_array_equal(view.camera.calibration_matrix(), [[50, 0, 20], [0, 50, 15], [0, 0, 1]])

@@ -127,3 +127,16 @@ def test_a_truncated_file_a_larger_count_and_trailing_bytes_are_damage(tmp_path,
         (model / name).write_bytes(content)
         with pytest.raises(SceneError, match=rf"{name} cannot be read: "):
             read_model(model)
+
+
+def test_a_colmap_model_cannot_name_files_outside_its_folder(tmp_path):
+    write_colmap(tmp_path / "in")
+    images = tmp_path / "in" / "sparse" / "0" / "images.txt"
+    images.write_text(images.read_text().replace("b.jpg", "../../../b.jpg"))
+    shutil.copy(tmp_path / "in/images/a.jpg", tmp_path / "b.jpg")  # the name means the b.jpg in the folder
+    import_scene(tmp_path / "in", tmp_path / "scene", test_every=0)
+    report = json.loads((tmp_path / "scene/registration.json").read_text())
+    assert report["views"]["b.png"]["registered"]
+    (tmp_path / "in/images/b.jpg").unlink()
+    with pytest.raises(SceneError, match=r"outside it: \.\./\.\./\.\./b\.jpg"):
+        import_scene(tmp_path / "in", tmp_path / "scene")

@@ -1,4 +1,4 @@
-"""The CPU backend against the slow reference, and defined behaviour at the edges."""
+"""The CPU backend against the closed form, the slow reference and defined behaviour at the edges."""
 
 import math
 from dataclasses import replace
@@ -30,6 +30,23 @@ def relative_errors(found: Parameters, leaves: list[torch.Tensor]) -> dict[str, 
         error = np.linalg.norm(getattr(found, name) - expected)
         errors[name] = float(error / max(np.linalg.norm(expected), 1e-12))
     return errors
+
+
+@pytest.mark.parametrize(("opacity", "scale", "depth"), [(0.8, 0.2, 2.0), (0.3, 0.05, 1.0), (0.99, 1.0, 5.0)])
+def test_a_round_gaussian_has_the_closed_form(opacity, scale, depth):
+    # alpha = o exp(-r^2 / (2 ((f s / z)^2 + 0.3))), r px from the principal point (16, 12)
+    rows, columns = np.mgrid[:24, :32] + 0.5
+    r2 = (columns - 16) ** 2 + (rows - 12) ** 2
+    expected = opacity * np.exp(-r2 / (2 * ((30 * scale / depth) ** 2 + 0.3)))
+    expected[expected < 1 / 255] = 0
+    grey = expected[..., None].repeat(3, axis=2)
+    seen = draw(round_gaussian(opacity, scale, depth), straight_camera(), 0)
+    np.testing.assert_allclose(seen.alpha, expected, atol=2e-6)
+    np.testing.assert_allclose(seen.image, grey, atol=2e-6)
+    image, alpha = render_reference(round_gaussian(opacity, scale, depth), straight_camera(), 0)
+    # the parameters are float32
+    np.testing.assert_allclose(alpha.numpy(), expected, rtol=2e-6, atol=1e-7)
+    np.testing.assert_allclose(image.numpy(), grey, rtol=2e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize(("depths", "expected"), [((4.0, 2.0), [0.25, 0.5]), ((2.0, 2.0), [0.5, 0.25])])
