@@ -55,9 +55,8 @@ class FinishedScene:
         """Find the artifacts of a variant, which must all be in the scene folder.
 
         Input paths are read from provenance; without it, each is expected beside the artifact made from it. A
-        variant without a field uses the field recorded in the provenance of its scores. During a run, the
-        variant's own CLIP vectors are sufficient. Until `default` has any, those of the key views are used,
-        with a warning.
+        variant may share the field recorded in the provenance of its scores. During a run, the variant's own
+        CLIP vectors are sufficient. Until `default` has any, those of the key views are used, with a warning.
 
         Raises:
             ArtifactError: the folder, the variant or a part is missing.
@@ -70,9 +69,7 @@ class FinishedScene:
                 expected=f"one of {', '.join(finished)}",
                 fix="list it under ablation_variants and run the workflow",
             )
-        field = folder / variant / "field.safetensors"
-        if not field.exists():
-            field = _recorded_input(folder / variant / "scores.csv", "field", folder) or field
+        field = _field_of(folder, variant)
         clip = folder / variant / "clip"
         if variant == "default" and not (clip.exists() or field.exists()):
             early = folder / KEY_VIEWS / "clip"
@@ -167,6 +164,16 @@ def finished_variants(folder: Path) -> list[str]:
     """Return the variants of a scene that accept queries: those with their own field or CLIP vectors."""
     outputs = [path for name in ("field.safetensors", "clip") for path in folder.glob(f"*/{name}")]
     return sorted({path.parent.name for path in outputs})
+
+
+def _field_of(folder: Path, variant: str) -> Path:
+    """Return the path of a variant's field: the one that was scored, unless its own is newer."""
+    own, scores = (folder / variant / name for name in ("field.safetensors", "scores.csv"))
+    scored = _recorded_input(scores, "field", folder)
+    if scored is None:
+        return own
+    is_newer = own.exists() and own.stat().st_mtime > provenance_path(scores).stat().st_mtime
+    return own if is_newer else scored
 
 
 def _unfinished(folder: Path, missing: Path) -> ArtifactError:

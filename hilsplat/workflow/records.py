@@ -81,7 +81,7 @@ class Records:
     """Comparison of artifacts' provenance with their files.
 
     Args:
-        results: results folder; provenance refers to it as `results/...`, even if the folder was moved.
+        results: results folder; it may have been moved since its artifacts were written.
         plan: the run that settings and seeds must equal; None to compare only code and inputs.
         every_byte: compare all contents; otherwise, those of files newer than their record.
     """
@@ -149,15 +149,21 @@ class Records:
             code = ""
         if code != record.code:
             yield "it was made by different code"
+        written = self._written_results(artifact, record)
         for name, read in record.inputs.items():
             files = {read.path: read.sha256} if read.files is None else read.files
             for file, digest in files.items():
-                recorded = Path(file)
-                inside = recorded.parts[:1] in (("results",), (self.results.name,))
-                path = self.results.joinpath(*recorded.parts[1:]) if inside else recorded
+                inside = Path(file).is_relative_to(written)
+                path = self.results / Path(file).relative_to(written) if inside else Path(file)
                 known = self._digest(path) if self.every_byte else self._known_digest(name, path)
                 if known != digest and (known is not None or (self.every_byte and inside)):
                     yield f"its input {name} {'is missing' if known is None else 'has changed'}: {path}"
+
+    def _written_results(self, artifact: Path, record: Provenance) -> Path:
+        """Return the results folder as an artifact's writer named it, given by the option `--out`."""
+        words, place = record.command, artifact.relative_to(self.results).parts
+        out = Path(words[words.index("--out") + 1]).parts if "--out" in words[:-1] else ()
+        return Path(*out[: -len(place)]) if out[-len(place) :] == place else Path("results")
 
     def _job_of(self, artifact: Path) -> VariantJob | None:
         """Return the job of an artifact that belongs to a scene of the plan."""

@@ -163,15 +163,14 @@ def run(
         fix = "change to that folder first (cd), or pass --config results=FOLDER"
         raise HilsplatError("hilsplat run works in the current folder; --directory is refused", fix=fix)
     configs = [_config_file(path) for path in (*configs, *given.configfile)]
-    try:
-        overrides = {
-            key: yaml.safe_load(value) for key, _, value in (word.partition("=") for word in given.config)
-        }
+    try:  # as Snakemake does: values are strings, and mappings of one key are merged
+        words = [word.partition("=") for word in given.config]
+        overrides = [{key: yaml.load(value, yaml.BaseLoader)} for key, _, value in words]
     except yaml.YAMLError as error:
         raise SettingsError(
             f"--config is not valid YAML: {error}", expected="key=value", found=" ".join(given.config)
         ) from error
-    settings = merged_config(configs, overrides)
+    settings = merged_config(configs, *overrides)
     try:
         chosen = parse_run(settings)
     except SettingsError as error:
@@ -259,9 +258,9 @@ def _start(
     ending = ["--", *files] if files else []
     wrong = outdated(plan, every_byte=every_byte)
     if wrong:
-        summary = _snakemake(command, "--summary", *ending)
-        needed = {line.split("\t")[0] for line in summary.stdout.splitlines()}
-        wrong = {output: reason for output, reason in wrong.items() if output in needed}
+        lines = _snakemake(command, "--summary", *ending).stdout.splitlines()
+        kept = {line.split("\t")[0] for line in lines if line.endswith("\tno update")}
+        wrong = {output: reason for output, reason in wrong.items() if output in kept}
     for output, reason in wrong.items():
         logger.warning("rebuilding %s: %s", output, reason)
     rebuilt = ["--forcerun", *forced, *wrong] if forced or wrong else []

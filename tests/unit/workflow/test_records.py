@@ -30,7 +30,7 @@ def write(artifact: Path, text: str = "one", **inputs: Path) -> None:
         artifact,
         stage=stage.name,
         code=stage.code_digest(),
-        command=["hilsplat"],
+        command=["hilsplat", stage.name, "--out", str(artifact)],
         settings={name: json.loads(plan.settings(name, Job())) for name in stage.sections.values()},
         seed=None,
         inputs=Inputs("masks", inputs),
@@ -154,10 +154,24 @@ def test_an_artifact_without_a_record_is_found(results):
     assert problems() == {"semantic_tree": "it has no provenance"}
 
 
-def test_a_moved_folder_is_still_whole(results, tmp_path):
-    shutil.rmtree(tmp_path / "photos")
+@pytest.mark.parametrize("name", ["results", "out/of runs", "/absolute"])
+def test_a_moved_folder_is_whole_until_an_input_in_it_is_missing(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    results = Path(name.replace("/absolute", str(tmp_path / "absolute")))
+    Path("photos").mkdir()
+    Path("photos/1.jpg").touch()
+    masks, tree = (results / Path(*path.parts[1:]) for path in (MASKS, TREE))
+    write(masks, scene=Path("photos"))
+    write(tree, masks=masks)
+    shutil.rmtree("photos")
     copy = shutil.copytree(results, tmp_path / "elsewhere/copy")
     assert verify(copy) == (f"2 artifacts in {copy}: 2 whole", True)
+    shutil.rmtree(results)
+    assert verify(copy)[1]
+    missing = copy / masks.relative_to(results)
+    shutil.rmtree(missing)
+    provenance_path(missing).unlink()
+    assert f"its input masks is missing: {missing}" in verify(copy)[0]
 
 
 def test_verify_reads_every_byte_and_prints_the_repair(results):
