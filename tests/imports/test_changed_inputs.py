@@ -185,7 +185,7 @@ def test_photographs_of_the_future_are_refused_with_the_command_that_corrects_th
     before = contents(project)
     for path in (project / "desk/images").iterdir():
         os.utime(path, (2**32, 2**32))
-    with pytest.raises(ArtifactError, match="desk/images/1.png has a modification time in the future") as found:
+    with pytest.raises(ArtifactError, match=r"1\.png has a modification time in the future") as found:
         contents(project)
     command = str(found.value).partition("or run: ")[2]
     subprocess.run(command, shell=True, check=True)

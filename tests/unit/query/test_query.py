@@ -1,8 +1,8 @@
 """Queries on the world with two boxes: flat, along a path, of a view."""
 
+import os
 from dataclasses import replace
 
-import os
 import numpy as np
 import pytest
 
