@@ -5,8 +5,10 @@ an unfinished output of a killed job, and it detects nothing if its metadata is 
 """
 
 import json
+import shlex
 from collections import Counter
 from collections.abc import Iterator
+from itertools import dropwhile
 from pathlib import Path
 
 from hilsplat.base.artifacts import provenance_path, run_command
@@ -23,10 +25,13 @@ from hilsplat.base.lineage import (
 from hilsplat.base.progress import track
 from hilsplat.models.store import model_digest
 from hilsplat.stages import all_stages
-from hilsplat.workflow.plan import Plan
+from hilsplat.workflow.plan import Plan, words_of
 from hilsplat.workflow.scene_data import VariantJob, of_variant
 
 WHOLE, STALE, DAMAGED = "whole", "stale", "damaged"
+
+OPTIONS = ("unit", "render", "source", "dataset", "variant", "names", "queries")
+"""Options of stages that are compared, besides settings; no rule replaces them, and they are no paths."""
 
 
 def outdated(plan: Plan, *, every_byte: bool = False) -> dict[str, str]:
@@ -143,6 +148,11 @@ class Records:
             seed = self.plan.seed(stage, job) if "seed" in stage.hints else None
             if record.seed != seed:
                 yield f"it was made with seed {record.seed}, not {seed}"
+            for name in stage.hints.keys() & OPTIONS if record.command else ():
+                words = shlex.split(words_of(stage, {name: self.plan.options[name](job)}))
+                after = [*dropwhile(f"--{name}".__ne__, record.command)]
+                if after[: max(1, len(words))] != words:
+                    yield f"it was made with another --{name}"
         try:
             code = stage.code_digest(record.plugins)
         except HilsplatError:  # this version does not have the reader

@@ -9,7 +9,6 @@ import os
 import shlex
 import time
 from collections.abc import Callable, Iterable, Sequence
-from datetime import datetime
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Protocol, runtime_checkable
@@ -221,11 +220,12 @@ def _require_past(files: Sequence[str]) -> None:
 
     Snakemake would fail after the job, because its output is older than an input.
     """
-    for path, stat in stats_of(map(Path, files)).items():
-        if stat.st_mtime > time.time() + MAX_SKEW_S:
-            touching = f"find {shlex.quote(str(path.parent))} -newermt now -exec touch {{}} +"
-            raise ArtifactError(
-                f"{path} has a modification time in the future",
-                found=f"{datetime.fromtimestamp(stat.st_mtime):%Y-%m-%d %H:%M}",
-                fix=f"correct this machine's clock, or run: {touching}",
-            )
+    now = time.time()
+    if late := [
+        path for path, stat in stats_of(map(Path, files)).items() if stat.st_mtime > now + MAX_SKEW_S
+    ]:
+        touching = f"find {shlex.quote(str(late[0].parent))} -newermt now -exec touch {{}} +"
+        raise ArtifactError(
+            f"{late[0]} has a modification time in the future",
+            fix=f"correct this machine's clock, or run: {touching}",
+        )

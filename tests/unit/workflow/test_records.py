@@ -20,9 +20,9 @@ FOLDER = Path("results/synthetic/one/default")
 MASKS, TREE = FOLDER / "masks", FOLDER / "coverage_tree"
 
 
-def write(artifact: Path, text: str = "one", **inputs: Path) -> None:
+def write(artifact: Path, text: str = "one", *options: str, stage: str = "", **inputs: Path) -> None:
     """Write an artifact and its record as the plan makes it."""
-    plan, stage = plan_of(Path(), BENCHMARK[:1]), stage_of(artifact.name)
+    plan, stage = plan_of(Path(), BENCHMARK[:1]), stage_of(stage or artifact.name)
     for name in ("a.npz", "b.npz"):
         artifact.mkdir(parents=True, exist_ok=True)
         (artifact / name).write_text(text)
@@ -30,9 +30,9 @@ def write(artifact: Path, text: str = "one", **inputs: Path) -> None:
         artifact,
         stage=stage.name,
         code=stage.code_digest(),
-        command=["hilsplat", stage.name, "--out", str(artifact)],
+        command=["hilsplat", stage.name, *options, "--out", str(artifact)],
         settings={name: json.loads(plan.settings(name, Job())) for name in stage.sections.values()},
-        seed=None,
+        seed=0 if "seed" in stage.hints else None,
         inputs=Inputs("masks", inputs),
     )
 
@@ -69,6 +69,17 @@ def test_other_settings_are_found(results, config, reasons):
     found = problems(**config)
     assert found.keys() == reasons.keys()
     assert all(reason in found[name] for name, reason in reasons.items())
+
+
+def test_other_options_are_found(results):
+    """Snakemake would find them, unless the results were moved to another project, or are shared by two."""
+    scene = FOLDER.with_name("scene")
+    write(scene, "one", "--unit", "metre", "--render", stage="poses")
+    assert problems() == {}
+    write(scene, "one", "--unit", "arbitrary", "--render", stage="poses")
+    assert problems() == {"scene": "it was made with another --unit"}
+    write(scene, "one", "--unit", "metre", stage="poses")
+    assert problems() == {"scene": "it was made with another --render"}
 
 
 def test_missing_and_cut_files_are_found(results):
