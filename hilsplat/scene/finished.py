@@ -69,7 +69,10 @@ class FinishedScene:
                 expected=f"one of {', '.join(finished)}",
                 fix="list it under ablation_variants and run the workflow",
             )
-        field = _field_of(folder, variant)
+        own, scores = (folder / variant / name for name in ("field.safetensors", "scores.csv"))
+        field = _recorded_input(scores, "field", folder) or own
+        if field != own and own.exists() and own.stat().st_mtime > provenance_path(scores).stat().st_mtime:
+            field = own  # it is not scored yet
         clip = folder / variant / "clip"
         if variant == "default" and not (clip.exists() or field.exists()):
             early = folder / KEY_VIEWS / "clip"
@@ -164,16 +167,6 @@ def finished_variants(folder: Path) -> list[str]:
     """Return the variants of a scene that accept queries: those with their own field or CLIP vectors."""
     outputs = [path for name in ("field.safetensors", "clip") for path in folder.glob(f"*/{name}")]
     return sorted({path.parent.name for path in outputs})
-
-
-def _field_of(folder: Path, variant: str) -> Path:
-    """Return the path of a variant's field: the one that was scored, unless its own is newer."""
-    own, scores = (folder / variant / name for name in ("field.safetensors", "scores.csv"))
-    scored = _recorded_input(scores, "field", folder)
-    if scored is None:
-        return own
-    is_newer = own.exists() and own.stat().st_mtime > provenance_path(scores).stat().st_mtime
-    return own if is_newer else scored
 
 
 def _unfinished(folder: Path, missing: Path) -> ArtifactError:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.workflow.conftest import SCENE, Project, copy_project
+from tests.workflow.conftest import Project, copy_project
 
 PRIVATE = re.compile(
     r"workflow\.(persistence|dag|is_main_process|executor_plugin|rerun_triggers|resource_settings|output_settings"
