@@ -145,7 +145,8 @@ def run(
     """Run the workflow in the working folder, and return Snakemake's exit status.
 
     Args:
-        targets: scenes (`photos/desk`, `desk`, `photos/*`), rules (`tables`) or files; empty for everything.
+        targets: scenes (`photos/desk`, `desk`, `photos/*`, `results/photos/desk`), rules (`tables`) or files;
+            empty for everything.
         configs: files that override config/config.yaml, in order.
         options: passed to Snakemake unchanged.
         every_byte: read all results of earlier runs, and rebuild those that are damaged.
@@ -177,8 +178,10 @@ def run(
         error.add_line("in", first_unusable(configs))
         raise
     rows = read_sheet(project_path(chosen.scenes), (), chosen.data_root)  # the plan checks the folders
+    files, names = f"{chosen.results}/", {row.name for row in rows}
+    targets = [str(Path(target)) for target in targets]  # shells complete folders with a slash
+    targets = [name if (name := target.removeprefix(files)) in names else target for target in targets]
     scenes = [target for target, found in matches_of(rows, targets).items() if found]
-    files = f"{chosen.results}/"
     named = [each for each in targets if each not in scenes and not each.startswith(files)]
     _require_known(named, rows, chosen.results)
     if scenes:
