@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from itertools import dropwhile
 from pathlib import Path
 
-from hilsplat.base.artifacts import provenance_path, run_command
+from hilsplat.base.artifacts import RUN, provenance_path, run_command
 from hilsplat.base.atomic import was_interrupted
 from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.base.lineage import (
@@ -62,7 +62,6 @@ def verify(results: Path) -> tuple[str, bool]:
     Raises:
         ArtifactError: the folder contains no artifacts.
     """
-    results = Path(results)
     artifacts = artifacts_in(results)
     if not artifacts:
         raise ArtifactError(
@@ -78,7 +77,8 @@ def verify(results: Path) -> tuple[str, bool]:
     lines.append(f"{len(artifacts)} artifacts in {results}: {states}")
     is_whole = counts[WHOLE] == len(artifacts)
     if not is_whole:
-        lines.append(f"to rebuild them, in the project that made them: {run_command(results, '--verify')}")
+        root = next((path for path in results.resolve().parents if (path / RUN).is_file()), results)
+        lines.append(f"to rebuild them, in the project that made them: {run_command(root, '--verify')}")
     return "\n".join(lines), is_whole
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hilsplat.base.artifacts import provenance_path, write_json
+from hilsplat.base.artifacts import RUN, provenance_path, write_json
 from hilsplat.base.atomic import lock_path, output_lock
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.lineage import Inputs, write_provenance
@@ -195,6 +195,8 @@ def test_verify_reads_every_byte_and_prints_the_repair(results):
         "2 artifacts in results: 1 stale, 1 damaged",
         "to rebuild them, in the project that made them: hilsplat run --verify",
     ]
+    write_json(results / RUN, {"results": ["results"]})
+    assert verify(FOLDER)[0].splitlines()[-1] == report.splitlines()[-1], "a folder in it is no target"
 
 
 def test_verify_finds_a_missing_input_and_damaged_provenance(results):
