@@ -148,7 +148,7 @@ class Records:
             seed = self.plan.seed(stage, job) if "seed" in stage.hints else None
             if record.seed != seed:
                 yield f"it was made with seed {record.seed}, not {seed}"
-            for name in stage.hints.keys() & OPTIONS if record.command else ():
+            for name in (name for name in OPTIONS if name in stage.hints and record.command):
                 words = shlex.split(words_of(stage, {name: self.plan.options[name](job)}))
                 after = [*dropwhile(f"--{name}".__ne__, record.command)]
                 if after[: max(1, len(words))] != words:

@@ -145,8 +145,7 @@ def run(
     """Run the workflow in the working folder, and return Snakemake's exit status.
 
     Args:
-        targets: scenes (`photos/desk`, `desk`, `photos/*`, `results/photos/desk`), rules (`tables`) or files;
-            empty for everything.
+        targets: scenes (`desk`, `photos/*`) or their folders, rules (`tables`) or files; empty: everything.
         configs: files that override config/config.yaml, in order.
         options: passed to Snakemake unchanged.
         every_byte: read all results of earlier runs, and rebuild those that are damaged.
@@ -330,8 +329,9 @@ def _recover(command: Sequence[str], results: Path) -> None:
                 f"another Snakemake process is running in {Path.cwd()}", fix="let it finish, or stop it"
             ) from error
     remove_leftovers(results)
-    if any(marker.read_text(encoding="utf-8") != socket.gethostname() for marker in markers):
-        logger.warning("another machine may be running this workflow; if not, run: hilsplat run -- --unlock")
+    is_elsewhere = any(marker.read_text(encoding="utf-8") != socket.gethostname() for marker in markers)
+    if is_elsewhere and "--unlock" not in command:
+        logger.warning("another machine may be running this workflow; if not, add once: -- --unlock")
         return
     try:
         alone = _locked(STATE / "processes.lock", wait=False)

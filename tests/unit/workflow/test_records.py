@@ -74,12 +74,9 @@ def test_other_settings_are_found(results, config, reasons):
 def test_other_options_are_found(results):
     """Snakemake would find them, unless the results were moved to another project, or are shared by two."""
     scene = FOLDER.with_name("scene")
-    write(scene, "one", "--unit", "metre", "--render", stage="poses")
-    assert problems() == {}
-    write(scene, "one", "--unit", "arbitrary", "--render", stage="poses")
-    assert problems() == {"scene": "it was made with another --unit"}
-    write(scene, "one", "--unit", "metre", stage="poses")
-    assert problems() == {"scene": "it was made with another --render"}
+    for options, other in ("metre --render", ""), ("feet --render", "unit"), ("metre", "render"):
+        write(scene, "one", "--unit", *options.split(), stage="poses")
+        assert problems() == ({"scene": f"it was made with another --{other}"} if other else {})
 
 
 def test_missing_and_cut_files_are_found(results):

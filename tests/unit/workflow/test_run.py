@@ -181,6 +181,8 @@ def test_the_locks_of_another_machine_stay(folder, started, unlocked, caplog):
     leave_marker("elsewhere")
     runs.run([], [], [])
     assert unlocked == [] and "another machine may be running" in caplog.text
+    runs.run([], [], ["--unlock"])
+    assert "unlock" in unlocked and list(STATE.glob("run-*")) == []
 
 
 def test_options_of_the_command_need_no_separator(folder, started, monkeypatch):
