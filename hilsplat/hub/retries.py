@@ -68,5 +68,5 @@ def retry_after_s(response: requests.Response) -> float:
     """Return the seconds in a response's `Retry-After` header (a number or a date); 0 without a valid one."""
     try:
         return Retry().parse_retry_after(response.headers.get("Retry-After", ""))
-    except InvalidHeader:
+    except (InvalidHeader, ValueError, OverflowError):
         return 0.0
