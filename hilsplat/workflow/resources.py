@@ -34,6 +34,7 @@ from hilsplat.scene.layouts import vertex_count
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.semantic_tree.limits import MAX_ALL
 from hilsplat.settings import GaussiansSettings, MasksSettings
+from hilsplat.splat.rasterise.device import cuda_problem
 from hilsplat.splat.steps import fit_steps
 from hilsplat.stages import all_stages, family_of, stage_of
 from hilsplat.workflow.plan import SCORED, Plan
@@ -184,8 +185,6 @@ class JobResources:
 
         For `device: auto`, these are jobs on this machine if it has a card; nodes of a cluster are unknown.
         """
-        from hilsplat.splat.rasterise.device import cuda_problem
-
         problem = cuda_problem if section in ("gaussians", "contributions") else card_problem
 
         def needed(wildcards: Any) -> int:

@@ -220,10 +220,8 @@ def _require_past(files: Sequence[str]) -> None:
 
     Snakemake would fail after the job, because its output is older than an input.
     """
-    now = time.time()
-    if late := [
-        path for path, stat in stats_of(map(Path, files)).items() if stat.st_mtime > now + MAX_SKEW_S
-    ]:
+    latest = time.time() + MAX_SKEW_S
+    if late := [path for path, stat in stats_of(map(Path, files)).items() if stat.st_mtime > latest]:
         touching = f"find {shlex.quote(str(late[0].parent))} -newermt now -exec touch {{}} +"
         raise ArtifactError(
             f"{late[0]} has a modification time in the future",
