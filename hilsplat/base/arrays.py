@@ -39,7 +39,7 @@ def require_arrays(built: Any) -> None:
     """
     with jaxtyped("context"):
         for name, declared, array in _declared(type(built), vars(built)):
-            if not _fits(array, declared):
+            if not isinstance(array, declared):
                 is_array = isinstance(array, np.ndarray)
                 raise SettingsError(
                     f"{type(built).__name__}: array {name} has the wrong type or shape",
@@ -49,17 +49,13 @@ def require_arrays(built: Any) -> None:
                 )
 
 
-def _declared(cls: type, arrays: Mapping[str, Any]) -> Iterator[tuple[str, type[AbstractArray], Any]]:
+def _declared(cls: type, arrays: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
     """Yield the arrays that have a jaxtyping annotation, by field name."""
     hints = get_type_hints(cls)
     for name, array in arrays.items():
         declared = hints.get(name)
         if isinstance(declared, type) and issubclass(declared, AbstractArray):
             yield name, declared, array
-
-
-def _fits(array: Any, declared: Any) -> bool:
-    return isinstance(array, declared)
 
 
 def require_types(cls: type, arrays: Mapping[str, Any], path: Path, limits: Limits) -> None:
@@ -72,7 +68,7 @@ def require_types(cls: type, arrays: Mapping[str, Any], path: Path, limits: Limi
     """
     with jaxtyped("context"):
         for name, declared, array in _declared(cls, arrays):
-            if not _fits(array, declared):
+            if not isinstance(array, declared):
                 found = f"{array.dtype} of shape {array.shape}"
                 raise damaged(path, f": array {name} has the wrong type or shape", described(declared), found)
             low, high = limits.get(name, (-np.inf, np.inf))

@@ -159,10 +159,6 @@ class MisalignedArtifactError(ArtifactError):
     """Two artifacts do not belong together: their rows, sizes or digests differ."""
 
 
-class EmptyMaskError(HilsplatError):
-    """A mask contains no pixels where at least one is required."""
-
-
 class DiskSpaceError(HilsplatError):
     """The disk is full, or has too little free space for a stage's output."""
 

@@ -192,9 +192,9 @@ def in_processes(
 
 OWN_PROCESS = """
 import sys
-sys.path += [entry for entry in sys.argv[3:] if entry not in sys.path]
+sys.path += [entry for entry in sys.argv[2:] if entry not in sys.path]
 from hilsplat.base.processes import run_alone
-run_alone(*map(int, sys.argv[1:3]))
+run_alone(int(sys.argv[1]))
 """
 
 
@@ -208,48 +208,36 @@ def in_own_process(work: Callable[..., Result], *arguments: Any) -> Result:
         ChildProcessError: the process ended without a result; the message contains the last 2000 characters
             of its stderr, which is otherwise not shown.
     """
-    from multiprocessing.connection import Pipe
-    from tempfile import TemporaryFile
+    from multiprocessing.reduction import ForkingPickler  # imported late: most commands need no process
 
-    ours, theirs = Pipe()
-    ids = str(theirs.fileno()), str(os.getpid())
-    command = [sys.executable, "-P", "-c", OWN_PROCESS, *ids, *sys.path]
-    with (
-        TemporaryFile() as stderr,
-        ours,
-        subprocess.Popen(command, stderr=stderr, pass_fds=[theirs.fileno()]) as process,
-    ):
-        theirs.close()
-        try:
-            ours.send((work, arguments))
-            result, error = ours.recv()
-        except (EOFError, OSError):
-            process.wait()
-            stderr.seek(max(0, stderr.tell() - 2000))
-            last = stderr.read().decode(errors="replace")
-            name = f"{work.__module__}.{work.__name__}"
-            raise ChildProcessError(f"{name} was terminated by a library\n{last}") from None
-        except BaseException:
-            process.kill()
-            raise
+    command = [sys.executable, "-P", "-c", OWN_PROCESS, str(os.getpid()), *sys.path]
+    call = bytes(ForkingPickler.dumps((work, arguments)))
+    done = subprocess.run(command, input=call, capture_output=True, check=False)
+    if done.returncode or not done.stdout:
+        last = done.stderr[-2000:].decode(errors="replace")
+        name = f"{work.__module__}.{work.__name__}"
+        raise ChildProcessError(f"{name} was terminated by a library\n{last}")
+    result, error = ForkingPickler.loads(done.stdout)
     if error is not None:
         raise error
     return result
 
 
-def run_alone(descriptor: int, parent: int) -> None:
-    """Receive a call from a pipe, and send its result and its exception."""
-    from multiprocessing.connection import Connection
+def run_alone(parent: int) -> None:
+    """Read a call from stdin, and write its result and its exception to stdout."""
+    from multiprocessing.reduction import ForkingPickler
 
     end_with_parent(parent)
+    answer = os.dup(1)
+    os.dup2(2, 1)  # libraries may print
+    work, arguments = ForkingPickler.loads(sys.stdin.buffer.read())
     result, error = None, None
-    with Connection(descriptor) as pipe:
-        work, arguments = pipe.recv()
-        try:
-            result = work(*arguments)
-        except Exception as raised:
-            error = raised
-        pipe.send((result, error))
+    try:
+        result = work(*arguments)
+    except Exception as raised:
+        error = raised
+    with os.fdopen(answer, "wb") as stream:
+        stream.write(ForkingPickler.dumps((result, error)))
 
 
 def in_order(work: Callable[[Item], Result], items: Sequence[Item], threads: int) -> Iterator[Result]:

@@ -25,6 +25,7 @@ from huggingface_hub.utils import disable_progress_bars
 from hilsplat.base.artifacts import read_json, read_memo, write_json
 from hilsplat.base.atomic import FULL_DISK, atomic_folder, explain_full_disk, output_lock, require_free_space
 from hilsplat.base.errors import DownloadError, ModelError, first_line
+from hilsplat.base.lineage import sha256_of_file
 from hilsplat.base.progress import track
 from hilsplat.base.removal import delete, is_tagged, tag
 from hilsplat.embed.model_check import check_model
@@ -144,7 +145,7 @@ def get_models(
 
 
 def _is_present(requested: ModelRequest, target: Path, listing: Listing) -> bool:
-    """Return whether the target was downloaded at this commit and all its files have their original size.
+    """Return whether the target was downloaded at this commit and all its files have their original digest.
 
     A folder that was not downloaded from this repository is refused.
     """
@@ -160,8 +161,8 @@ def _is_present(requested: ModelRequest, target: Path, listing: Listing) -> bool
     if origin and origin.get("revision") != listing.revision:
         logger.info("%s is replaced: it has commit %s", target, origin.get("revision"))
     return origin.get("revision") == listing.revision and all(
-        (target / path).is_file() and (target / path).stat().st_size == size
-        for path, size in origin["holds"].items()
+        (target / path).is_file() and sha256_of_file(target / path) == sha256
+        for path, sha256 in origin["holds"].items()
     )
 
 
@@ -341,7 +342,7 @@ def _complete(folder: Path, target: Path, files: list[HubFile], listing: Listing
             for file in files
         ],
         **more,
-        "holds": {path.relative_to(folder).as_posix(): path.stat().st_size for path in contents},
+        "holds": {path.relative_to(folder).as_posix(): sha256_of_file(path) for path in contents},
     }
     write_json(folder / ORIGIN, origin)
     return report

@@ -3,12 +3,12 @@
 import logging
 import time
 from collections.abc import Callable
-from datetime import UTC, datetime
-from email.utils import parsedate_to_datetime
 from typing import TypeVar
 
 import requests
 from huggingface_hub.errors import LocalEntryNotFoundError, OfflineModeIsEnabled
+from urllib3.exceptions import InvalidHeader
+from urllib3.util import Retry
 
 from hilsplat.base.errors import first_line
 
@@ -66,10 +66,7 @@ def _pause_s(error: Exception, wait_s: float) -> float | None:
 
 def retry_after_s(response: requests.Response) -> float:
     """Return the seconds in a response's `Retry-After` header (a number or a date); 0 without a valid one."""
-    text = response.headers.get("Retry-After", "")
-    if text.strip().isdecimal():
-        return float(text)
     try:
-        return max(0.0, (parsedate_to_datetime(text) - datetime.now(UTC)).total_seconds())
-    except (TypeError, ValueError):
+        return Retry().parse_retry_after(response.headers.get("Retry-After", ""))
+    except (InvalidHeader, ValueError, OverflowError):
         return 0.0

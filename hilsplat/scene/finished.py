@@ -55,9 +55,8 @@ class FinishedScene:
         """Find the artifacts of a variant, which must all be in the scene folder.
 
         Input paths are read from provenance; without it, each is expected beside the artifact made from it. A
-        variant without a field uses the field recorded in the provenance of its scores. During a run, the
-        variant's own CLIP vectors are sufficient. Until `default` has any, those of the key views are used,
-        with a warning.
+        variant may share the field recorded in the provenance of its scores. During a run, the variant's own
+        CLIP vectors are sufficient. Until `default` has any, those of the key views are used, with a warning.
 
         Raises:
             ArtifactError: the folder, the variant or a part is missing.
@@ -70,9 +69,10 @@ class FinishedScene:
                 expected=f"one of {', '.join(finished)}",
                 fix="list it under ablation_variants and run the workflow",
             )
-        field = folder / variant / "field.safetensors"
-        if not field.exists():
-            field = _recorded_input(folder / variant / "scores.csv", "field", folder) or field
+        own, scores = (folder / variant / name for name in ("field.safetensors", "scores.csv"))
+        field = _recorded_input(scores, "field", folder) or own
+        if field != own and own.exists() and own.stat().st_mtime > provenance_path(scores).stat().st_mtime:
+            field = own  # it is not scored yet
         clip = folder / variant / "clip"
         if variant == "default" and not (clip.exists() or field.exists()):
             early = folder / KEY_VIEWS / "clip"

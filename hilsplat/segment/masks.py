@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float32, Int, Int32, Int64, UInt8, UInt32
 
 from hilsplat.base.arrays import build_checked, impossible, require_types
 from hilsplat.base.artifacts import read_npz, write_npz
-from hilsplat.base.errors import EmptyMaskError
+from hilsplat.base.errors import HilsplatError
 from hilsplat.base.levels import NONE, Level
 from hilsplat.segment.kernels import areas_and_boxes, paint_runs, shared_pixels
 
@@ -120,10 +120,10 @@ class HierarchicalMasks:
         stability: Float32[np.ndarray, " M"],
         size_hw: tuple[int, int],
     ) -> "HierarchicalMasks":
-        """Build masks of given levels, or of one level; raise an EmptyMaskError if a mask is empty."""
+        """Build masks of given levels, or of one level; raise a HilsplatError if a mask is empty."""
         area_px, boxes = areas_and_boxes(runs, offsets, size_hw[1])
         if not area_px.all():
-            raise EmptyMaskError(
+            raise HilsplatError(
                 f"masks {np.flatnonzero(area_px == 0).tolist()} of {len(area_px)} contain no pixels",
                 fix="drop empty masks before packing",
             )

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Literal
 
 from packaging.requirements import Requirement
-from packaging.specifiers import SpecifierSet
 
 from hilsplat.base.atomic import existing_folder
 from hilsplat.base.errors import HilsplatError
@@ -48,11 +47,7 @@ def examine() -> Iterator[Finding]:
 
 
 def python() -> Iterator[Finding]:
-    required = importlib.metadata.metadata("hilsplat")["Requires-Python"]
-    found = platform.python_version()
-    problem = "" if SpecifierSet(required).contains(found) else f"{found}, but {required} is required"
-    sound = f"{found} on {platform.system()} {platform.machine()}"
-    yield verdict("python", problem, sound, "use a different Python version")
+    yield Finding("python", "ok", f"{platform.python_version()} on {platform.system()} {platform.machine()}")
 
 
 def libraries() -> Iterator[Finding]:
@@ -100,7 +95,12 @@ def video() -> Iterator[Finding]:
     import av
 
     needed: tuple[tuple[str, Literal["r", "w"]], ...] = (("h264", "r"), ("hevc", "r"), ("libx264", "w"))
-    missing = [f"{mode} {name}" for name, mode in needed if not _codec(name, mode)]
+    missing = []
+    for name, mode in needed:
+        try:
+            av.codec.Codec(name, mode)
+        except (av.FFmpegError, ValueError):
+            missing.append(f"{mode} {name}")
     problem = f"PyAV {av.__version__} lacks {', '.join(missing)}" if missing else ""
     sound = f"PyAV {av.__version__} reads H.264 and HEVC and writes H.264"
     yield verdict("video", problem, sound, "pip install --force-reinstall av")
@@ -171,13 +171,3 @@ def writing() -> Iterator[Finding]:
 
 
 CHECKS = (python, libraries, cuda, kernels, video, models, space, writing)
-
-
-def _codec(name: str, mode: Literal["r", "w"]) -> bool:
-    import av
-
-    try:
-        av.codec.Codec(name, mode)
-    except (av.FFmpegError, ValueError):
-        return False
-    return True

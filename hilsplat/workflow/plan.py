@@ -88,7 +88,7 @@ def escape_json_for_report(text: str) -> str:
     return text.replace("<", "\\u003c")
 
 
-def _words(stage: Stage[..., Any], values: Mapping[str, Any]) -> str:
+def words_of(stage: Stage[..., Any], values: Mapping[str, Any]) -> str:
     """Return options and arguments of a stage's command: one for each value, none for an empty value."""
     words: list[str] = []
     for name, value in values.items():
@@ -268,10 +268,10 @@ class Plan:
         stage = stage_of(name)
 
         def settings(wildcards: Any) -> str:
-            return _words(stage, self._values(stage, wildcards, options))
+            return words_of(stage, self._values(stage, wildcards, options))
 
         def command(wildcards: Any, input: Any, output: Any) -> str:
-            paths = _words(stage, self._paths(stage, wildcards, input, output))
+            paths = words_of(stage, self._paths(stage, wildcards, input, output))
             return f"{stage.command} {settings(wildcards)} {paths}"
 
         code = functools.cache(stage.code_digest)

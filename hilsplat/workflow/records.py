@@ -5,11 +5,13 @@ an unfinished output of a killed job, and it detects nothing if its metadata is 
 """
 
 import json
+import shlex
 from collections import Counter
 from collections.abc import Iterator
+from itertools import dropwhile
 from pathlib import Path
 
-from hilsplat.base.artifacts import provenance_path, run_command
+from hilsplat.base.artifacts import RUN, provenance_path, run_command
 from hilsplat.base.atomic import was_interrupted
 from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.base.lineage import (
@@ -23,10 +25,13 @@ from hilsplat.base.lineage import (
 from hilsplat.base.progress import track
 from hilsplat.models.store import model_digest
 from hilsplat.stages import all_stages
-from hilsplat.workflow.plan import Plan
+from hilsplat.workflow.plan import Plan, words_of
 from hilsplat.workflow.scene_data import VariantJob, of_variant
 
 WHOLE, STALE, DAMAGED = "whole", "stale", "damaged"
+
+OPTIONS = ("unit", "render", "source", "dataset", "variant", "names", "queries")
+"""Options of stages that are compared, besides settings; no rule replaces them, and they are no paths."""
 
 
 def outdated(plan: Plan, *, every_byte: bool = False) -> dict[str, str]:
@@ -57,7 +62,6 @@ def verify(results: Path) -> tuple[str, bool]:
     Raises:
         ArtifactError: the folder contains no artifacts.
     """
-    results = Path(results)
     artifacts = artifacts_in(results)
     if not artifacts:
         raise ArtifactError(
@@ -73,7 +77,8 @@ def verify(results: Path) -> tuple[str, bool]:
     lines.append(f"{len(artifacts)} artifacts in {results}: {states}")
     is_whole = counts[WHOLE] == len(artifacts)
     if not is_whole:
-        lines.append(f"to rebuild them, in the project that made them: {run_command(results, '--verify')}")
+        root = next((path for path in results.resolve().parents if (path / RUN).is_file()), results)
+        lines.append(f"to rebuild them, in the project that made them: {run_command(root, '--verify')}")
     return "\n".join(lines), is_whole
 
 
@@ -81,7 +86,7 @@ class Records:
     """Comparison of artifacts' provenance with their files.
 
     Args:
-        results: results folder; provenance refers to it as `results/...`, even if the folder was moved.
+        results: results folder; it may have been moved since its artifacts were written.
         plan: the run that settings and seeds must equal; None to compare only code and inputs.
         every_byte: compare all contents; otherwise, those of files newer than their record.
     """
@@ -143,21 +148,32 @@ class Records:
             seed = self.plan.seed(stage, job) if "seed" in stage.hints else None
             if record.seed != seed:
                 yield f"it was made with seed {record.seed}, not {seed}"
+            for name in (name for name in OPTIONS if name in stage.hints and record.command):
+                words = shlex.split(words_of(stage, {name: self.plan.options[name](job)}))
+                after = [*dropwhile(f"--{name}".__ne__, record.command)]
+                if after[: max(1, len(words))] != words:
+                    yield f"it was made with another --{name}"
         try:
             code = stage.code_digest(record.plugins)
         except HilsplatError:  # this version does not have the reader
             code = ""
         if code != record.code:
             yield "it was made by different code"
+        written = self._written_results(artifact, record)
         for name, read in record.inputs.items():
             files = {read.path: read.sha256} if read.files is None else read.files
             for file, digest in files.items():
-                recorded = Path(file)
-                inside = recorded.parts[:1] in (("results",), (self.results.name,))
-                path = self.results.joinpath(*recorded.parts[1:]) if inside else recorded
+                inside = Path(file).is_relative_to(written)
+                path = self.results / Path(file).relative_to(written) if inside else Path(file)
                 known = self._digest(path) if self.every_byte else self._known_digest(name, path)
                 if known != digest and (known is not None or (self.every_byte and inside)):
                     yield f"its input {name} {'is missing' if known is None else 'has changed'}: {path}"
+
+    def _written_results(self, artifact: Path, record: Provenance) -> Path:
+        """Return the results folder as an artifact's writer named it, given by the option `--out`."""
+        words, place = record.command, artifact.relative_to(self.results).parts
+        out = Path(words[words.index("--out") + 1]).parts if "--out" in words[:-1] else ()
+        return Path(*out[: -len(place)]) if out[-len(place) :] == place else Path("results")
 
     def _job_of(self, artifact: Path) -> VariantJob | None:
         """Return the job of an artifact that belongs to a scene of the plan."""

@@ -34,6 +34,7 @@ from hilsplat.scene.layouts import vertex_count
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.semantic_tree.limits import MAX_ALL
 from hilsplat.settings import GaussiansSettings, MasksSettings
+from hilsplat.splat.rasterise.device import cuda_problem
 from hilsplat.splat.steps import fit_steps
 from hilsplat.stages import all_stages, family_of, stage_of
 from hilsplat.workflow.plan import SCORED, Plan
@@ -184,15 +185,15 @@ class JobResources:
 
         For `device: auto`, these are jobs on this machine if it has a card; nodes of a cluster are unknown.
         """
-        uses = _fit_can_use_card if section in ("gaussians", "contributions") else _networks_can_use_card
-        is_here = self.cores is not None
+        problem = cuda_problem if section in ("gaussians", "contributions") else card_problem
 
         def needed(wildcards: Any) -> int:
             row, settings = self.plan.row(wildcards), getattr(self.plan.stages(wildcards), section)
             is_imported = row.gaussians is not None if section == "gaussians" else bool(row.features)
             if is_imported and section != "contributions":
                 return 0
-            return int(settings.uses_card and (settings.device == "cuda" or (is_here and uses())))
+            has_card = settings.device == "cuda" or (self.cores is not None and cards() and problem() is None)
+            return int(settings.uses_card and bool(has_card))
 
         return needed
 
@@ -297,16 +298,6 @@ def _pairs_mb(views: int) -> float:
     The stage counts them, and refuses to start if they need more.
     """
     return 0.12 * views**2 if views <= MAX_ALL else 4.0 * views
-
-
-def _fit_can_use_card() -> bool:
-    from hilsplat.splat.rasterise.device import cuda_problem
-
-    return bool(cards()) and cuda_problem() is None
-
-
-def _networks_can_use_card() -> bool:
-    return bool(cards()) and card_problem() is None
 
 
 def _steps_and_mp(fit: GaussiansSettings, views: int, view_mp: float) -> tuple[int, float]:

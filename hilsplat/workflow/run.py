@@ -145,7 +145,7 @@ def run(
     """Run the workflow in the working folder, and return Snakemake's exit status.
 
     Args:
-        targets: scenes (`photos/desk`, `desk`, `photos/*`), rules (`tables`) or files; empty for everything.
+        targets: scenes (`desk`, `photos/*`) or their folders, rules (`tables`) or files; empty: everything.
         configs: files that override config/config.yaml, in order.
         options: passed to Snakemake unchanged.
         every_byte: read all results of earlier runs, and rebuild those that are damaged.
@@ -163,23 +163,24 @@ def run(
         fix = "change to that folder first (cd), or pass --config results=FOLDER"
         raise HilsplatError("hilsplat run works in the current folder; --directory is refused", fix=fix)
     configs = [_config_file(path) for path in (*configs, *given.configfile)]
-    try:
-        overrides = {
-            key: yaml.safe_load(value) for key, _, value in (word.partition("=") for word in given.config)
-        }
+    try:  # as Snakemake does: values are strings, and mappings of one key are merged
+        words = [word.partition("=") for word in given.config]
+        overrides = [{key: yaml.load(value, yaml.BaseLoader)} for key, _, value in words]
     except yaml.YAMLError as error:
         raise SettingsError(
             f"--config is not valid YAML: {error}", expected="key=value", found=" ".join(given.config)
         ) from error
-    settings = merged_config(configs, overrides)
+    settings = merged_config(configs, *overrides)
     try:
         chosen = parse_run(settings)
     except SettingsError as error:
         error.add_line("in", first_unusable(configs))
         raise
     rows = read_sheet(project_path(chosen.scenes), (), chosen.data_root)  # the plan checks the folders
+    files, names = f"{chosen.results}/", {row.name for row in rows}
+    targets = [str(Path(target)) for target in targets]  # shells complete folders with a slash
+    targets = [name if (name := target.removeprefix(files)) in names else target for target in targets]
     scenes = [target for target, found in matches_of(rows, targets).items() if found]
-    files = f"{chosen.results}/"
     named = [each for each in targets if each not in scenes and not each.startswith(files)]
     _require_known(named, rows, chosen.results)
     if scenes:
@@ -259,9 +260,9 @@ def _start(
     ending = ["--", *files] if files else []
     wrong = outdated(plan, every_byte=every_byte)
     if wrong:
-        summary = _snakemake(command, "--summary", *ending)
-        needed = {line.split("\t")[0] for line in summary.stdout.splitlines()}
-        wrong = {output: reason for output, reason in wrong.items() if output in needed}
+        lines = _snakemake(command, "--summary", *ending).stdout.splitlines()
+        kept = {line.split("\t")[0] for line in lines if line.endswith("\tno update")}
+        wrong = {output: reason for output, reason in wrong.items() if output in kept}
     for output, reason in wrong.items():
         logger.warning("rebuilding %s: %s", output, reason)
     rebuilt = ["--forcerun", *forced, *wrong] if forced or wrong else []
@@ -328,8 +329,9 @@ def _recover(command: Sequence[str], results: Path) -> None:
                 f"another Snakemake process is running in {Path.cwd()}", fix="let it finish, or stop it"
             ) from error
     remove_leftovers(results)
-    if any(marker.read_text(encoding="utf-8") != socket.gethostname() for marker in markers):
-        logger.warning("another machine may be running this workflow; if not, run: hilsplat run -- --unlock")
+    is_elsewhere = any(marker.read_text(encoding="utf-8") != socket.gethostname() for marker in markers)
+    if is_elsewhere and "--unlock" not in command:
+        logger.warning("another machine may be running this workflow; if not, add once: -- --unlock")
         return
     try:
         alone = _locked(STATE / "processes.lock", wait=False)

@@ -6,13 +6,15 @@ wildcards of a rule, or a row of the sheet. Only evaluation and figures read lab
 
 import functools
 import os
+import shlex
+import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Protocol, runtime_checkable
 
-from hilsplat.base.errors import SettingsError, nearest
-from hilsplat.base.files import IMAGE_SUFFIXES
+from hilsplat.base.errors import ArtifactError, SettingsError, nearest
+from hilsplat.base.files import IMAGE_SUFFIXES, stats_of
 from hilsplat.base.lineage import digests_of, sha256_of_json
 from hilsplat.datasets.registry import readers_of
 from hilsplat.datasets.sources import absence, image_files, is_exported, label_files, label_sets
@@ -21,6 +23,9 @@ from hilsplat.scene.sheet import DATA_PREFIX, SceneRow
 
 CATEGORY = b'"category"'
 """Key of the text of an object in a file of labels."""
+
+MAX_SKEW_S = 60.0
+"""How far ahead of this machine's clock the time of a user's file may be; file servers have other clocks."""
 
 
 @runtime_checkable  # for the type checker of the tests
@@ -96,6 +101,7 @@ class SceneData:
             found = files(job)
             if isinstance(found, str):
                 found = []  # a folder that a rule writes
+            _require_past(found)
             memo = Path(self.path(job)).parents[1] / ".cache/inputs" / job.dataset / f"{job.scene}.json"
             return self._digest(memo if found else None, *found)
 
@@ -207,3 +213,17 @@ class SceneData:
         """Return the labels for queries and outlines in figures, which must be on images, if any."""
         labels = [name for name in self.labels(self.row(job)) if not is_exported(f"{DATA_PREFIX}{name}")]
         return labels[-1] if labels else ""
+
+
+def _require_past(files: Sequence[str]) -> None:
+    """Raise ArtifactError for a time in the future, such as that of a camera in another time zone.
+
+    Snakemake would fail after the job, because its output is older than an input.
+    """
+    latest = time.time() + MAX_SKEW_S
+    if late := [path for path, stat in stats_of(map(Path, files)).items() if stat.st_mtime > latest]:
+        touching = f"find {shlex.quote(str(late[0].parent))} -newermt now -exec touch {{}} +"
+        raise ArtifactError(
+            f"{late[0]} has a modification time in the future",
+            fix=f"correct this machine's clock, or run: {touching}",
+        )

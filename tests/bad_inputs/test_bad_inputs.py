@@ -205,9 +205,6 @@ ROWS = {
     "a query of a separator alone": row(
         nothing, ("query", "photos/desk", ">"), "contains an empty text", "up to 500 characters", "fix"
     ),
-    "a query that ends with a separator": row(
-        nothing, ("query", "photos/desk", "a >"), "contains an empty text", "'a >', 3 characters"
-    ),
     "a query of 10,000 letters": row(
         nothing, ("query", "photos/desk", "a" * 10_000), "the query is too long", "10000 characters"
     ),
@@ -300,7 +297,6 @@ ROWS = {
     "YAML for --configfile in Latin-1": row(
         write("my.yaml", b"labels: {a: \xff}\n"), (*CHECK, "my.yaml"), "my.yaml cannot be read", "UTF-8"
     ),
-    "a missing configuration file": row(nothing, (*CHECK, "my.yaml"), "my.yaml is missing"),
     "YAML that is a list": row(
         write("config/config.yaml", "- a\n"), OWN_CONFIG, "does not contain settings", "list"
     ),

@@ -2,10 +2,12 @@
 
 import json
 import os
+import subprocess
 from pathlib import Path
 
 import pytest
 
+from hilsplat.base.errors import ArtifactError
 from hilsplat.scene.layouts import NO_POSES, photo_files
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.workflow.scene_data import SceneData
@@ -121,7 +123,7 @@ def replace(path: Path, text: str, ns: int) -> None:
     path.with_suffix(".new").replace(path)
 
 
-@pytest.mark.parametrize("ns", [1, 10**18, 2 * 10**18], ids=["older", "same time", "newer"])
+@pytest.mark.parametrize("ns", [1, 10**18, 10**18 + 10**9], ids=["older", "same time", "newer"])
 @pytest.mark.parametrize(
     ("name", "stage"),
     [
@@ -176,3 +178,15 @@ def test_an_unreadable_file_stops_no_plan(project):
     (project / "words.txt").unlink()
     (project / "words.txt").mkdir()
     assert contents(project)["names"]
+
+
+def test_photographs_of_the_future_are_refused_with_the_command_that_corrects_them(project):
+    """Snakemake would fail after the job, because its output is older than an input."""
+    before = contents(project)
+    for path in (project / "desk/images").iterdir():
+        os.utime(path, (2**32, 2**32))
+    with pytest.raises(ArtifactError, match=r"1\.png has a modification time in the future") as found:
+        contents(project)
+    command = str(found.value).partition("or run: ")[2]
+    subprocess.run(command, shell=True, check=True)
+    assert contents(project) == before

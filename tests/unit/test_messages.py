@@ -30,7 +30,7 @@ PROSE = {
     "in",
 }
 """What follows the name in sentences about hilsplat."""
-TO_SNAKEMAKE = {"--unlock", "--config"}
+TO_SNAKEMAKE = {"--config"}
 """Options of Snakemake that messages suggest after `--`."""
 
 

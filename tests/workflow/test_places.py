@@ -1,14 +1,13 @@
 """The workflow runs from any folder, as a module, from a read-only clone, in an unactivated environment."""
 
-import os
 import re
-import subprocess
+import shutil
 import sys
 from pathlib import Path
 
 import pytest
 
-from tests.workflow.conftest import SCENE, Project, copy_project
+from tests.workflow.conftest import Project, copy_project
 
 PRIVATE = re.compile(
     r"workflow\.(persistence|dag|is_main_process|executor_plugin|rerun_triggers|resource_settings|output_settings"
@@ -66,7 +65,7 @@ def test_another_directory_takes_configuration_sheet_and_models_from_a_read_only
     assert written_files(clone.root) == before
 
 
-def test_a_module_with_a_prefix_gives_the_same_bytes_on_one_core(
+def test_a_module_with_a_prefix_gives_the_same_bytes_on_one_core_without_an_activated_environment(
     finished: Project, clone: Project, tmp_path: Path
 ) -> None:
     outer = tmp_path / "outer"
@@ -92,7 +91,10 @@ rule mine:
     assert len(commands) >= 10 and "rule hilsplat_evaluate:" in printed
     paths = [word for line in commands for word in line.split() if "results" in word]
     assert [path for path in paths if not path.startswith("inner/results/")] == []
-    Project(outer).run(sys.executable, "-m", "snakemake", "--cores", "1", PYTHONPATH=str(clone.root))
+    for name in ("gaussians", "masks", "contributions"):  # `test_library` computes these on one core
+        shutil.copytree(finished.root / "results/.cache" / name, outer / "inner/results/.cache" / name)
+    bare = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(clone.root)}
+    Project(outer).run(sys.executable, "-m", "snakemake", "--cores", "1", **bare)
     # the plan, which no prefix reaches, keeps digests of models there
     beside = [path.name for path in (outer / "results").rglob("*") if path.is_file()]
     assert beside == ["digests.json"]
@@ -106,11 +108,3 @@ def test_the_results_folder_is_one_setting(clone: Project) -> None:
     assert "output: out put/" in printed and "output: results/" not in printed
     commands = [line for line in printed.splitlines() if "python -m hilsplat" in line]
     assert not [line for line in commands if " results/" in line]
-
-
-def test_jobs_run_without_an_activated_environment(clone: Project) -> None:
-    home, images = os.environ.get("HOME", "/"), str(SCENE / "world/images")
-    environment = {"PATH": "/usr/bin:/bin", "HOME": home, "PYTHONPATH": str(clone.root)}
-    command = [sys.executable, "-m", "snakemake", "--configfile", "config/ci.yaml", "--cores", "2", images]
-    subprocess.run(command, cwd=clone.root, env=environment, check=True)
-    assert (clone.root / images).is_dir()

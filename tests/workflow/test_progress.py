@@ -17,9 +17,6 @@ def test_a_finished_stage_is_one_line_and_query_commands_follow(copy_of_finished
     assert "rule clip:" not in printed and "Select jobs" not in printed
     record = max((project.root / ".snakemake/log").iterdir(), key=lambda file: file.stat().st_mtime)
     assert "rule clip:" in record.read_text()  # Snakemake's own log has everything
-    shutil.rmtree(project.root / VECTORS)
-    printed = project.snakemake(VECTORS, "--verbose").stderr
-    assert "rule clip:" in printed and "synthetic/tiny clip: " not in printed
 
 
 def test_the_error_of_a_failed_job_is_the_last_lines_of_a_run(copy_of_finished: Project) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from hilsplat.models.store import RECOMMENDED, RELEASES
 from tests.loopback_hub import LoopbackHub, loopback_hub
-from tests.workflow.conftest import Project
+from tests.workflow.conftest import SCENE, Project
 
 SMALL = {
     # a run of seconds; the photographs are renders of the tiny scene, so the lens is known
@@ -30,14 +30,9 @@ def serve(hub: LoopbackHub, project: Path, folder: Path) -> None:
         hub.repositories[repository_of[name]] = folder / name
 
 
-def test_get_new_run_and_query(project: Path, plain: Project, tmp_path: Path) -> None:
+def test_get_new_run_and_query(project: Path, finished: Project, plain: Project, tmp_path: Path) -> None:
     (plain.root / "config/small.yaml").write_text(json.dumps({"overrides": {"photos": SMALL}}))
-    world = {"views": 12, "image_px": 128, "arc_deg": 100, "objects": 3, "samples": 2}
-    places = ("--out", "photographs", "--truth", "truth")
-    plain.hilsplat(
-        "world", "make", "--source", "world:tabletop:210", "--settings", json.dumps(world), *places
-    )
-
+    shutil.copytree(finished.root / SCENE / "world/images", plain.root / "photographs")
     without = plain.hilsplat("new", "before", "photographs")
     assert "text queries by clip-tiny" in without and "meaningless" in without
     with loopback_hub() as hub:

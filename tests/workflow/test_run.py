@@ -1,7 +1,5 @@
 """The CI configuration from nothing to tables and figures."""
 
-import json
-
 import pandas as pd
 
 from tests.reference import tiny
@@ -11,7 +9,6 @@ TABLES = ("hierarchy", "lerf", "3dovs", "ablation", "theta", "omega", "frames-hi
 TABLES += ("efficiency", "pruning", "cost-seconds", "efficiency-seconds", "pruning-seconds")
 OWN = ("components",)  # tables without a row of the paper
 REPORTED = ("cost", "replica", "scannet", "waymo")  # tables in which the tiny scene has no row
-FOLDERS = ("masks", "coverage_tree", "clip", "contributions", "semantic_tree", "autoencoder")
 
 
 def test_all_tables_and_figures_are_there(finished: Project) -> None:
@@ -66,12 +63,3 @@ def times_of(project: Project) -> dict[str, int]:
     """Return the modification time of each file of the results, but not of the cache."""
     files = (path for path in (project.root / "results").rglob("*") if ".cache" not in path.parts)
     return {str(path): path.stat().st_mtime_ns for path in files if path.is_file()}
-
-
-def test_every_artifact_has_provenance(finished: Project) -> None:
-    for name in (*FOLDERS, "field.safetensors", "scores.csv"):
-        path = finished.root / SCENE / "default" / f"{name}.provenance.json"
-        record = json.loads(path.read_text())
-        assert record["code"], name
-        assert record["libraries"]["numpy"], name
-        assert all(entry["sha256"] for entry in record["inputs"].values()), name

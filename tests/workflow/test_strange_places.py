@@ -30,10 +30,6 @@ def make_again(place: Project, **environment: str) -> None:
     assert not list(place.root.rglob("*.ran"))
 
 
-def test_no_module_is_imported_from_the_working_folder(place):
-    make_again(place)
-
-
 @pytest.mark.parametrize("streams", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
 def test_a_command_with_closed_streams_ends_well(place, streams):
     closed = replace(place, before=("sh", "-c", f'exec "$@" {streams}', "sh"))

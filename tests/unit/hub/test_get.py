@@ -27,6 +27,7 @@ from hilsplat.hub.pins import pins
 from hilsplat.hub.retries import retry_after_s
 from hilsplat.models.store import RELEASES, models_table, real_model
 from tests.loopback_hub import Refusal, git_sha1
+from tests.unit.artifact_changes import flip_bit
 from tests.unit.hub.conftest import CLIP, SAM, point_at, write_pins
 from tests.unit.segment.handmade import move_weights
 
@@ -105,8 +106,9 @@ def test_a_second_get_transfers_nothing_and_a_new_commit_replaces_all_but_files_
     hub.asked.clear()
     assert "models/sam-vit-base already exists" in get_models(["sam-vit-base"])
     assert [path for _, path, _ in hub.asked] == [f"/api/models/{SAM}"]
-    (TARGET / "onnx" / ENCODER).unlink()  # a file is lost: fetched again
-    assert "kind       sam" in get_models(["sam-vit-base"])
+    for damage in (Path.unlink, lambda path: flip_bit(path, 0.5)):
+        damage(TARGET / "onnx" / ENCODER)
+        assert "kind       sam" in get_models(["sam-vit-base"]), "it was not fetched again"
     preprocessing = json.loads((changed / "preprocessor_config.json").read_text())
     (changed / "preprocessor_config.json").write_text(json.dumps({**preprocessing, "resample": 3}))
     (TARGET / "vocabulary.txt").write_text("mug")
@@ -252,8 +254,9 @@ def test_a_date_in_retry_after_is_a_time_from_now():
     response = requests.Response()
     response.headers["Retry-After"] = formatdate(time.time() + 3600, usegmt=True)
     assert 1800 < retry_after_s(response) <= 3600
-    response.headers["Retry-After"] = "soon"
-    assert retry_after_s(response) == 0
+    for text in ("soon", "9" * 5000, "Mon, 30 Nov 99999 00:00:00 GMT"):
+        response.headers["Retry-After"] = text
+        assert retry_after_s(response) == 0
 
 
 def test_escape_sequences_of_the_hub_do_not_reach_the_terminal(hub, caplog):

@@ -1,5 +1,6 @@
 """Queries on the world with two boxes: flat, along a path, of a view."""
 
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -273,6 +274,12 @@ def test_a_variant_uses_the_parts_recorded_in_its_scores_or_those_that_exist(tmp
     found = FinishedScene.locate(folder, "theta").parts
     assert found.field == folder / "default/field.safetensors"
     assert found.semantic_tree == folder / "default/semantic_tree"
+    own = folder / "theta/field.safetensors"
+    own.touch()
+    write_record(own, inputs={"autoencoder": {"path": "results/photos/bear/default/autoencoder"}})
+    for time_s, used in ((0, found.field), (2**32, own)):  # of before it shared the field, and made since
+        os.utime(own, (time_s, time_s))
+        assert FinishedScene.locate(folder, "theta").parts.field == used
     with pytest.raises(ArtifactError, match="no variant 'x'"):
         FinishedScene.locate(folder, "x")
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from hilsplat.base.errors import EmptyMaskError
+from hilsplat.base.errors import HilsplatError
 from hilsplat.base.levels import Level
 from hilsplat.segment.kernels import BAND_WORDS
 from hilsplat.segment.masks import HierarchicalMasks, encode_runs, runs_of_labels
@@ -78,5 +78,5 @@ def test_no_masks_at_all_is_a_valid_view():
 
 
 def test_empty_mask_is_refused():
-    with pytest.raises(EmptyMaskError, match=r"masks \[1\] of 2"):
+    with pytest.raises(HilsplatError, match=r"masks \[1\] of 2"):
         pack(np.array([[[True]], [[False]]]))

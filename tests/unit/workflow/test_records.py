@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hilsplat.base.artifacts import provenance_path, write_json
+from hilsplat.base.artifacts import RUN, provenance_path, write_json
 from hilsplat.base.atomic import lock_path, output_lock
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.lineage import Inputs, write_provenance
@@ -20,9 +20,9 @@ FOLDER = Path("results/synthetic/one/default")
 MASKS, TREE = FOLDER / "masks", FOLDER / "coverage_tree"
 
 
-def write(artifact: Path, text: str = "one", **inputs: Path) -> None:
+def write(artifact: Path, text: str = "one", *options: str, stage: str = "", **inputs: Path) -> None:
     """Write an artifact and its record as the plan makes it."""
-    plan, stage = plan_of(Path(), BENCHMARK[:1]), stage_of(artifact.name)
+    plan, stage = plan_of(Path(), BENCHMARK[:1]), stage_of(stage or artifact.name)
     for name in ("a.npz", "b.npz"):
         artifact.mkdir(parents=True, exist_ok=True)
         (artifact / name).write_text(text)
@@ -30,9 +30,9 @@ def write(artifact: Path, text: str = "one", **inputs: Path) -> None:
         artifact,
         stage=stage.name,
         code=stage.code_digest(),
-        command=["hilsplat"],
+        command=["hilsplat", stage.name, *options, "--out", str(artifact)],
         settings={name: json.loads(plan.settings(name, Job())) for name in stage.sections.values()},
-        seed=None,
+        seed=0 if "seed" in stage.hints else None,
         inputs=Inputs("masks", inputs),
     )
 
@@ -69,6 +69,14 @@ def test_other_settings_are_found(results, config, reasons):
     found = problems(**config)
     assert found.keys() == reasons.keys()
     assert all(reason in found[name] for name, reason in reasons.items())
+
+
+def test_other_options_are_found(results):
+    """Snakemake would find them, unless the results were moved to another project, or are shared by two."""
+    scene = FOLDER.with_name("scene")
+    for options, other in ("metre --render", ""), ("feet --render", "unit"), ("metre", "render"):
+        write(scene, "one", "--unit", *options.split(), stage="poses")
+        assert problems() == ({"scene": f"it was made with another --{other}"} if other else {})
 
 
 def test_missing_and_cut_files_are_found(results):
@@ -154,10 +162,24 @@ def test_an_artifact_without_a_record_is_found(results):
     assert problems() == {"semantic_tree": "it has no provenance"}
 
 
-def test_a_moved_folder_is_still_whole(results, tmp_path):
-    shutil.rmtree(tmp_path / "photos")
+@pytest.mark.parametrize("name", ["results", "out/of runs", "/absolute"])
+def test_a_moved_folder_is_whole_until_an_input_in_it_is_missing(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    results = Path(name.replace("/absolute", str(tmp_path / "absolute")))
+    Path("photos").mkdir()
+    Path("photos/1.jpg").touch()
+    masks, tree = (results / Path(*path.parts[1:]) for path in (MASKS, TREE))
+    write(masks, scene=Path("photos"))
+    write(tree, masks=masks)
+    shutil.rmtree("photos")
     copy = shutil.copytree(results, tmp_path / "elsewhere/copy")
     assert verify(copy) == (f"2 artifacts in {copy}: 2 whole", True)
+    shutil.rmtree(results)
+    assert verify(copy)[1]
+    missing = copy / masks.relative_to(results)
+    shutil.rmtree(missing)
+    provenance_path(missing).unlink()
+    assert f"its input masks is missing: {missing}" in verify(copy)[0]
 
 
 def test_verify_reads_every_byte_and_prints_the_repair(results):
@@ -170,6 +192,8 @@ def test_verify_reads_every_byte_and_prints_the_repair(results):
         "2 artifacts in results: 1 stale, 1 damaged",
         "to rebuild them, in the project that made them: hilsplat run --verify",
     ]
+    write_json(results / RUN, {"results": ["results"]})
+    assert verify(FOLDER)[0].splitlines()[-1] == report.splitlines()[-1], "a folder in it is no target"
 
 
 def test_verify_finds_a_missing_input_and_damaged_provenance(results):

@@ -110,7 +110,7 @@ def test_jobs_that_use_a_card_request_one(
 ):
     monkeypatch.setattr("hilsplat.workflow.resources.cards", lambda: on_machine)
     monkeypatch.setattr("hilsplat.workflow.resources.card_problem", lambda: None)
-    monkeypatch.setattr("hilsplat.splat.rasterise.device.cuda_problem", lambda: gsplat_problem)
+    monkeypatch.setattr("hilsplat.workflow.resources.cuda_problem", lambda: gsplat_problem)
     sections = ("gaussians", "masks", "clip", "contributions")
     config = {section: {"device": device} for section in sections}
     config["masks"]["segmenter"] = segmenter

@@ -13,6 +13,7 @@ from hilsplat.base.artifacts import run_command
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.cli.main import app
 from hilsplat.workflow import run as runs
+from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.run import STATE
 from tests.unit.workflow.plans import write_sheet
 
@@ -87,6 +88,8 @@ def test_scenes_become_a_configuration_and_other_targets_stay(folder, started):
     assert value(command, "--cores") == "1" and "--keep-going" in command
     runs.run(["synthetic/two"], [], [])
     assert 'only=["synthetic/two"]' in started[-1]
+    runs.run(["./results/synthetic/two/", "./results/synthetic/two/scene/"], [], [])  # as shells complete
+    assert 'only=["synthetic/two"]' in started[-1] and started[-1][-1] == "results/synthetic/two/scene"
     runs.run(["synthetic/*", "tables"], [], [])
     assert 'only=["synthetic/*"]' in started[-1] and started[-1][-2:] == ["--", "tables"]
     runs.run(["models/the-two"], [], [])  # a file, although it ends like the name of a scene
@@ -104,13 +107,16 @@ def test_a_misspelt_scene_is_refused(folder, started):
     assert started == []
 
 
-def test_needed_outputs_that_do_not_match_their_provenance_are_rebuilt_with_forced_stages(
+def test_outputs_without_their_provenance_that_snakemake_would_keep_are_rebuilt_with_forced_stages(
     folder, started, monkeypatch
 ):
     ply = Path("results/synthetic/one/gaussians.ply")
-    (ply.parent / "scene").mkdir(parents=True)  # it is not needed
+    scene = ply.parent / "scene"
+    scene.mkdir(parents=True)
+    (ply.parent / "default/masks").mkdir(parents=True)  # it is not needed
     ply.write_text("")
-    answer = subprocess.CompletedProcess([], 0, f"output_file\tdate\n{ply}\t-\n", "")
+    lines = ("output_file\tplan", f"{scene}\tupdate pending", f"{ply}\tno update")
+    answer = subprocess.CompletedProcess([], 0, "\n".join(lines), "")
     monkeypatch.setattr(runs.subprocess, "run", lambda words, **kwargs: answer)
     runs.run([str(ply)], [], [])
     runs.run([], [], ["--forcerun", "field"])
@@ -175,6 +181,8 @@ def test_the_locks_of_another_machine_stay(folder, started, unlocked, caplog):
     leave_marker("elsewhere")
     runs.run([], [], [])
     assert unlocked == [] and "another machine may be running" in caplog.text
+    runs.run([], [], ["--unlock"])
+    assert "unlock" in unlocked and list(STATE.glob("run-*")) == []
 
 
 def test_options_of_the_command_need_no_separator(folder, started, monkeypatch):
@@ -206,6 +214,15 @@ def test_a_run_records_installed_configurations_by_name_for_the_commands_of_mess
     runs.record_run(Path("results"), [project / "config/ci.yaml", folder / "config/mine.yaml"], {})
     command = "hilsplat run --config ci --config config/mine.yaml results/a/b/scene"
     assert run_command(Path("results/a/b/scene")) == command
+
+
+def test_values_on_the_command_line_are_read_as_snakemake_reads_them(folder, started, monkeypatch):
+    plans: list[Plan] = []
+    monkeypatch.setattr(runs, "outdated", lambda plan, **_: plans.append(plan) or {})
+    values = ["results=2026-11-30", "masks={levels: tree}", "masks={theta: 0.8}"]
+    runs.run([], [], ["-n", "--config", *values])
+    masks = plans[0].run.masks
+    assert (plans[0].run.results, masks.levels, masks.theta) == ("2026-11-30", "tree", 0.8)
 
 
 def test_the_snakefile_is_beside_the_configuration_or_the_installed_one(
