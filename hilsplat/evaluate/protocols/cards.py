@@ -1,7 +1,7 @@
 """Protocols: the name, the version and everything else that determines a number measured under each.
 
 The same model scores 51.4 under `lerf/langsplat` and 9.66 under `lerf/opengaussian`, so each row of
-`scores.csv` has the full name, such as `lerf/langsplat@2`, then non-default settings in brackets. A change to
+`scores.csv` has the full name, such as `lerf/langsplat@3`, then non-default settings in brackets. A change to
 a card (`cards.json`) that affects its numbers requires a new version; a test checks this.
 """
 

@@ -28,15 +28,15 @@ def results(desk, tmp_path) -> Path:
     one = tmp_path / "rooms/one"
     write_json(one / "gaussians/report.json", {"psnr_db": 21.456, "gaussians": 864})
     values = {
-        "lerf/tree-nodes@5": (0.5, 0.8),
-        "lerf/langsplat@2 (wholes)": (0.2,),
-        "lerf/langsplat-v2@2": (0.6,),
+        "lerf/tree-nodes@6": (0.5, 0.8),
+        "lerf/langsplat@3 (wholes)": (0.2,),
+        "lerf/langsplat-v2@3": (0.6,),
     }
     scores = [of_protocol(name, value) for name, of_name in values.items() for value in of_name]
-    scores.append(of_protocol("lerf/langsplat@2", 0.1, "field"))
+    scores.append(of_protocol("lerf/langsplat@3", 0.1, "field"))
     of_levels = {"whole": (0.5, 0.7), "part": (0.1, 0.1, 0.1, 0.1), "subpart": (0.2,)}
     for level, of_level in of_levels.items():
-        scores += [of_protocol("hierarchy/level-auto@6", value, level=level) for value in of_level]
+        scores += [of_protocol("hierarchy/level-auto@7", value, level=level) for value in of_level]
     write_scores(one / "default/scores.csv", scores)
     for part in ("clip", "semantic_tree", "masks"):
         shutil.copytree(desk / "default" / part, tmp_path / "rooms/early/key-views" / part)

@@ -196,7 +196,7 @@ synthetic stand-in,synthetic,theta = 0.6,a,level given,41.00,
 synthetic stand-in,synthetic,"theta = 0.6, by head",a,level given,61.00,
 synthetic stand-in,synthetic,"theta = 0.9, by head",a,level given,62.00,
 synthetic stand-in,synthetic,"theta = 0.9, by head",b,level given,72.00,
-synthetic stand-in,synthetic,theta = 0.9,a,hierarchy/level-given@5 (filter 20),82.00,
+synthetic stand-in,synthetic,theta = 0.9,a,hierarchy/level-given@6 (filter 20),82.00,
 """
 
 

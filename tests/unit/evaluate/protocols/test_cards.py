@@ -4,60 +4,134 @@ import hashlib
 import re
 from dataclasses import asdict
 
+import numpy as np
 import pytest
 
+import hilsplat
 from hilsplat.base.errors import ArtifactError
-from hilsplat.evaluate.protocols.cards import CARDS, LERF_LANGSPLAT, LEVEL_GIVEN, PATH, TREE_NODES, card_of
+from hilsplat.base.levels import Level
+from hilsplat.evaluate.extra_protocols import ExtraProtocols
+from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
+from hilsplat.evaluate.protocols.cards import (
+    CARDS,
+    INSTANCES,
+    LERF_LANGSPLAT,
+    LEVEL_GIVEN,
+    PATH,
+    TREE_NODES,
+    card_of,
+)
 from hilsplat.evaluate.protocols.points import class_set
-from hilsplat.evaluate.protocols.views import label_of
+from hilsplat.evaluate.protocols.view_truth import ViewTruth
+from hilsplat.evaluate.protocols.views import label_of, measure_view
+from hilsplat.evaluate.score import SCORED
 from hilsplat.settings import EvaluateSettings
 from tests.conftest import PROJECT
+from tests.unit.evaluate.builders import HandMade, box, region_of
 
 DECIDED = {
     # full name: digest of all that determines a number
-    "lerf/langsplat@2": "00e1f107",
-    "lerf/tree-nodes@5": "1fa14c68",
-    "lerf/langsplat-v2@2": "b0d9afb3",
-    "lerf/paper-filter@2": "804964c0",
-    "lerf/paper-mean@2": "5768b3cc",
-    "lerf/opengaussian@1": "1b122683",
-    "lerf-mask/gaussian-grouping@1": "e6d93a59",
-    "lerf-mask/gaussian-grouping-skipping@1": "c241ea72",
-    "3d-ovs/argmax@3": "1128109f",
-    "3d-ovs/langsplat@2": "f6e46c55",
-    "3d-ovs/langsplat-raw@2": "032c1219",
-    "3d-ovs/langsplat-v2@3": "e9ed3d71",
-    "3d-ovs/tree-nodes@1": "e097e501",
-    "scannet/opengaussian-19@1": "d64c6a7c",
-    "scannet/opengaussian-15@1": "9c2bf111",
-    "scannet/opengaussian-10@1": "d9b46593",
-    "scannet200/opengaussian@1": "55c18009",
-    "scannet200/benchmark@1": "8ed63d14",
-    "scannet200/instances@1": "c9866886",
-    "replica/per-scene@1": "02a2f18f",
-    "replica/opennerf@1": "3bd79743",
-    "replica/conceptgraphs@1": "a221d8a0",
-    "waymo/segmentation@1": "9622c7a0",
-    "hierarchy/level-given@5": "cc1e20b7",
-    "hierarchy/level-auto@6": "97938d15",
-    "hierarchy/path@3": "90fed6d1",
-    "hierarchy/scene-wide@2": "0ddcebe5",
-    "hierarchy/annotations@1": "7aa18d6b",
-    "world/view-consistency@2": "e5909c33",
+    "lerf/langsplat@3": "d23d3910",
+    "lerf/tree-nodes@6": "39469e82",
+    "lerf/langsplat-v2@3": "5aaf19cd",
+    "lerf/paper-filter@3": "47a7c534",
+    "lerf/paper-mean@3": "fb3ac8d6",
+    "lerf/opengaussian@1": "a4ffff06",
+    "lerf-mask/gaussian-grouping@1": "40f271f1",
+    "lerf-mask/gaussian-grouping-skipping@1": "f6f3bcd9",
+    "3d-ovs/argmax@3": "46733171",
+    "3d-ovs/langsplat@2": "361dc448",
+    "3d-ovs/langsplat-raw@2": "d787304f",
+    "3d-ovs/langsplat-v2@3": "b7498973",
+    "3d-ovs/tree-nodes@1": "073a53bf",
+    "scannet/opengaussian-19@1": "f4554681",
+    "scannet/opengaussian-15@1": "2698bc3a",
+    "scannet/opengaussian-10@1": "383ae9c8",
+    "scannet200/opengaussian@1": "e2233b62",
+    "scannet200/benchmark@1": "f3fa6245",
+    "scannet200/instances@1": "457a8e45",
+    "replica/per-scene@1": "fe539e49",
+    "replica/opennerf@1": "acaecbf3",
+    "replica/conceptgraphs@1": "d5538acc",
+    "waymo/segmentation@1": "dbce9ca2",
+    "hierarchy/level-given@6": "2d3edb0d",
+    "hierarchy/level-auto@7": "a5233133",
+    "hierarchy/path@4": "b2b26394",
+    "hierarchy/scene-wide@2": "5da0401e",
+    "hierarchy/annotations@1": "6192fc96",
+    "world/view-consistency@2": "513ed7e3",
 }
 
 
-def digest(card):
-    """Digest of everything that determines a number, without the explanations."""
+SIZE, TEXTS = (96, 128), ("wood wall", "wood table", "nose", "nothing", "constant")
+
+
+def scores_of_images():
+    """Scores of fixed answers, some empty or constant, by our own evaluation and as arrays of a program."""
+    rng = np.random.default_rng(0)
+    paths = {TEXTS[0]: TEXTS[:1], **{text: (TEXTS[0], text) for text in TEXTS[1:]}}
+    low = dict(zip(TEXTS, rng.integers(0, 40, (len(TEXTS), 2)).tolist(), strict=True))
+    regions = {text: box((top, top + 48), (left, left + 64), SIZE) for text, (top, left) in low.items()}
+    maps = {text: rng.integers(0, 9, (3, 12, 16)).repeat(8, 1).repeat(8, 2) / 16 for text in TEXTS[:3]}
+    maps = {name: values.astype(np.float32) for name, values in maps.items()}
+    maps |= {"nothing": np.zeros((3, *SIZE), np.float32), "constant": np.full((3, *SIZE), 0.5, np.float32)}
+    masks = [rng.random((6, 8)).repeat(16, 0).repeat(16, 1) > 0.5 for _ in TEXTS]
+    nodes = {path: [row] for row, path in enumerate(paths.values()) if path[-1] != "nothing"}
+    nodes |= {(path[-1], level): row for path, row in nodes.items() for level in (None, Level(len(path)))}
+    scene = HandMade(masks, nodes, maps, SIZE)
+    labelled = {
+        text: region_of(mask, text, Level(len(paths[text])), paths[text]) for text, mask in regions.items()
+    }
+    truth, flat = (
+        ViewTruth.of_regions(labelled.values(), SIZE),
+        tuple(card for card in CARDS if card.averaging in ("pairs", "classes")),
+    )
+    rows = measure_view(
+        Selections(scene), truth, "v.png", PackedMasks(SIZE), EvaluateSettings(), ExtraProtocols(flat)
+    )
+    for row in rows:
+        yield row.protocol.split(" ")[0], vars(row)
+    predicted = {text: masks[row] for row, text in enumerate(TEXTS) if text != "nothing"}
+    for name in (name for name, card in SCORED.items() if not card.classes and card is not LEVEL_GIVEN):
+        for row in hilsplat.score({"v.png": predicted}, {"v.png": regions}, name).rows:
+            yield name, row
+
+
+def scores_of_points():
+    """Scores of fixed class ids and instances as arrays of a program."""
+    for name, card in SCORED.items():
+        if card.classes:
+            rng, ids = np.random.default_rng(0), [0, *class_set(card.classes)[1].ids[:6]]
+            labels, predictions = rng.choice(ids[:-1], 2000), rng.choice(ids, 2000)
+            if card is INSTANCES:
+                classes = rng.choice(ids, 9)
+                masks = (labels == classes[:, None]) & (rng.random((9, 2000)) > 0.3)
+                predictions = masks, classes, rng.integers(1, 5, 9) / 4
+                labels = labels, rng.integers(0, 2, 2000)
+            scores = hilsplat.score(predictions, labels, name)
+            for row in (*scores.rows, scores.means):
+                yield name, row
+
+
+@pytest.fixture(scope="module")
+def digests():
+    """Digest of each protocol: its card without explanations, and scores under it, to four decimals."""
     explanations = ("selection", "source", "public")
-    decided = {name: value for name, value in asdict(card).items() if name not in explanations}
-    return hashlib.sha256(repr(decided).encode()).hexdigest()[:8]
+    decided = {
+        card.full_name: {k: v for k, v in asdict(card).items() if k not in explanations} for card in CARDS
+    }
+    rows = {name: [] for name in decided}
+    for name, row in (*scores_of_images(), *scores_of_points()):
+        rows[name].append(repr({k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()}))
+    return {
+        name: hashlib.sha256(repr((decided[name], sorted(rows[name]))).encode()).hexdigest()[:8]
+        for name in decided
+    }
 
 
-def test_a_protocol_changes_only_with_its_version():
-    found = {card.full_name: digest(card) for card in CARDS}
+def test_a_protocol_changes_only_with_its_version(digests):
     # An added or removed metric changes no other number, so it needs no new version.
-    assert found == DECIDED, "raise the version of a protocol that changed, then write its digest here"
+    assert digests == DECIDED, "raise the version of a protocol that changed, then write its digest here"
 
 
 PUBLIC = re.compile(r"[\w.-]+/[\w.-]+@[0-9a-f]{7} \S+\.(py|cc)(:\w+)?")
@@ -107,6 +181,6 @@ def test_rows_name_the_settings_that_affect_them(card, method, settings, departu
 
 
 def test_the_label_of_a_row_identifies_its_protocol():
-    assert card_of("lerf/langsplat@2 (filter 20, raw)") is LERF_LANGSPLAT
+    assert card_of("lerf/langsplat@3 (filter 20, raw)") is LERF_LANGSPLAT
     with pytest.raises(ArtifactError, match=r"no protocol 'lerf/langsplat@9'"):
         card_of("lerf/langsplat@9")
