@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from plyfile import PlyData, PlyElement
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.images import write_png
@@ -50,6 +51,17 @@ def make_frames(root: Path, count: int) -> None:
     """Write the images of a sequence in the layout of Semantic-NeRF, and a picture that is no frame."""
     for name in (*(f"rgb_{number}" for number in range(count)), "vis_rgb_0"):
         write_png(root / SEQUENCE / "rgb" / f"{name}.png", np.zeros((6, 10, 3), np.uint8))
+
+
+def triangle_among_quads(root: Path) -> None:
+    """Write the mesh as text, with a triangle."""
+    faces = [[4, 5, 1, 0], [5, 6, 2], [6, 7, 3, 2]]
+    corners = np.array(
+        [(np.array(face, np.int32), 0) for face in faces], [("vertex_indices", "O"), ("object_id", "i4")]
+    )
+    vertices = PlyElement.describe(np.rec.fromarrays(XYZ.T, names="x, y, z"), "vertex")
+    described = PlyElement.describe(corners, "face", val_types={"vertex_indices": "i4"})
+    PlyData([vertices, described], text=True).write(root / MESH)
 
 
 @pytest.fixture
@@ -104,6 +116,12 @@ def test_a_sequence_of_nice_slam_is_preferred_and_has_its_own_lens(root, tmp_pat
         (text_in(INFO, "{}"), "expected  an object with the keys classes, id"),
         (lambda root: (root / INFO).unlink(), r"info_semantic\.json is missing\n.*mesh_semantic\.ply"),
         (lambda root: (root / MESH).unlink(), r"mesh_semantic\.ply is missing"),
+        (
+            lambda root: write_ply(root / MESH, XYZ, QUADS[:, :3], object_id=OBJECT),
+            "with 3 corners\n  expected  4 corners per face\n  fix       use the labelled file",
+        ),
+        (triangle_among_quads, "with 3 corners\n"),
+        (lambda root: (root / MESH).write_bytes((root / MESH).read_bytes()[:-9]), "early end.*damaged"),
         (poses(1), "1 lines, 3 images; the first frame without a line is 1"),
         (moved(f"{SEQUENCE}/rgb/rgb_2.png", f"{SEQUENCE}/rgb/rgb_001.png"), "several images of one frame"),
         (text_in(f"{SEQUENCE}/traj_w_c.txt", "1 0 0 0\n"), "1 lines of 4 numbers\n.*16 numbers per line"),
