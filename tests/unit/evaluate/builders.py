@@ -1,7 +1,5 @@
 """Masks, cameras, labelled regions and rows of scores for the tests of this folder."""
 
-from types import SimpleNamespace
-
 import numpy as np
 
 from hilsplat.datasets.labelled import LabelledRegion
@@ -50,31 +48,3 @@ def score(metric, value, **more):
         "n": 1,
     }
     return Score(**{**fields, **more}, metric=metric, value=value)
-
-
-class HandMade:
-    """Given answers: nodes, rows of `masks`, by text or path and level; relevancy maps by text.
-
-    `scene_wide` contains those answers that differ if the whole scene is searched.
-    """
-
-    def __init__(self, masks, answers, relevancy=None, size_hw=(10, 10)):
-        self.masks, self.answers, self.maps, self.scene_wide = masks, answers, relevancy or {}, {}
-        self.size_hw = size_hw
-        self.views, self.field = self, self
-
-    def relevancy(self, texts, view):
-        return np.stack([self.maps.get(text, np.zeros((3, *self.size_hw), np.float32)) for text in texts])
-
-    def cosine(self, texts, view, pixels):
-        return self.relevancy(texts, view).reshape(len(texts), 3, -1)[..., pixels]
-
-    node_relevancy_map, node_cosine = relevancy, cosine
-
-    def select(self, path, *, level=None, view=None):
-        answers = self.answers if view == "v.png" else self.answers | self.scene_wide
-        found = answers.get(path, answers.get((path[0], level), []) if len(path) == 1 else [])
-        return SimpleNamespace(ids=np.array(found, dtype=np.int64), level=level)
-
-    def node_masks(self, view, ids):
-        return np.any([self.masks[node] for node in ids], axis=0)

@@ -1,6 +1,7 @@
 """Queries of a view, their scores, and the scores of missing answers."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from hilsplat.evaluate.protocols.cards import card_of
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import measure_view
 from hilsplat.settings import EvaluateSettings
-from tests.unit.evaluate.builders import HandMade, box, region_of
+from tests.unit.evaluate.builders import box, region_of
 
 SIZE = (10, 10)
 
@@ -38,10 +39,37 @@ def truth_of(folder, nodes, regions):
     return truth_in(annotations_of(folder, nodes, regions))
 
 
-def measured(scene, truth, **settings):
+class HandMade:
+    """Given answers: nodes, rows of `masks`, by text or path and level; relevancy maps by text.
+
+    `scene_wide` contains those answers that differ if the whole scene is searched.
+    """
+
+    def __init__(self, masks, answers, relevancy=None):
+        self.masks, self.answers, self.maps, self.scene_wide = masks, answers, relevancy or {}, {}
+        self.views, self.field = self, self
+
+    def relevancy(self, texts, view):
+        return np.stack([self.maps.get(text, np.zeros((3, *SIZE), np.float32)) for text in texts])
+
+    def cosine(self, texts, view, pixels):
+        return self.relevancy(texts, view).reshape(len(texts), 3, -1)[..., pixels]
+
+    node_relevancy_map, node_cosine = relevancy, cosine
+
+    def select(self, path, *, level=None, view=None):
+        answers = self.answers if view == "v.png" else self.answers | self.scene_wide
+        found = answers.get(path, answers.get((path[0], level), []) if len(path) == 1 else [])
+        return SimpleNamespace(ids=np.array(found, dtype=np.int64), level=level)
+
+    def node_masks(self, view, ids):
+        return np.any([self.masks[node] for node in ids], axis=0)
+
+
+def measured(scene, truth, flat=(), **settings):
     """{(method, protocol, query, level, metric): value} of one view."""
     section = EvaluateSettings(min_region_px=1, **settings)
-    rows = measure_view(Selections(scene), truth, "v.png", PackedMasks(SIZE), section, ExtraProtocols())
+    rows = measure_view(Selections(scene), truth, "v.png", PackedMasks(SIZE), section, ExtraProtocols(flat))
     return {(row.method, row.protocol, row.query, row.level, row.metric): row.value for row in rows}
 
 
