@@ -6,7 +6,7 @@ a card (`cards.json`) that affects its numbers requires a new version; a test ch
 """
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -15,17 +15,20 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.evaluate.metrics.relevancy_rule import RelevancyRule
 
-CANONICAL: tuple[str, ...] = ("object", "things", "stuff", "texture")
-"""Canonical phrases of every protocol that uses relevancy (LERF, LangSplat)."""
-
-RELEVANCY_SCALE = 10.0
-"""Scale of the cosine in the relevancy (LERF, LangSplat)."""
-
-NODE_SELECT = 0.95
-"""`evaluate.node_select`; the selection of `TREE_NODES` states the rule."""
-
-ANCESTORS = 0.2
-"""Fraction of the ancestors' mean margin that is added to a node's own margin, except on paths."""
+STATED: dict[str, tuple[Any, Callable[[Any], str]]] = {
+    "filter_px": (0, "filter {}".format),
+    "mix": (True, lambda _: "no mix"),
+    "relevancy_threshold": (0.4, "threshold {:g}".format),
+    "threshold_on": ("normalised_pm1", str),
+    "majority": (True, lambda _: "no majority"),
+    "level_rule": ("max", str),
+    "node_select": (0.95, "node share {:g}".format),
+    "ancestors": (0.2, "ancestors {:g}".format),
+    "canonical": (("object", "things", "stuff", "texture"), lambda phrases: f"canonical {'+'.join(phrases)}"),
+    "template": ("{}", lambda template: f"texts as {template.replace('{}', '...')}"),
+    "relevancy_scale": (10.0, "relevancy scale {:g}".format),
+}
+"""Setting of `evaluate` -> the value under which the cards hold, and words for any other value in names."""
 
 MIN_REGION_PX = 60
 """Minimum area of a scored region of a generated scene; published labels have no minimum."""
