@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from plyfile import PlyData, PlyElement
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.images import write_png
@@ -53,15 +52,18 @@ def make_frames(root: Path, count: int) -> None:
         write_png(root / SEQUENCE / "rgb" / f"{name}.png", np.zeros((6, 10, 3), np.uint8))
 
 
-def triangle_among_quads(root: Path) -> None:
-    """Write the mesh as text, with a triangle."""
-    faces = [[4, 5, 1, 0], [5, 6, 2], [6, 7, 3, 2]]
-    corners = np.array(
-        [(np.array(face, np.int32), 0) for face in faces], [("vertex_indices", "O"), ("object_id", "i4")]
-    )
-    vertices = PlyElement.describe(np.rec.fromarrays(XYZ.T, names="x, y, z"), "vertex")
-    described = PlyElement.describe(corners, "face", val_types={"vertex_indices": "i4"})
-    PlyData([vertices, described], text=True).write(root / MESH)
+TRIANGLE = """ply
+format ascii 1.0
+element vertex 4
+property float x\nproperty float y\nproperty float z
+element face 2
+property list uchar int vertex_indices\nproperty int object_id
+end_header
+0 0 0\n1 0 0\n1 1 0\n0 1 0
+4 0 1 2 3 1
+3 0 1 2 1
+"""
+"""A mesh with a triangle among quads."""
 
 
 @pytest.fixture
@@ -120,7 +122,7 @@ def test_a_sequence_of_nice_slam_is_preferred_and_has_its_own_lens(root, tmp_pat
             lambda root: write_ply(root / MESH, XYZ, QUADS[:, :3], object_id=OBJECT),
             "with 3 corners\n  expected  4 corners per face\n  fix       use the labelled file",
         ),
-        (triangle_among_quads, "with 3 corners\n"),
+        (text_in(MESH, TRIANGLE), "with 3 corners\n"),
         (lambda root: (root / MESH).write_bytes((root / MESH).read_bytes()[:-9]), "early end.*damaged"),
         (poses(1), "1 lines, 3 images; the first frame without a line is 1"),
         (moved(f"{SEQUENCE}/rgb/rgb_2.png", f"{SEQUENCE}/rgb/rgb_001.png"), "several images of one frame"),
