@@ -65,7 +65,7 @@ def run_evaluate_files(
         A table of the means under each protocol, in %.
 
     Raises:
-        ArtifactError: a view has no predictions, or a file is missing or malformed.
+        ArtifactError: the labels are empty, a view has no predictions, or a file is missing or malformed.
         MisalignedArtifactError: a prediction and its labels differ in size, or no label has its text.
         SettingsError: neither labels nor truth and scene are given, or both are.
     """
@@ -96,6 +96,11 @@ def run_evaluate_files(
                     if regions:
                         image_hw = image_size_hw(labelled.images[view]) if view in labelled.images else None
                         views[view] = partial(ViewTruth.of_regions, regions, regions[0].size_hw, image_hw)
+        if not views and not points:
+            raise ArtifactError(
+                f"{labels or truth} labels nothing: no region in any view, and no point",
+                fix="draw or accept regions in the labels",
+            )
         rows = list(_mask_rows(predictions, views, extra)) if views else []
         matches: dict[tuple[str, ...], InstanceMatches] = {}
         for result in _point_rows(predictions, points, extra) if points else ():

@@ -185,6 +185,12 @@ def test_labels_of_a_data_set_take_grey_where_the_protocol_does(data_set, tmp_pa
     assert means["3d-ovs/argmax@3 (masks of files)"] == ["m", "0.0", "50.0", "1"]
 
 
+def test_labels_without_regions_are_refused(data_set, tmp_path):
+    data_set({"a.png": ()})  # such as proposals that nobody has accepted
+    with pytest.raises(ArtifactError, match="set/s labels nothing"):
+        scored(tmp_path)
+
+
 def point_scene(num=400, seed=0):
     rng = np.random.default_rng(seed)
     class_id = rng.choice([0, 1, 2, 3, 4, 5], num).astype(np.int32)
