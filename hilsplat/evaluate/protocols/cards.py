@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import Level
+from hilsplat.base.tables import described
 from hilsplat.evaluate.metrics.relevancy_rule import RelevancyRule
 
 STATED: dict[str, tuple[Any, Callable[[Any], str]]] = {
@@ -88,10 +89,11 @@ def _card(fields: dict[str, Any]) -> ProtocolCard:
     return ProtocolCard(**{**fields, "metrics": tuple(fields["metrics"]), "united": united})
 
 
-CARDS: tuple[ProtocolCard, ...] = tuple(
-    map(_card, json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8")))
-)
-"""Every protocol, from `cards.json`; a `rule` there lists the fields that differ from `RelevancyRule`."""
+_ENTRIES = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))
+_BY_FULL_NAME = {entry["full_name"]: entry for entry in _ENTRIES}
+CARDS: tuple[ProtocolCard, ...] = tuple(_card(described(_BY_FULL_NAME, name)) for name in _BY_FULL_NAME)
+"""Every protocol, from `cards.json`; a `rule` there lists the fields that differ from `RelevancyRule`, and
+`like` names a protocol from which omitted values are taken."""
 
 BY_NAME: dict[str, ProtocolCard] = {name: card for card in CARDS for name in (card.name, card.full_name)}
 
