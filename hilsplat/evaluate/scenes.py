@@ -89,10 +89,13 @@ def scene_lines(
 
 
 def _tree_iou(scores: Path, protocol: str) -> str:
-    """Return the mean IoU of the tree under the protocol and data set with the most labelled queries."""
+    """Return the mean IoU of the tree under the protocol and data set with the most labelled queries.
+
+    It is empty if the scores are of another version of the protocol.
+    """
     table = read_scores([scores] if scores.is_file() else [])
     is_shown = (table["method"] == "tree") & (table["metric"] == "iou")
-    is_of_protocol = table["protocol"].str.split("@").str[0] == BY_NAME[protocol].name
+    is_of_protocol = table["protocol"].str.split(" (", regex=False).str[0] == BY_NAME[protocol].full_name
     groups = table[is_shown & is_of_protocol].groupby(["dataset", "protocol"])
     parts = [(name, part) for (_, name), part in groups]
     name, most = max(parts, key=lambda named: len(named[1]), default=("", table))

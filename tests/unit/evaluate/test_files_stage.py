@@ -186,7 +186,7 @@ def test_labels_of_a_data_set_take_grey_where_the_protocol_does(data_set, tmp_pa
 
 
 def test_labels_without_regions_are_refused(data_set, tmp_path):
-    data_set({"a.png": ()})  # such as proposals that nobody has accepted
+    data_set({"a.png": ()})  # such as a file of proposals
     with pytest.raises(ArtifactError, match="set/s labels nothing"):
         scored(tmp_path)
 

@@ -70,6 +70,10 @@ def test_each_scene_has_a_row_with_what_its_run_has_computed(results, capsys):
         options = ("--results", str(results), "--protocol", protocol)
         app(["scenes", "rooms/o*", *options], standalone_mode=False)
         assert iou in capsys.readouterr().out.splitlines()[1]
+    scores = results / "rooms/one/default/scores.csv"  # of an earlier release
+    scores.write_text(scores.read_text().replace("lerf/tree-nodes@6", "lerf/tree-nodes@5"))
+    app(["scenes", "rooms/o*", "--results", str(results)], standalone_mode=False)
+    assert capsys.readouterr().out.splitlines()[1].split()[:6] == [*printed[3].split()[:5], "0"]
     with pytest.raises(SettingsError, match=r"'lerf/tree' is unknown(.|\n)*did you mean 'lerf/tree-nodes'"):
         app(["scenes", "--results", str(results), "--protocol", "lerf/tree"], standalone_mode=False)
 

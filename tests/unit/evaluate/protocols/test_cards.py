@@ -61,7 +61,7 @@ DECIDED = {
 
 
 def digests(folder):
-    """Digest of each protocol's card, without explanations, and of scores of fixed answers under it."""
+    """Digest of each protocol's card, without explanations, and of its scores for fixed answers."""
     rng = np.random.default_rng(0)
     scene, truth = worked_example(folder, without=("a1",))
     constant = np.full((3, *SIZE), 0.5, np.float32)
