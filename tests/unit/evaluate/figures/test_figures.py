@@ -55,9 +55,8 @@ def test_largest_text_of_each_level_is_shown_first(rows):
     truths, first = rows
     assert [(row.text, int(row.level)) for row in first] == [("bear", 1), ("head", 2), ("nose", 3)]
     assert first[2].path == ("bear", "head", "nose")
-    assert (
-        len(annotated_rows(truths, FiguresSettings())) == 5
-    )  # two of whole and part, the only one of subpart
+    # two of whole and part, the only one of subpart
+    assert len(annotated_rows(truths, FiguresSettings())) == 5
 
 
 @pytest.mark.parametrize("texts", [["bear", "bear > head"], []])

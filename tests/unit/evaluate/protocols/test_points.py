@@ -44,10 +44,8 @@ def test_missed_points_count_zero_and_a_scene_without_truth_has_no_rows():
     rows = list(scoring.measure_points(OPENGAUSSIAN, "tree", TRUTH, nothing, sets.SCANNET_19, "frozen"))
     assert {row.value for row in rows} == {0.0}
     assert {row.query for row in rows} == {"", "wall", "floor", "cabinet"}
-    assert (
-        list(scoring.measure_points(OPENGAUSSIAN, "tree", nothing, PREDICTION, sets.SCANNET_19, "frozen"))
-        == []
-    )
+    no_truth = nothing, PREDICTION, sets.SCANNET_19, "frozen"
+    assert list(scoring.measure_points(OPENGAUSSIAN, "tree", *no_truth)) == []
 
 
 def test_pooled_rows_equal_points_put_together_also_after_a_file(tmp_path):

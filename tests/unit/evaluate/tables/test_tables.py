@@ -240,17 +240,14 @@ def test_names_are_text_in_every_format(tmp_path):
         assert "](java" not in forms[".md"]
         bars = {len(re.findall(r"(?<!\\)\|", line)) for line in block if line.startswith("|")}
         assert len(bars) == 1  # every row has the columns of the header
-        assert (
-            "\n[" not in forms[".tex"] and "\n\n" not in forms[".tex"]
-        )  # arguments of a row's end, paragraphs
+        # no arguments of a row's end, no paragraphs
+        assert "\n[" not in forms[".tex"] and "\n\n" not in forms[".tex"]
 
 
 def test_scenes_whose_names_differ_only_in_a_space_have_columns_of_their_own(tmp_path):
     scores = [score("iou", value, scene=scene, **LERF) for scene, value in (("desk1", 0.5), ("desk_1", 0.7))]
-    assert cells(measured(built(tmp_path, "lerf", scores)[0]), "desk1 mIoU", "desk_1 mIoU") == [
-        "50.00",
-        "70.00",
-    ]
+    row = measured(built(tmp_path, "lerf", scores)[0])
+    assert cells(row, "desk1 mIoU", "desk_1 mIoU") == ["50.00", "70.00"]
 
 
 def test_an_unknown_table_is_an_error_that_lists_the_tables(tmp_path):
