@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote
 
 from hilsplat.base.artifacts import read_npz, rebuild_command, write_npz
 from hilsplat.base.errors import ArtifactError
@@ -76,9 +77,10 @@ def read_scores(paths: Iterable[Path]) -> "pd.DataFrame":
 
 def write_instances(scores: Path, matches: Mapping[tuple[str, ...], InstanceMatches]) -> None:
     """Write matches, keyed by (data set, scene, variant, masks, method), beside a score file."""
-    arrays = {
-        "/".join([*key, name]): array for key, found in matches.items() for name, array in vars(found).items()
-    }
+    arrays = {}
+    for key, found in matches.items():  # a program's name may contain a slash, as in "w/ SAM"
+        place = "/".join(part.replace("%", "%25").replace("/", "%2F") for part in key)
+        arrays |= {f"{place}/{name}": array for name, array in vars(found).items()}
     write_npz(Path(scores).with_name(INSTANCES), **arrays)
 
 
@@ -88,6 +90,6 @@ def read_instances(scores: Iterable[Path]) -> dict[tuple[str, ...], InstanceMatc
     for path in scores:
         beside = Path(path).with_name(INSTANCES)
         for name, array in read_npz(beside).items() if beside.is_file() else ():
-            *key, part = name.split("/")
+            *key, part = map(unquote, name.split("/"))
             found.setdefault(tuple(key), {})[part] = array
     return {key: InstanceMatches(**arrays) for key, arrays in found.items()}

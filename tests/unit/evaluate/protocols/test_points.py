@@ -133,7 +133,7 @@ def test_a_node_is_an_instance_of_its_best_class_also_after_a_file(block_world, 
     assert matches.has_truth.all()
     assert np.nanmean(average_precision([matches])) == 1.0
     assert matches.misses.sum() == 0
-    key = ("synthetic-rooms", "room-1", "default", "sam-tiny", "tree")
+    key = ("synthetic-rooms", "room-1", "ours w/ SAM, 100%", "sam-tiny", "tree")
     write_instances(tmp_path / "scores.csv", {key: matches})
     found = read_instances([tmp_path / "scores.csv"])[key]
     assert np.array_equal(average_precision([found]), average_precision([matches]), equal_nan=True)
