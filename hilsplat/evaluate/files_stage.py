@@ -23,7 +23,7 @@ from hilsplat.evaluate.protocols import cards
 from hilsplat.evaluate.protocols.points import class_set, instance_scan, measure_instances, measure_points
 from hilsplat.evaluate.protocols.view_truth import ViewTruth, truths_of
 from hilsplat.evaluate.score import METHOD, OF_EVERY_TEXT, check_answers, flat_rows, key_of, level_rows
-from hilsplat.evaluate.scores import COLUMNS, Measured, Score, write_instances, write_scores
+from hilsplat.evaluate.scores import COLUMNS, OF_FILES, Measured, Score, write_instances, write_scores
 from hilsplat.evaluate.tables.means import TEXTS, mean_rows
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import EvaluateSettings
@@ -111,7 +111,7 @@ def run_evaluate_files(
         score = partial(Score, dataset=dataset, scene=name, variant=method, masks="-")
         scores = [score(view=view, **vars(row)) for view, row in rows]
         counts["views"], counts["rows"] = len(views), len(scores)
-        write_instances(out, matches)
+        write_instances(out, matches, out.with_suffix(OF_FILES).name)
         write_scores(out, scores)
         scans = {scene: found for (_, scene, *_), found in matches.items()}
         precisions = measure_instances(METHOD, scans, "files") if scans else ()

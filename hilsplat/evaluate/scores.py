@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 INSTANCES = "instances.npz"
+OF_FILES = ".instances.npz"
+"""Suffix of the matches that `evaluate-files` writes, beside a score file whose name begins alike."""
 
 COLUMNS: tuple[str, ...] = (
     *("dataset", "scene", "variant", "masks", "method", "view"),
@@ -75,21 +77,23 @@ def read_scores(paths: Iterable[Path]) -> "pd.DataFrame":
     return pd.DataFrame(rows, columns=list(COLUMNS)).astype({"value": float, "n": int})
 
 
-def write_instances(scores: Path, matches: Mapping[tuple[str, ...], InstanceMatches]) -> None:
+def write_instances(
+    scores: Path, matches: Mapping[tuple[str, ...], InstanceMatches], name: str = INSTANCES
+) -> None:
     """Write matches, keyed by (data set, scene, variant, masks, method), beside a score file."""
-    arrays = {}
+    arrays: dict[str, Any] = {}
     for key, found in matches.items():  # a program's name may contain a slash, as in "w/ SAM"
         place = "/".join(part.replace("%", "%25").replace("/", "%2F") for part in key)
-        arrays |= {f"{place}/{name}": array for name, array in vars(found).items()}
-    write_npz(Path(scores).with_name(INSTANCES), **arrays)
+        arrays |= {f"{place}/{field}": array for field, array in vars(found).items()}
+    write_npz(Path(scores).with_name(name), **arrays)
 
 
 def read_instances(scores: Iterable[Path]) -> dict[tuple[str, ...], InstanceMatches]:
     """Read the matches beside score files, keyed by (data set, scene, variant, masks, method)."""
     found: dict[tuple[str, ...], dict[str, Any]] = {}
-    for path in scores:
-        beside = Path(path).with_name(INSTANCES)
-        for name, array in read_npz(beside).items() if beside.is_file() else ():
+    files = [file for path in scores for file in (path.with_name(INSTANCES), path.with_suffix(OF_FILES))]
+    for file in filter(Path.is_file, files):
+        for name, array in read_npz(file).items():
             *key, part = map(unquote, name.split("/"))
             found.setdefault(tuple(key), {})[part] = array
     return {key: InstanceMatches(**arrays) for key, arrays in found.items()}

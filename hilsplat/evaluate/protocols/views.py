@@ -42,7 +42,7 @@ RELEVANCY_CHUNK_MIB = 512
 """Memory limit for relevancy maps, which limits the texts per chunk; each chunk decodes the view again."""
 
 MAP_RULE = ("filter_px", "mix", "relevancy_threshold", "threshold_on", "majority", "level_rule")
-"""Settings that change the masks of a field."""
+"""Settings that change the masks of a field: the first fields of `RelevancyRule`, in order."""
 
 MAPS_OF_NODES = ("filter_px", "mix")
 """Settings that change localization and diagnostics of nodes, which are selected without thresholds."""
@@ -55,14 +55,7 @@ RELEVANCY = ("canonical", "template", "relevancy_scale")
 
 
 def rule_of(settings: EvaluateSettings) -> RelevancyRule:
-    return RelevancyRule(
-        settings.filter_px,
-        settings.mix,
-        settings.relevancy_threshold,
-        settings.threshold_on,
-        settings.majority,
-        settings.level_rule,
-    )
+    return RelevancyRule(*(getattr(settings, name) for name in MAP_RULE))
 
 
 def label_of(

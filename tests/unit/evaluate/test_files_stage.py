@@ -233,6 +233,12 @@ def test_instances_in_scannets_format_are_matched(data_set, tmp_path):
     assert key == ("set", "s", "m", "-", "files")
     assert matches.is_match.all()
     assert matches.misses.sum() == 0
+    nothing = tmp_path / "nothing"  # another program, scored to the same folder
+    nothing.mkdir()
+    (nothing / "instances.txt").touch()
+    run_evaluate_files(nothing, tmp_path / "other.csv", method="n", labels="set/s")
+    of_both = read_instances([tmp_path / "scores.csv", tmp_path / "other.csv"])
+    assert {key[2]: found.misses.any() for key, found in of_both.items()} == {"m": False, "n": True}
 
 
 @pytest.mark.parametrize(
