@@ -108,15 +108,15 @@ def run_evaluate_files(
                 rows.append(("", result))
             else:
                 matches[dataset, name, method, "-", METHOD] = result
+        scans = {scene: found for (_, scene, *_), found in matches.items()}
+        precisions = measure_instances(METHOD, scans, "files") if scans else ()
+        rows += [("", row) for row in precisions if not math.isnan(row.value)]
         score = partial(Score, dataset=dataset, scene=name, variant=method, masks="-")
         scores = [score(view=view, **vars(row)) for view, row in rows]
         counts["views"], counts["rows"] = len(views), len(scores)
         write_instances(out, matches, out.with_suffix(OF_FILES).name)
         write_scores(out, scores)
-        scans = {scene: found for (_, scene, *_), found in matches.items()}
-        precisions = measure_instances(METHOD, scans, "files") if scans else ()
-        every = [*scores, *(score(view="", **vars(row)) for row in precisions)]
-        frame = pd.DataFrame(map(vars, every), columns=list(COLUMNS))
+        frame = pd.DataFrame(map(vars, scores), columns=list(COLUMNS))
         return "\n".join(aligned_table(mean_rows(frame, {}), TEXTS))
 
 
