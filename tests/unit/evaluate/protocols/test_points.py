@@ -62,10 +62,8 @@ def test_pooled_rows_equal_points_put_together_also_after_a_file(tmp_path):
         WAYMO, scoring.measure_points(WAYMO, "t", *together, sets.WAYMO_22, "x"), sets.WAYMO_22
     )
     write_scores(tmp_path / "scores.csv", [score(**vars(row), view="") for row in rows])
-    assert (
-        scoring.pooled_points(WAYMO, read_scores([tmp_path / "scores.csv"]).itertuples(), sets.WAYMO_22)
-        == expected
-    )
+    again = read_scores([tmp_path / "scores.csv"]).itertuples()
+    assert scoring.pooled_points(WAYMO, again, sets.WAYMO_22) == expected
     # five of 22 classes occur; the other 17 count 1 under Waymo's own mean
     assert expected["miou_absent_as_one"] == pytest.approx((5 * expected["miou_present"] + 17) / 22)
 
