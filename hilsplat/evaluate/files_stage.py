@@ -98,7 +98,7 @@ def run_evaluate_files(
                         views[view] = partial(ViewTruth.of_regions, regions, regions[0].size_hw, image_hw)
         if not views and not points:
             raise ArtifactError(
-                f"{labels or truth} labels nothing: no region in any view, and no point",
+                f"{labels or truth} has neither a labelled region nor a labelled point",
                 fix="draw or accept regions in the labels",
             )
         rows = list(_mask_rows(predictions, views, extra)) if views else []

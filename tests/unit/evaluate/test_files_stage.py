@@ -188,7 +188,7 @@ def test_labels_of_a_data_set_take_grey_where_the_protocol_does(data_set, tmp_pa
 
 def test_labels_without_regions_are_refused(data_set, tmp_path):
     data_set({"a.png": ()})  # such as a file of proposals
-    with pytest.raises(ArtifactError, match="set/s labels nothing"):
+    with pytest.raises(ArtifactError, match="set/s has neither a labelled region"):
         scored(tmp_path)
 
 
