@@ -67,12 +67,13 @@ class ActivatedViews:
         self.cameras, self.degree, self.has_depth, self.threads = cameras, degree, has_depth, threads
         self.sh, self.colours = np.zeros((n, 1, 3), np.float32), None
         if colours is not None and degree is not None:
-            self.sh = as_array("colors", colours, n, None, 3)
-            if not 0 <= degree <= MAX_DEGREE or (degree + 1) ** 2 > self.sh.shape[1]:
+            harmonics = as_array("colors", colours, n, None, 3)
+            if not 0 <= degree <= MAX_DEGREE or (degree + 1) ** 2 > harmonics.shape[1]:
                 raise ValueError(
-                    f"sh_degree is {degree} with {self.sh.shape[1]} harmonics; expected 0 to {MAX_DEGREE}, "
+                    f"sh_degree is {degree} with {harmonics.shape[1]} harmonics; expected 0 to {MAX_DEGREE}, "
                     "and (sh_degree + 1)^2 harmonics or more"
                 )
+            self.sh = harmonics[:, : (MAX_DEGREE + 1) ** 2]  # the kernels have room for no more
         elif colours is not None:
             axes = (n, None) if np.ndim(colours) == 2 else (len(cameras), n, None)
             array = as_array("colors", colours, *axes)

@@ -22,7 +22,7 @@ def draw(
     gradients too. The shape and opacity at the pixels depend on the Gaussians in ways that no other output
     shows; `link`, an empty tensor, stands for them in the graph.
     """
-    harmonics = colours if views.has_harmonics else None
+    harmonics = colours[:, : views.sh.shape[1]] if views.has_harmonics and colours is not None else None
     means2d, depths, link = _Projection.apply(views, means, quats, scales, opacities, harmonics)
     images, alphas = _Blending.apply(views, means2d, depths, link, None if views.has_harmonics else colours)
     return images, alphas, means2d, depths

@@ -474,7 +474,7 @@ def score_means(
     run_score_means(scores, names, out)
 
 
-@stage(scope="run", reads=_labels)
+@stage(scope="run", reads=_labels, beside=lambda out: (out.with_suffix(".instances.npz"),))
 def evaluate_files(
     predictions: Annotated[
         Path, typer.Argument(help="folder of masks or point labels from any program"), Role.INPUT

@@ -2,9 +2,10 @@
 
 import csv
 import re
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 from hilsplat.base.artifacts import write_text
 from hilsplat.base.errors import ArtifactError
@@ -42,6 +43,13 @@ def read_csv(path: Path, columns: Sequence[str] | None, fix: str) -> list[dict[s
             f"{path} has unexpected columns", expected=", ".join(columns), found=", ".join(header), fix=fix
         )
     return table
+
+
+def described(entries: Mapping[str, Mapping[str, Any]], name: str) -> dict[str, Any]:
+    """Return an entry; the fields that it omits are those of the entry that its field `like` names."""
+    fields = dict(entries[name])
+    base = fields.pop("like", None)
+    return {**described(entries, base), **fields} if base else fields
 
 
 def plain_markdown(text: str) -> str:

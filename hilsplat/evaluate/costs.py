@@ -78,7 +78,7 @@ def jobs_of(scores: Path) -> dict[str, Job | None]:
     """Map each stage behind a score file to its job, run by any variant, or to None if it has no record.
 
     The score file's provenance lists the artifacts that `evaluate` read; the field's provenance lists the
-    rest. Stages whose output was not read are absent, such as trees for a baseline.
+    rest. Stages whose output was not read are absent.
     """
     places = _inputs(scores)
     if "field" in places:

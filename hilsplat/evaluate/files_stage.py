@@ -23,7 +23,7 @@ from hilsplat.evaluate.protocols import cards
 from hilsplat.evaluate.protocols.points import class_set, instance_scan, measure_instances, measure_points
 from hilsplat.evaluate.protocols.view_truth import ViewTruth, truths_of
 from hilsplat.evaluate.score import METHOD, OF_EVERY_TEXT, check_answers, flat_rows, key_of, level_rows
-from hilsplat.evaluate.scores import COLUMNS, Measured, Score, write_instances, write_scores
+from hilsplat.evaluate.scores import COLUMNS, OF_FILES, Measured, Score, write_instances, write_scores
 from hilsplat.evaluate.tables.means import TEXTS, mean_rows
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import EvaluateSettings
@@ -65,7 +65,7 @@ def run_evaluate_files(
         A table of the means under each protocol, in %.
 
     Raises:
-        ArtifactError: a view has no predictions, or a file is missing or malformed.
+        ArtifactError: the labels are empty, a view has no predictions, or a file is missing or malformed.
         MisalignedArtifactError: a prediction and its labels differ in size, or no label has its text.
         SettingsError: neither labels nor truth and scene are given, or both are.
     """
@@ -96,6 +96,11 @@ def run_evaluate_files(
                     if regions:
                         image_hw = image_size_hw(labelled.images[view]) if view in labelled.images else None
                         views[view] = partial(ViewTruth.of_regions, regions, regions[0].size_hw, image_hw)
+        if not views and not points:
+            raise ArtifactError(
+                f"{labels or truth} has neither a labelled region nor a labelled point",
+                fix="draw or accept regions in the labels",
+            )
         rows = list(_mask_rows(predictions, views, extra)) if views else []
         matches: dict[tuple[str, ...], InstanceMatches] = {}
         for result in _point_rows(predictions, points, extra) if points else ():
@@ -103,15 +108,15 @@ def run_evaluate_files(
                 rows.append(("", result))
             else:
                 matches[dataset, name, method, "-", METHOD] = result
+        scans = {scene: found for (_, scene, *_), found in matches.items()}
+        precisions = measure_instances(METHOD, scans, "files") if scans else ()
+        rows += [("", row) for row in precisions if not math.isnan(row.value)]
         score = partial(Score, dataset=dataset, scene=name, variant=method, masks="-")
         scores = [score(view=view, **vars(row)) for view, row in rows]
         counts["views"], counts["rows"] = len(views), len(scores)
-        write_instances(out, matches)
+        write_instances(out, matches, out.with_suffix(OF_FILES).name)
         write_scores(out, scores)
-        scans = {scene: found for (_, scene, *_), found in matches.items()}
-        precisions = measure_instances(METHOD, scans, "files") if scans else ()
-        every = [*scores, *(score(view="", **vars(row)) for row in precisions)]
-        frame = pd.DataFrame(map(vars, every), columns=list(COLUMNS))
+        frame = pd.DataFrame(map(vars, scores), columns=list(COLUMNS))
         return "\n".join(aligned_table(mean_rows(frame, {}), TEXTS))
 
 

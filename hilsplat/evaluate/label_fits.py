@@ -116,9 +116,12 @@ def run_label_fits(
     with stage_log("label_fits", scene.name) as counts:
         for view in track(views, "views compared"):
             camera = scene.cameras[view]
-            regions = [
+            drawn = [
                 (region, region.on(camera, view).mask(camera.size_hw)) for region in labelled.views[view]
             ]
+            regions = [(region, mask) for region, mask in drawn if mask.any()]  # some are outside the view
+            if not regions:
+                continue
             split = "held out" if scene.split[view] == "test" else "training"
             raw = pixel_weights(gaussians, camera, min_weight=tree.min_weight, threads=threads)
             found = {"nodes": nodes_of_view(tree, normalised_weights(raw))}

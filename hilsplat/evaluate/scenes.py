@@ -8,7 +8,7 @@ from hilsplat.base.errors import ArtifactError, HilsplatError, nearest
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.ownership import require_beginning
 from hilsplat.base.tables import aligned_table, write_csv
-from hilsplat.evaluate.protocols.cards import card_of
+from hilsplat.evaluate.protocols.cards import BY_NAME, card_of
 from hilsplat.evaluate.scores import read_scores
 from hilsplat.evaluate.tables.means import metric_means
 from hilsplat.query.scene_state import SceneState
@@ -81,10 +81,13 @@ def scene_lines(results: Path, names: list[str]) -> tuple[list[str], list[list[o
 
 
 def _tree_iou(scores: Path) -> str:
-    """Return the mean IoU of the tree under `PROTOCOL`, for the data set with the most labelled queries."""
+    """Return the mean IoU of the tree under `PROTOCOL`, for the data set with the most labelled queries.
+
+    It is empty if the scores are of another version of the protocol.
+    """
     table = read_scores([scores] if scores.is_file() else [])
     is_shown = (table["method"] == "tree") & (table["metric"] == "iou")
-    is_of_protocol = table["protocol"].str.split("@").str[0] == PROTOCOL
+    is_of_protocol = table["protocol"].str.split(" (", regex=False).str[0] == BY_NAME[PROTOCOL].full_name
     groups = table[is_shown & is_of_protocol].groupby(["dataset", "protocol"])
     parts = [(name, part) for (_, name), part in groups]
     name, most = max(parts, key=lambda named: len(named[1]), default=("", table))

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote
 
 from hilsplat.base.artifacts import read_npz, rebuild_command, write_npz
 from hilsplat.base.errors import ArtifactError
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 INSTANCES = "instances.npz"
+OF_FILES = ".instances.npz"
+"""Suffix of the matches that `evaluate-files` writes, beside a score file whose name begins alike."""
 
 COLUMNS: tuple[str, ...] = (
     *("dataset", "scene", "variant", "masks", "method", "view"),
@@ -74,20 +77,23 @@ def read_scores(paths: Iterable[Path]) -> "pd.DataFrame":
     return pd.DataFrame(rows, columns=list(COLUMNS)).astype({"value": float, "n": int})
 
 
-def write_instances(scores: Path, matches: Mapping[tuple[str, ...], InstanceMatches]) -> None:
+def write_instances(
+    scores: Path, matches: Mapping[tuple[str, ...], InstanceMatches], name: str = INSTANCES
+) -> None:
     """Write matches, keyed by (data set, scene, variant, masks, method), beside a score file."""
-    arrays = {
-        "/".join([*key, name]): array for key, found in matches.items() for name, array in vars(found).items()
-    }
-    write_npz(Path(scores).with_name(INSTANCES), **arrays)
+    arrays: dict[str, Any] = {}
+    for key, found in matches.items():  # a program's name may contain a slash, as in "w/ SAM"
+        place = "/".join(part.replace("%", "%25").replace("/", "%2F") for part in key)
+        arrays |= {f"{place}/{field}": array for field, array in vars(found).items()}
+    write_npz(Path(scores).with_name(name), **arrays)
 
 
 def read_instances(scores: Iterable[Path]) -> dict[tuple[str, ...], InstanceMatches]:
     """Read the matches beside score files, keyed by (data set, scene, variant, masks, method)."""
     found: dict[tuple[str, ...], dict[str, Any]] = {}
-    for path in scores:
-        beside = Path(path).with_name(INSTANCES)
-        for name, array in read_npz(beside).items() if beside.is_file() else ():
-            *key, part = name.split("/")
+    files = [file for path in scores for file in (path.with_name(INSTANCES), path.with_suffix(OF_FILES))]
+    for file in filter(Path.is_file, files):
+        for name, array in read_npz(file).items():
+            *key, part = map(unquote, name.split("/"))
             found.setdefault(tuple(key), {})[part] = array
     return {key: InstanceMatches(**arrays) for key, arrays in found.items()}

@@ -383,9 +383,9 @@ def test_sam_outlines_clicked_things(annotating, own_desk, tmp_path):
 
 
 def test_the_page_shows_the_saved_scores_and_reports_a_rewritten_scene(annotating, own_desk, tmp_path):
-    write_csv(own_desk / "scores.csv", ("method", "mIoU", "protocol"), [("tree", "65.0", "lerf/langsplat@2")])
+    write_csv(own_desk / "scores.csv", ("method", "mIoU", "protocol"), [("tree", "65.0", "lerf/langsplat@3")])
     page = annotating(own_desk)
-    assert page.get_by_text("mIoU: tree 65.0 % (lerf/langsplat@2).").is_visible()
+    assert page.get_by_text("mIoU: tree 65.0 % (lerf/langsplat@3).").is_visible()
     assert not page.get_by_role("alert").is_visible()
     write_again(own_desk / "default/semantic_tree")
     page.get_by_role("alert").get_by_text("The scene has changed (semantic_tree).").wait_for()

@@ -53,7 +53,7 @@ def test_a_scene_of_langsplat_answers_after_two_commands(
     assert (results / "default/field.safetensors").is_file()
     for variant in ("default", "langsplat"):
         scores = pd.read_csv(results / variant / "scores.csv")
-        field = scores[(scores["protocol"] == "lerf/langsplat@2") & (scores["metric"] == "iou")]
+        field = scores[(scores["protocol"] == "lerf/langsplat@3") & (scores["metric"] == "iou")]
         assert field["value"].mean() > 0.1, variant
     assert (project.root / "results/figures/photos/theirs/panel.webp").is_file()
     before = finished.hilsplat("query", "synthetic/tiny", "mug", "--out", str(project.root / "a"))

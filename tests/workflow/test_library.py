@@ -54,6 +54,6 @@ def test_the_example_of_the_page_runs(
     names: dict = {}
     exec(compile(example.replace("iterations=2000", "iterations=200"), "docs/python.md", "exec"), names)
     printed = capsys.readouterr().out
-    assert "Scene(photos/desk: 12 views" in printed and "Scores(lerf/langsplat@2 (masks of files)" in printed
+    assert "Scene(photos/desk: 12 views" in printed and "Scores(lerf/langsplat@3 (masks of files)" in printed
     assert Path("answer.png").is_file() and names["rendering"].depth.shape == (300, 400)
     assert hilsplat.open_scene("results/photos/desk").query("car")

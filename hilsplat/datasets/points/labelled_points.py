@@ -19,6 +19,7 @@ from hilsplat.scene.importers.ply_file import read_ply
 from hilsplat.scene.posed_images import PosedImage, rigid_pose
 
 UNPACK_AGAIN = "unpack or download the file again; this copy is damaged or incomplete"
+AS_DISTRIBUTED = "use the labelled file distributed with the data set, not an export by another program"
 
 decoding = partial(foreign, fix=UNPACK_AGAIN)
 
@@ -99,9 +100,12 @@ class PlyMesh:
     """A PLY mesh in which every face has `corners` corners."""
 
     def __init__(self, path: Path, corners: int, fix: str = UNPACK_AGAIN) -> None:
-        self.path, self.fix = require_file(path, fix), fix
+        self.path, self.fix, self.corners = require_file(path, fix), fix, corners
         with foreign(path, expected=f"a PLY mesh with {corners} corners per face", fix=fix):
-            self._content = read_ply(path, corners)
+            try:
+                self._content = read_ply(path, corners)
+            except Exception:  # is raised again, unless the file is intact but has other faces
+                self._content = read_ply(path)
             for element in ("vertex", "face"):
                 self._content[element]  # raises KeyError if the element is missing
 
@@ -112,7 +116,7 @@ class PlyMesh:
                 f"the {element} element of {self.path} has no property {name}",
                 expected=name,
                 found=", ".join(data.dtype.names),
-                fix="use the labelled file distributed with the data set",
+                fix=AS_DISTRIBUTED,
             )
         return np.asarray(data[name])
 
@@ -123,7 +127,15 @@ class PlyMesh:
     @cached_property
     def faces(self) -> Int32[np.ndarray, "F corners"]:
         """Vertex indices of all faces' corners, checked against the number of vertices."""
-        faces = self.column("face", "vertex_indices").astype(np.int32)
+        rows = self.column("face", "vertex_indices")
+        listed = rows[:1] if rows.ndim == 2 else rows  # rows of an array have the same length
+        if other := {len(face) for face in listed} - {self.corners}:
+            raise SceneError(
+                f"{self.path} has faces with {', '.join(map(str, sorted(other)))} corners",
+                expected=f"{self.corners} corners per face",
+                fix=AS_DISTRIBUTED,
+            )
+        faces = np.array([*rows] if rows.dtype == object else rows, np.int32).reshape(-1, self.corners)
         count = len(self._content["vertex"].data)
         if faces.size and (faces.min() < 0 or faces.max() >= count):
             raise SceneError(f"{self.path}: a face has an invalid vertex index", fix=self.fix)

@@ -109,7 +109,7 @@ def run_comparison(
     scene, image = first.scene, first.views.image
     with stage_log("comparison", scene.name) as counts:
         truths = shown_truths(scene, truth, labels, data_root, evaluate)
-        rows = annotated_rows(truths, settings) if truths else free_rows(first, queries, settings)
+        rows = annotated_rows(truths, settings) or free_rows(first, queries, settings)
         del first
         several = over_views(scene, rows, truths)
         view = several[0].view if several else (scene.views("test") or scene.views("train"))[0]

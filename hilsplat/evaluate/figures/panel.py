@@ -97,7 +97,7 @@ def run_figures(
     answers = LanguageScene.from_parts(parts, evaluate, threads=threads)
     with stage_log("figures", answers.scene.name) as counts:
         truths = shown_truths(answers.scene, truth, labels, data_root, evaluate)
-        rows = annotated_rows(truths, settings) if truths else free_rows(answers, queries, settings)
+        rows = annotated_rows(truths, settings) or free_rows(answers, queries, settings)
         save_with_pdf(draw_panel(answers, parts.masks, rows, evaluate), out)
         counts["queries"] = len(rows)
 

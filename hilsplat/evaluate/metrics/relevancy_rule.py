@@ -44,20 +44,6 @@ class RelevancyRule:
     # Under `mean_in_mask`, an empty mask ranks first (LangSplatV2: torch's argmax prefers NaN) or last.
     empty_wins: bool = False
 
-    def departures(self) -> tuple[str, ...]:
-        """Return the differences from the defaults that settings can cause, for protocol names."""
-        words = {
-            "filter_px": f"filter {self.filter_px}",
-            "mix": "no mix",
-            "threshold": f"threshold {self.threshold:g}",
-            "threshold_on": self.threshold_on,
-            "majority": "no majority",
-            "level_rule": self.level_rule,
-        }
-        return tuple(
-            text for name, text in words.items() if getattr(self, name) != getattr(RelevancyRule, name)
-        )
-
 
 def filter_side_px(filter_px: int, height_px: int) -> int:
     """Return the side of the mean filter; 0 means 30 px per 730 px of height, and at least 1 px."""

@@ -1,31 +1,35 @@
 """Protocols: the name, the version and everything else that determines a number measured under each.
 
 The same model scores 51.4 under `lerf/langsplat` and 9.66 under `lerf/opengaussian`, so each row of
-`scores.csv` has the full name, such as `lerf/langsplat@2`, then non-default settings in brackets. A change to
+`scores.csv` has the full name, such as `lerf/langsplat@3`, then non-default settings in brackets. A change to
 a card (`cards.json`) that affects its numbers requires a new version; a test checks this.
 """
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import Level
+from hilsplat.base.tables import described
 from hilsplat.evaluate.metrics.relevancy_rule import RelevancyRule
 
-CANONICAL: tuple[str, ...] = ("object", "things", "stuff", "texture")
-"""Canonical phrases of every protocol that uses relevancy (LERF, LangSplat)."""
-
-RELEVANCY_SCALE = 10.0
-"""Scale of the cosine in the relevancy (LERF, LangSplat)."""
-
-NODE_SELECT = 0.95
-"""`evaluate.node_select`; the selection of `TREE_NODES` states the rule."""
-
-ANCESTORS = 0.2
-"""Fraction of the ancestors' mean margin that is added to a node's own margin, except on paths."""
+STATED: dict[str, tuple[Any, Callable[[Any], str]]] = {
+    "filter_px": (0, "filter {}".format),
+    "mix": (True, lambda _: "no mix"),
+    "relevancy_threshold": (0.4, "threshold {:g}".format),
+    "threshold_on": ("normalised_pm1", str),
+    "majority": (True, lambda _: "no majority"),
+    "level_rule": ("max", str),
+    "node_select": (0.95, "node share {:g}".format),
+    "ancestors": (0.2, "ancestors {:g}".format),
+    "canonical": (("object", "things", "stuff", "texture"), lambda phrases: f"canonical {'+'.join(phrases)}"),
+    "template": ("{}", lambda template: f"texts as {template.replace('{}', '...')}"),
+    "relevancy_scale": (10.0, "relevancy scale {:g}".format),
+}
+"""Setting of `evaluate` -> the value under which the cards hold, and words for any other value in names."""
 
 MIN_REGION_PX = 60
 """Minimum area of a scored region of a generated scene; published labels have no minimum."""
@@ -85,10 +89,11 @@ def _card(fields: dict[str, Any]) -> ProtocolCard:
     return ProtocolCard(**{**fields, "metrics": tuple(fields["metrics"]), "united": united})
 
 
-CARDS: tuple[ProtocolCard, ...] = tuple(
-    map(_card, json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8")))
-)
-"""Every protocol, from `cards.json`; a `rule` there lists the fields that differ from `RelevancyRule`."""
+_ENTRIES = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))
+_BY_FULL_NAME = {entry["full_name"]: entry for entry in _ENTRIES}
+CARDS: tuple[ProtocolCard, ...] = tuple(_card(described(_BY_FULL_NAME, name)) for name in _BY_FULL_NAME)
+"""Every protocol, from `cards.json`; a `rule` there lists the fields that differ from `RelevancyRule`, and
+`like` names a protocol from which omitted values are taken."""
 
 BY_NAME: dict[str, ProtocolCard] = {name: card for card in CARDS for name in (card.name, card.full_name)}
 

@@ -41,16 +41,21 @@ from hilsplat.settings import EvaluateSettings
 RELEVANCY_CHUNK_MIB = 512
 """Memory limit for relevancy maps, which limits the texts per chunk; each chunk decodes the view again."""
 
+MAP_RULE = ("filter_px", "mix", "relevancy_threshold", "threshold_on", "majority", "level_rule")
+"""Settings that change the masks of a field: the first fields of `RelevancyRule`, in order."""
+
+MAPS_OF_NODES = ("filter_px", "mix")
+"""Settings that change localization and diagnostics of nodes, which are selected without thresholds."""
+
+NODES = ("node_select", "ancestors")
+"""Settings that change which nodes answer a text, or a path of one text."""
+
+RELEVANCY = ("canonical", "template", "relevancy_scale")
+"""Settings that change the relevancy itself."""
+
 
 def rule_of(settings: EvaluateSettings) -> RelevancyRule:
-    return RelevancyRule(
-        settings.filter_px,
-        settings.mix,
-        settings.relevancy_threshold,
-        settings.threshold_on,
-        settings.majority,
-        settings.level_rule,
-    )
+    return RelevancyRule(*(getattr(settings, name) for name in MAP_RULE))
 
 
 def label_of(
@@ -62,24 +67,14 @@ def label_of(
     """
     if method == "truth":
         return card.labelled(of_truth)
-    rule = rule_of(settings)
-    words: list[str] = []
-    if method == "field":
-        words += rule.departures()
-    else:  # nodes are selected without thresholds; localization and diagnostics still use smoothed maps
-        words += RelevancyRule(rule.filter_px, rule.mix).departures()
-        words += node_departures(settings)
-    return card.labelled([*words, *relevancy_departures(settings), *of_truth])
+    own = MAP_RULE if method == "field" else (*MAPS_OF_NODES, *NODES)
+    return card.labelled([*departures(settings, (*own, *RELEVANCY)), *of_truth])
 
 
-def node_departures(settings: EvaluateSettings) -> list[str]:
-    """Return descriptions of the settings that change which nodes answer a text, or a path of one text."""
-    words = []
-    if settings.node_select != cards.NODE_SELECT:
-        words.append(f"node share {settings.node_select:g}")
-    if settings.ancestors != cards.ANCESTORS:
-        words.append(f"ancestors {settings.ancestors:g}")
-    return words
+def departures(settings: EvaluateSettings, names: Sequence[str]) -> list[str]:
+    """Return descriptions of those settings whose values the cards do not state."""
+    found = ((getattr(settings, name), *cards.STATED[name]) for name in names)
+    return [describe(value) for value, stated, describe in found if value != stated]
 
 
 def given_key(method: str, query: Query) -> tuple[Any, ...]:
@@ -87,20 +82,9 @@ def given_key(method: str, query: Query) -> tuple[Any, ...]:
     return (method, cards.LEVEL_GIVEN.name, query.text, query.level)
 
 
-def relevancy_departures(settings: EvaluateSettings) -> list[str]:
-    """Return descriptions of the settings that change the relevancy itself."""
-    words = []
-    if settings.canonical != cards.CANONICAL:
-        words.append(f"canonical {'+'.join(settings.canonical)}")
-    words += text_departures(settings)
-    if settings.relevancy_scale != cards.RELEVANCY_SCALE:
-        words.append(f"relevancy scale {settings.relevancy_scale:g}")
-    return words
-
-
 def text_departures(settings: EvaluateSettings) -> list[str]:
     """Return a description of the prompt template, which changes every cosine, unless it is the default."""
-    return [] if settings.template == "{}" else [f"texts as {settings.template.replace('{}', '...')}"]
+    return departures(settings, ("template",))
 
 
 def measure_view(
@@ -113,7 +97,7 @@ def measure_view(
 ) -> Iterator[Measured]:
     """Yield all rows of one view, in arbitrary order, and store the answers in `masks`."""
     answers, scene = _ViewAnswers(selections, view, settings, masks, truth), selections.scene
-    words, of_nodes = [*relevancy_departures(settings), *truth.departures], node_departures(settings)
+    words, of_nodes = [*departures(settings, RELEVANCY), *truth.departures], departures(settings, NODES)
     flat_views = FlatProtocols(scene, view, extra.flat, extra.level, words, of_nodes)
     rule = rule_of(settings)
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from hilsplat.base.tables import described
+
 _DESCRIPTIONS = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))
 
 SECONDS = "-seconds"
@@ -57,14 +59,8 @@ class TableKind:
         )
 
 
-def _described(name: str) -> dict[str, Any]:
-    fields = dict(_DESCRIPTIONS["tables"][name])
-    base = fields.pop("like", None)
-    return {**_described(base), **fields} if base else fields
-
-
 def _kind(name: str) -> TableKind:
-    fields = {key: _frozen(value) for key, value in _described(name).items()}
+    fields = {key: _frozen(value) for key, value in described(_DESCRIPTIONS["tables"], name).items()}
     return TableKind(**{**fields, "footnotes": tuple(NOTES.get(note, note) for note in fields["footnotes"])})
 
 

@@ -64,9 +64,9 @@ def test_the_page_shows_the_saved_scores_and_whether_they_are_older_than_the_ann
     assert line() == ""
     means = own_desk / "scores.csv"
     of_methods = [("tree", "65.0"), ("field", "40.1"), ("LangSplat", "30.2"), ("LERF", "20.0"), ("none", "")]
-    rows = [(method, iou, "12", "lerf/langsplat@2") for method, iou in of_methods]
+    rows = [(method, iou, "12", "lerf/langsplat@3") for method, iou in of_methods]
     write_csv(means, ("method", "mIoU", "queries", "protocol"), rows)
-    shown = [f"{method} {iou} % (lerf/langsplat@2)" for method, iou in of_methods[:3]]
+    shown = [f"{method} {iou} % (lerf/langsplat@3)" for method, iou in of_methods[:3]]
     assert line() == "; ".join([*shown, f"all in {means.with_suffix('.md')}"])
     assert put(opened(own_desk, labels), 0, [MUG], "none").status_code == 200
     os.utime(means, (0, 0))

@@ -24,11 +24,8 @@ def test_subsets_lack_the_classes_that_their_sources_exclude():
     assert lists.SCANNET_10.texts == ten
     assert set(lists.SCANNET200.texts) - set(lists.SCANNET200_INSTANCES.texts) == {"wall", "floor"}
     assert set(lists.REPLICA_51.texts) - set(lists.REPLICA_48.texts) == {"wall", "floor", "ceiling"}
-    assert [sum(members) for members in lists.splits_of(lists.SCANNET200).values()] == [
-        66,
-        68,
-        66,
-    ]  # head, common, tail
+    head_common_tail = [sum(members) for members in lists.splits_of(lists.SCANNET200).values()]
+    assert head_common_tail == [66, 68, 66]
     assert lists.WAYMO_22.ids == tuple(range(1, 23)) and lists.WAYMO_22.texts[6] == "pedestrian"
 
 

@@ -44,7 +44,7 @@ def score(metric, value, **more):
         "view": "v.png",
         "query": "cup",
         "level": "whole",
-        "protocol": "hierarchy/level-given@5",
+        "protocol": "hierarchy/level-given@6",
         "n": 1,
     }
     return Score(**{**fields, **more}, metric=metric, value=value)

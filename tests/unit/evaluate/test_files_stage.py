@@ -10,6 +10,7 @@ from PIL import Image
 import hilsplat
 from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError
 from hilsplat.base.images import write_png
+from hilsplat.base.tables import read_csv
 from hilsplat.datasets.classes import SCANNET_10, SCANNET_19
 from hilsplat.datasets.labelled import LabelledScene
 from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
@@ -20,7 +21,7 @@ from hilsplat.evaluate.protocols.cards import LEVEL_AUTO, card_of
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import given_key, measure_view
 from hilsplat.evaluate.scores import read_instances, read_scores
-from hilsplat.evaluate.tables.build import run_table
+from hilsplat.evaluate.tables.build import published_values, run_table
 from hilsplat.evaluate.tables.rows import PUBLISHED_COLUMNS
 from hilsplat.settings import EvaluateSettings
 from tests.unit.evaluate.builders import box, region_of
@@ -185,6 +186,12 @@ def test_labels_of_a_data_set_take_grey_where_the_protocol_does(data_set, tmp_pa
     assert means["3d-ovs/argmax@3 (masks of files)"] == ["m", "0.0", "50.0", "1"]
 
 
+def test_labels_without_regions_are_refused(data_set, tmp_path):
+    data_set({"a.png": ()})  # such as a file of proposals
+    with pytest.raises(ArtifactError, match="set/s has neither a labelled region"):
+        scored(tmp_path)
+
+
 def point_scene(num=400, seed=0):
     rng = np.random.default_rng(seed)
     class_id = rng.choice([0, 1, 2, 3, 4, 5], num).astype(np.int32)
@@ -227,6 +234,16 @@ def test_instances_in_scannets_format_are_matched(data_set, tmp_path):
     assert key == ("set", "s", "m", "-", "files")
     assert matches.is_match.all()
     assert matches.misses.sum() == 0
+    nothing = tmp_path / "nothing"  # another program, scored to the same folder
+    nothing.mkdir()
+    (nothing / "instances.txt").touch()
+    run_evaluate_files(nothing, tmp_path / "other.csv", method="n", labels="set/s")
+    of_both = read_instances(files := [tmp_path / "scores.csv", tmp_path / "other.csv"])
+    assert {key[2]: found.misses.any() for key, found in of_both.items()} == {"m": False, "n": True}
+    published = published_values("scannet")
+    run_table("scannet", files, published, {}, tmp_path / "scannet.csv")
+    rows = [row for row in read_csv(tmp_path / "scannet.csv", None, "") if row["kind"] == "measured"]
+    assert {row["method"]: row["ScanNet200 AP"] for row in rows} == {"m": "100.00", "n": "0.00"}
 
 
 @pytest.mark.parametrize(

@@ -46,14 +46,19 @@ def test_a_view_may_lack_masks_at_a_level(tmp_path):
 
 
 def test_a_finished_scene_is_measured_by_level_and_split(desk_project, tmp_path):
+    size_hw = 2 * HEIGHT, 2 * (WIDTH + NUM_VIEWS)
+    nothing = Label(id=3, level=1, text="pen", polygons=traced(box((1, 2), (1, 2), size_hw)))  # in the view
+    proposal = Label(id=1, level=1, text="mug", polygons=[[(0, 0), (9, 0), (0, 9)]], origin="proposed")
+    folder = tmp_path / "annotated/photos/desk"
+    write_labels(label_path(folder, "002.png"), "002.png", size_hw, [proposal], NO_FILE)
     for number in (1, NUM_VIEWS - 1):  # a training view and the one held out
-        view, mug, handle = f"{number:03d}.png", region_mask("mug", number), region_mask("handle", number)
+        view, names = f"{number:03d}.png", ("mug", "handle")
+        mug, handle = (region_mask(name, number).repeat(2, 0).repeat(2, 1) for name in names)
         labels = [
             Label(id=1, level=1, text="mug", polygons=traced(mug)),
             Label(id=2, level=2, parent=1, text="handle", polygons=traced(handle)),
         ]
-        folder = tmp_path / "annotated/photos/desk"
-        write_labels(label_path(folder, view), view, (HEIGHT, WIDTH + NUM_VIEWS), labels, NO_FILE)
+        write_labels(label_path(folder, view), view, size_hw, [*labels, nothing], NO_FILE)
     out = tmp_path / "fits.csv"
     folder = desk_project / SCENE
     variant = folder / "default"

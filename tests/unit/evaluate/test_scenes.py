@@ -23,11 +23,11 @@ def results(desk, tmp_path) -> Path:
         shutil.copytree(desk, tmp_path / name)
     one = tmp_path / "rooms/one"
     write_json(one / "gaussians/report.json", {"psnr_db": 21.456, "gaussians": 864})
-    scores = [("lerf/tree-nodes@5", 0.5), ("lerf/tree-nodes@5", 0.8), ("lerf/langsplat@2 (wholes)", 0.2)]
+    scores = [("lerf/tree-nodes@6", 0.5), ("lerf/tree-nodes@6", 0.8), ("lerf/langsplat@3 (wholes)", 0.2)]
     of_tree = [
         score("iou", value, method="tree", query=f"text {value}", protocol=name) for name, value in scores
     ]
-    of_field = score("iou", 0.1, method="field", protocol="lerf/tree-nodes@5")
+    of_field = score("iou", 0.1, method="field", protocol="lerf/tree-nodes@6")
     write_scores(one / "default/scores.csv", [*of_tree, of_field])
     for part in ("clip", "semantic_tree", "masks"):
         shutil.copytree(desk / "default" / part, tmp_path / "rooms/early/key-views" / part)
@@ -56,6 +56,10 @@ def test_each_scene_has_a_row_with_what_its_run_has_computed(results, capsys):
     assert printed[0].split() == ["scene", "state", "views", "PSNR", "mIoU", "MB", "date", "models"]
     assert printed[3].split()[:6] == ["rooms/one", "tree,", "field", "6", "21.46", "0.6500"]
     assert printed[3].endswith(f"{date}  graph, colours")
+    scores = results / "rooms/one/default/scores.csv"  # of an earlier release
+    scores.write_text(scores.read_text().replace("lerf/tree-nodes@6", "lerf/tree-nodes@5"))
+    app(["scenes", "rooms/o*", "--results", str(results)], standalone_mode=False)
+    assert capsys.readouterr().out.splitlines()[1].split()[:6] == [*printed[3].split()[:5], "0"]
 
 
 @pytest.mark.parametrize("file", ["gaussians/report.json", "default/scores.csv", "scene/index.json"])

@@ -366,19 +366,6 @@ def test_impossible_queries_are_refused(scene, text, options, words):
         scene.query(text, **options)
 
 
-@pytest.mark.parametrize(("answerer", "ahead_by"), [("tree", 0), ("field", 0.05)])
-def test_maps_are_high_where_the_region_is(scene, answerer, ahead_by):
-    relevancy = scene.node_relevancy_map if answerer == "tree" else scene.field.relevancy
-    maps = relevancy(["B", "A top"], "004.png")
-    assert maps.shape == (2, 3, HEIGHT, WIDTH)
-    for text, region in enumerate((1, 2)):
-        own = maps[text, text]
-        inside = np.roll(region_mask(region), 4, axis=1)
-        assert own[inside].mean() > own[~inside].mean() + ahead_by
-        if answerer == "tree":
-            assert own[inside].min() > own[~inside].max()
-
-
 @pytest.fixture
 def thin(scene) -> LanguageScene:
     """The scene with a first pixel that shows nothing."""

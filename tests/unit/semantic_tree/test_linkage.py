@@ -55,31 +55,6 @@ def evidence_of(shares, importance, visible, view, min_covisible, threads=1) -> 
     return mask_evidence(sp.csr_matrix(shares), importance, visible, view, pairs, min_covisible, threads)
 
 
-FOUR_OF_ELEVEN = np.array([[1] * 5 + [0] * 6, [0] * 4 + [1] * 7], bool)
-"""Two views that share Gaussian 4 alone."""
-
-
-@pytest.mark.parametrize(
-    ("shares", "visible", "view", "min_covisible", "expected"),
-    [
-        # both agree on Gaussian 1, the only one that both views see: intersection 1, union 1 + 1 - 1
-        ([[1, 1, 0], [0, 1, 0.5]], [[1, 1, 0], [0, 1, 1]], [0, 1], 0.2, (1, 1)),
-        # a blurred region agrees fully with itself: 0.3^2 in both
-        ([[0.3], [0.3]], [[1], [1]], [0, 1], 0.2, (0.09, 0.09)),
-        # masks of one view, of sizes 1 and 2, are evidence against a link
-        ([[1, 0], [1, 1]], [[1, 1]], [0, 0], 0.2, (0, 3)),
-        # masks whose views share little are no evidence
-        (FOUR_OF_ELEVEN, FOUR_OF_ELEVEN, [0, 1], 0.1, (1, 1)),
-        (FOUR_OF_ELEVEN, FOUR_OF_ELEVEN, [0, 1], 0.25, (0, 0)),
-    ],
-)
-def test_evidence_of_two_masks(shares, visible, view, min_covisible, expected):
-    shares, visible = np.array(shares, float), np.array(visible, bool)
-    importance, view = np.ones(shares.shape[1]), np.array(view, np.int32)
-    evidence = evidence_of(shares, importance, visible, view, min_covisible)
-    assert pair(evidence, 0, 1) == pair(evidence, 1, 0) == pytest.approx(expected)
-
-
 @pytest.mark.parametrize(
     ("intersection", "union", "threshold", "cluster", "quality"),
     [
@@ -155,8 +130,8 @@ def test_evidence_equals_the_rule_pair_by_pair(threads):
     visible = rng.random((4, 30)) < 0.6
     shares = rng.random((12, 30)) * (rng.random((12, 30)) < 0.25) * visible[view]
     importance = rng.uniform(0.5, 2.0, 30)
-    found = evidence_of(shares, importance, visible, view, 0.4, threads)
-    intersection, union = dense_rule(shares, importance, visible, view, 0.4)
+    found = evidence_of(shares, importance, visible, view, 0.6, threads)
+    intersection, union = dense_rule(shares, importance, visible, view, 0.6)
     assert (intersection > 0).sum() > 20
     for a in range(12):
         for b in range(12):

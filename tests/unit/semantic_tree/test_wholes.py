@@ -75,9 +75,8 @@ def test_floating_gaussians_and_those_without_region_join_nothing():
         patch.setattr(wholes, "NEIGHBOURS", 2)  # the floating one at 1.1 alone would touch region 0
         assert joined_regions(region, 2, means, mass, 5.0).tolist() == [0, 1]
     none = np.full(3, -1, np.int32)
-    assert (
-        len(joined_regions(none, 0, on_a_line(0, 1, 2), sp.csr_matrix(np.ones((1, 3), np.float32)), 1.0)) == 0
-    )
+    seen = sp.csr_matrix(np.ones((1, 3), np.float32))
+    assert len(joined_regions(none, 0, on_a_line(0, 1, 2), seen, 1.0)) == 0
 
 
 def test_joined_nodes_keep_their_masks_gaussians_and_mean_quality():

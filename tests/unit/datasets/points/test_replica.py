@@ -52,6 +52,20 @@ def make_frames(root: Path, count: int) -> None:
         write_png(root / SEQUENCE / "rgb" / f"{name}.png", np.zeros((6, 10, 3), np.uint8))
 
 
+TRIANGLE = """ply
+format ascii 1.0
+element vertex 4
+property float x\nproperty float y\nproperty float z
+element face 2
+property list uchar int vertex_indices\nproperty int object_id
+end_header
+0 0 0\n1 0 0\n1 1 0\n0 1 0
+4 0 1 2 3 1
+3 0 1 2 1
+"""
+"""A mesh with a triangle among quads."""
+
+
 @pytest.fixture
 def root(tmp_path) -> Path:
     (tmp_path / MESH).parent.mkdir(parents=True)
@@ -104,6 +118,12 @@ def test_a_sequence_of_nice_slam_is_preferred_and_has_its_own_lens(root, tmp_pat
         (text_in(INFO, "{}"), "expected  an object with the keys classes, id"),
         (lambda root: (root / INFO).unlink(), r"info_semantic\.json is missing\n.*mesh_semantic\.ply"),
         (lambda root: (root / MESH).unlink(), r"mesh_semantic\.ply is missing"),
+        (
+            lambda root: write_ply(root / MESH, XYZ, QUADS[:, :3], object_id=OBJECT),
+            "with 3 corners\n  expected  4 corners per face\n  fix       use the labelled file",
+        ),
+        (text_in(MESH, TRIANGLE), "with 3 corners\n"),
+        (lambda root: (root / MESH).write_bytes((root / MESH).read_bytes()[:-9]), "early end.*damaged"),
         (poses(1), "1 lines, 3 images; the first frame without a line is 1"),
         (moved(f"{SEQUENCE}/rgb/rgb_2.png", f"{SEQUENCE}/rgb/rgb_001.png"), "several images of one frame"),
         (text_in(f"{SEQUENCE}/traj_w_c.txt", "1 0 0 0\n"), "1 lines of 4 numbers\n.*16 numbers per line"),

@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from hilsplat.base.levels import Level
 from hilsplat.evaluate.figures import comparison
 from hilsplat.evaluate.figures.panel import annotated_rows, draw_panel, free_rows, shown_truths
 from hilsplat.evaluate.figures.sweep_plot import draw_sweep, read_curves, run_sweep_plot
+from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.query.answer import report, views_of
 from hilsplat.query.pictures import ANSWER_RGB, TRUTH_RGB, outline, paint_answer, save_figure
 from hilsplat.query.query_panel import query_panel
@@ -55,9 +57,8 @@ def test_largest_text_of_each_level_is_shown_first(rows):
     truths, first = rows
     assert [(row.text, int(row.level)) for row in first] == [("bear", 1), ("head", 2), ("nose", 3)]
     assert first[2].path == ("bear", "head", "nose")
-    assert (
-        len(annotated_rows(truths, FiguresSettings())) == 5
-    )  # two of whole and part, the only one of subpart
+    # two of whole and part, the only one of subpart
+    assert len(annotated_rows(truths, FiguresSettings())) == 5
 
 
 @pytest.mark.parametrize("texts", [["bear", "bear > head"], []])
@@ -201,8 +202,10 @@ def test_all_figures_are_written_as_webp_and_pdf_twice_the_same(block_world, tmp
             assert picture.width == 1430
 
 
-def test_scenes_without_labels_show_the_queries_of_the_configuration(compare, monkeypatch):
+@pytest.mark.parametrize("truths", [{}, {"001.png": partial(ViewTruth.of_regions, [], (64, 64))}])
+def test_scenes_without_labelled_regions_show_the_queries_of_the_configuration(compare, monkeypatch, truths):
     drawn = []
+    monkeypatch.setattr(comparison, "shown_truths", lambda *how: truths)
     monkeypatch.setattr(comparison, "draw_methods", lambda *of: drawn.append(of[-1]) or None)
     monkeypatch.setattr(comparison, "save_with_pdf", lambda figure, out: None)
     compare("free", ["default"], {}, queries=["bear"])
@@ -227,7 +230,7 @@ synthetic stand-in,synthetic,theta = 0.6,a,level given,41.00,
 synthetic stand-in,synthetic,"theta = 0.6, by head",a,level given,61.00,
 synthetic stand-in,synthetic,"theta = 0.9, by head",a,level given,62.00,
 synthetic stand-in,synthetic,"theta = 0.9, by head",b,level given,72.00,
-synthetic stand-in,synthetic,theta = 0.9,a,hierarchy/level-given@5 (filter 20),82.00,
+synthetic stand-in,synthetic,theta = 0.9,a,hierarchy/level-given@6 (filter 20),82.00,
 """
 
 

@@ -4,60 +4,99 @@ import hashlib
 import re
 from dataclasses import asdict
 
+import numpy as np
 import pytest
 
+import hilsplat
 from hilsplat.base.errors import ArtifactError
-from hilsplat.evaluate.protocols.cards import CARDS, LERF_LANGSPLAT, LEVEL_GIVEN, PATH, TREE_NODES, card_of
+from hilsplat.evaluate.protocols.cards import (
+    CARDS,
+    INSTANCES,
+    LERF_LANGSPLAT,
+    LEVEL_GIVEN,
+    PATH,
+    TREE_NODES,
+    card_of,
+)
 from hilsplat.evaluate.protocols.points import class_set
 from hilsplat.evaluate.protocols.views import label_of
+from hilsplat.evaluate.score import SCORED
 from hilsplat.settings import EvaluateSettings
 from tests.conftest import PROJECT
+from tests.unit.evaluate.builders import box
+from tests.unit.evaluate.protocols.test_protocols import SIZE, measured, worked_example
 
 DECIDED = {
     # full name: digest of all that determines a number
-    "lerf/langsplat@2": "00e1f107",
-    "lerf/tree-nodes@5": "1fa14c68",
-    "lerf/langsplat-v2@2": "b0d9afb3",
-    "lerf/paper-filter@2": "804964c0",
-    "lerf/paper-mean@2": "5768b3cc",
-    "lerf/opengaussian@1": "1b122683",
-    "lerf-mask/gaussian-grouping@1": "e6d93a59",
-    "lerf-mask/gaussian-grouping-skipping@1": "c241ea72",
-    "3d-ovs/argmax@3": "1128109f",
-    "3d-ovs/langsplat@2": "f6e46c55",
-    "3d-ovs/langsplat-raw@2": "032c1219",
-    "3d-ovs/langsplat-v2@3": "e9ed3d71",
-    "3d-ovs/tree-nodes@1": "e097e501",
-    "scannet/opengaussian-19@1": "d64c6a7c",
-    "scannet/opengaussian-15@1": "9c2bf111",
-    "scannet/opengaussian-10@1": "d9b46593",
-    "scannet200/opengaussian@1": "55c18009",
-    "scannet200/benchmark@1": "8ed63d14",
-    "scannet200/instances@1": "c9866886",
-    "replica/per-scene@1": "02a2f18f",
-    "replica/opennerf@1": "3bd79743",
-    "replica/conceptgraphs@1": "a221d8a0",
-    "waymo/segmentation@1": "9622c7a0",
-    "hierarchy/level-given@5": "cc1e20b7",
-    "hierarchy/level-auto@6": "97938d15",
-    "hierarchy/path@3": "90fed6d1",
-    "hierarchy/scene-wide@2": "0ddcebe5",
-    "hierarchy/annotations@1": "7aa18d6b",
-    "world/view-consistency@2": "e5909c33",
+    "lerf/langsplat@3": "d43dfb29",
+    "lerf/tree-nodes@6": "4dfc2086",
+    "lerf/langsplat-v2@3": "65314bd7",
+    "lerf/paper-filter@3": "94d0aeec",
+    "lerf/paper-mean@3": "48c2803c",
+    "lerf/opengaussian@1": "51f63088",
+    "lerf-mask/gaussian-grouping@1": "ac76d338",
+    "lerf-mask/gaussian-grouping-skipping@1": "30c45b6e",
+    "3d-ovs/argmax@3": "0569c777",
+    "3d-ovs/langsplat@2": "3e9d5495",
+    "3d-ovs/langsplat-raw@2": "83cf5c2a",
+    "3d-ovs/langsplat-v2@3": "d1eef0f9",
+    "3d-ovs/tree-nodes@1": "2871bf96",
+    "scannet/opengaussian-19@1": "5cfd5215",
+    "scannet/opengaussian-15@1": "540633c5",
+    "scannet/opengaussian-10@1": "ade62598",
+    "scannet200/opengaussian@1": "38d571c2",
+    "scannet200/benchmark@1": "143662e3",
+    "scannet200/instances@1": "369e6639",
+    "replica/per-scene@1": "a8091a33",
+    "replica/opennerf@1": "f1bdad4a",
+    "replica/conceptgraphs@1": "a942dcfd",
+    "waymo/segmentation@1": "820ca0d8",
+    "hierarchy/level-given@6": "40e6ae22",
+    "hierarchy/level-auto@7": "81da9fd0",
+    "hierarchy/path@4": "4602f295",
+    "hierarchy/scene-wide@2": "b748cc19",
+    "hierarchy/annotations@1": "cfaa55f5",
+    "world/view-consistency@2": "1b2df5f1",
 }
 
 
-def digest(card):
-    """Digest of everything that determines a number, without the explanations."""
-    explanations = ("selection", "source", "public")
-    decided = {name: value for name, value in asdict(card).items() if name not in explanations}
-    return hashlib.sha256(repr(decided).encode()).hexdigest()[:8]
+def digests(folder):
+    """Digest of each protocol's card, without explanations, and of its scores for fixed answers."""
+    rng = np.random.default_rng(0)
+    scene, truth = worked_example(folder, without=("a1",))
+    constant = np.full((3, *SIZE), 0.5, np.float32)
+    scene.maps = {"A": rng.integers(0, 9, constant.shape) / np.float32(8), "B": constant[:, ::-1] / 2}
+    scene.maps |= {"b1": constant, "x": scene.maps["A"][::-1]}
+    flat = tuple(card for card in CARDS if card.averaging in ("pairs", "classes"))
+    rows = [((key[1].split(" ")[0], *key), value) for key, value in measured(scene, truth, flat).items()]
+    for name, card in SCORED.items():
+        predictions, labels = {"v": {"cup": box((2, 9), (3, 9))}}, {"v": {"cup": box((3, 9), (0, 8))}}
+        if card.classes:
+            ids = [0, *class_set(card.classes)[1].ids[:6]]
+            labels, predictions = rng.choice(ids[:-1], 2000), rng.choice(ids, 2000)
+        if card is INSTANCES:
+            classes, counts = rng.choice(ids, 9), rng.integers(0, 2, 2000)
+            masks = (labels == classes[:, None]) & (rng.random((9, 2000)) > 0.3)
+            labels, predictions = (labels, counts), (masks, classes, rng.integers(1, 5, 9) / 4)
+        if card is not LEVEL_GIVEN:
+            scores = hilsplat.score(predictions, labels, name)
+            rows += [((name, *key), value) for key, value in scores.means.items()]
+    explanations = {"selection", "source", "public"}
+    decided = {
+        card.full_name: (
+            sorted((key, repr(value)) for key, value in asdict(card).items() if key not in explanations),
+            sorted((key, f"{value:.4f}") for key, value in rows if key[0] == card.full_name),
+        )
+        for card in CARDS
+    }
+    return {name: hashlib.sha256(repr(each).encode()).hexdigest()[:8] for name, each in decided.items()}
 
 
-def test_a_protocol_changes_only_with_its_version():
-    found = {card.full_name: digest(card) for card in CARDS}
+def test_a_protocol_changes_only_with_its_version(tmp_path):
     # An added or removed metric changes no other number, so it needs no new version.
-    assert found == DECIDED, "raise the version of a protocol that changed, then write its digest here"
+    assert digests(tmp_path) == DECIDED, (
+        "raise the version of a protocol that changed, then write its digest here"
+    )
 
 
 PUBLIC = re.compile(r"[\w.-]+/[\w.-]+@[0-9a-f]{7} \S+\.(py|cc)(:\w+)?")
@@ -107,6 +146,6 @@ def test_rows_name_the_settings_that_affect_them(card, method, settings, departu
 
 
 def test_the_label_of_a_row_identifies_its_protocol():
-    assert card_of("lerf/langsplat@2 (filter 20, raw)") is LERF_LANGSPLAT
+    assert card_of("lerf/langsplat@3 (filter 20, raw)") is LERF_LANGSPLAT
     with pytest.raises(ArtifactError, match=r"no protocol 'lerf/langsplat@9'"):
         card_of("lerf/langsplat@9")

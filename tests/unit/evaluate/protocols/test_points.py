@@ -44,10 +44,8 @@ def test_missed_points_count_zero_and_a_scene_without_truth_has_no_rows():
     rows = list(scoring.measure_points(OPENGAUSSIAN, "tree", TRUTH, nothing, sets.SCANNET_19, "frozen"))
     assert {row.value for row in rows} == {0.0}
     assert {row.query for row in rows} == {"", "wall", "floor", "cabinet"}
-    assert (
-        list(scoring.measure_points(OPENGAUSSIAN, "tree", nothing, PREDICTION, sets.SCANNET_19, "frozen"))
-        == []
-    )
+    no_truth = nothing, PREDICTION, sets.SCANNET_19, "frozen"
+    assert list(scoring.measure_points(OPENGAUSSIAN, "tree", *no_truth)) == []
 
 
 def test_pooled_rows_equal_points_put_together_also_after_a_file(tmp_path):
@@ -64,10 +62,8 @@ def test_pooled_rows_equal_points_put_together_also_after_a_file(tmp_path):
         WAYMO, scoring.measure_points(WAYMO, "t", *together, sets.WAYMO_22, "x"), sets.WAYMO_22
     )
     write_scores(tmp_path / "scores.csv", [score(**vars(row), view="") for row in rows])
-    assert (
-        scoring.pooled_points(WAYMO, read_scores([tmp_path / "scores.csv"]).itertuples(), sets.WAYMO_22)
-        == expected
-    )
+    again = read_scores([tmp_path / "scores.csv"]).itertuples()
+    assert scoring.pooled_points(WAYMO, again, sets.WAYMO_22) == expected
     # five of 22 classes occur; the other 17 count 1 under Waymo's own mean
     assert expected["miou_absent_as_one"] == pytest.approx((5 * expected["miou_present"] + 17) / 22)
 
@@ -135,7 +131,7 @@ def test_a_node_is_an_instance_of_its_best_class_also_after_a_file(block_world, 
     assert matches.has_truth.all()
     assert np.nanmean(average_precision([matches])) == 1.0
     assert matches.misses.sum() == 0
-    key = ("synthetic-rooms", "room-1", "default", "sam-tiny", "tree")
+    key = ("synthetic-rooms", "room-1", "ours w/ SAM, 100%", "sam-tiny", "tree")
     write_instances(tmp_path / "scores.csv", {key: matches})
     found = read_instances([tmp_path / "scores.csv"])[key]
     assert np.array_equal(average_precision([found]), average_precision([matches]), equal_nan=True)

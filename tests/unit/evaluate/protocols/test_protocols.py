@@ -52,7 +52,10 @@ class HandMade:
     def relevancy(self, texts, view):
         return np.stack([self.maps.get(text, np.zeros((3, *SIZE), np.float32)) for text in texts])
 
-    node_relevancy_map = relevancy
+    def cosine(self, texts, view, pixels):
+        return self.relevancy(texts, view).reshape(len(texts), 3, -1)[..., pixels]
+
+    node_relevancy_map, node_cosine = relevancy, cosine
 
     def select(self, path, *, level=None, view=None):
         answers = self.answers if view == "v.png" else self.answers | self.scene_wide
@@ -63,10 +66,10 @@ class HandMade:
         return np.any([self.masks[node] for node in ids], axis=0)
 
 
-def measured(scene, truth, **settings):
+def measured(scene, truth, flat=(), **settings):
     """{(method, protocol, query, level, metric): value} of one view."""
     section = EvaluateSettings(min_region_px=1, **settings)
-    rows = measure_view(Selections(scene), truth, "v.png", PackedMasks(SIZE), section, ExtraProtocols())
+    rows = measure_view(Selections(scene), truth, "v.png", PackedMasks(SIZE), section, ExtraProtocols(flat))
     return {(row.method, row.protocol, row.query, row.level, row.metric): row.value for row in rows}
 
 
@@ -97,7 +100,7 @@ def worked_example(tmp_path, without=()):
 def test_consistency_rows_match_the_worked_example(tmp_path):
     scene, truth = worked_example(tmp_path)
     values = measured(scene, truth, methods=("tree", "tree-path"))
-    for protocol in ("level-given@5", "level-auto@6", "scene-wide@2", "path@3"):
+    for protocol in ("level-given@6", "level-auto@7", "scene-wide@2", "path@4"):
         key = ("tree-path" if "path" in protocol else "tree", f"hierarchy/{protocol}", "", "")
         assert values[*key, "hc_containment"] == pytest.approx(0.9375)
         assert values[*key, "hc_literal"] == pytest.approx(0.27)
@@ -110,7 +113,7 @@ def test_consistency_rows_match_the_worked_example(tmp_path):
 def test_missing_answer_counts_zero_and_breaks_consistency(tmp_path):
     scene, truth = worked_example(tmp_path, without=("x",))
     values = measured(scene, truth, methods=("tree",))
-    given = ("tree", "hierarchy/level-given@5")
+    given = ("tree", "hierarchy/level-given@6")
     assert values[*given, "x", "subpart", "iou"] == 0
     assert values[*given, "A", "whole", "iou"] == 1
     assert values[*given, "", "", "hc_containment"] == pytest.approx(0.4375)
@@ -120,8 +123,8 @@ def test_scene_wide_answers_do_not_depend_on_the_view(tmp_path):
     scene, truth = worked_example(tmp_path)
     scene.scene_wide = {("x", Level.SUBPART): [4], ("A", "a1", "x"): [4]}  # b1 is more like it, elsewhere
     values = measured(scene, truth, methods=("tree", "tree-path"))
-    assert values["tree-path", "hierarchy/path@3", "x", "subpart", "iou"] == 1
-    assert values["tree", "hierarchy/level-given@5", "x", "subpart", "iou"] == 1
+    assert values["tree-path", "hierarchy/path@4", "x", "subpart", "iou"] == 1
+    assert values["tree", "hierarchy/level-given@6", "x", "subpart", "iou"] == 1
     assert values["tree", "hierarchy/scene-wide@2", "x", "subpart", "iou"] == 0
     assert values["tree", "hierarchy/scene-wide@2", "A", "whole", "iou"] == 1
     # as if x had no answer: no pixel of its mask lies inside a1
@@ -133,7 +136,7 @@ def test_regions_with_the_same_text_are_merged(tmp_path):
     truth = truth_of(tmp_path, nodes, [((0, 4), (0, 4)), ((6, 10), (6, 10))])
     scene = HandMade([box((0, 4), (0, 4))], {("cup", Level.WHOLE): [0], ("cup", None): [0]})
     values = measured(scene, truth, methods=("tree",))
-    assert values["tree", "hierarchy/level-given@5", "cup", "whole", "iou"] == pytest.approx(0.5)
+    assert values["tree", "hierarchy/level-given@6", "cup", "whole", "iou"] == pytest.approx(0.5)
     assert not [key for key in values if key[4].startswith("hc_")]  # a view without parents
 
 
@@ -163,7 +166,7 @@ def test_automatic_level_of_the_field_follows_the_highest_value(tmp_path):
     values = measured(scene, truth, methods=("field",), filter_px=1, majority=False)
     given, auto, lerf = (
         f"{name} (filter 1, no majority)"
-        for name in ("hierarchy/level-given@5", "hierarchy/level-auto@6", "lerf/langsplat@2")
+        for name in ("hierarchy/level-given@6", "hierarchy/level-auto@7", "lerf/langsplat@3")
     )
     for metric in ("iou", "localization_box"):
         assert values["field", given, "cup", "whole", metric] == 1
@@ -198,8 +201,8 @@ def test_a_repeated_text_nests_in_each_of_its_wholes(tmp_path):
     answers |= {("chair", Level.WHOLE): [0], ("table", Level.WHOLE): [1], ("leg", Level.PART): [2, 3]}
     values = measured(HandMade([box(*each) for each in regions], answers), truth, methods=("tree",))
     perfect = values["truth", "hierarchy/annotations@1", "", "", "hc_containment"]
-    assert values["tree", "hierarchy/level-given@5", "", "", "hc_containment"] == perfect == 0.5
-    assert values["tree", "hierarchy/level-given@5", "", "", "hc_anchored"] == 0.5
+    assert values["tree", "hierarchy/level-given@6", "", "", "hc_containment"] == perfect == 0.5
+    assert values["tree", "hierarchy/level-given@6", "", "", "hc_anchored"] == 0.5
 
 
 def test_path_localization_searches_the_parent(tmp_path):
@@ -211,8 +214,8 @@ def test_path_localization_searches_the_parent(tmp_path):
     answers = {("bear",): [0], ("bear", "nose"): [1], ("nose", Level.PART): [1]}
     scene = HandMade([box(*each) for each in regions], answers, {"nose": relevancy})
     values = measured(scene, truth, methods=("tree", "tree-path"), filter_px=1)
-    assert values["tree", "hierarchy/level-given@5 (filter 1)", "nose", "part", "localization_box"] == 0
-    assert values["tree-path", "hierarchy/path@3 (filter 1)", "nose", "part", "localization_box"] == 1
+    assert values["tree", "hierarchy/level-given@6 (filter 1)", "nose", "part", "localization_box"] == 0
+    assert values["tree-path", "hierarchy/path@4 (filter 1)", "nose", "part", "localization_box"] == 1
 
 
 def test_perfect_tree_of_the_block_world_scores_one(block_world):
@@ -220,12 +223,12 @@ def test_perfect_tree_of_the_block_world_scores_one(block_world):
     truth = ViewTruth.of(block_world.annotations, view, size_hw, settings.min_region_px)
     selections = Selections(block_world.answers)
     rows = list(measure_view(selections, truth, view, PackedMasks(size_hw), settings, ExtraProtocols()))
-    given = [row for row in rows if row.method == "tree" and row.protocol == "hierarchy/level-given@5"]
+    given = [row for row in rows if row.method == "tree" and row.protocol == "hierarchy/level-given@6"]
     ious = {row.query: row.value for row in given if row.metric == "iou"}
     assert ious == dict.fromkeys(("bear", "chest", "head", "lid", "nose"), 1.0)
     assert {row.value for row in given if row.metric in ("localization_box", "hc_containment")} == {1.0}
     for name in {row.protocol for row in rows}:
         assert {row.metric for row in rows if row.protocol == name} == set(card_of(name).metrics)
-    key = ("field", "hierarchy/level-given@5", "iou", "bear")
+    key = ("field", "hierarchy/level-given@6", "iou", "bear")
     (value,) = [row.value for row in rows if (row.method, row.protocol, row.metric, row.query) == key]
     assert value > 0.9  # exact features; the filter rounds the corners

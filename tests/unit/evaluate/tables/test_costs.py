@@ -132,7 +132,7 @@ def test_rows_over_part_of_the_scenes_are_compared_only_within_a_scene(scene, tm
 
 
 def test_quality_and_costs_of_a_row_are_of_the_same_scenes(scene, tmp_path):
-    more = another(scene[0], "table-2", "default", 0.9, 0.05, protocol="lerf/langsplat@2")
+    more = another(scene[0], "table-2", "default", 0.9, 0.05, protocol="lerf/langsplat@3")
     (row,), _ = built("pruning-seconds", [scene[0], more], tmp_path)
     assert (row["Hi-LERF mIoU"], row["Query (s)"]) == ("50.00", "0.25")  # not of the scene without levels
 

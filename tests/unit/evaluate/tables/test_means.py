@@ -21,7 +21,7 @@ def means(*rows):
 
 
 def test_each_method_and_protocol_has_a_row_averaged_as_its_card_says():
-    tree, field = {"protocol": "lerf/tree-nodes@5"}, {"protocol": "lerf/langsplat@2", "method": "field"}
+    tree, field = {"protocol": "lerf/tree-nodes@6"}, {"protocol": "lerf/langsplat@3", "method": "field"}
     pairs = [score("iou", 0.5, query="mug", **tree), score("iou", 1.0, query="pen", **tree)]
     localized = [score("localization_mask", 1.0, query="mug", **tree)]
     of_level = [score("iou", 0.9, level="whole"), score("iou", 0.7), score("iou", 0.2, level="part")]
@@ -34,7 +34,7 @@ def test_each_method_and_protocol_has_a_row_averaged_as_its_card_says():
     rows = means(*pairs, *localized, *of_level, *by_class, consistency, other)
     assert rows == [
         {"method": "hilsplat (tree)", "mIoU": "50.0", "whole": "80.0", "part": "20.0", "queries": "3"}
-        | {"protocol": "hierarchy/level-given@5"},
+        | {"protocol": "hierarchy/level-given@6"},
         {"method": "hilsplat (tree)", "mIoU": "75.0", "queries": "3"}
         | {"protocol": "lerf-mask/gaussian-grouping@1"},
         {"method": "hilsplat (tree)", "mIoU": "75.0", "localized": "100.0", "queries": "2", **tree},
@@ -58,28 +58,24 @@ def test_classes_of_a_pooled_protocol_are_averaged_from_their_points():
 def test_the_means_of_a_scene_are_written_as_markdown_and_csv(tmp_path):
     files = [tmp_path / variant / "scores.csv" for variant in ("default", "langsplat")]
     for path, value in zip(files, (0.75, 0.5), strict=True):
-        write_scores(path, [score("iou", value, variant=path.parent.name, protocol="lerf/tree-nodes@5")])
+        write_scores(path, [score("iou", value, variant=path.parent.name, protocol="lerf/tree-nodes@6")])
     out = tmp_path / "scores.md"
     words = ["score-means", *map(str, files), "--out", str(out), "--names", '{"langsplat": "LangSplat"}']
     app(words, standalone_mode=False)
     rows = read_csv(out.with_suffix(".csv"), None, "")
-    assert [(row["method"], row["mIoU"]) for row in rows] == [
-        ("hilsplat (tree)", "75.0"),
-        ("LangSplat, tree", "50.0"),
-    ]
-    assert "| hilsplat (tree) | 75.0 | 1 | lerf/tree-nodes@5 |" in out.read_text()
+    found = [(row["method"], row["mIoU"]) for row in rows]
+    assert found == [("hilsplat (tree)", "75.0"), ("LangSplat, tree", "50.0")]
+    assert "| hilsplat (tree) | 75.0 | 1 | lerf/tree-nodes@6 |" in out.read_text()
     write_scores(files[0], [])
     app([words[0], str(files[0]), *words[3:]], standalone_mode=False)
     assert read_csv(out.with_suffix(".csv"), None, "") == []
 
 
 def test_labels_of_several_data_sets_are_not_averaged_together():
-    theirs = [score("iou", 0.8, dataset="lerf_ovs", query=text, protocol="lerf/langsplat@2") for text in "ab"]
-    own = score("iou", 0.0, dataset="annotated", protocol="lerf/langsplat@2")
-    assert [(row["labels"], row["mIoU"]) for row in means(*theirs, own)] == [
-        ("annotated", "0.0"),
-        ("lerf_ovs", "80.0"),
-    ]
+    theirs = [score("iou", 0.8, dataset="lerf_ovs", query=text, protocol="lerf/langsplat@3") for text in "ab"]
+    own = score("iou", 0.0, dataset="annotated", protocol="lerf/langsplat@3")
+    found = [(row["labels"], row["mIoU"]) for row in means(*theirs, own)]
+    assert found == [("annotated", "0.0"), ("lerf_ovs", "80.0")]
 
 
 def test_score_files_are_sorted_and_stable(tmp_path):

@@ -28,7 +28,7 @@ from tests.unit.evaluate.builders import score
 
 PUBLISHED = PROJECT / "config" / "published"
 
-LERF, LEVELS = {"protocol": "lerf/tree-nodes@5", "level": ""}, "hierarchy/level-given@5"
+LERF, LEVELS = {"protocol": "lerf/tree-nodes@6", "level": ""}, "hierarchy/level-given@6"
 SCORES = [
     # scene one: L1 0.8 and 0.6, L2 0.5, L3 0.2, 0.0, 0.1; scene two: L1 0.3 only
     score("iou", 0.8, query="a"),
@@ -104,7 +104,7 @@ def test_hierarchy_means_go_over_pairs_then_scenes_then_levels(tmp_path, departu
 
 def test_lerf_table_has_a_column_per_scene_and_the_mean_of_scenes(tmp_path):
     rows, forms = built(tmp_path, "lerf", labels={"default": "ours"})
-    row = measured(rows, method="ours (tree)", protocol="lerf/tree-nodes@5")
+    row = measured(rows, method="ours (tree)", protocol="lerf/tree-nodes@6")
     assert cells(row, "one mIoU", "two mIoU", "Average mIoU") == ["50.00", "70.00", "60.00"]
     assert cells(row, "one mBIoU", "Average mBIoU", "Average localization") == ["25.00", "25.00", "50.00"]
     for entry in read_published(PUBLISHED / "lerf.csv"):
@@ -240,17 +240,14 @@ def test_names_are_text_in_every_format(tmp_path):
         assert "](java" not in forms[".md"]
         bars = {len(re.findall(r"(?<!\\)\|", line)) for line in block if line.startswith("|")}
         assert len(bars) == 1  # every row has the columns of the header
-        assert (
-            "\n[" not in forms[".tex"] and "\n\n" not in forms[".tex"]
-        )  # arguments of a row's end, paragraphs
+        # no arguments of a row's end, no paragraphs
+        assert "\n[" not in forms[".tex"] and "\n\n" not in forms[".tex"]
 
 
 def test_scenes_whose_names_differ_only_in_a_space_have_columns_of_their_own(tmp_path):
     scores = [score("iou", value, scene=scene, **LERF) for scene, value in (("desk1", 0.5), ("desk_1", 0.7))]
-    assert cells(measured(built(tmp_path, "lerf", scores)[0]), "desk1 mIoU", "desk_1 mIoU") == [
-        "50.00",
-        "70.00",
-    ]
+    row = measured(built(tmp_path, "lerf", scores)[0])
+    assert cells(row, "desk1 mIoU", "desk_1 mIoU") == ["50.00", "70.00"]
 
 
 def test_an_unknown_table_is_an_error_that_lists_the_tables(tmp_path):
@@ -405,7 +402,7 @@ def test_view_consistency_is_shown_beside_the_level_given_rows(tmp_path):
     protocol = {"protocol": "world/view-consistency@2"}
     scores = [
         score("iou", 0.5),
-        score("iou", 0.5, protocol="hierarchy/level-auto@6"),
+        score("iou", 0.5, protocol="hierarchy/level-auto@7"),
         score("view_consistency", 0.8, **protocol),
         score("view_consistency", 0.6, query="mug", **protocol),
         score("view_consistency", 0.1, level="part", **protocol),
