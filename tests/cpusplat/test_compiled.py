@@ -47,7 +47,8 @@ def call(package: Path, *edit: str) -> tuple[int, int, int]:
     paths = (package.parent, Path(cpusplat.__file__).parents[1])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths))}
     environment.pop("NUMBA_CACHE_DIR", None)
-    command = [sys.executable, "-c", CALL, *edit]
+    # -B: Python takes a compiled module for current if an edit in the same second keeps the size
+    command = [sys.executable, "-B", "-c", CALL, *edit]
     done = subprocess.run(
         command, env=environment, cwd=package, capture_output=True, text=True, check=True, timeout=300
     )
