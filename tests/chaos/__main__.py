@@ -35,6 +35,8 @@ from tests.workflow.conftest import Project, copy_project, given_to_stranger, wi
 
 DISK_MIB = 1000  # size of the results disk, MiB; the ci configuration needs less than a tenth of it
 
+MAX_FINISHED = 5  # maximum number of complete runs per kill; with more, jobs are not seen
+
 SLACK_S = 3600  # maximum time of a start without a fault, in addition to that of the undisturbed run
 
 
@@ -109,6 +111,8 @@ def torment(
         if code == 0:
             tally.finished += 1
             tally.problems += differences(reference, project)
+            if tally.finished > MAX_FINISHED * (tally.kills + 1):
+                tally.problems.append(f"only {tally.kills} kills in {tally.finished} complete runs")
         if tally.problems or (code == 0 and tally.kills >= options.kills):
             return tally
         if code == 0:

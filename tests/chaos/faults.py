@@ -39,6 +39,11 @@ def children(pid: int) -> list[int]:
     return found
 
 
+def descendants(pid: int) -> list[int]:
+    """Return the processes that a process or its descendants started."""
+    return [each for child in children(pid) for each in (child, *descendants(child))]
+
+
 class Run:
     """A run of `COMMAND` in a project, and problems that need manual intervention."""
 
@@ -63,7 +68,7 @@ class Run:
 
     def look(self) -> list[int]:
         """Return the processes of the running jobs."""
-        for pid in children(self.process.pid):
+        for pid in descendants(self.process.pid):  # Snakemake, and its jobs
             if pid not in self.jobs and (stage := stage_of(pid)) is not None:
                 self.jobs[pid] = stage
         return [pid for pid in self.jobs if not has_ended(pid)]
@@ -103,8 +108,8 @@ class Run:
         return code
 
     def kill_snakemake(self, chance: random.Random) -> None:
-        """Kill only Snakemake, as the kernel does when memory runs out."""
-        self.process.kill()
+        """Kill only Snakemake, or the command that started it, as the kernel does when memory runs out."""
+        os.kill(chance.choice([self.process.pid, *children(self.process.pid)]), signal.SIGKILL)
 
     def kill_all(self, chance: random.Random) -> None:
         """Kill all processes, as in a power failure."""
@@ -120,7 +125,8 @@ class Run:
         self._frozen = self.look()
         for pid in self._frozen:
             os.kill(pid, signal.SIGSTOP)
-        self.process.kill()
+        for pid in (*children(self.process.pid), self.process.pid):
+            os.kill(pid, signal.SIGKILL)
 
     def fill_the_disk(self, chance: random.Random) -> None:
         """Fill the disk until the run has ended, so that jobs fail."""
