@@ -10,7 +10,7 @@ import pytest
 
 import cpusplat
 from cpusplat import rasterization
-from tests.cpusplat.scenes import random_gaussians, two_cameras
+from tests.cpusplat.scenes import HEIGHT, WIDTH, random_gaussians, two_cameras
 
 STRAIGHT = {
     "viewmats": np.eye(4)[None],
@@ -59,6 +59,35 @@ def test_near_far_and_low_pass_are_honoured():
     assert rasterization(**one_gaussian(), far_plane=1.9)[1].max() == 0
     _, alphas, _ = rasterization(**one_gaussian(), eps2d=1.0)
     assert alphas[0, 12, 16, 0] == pytest.approx(0.8 * np.exp(-0.25 / (1.5**2 + 1)), rel=1e-5)
+
+
+@pytest.mark.parametrize(("mode", "channels"), [("RGB", 5), ("D", 1), ("ED", 1), ("RGB+D", 6), ("RGB+ED", 6)])
+def test_render_modes(mode, channels):
+    gaussians, cameras = random_gaussians(60, channels=5), two_cameras()
+    backgrounds = np.full((2, 5), 0.5, np.float32)
+    colors, alphas, _ = rasterization(**gaussians, **cameras, render_mode=mode, backgrounds=backgrounds)
+    assert colors.shape == (2, HEIGHT, WIDTH, channels) and alphas.shape == (2, HEIGHT, WIDTH, 1)
+    assert colors.dtype == alphas.dtype == np.float32
+    plain, same_alphas, _ = rasterization(**gaussians, **cameras)
+    np.testing.assert_array_equal(alphas, same_alphas)
+    if "RGB" in mode:
+        np.testing.assert_array_equal(colors[..., :5], plain + (1 - alphas) * np.float32(0.5))
+    if "D" in mode:
+        depth, _, _ = rasterization(**gaussians, **cameras, render_mode="D")
+        expected = depth / alphas.clip(1e-10) if "ED" in mode else depth
+        np.testing.assert_array_equal(colors[..., -1:], expected)
+        inside = alphas[..., 0] > 0.5
+        mean = (depth / alphas.clip(1e-10))[inside]
+        assert mean.min() > 0.01 and mean.max() < 8
+
+
+def test_colours_may_differ_between_views():
+    gaussians, cameras = random_gaussians(60), two_cameras()
+    both = np.stack([gaussians["colors"], 2 * gaussians["colors"]])
+    colors, _, _ = rasterization(**gaussians | {"colors": both}, **cameras)
+    plain, _, _ = rasterization(**gaussians, **cameras)
+    np.testing.assert_array_equal(colors[0], plain[0])
+    np.testing.assert_allclose(colors[1], 2 * plain[1], rtol=1e-6, atol=1e-7)
 
 
 def test_no_gaussians_render_the_background():
