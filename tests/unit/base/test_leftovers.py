@@ -191,3 +191,18 @@ def test_the_old_folder_is_restored_if_the_new_one_cannot_replace_it(tmp_path, m
     with pytest.raises(OSError, match="a fault"), atomic_folder(tmp_path / "out") as folder:
         write_text(folder / "later", "text")
     assert [path.name for path in tmp_path.rglob("*")] == ["out", "former"]
+
+
+@pytest.mark.parametrize("can_exchange", [True, False])
+def test_the_old_folder_remains_until_the_new_one_is_complete(tmp_path, monkeypatch, can_exchange):
+    if not can_exchange:
+        monkeypatch.setattr(removal, "_renameat2", None)
+    out = tmp_path / "out"
+    for text in ("one", "two"):
+        with atomic_folder(out) as folder:
+            (folder / text).touch()
+            assert not (out / text).exists()
+    with pytest.raises(ZeroDivisionError), atomic_folder(out):
+        raise ZeroDivisionError
+    assert [path.name for path in Path(out).iterdir()] == ["two"]
+    assert list(tmp_path.iterdir()) == [out]

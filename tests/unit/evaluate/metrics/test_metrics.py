@@ -176,3 +176,14 @@ def test_whole_image_fools_all_readings_but_the_anchored_one():
     assert hierarchical_consistency(fooled, "containment") == hierarchical_consistency(fooled, "literal") == 1
     # area of the true parents: A 50, B 25, a1 20 of 100 px
     assert hierarchical_consistency(fooled, "anchored") == pytest.approx((0.375 + 0.2) / 2)
+
+
+def test_majority_inside_the_image_includes_the_last_row_and_column():
+    mask = box((4, 8), (4, 8), (8, 8))
+    # turned by 180 degrees this is the same square at the other corner, and so is the smoothed mask
+    turned = rules.majority_smooth(mask[::-1, ::-1], "inside")[::-1, ::-1]
+    np.testing.assert_array_equal(rules.majority_smooth(mask, "inside"), turned)
+    # at (7, 7) the window holds rows and columns 4 .. 7: all ones. LangSplat's window drops row and column 7.
+    assert rules.majority_smooth(mask, "inside")[7, 7]
+    corner = box((7, 8), (0, 8), (8, 8))
+    assert not rules.majority_smooth(corner).any()
