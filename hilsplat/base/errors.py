@@ -32,7 +32,16 @@ class HilsplatError(Exception):
 
 
 def system_error(error: BaseException) -> HilsplatError | None:
-    """Convert a system error that a user can fix into a `HilsplatError`; return None for any other error."""
+    """Convert a system error that a user can fix into a `HilsplatError`; return None for any other error.
+
+    An error about a file's content keeps its message, but not its fix, if the `MACHINE` could not read it.
+    """
+    if isinstance(error, HilsplatError):
+        number = getattr(error.__cause__, "errno", None)
+        if isinstance(error.__cause__, OSError) and number in MACHINE:
+            fix = f"the content may be intact, but it {MACHINE[number]}; correct this, then run again"
+            return HilsplatError(str(error).partition("\n")[0], fix=fix)
+        return error
     is_limited = resource is not None and resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
     by_library = is_limited and any(words in str(error) for words in NO_MEMORY)
     if isinstance(error, MemoryError) or by_library:
@@ -40,10 +49,11 @@ def system_error(error: BaseException) -> HilsplatError | None:
             f"there is not enough memory: {error or 'an allocation failed'}",
             fix="close other programs, raise the limit (ulimit -v), or use smaller or fewer images",
         )
-    if not isinstance(error, OSError) or error.errno not in PLACES:
+    if not isinstance(error, OSError) or error.errno is None:
         return None
+    problem = (MACHINE | PLACES).get(error.errno, "cannot be read or written")
     return HilsplatError(
-        f"{error.filename or 'standard output or an open file'} {PLACES[error.errno]}",
+        f"{error.filename or 'standard output or an open file'} {problem}",
         found=error.strerror,
         fix="correct the problem, or choose a different path",
     )
@@ -108,21 +118,28 @@ def require_working_directory() -> None:
 NO_MEMORY = ("can't start new thread", "failed to map segment", "Could not find/load shared object")
 """Parts of error messages that appear if `ulimit -v` keeps a library from loading or starting a thread."""
 
-PLACES = {
+MACHINE = {
     errno.EACCES: "cannot be read or written: permission denied",
     errno.EPERM: "cannot be read or written: permission denied",
     errno.EROFS: "is on a read-only disk",
+    errno.EMFILE: "cannot be opened: too many files are open (ulimit -n)",
+    errno.ENFILE: "cannot be opened: too many files are open on this machine",
+    errno.EFBIG: "would exceed the size limit of this shell (ulimit -f) or of the file system",
+    errno.EIO: "cannot be read or written: the disk reported an error",
+    errno.ESTALE: "cannot be read or written: the network disk has lost it",
+    errno.ENOLCK: "cannot be locked: the network disk has no lock service",
+    errno.ENOSPC: "cannot be written: the disk is full",
+    errno.EDQUOT: "exceeds your disk quota",
+}
+"""System error number -> problem with the machine, whatever the path and content."""
+
+PLACES = {
     errno.ENOENT: "is missing or cannot be created",
     errno.ENOTDIR: "cannot be opened or created: part of the path is a file",
     errno.EISDIR: "is a folder; a file is expected",
     errno.EEXIST: "already exists",
     errno.ELOOP: "is a symbolic link that points back to itself",
-    errno.EMFILE: "cannot be opened: too many files are open (ulimit -n)",
     errno.ENAMETOOLONG: "is too long for this file system",
-    errno.EFBIG: "would exceed the size limit of this shell (ulimit -f) or of the file system",
-    errno.EIO: "cannot be read or written: the disk reported an error",
-    errno.ENOSPC: "cannot be written: the disk is full",
-    errno.EDQUOT: "exceeds your disk quota",
 }
 """System error number -> problem with the path."""
 
