@@ -34,13 +34,13 @@ class HilsplatError(Exception):
 def system_error(error: BaseException) -> HilsplatError | None:
     """Convert a system error that a user can fix into a `HilsplatError`; return None for any other error.
 
-    An error about a file's content keeps its message, but not its fix, if the `MACHINE` could not read it.
+    An error about content (`OF_CONTENT`) gets another fix if the machine, not the content, is the reason.
     """
     if isinstance(error, HilsplatError):
         number = getattr(error.__cause__, "errno", None)
-        if isinstance(error.__cause__, OSError) and number in MACHINE:
-            fix = f"the content may be intact, but it {MACHINE[number]}; correct this, then run again"
-            return HilsplatError(str(error).partition("\n")[0], fix=fix)
+        if isinstance(error, OF_CONTENT) and isinstance(error.__cause__, OSError) and number in MACHINE:
+            fix = f"the file may be intact, but it {MACHINE[number]}: correct this, then run again"
+            return type(error)(str(error).partition("\n")[0], fix=fix)
         return error
     is_limited = resource is not None and resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
     by_library = is_limited and any(words in str(error) for words in NO_MEMORY)
@@ -174,6 +174,9 @@ class ArtifactError(HilsplatError):
 
 class MisalignedArtifactError(ArtifactError):
     """Two artifacts do not belong together: their rows, sizes or digests differ."""
+
+
+OF_CONTENT = (ArtifactError, ImageError, ModelError, SceneError)
 
 
 class DiskSpaceError(HilsplatError):

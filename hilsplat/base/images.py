@@ -135,8 +135,8 @@ def read_image(
     """
     try:
         with open_image(file, max_side_px) as image:
-            if (num_frames := _frames(image)) > 1:
-                raise ValueError(f"it contains {num_frames} frames of the same size, like an animation")
+            if _is_animation(image):
+                raise ValueError("it contains several frames of the same size, like an animation")
             turn = orientation(image) if image.format == "TIFF" else 0  # read first: Pillow turns it upright
             image.load()  # raises only the first time, so nothing may have loaded it before
             turn = turn or orientation(image)
@@ -227,16 +227,17 @@ def require_usable_size(image: object, size_hw: tuple[int, ...], max_side_px: in
         )
 
 
-def _frames(image: Image.Image) -> int:
-    """Return the number of animation frames, without previews and the additional pictures of phones."""
-    num_frames = int(getattr(image, "n_frames", 1))
-    if num_frames < 2 or image.format in ("MPO", "HEIF"):
-        return 1
+def _is_animation(image: Image.Image) -> bool:
+    """Return whether a file has a second frame that is no preview and no additional picture of a phone."""
     size = image.size
-    image.seek(1)
-    same = image.size == size
-    image.seek(0)
-    return num_frames if same else 1
+    if image.format in ("MPO", "HEIF"):
+        return False
+    with suppress(EOFError):  # Pillow counts the frames of a TIFF in quadratic time
+        image.seek(1)
+        same = image.size == size
+        image.seek(0)
+        return same
+    return False
 
 
 def _to_srgb(image: Image.Image, info: Mapping[Any, Any], file: object) -> Image.Image:

@@ -129,14 +129,13 @@ def _locked(path: Path, *, shared: bool = False, wait: bool = True) -> TextIOWra
 
 
 def start_project(folder: Path) -> list[Path]:
-    """Copy the default configuration and scene sheet into a folder, unless either already exists."""
-    written = [Path(folder) / path for path in (CONFIG, DEFAULT_SHEET)]
-    for path in written:
-        if os.path.lexists(path):
-            raise HilsplatError(f"{path} already exists", fix="edit it, or choose another folder")
-    for path, installed in zip(written, (CONFIG, DEFAULT_SHEET), strict=True):
-        write_text(path, (INSTALLED / installed).read_text(encoding="utf-8"))
-    return written
+    """Copy the default configuration and scene sheet into a folder, without replacing an existing one."""
+    missing = [path for path in (CONFIG, DEFAULT_SHEET) if not os.path.lexists(folder / path)]
+    if not missing:
+        raise HilsplatError(f"{folder / CONFIG} already exists", fix="edit it, or choose another folder")
+    for path in missing:
+        write_text(folder / path, (INSTALLED / path).read_text(encoding="utf-8"))
+    return [folder / path for path in missing]
 
 
 def run(
