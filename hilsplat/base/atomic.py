@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from hilsplat.base.errors import ArtifactError, DiskSpaceError, HilsplatError
+from hilsplat.base.errors import MACHINE, ArtifactError, DiskSpaceError, HilsplatError
 from hilsplat.base.processes import lock, unfinished_folder
 from hilsplat.base.removal import UNFINISHED, delete, is_unfinished, replace_folder
 
@@ -19,6 +19,9 @@ FULL_DISK = ("No space left on device", "disk is full", "Disk quota exceeded")
 
 LIBRARY_ERRORS = (RuntimeError, ChildProcessError)
 """Exceptions raised by C++ libraries, or because a library terminated its process."""
+
+NO_FLUSH = (errno.EINVAL, errno.EBADF, errno.ENOSYS, errno.EOPNOTSUPP)
+"""Errors of file systems that cannot flush folders, such as 9p and some of FUSE."""
 
 FULL_BELOW_MIB = 1.0
 """Free space below which `LIBRARY_ERRORS` are attributed to a full disk, which COLMAP does not report."""
@@ -34,7 +37,7 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
     if is_unfinished(path):  # the file is in a hidden folder that is flushed to the disk later
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            with explain_full_disk(path), _keep_mode(path):
+            with explain_full_disk(path), _keep_mode(path, path):
                 yield path
         except BaseException:
             delete(path)
@@ -42,7 +45,7 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
         return
     with work_folder(path) as folder:
         temporary = folder / f"new{path.suffix[-16:]}"
-        with _keep_mode(temporary):
+        with _keep_mode(temporary, path):
             yield temporary
         if durable:
             _flush(temporary)
@@ -52,12 +55,13 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
 
 
 @contextmanager
-def _keep_mode(path: Path) -> Iterator[None]:
-    """Create a file with the umask's mode, and restore this mode at the end; safetensors would set 0600."""
-    path.touch()
-    mode = path.stat().st_mode & 0o777
+def _keep_mode(temporary: Path, path: Path) -> Iterator[None]:
+    """Create a file; at the end it has the mode of `path` or, if that is new, the umask's (safetensors: 0600)."""
+    temporary.touch()
+    mode = (path if path.exists() else temporary).stat().st_mode & 0o777
     yield
-    path.chmod(mode)
+    if temporary.stat().st_mode & 0o777 != mode:  # file systems without modes refuse any change
+        temporary.chmod(mode)
 
 
 @contextmanager
@@ -94,7 +98,7 @@ def _flush(path: Path) -> None:
     try:
         os.fsync(descriptor)
     except OSError as error:
-        if error.errno != errno.EINVAL:  # file systems such as 9p cannot flush folders
+        if error.errno not in NO_FLUSH:
             raise
     finally:
         os.close(descriptor)
@@ -123,6 +127,8 @@ def explain_full_disk(path: Path) -> Iterator[None]:
             ) from error
         if isinstance(error, OSError) and is_unfinished(Path(str(error.filename))):
             error.filename = str(path)  # a temporary name means nothing to a user
+        elif isinstance(error, OSError) and error.filename is None and error.errno in MACHINE:
+            error.filename = f"{path}, or a file that it is made from,"
         raise
 
 

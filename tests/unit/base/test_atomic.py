@@ -57,6 +57,20 @@ def test_outputs_have_the_permissions_of_other_new_files(tmp_path: Path) -> None
     file, folder = ((tmp_path / name).stat().st_mode for name in ("file", "folder"))
     files = dict.fromkeys(("a.txt", "b.txt", "c.safetensors", "d.safetensors"), file)
     assert found == files | {"new": folder, "inner": folder}
+    for mode in (0o600, 0o664):  # of a file that a user shares or hides
+        (tmp_path / "out/a.txt").chmod(mode)
+        write_text(tmp_path / "out/a.txt", "other text")
+        assert (tmp_path / "out/a.txt").stat().st_mode & 0o777 == mode
+
+
+def test_file_systems_without_modes_can_be_written(tmp_path: Path, monkeypatch) -> None:
+    def refuse(*arguments, **options) -> None:
+        raise PermissionError(errno.EPERM, "chmod")
+
+    monkeypatch.setattr(os, "chmod", refuse)
+    write_text(tmp_path / "a.txt", "text")
+    write_text(tmp_path / "a.txt", "other text")
+    assert (tmp_path / "a.txt").read_text() == "other text"
 
 
 def test_a_file_is_flushed_before_it_replaces_the_former_one_and_its_folder_after_that(
@@ -81,7 +95,9 @@ def test_the_files_of_a_folder_are_flushed_once_before_it_replaces_the_former_on
     assert flushed[4:] == [str(new), str(tmp_path)]
 
 
-@pytest.mark.parametrize(("code", "is_raised"), [(errno.EINVAL, False), (errno.EIO, True)])
+@pytest.mark.parametrize(
+    ("code", "is_raised"), [(errno.EINVAL, False), (errno.EOPNOTSUPP, False), (errno.EIO, True)]
+)
 def test_only_file_systems_that_cannot_flush_are_excused(tmp_path, monkeypatch, code, is_raised) -> None:
     def fail(_: int) -> None:
         raise OSError(code, "flush")
@@ -151,6 +167,9 @@ def test_errors_inside_a_new_folder_name_the_final_path(tmp_path: Path, free_mib
     ):
         raise OSError(errno.EIO, "broken", str(temporary))
     assert raised.value.filename == str(tmp_path / "a.txt")
+    with pytest.raises(OSError, match="broken") as raised, atomic_path(tmp_path / "a.txt"):
+        raise OSError(errno.EIO, "broken")
+    assert raised.value.filename == f"{tmp_path / 'a.txt'}, or a file that it is made from,"
 
 
 def test_too_little_space_is_refused_before_work_begins(tmp_path: Path, free_mib) -> None:
