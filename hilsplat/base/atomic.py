@@ -3,6 +3,7 @@
 import errno
 import logging
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,8 +15,11 @@ from hilsplat.base.removal import UNFINISHED, delete, is_unfinished, replace_fol
 
 logger = logging.getLogger(__name__)
 
-FULL_DISK = ("No space left on device", "disk is full", "Disk quota exceeded")
-"""Parts of disk-full messages from libraries that raise their own error types: safetensors, SQLite."""
+FULL_DISK = ("No space left on device", "disk is full", "Disk quota exceeded", "requested and")
+"""Parts of disk-full messages from libraries: safetensors, SQLite, NumPy ("8 requested and 0 written")."""
+
+SYSTEM_ERROR = re.compile(r"\(os error (\d+)\)")
+"""Number of a system error in a message from Rust, such as of safetensors."""
 
 LIBRARY_ERRORS = (RuntimeError, ChildProcessError)
 """Exceptions raised by C++ libraries, or because a library terminated its process."""
@@ -56,7 +60,7 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
 
 @contextmanager
 def _keep_mode(temporary: Path, path: Path) -> Iterator[None]:
-    """Create a file; at the end it has the mode of `path` or, if that is new, the umask's (safetensors: 0600)."""
+    """Create a file with the mode of `path` or, if that is new, the umask's; safetensors would set 0600."""
     temporary.touch()
     mode = (path if path.exists() else temporary).stat().st_mode & 0o777
     yield
@@ -115,8 +119,9 @@ def explain_full_disk(path: Path) -> Iterator[None]:
         hidden = [parent for parent in path.parents if UNFINISHED.fullmatch(parent.name)]
         folder = existing_folder(hidden[-1].parent if hidden else path.parent)
         usage = shutil.disk_usage(folder)
-        full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
-        full = full or any(words in str(error) for words in FULL_DISK)
+        of_rust = SYSTEM_ERROR.search(str(error))
+        number = int(of_rust[1]) if of_rust else getattr(error, "errno", None)
+        full = number in (errno.ENOSPC, errno.EDQUOT) or any(words in str(error) for words in FULL_DISK)
         full = full or (isinstance(error, LIBRARY_ERRORS) and usage.free < FULL_BELOW_MIB * 2**20)
         if full:
             raise DiskSpaceError(
@@ -129,6 +134,8 @@ def explain_full_disk(path: Path) -> Iterator[None]:
             error.filename = str(path)  # a temporary name means nothing to a user
         elif isinstance(error, OSError) and error.filename is None and error.errno in MACHINE:
             error.filename = f"{path}, or a file that it is made from,"
+        elif number is not None and not isinstance(error, OSError):
+            raise OSError(number, os.strerror(number), str(path)) from error
         raise
 
 

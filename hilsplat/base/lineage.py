@@ -90,7 +90,7 @@ def digests_of(paths: Collection[str], memo: Path) -> dict[str, str]:
     if changed:  # a run of thousands of scenes would otherwise start as many pools
         with ThreadPoolExecutor() as threads:
             list(threads.map(read, changed))
-        with suppress(OSError):  # a read-only folder of results
+        with suppress(OSError, HilsplatError):  # a read-only folder of results, or a full disk
             write_json(memo, old | entries)
     return {path: entries.get(path, "unreadable").split()[-1] for path in paths}
 

@@ -10,6 +10,7 @@ import logging
 import os
 import re
 import secrets
+import shlex
 import signal
 import socket
 import subprocess
@@ -219,9 +220,8 @@ def _config_file(name: Path) -> Path:
     if name.suffix or len(name.parts) != 1 or name.exists():
         return project_path(name)
     if "=" in str(name):
-        raise SettingsError(
-            f"{name} is not a file", fix=f"pass keys after --: hilsplat run -- --config {name}"
-        )
+        command = f"hilsplat run -- --config {shlex.quote(str(name))}"
+        raise SettingsError(f"{name} is not a file", fix=f"pass keys after --: {command}")
     if not (found := project_path(named)).exists():
         known = {
             path.stem for folder in (Path(), INSTALLED) for path in (folder / named).parent.glob("*.yaml")

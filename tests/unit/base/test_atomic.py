@@ -125,6 +125,7 @@ def free_mib(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
         (OSError(errno.EDQUOT, "full"), 5, True),
         (OSError(errno.EACCES, "locked"), 0.5, False),
         (Exception("SQLite: database or disk is full"), 5, True),
+        (OSError("4326 requested and 0 written"), 5, True),  # NumPy
         (RuntimeError("a library failed"), 0.5, True),
         (ChildProcessError("a library ended its process"), 0.5, True),
         (RuntimeError("a library failed"), 1, False),
@@ -167,6 +168,10 @@ def test_errors_inside_a_new_folder_name_the_final_path(tmp_path: Path, free_mib
     ):
         raise OSError(errno.EIO, "broken", str(temporary))
     assert raised.value.filename == str(tmp_path / "a.txt")
+    free_mib(5)
+    with pytest.raises(OSError, match="Too many open files") as raised, atomic_path(tmp_path / "a.txt"):
+        raise RuntimeError("Too many open files (os error 24)")  # safetensors
+    assert (raised.value.errno, raised.value.filename) == (errno.EMFILE, str(tmp_path / "a.txt"))
     with pytest.raises(OSError, match="broken") as raised, atomic_path(tmp_path / "a.txt"):
         raise OSError(errno.EIO, "broken")
     assert raised.value.filename == f"{tmp_path / 'a.txt'}, or a file that it is made from,"
