@@ -43,11 +43,12 @@ def system_error(error: BaseException) -> HilsplatError | None:
             return type(error)(str(error).partition("\n")[0], fix=fix)
         return error
     is_limited = resource is not None and resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
-    by_library = is_limited and any(words in str(error) for words in NO_MEMORY)
+    by_library = NO_THREAD in str(error) or (is_limited and any(words in str(error) for words in NO_MEMORY))
     if isinstance(error, MemoryError) or by_library:
         return HilsplatError(
-            f"there is not enough memory: {error or 'an allocation failed'}",
-            fix="close other programs, raise the limit (ulimit -v), or use smaller or fewer images",
+            f"there is not enough memory, or too few threads: {error or 'an allocation failed'}",
+            fix="close other programs, raise the limits (ulimit -v and -u, or those of a container), or use "
+            "smaller or fewer images",
         )
     if not isinstance(error, OSError) or error.errno is None:
         return None
@@ -115,13 +116,15 @@ def require_working_directory() -> None:
         ) from None
 
 
-NO_MEMORY = ("can't start new thread", "failed to map segment", "Could not find/load shared object")
-"""Parts of error messages that appear if `ulimit -v` keeps a library from loading or starting a thread."""
+NO_THREAD = "can't start new thread"
+NO_MEMORY = ("failed to map segment", "Could not find/load shared object")
+"""Parts of error messages that appear if `ulimit -v` keeps a library from loading."""
 
 MACHINE = {
     errno.EACCES: "cannot be read or written: permission denied",
     errno.EPERM: "cannot be read or written: permission denied",
     errno.EROFS: "is on a read-only disk",
+    errno.EAGAIN: "needs more processes than allowed (ulimit -u, or the limit of a container)",
     errno.EMFILE: "cannot be opened: too many files are open (ulimit -n)",
     errno.ENFILE: "cannot be opened: too many files are open on this machine",
     errno.EFBIG: "would exceed the size limit of this shell (ulimit -f) or of the file system",
