@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -26,13 +25,6 @@ INDEX = "index.json"  # written last in a folder artifact, so its presence means
 
 SEALED = (".json", ".npy", ".npz", ".png", ".safetensors")
 """Suffixes of the files whose checksums are in an artifact's index."""
-
-DAMAGE = (
-    *(EOFError, MemoryError, NotImplementedError, OSError, SyntaxError, TokenError, ValueError),
-    *(OverflowError, zipfile.BadZipFile, zlib.error),
-    TypeError,  # an .npy file instead of .npz
-)
-"""Errors that numpy and zipfile raise on damaged files."""
 
 OTHER_VERSION = " was written by a different version of hilsplat"
 
@@ -134,7 +126,9 @@ def _readable(path: Path, problem: str = "cannot be read") -> Iterator[None]:
         yield
     except FileNotFoundError as error:
         raise damaged(path, " is missing") from error
-    except DAMAGE as error:
+    except HilsplatError:
+        raise
+    except Exception as error:  # numpy and zipfile raise nearly everything on damaged files
         raise damaged(path, f" {problem}: {error}") from error
 
 

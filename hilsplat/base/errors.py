@@ -211,5 +211,7 @@ def foreign(
     except HilsplatError:
         raise
     except Exception as cause:
+        if isinstance(cause, FileNotFoundError) and str(what).endswith(str(cause.filename)):
+            raise error(f"{what} is missing", fix=fix) from cause
         reason = f"{first_line(cause)} is missing" if isinstance(cause, KeyError) else first_line(cause)
         raise error(f"{what} cannot be read: {reason}", expected=expected, fix=fix) from cause
