@@ -2,7 +2,7 @@
 
 import difflib
 import errno
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -78,6 +78,9 @@ def visible(text: object) -> str:
 
 def first_line(error: object) -> str:
     """Return the first line of an error from elsewhere, without unprintable characters, or its type."""
+    if isinstance(error, ValueError) and hasattr(error, "errors"):  # of pydantic
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
     lines = str(error)[:1000].strip().splitlines() or [type(error).__name__]
     return "".join(letter for letter in lines[0] if letter.isprintable())[:200]
 
@@ -199,8 +202,9 @@ def foreign(
     what: object,
     error: type[HilsplatError] = SceneError,
     *,
+    problem: str = "cannot be read",
     expected: object = None,
-    fix: str = "export it again",
+    fix: str | Callable[[], str] = "export it again",
 ) -> Iterator[None]:
     """Turn every exception of a block that parses another program's data into `error`, which names `what`.
 
@@ -211,7 +215,8 @@ def foreign(
     except HilsplatError:
         raise
     except Exception as cause:
-        if isinstance(cause, FileNotFoundError) and str(what).endswith(str(cause.filename)):
-            raise error(f"{what} is missing", fix=fix) from cause
         reason = f"{first_line(cause)} is missing" if isinstance(cause, KeyError) else first_line(cause)
-        raise error(f"{what} cannot be read: {reason}", expected=expected, fix=fix) from cause
+        problem = f"{what} {problem}: {reason}"
+        if isinstance(cause, FileNotFoundError) and str(what).endswith(str(cause.filename)):
+            problem, expected = f"{what} is missing", None
+        raise error(problem, expected=expected, fix=fix if isinstance(fix, str) else fix()) from cause

@@ -24,7 +24,7 @@ from hilsplat.base.artifacts import (
     seal_of,
     write_json,
 )
-from hilsplat.base.errors import ArtifactError, HilsplatError, MisalignedArtifactError
+from hilsplat.base.errors import ArtifactError, HilsplatError, MisalignedArtifactError, foreign
 from hilsplat.base.files import files_below, regular
 
 CONVERTED = ".made_from.json"
@@ -266,23 +266,15 @@ def _checker() -> Any:
 
 def read_provenance(artifact: Path) -> Provenance | None:
     """Return the provenance of an artifact, or None; raise ArtifactError if the record is damaged."""
-    from pydantic import ValidationError
-
     path = provenance_path(artifact)
     if not path.is_file():
         return None
-    try:
-        values = read_json(path)
+    values, fix = read_json(path), functools.partial(rebuild_command, artifact)
+    with foreign(path, ArtifactError, problem="is damaged", fix=fix):
         record: Provenance = _checker().validate_python(values)
         if record.seal is not None and values.pop("seal") != seal_of(values):
-            raise ArtifactError(f"{path} was changed after it was written", fix=rebuild_command(artifact))
+            raise ArtifactError(f"{path} was changed after it was written", fix=fix())
         return record
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise ArtifactError(
-            f"{path} is damaged: {'.'.join(map(str, first['loc']))}: {first['msg']}",
-            fix=rebuild_command(artifact),
-        ) from error
 
 
 def require_as_written(path: Path, sha256: str | None) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -126,18 +127,14 @@ class NodeNaming:
         if made_for != (tree_digest(semantic_tree), sha256_of_file(clip_folder / INDEX)):
             return None
         rows = read_json(sealed(folder, "names.json"))
-        try:
+        fix, expected = partial(rebuild_command, folder), f"{index['nodes']} names, and vectors (W, C)"
+        what = f"{folder / 'names.json'} or rivals.npy"
+        with foreign(what, ArtifactError, problem="is damaged", expected=expected, fix=fix):
             names = tuple(checked_name(str(row["name"])) for row in rows)
             surfaces = tuple(bool(row["surface"]) for row in rows)
             rivals = read_npy(sealed(folder, "rivals.npy")).astype(np.float32)
             if len(rows) != index["nodes"] or rivals.ndim != 2:
                 raise ValueError(f"{len(rows)} names, rivals of shape {rivals.shape}")
-        except (TypeError, KeyError, ValueError) as error:
-            raise ArtifactError(
-                f"{folder / 'names.json'} or rivals.npy is damaged: {error!r}",
-                expected=f"{index['nodes']} names, and vectors (W, C)",
-                fix=rebuild_command(folder),
-            ) from error
         return NodeNaming(names, surfaces, rivals)
 
 

@@ -19,7 +19,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from hilsplat.base.errors import HilsplatError, SettingsError, system_error
+from hilsplat.base.errors import HilsplatError, SettingsError, first_line, system_error
 from hilsplat.scene.scene import Scene
 from hilsplat.web.file_changes import StaleFileError, StaleSceneError
 from hilsplat.web.guard import Guard
@@ -68,10 +68,7 @@ def guarded(routes: list[Route], token: str, max_body: int, *, embedded: bool = 
 
 async def _refused(request: Request, error: Exception) -> Response:
     """Send the error's text to the page."""
-    text = str(system_error(error) or error)
-    if isinstance(error, ValidationError):
-        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        text = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+    text = first_line(error) if isinstance(error, ValidationError) else str(system_error(error) or error)
     status = next(STATUS[kind] for kind in type(error).__mro__ if kind in STATUS)
     return plain(as_json({"error": text}), "application/json", status)
 
