@@ -55,7 +55,7 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
             _flush(temporary)
         temporary.replace(path)
         if durable:
-            _flush(path.parent)
+            _flush_replaced(path)
 
 
 @contextmanager
@@ -84,7 +84,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
                 _flush(Path(parent))
         replace_folder(temporary, path, folder)
         if durable:
-            _flush(path.parent)
+            _flush_replaced(path)
 
 
 @contextmanager
@@ -106,6 +106,14 @@ def _flush(path: Path) -> None:
             raise
     finally:
         os.close(descriptor)
+
+
+def _flush_replaced(path: Path) -> None:
+    """Flush the folder of a replaced path; an error is only logged, because the new version is in place."""
+    try:
+        _flush(path.parent)
+    except OSError as error:
+        logger.warning("%s was written, but a power failure may undo this: %s", path, error.strerror)
 
 
 @contextmanager

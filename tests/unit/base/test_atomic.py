@@ -108,6 +108,21 @@ def test_only_file_systems_that_cannot_flush_are_excused(tmp_path, monkeypatch, 
     assert (tmp_path / "a.txt").exists() != is_raised
 
 
+@pytest.mark.parametrize("writer", [atomic_path, atomic_folder])
+def test_a_replaced_file_is_no_error_if_only_its_folder_cannot_be_flushed(
+    tmp_path, monkeypatch, caplog, writer
+) -> None:
+    def fail(descriptor: int) -> None:
+        if os.path.samestat(os.fstat(descriptor), tmp_path.stat()):
+            raise OSError(errno.EIO, "flush")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with writer(tmp_path / "a.txt"):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+    assert "a.txt was written, but a power failure may undo this: flush" in caplog.text
+
+
 @pytest.fixture
 def free_mib(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     """A function that sets the free space on a disk of 8 MiB."""
