@@ -108,9 +108,13 @@ def visible_files(folder: Path) -> list[Path]:
 
 
 def _is_apart(folder: Path) -> bool:
-    """Return whether a folder is results, an artifact, a converted source, or a link to a parent folder."""
-    marks = (folder / RUN, folder / CONVERTED, provenance_path(folder))
-    return any(map(Path.is_file, marks)) or folder.parent.resolve().is_relative_to(folder.resolve())
+    """Return whether a folder is results, an artifact, a converted source, or a link to a parent folder.
+
+    Links among folders also count: in all/a/all, the last one leads to the first.
+    """
+    marks, real = (folder / RUN, folder / CONVERTED, provenance_path(folder)), folder.resolve()
+    is_loop = folder.is_symlink() and any(each.resolve().is_relative_to(real) for each in folder.parents)
+    return any(map(Path.is_file, marks)) or is_loop
 
 
 def files_of(path: Path | Sequence[Path]) -> list[Path]:
