@@ -53,11 +53,8 @@ def system_error(error: BaseException) -> HilsplatError | None:
     if not isinstance(error, OSError) or error.errno is None:
         return None
     problem = (MACHINE | PLACES).get(error.errno, "cannot be read or written")
-    if (
-        error.errno == errno.EEXIST
-        and (path := Path(error.filename or "")).is_symlink()
-        and not path.exists()
-    ):
+    path = Path(error.filename or "")
+    if error.errno == errno.EEXIST and path.is_symlink() and not path.exists():
         problem = f"is a link to {path.readlink()}, which is missing; its disk may not be mounted"
     return HilsplatError(
         f"{error.filename or 'standard output or an open file'} {problem}",
