@@ -196,9 +196,14 @@ def in_processes(
     from concurrent.futures.process import BrokenProcessPool
     from multiprocessing import get_context
 
+    context, how = get_context("spawn"), (end_with_parent, (os.getpid(),))
     try:
-        context, how = get_context("spawn"), (end_with_parent, (os.getpid(),))
-        with ProcessPoolExecutor(min(workers, len(items)), context, *how) as pool:
+        pool = ProcessPoolExecutor(min(workers, len(items)), context, *how)
+    except OSError as error:
+        fix = "mount a writable /dev/shm, or use one core: hilsplat run --cores 1"
+        raise HilsplatError(f"no second process can be started: {error.strerror}", fix=fix) from error
+    try:
+        with pool:
             yield from pool.map(work, *zip(*items, strict=True), chunksize=chunk)
     except BrokenProcessPool as error:
         raise HilsplatError(f"a process of {work} was killed, {KILLED}", fix=KILLED_FIX) from error
