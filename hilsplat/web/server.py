@@ -31,7 +31,7 @@ STATUS: dict[type, int] = {
     StaleSceneError: 409,
     HilsplatError: 422,
     ValidationError: 400,
-    ClientDisconnect: 400,  # received by nobody
+    ClientDisconnect: 400,  # cannot be received
     OSError: 500,
     MemoryError: 500,
 }
