@@ -46,7 +46,7 @@ def system_error(error: BaseException) -> HilsplatError | None:
     by_library = NO_THREAD in str(error) or (is_limited and any(words in str(error) for words in NO_MEMORY))
     if isinstance(error, MemoryError) or by_library:
         return HilsplatError(
-            f"there is not enough memory, or too few threads: {error or 'an allocation failed'}",
+            f"there is not enough memory, or too few threads are allowed: {error or 'an allocation failed'}",
             fix="close other programs, raise the limits (ulimit -v and -u, or those of a container), or use "
             "smaller or fewer images",
         )

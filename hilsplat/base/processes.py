@@ -158,7 +158,7 @@ def _is_removed(path: Path) -> bool:
     ours, unless it is empty.
     """
     match = UNFINISHED.fullmatch(path.name)
-    if match is None or match["host"] != host_token():
+    if match is None or match["host"] != host_token() or path.is_symlink():
         return False
     with suppress(OSError):
         is_new = not any(path.iterdir())  # its writer may be about to create the lock

@@ -149,8 +149,14 @@ def test_only_folders_of_unfinished_files_of_this_host_are_removed(tmp_path):
     for path in kept:
         path.mkdir()
     (of_user / "drawing.png").touch()
+    (of_others := tmp_path / "of_others").mkdir()
+    for name in (".lock", "drawing.png"):
+        (of_others / name).touch()
+    kept.append(folder / f".writing-{host_token()}-fedcba98")
+    kept[-1].symlink_to(of_others)
     assert remove_leftovers(tmp_path) == [leftover]
     assert sorted(folder.iterdir()) == sorted(kept)
+    assert (of_others / "drawing.png").exists()
     assert remove_leftovers(tmp_path / "nowhere") == []
 
 
