@@ -28,7 +28,7 @@ from hilsplat.annotate.labels import (
     write_labels,
 )
 from hilsplat.annotate.proposals import Clicks, Proposals
-from hilsplat.base.artifacts import read_json, rebuild_command
+from hilsplat.base.artifacts import read_json, rebuild_command, run_command
 from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError, first_line
 from hilsplat.base.tables import read_csv
 from hilsplat.datasets.images.isat import fill_polygons
@@ -125,7 +125,7 @@ class OpenedScene(ShownScene):
             raise ArtifactError(
                 f"{folder} has no photographs to annotate yet: {scene} is missing",
                 expected="a run's results/<dataset>/<scene>, or a copy of it",
-                fix=f"hilsplat run {scene}",
+                fix=run_command(scene),
             )
         proposing = (folder / variant / "masks", folder / variant / "semantic_tree")
         parts = (scene, folder / "gaussians.ply", *proposing)

@@ -10,6 +10,7 @@ import json
 import logging
 import math
 import re
+import shlex
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -99,7 +100,7 @@ def export_labels(scene: Scene, folder: Path, data_root: Path, out: Path) -> int
         raise SceneError(
             f"{scene.name} has no labels",
             expected=f"drawn or accepted regions in files in {annotated}",
-            fix=f"hilsplat annotate {folder}",
+            fix=f"hilsplat annotate {shlex.quote(str(folder))}",
         )
     with atomic_folder(out) as temporary:
         for view, labels in known.items():

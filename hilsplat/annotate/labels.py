@@ -13,10 +13,10 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Bool
-from pydantic import AfterValidator, Field, ValidationError
+from pydantic import AfterValidator, Field
 
 from hilsplat.base.artifacts import write_text
-from hilsplat.base.errors import SceneError, SettingsError
+from hilsplat.base.errors import SettingsError, foreign
 from hilsplat.base.levels import Level
 from hilsplat.base.removal import delete
 from hilsplat.datasets.images.hi import by_id, parents_of
@@ -65,14 +65,9 @@ class Label(Message):
     @staticmethod
     def read(where: str, **values: object) -> "Label":
         """Create a label from values of the file `where`; raise SceneError if one is invalid."""
-        try:
+        fix = "correct it in the file"
+        with foreign(f"{where}: label {values['text']!r}", problem="is invalid", fix=fix):
             return Label.model_validate(values)
-        except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            raise SceneError(
-                f"{where}: label {values['text']!r} is invalid: {first['loc'][0]}: {first['msg']}",
-                fix="correct it in the file",
-            ) from error
 
     def mask(self, size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
         """Return the label's region."""

@@ -19,9 +19,9 @@ from typing import Any, TypeVar, get_type_hints
 import numpy as np
 import safetensors.numpy
 from jaxtyping import AbstractArray, jaxtyped
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 
-from hilsplat.base.artifacts import OTHER_VERSION, damaged, parse_json
+from hilsplat.base.artifacts import OTHER_VERSION, damaged, parse_json, readable
 from hilsplat.base.atomic import atomic_path
 from hilsplat.base.errors import ArtifactError, SettingsError
 
@@ -120,14 +120,12 @@ def write_tensors(path: Path, arrays: Mapping[str, np.ndarray], **about: Any) ->
 
 def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Return the arrays and metadata of a `write_tensors` file; raise ArtifactError for any other file."""
-    try:
+    with readable(path):
         with safe_open(path, framework="np") as file:
             about = parse_json(file.metadata()[TENSORS_KEY])
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         if about.pop("crc32") != _checksum(arrays, about):
             raise ValueError("its content was changed after it was written")
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise damaged(path, f" cannot be read: {error}") from error
     return arrays, about
 
 

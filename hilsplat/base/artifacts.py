@@ -8,16 +8,15 @@ import shlex
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
 
 from hilsplat.base.atomic import atomic_path
-from hilsplat.base.errors import ArtifactError, HilsplatError
+from hilsplat.base.errors import ArtifactError, HilsplatError, foreign
 from hilsplat.base.files import regular
 
 ZIP64_BYTES = 2**30  # arrays above this size get an archive entry that may exceed 2 GiB
@@ -26,13 +25,6 @@ INDEX = "index.json"  # written last in a folder artifact, so its presence means
 
 SEALED = (".json", ".npy", ".npz", ".png", ".safetensors")
 """Suffixes of the files whose checksums are in an artifact's index."""
-
-DAMAGE = (
-    *(EOFError, MemoryError, NotImplementedError, OSError, SyntaxError, TokenError, ValueError),
-    *(OverflowError, zipfile.BadZipFile, zlib.error),
-    TypeError,  # an .npy file instead of .npz
-)
-"""Errors that numpy and zipfile raise on damaged files."""
 
 OTHER_VERSION = " was written by a different version of hilsplat"
 
@@ -98,7 +90,7 @@ def write_json(path: Path, value: Any) -> None:
 
 def read_json(path: Path) -> Any:
     """Read JSON; raise ArtifactError if the file is missing or invalid."""
-    with _readable(path, "is not valid JSON"):
+    with readable(path, "is not valid JSON"):
         return parse_json(regular(Path(path)).read_text(encoding="utf-8"))
 
 
@@ -127,15 +119,9 @@ def read_memo(path: Path, kind: Any) -> Any:
         return {}
 
 
-@contextmanager
-def _readable(path: Path, problem: str = "cannot be read") -> Iterator[None]:
+def readable(path: Path, problem: str = "cannot be read") -> AbstractContextManager[None]:
     """Raise ArtifactError if the file is missing or damaged."""
-    try:
-        yield
-    except FileNotFoundError as error:
-        raise damaged(path, " is missing") from error
-    except DAMAGE as error:
-        raise damaged(path, f" {problem}: {error}") from error
+    return foreign(path, ArtifactError, problem=problem, fix=functools.partial(rebuild_command, path))
 
 
 def write_npz(path: Path, **arrays: np.ndarray) -> None:
@@ -165,7 +151,7 @@ def read_npz(path: Path, *needed: str, max_gib: float = math.inf) -> dict[str, n
 
     An ArtifactError is raised if it is damaged, lacks a needed array or, unpacked, is larger than `max_gib`.
     """
-    with _readable(path):
+    with readable(path):
         with np.load(regular(Path(path)), allow_pickle=False) as archive:
             if (gib := sum(entry.file_size for entry in archive.zip.infolist()) / 2**30) > max_gib:
                 raise ValueError(f"it unpacks to {gib:.1f} GiB, but the limit is {max_gib} GiB")
@@ -186,7 +172,7 @@ def write_npy(path: Path, array: np.ndarray) -> None:
 
 def read_npy(path: Path) -> np.ndarray:
     """Read a numeric array from an .npy file without unpickling; raise ArtifactError for anything else."""
-    with _readable(path):
+    with readable(path):
         with regular(Path(path)).open("rb") as stream:
             array = np.load(stream, allow_pickle=False)
             if stream.read(1):

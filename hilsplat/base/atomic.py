@@ -3,22 +3,29 @@
 import errno
 import logging
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from hilsplat.base.errors import ArtifactError, DiskSpaceError, HilsplatError
+from hilsplat.base.errors import MACHINE, ArtifactError, DiskSpaceError, HilsplatError
 from hilsplat.base.processes import lock, unfinished_folder
 from hilsplat.base.removal import UNFINISHED, delete, is_unfinished, replace_folder
 
 logger = logging.getLogger(__name__)
 
-FULL_DISK = ("No space left on device", "disk is full", "Disk quota exceeded")
-"""Parts of disk-full messages from libraries that raise their own error types: safetensors, SQLite."""
+FULL_DISK = ("No space left on device", "disk is full", "Disk quota exceeded", "requested and")
+"""Parts of disk-full messages from libraries: safetensors, SQLite, NumPy ("8 requested and 0 written")."""
+
+SYSTEM_ERROR = re.compile(r"\(os error (\d+)\)")
+"""Number of a system error in a message from Rust, such as of safetensors."""
 
 LIBRARY_ERRORS = (RuntimeError, ChildProcessError)
 """Exceptions raised by C++ libraries, or because a library terminated its process."""
+
+NO_FLUSH = (errno.EINVAL, errno.EBADF, errno.ENOSYS, errno.EOPNOTSUPP)
+"""Errors of file systems that cannot flush folders, such as 9p and some of FUSE."""
 
 FULL_BELOW_MIB = 1.0
 """Free space below which `LIBRARY_ERRORS` are attributed to a full disk, which COLMAP does not report."""
@@ -34,7 +41,7 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
     if is_unfinished(path):  # the file is in a hidden folder that is flushed to the disk later
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            with explain_full_disk(path), _keep_mode(path):
+            with explain_full_disk(path), _keep_mode(path, path):
                 yield path
         except BaseException:
             delete(path)
@@ -42,22 +49,23 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
         return
     with work_folder(path) as folder:
         temporary = folder / f"new{path.suffix[-16:]}"
-        with _keep_mode(temporary):
+        with _keep_mode(temporary, path):
             yield temporary
         if durable:
             _flush(temporary)
         temporary.replace(path)
         if durable:
-            _flush(path.parent)
+            _flush_replaced(path)
 
 
 @contextmanager
-def _keep_mode(path: Path) -> Iterator[None]:
-    """Create a file with the umask's mode, and restore this mode at the end; safetensors would set 0600."""
-    path.touch()
-    mode = path.stat().st_mode & 0o777
+def _keep_mode(temporary: Path, path: Path) -> Iterator[None]:
+    """Create a file with the mode of `path` or, if that is new, the umask's; safetensors would set 0600."""
+    temporary.touch()
+    mode = (path if path.exists() else temporary).stat().st_mode & 0o777
     yield
-    path.chmod(mode)
+    if temporary.stat().st_mode & 0o777 != mode:  # file systems without modes refuse any change
+        temporary.chmod(mode)
 
 
 @contextmanager
@@ -76,7 +84,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
                 _flush(Path(parent))
         replace_folder(temporary, path, folder)
         if durable:
-            _flush(path.parent)
+            _flush_replaced(path)
 
 
 @contextmanager
@@ -94,10 +102,18 @@ def _flush(path: Path) -> None:
     try:
         os.fsync(descriptor)
     except OSError as error:
-        if error.errno != errno.EINVAL:  # file systems such as 9p cannot flush folders
+        if error.errno not in NO_FLUSH:
             raise
     finally:
         os.close(descriptor)
+
+
+def _flush_replaced(path: Path) -> None:
+    """Flush the folder of a replaced path; an error is only logged, because the new version is in place."""
+    try:
+        _flush(path.parent)
+    except OSError as error:
+        logger.warning("%s was written, but a power failure may undo this: %s", path, error.strerror)
 
 
 @contextmanager
@@ -111,8 +127,9 @@ def explain_full_disk(path: Path) -> Iterator[None]:
         hidden = [parent for parent in path.parents if UNFINISHED.fullmatch(parent.name)]
         folder = existing_folder(hidden[-1].parent if hidden else path.parent)
         usage = shutil.disk_usage(folder)
-        full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
-        full = full or any(words in str(error) for words in FULL_DISK)
+        of_rust = SYSTEM_ERROR.search(str(error))
+        number = int(of_rust[1]) if of_rust else getattr(error, "errno", None)
+        full = number in (errno.ENOSPC, errno.EDQUOT) or any(words in str(error) for words in FULL_DISK)
         full = full or (isinstance(error, LIBRARY_ERRORS) and usage.free < FULL_BELOW_MIB * 2**20)
         if full:
             raise DiskSpaceError(
@@ -123,6 +140,10 @@ def explain_full_disk(path: Path) -> Iterator[None]:
             ) from error
         if isinstance(error, OSError) and is_unfinished(Path(str(error.filename))):
             error.filename = str(path)  # a temporary name means nothing to a user
+        elif isinstance(error, OSError) and error.filename is None and error.errno in MACHINE:
+            error.filename = f"{path}, or a file that it is made from,"
+        elif number is not None and not isinstance(error, OSError):
+            raise OSError(number, os.strerror(number), str(path)) from error
         raise
 
 

@@ -2,7 +2,7 @@
 
 import difflib
 import errno
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -32,18 +32,32 @@ class HilsplatError(Exception):
 
 
 def system_error(error: BaseException) -> HilsplatError | None:
-    """Convert a system error that a user can fix into a `HilsplatError`; return None for any other error."""
+    """Convert a system error that a user can fix into a `HilsplatError`; return None for any other error.
+
+    An error about content (`OF_CONTENT`) gets another fix if the machine, not the content, is the reason.
+    """
+    if isinstance(error, HilsplatError):
+        number = getattr(error.__cause__, "errno", None)
+        if isinstance(error, OF_CONTENT) and isinstance(error.__cause__, OSError) and number in MACHINE:
+            fix = f"the file may be intact, but it {MACHINE[number]}: correct this, then run again"
+            return type(error)(str(error).partition("\n")[0], fix=fix)
+        return error
     is_limited = resource is not None and resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
-    by_library = is_limited and any(words in str(error) for words in NO_MEMORY)
+    by_library = NO_THREAD in str(error) or (is_limited and any(words in str(error) for words in NO_MEMORY))
     if isinstance(error, MemoryError) or by_library:
         return HilsplatError(
-            f"there is not enough memory: {error or 'an allocation failed'}",
-            fix="close other programs, raise the limit (ulimit -v), or use smaller or fewer images",
+            f"there is not enough memory, or too few threads are allowed: {error or 'an allocation failed'}",
+            fix="close other programs, raise the limits (ulimit -v and -u, or those of a container), or use "
+            "smaller or fewer images",
         )
-    if not isinstance(error, OSError) or error.errno not in PLACES:
+    if not isinstance(error, OSError) or error.errno is None:
         return None
+    problem = (MACHINE | PLACES).get(error.errno, "cannot be read or written")
+    path = Path(error.filename or "")
+    if error.errno == errno.EEXIST and path.is_symlink() and not path.exists():
+        problem = f"is a link to {path.readlink()}, which is missing; its disk may not be mounted"
     return HilsplatError(
-        f"{error.filename or 'standard output or an open file'} {PLACES[error.errno]}",
+        f"{error.filename or 'standard output or an open file'} {problem}",
         found=error.strerror,
         fix="correct the problem, or choose a different path",
     )
@@ -67,6 +81,9 @@ def visible(text: object) -> str:
 
 def first_line(error: object) -> str:
     """Return the first line of an error from elsewhere, without unprintable characters, or its type."""
+    if isinstance(error, ValueError) and hasattr(error, "errors"):  # of pydantic
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
     lines = str(error)[:1000].strip().splitlines() or [type(error).__name__]
     return "".join(letter for letter in lines[0] if letter.isprintable())[:200]
 
@@ -105,24 +122,33 @@ def require_working_directory() -> None:
         ) from None
 
 
-NO_MEMORY = ("can't start new thread", "failed to map segment", "Could not find/load shared object")
-"""Parts of error messages that appear if `ulimit -v` keeps a library from loading or starting a thread."""
+NO_THREAD = "can't start new thread"
+NO_MEMORY = ("failed to map segment", "Could not find/load shared object")
+"""Parts of error messages that appear if `ulimit -v` keeps a library from loading."""
 
-PLACES = {
+MACHINE = {
     errno.EACCES: "cannot be read or written: permission denied",
     errno.EPERM: "cannot be read or written: permission denied",
     errno.EROFS: "is on a read-only disk",
+    errno.EAGAIN: "needs more processes than allowed (ulimit -u, or the limit of a container)",
+    errno.EMFILE: "cannot be opened: too many files are open (ulimit -n)",
+    errno.ENFILE: "cannot be opened: too many files are open on this machine",
+    errno.EFBIG: "would exceed the size limit of this shell (ulimit -f) or of the file system",
+    errno.EIO: "cannot be read or written: the disk reported an error",
+    errno.ESTALE: "cannot be read or written: the network disk has lost it",
+    errno.ENOLCK: "cannot be locked: the network disk has no lock service",
+    errno.ENOSPC: "cannot be written: the disk is full",
+    errno.EDQUOT: "exceeds your disk quota",
+}
+"""System error number -> problem with the machine, whatever the path and content."""
+
+PLACES = {
     errno.ENOENT: "is missing or cannot be created",
     errno.ENOTDIR: "cannot be opened or created: part of the path is a file",
     errno.EISDIR: "is a folder; a file is expected",
     errno.EEXIST: "already exists",
     errno.ELOOP: "is a symbolic link that points back to itself",
-    errno.EMFILE: "cannot be opened: too many files are open (ulimit -n)",
     errno.ENAMETOOLONG: "is too long for this file system",
-    errno.EFBIG: "would exceed the size limit of this shell (ulimit -f) or of the file system",
-    errno.EIO: "cannot be read or written: the disk reported an error",
-    errno.ENOSPC: "cannot be written: the disk is full",
-    errno.EDQUOT: "exceeds your disk quota",
 }
 """System error number -> problem with the path."""
 
@@ -159,6 +185,9 @@ class MisalignedArtifactError(ArtifactError):
     """Two artifacts do not belong together: their rows, sizes or digests differ."""
 
 
+OF_CONTENT = (ArtifactError, ImageError, ModelError, SceneError)
+
+
 class DiskSpaceError(HilsplatError):
     """The disk is full, or has too little free space for a stage's output."""
 
@@ -176,8 +205,9 @@ def foreign(
     what: object,
     error: type[HilsplatError] = SceneError,
     *,
+    problem: str = "cannot be read",
     expected: object = None,
-    fix: str = "export it again",
+    fix: str | Callable[[], str] = "export it again",
 ) -> Iterator[None]:
     """Turn every exception of a block that parses another program's data into `error`, which names `what`.
 
@@ -189,4 +219,7 @@ def foreign(
         raise
     except Exception as cause:
         reason = f"{first_line(cause)} is missing" if isinstance(cause, KeyError) else first_line(cause)
-        raise error(f"{what} cannot be read: {reason}", expected=expected, fix=fix) from cause
+        problem = f"{what} {problem}: {reason}"
+        if isinstance(cause, FileNotFoundError) and str(what).endswith(str(cause.filename)):
+            problem, expected = f"{what} is missing", None
+        raise error(problem, expected=expected, fix=fix if isinstance(fix, str) else fix()) from cause

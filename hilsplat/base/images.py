@@ -14,7 +14,7 @@ from jaxtyping import Float, Float64, UInt8
 from PIL import ExifTags, Image, ImageCms, PngImagePlugin
 
 from hilsplat.base.atomic import atomic_path
-from hilsplat.base.errors import ImageError
+from hilsplat.base.errors import ImageError, foreign
 
 logger = logging.getLogger(__name__)
 
@@ -38,9 +38,6 @@ MAX_CLASSES = 20
 
 GREY_NOISE = 16
 """Difference between the channels up to which a mask's pixel counts as grey, as after lossy compression."""
-
-DAMAGE = (EOFError, MemoryError, OSError, SyntaxError, ValueError)
-"""Errors that Pillow raises on damaged files."""
 
 
 def open_image(file: Path | io.BytesIO, max_side_px: int = 2**16) -> Image.Image:
@@ -87,12 +84,9 @@ def _has_boxes(file: Path | io.BytesIO) -> bool:
 @contextmanager
 def opened_image(path: Path, what: str = "image") -> Iterator[Image.Image]:
     """Open an image as `open_image` does; raise ImageError if opening or the block fails on its content."""
-    try:
-        with open_image(path) as image:
-            yield image
-    except DAMAGE as error:
-        fix = "replace it with an intact copy"
-        raise ImageError(f"{what} {path} cannot be read: {error}", fix=fix) from error
+    fix = "replace it with an intact copy"
+    with foreign(f"{what} {path}", ImageError, fix=fix), open_image(path) as image:
+        yield image
 
 
 def image_size_hw(path: Path, *, upright: bool = False) -> tuple[int, int]:
@@ -133,32 +127,23 @@ def read_image(
     Raises:
         ImageError: the file is missing, empty, truncated, too large (`open_image`) or not an image.
     """
-    try:
-        with open_image(file, max_side_px) as image:
-            if (num_frames := _frames(image)) > 1:
-                raise ValueError(f"it contains {num_frames} frames of the same size, like an animation")
-            turn = orientation(image) if image.format == "TIFF" else 0  # read first: Pillow turns it upright
-            image.load()  # raises only the first time, so nothing may have loaded it before
-            turn = turn or orientation(image)
-            if image.format == "TIFF":
-                turn = {6: 8, 8: 6}.get(turn, turn) if as_stored else 1
-            elif as_stored:
-                turn = 1
-            pixels = image if turn == 1 else image.transpose(UPRIGHT[turn])
-            if image.mode.startswith("I"):
-                pixels = Image.fromarray(_eight_bits(np.asarray(pixels)))
-            if image.mode == "F":
-                raise ValueError("its pixels are floating-point numbers of unknown range")
-            return np.asarray(_to_srgb(pixels, image.info, file))
-    except FileNotFoundError as error:
-        raise ImageError(f"image {file} is missing") from error
-    except DAMAGE as error:
-        size = file.stat().st_size if isinstance(file, Path) and file.exists() else 0
-        raise ImageError(
-            f"image {file} cannot be read: {error}",
-            found=f"a file of {size} bytes",
-            fix="remove it from the folder, or replace it with an intact copy",
-        ) from error
+    fix = "remove it from the folder, or replace it with an intact copy"
+    with foreign(f"image {file}", ImageError, fix=fix), open_image(file, max_side_px) as image:
+        if _is_animation(image):
+            raise ValueError("it contains several frames of the same size, like an animation")
+        turn = orientation(image) if image.format == "TIFF" else 0  # read first: Pillow turns it upright
+        image.load()  # raises only the first time, so nothing may have loaded it before
+        turn = turn or orientation(image)
+        if image.format == "TIFF":
+            turn = {6: 8, 8: 6}.get(turn, turn) if as_stored else 1
+        elif as_stored:
+            turn = 1
+        pixels = image if turn == 1 else image.transpose(UPRIGHT[turn])
+        if image.mode.startswith("I"):
+            pixels = Image.fromarray(_eight_bits(np.asarray(pixels)))
+        if image.mode == "F":
+            raise ValueError("its pixels are floating-point numbers of unknown range")
+        return np.asarray(_to_srgb(pixels, image.info, file))
 
 
 def _eight_bits(values: np.ndarray) -> UInt8[np.ndarray, "H W"]:
@@ -227,16 +212,17 @@ def require_usable_size(image: object, size_hw: tuple[int, ...], max_side_px: in
         )
 
 
-def _frames(image: Image.Image) -> int:
-    """Return the number of animation frames, without previews and the additional pictures of phones."""
-    num_frames = int(getattr(image, "n_frames", 1))
-    if num_frames < 2 or image.format in ("MPO", "HEIF"):
-        return 1
+def _is_animation(image: Image.Image) -> bool:
+    """Return whether a file has a second frame that is no preview and no additional picture of a phone."""
     size = image.size
-    image.seek(1)
-    same = image.size == size
-    image.seek(0)
-    return num_frames if same else 1
+    if image.format in ("MPO", "HEIF"):
+        return False
+    with suppress(EOFError):  # Pillow counts the frames of a TIFF in quadratic time
+        image.seek(1)
+        same = image.size == size
+        image.seek(0)
+        return same
+    return False
 
 
 def _to_srgb(image: Image.Image, info: Mapping[Any, Any], file: object) -> Image.Image:

@@ -24,7 +24,7 @@ from hilsplat.base.artifacts import (
     seal_of,
     write_json,
 )
-from hilsplat.base.errors import ArtifactError, HilsplatError, MisalignedArtifactError
+from hilsplat.base.errors import ArtifactError, HilsplatError, MisalignedArtifactError, foreign
 from hilsplat.base.files import files_below, regular
 
 CONVERTED = ".made_from.json"
@@ -90,7 +90,7 @@ def digests_of(paths: Collection[str], memo: Path) -> dict[str, str]:
     if changed:  # a run of thousands of scenes would otherwise start as many pools
         with ThreadPoolExecutor() as threads:
             list(threads.map(read, changed))
-        with suppress(OSError):  # a read-only folder of results
+        with suppress(OSError, HilsplatError):  # a read-only folder of results, or a full disk
             write_json(memo, old | entries)
     return {path: entries.get(path, "unreadable").split()[-1] for path in paths}
 
@@ -108,9 +108,13 @@ def visible_files(folder: Path) -> list[Path]:
 
 
 def _is_apart(folder: Path) -> bool:
-    """Return whether a folder is results, an artifact, a converted source, or a link to a parent folder."""
-    marks = (folder / RUN, folder / CONVERTED, provenance_path(folder))
-    return any(map(Path.is_file, marks)) or folder.parent.resolve().is_relative_to(folder.resolve())
+    """Return whether a folder is results, an artifact, a converted source, or a link to a parent folder.
+
+    Links among folders also count: in all/a/all, the last one leads to the first.
+    """
+    marks, real = (folder / RUN, folder / CONVERTED, provenance_path(folder)), folder.resolve()
+    is_loop = folder.is_symlink() and any(each.resolve().is_relative_to(real) for each in folder.parents)
+    return any(map(Path.is_file, marks)) or is_loop
 
 
 def files_of(path: Path | Sequence[Path]) -> list[Path]:
@@ -266,23 +270,15 @@ def _checker() -> Any:
 
 def read_provenance(artifact: Path) -> Provenance | None:
     """Return the provenance of an artifact, or None; raise ArtifactError if the record is damaged."""
-    from pydantic import ValidationError
-
     path = provenance_path(artifact)
     if not path.is_file():
         return None
-    try:
-        values = read_json(path)
+    values, fix = read_json(path), functools.partial(rebuild_command, artifact)
+    with foreign(path, ArtifactError, problem="is damaged", fix=fix):
         record: Provenance = _checker().validate_python(values)
         if record.seal is not None and values.pop("seal") != seal_of(values):
-            raise ArtifactError(f"{path} was changed after it was written", fix=rebuild_command(artifact))
+            raise ArtifactError(f"{path} was changed after it was written", fix=fix())
         return record
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise ArtifactError(
-            f"{path} is damaged: {'.'.join(map(str, first['loc']))}: {first['msg']}",
-            fix=rebuild_command(artifact),
-        ) from error
 
 
 def require_as_written(path: Path, sha256: str | None) -> None:

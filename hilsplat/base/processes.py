@@ -92,7 +92,11 @@ def lock(stream: IO[Any], *, shared: bool = False, wait: bool = True) -> None:
             fix="run hilsplat in WSL: https://learn.microsoft.com/windows/wsl",
         )
     kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
-    fcntl.flock(stream, kind if wait else kind | fcntl.LOCK_NB)
+    try:
+        fcntl.flock(stream, kind if wait else kind | fcntl.LOCK_NB)
+    except OSError as error:
+        error.filename = stream.name
+        raise
 
 
 @functools.cache
@@ -103,20 +107,26 @@ def host_token() -> str:
 
 @contextmanager
 def unfinished_folder(parent: Path) -> Iterator[Path]:
-    """Create a folder for unfinished files, and delete it at the end.
+    """Create a folder for unfinished files, and delete it at the end; first delete those of killed processes.
 
     A locked file in it shows `remove_leftovers` that the writer is alive: the system releases the lock when
     the writer ends, even if it is killed. Process ids have no meaning in other containers or after a reboot.
     The folder itself is not locked, because NFS can lock only files.
     """
     is_locked = False
+    for path in Path(parent).glob(f".writing-{host_token()}-*"):
+        _is_removed(path)
     while not is_locked:
         folder = Path(parent) / f".writing-{host_token()}-{secrets.token_hex(4)}"
         folder.mkdir()
-        with suppress(FileNotFoundError):  # a clean-up deleted the folder before it was locked
+        try:
             stream = (folder / LOCK).open("ab")
             lock(stream)
             is_locked = os.fstat(stream.fileno()).st_nlink > 0
+        except BaseException as error:
+            delete(folder)
+            if not isinstance(error, FileNotFoundError):  # a clean-up deleted the folder before it was locked
+                raise
     try:
         yield folder
     finally:
@@ -130,29 +140,33 @@ def _discard(folder: Path, lock: IO[bytes]) -> None:
 
 
 def remove_leftovers(folder: Path) -> list[Path]:
-    """Delete unfinished files left in a folder by dead processes on this host; return the deleted folders.
+    """Delete unfinished files left in a folder by dead processes on this host; return the deleted folders."""
+    removed = []
+    for parent, folders, _ in os.walk(folder):
+        removed += [path for name in folders if _is_removed(path := Path(parent, name))]
+        folders[:] = [name for name in folders if not UNFINISHED.fullmatch(name)]
+    if removed:
+        logger.info("deleted the unfinished files of %d killed jobs", len(removed))
+    return removed
+
+
+def _is_removed(path: Path) -> bool:
+    """Delete a folder of unfinished files unless its writer is alive; return whether it was deleted.
 
     Files of live processes, including those in other containers, are kept. If the folder is shared, files
     from other hosts are also kept, because their locks may be invisible here. A folder without a lock is not
     ours, unless it is empty.
     """
-    removed = []
-    for parent, folders, _ in os.walk(folder):
-        for name in folders:
-            match = UNFINISHED.fullmatch(name)
-            if match is None or match["host"] != host_token():
-                continue
-            path = Path(parent) / name
-            with suppress(BlockingIOError, FileNotFoundError, PermissionError):
-                is_new = not any(path.iterdir())  # its writer may be about to create the lock
-                with (path / LOCK).open("ab" if is_new else "rb+") as stream:
-                    lock(stream, wait=False)
-                    _discard(path, stream)
-                removed.append(path)
-        folders[:] = [name for name in folders if not UNFINISHED.fullmatch(name)]
-    if removed:
-        logger.info("deleted the unfinished files of %d killed jobs", len(removed))
-    return removed
+    match = UNFINISHED.fullmatch(path.name)
+    if match is None or match["host"] != host_token() or path.is_symlink():
+        return False
+    with suppress(OSError):
+        is_new = not any(path.iterdir())  # its writer may be about to create the lock
+        with (path / LOCK).open("ab" if is_new else "rb+") as stream:
+            lock(stream, wait=False)
+            _discard(path, stream)
+        return True
+    return False
 
 
 def is_alive(pid: int) -> bool:
@@ -182,9 +196,14 @@ def in_processes(
     from concurrent.futures.process import BrokenProcessPool
     from multiprocessing import get_context
 
+    context, how = get_context("spawn"), (end_with_parent, (os.getpid(),))
     try:
-        context, how = get_context("spawn"), (end_with_parent, (os.getpid(),))
-        with ProcessPoolExecutor(min(workers, len(items)), context, *how) as pool:
+        pool = ProcessPoolExecutor(min(workers, len(items)), context, *how)
+    except OSError as error:
+        fix = "mount a writable /dev/shm, or use one core: hilsplat run --cores 1"
+        raise HilsplatError(f"no second process can be started: {error.strerror}", fix=fix) from error
+    try:
+        with pool:
             yield from pool.map(work, *zip(*items, strict=True), chunksize=chunk)
     except BrokenProcessPool as error:
         raise HilsplatError(f"a process of {work} was killed, {KILLED}", fix=KILLED_FIX) from error

@@ -69,7 +69,7 @@ def main() -> None:
     except Exception as error:
         if is_interruption(error):
             sys.exit(130)
-        message = error if isinstance(error, HilsplatError) else system_error(error)
+        message = system_error(error)
         if message is None and sys.gettrace() is not None:  # for post-mortem debugging
             raise
         logging.getLogger("hilsplat").error("%s", message or "unexpected error", exc_info=message is None)

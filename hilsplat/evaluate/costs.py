@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hilsplat.base.artifacts import parse_json, write_text
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.errors import ArtifactError, foreign
 from hilsplat.base.lineage import artifacts_in, read_provenance, require_as_written, sha256_of_file
 from hilsplat.base.ownership import require_beginning
 from hilsplat.base.tables import markdown_table, read_csv, write_csv
@@ -156,13 +156,10 @@ def read_benchmark(path: Path, results: Path) -> list[Job]:
     dataset, scene, variant = (*place, "", "", "")[:3]
     jobs = []
     for line in path.read_text(encoding="utf-8").splitlines():
-        try:
+        problem = "is not a valid benchmark file"
+        with foreign(path, ArtifactError, problem=problem, fix="run its stage again"):
             record = parse_json(line)
             elapsed_s = float(record["s"])
-        except (ValueError, KeyError, TypeError) as error:
-            raise ArtifactError(
-                f"{path} is not a valid benchmark file: {error}", fix="run its stage again"
-            ) from error
         sampled = (record.get("cpu_time"), record.get("max_rss"))  # "-" or null if Snakemake could not sample
         numbers = (float(value) if isinstance(value, int | float) else 0.0 for value in sampled)
         jobs.append(Job(path.stem, dataset, scene, variant, elapsed_s, *numbers))

@@ -11,7 +11,7 @@ import pandas as pd
 from jaxtyping import Bool, Float64, Int64
 
 from hilsplat.base.artifacts import read_npz
-from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, SettingsError
+from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, SettingsError, foreign
 from hilsplat.base.files import list_masks
 from hilsplat.base.images import image_size_hw, read_mask
 from hilsplat.base.progress import stage_log
@@ -292,7 +292,5 @@ def _as_mask(array: np.ndarray, where: str) -> Bool[np.ndarray, "h w"]:
 
 
 def _text(path: Path) -> str:
-    try:
+    with foreign(path, ArtifactError, fix="write it as UTF-8 text"):
         return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ArtifactError(f"{path} cannot be read: {error}", fix="write it as UTF-8 text") from error

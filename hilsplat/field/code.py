@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int64
 
 from hilsplat.base.arrays import build_checked, read_tensors, require_types, write_tensors
-from hilsplat.base.artifacts import damaged, read_npz, sealed
+from hilsplat.base.artifacts import read_npz, readable, sealed
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.decoder_kernels import UNITS, through_layers
 from hilsplat.segment.digests import require_same_masks
@@ -201,7 +201,7 @@ def load_code(folder: Path) -> Code:
     """Read the code (network or linear) in a finished folder; raise ArtifactError if missing or damaged."""
     path = autoencoder_file(folder)
     state, about = read_tensors(path)
-    try:
+    with readable(path, "is from a different version"):
         if about.get("code") == "pca":
             return LinearCode(state["mean"], state["basis"])
         model = Autoencoder.initial(about["channels"], about["latent"], np.random.RandomState(0))
@@ -210,8 +210,6 @@ def load_code(folder: Path) -> Code:
                 raise ValueError(f"array {name} of shape {values.shape} is missing")
             model.arrays[name] = state[name]
         return model
-    except (KeyError, ValueError) as error:
-        raise damaged(path, f" is from a different version: {error}") from error
 
 
 def autoencoder_file(folder: Path) -> Path:

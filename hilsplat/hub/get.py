@@ -375,16 +375,12 @@ def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
             f"{', '.join(dict.fromkeys(files))}",
         ) from error
     except OSError as error:
-        if str(error).startswith(WRONG_LENGTH):
-            raise DownloadError(
-                f"{requested.repository} cannot be downloaded: a file does not have the announced length",
-                found=first_line(error),
-                fix="run the command again; if the error persists, a proxy or mirror truncates files",
-            ) from error
-        if error.filename is None:
+        if not str(error).startswith(WRONG_LENGTH):
             raise
         raise DownloadError(
-            f"{error.filename} cannot be written: {error.strerror}", fix=f"make {models} writable"
+            f"{requested.repository} cannot be downloaded: a file does not have the announced length",
+            found=first_line(error),
+            fix="run the command again; if the error persists, a proxy or mirror truncates files",
         ) from error
 
 

@@ -5,6 +5,7 @@ A folder contains `config.json`, the preprocessing configuration and the network
 so its digest identifies the model.
 """
 
+import shlex
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -180,7 +181,8 @@ def _incomplete(folder: Path, name: str, missing: list[str], alternative: str) -
         what = "suffixes" if any(variants) else "no suffix"
         fix = f"its networks have {what}: set {SECTIONS[layout.kind]}.variant to one of {listed}"
     elif layout.kind == "clip" and whole_clip(folder):
-        fix = f"split its single network into the required two: hilsplat models split {folder}"
+        command = f"hilsplat models split {shlex.quote(str(folder))}"
+        fix = f"split its single network into the required two: {command}"
     elif any(file.endswith(TORCH_SUFFIXES) for file in files) and not any(folder.rglob("*.onnx")):
         fix = (
             "these are PyTorch weights, but hilsplat reads ONNX networks: fetch an ONNX export of the model "

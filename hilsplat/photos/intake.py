@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 
 from hilsplat.base.artifacts import read_memo, write_json
 from hilsplat.base.atomic import atomic_folder, require_free_space
-from hilsplat.base.errors import HilsplatError, SceneError
+from hilsplat.base.errors import SceneError, foreign
 from hilsplat.base.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_outside, list_files, list_images
 from hilsplat.base.lineage import CONVERTED
 from hilsplat.base.removal import undone_on_error
@@ -99,35 +99,30 @@ def unpack_photographs(archive: Path, folder: Path) -> None:
             names that point outside the folder.
         DiskSpaceError: there is too little free space.
     """
-    try:
-        with zipfile.ZipFile(archive) as opened:
-            listed = opened.infolist()
-            if _num_listed(archive) not in (len(listed), 2**16 - 1):
-                raise zipfile.BadZipFile(f"its list of files is damaged after {len(listed)} files")
-            entries = [entry for entry in listed if not entry.filename.endswith(("/", "\\"))]
-            _check_entries(archive, entries)
-            chosen = [entry for entry in entries if _is_wanted(PurePosixPath(entry.filename))]
-            suffixes = Counter(PurePosixPath(entry.filename).suffix.lower() for entry in entries)
-            if not IMAGE_SUFFIXES & suffixes.keys():
-                raise SceneError(
-                    f"archive {archive} contains no photographs",
-                    expected=f"images: {' '.join(sorted(IMAGE_SUFFIXES))}",
-                    found=", ".join(f"{count} files ({suffix})" for suffix, count in suffixes.items()),
-                    fix="unpack it yourself, and pass the folder of the photographs, or the video",
-                )
-            require_free_space(folder, sum(entry.file_size for entry in chosen) / 2**20 + 200)
-            opened.extractall(folder, chosen)  # stops at the declared size; checks the CRC
-            for entry in chosen:
-                if (folder / entry.filename).stat().st_size != entry.file_size:
-                    raise zipfile.BadZipFile(f"{entry.filename} is incomplete")
-    except HilsplatError:
-        raise
-    except Exception as error:  # zipfile and zlib raise nearly everything on damaged data
-        raise SceneError(
-            f"archive {archive} cannot be unpacked: {error}",
-            found=f"a file of {archive.stat().st_size} bytes" if archive.is_file() else "no file",
-            fix="copy it again, or unpack it yourself and pass the folder",
-        ) from error
+    fix = "copy it again, or unpack it yourself and pass the folder"
+    with (
+        foreign(f"archive {archive}", problem="cannot be unpacked", fix=fix),
+        zipfile.ZipFile(archive) as opened,
+    ):
+        listed = opened.infolist()
+        if _num_listed(archive) not in (len(listed), 2**16 - 1):
+            raise zipfile.BadZipFile(f"its list of files is damaged after {len(listed)} files")
+        entries = [entry for entry in listed if not entry.filename.endswith(("/", "\\"))]
+        _check_entries(archive, entries)
+        chosen = [entry for entry in entries if _is_wanted(PurePosixPath(entry.filename))]
+        suffixes = Counter(PurePosixPath(entry.filename).suffix.lower() for entry in entries)
+        if not IMAGE_SUFFIXES & suffixes.keys():
+            raise SceneError(
+                f"archive {archive} contains no photographs",
+                expected=f"images: {' '.join(sorted(IMAGE_SUFFIXES))}",
+                found=", ".join(f"{count} files ({suffix})" for suffix, count in suffixes.items()),
+                fix="unpack it yourself, and pass the folder of the photographs, or the video",
+            )
+        require_free_space(folder, sum(entry.file_size for entry in chosen) / 2**20 + 200)
+        opened.extractall(folder, chosen)  # stops at the declared size; checks the CRC
+        for entry in chosen:
+            if (folder / entry.filename).stat().st_size != entry.file_size:
+                raise zipfile.BadZipFile(f"{entry.filename} is incomplete")
 
 
 def _num_listed(archive: Path) -> int:

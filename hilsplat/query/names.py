@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, NonNegativeInt, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, NonNegativeInt
 
 from hilsplat.base.artifacts import read_json, read_npz, write_json
-from hilsplat.base.errors import ArtifactError, SettingsError
+from hilsplat.base.errors import ArtifactError, SettingsError, foreign
 from hilsplat.base.levels import PATH_SEPARATOR, plain_text
 from hilsplat.base.lineage import sha256_of_file
 from hilsplat.web.file_changes import NO_FILE, replacing, version_of
@@ -104,13 +104,12 @@ class NamesFile(BaseModel):
 def _stored(path: Path) -> NamesFile:
     if not path.is_file():
         return NamesFile(format="hilsplat-names-1", trees={})
-    try:
+    with foreign(
+        path,
+        ArtifactError,
+        problem="is damaged or in a different format",
+        expected='{"format": "hilsplat-names-1", "trees": {<digest of a tree>: {"<row>": "<name>"}}}, '
+        f"with names of {NAME_RULE}",
+        fix="correct the file, or move it elsewhere to start without names",
+    ):
         return NamesFile.model_validate(read_json(path))
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise ArtifactError(
-            f"{path} is damaged or in a different format: {'.'.join(map(str, first['loc']))}: {first['msg']}",
-            expected='{"format": "hilsplat-names-1", "trees": {<digest of a tree>: {"<row>": "<name>"}}}, '
-            f"with names of {NAME_RULE}",
-            fix="correct the file, or move it elsewhere to start without names",
-        ) from error

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from hilsplat.base.artifacts import (
 from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.cache import ViewCache
 from hilsplat.base.code import code_digest
-from hilsplat.base.errors import ArtifactError, SettingsError
+from hilsplat.base.errors import ArtifactError, SettingsError, foreign
 from hilsplat.base.files import regular
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.lineage import sha256_of_file, sha256_of_json
@@ -69,12 +70,8 @@ class Vocabulary:
         Raises:
             SettingsError: the file cannot be read or contains no text, or a section or name is invalid.
         """
-        try:
+        with foreign(f"the vocabulary {path}", SettingsError, fix="correct the path, or save it as UTF-8"):
             lines = regular(Path(path)).read_text(encoding="utf-8-sig").splitlines()
-        except (OSError, UnicodeDecodeError) as error:
-            raise SettingsError(
-                f"the vocabulary {path} cannot be read: {error}", expected="a UTF-8 text file"
-            ) from error
         texts: dict[str, dict[str, None]] = {section: {} for section in SECTIONS}
         section = SECTIONS[0]
         for number, line in enumerate(lines, 1):
@@ -130,18 +127,14 @@ class NodeNaming:
         if made_for != (tree_digest(semantic_tree), sha256_of_file(clip_folder / INDEX)):
             return None
         rows = read_json(sealed(folder, "names.json"))
-        try:
+        fix, expected = partial(rebuild_command, folder), f"{index['nodes']} names, and vectors (W, C)"
+        what = f"{folder / 'names.json'} or rivals.npy"
+        with foreign(what, ArtifactError, problem="is damaged", expected=expected, fix=fix):
             names = tuple(checked_name(str(row["name"])) for row in rows)
             surfaces = tuple(bool(row["surface"]) for row in rows)
             rivals = read_npy(sealed(folder, "rivals.npy")).astype(np.float32)
             if len(rows) != index["nodes"] or rivals.ndim != 2:
                 raise ValueError(f"{len(rows)} names, rivals of shape {rivals.shape}")
-        except (TypeError, KeyError, ValueError) as error:
-            raise ArtifactError(
-                f"{folder / 'names.json'} or rivals.npy is damaged: {error!r}",
-                expected=f"{index['nodes']} names, and vectors (W, C)",
-                fix=rebuild_command(folder),
-            ) from error
         return NodeNaming(names, surfaces, rivals)
 
 

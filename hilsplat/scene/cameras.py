@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float, Int32
 
 from hilsplat.base.arrays import require_arrays, require_types
-from hilsplat.base.artifacts import read_npz, rebuild_command, write_npz
-from hilsplat.base.errors import ArtifactError, SceneError, shorten_list
+from hilsplat.base.artifacts import damaged, read_npz, write_npz
+from hilsplat.base.errors import SceneError, shorten_list
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 
 MAX_SIDE_PX = 2**15
@@ -157,9 +157,7 @@ class Cameras:
         else:
             fault = _fault_of(poses, K)
         if fault:
-            raise ArtifactError(
-                f"{path} does not contain valid cameras", expected=fault, fix=rebuild_command(path)
-            )
+            raise damaged(path, " does not contain valid cameras", fault)
         order = tuple(names.tolist())
         photos = {}
         if "photo_model" in arrays:

@@ -1,10 +1,13 @@
 """pycolmap, loaded after Pillow (import it only from here), and conversions of its models to arrays.
 
 Measured with pycolmap 4.2.1 and Pillow 13.0: if pycolmap is loaded before Pillow's core, writing a PNG with
-Pillow corrupts the heap, and the process aborts or hangs. The reverse order works.
+Pillow corrupts the heap, and the process aborts or hangs. The reverse order works. pycolmap's handler of
+SIGTERM, which reports a crash if a job is cancelled, is replaced by the former one.
 """
 
+import signal
 from collections.abc import Sequence
+from contextlib import suppress
 
 import numpy as np
 from jaxtyping import Float64, UInt8
@@ -12,8 +15,13 @@ from PIL import Image  # noqa: F401
 
 from hilsplat.scene.cameras import Photo
 
+_on_sigterm = signal.getsignal(signal.SIGTERM)
+
 # isort: split
-import pycolmap as pycolmap
+import pycolmap as pycolmap  # noqa: E402
+
+with suppress(ValueError):  # this is not the main thread
+    signal.signal(signal.SIGTERM, _on_sigterm)
 
 Points = tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]
 """Positions and colours."""

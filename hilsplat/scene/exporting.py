@@ -1,5 +1,6 @@
 """Export of a scene for other programs (COLMAP, nerfstudio), in the coordinates of the scene's source."""
 
+import errno
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,6 +13,9 @@ from hilsplat.scene.assemble import move_cameras
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.posed_images import PosedImage, write_posed_images
 from hilsplat.scene.scene import Scene
+
+POINT_BYTES = 51
+"""Size of a point without a track in COLMAP's points3D.bin, which begins with the number of points."""
 
 
 def in_source(scene: Scene) -> tuple[list[PosedImage], Float64[np.ndarray, "P 3"]]:
@@ -42,8 +46,12 @@ def add_colmap(scene: Scene, folder: Path) -> None:
     (folder / "images").mkdir()
     for view in scene.views():
         shutil.copyfile(scene.image_path(view), folder / "images" / view)
-    (folder / "sparse" / "0").mkdir(parents=True)
-    pinhole_model(*in_source(scene), scene.points_rgb).write_binary(folder / "sparse" / "0")
+    model = folder / "sparse" / "0"
+    model.mkdir(parents=True)
+    pinhole_model(*in_source(scene), scene.points_rgb).write_binary(model)
+    points = model / "points3D.bin"  # is written last; COLMAP ignores a full disk
+    if points.stat().st_size != 8 + POINT_BYTES * len(scene.points_rgb):
+        raise ChildProcessError(errno.EIO, "COLMAP wrote an incomplete file", str(points))
 
 
 def pinhole_model(

@@ -4,10 +4,8 @@ import logging
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from pydantic import ValidationError
-
 from hilsplat.base.artifacts import INDEX, provenance_path, read_index, run_command
-from hilsplat.base.errors import ArtifactError, nearest
+from hilsplat.base.errors import ArtifactError, foreign, nearest
 from hilsplat.base.lineage import read_provenance
 from hilsplat.base.plugins import entry_points
 from hilsplat.settings import EvaluateSettings
@@ -110,14 +108,9 @@ class FinishedScene:
             )
             settings = {}
         values = {name: settings[name] for name in EvaluateSettings.model_fields if name in settings}
-        try:
+        fix = "delete the damaged provenance file of the scores, or rerun the workflow"
+        with foreign("the record of query settings", ArtifactError, problem="is not valid", fix=fix):
             return EvaluateSettings(**values)
-        except ValidationError as error:
-            raise ArtifactError(
-                f"the recorded query settings are not valid: {error.errors(include_url=False)[0]['msg']}",
-                expected="settings that EvaluateSettings accepts",
-                fix="delete the damaged provenance file of the scores, or rerun the workflow",
-            ) from error
 
 
 def scenes_in(results: Path) -> list[str]:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Any
 
-from hilsplat.base.errors import ModelError
+from hilsplat.base.errors import ModelError, foreign
 from hilsplat.models.folder import ModelFolder
 from hilsplat.settings import MasksSettings
 
@@ -32,12 +32,9 @@ def own_thresholds(model: ModelFolder) -> Thresholds:
     """
     own: Any = model.config.get(OWN, {})
     names = vars(REAL_SAM)
-    try:
+    what = f"{model.folder / 'config.json'}: {OWN}"
+    with foreign(what, ModelError, problem="is invalid", fix="correct or remove it"):
         if not isinstance(own, dict) or not own.keys() <= names.keys():
             raise ValueError(f"known keys are {', '.join(names)}")
         settings = MasksSettings(**own)
         return replace(REAL_SAM, **{name: getattr(settings, name) for name in own})
-    except ValueError as error:  # includes pydantic's ValidationError
-        raise ModelError(
-            f"{model.folder / 'config.json'}: {OWN} is invalid: {error}", fix="correct or remove it"
-        ) from error

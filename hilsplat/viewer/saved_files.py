@@ -19,7 +19,7 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 
-from hilsplat.base.errors import HilsplatError, SettingsError
+from hilsplat.base.errors import HilsplatError, SettingsError, system_error
 from hilsplat.query.hits import NodeGroup, label_comments
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.scene_views import ViewStore
@@ -78,8 +78,8 @@ class SavedFiles:
             yield _line(made=result[0], of=result[1])
             try:
                 result = await self.thread.run(partial(_step, steps), worker)
-            except (HilsplatError, OSError) as error:  # such as a full disk
-                yield _line(error=f"the file could not be created: {error}")
+            except (HilsplatError, OSError, MemoryError) as error:
+                yield _line(error=f"the file could not be created: {system_error(error) or error}")
                 return
         yield _line(bytes=len(result))
         yield result

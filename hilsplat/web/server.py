@@ -15,11 +15,11 @@ import uvicorn
 from jaxtyping import UInt8
 from pydantic import BaseModel, ValidationError
 from starlette.applications import Starlette
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from hilsplat.base.errors import HilsplatError, SettingsError
+from hilsplat.base.errors import HilsplatError, SettingsError, first_line, system_error
 from hilsplat.scene.scene import Scene
 from hilsplat.web.file_changes import StaleFileError, StaleSceneError
 from hilsplat.web.guard import Guard
@@ -31,6 +31,9 @@ STATUS: dict[type, int] = {
     StaleSceneError: 409,
     HilsplatError: 422,
     ValidationError: 400,
+    ClientDisconnect: 400,  # cannot be received
+    OSError: 500,
+    MemoryError: 500,
 }
 """HTTP status of each error that is sent to the page."""
 
@@ -65,10 +68,7 @@ def guarded(routes: list[Route], token: str, max_body: int, *, embedded: bool = 
 
 async def _refused(request: Request, error: Exception) -> Response:
     """Send the error's text to the page."""
-    text = str(error)
-    if isinstance(error, ValidationError):
-        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        text = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+    text = first_line(error) if isinstance(error, ValidationError) else str(system_error(error) or error)
     status = next(STATUS[kind] for kind in type(error).__mro__ if kind in STATUS)
     return plain(as_json({"error": text}), "application/json", status)
 

@@ -3,6 +3,7 @@
 import importlib.metadata
 import os
 import platform
+import shlex
 import shutil
 import time
 from collections.abc import Iterator
@@ -118,7 +119,7 @@ def models() -> Iterator[Finding]:
             check_model(folder)
             apart = None if card_problem() else card_disagreement(folder)
         except HilsplatError as error:
-            yield Finding("models", "fault", str(error), f"hilsplat models get {folder.name}")
+            yield Finding("models", "fault", str(error), f"hilsplat models get {shlex.quote(folder.name)}")
             continue
         sound = f"{folder} works on the CPU{'' if card_problem() else ' and the GPU'}"
         problem = f"{folder}: {apart}" if apart else ""

@@ -1,6 +1,7 @@
 """Models and devices of a run: checks before the first job, and descriptions of the models."""
 
 import functools
+import shlex
 from pathlib import Path
 
 from hilsplat.base.errors import HilsplatError, SettingsError
@@ -65,7 +66,7 @@ def _require_model(folder: Path, kind: str, variant: str) -> None:
     from hilsplat.models.folder import open_model_folder  # onnxruntime is slow to import
 
     is_released = any(folder.name == release.name for release in RELEASES)
-    fix = f"fetch it: hilsplat models get {folder.name}" if is_released else ""
+    fix = f"fetch it: hilsplat models get {shlex.quote(folder.name)}" if is_released else ""
     open_model_folder(folder, kind, variant=variant, fix=fix)
 
 

@@ -10,6 +10,7 @@ import logging
 import os
 import re
 import secrets
+import shlex
 import signal
 import socket
 import subprocess
@@ -129,14 +130,13 @@ def _locked(path: Path, *, shared: bool = False, wait: bool = True) -> TextIOWra
 
 
 def start_project(folder: Path) -> list[Path]:
-    """Copy the default configuration and scene sheet into a folder, unless either already exists."""
-    written = [Path(folder) / path for path in (CONFIG, DEFAULT_SHEET)]
-    for path in written:
-        if os.path.lexists(path):
-            raise HilsplatError(f"{path} already exists", fix="edit it, or choose another folder")
-    for path, installed in zip(written, (CONFIG, DEFAULT_SHEET), strict=True):
-        write_text(path, (INSTALLED / installed).read_text(encoding="utf-8"))
-    return written
+    """Copy the default configuration and scene sheet into a folder, without replacing an existing one."""
+    missing = [path for path in (CONFIG, DEFAULT_SHEET) if not os.path.lexists(folder / path)]
+    if not missing:
+        raise HilsplatError(f"{folder / CONFIG} already exists", fix="edit it, or choose another folder")
+    for path in missing:
+        write_text(folder / path, (INSTALLED / path).read_text(encoding="utf-8"))
+    return [folder / path for path in missing]
 
 
 def run(
@@ -220,9 +220,8 @@ def _config_file(name: Path) -> Path:
     if name.suffix or len(name.parts) != 1 or name.exists():
         return project_path(name)
     if "=" in str(name):
-        raise SettingsError(
-            f"{name} is not a file", fix=f"pass keys after --: hilsplat run -- --config {name}"
-        )
+        command = f"hilsplat run -- --config {shlex.quote(str(name))}"
+        raise SettingsError(f"{name} is not a file", fix=f"pass keys after --: {command}")
     if not (found := project_path(named)).exists():
         known = {
             path.stem for folder in (Path(), INSTALLED) for path in (folder / named).parent.glob("*.yaml")

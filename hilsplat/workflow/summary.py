@@ -1,5 +1,6 @@
 """The last lines of a run: what exists of each scene, how good it is, and the next command."""
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -31,7 +32,8 @@ def summary(plan: Plan, files: Sequence[str] = ()) -> list[str]:
     if files:
         rows = [row for row in rows if any(file.startswith(f"{plan.path(row)}/") for file in files)]
     if len(rows) > TABLED:
-        lines = [f"{len(rows)} scenes have poses; to list them: hilsplat scenes --results {plan.results}"]
+        command = f"hilsplat scenes --results {shlex.quote(str(plan.results))}"
+        lines = [f"{len(rows)} scenes have poses; to list them: {command}"]
     elif len(rows) > DETAILED:
         lines = scene_lines(plan.results, [row.name for row in rows])[0]
     else:

@@ -268,6 +268,11 @@ ROWS = {
         ("coverage-tree", "--masks", str(MASKS), "--out", "/proc/none/new"),
         "not enough space on the disk of /proc",
     ),
+    "an output below a link to a disk that is not mounted": row(
+        lambda: Path("link").symlink_to("gone/results"),
+        ("export", "photos/desk", "--out", "link/new"),
+        "link is a link to gone/results, which is missing",
+    ),
     "a name that no disk takes": row(
         nothing, ("coverage-tree", "--masks", str(MASKS), "--out", "n" * 260), "too long for this file system"
     ),

@@ -1,11 +1,14 @@
 """Commands in an unusable environment: full output, shell limits, a deleted working directory."""
 
+import errno
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from hilsplat.base.errors import ImageError, system_error
+from hilsplat.base.images import read_image
 from tests.bad_inputs.test_bad_inputs import CONTRIBUTE, MASKS
 
 QUERY = "query photos/desk mug --out answers"
@@ -39,6 +42,31 @@ def test_what_surrounds_a_command(line: str, words: str, project: Path):
     assert words in said
     assert "Traceback" not in said
     assert not list(project.rglob(".writing-*"))
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (RuntimeError("can't start new thread"), "too few threads"),
+        (OSError(errno.EAGAIN, "Resource temporarily unavailable", "git"), "git needs more processes than"),
+        (OSError(errno.ESTALE, "Stale file handle", "a.png"), "a.png cannot be read or written: the network"),
+        (OSError(errno.ETIMEDOUT, "Connection timed out", "a.png"), "a.png cannot be read or written"),
+    ],
+)
+def test_errors_of_the_machine_are_no_traceback(error: Exception, words: str):
+    assert words in str(system_error(error))
+
+
+def test_an_image_that_the_machine_cannot_read_is_not_called_damaged(tmp_path: Path, monkeypatch):
+    def refuse(*arguments, **options):
+        raise OSError(errno.EIO, "Input/output error")
+
+    (tmp_path / "a.png").write_bytes(bytes(100))
+    monkeypatch.setattr("PIL.Image.open", refuse)
+    with pytest.raises(ImageError, match="replace it with an intact copy") as refusal:
+        read_image(tmp_path / "a.png")
+    text = str(system_error(refusal.value))
+    assert "a.png cannot be read" in text and "the file may be intact" in text and "replace" not in text
 
 
 def test_more_threads_than_cores_cost_nothing(project: Path):

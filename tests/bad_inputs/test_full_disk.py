@@ -108,6 +108,13 @@ def test_a_full_disk_is_reported_and_costs_nothing(case: str, disk: Path, told: 
     assert not list(disk.rglob(".writing-*"))
 
 
+def test_a_full_disk_does_not_truncate_an_exported_colmap_model(disk: Path, told: Callable[..., str]) -> None:
+    leave(disk, 4 * 6)  # a block for each photograph; COLMAP reports no error
+    text = told(("export", "photos/desk", "--as", "colmap", "--out", "disk/model"))
+    assert "no space left while writing model" in text
+    assert not (disk / "model").exists()
+
+
 def test_a_read_only_disk_is_reported_with_the_users_file(disk: Path, told: Callable[..., str]) -> None:
     shutil.copy("config/scenes.tsv", disk)
     textured(Path("photos"))

@@ -30,6 +30,8 @@ PROSE = {
     "in",
 }
 """What follows the name in sentences about hilsplat."""
+SAFE = {"name", "scene", "requested.name"}
+"""Names of scenes and of released models, which contain no character that a shell obeys."""
 TO_SNAKEMAKE = {"--config"}
 """Options of Snakemake that messages suggest after `--`."""
 
@@ -100,6 +102,20 @@ def test_a_command_in_a_message_can_be_parsed(module, text):
         assert not word.startswith("-") or word.partition("=")[0].rstrip(".") in known, text
     after = words[words.index("--") + 1 :] if "--" in words else []
     assert {word for word in after if word.startswith("-")} <= TO_SNAKEMAKE
+
+
+def test_paths_in_suggested_commands_are_quoted_for_the_shell():
+    values = set()
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            before = ""
+            for part in node.values if isinstance(node, ast.JoinedStr) else ():
+                if isinstance(part, ast.Constant):
+                    before += part.value
+                elif re.search(r"\bhilsplat (?!run has)[a-z-][^`;()\n]*$", before):
+                    values.add(ast.unparse(part.value))
+    assert "shlex.quote(str(folder))" in values
+    assert {value for value in values if not value.startswith("shlex.quote(")} <= SAFE
 
 
 def test_ctrl_c_during_an_import_ends_the_command_without_an_error(monkeypatch, caplog):

@@ -1,5 +1,7 @@
 """Server of the annotation page: access, versions of saved files, shapes, proposals, transfer to views."""
 
+import asyncio
+import errno
 import json
 import os
 import shutil
@@ -93,6 +95,37 @@ def test_saved_labels_are_cut_to_their_parents_versioned_and_a_data_set(client, 
     scene = open_labelled("annotated/photos/desk", tmp_path)
     assert [region.path for region in scene.views["002.png"]] == [("mug",), ("mug", "handle")]
     np.testing.assert_array_equal(scene.views["002.png"][1].mask(), child)
+
+
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [(errno.EROFS, "000.json is on a read-only disk"), (errno.ESTALE, "000.json cannot be read or written")],
+)
+def test_the_page_is_told_why_annotations_cannot_be_saved(client, labels, monkeypatch, number, words):
+    def refuse(path, text):
+        raise OSError(number, os.strerror(number), str(path))
+
+    monkeypatch.setattr("hilsplat.annotate.labels.write_text", refuse)
+    sent = put(client, 0, [MUG], "none")
+    assert sent.status_code == 500 and words in sent.json()["error"]
+
+
+def test_a_page_that_is_closed_while_it_sends_leaves_no_traceback(desk, labels):
+    app = Annotator(OpenedScene(desk, labels, "default", 1)).app(TOKEN)
+    headers = {"host": "127.0.0.1:1", "cookie": f"{app.cookie}={TOKEN}", "origin": "http://127.0.0.1:1"}
+    headers["content-type"] = "application/json"
+    fields = [(name.encode(), value.encode()) for name, value in headers.items()]
+    scope = {"type": "http", "method": "POST", "path": "/api/at", "query_string": b"", "headers": fields}
+
+    async def receive() -> dict:
+        return {"type": "http.disconnect"}
+
+    async def send(message: dict) -> None:
+        sent.append(message["type"])
+
+    sent: list[str] = []
+    asyncio.run(app(scope, receive, send))
+    assert sent == ["http.response.start", "http.response.body"]
 
 
 HALVES = [[[0.5, 1], [2, 2], [3, 1]]]

@@ -57,6 +57,20 @@ def test_outputs_have_the_permissions_of_other_new_files(tmp_path: Path) -> None
     file, folder = ((tmp_path / name).stat().st_mode for name in ("file", "folder"))
     files = dict.fromkeys(("a.txt", "b.txt", "c.safetensors", "d.safetensors"), file)
     assert found == files | {"new": folder, "inner": folder}
+    for mode in (0o600, 0o664):  # of a file that a user shares or hides
+        (tmp_path / "out/a.txt").chmod(mode)
+        write_text(tmp_path / "out/a.txt", "other text")
+        assert (tmp_path / "out/a.txt").stat().st_mode & 0o777 == mode
+
+
+def test_file_systems_without_modes_can_be_written(tmp_path: Path, monkeypatch) -> None:
+    def refuse(*arguments, **options) -> None:
+        raise PermissionError(errno.EPERM, "chmod")
+
+    monkeypatch.setattr(os, "chmod", refuse)
+    write_text(tmp_path / "a.txt", "text")
+    write_text(tmp_path / "a.txt", "other text")
+    assert (tmp_path / "a.txt").read_text() == "other text"
 
 
 def test_a_file_is_flushed_before_it_replaces_the_former_one_and_its_folder_after_that(
@@ -81,7 +95,9 @@ def test_the_files_of_a_folder_are_flushed_once_before_it_replaces_the_former_on
     assert flushed[4:] == [str(new), str(tmp_path)]
 
 
-@pytest.mark.parametrize(("code", "is_raised"), [(errno.EINVAL, False), (errno.EIO, True)])
+@pytest.mark.parametrize(
+    ("code", "is_raised"), [(errno.EINVAL, False), (errno.EOPNOTSUPP, False), (errno.EIO, True)]
+)
 def test_only_file_systems_that_cannot_flush_are_excused(tmp_path, monkeypatch, code, is_raised) -> None:
     def fail(_: int) -> None:
         raise OSError(code, "flush")
@@ -90,6 +106,21 @@ def test_only_file_systems_that_cannot_flush_are_excused(tmp_path, monkeypatch, 
     with pytest.raises(OSError, match="flush") if is_raised else nullcontext():
         write_text(tmp_path / "a.txt", "text")
     assert (tmp_path / "a.txt").exists() != is_raised
+
+
+@pytest.mark.parametrize("writer", [atomic_path, atomic_folder])
+def test_a_replaced_file_is_no_error_if_only_its_folder_cannot_be_flushed(
+    tmp_path, monkeypatch, caplog, writer
+) -> None:
+    def fail(descriptor: int) -> None:
+        if os.path.samestat(os.fstat(descriptor), tmp_path.stat()):
+            raise OSError(errno.EIO, "flush")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with writer(tmp_path / "a.txt"):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+    assert "a.txt was written, but a power failure may undo this: flush" in caplog.text
 
 
 @pytest.fixture
@@ -109,6 +140,7 @@ def free_mib(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
         (OSError(errno.EDQUOT, "full"), 5, True),
         (OSError(errno.EACCES, "locked"), 0.5, False),
         (Exception("SQLite: database or disk is full"), 5, True),
+        (OSError("4326 requested and 0 written"), 5, True),  # NumPy
         (RuntimeError("a library failed"), 0.5, True),
         (ChildProcessError("a library ended its process"), 0.5, True),
         (RuntimeError("a library failed"), 1, False),
@@ -151,6 +183,13 @@ def test_errors_inside_a_new_folder_name_the_final_path(tmp_path: Path, free_mib
     ):
         raise OSError(errno.EIO, "broken", str(temporary))
     assert raised.value.filename == str(tmp_path / "a.txt")
+    free_mib(5)
+    with pytest.raises(OSError, match="Too many open files") as raised, atomic_path(tmp_path / "a.txt"):
+        raise RuntimeError("Too many open files (os error 24)")  # safetensors
+    assert (raised.value.errno, raised.value.filename) == (errno.EMFILE, str(tmp_path / "a.txt"))
+    with pytest.raises(OSError, match="broken") as raised, atomic_path(tmp_path / "a.txt"):
+        raise OSError(errno.EIO, "broken")
+    assert raised.value.filename == f"{tmp_path / 'a.txt'}, or a file that it is made from,"
 
 
 def test_too_little_space_is_refused_before_work_begins(tmp_path: Path, free_mib) -> None:

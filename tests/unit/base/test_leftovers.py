@@ -1,5 +1,6 @@
 """Killed writers leave artifacts whole, and the next clean-up removes unfinished files."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -12,6 +13,7 @@ import pytest
 from hilsplat.base import processes, removal
 from hilsplat.base.artifacts import write_text
 from hilsplat.base.atomic import atomic_folder
+from hilsplat.base.errors import system_error
 from hilsplat.base.processes import host_token, remove_leftovers
 
 KILL = """
@@ -68,10 +70,11 @@ while is_killed:
         write("old")
     if kind == "clean-up":
         former = folder / f".writing-{processes.host_token()}-01234567/.former"
+        path.rename(folder / "aside")
+        write("new")
         former.mkdir(parents=True)
         (former.parent / ".lock").touch()
-        path.rename(former / "artifact")
-        write("new")
+        (folder / "aside").rename(former / "artifact")
         is_killed = killed_before(line, lambda: processes.remove_leftovers(folder))
         shutil.rmtree(path)  # by Snakemake, for instance
     else:
@@ -129,11 +132,11 @@ def writers(tmp_path, request) -> Iterator[list[subprocess.Popen]]:
 
 def test_unfinished_files_are_kept_while_their_writer_lives_in_any_container(tmp_path, writers):
     assert remove_leftovers(tmp_path) == []
-    for left in (1, 0):
+    for left, clean_up in ((1, remove_leftovers), (0, lambda folder: write_text(folder / "scene/next", ""))):
         writers[left].send_signal(signal.SIGKILL)
         writers[left].wait()
-        assert len(remove_leftovers(tmp_path)) == 1
-        assert len(list((tmp_path / "scene").iterdir())) == left
+        clean_up(tmp_path)
+        assert len(list((tmp_path / "scene").glob(".*"))) == left
 
 
 def test_only_folders_of_unfinished_files_of_this_host_are_removed(tmp_path):
@@ -146,8 +149,14 @@ def test_only_folders_of_unfinished_files_of_this_host_are_removed(tmp_path):
     for path in kept:
         path.mkdir()
     (of_user / "drawing.png").touch()
+    (of_others := tmp_path / "of_others").mkdir()
+    for name in (".lock", "drawing.png"):
+        (of_others / name).touch()
+    kept.append(folder / f".writing-{host_token()}-fedcba98")
+    kept[-1].symlink_to(of_others)
     assert remove_leftovers(tmp_path) == [leftover]
     assert sorted(folder.iterdir()) == sorted(kept)
+    assert (of_others / "drawing.png").exists()
     assert remove_leftovers(tmp_path / "nowhere") == []
 
 
@@ -166,6 +175,18 @@ def test_a_writer_whose_folder_is_removed_before_it_is_locked_takes_another(
     monkeypatch.setattr(module, name, after_a_clean_up)
     write_text(tmp_path / "a", "text")
     assert [path.read_text() for path in tmp_path.iterdir()] == ["text"]
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ESTALE, errno.EOPNOTSUPP])
+def test_a_folder_that_cannot_be_locked_is_deleted_and_the_users_file_is_named(tmp_path, monkeypatch, number):
+    def refuse(*arguments):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("fcntl.flock", refuse)
+    with pytest.raises(OSError, match=os.strerror(number)) as refusal:
+        write_text(tmp_path / "a", "text")
+    assert str(system_error(refusal.value)).startswith(f"{tmp_path / 'a'} cannot be")
+    assert not list(tmp_path.iterdir())
 
 
 def test_every_name_that_fits_a_folder_can_be_written(tmp_path):

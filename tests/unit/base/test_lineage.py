@@ -7,7 +7,13 @@ import pytest
 from hilsplat.base.artifacts import RUN, rebuild_command, write_json
 from hilsplat.base.atomic import work_folder
 from hilsplat.base.errors import MisalignedArtifactError
-from hilsplat.base.lineage import require_made_from, sha256_of_bytes, sha256_of_json, sha256_of_path
+from hilsplat.base.lineage import (
+    require_made_from,
+    sha256_of_bytes,
+    sha256_of_json,
+    sha256_of_path,
+    visible_files,
+)
 from tests.unit.artifact_changes import write_record
 
 
@@ -53,3 +59,12 @@ def test_the_command_that_rebuilds_a_file_names_the_artifact_that_records_it(tmp
     for path in (images, images / "000.png", images.parent / "truth/labels/000.png"):
         assert rebuild_command(path) == command
     assert rebuild_command(images.parent) == "rerun the stage that writes it"
+
+
+def test_folders_that_link_to_each_other_are_read_once_each_way(tmp_path):
+    for folder, other in (("a", "all"), ("all", "a")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / f"of_{folder}.png").touch()
+        (tmp_path / folder / other).symlink_to(tmp_path / other)
+    found = [path.relative_to(tmp_path).as_posix() for path in visible_files(tmp_path)]
+    assert found == ["a/all/of_all.png", "a/of_a.png", "all/a/of_a.png", "all/of_all.png"]

@@ -1,5 +1,6 @@
 """Pools of processes, and jobs that end with their workflow."""
 
+import errno
 import os
 import select
 import shlex
@@ -142,6 +143,15 @@ def test_under_a_debugger_items_are_computed_in_the_main_thread():
 
 def end_by_signal(number: int) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_machine_without_shared_memory_is_explained(monkeypatch):
+    def refuse(*arguments, **options):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr("multiprocessing.synchronize.SemLock.__init__", refuse)
+    with pytest.raises(HilsplatError, match=r"Read-only file system(.|\n)*/dev/shm"):
+        list(in_processes(divmod, [(1, 1), (2, 1)], 2))
 
 
 def test_a_killed_process_of_a_pool_is_explained():

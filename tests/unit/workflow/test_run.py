@@ -66,6 +66,16 @@ def unlocked(monkeypatch) -> list[str]:
     return found
 
 
+def test_init_writes_what_is_missing_beside_the_sheet_of_new_or_after_a_full_disk(folder):
+    sheet, config = Path("config/scenes.tsv"), Path("config/config.yaml")
+    before = sheet.read_text()
+    config.unlink()
+    assert runs.start_project(Path()) == [config]
+    assert sheet.read_text() == before
+    with pytest.raises(HilsplatError, match=r"config\.yaml already exists"):
+        runs.start_project(Path())
+
+
 def value(command: list[str], option: str) -> str:
     return command[command.index(option) + 1]
 
