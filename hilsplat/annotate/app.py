@@ -194,7 +194,6 @@ class Annotator:
         self.drawing = ThreadPoolExecutor(1, thread_name_prefix="drawing")  # so that saving doesn't wait
 
     def app(self, token: str) -> Guard:
-        """Return the guarded application."""
         get, post = self.thread.get, self.thread.post
         routes = [
             *self.files,

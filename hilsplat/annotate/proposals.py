@@ -179,7 +179,6 @@ class Proposals:
 
 
 def _visible_mass(weights: sp.csr_matrix) -> np.ndarray:
-    """Return the visible mass of each Gaussian, px."""
     return np.asarray(weights.sum(axis=0)).ravel()
 
 

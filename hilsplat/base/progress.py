@@ -47,7 +47,6 @@ def last_progress(log: Path) -> tuple[str, int, int] | None:
 
 
 def warnings_in(log: Path) -> list[str]:
-    """Return the warnings in a stage's log."""
     return [match["text"].rstrip() for match in WARNING.finditer(_tail(log, sys.maxsize))]
 
 

@@ -140,7 +140,6 @@ class Output:
 
 
 def drawn_weights(gaussians: Gaussians, camera: Camera, *, min_weight: float, threads: int) -> sp.csr_matrix:
-    """Return the normalised weights of Gaussians in a view."""
     return normalised_weights(pixel_weights(gaussians, camera, min_weight=min_weight, threads=threads))
 
 

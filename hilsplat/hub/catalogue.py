@@ -38,8 +38,6 @@ WHOLES = ("onnx/model", "model")
 
 @dataclass(frozen=True)
 class ModelRequest:
-    """A model to download."""
-
     name: str  # name of the model folder
     repository: str  # owner/name on the hub
     release: Release | None
@@ -74,8 +72,6 @@ def networks_of(kind: str) -> list[tuple[str, ...]]:
 
 @dataclass(frozen=True)
 class HubFile:
-    """A file as listed by the hub."""
-
     path: str
     size: int
     digest: str  # pinned or listed: SHA-256 (64 digits), or git's SHA-1 of a small file (40 digits)

@@ -66,8 +66,6 @@ class Preprocessing(BaseModel):
 
 @dataclass(frozen=True)
 class ModelFolder:
-    """A complete model folder."""
-
     folder: Path
     layout: str  # key of `LAYOUTS`
     config: dict[str, Any]

@@ -241,7 +241,6 @@ def _repeat(steps: list[Step], values: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def host_tensor(tensor: Any) -> Tensor:
-    """Return a tensor of a graph on the host."""
     return torch.from_numpy(np.array(onnx.numpy_helper.to_array(tensor)))
 
 

@@ -44,7 +44,6 @@ class NodeNames:
 
 
 def tree_digest(semantic_tree: Path) -> str:
-    """Return the digest that identifies a semantic tree."""
     return sha256_of_file(Path(semantic_tree) / "tree.npz")
 
 

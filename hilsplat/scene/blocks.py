@@ -78,7 +78,6 @@ class Blocks:
 
 
 def nearest(places: Float[np.ndarray, "n 3"], centres: Float64[np.ndarray, "K 3"]) -> Int64[np.ndarray, " n"]:
-    """Return the row of the nearest centre of each place."""
     distances = [np.square(places - centre).sum(axis=1) for centre in centres]
     return np.argmin(distances, axis=0)
 

@@ -33,7 +33,6 @@ HARMONIC_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])
 
 
 def fractional_bits(gaussians: Gaussians) -> int:
-    """Return the number of fractional bits of positions."""
     away = np.linalg.norm(gaussians.means - np.median(gaussians.means, axis=0), axis=1)
     spread = float(np.median(away)) or 1.0
     return int(np.clip(np.ceil(np.log2(STEPS_PER_SPREAD / spread)), 0, 22))

@@ -153,7 +153,6 @@ class ViewerScene(ShownScene):
         return scene
 
     def parts(self, variant: str) -> SceneParts:
-        """Return the paths of the parts of an opened variant."""
         return self._variants[variant][0]
 
     def rename(self, semantic_tree: Path, names: NodeNames) -> None:
@@ -218,7 +217,6 @@ class ViewerScene(ShownScene):
         return faded(self.gaussians, ~self.marked(removed)) if removed else self.gaussians
 
     def spz(self, rows: np.ndarray) -> bytes:
-        """Return the given Gaussians as SPZ."""
         return spz_bytes(self.gaussians, rows, self._bits)
 
     @cached_property

@@ -211,7 +211,6 @@ class SceneThread(Generic[Shown]):
 
 
 def _photo(shown: ShownScene, path: Mapping[str, Any]) -> Response:
-    """Return an undistorted photograph."""
     file = shown.scene.image_path(view_name(shown.scene, path["number"]))
     with shown.unchanged(*shown.photographs):
         return plain(file.read_bytes(), "image/png", cached=True)

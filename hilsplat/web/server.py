@@ -74,7 +74,6 @@ async def _refused(request: Request, error: Exception) -> Response:
 
 
 def as_json(value: Any) -> bytes:
-    """Encode a value as compact JSON."""
     return json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
 
 
@@ -97,7 +96,6 @@ def answer(content: Any) -> Response:
 
 
 def plain(data: bytes, kind: str, status: int = 200, *, cached: bool = False) -> Response:
-    """Return a response with bytes."""
     lasting = "private, max-age=3600" if cached else "no-store"
     return Response(data, status, headers={"content-type": kind, "cache-control": lasting})
 

@@ -95,7 +95,6 @@ def find_parts(folder: Path, named: dict[str, Path | None], settings: StageSetti
 
 
 def _poses(folder: Path, named: Path | None, settings: StageSettings, parts: Parts) -> Views:
-    """Read the poses."""
     known = layouts.find_known_poses(folder, named)
     if named is not None and (named != layouts.NO_POSES or layouts.has_known_poses(folder)):
         parts.columns["poses"] = named if named == layouts.NO_POSES else named.resolve()

@@ -43,7 +43,6 @@ class SamBatch:
     truth: Float[Tensor, "B P 3 K"]  # share of each of these mask pixels in the prompted region, per head
 
     def to(self, device: torch.device) -> "SamBatch":
-        """Return the batch on a device."""
         return SamBatch(**{field.name: getattr(self, field.name).to(device) for field in fields(self)})
 
 

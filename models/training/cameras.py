@@ -12,7 +12,6 @@ from hilsplat_world.views import Sight, on_sphere, square_camera
 
 
 def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int) -> Camera:
-    """Return a random view of a training scene."""
     draw = {"tabletop": _table_sight, "room": _room_sight, "street": _street_sight}[scene.kind]
     sight, fov_deg = draw(scene, rng)
     return square_camera(sight, image_px, fov_deg)

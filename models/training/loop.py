@@ -100,8 +100,6 @@ class Tuning:
 
 @dataclass
 class Progress:
-    """Progress of a training."""
-
     step: int = 0  # number of finished steps
     minutes: float = 0.0  # their duration over all runs
     decay_from: int = -1  # first step of the learning rate decay, -1 before it

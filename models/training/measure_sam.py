@@ -27,7 +27,6 @@ PER_LEVEL = 8  # maximum number of regions scored per view and level
 
 
 def mean_or_zero(values: Sequence[float] | Shaped[np.ndarray, " n"]) -> float:
-    """Return the mean, or 0 if there are no values."""
     return float(np.mean(values)) if len(values) else 0.0
 
 

@@ -70,8 +70,6 @@ def trace_polygons(mask: Bool[np.ndarray, "H W"]) -> list[Int[np.ndarray, "_ 2"]
 
 @dataclass(frozen=True, eq=False)
 class IsatObject:
-    """One annotated object."""
-
     category: str  # the text, in composed Unicode
     polygons: tuple[Float[np.ndarray, "_ 2"], ...]  # vertices, px; the region is their filled union
     box_xyxy: Int64[np.ndarray, " 4"]  # whole pixels inside the annotated box, borders included

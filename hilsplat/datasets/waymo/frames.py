@@ -50,8 +50,6 @@ class LidarFrame:
 
 @dataclass(frozen=True, eq=False)
 class WaymoCamera:
-    """One camera of the car."""
-
     name: str
     # f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3: px with the first pixel's left edge at 0, OpenCV's distortion
     intrinsic: Float[np.ndarray, " 9"]

@@ -48,8 +48,6 @@ pooled: counts of all scenes are summed first, so each scene is weighted by its 
 
 @dataclass(frozen=True)
 class ProtocolCard:
-    """One protocol."""
-
     full_name: str  # `benchmark/variant@version`; a change below that affects the numbers needs a new version
     metrics: tuple[str, ...]
     averaging: Averaging

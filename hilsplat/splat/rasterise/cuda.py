@@ -25,8 +25,6 @@ EVERYTHING = 2**31 - 1  # a number larger than any tile's batch index
 
 
 class CardCamera(NamedTuple):
-    """Camera on the device."""
-
     size_hw: tuple[int, int]
     pose: Float[Tensor, "1 4 4"]  # cam_from_world
     K: Float[Tensor, "1 3 3"]
