@@ -81,11 +81,7 @@ class LanguageScene(NodeQueries):
 
     @staticmethod
     def from_parts(
-        parts: SceneParts,
-        settings: EvaluateSettings,
-        *,
-        threads: int = 1,
-        opened: Opened | None = None,
+        parts: SceneParts, settings: EvaluateSettings, *, threads: int = 1, opened: Opened | None = None
     ) -> "LanguageScene":
         """Read each artifact of a scene once, except node names, and check that the artifacts match.
 

@@ -34,9 +34,7 @@ STEPS = 32767
 
 
 def margins(
-    embeddings: Float[np.ndarray, "B C"],
-    texts: Float[np.ndarray, "T C"],
-    canonical: Float[np.ndarray, "K C"],
+    embeddings: Float[np.ndarray, "B C"], texts: Float[np.ndarray, "T C"], canonical: Float[np.ndarray, "K C"]
 ) -> Float32[np.ndarray, "T B"]:
     """Return the cosine with each text minus the cosine with the nearest canonical phrase, in [-2, 2].
 

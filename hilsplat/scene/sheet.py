@@ -100,11 +100,7 @@ def project_root(sheet: Path) -> Path:
 
 
 def read_sheet(
-    path: Path,
-    checked_groups: Collection[str] | None = None,
-    data_root: str = "",
-    *,
-    text: str | None = None,
+    path: Path, checked_groups: Collection[str] | None = None, data_root: str = "", *, text: str | None = None
 ) -> list[SceneRow]:
     """Read and check the scene sheet: tab-separated, with one header line and `#` for comment lines.
 

@@ -118,10 +118,7 @@ def painted(
 
 
 def within(
-    means: Float32[np.ndarray, "N 3"],
-    camera: Camera,
-    points: Sequence[tuple[float, float]],
-    radius: float,
+    means: Float32[np.ndarray, "N 3"], camera: Camera, points: Sequence[tuple[float, float]], radius: float
 ) -> Bool[np.ndarray, " N"]:
     """Return which points of the scene are projected into a region of a view, up to its pixels.
 

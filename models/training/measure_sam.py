@@ -103,10 +103,7 @@ def measure_sam(
         }
         for size, (least, below) in SIZES.items():
             of_size = values[(values[:, 3] >= least) & (values[:, 3] < below), 0]
-            report[level.label] |= {
-                f"iou_{size}": mean_or_zero(of_size),
-                f"n_{size}": len(of_size),
-            }
+            report[level.label] |= {f"iou_{size}": mean_or_zero(of_size), f"n_{size}": len(of_size)}
     return report
 
 
