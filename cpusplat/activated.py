@@ -11,8 +11,7 @@ MAX_DEGREE = 3
 MIN_OPACITY, MAX_OPACITY = 1e-12, 1 - 2**-24
 """Opacities are clipped to this range, in which they have a logit; smaller ones are not drawn anyway."""
 MIN_SCALE = 1e-30
-MAX_SIGMAS = 3.33
-"""Radii in units of the standard deviation of opaque Gaussians (gsplat)."""
+MAX_SIGMAS = 3.33  # radii in units of the standard deviation of opaque Gaussians (gsplat)
 
 
 def as_array(name: str, values: Any, *shape: int | None, dtype: type = np.float32) -> np.ndarray:

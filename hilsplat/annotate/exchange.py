@@ -40,8 +40,7 @@ from hilsplat.web.coco import coco_content, coco_region
 logger = logging.getLogger(__name__)
 
 Kind = Literal["hilsplat", "isat", "labelme", "coco"]
-OURS = {"level", "parent", "origin"}
-"""Our extra keys in the other formats."""
+OURS = {"level", "parent", "origin"}  # our extra keys in the other formats
 
 
 def exported(kind: Kind, known: Mapping[str, Sequence[Label]], cameras: Cameras) -> bytes:
@@ -184,8 +183,7 @@ POLYGONS = {"polygon", "oriented_rectangle", "rotation", "quadrilateral"}
 """Shape types of labelme, and of X-AnyLabeling, which has the same format."""
 
 
-Photos = Mapping[str, Mapping[str, Any]]
-"""Entries of `registration.json`, by view."""
+Photos = Mapping[str, Mapping[str, Any]]  # entries of `registration.json`, by view
 
 
 class Piece(NamedTuple):

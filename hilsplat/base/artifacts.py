@@ -39,8 +39,7 @@ OTHER_VERSION = " was written by a different version of hilsplat"
 RECORD = ".provenance.json"
 """Ending of the name of a provenance record, which begins with the artifact's name."""
 
-RUN = ".run.json"
-"""Hidden file in a results folder that records the options of the run that writes to it."""
+RUN = ".run.json"  # hidden file in a results folder that records the options of the run that writes to it
 
 
 def provenance_path(artifact: Path) -> Path:

@@ -23,14 +23,12 @@ from hilsplat.evaluate.protocols.views import consistency_rows
 from hilsplat.evaluate.scores import Measured
 from hilsplat.evaluate.tables.means import metric_means
 
-METHOD = "files"
-"""Method in the score rows; the variant is the program's name."""
+METHOD = "files"  # method in the score rows; the variant is the program's name
 
 WORDS = "masks of files"
 """Bracketed suffix of a protocol's name: masks were supplied, so the protocol's map rule was not applied."""
 
-MASK_METRICS = (*cards.MASK, "acc_25", "acc_50")
-"""Metrics of masks; localization needs relevancy maps."""
+MASK_METRICS = (*cards.MASK, "acc_25", "acc_50")  # metrics of masks; localization needs relevancy maps
 
 OF_EVERY_TEXT = (cards.LERF_LANGSPLAT, cards.LERF_OPENGAUSSIAN)
 """Protocols that score every text of a view, merged over levels."""

@@ -34,8 +34,7 @@ logger = logging.getLogger(__name__)
 MAX_CAMERA_ERROR_M = 0.1
 """Median camera error above which point scores are meaningless and a warning is logged."""
 
-TIMED_TEXTS = 3
-"""Number of timed queries, all in one view."""
+TIMED_TEXTS = 3  # number of timed queries, all in one view
 
 Annotations = LabelledScene | PointScene | Truth
 """Labels of a published data set, or the ground truth of a generated scene."""

@@ -38,8 +38,7 @@ from hilsplat.splat.rasterise.rendering import Rendering, render
 
 logger = logging.getLogger(__name__)
 
-BEST_VIEWS = 3
-"""Maximum number of best views of an answer."""
+BEST_VIEWS = 3  # maximum number of best views of an answer
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,7 @@ from hilsplat.query.relevancy import margins
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import EvaluateSettings, QuerySettings
 
-CANDIDATES = 5
-"""Number of texts stored for each node, best first."""
+CANDIDATES = 5  # number of texts stored for each node, best first
 
 STANDS_OUT = 0.5
 """Minimum lead of a name's margin over that of the fifth-nearest text (nearer texts include synonyms), in

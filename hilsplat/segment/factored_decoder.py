@@ -39,8 +39,7 @@ from hilsplat.segment.decoder_weights import DecoderGraph, Linear
 LOG2_E = np.float32(1 / np.log(2))  # converts scores to base 2
 BLOCK = 64
 """Maximum pixels per block. A block's arrays fit into a core's L2 cache; 128 and 256 are 2 % slower."""
-PROMPTS = 16
-"""Prompts per call, applied to each block one after the other while the block is in the cache."""
+PROMPTS = 16  # prompts per call, applied to each block one after the other while the block is in the cache
 HEADS_PER_ATTENTION = 8  # if the model's configuration doesn't specify them
 
 

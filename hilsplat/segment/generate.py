@@ -27,14 +27,12 @@ from hilsplat.settings import MasksSettings
 
 LOOSE = 0.1
 """Masks below this predicted IoU or stability (or the settings' threshold, if lower) are not cached."""
-BAND_PX = 3
-"""Logits within this many low-resolution pixels of a mask's edge are kept (see `Candidates`)."""
+BAND_PX = 3  # logits within this many low-resolution pixels of a mask's edge are kept (see `Candidates`)
 REPEAT_IOU = 0.95
 """A preview mask repeats a better one if the IoU of their boxes exceeds this (`distinct_prompts`)."""
 REPEAT_SLACK = 0.05
 """Amount by which a repeated mask's preview stability (from few pixels) may exceed the better mask's."""
-CROP_OVERLAP = 512 / 1500
-"""Overlap of the first layer's crops, as a share of the image's shorter side (SAM)."""
+CROP_OVERLAP = 512 / 1500  # overlap of the first layer's crops, as a share of the image's shorter side (SAM)
 CROP_EDGE_PX = 20
 """A mask is truncated if its box is at most this far from a crop edge that isn't an image edge (SAM)."""
 

@@ -8,8 +8,7 @@ from jaxtyping import Float, Float32, Int64, UInt64
 from hilsplat.base.arrays import require_arrays
 from hilsplat.base.errors import SettingsError
 
-SH_0 = 0.28209479177387814
-"""Value of the constant harmonic."""
+SH_0 = 0.28209479177387814  # value of the constant harmonic
 
 
 @dataclass(frozen=True)

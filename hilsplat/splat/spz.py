@@ -26,8 +26,7 @@ HARMONIC_STEP = 8
 COLOUR_SCALE = 0.15
 GZIP_LEVEL = 6
 
-FLIPPED = np.array([1, -1, -1])
-"""Signs that convert our axes (x right, y down, z forward) to those of SPZ."""
+FLIPPED = np.array([1, -1, -1])  # signs that convert our axes (x right, y down, z forward) to those of SPZ
 HARMONIC_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])
 """Sign of each non-constant harmonic when y and z are negated."""
 

@@ -37,8 +37,7 @@ from hilsplat.viewer.frames import Paint, faded, painted, pick
 from hilsplat.viewer.wire import MAX_GAUSSIANS, MAX_NODES, Style, rows_of
 from hilsplat.web.scene_thread import ShownScene
 
-VIEWS_MIB = 256.0
-"""Memory limit for cached per-view results, such as compositing weights."""
+VIEWS_MIB = 256.0  # memory limit for cached per-view results, such as compositing weights
 
 CACHED_RELEVANCIES = 8
 """Number of cached field relevancies (per variant, text and level), each with one byte per Gaussian."""

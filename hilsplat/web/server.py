@@ -34,8 +34,7 @@ STATUS: dict[type, int] = {
 }
 """HTTP status of each error that is sent to the page."""
 
-OWN_PORTS = range(20_000, 30_000)
-"""Ports of pages, below those that Linux and macOS assign to other programs."""
+OWN_PORTS = range(20_000, 30_000)  # ports of pages, below those that Linux and macOS assign to other programs
 
 Ready = Callable[[str], None]
 """Called once a page can be opened, with the text to print, which contains the address."""

@@ -32,8 +32,7 @@ from hilsplat.workflow.scene_data import Job
 KEPT = ("Nothing to be done", "This was a dry-run")
 """Beginnings of the messages of Snakemake that are printed although they are no warnings."""
 
-PLANNED = frozenset({"run_info", "job_info", "shellcmd"})
-"""Events that a dry run prints."""
+PLANNED = frozenset({"run_info", "job_info", "shellcmd"})  # events that a dry run prints
 
 FOLLOWING = ("At least one job did not complete", "Exiting because a job execution failed")
 """Parts of errors that only repeat that a job has failed."""
@@ -43,11 +42,9 @@ COMMAND_FAILED = "CalledProcessError"
 
 TARGETS = ("all", "everything", "tables", "total")  # entries of the job counts that are not jobs
 
-QUERIED = (stages.semantic_tree.file, stages.clip.file)
-"""Artifacts of a variant that queries need."""
+QUERIED = (stages.semantic_tree.file, stages.clip.file)  # artifacts of a variant that queries need
 
-SIGKILL = ("died with <Signals.SIGKILL", "exit status 137")
-"""How Snakemake reports a job that was killed."""
+SIGKILL = ("died with <Signals.SIGKILL", "exit status 137")  # how Snakemake reports a job that was killed
 
 STARTED = 0.1
 """Share of a loop from which its speed predicts the rest; before, start-up and compilation dominate."""

@@ -18,8 +18,7 @@ Word = TypeVar("Word")
 
 PARENT_CONTRAST = 24.0  # minimum distance in L*a*b* between a subpart and its part
 
-NEIGHBOUR_CONTRAST = 11.0
-"""Minimum distance in L*a*b* between other adjacent parts and subparts of an object."""
+NEIGHBOUR_CONTRAST = 11.0  # minimum distance in L*a*b* between other adjacent parts and subparts of an object
 
 CORNERS = ((-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0))  # signs of x and y, for legs and wheels
 

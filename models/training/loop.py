@@ -22,8 +22,7 @@ from hilsplat.base.errors import ArtifactError
 logger = logging.getLogger(__name__)
 
 Batch = TypeVar("Batch")
-Curve = list[dict[str, float]]
-"""Learning curve: rows with equal keys; the first key is `step`."""
+Curve = list[dict[str, float]]  # learning curve: rows with equal keys; the first key is `step`
 
 DECAY_SHARE = 0.25  # final share of a budget, during which the learning rate decays
 

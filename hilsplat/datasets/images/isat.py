@@ -24,8 +24,7 @@ from hilsplat.scene.layouts import read_json_object
 
 Polygon = Float[np.ndarray, "_ 2"] | Int[np.ndarray, "_ 2"] | Sequence[tuple[int, int]]
 
-BACKGROUND = "__background__"
-"""ISAT's category of regions that belong to no object, such as holes."""
+BACKGROUND = "__background__"  # ISAT's category of regions that belong to no object, such as holes
 
 MAX_SIDE_PX = 20_000
 """Limit on the image size stated in a label file; drawing regions at a wrong size could exhaust memory."""

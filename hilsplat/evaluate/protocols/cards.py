@@ -31,8 +31,7 @@ STATED: dict[str, tuple[Any, Callable[[Any], str]]] = {
 }
 """Setting of `evaluate` -> the value under which the cards hold, and words for any other value in names."""
 
-MIN_REGION_PX = 60
-"""Minimum area of a scored region of a generated scene; published labels have no minimum."""
+MIN_REGION_PX = 60  # minimum area of a scored region of a generated scene; published labels have no minimum
 
 Averaging = Literal["pairs", "classes", "levels", "views", "scenes", "pooled"]
 """How rows are averaged into one number of a table.

@@ -47,11 +47,9 @@ MAP_RULE = ("filter_px", "mix", "relevancy_threshold", "threshold_on", "majority
 MAPS_OF_NODES = ("filter_px", "mix")
 """Settings that change localization and diagnostics of nodes, which are selected without thresholds."""
 
-NODES = ("node_select", "ancestors")
-"""Settings that change which nodes answer a text, or a path of one text."""
+NODES = ("node_select", "ancestors")  # settings that change which nodes answer a text, or a path of one text
 
-RELEVANCY = ("canonical", "template", "relevancy_scale")
-"""Settings that change the relevancy itself."""
+RELEVANCY = ("canonical", "template", "relevancy_scale")  # settings that change the relevancy itself
 
 
 def rule_of(settings: EvaluateSettings) -> RelevancyRule:
