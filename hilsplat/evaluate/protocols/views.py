@@ -80,11 +80,6 @@ def given_key(method: str, query: Query) -> tuple[Any, ...]:
     return (method, cards.LEVEL_GIVEN.name, query.text, query.level)
 
 
-def text_departures(settings: EvaluateSettings) -> list[str]:
-    """Return a description of the prompt template, which changes every cosine, unless it is the default."""
-    return departures(settings, ("template",))
-
-
 def measure_view(
     selections: Selections,
     truth: ViewTruth,
