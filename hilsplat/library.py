@@ -49,7 +49,6 @@ from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply, save_ply
 
 FRAMES = 60  # maximum number of frames of videos, as in `hilsplat new`
-
 GIVEN = "given"  # kind of Gaussians that `link` stored, in the JSON file beside the PLY
 
 logger = logging.getLogger(__name__)

@@ -40,7 +40,6 @@ from hilsplat.web.scene_thread import SceneThread, ShownScene
 from hilsplat.web.server import Ready, answer, files_of, guarded, plain, read, serve, version_sent, view_name
 
 SCORES = 3  # maximum number of mean scores that the page shows
-
 MAX_BODY_BYTES = 16 << 20  # maximum size of a request, enough for a COCO file of a whole scene
 
 

@@ -21,7 +21,6 @@ from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.base.files import regular
 
 ZIP64_BYTES = 2**30  # arrays above this size get an archive entry that may exceed 2 GiB
-
 INDEX = "index.json"  # written last in a folder artifact, so its presence means that the folder is complete
 
 SEALED = (".json", ".npy", ".npz", ".png", ".safetensors")

@@ -28,7 +28,6 @@ class LogFormatter(logging.Formatter):  # noqa: TID251
 
 
 LOG_EVERY_S = 5.0  # seconds between progress lines if stderr is not a terminal
-
 BARS = ContextVar("bars", default=True)  # whether loops show bars on a terminal
 
 LOG_TAIL_BYTES = 20_000

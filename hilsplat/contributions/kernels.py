@@ -6,7 +6,6 @@ from cpusplat.compiled import compiled
 from cpusplat.lanes import WIDTH, add_products, lanes, load, plus, prefetch, store
 
 SUMS = 4  # number of sums per pair that are stored as one vector: one per level, plus padding
-
 AHEAD = 8  # weights of W are fetched into the cache this many pixels before they are needed
 
 PLACE = np.uint64(2**32 - 1)

@@ -24,7 +24,6 @@ from hilsplat.models.store import model_path
 OTHER_FOLDER = "choose a folder in a layout listed in docs/models.md"
 WHOLE_COPY = "fetch a complete copy"
 SWITCHES = ("do_resize", "do_rescale", "do_normalize")  # preprocessing steps that our code always performs
-
 SAM_SIDE_PX = 1024  # default of `size`
 MAX_SIDE_PX = 4096
 

@@ -50,7 +50,6 @@ USUAL_RATE = 30.0  # assumed frames per second for files without a frame rate or
 NUM_CORNERS = 300
 PYRAMID_LEVELS = 4
 LOST = 0.25  # displacement, as a share of the diagonal, assumed if too few corners can be tracked
-
 MIN_FOLLOWED = 20  # minimum number of corners tracked forwards and backwards for a valid measurement
 
 

@@ -25,7 +25,6 @@ from hilsplat.splat.gaussians import morton_order
 from hilsplat.splat.spz import fractional_bits, spz_bytes
 
 LISTED = 10  # maximum number of answers in a report
-
 MAX_NAME_BYTES = 80  # maximum length of the query's own text in a folder name, bytes
 
 

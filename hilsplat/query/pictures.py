@@ -24,7 +24,6 @@ RELEVANCY_COLOURS = "inferno"
 
 DPI = 110
 TITLE_LETTERS = 110  # maximum number of characters per line of a panel's title
-
 MAX_POINTS = 30_000  # maximum number of Gaussians drawn in a top-down map
 
 

@@ -21,9 +21,7 @@ ROWS_AT_A_TIME = 1 << 16
 """Number of embeddings or pixels processed at once; it limits the size of products with many texts."""
 
 ERROR = 2e-3  # maximum relevancy error at any pixel if the code is a network
-
 RESIDUAL = 5e-5  # maximum root mean square of the decoded vectors' component outside the stored directions
-
 SAMPLE = 8192  # number of latents in the sample from which the directions are computed
 
 STEPS = 32767

@@ -26,7 +26,6 @@ PHOTO_FOLDERS = ("images", "input")
 """Folders of photographs: COLMAP's and nerfstudio's, then that of 3DGS's `convert.py`."""
 
 POSES_BOUNDS = "poses_bounds.npy"  # pose file of LLFF
-
 NO_POSES = Path("none")  # value used instead of a path to ignore the poses in the folder
 
 DATAPARSER = "dataparser_transforms.json"

@@ -11,7 +11,6 @@ from hilsplat.scene.features import LARGE_CAPTURE, MIN_INLIERS, incremental_opti
 from hilsplat.scene.sheet import MIN_PHOTOS
 
 INIT_MIN_INLIERS = 50  # minimum number of matches in a model's first pair (COLMAP: 100)
-
 POSE_MIN_INLIERS = 15  # minimum number of visible points needed to pose each additional view (COLMAP: 30)
 
 STARTS = 5

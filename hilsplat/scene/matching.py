@@ -20,9 +20,7 @@ from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.kernels import two_nearest
 
 MAX_ANGLE = 0.7  # maximum angle between matching descriptors, radians (as in COLMAP)
-
 MAX_RATIO = 0.8  # maximum ratio of the angles to the nearest and the second-nearest descriptor (as in COLMAP)
-
 MIN_MATCHES = 15  # minimum number of matches for a pair to count as matched (as in COLMAP)
 
 _CHANNELS = 128

@@ -41,7 +41,6 @@ LOST_PICTURE = "not_registered.png"
 """Picture written beside the scene folder if too few photographs were registered."""
 
 FEW_FEATURES = 30  # with fewer features, a photograph rarely has `MIN_INLIERS` verified matches
-
 NEIGHBOURS = 3  # number of registered photographs listed as neighbours of each unregistered one
 
 MAX_ROWS = 12

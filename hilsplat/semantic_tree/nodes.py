@@ -19,7 +19,6 @@ from hilsplat.semantic_tree.view_pairs import ViewPairs, view_pairs
 from hilsplat.settings import SemanticTreeSettings
 
 MIN_VISIBLE_PX = 0.3  # a Gaussian counts as visible in a view if its mass there exceeds this
-
 SAMPLED_VIEWS = 8  # number of views whose pairs of masks are counted to estimate the memory of all pairs
 
 PAIR_BYTES, LINKED_PAIR_BYTES = 80, 40

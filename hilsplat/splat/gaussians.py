@@ -59,7 +59,6 @@ def base_rgb(sh: Float32[np.ndarray, "N K 3"]) -> Float32[np.ndarray, "N 3"]:
 
 
 FIELDS = tuple(field.name for field in fields(Gaussians))  # names of the parameter fields
-
 BITS = 21  # bits per coordinate; three coordinates use 63 of a key's 64 bits
 
 

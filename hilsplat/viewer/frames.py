@@ -30,7 +30,6 @@ MARKED_SHARE = np.float32(0.7)
 """Colour of Gaussians selected for editing, and its weight; `styles.js` has the same numbers."""
 
 NEAR = 0.01  # minimum depth of a Gaussian that can be selected, as in the rasteriser
-
 SEEN = 0.05  # minimum alpha of a pixel that can be picked
 
 

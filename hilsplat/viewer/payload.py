@@ -20,7 +20,6 @@ from hilsplat.viewer.wire import Question
 from hilsplat.web.server import view_name
 
 CHUNK = 65_536  # Gaussians per chunk: 16 rows of the page's textures
-
 ALIKE = 24  # maximum number of similar nodes in an answer
 
 

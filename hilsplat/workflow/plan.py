@@ -41,7 +41,6 @@ MIN_PHOTOGRAPHS = 16
 """Minimum number of photographs for key views; with fewer, the key views (half) would link too few masks."""
 
 SCORED = "evaluate"  # the stage that reads everything that a variant may change
-
 Option = Callable[[Any], Any]  # an option of a stage's command: a function of the wildcards
 
 

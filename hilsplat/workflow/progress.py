@@ -41,9 +41,7 @@ COMMAND_FAILED = "CalledProcessError"
 """Part of an error that quotes the command of a failed job, just before the event of its failure."""
 
 TARGETS = ("all", "everything", "tables", "total")  # entries of the job counts that are not jobs
-
 QUERIED = (stages.semantic_tree.file, stages.clip.file)  # artifacts of a variant that queries need
-
 SIGKILL = ("died with <Signals.SIGKILL", "exit status 137")  # how Snakemake reports a job that was killed
 
 STARTED = 0.1

@@ -23,7 +23,6 @@ logger = logging.getLogger(__name__)
 
 Batch = TypeVar("Batch")
 Curve = list[dict[str, float]]  # learning curve: rows with equal keys; the first key is `step`
-
 DECAY_SHARE = 0.25  # final share of a budget, during which the learning rate decays
 
 

@@ -48,7 +48,6 @@ MAPS_OF_NODES = ("filter_px", "mix")
 """Settings that change localization and diagnostics of nodes, which are selected without thresholds."""
 
 NODES = ("node_select", "ancestors")  # settings that change which nodes answer a text, or a path of one text
-
 RELEVANCY = ("canonical", "template", "relevancy_scale")  # settings that change the relevancy itself
 
 
