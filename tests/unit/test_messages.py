@@ -30,8 +30,7 @@ PROSE = {
     "in",
 }
 """What follows the name in sentences about hilsplat."""
-TO_SNAKEMAKE = {"--config"}
-"""Options of Snakemake that messages suggest after `--`."""
+TO_SNAKEMAKE = {"--config"}  # options of Snakemake that messages suggest after `--`
 
 
 def texts_of(path: Path) -> list[str]:

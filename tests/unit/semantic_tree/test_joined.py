@@ -43,8 +43,7 @@ REGIONS = (
 PICTURE = painted(REGIONS, (HEIGHT, LENGTH))
 
 BORDER = 58
-OTHERWISE = {"pen": (56, 80)}
-"""Columns of masks that differ in the first block, which reach over the border."""
+OTHERWISE = {"pen": (56, 80)}  # columns of masks that differ in the first block, which reach over the border
 
 VIEWS = tuple(f"{view:03d}.png" for view in range((LENGTH - WINDOW) // STEP + 1))
 DISTANCE = 30.0
