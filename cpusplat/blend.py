@@ -61,7 +61,8 @@ GROUP = 4  # number of channels that are summed together in registers
 
 _NUMBERS = np.arange(LANES, dtype=np.float32)
 _X = np.repeat(BLOCK_X, LANES) + np.tile(_NUMBERS % 4, BLOCKS)
-_Y = np.repeat(BLOCK_Y, LANES) + np.tile(_NUMBERS // 4, BLOCKS)  # pixel centres of a tile, block by block
+_Y = np.repeat(BLOCK_Y, LANES) + np.tile(_NUMBERS // 4, BLOCKS)
+"""Pixel centres of a tile, block by block."""
 
 
 @compiled(inline="always")

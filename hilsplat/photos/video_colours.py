@@ -13,8 +13,7 @@ PQ, HLG = 16, 18  # transfer characteristics of HDR video (ITU-T H.273): SMPTE S
 UNSPECIFIED, BT709, BT601 = 2, 1, 5  # colour matrices (ITU-T H.273)
 WHITE_NITS = 203.0  # luminance of reference white in HDR video (ITU-R BT.2408)
 
-HLG_PEAK_NITS = 1000.0
-HLG_SYSTEM_GAMMA = 1.2  # reference display for HLG (ITU-R BT.2100)
+HLG_PEAK_NITS, HLG_SYSTEM_GAMMA = 1000.0, 1.2  # reference display for HLG (ITU-R BT.2100)
 KNEE = 0.6  # linear light (white = 1) above which HDR highlights are compressed towards 1
 BAND_ROWS = 32  # number of rows tone-mapped at once, chosen to fit into the processor's cache
 
