@@ -12,6 +12,7 @@ from jaxtyping import Bool, UInt8
 
 from hilsplat.base.artifacts import read_index, run_command
 from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError, first_line, nearest
+from hilsplat.base.images import to_uint8
 from hilsplat.base.lineage import sha256_of_file
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.query.language_scene import LanguageScene
@@ -226,8 +227,7 @@ class ViewerScene(ShownScene):
 
     def _field_relevancy(self, variant: str, text: str, level: str) -> UInt8[np.ndarray, " N"]:
         """Return `FieldAnswers.gaussian_relevancy`, in steps of 1/255."""
-        relevancy = self.answering(variant).field.gaussian_relevancy(text, level)
-        return (np.clip(relevancy, 0, 1) * 255 + 0.5).astype(np.uint8)
+        return to_uint8(self.answering(variant).field.gaussian_relevancy(text, level))
 
     def _paint(self, variant: str, style: Style) -> Paint | None:
         """Resolve a style for each Gaussian; None means the scene's own colours.
