@@ -26,12 +26,7 @@ from hilsplat.web.guard import Guard
 
 TYPES = {"html": "text/html; charset=utf-8", "js": "text/javascript", "css": "text/css"}
 BYTES = "application/octet-stream"
-STATUS: dict[type, int] = {
-    StaleFileError: 412,
-    StaleSceneError: 409,
-    HilsplatError: 422,
-    ValidationError: 400,
-}
+STATUS = {StaleFileError: 412, StaleSceneError: 409, HilsplatError: 422, ValidationError: 400}
 """HTTP status of each error that is sent to the page."""
 
 OWN_PORTS = range(20_000, 30_000)  # ports of pages, below those that Linux and macOS assign to other programs
