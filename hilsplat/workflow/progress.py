@@ -25,7 +25,6 @@ from hilsplat.base.artifacts import INDEX, parse_json
 from hilsplat.base.errors import KILLED, KILLED_FIX, visible
 from hilsplat.base.progress import last_error, last_progress, warnings_in
 from hilsplat.scene.finished import KEY_VIEWS, command_name, refining
-from hilsplat.stages import all_stages
 from hilsplat.workflow.resources import START_S, JobResources
 from hilsplat.workflow.scene_data import Job
 
@@ -70,7 +69,7 @@ class RunningJob:
     @property
     def loop(self) -> str:
         """The loop that takes almost all of the job's time."""
-        stage = all_stages().get(self.rule)
+        stage = stages.all_stages().get(self.rule)
         return stage.loop if stage else ""
 
     def progress(self) -> tuple[str, int, int] | None:
@@ -224,7 +223,7 @@ class RunProgress:
 
     def _hint(self, job: RunningJob) -> list[str]:
         """Return a line when a scene is ready to query, with the query commands once per run."""
-        variant, stage = job.wildcards.get("variant"), all_stages().get(job.rule)
+        variant, stage = job.wildcards.get("variant"), stages.all_stages().get(job.rule)
         if stage is None or stage.file not in QUERIED or variant not in ("default", KEY_VIEWS):
             return []
         others = [name for name in QUERIED if name != stage.file]
