@@ -4,22 +4,14 @@ from typing import Any
 
 import numpy as np
 
+from cpusplat import views
 from cpusplat.project import LN_2, LOG2_E, LOG2_MIN_ALPHA, MOMENTS
-from cpusplat.views import (
-    Parameters,
-    Projected,
-    blend_forward,
-    blend_gradients,
-    project_gaussians,
-    project_gradients,
-)
 
 MAX_DEGREE = 3
 MIN_OPACITY, MAX_OPACITY = 1e-12, 1 - 2**-24
 """Opacities are clipped to this range, in which they have a logit; smaller ones are not drawn anyway."""
 MIN_SCALE = 1e-30
-MAX_SIGMAS = 3.33
-"""Radii in units of the standard deviation of opaque Gaussians (gsplat)."""
+MAX_SIGMAS = 3.33  # radii in units of the standard deviation of opaque Gaussians (gsplat)
 
 
 def as_array(name: str, values: Any, *shape: int | None, dtype: type = np.float32) -> np.ndarray:
@@ -85,9 +77,9 @@ class ActivatedViews:
         log_scales = np.log(np.maximum(self.scales, MIN_SCALE, dtype=np.float64)).astype(np.float32)
         peaks = self.opacities.astype(np.float64).clip(MIN_OPACITY, MAX_OPACITY)
         logits = (np.log(peaks) - np.log1p(-peaks)).astype(np.float32)
-        parameters = Parameters(self.means, log_scales, self.quats, logits, self.sh)
+        parameters = views.Parameters(self.means, log_scales, self.quats, logits, self.sh)
         degree = self.degree if self.has_harmonics and self.degree else 0
-        self.views = [project_gaussians(parameters, row, degree, self.threads) for row in self.cameras]
+        self.views = [views.project_gaussians(parameters, row, degree, self.threads) for row in self.cameras]
         if broken := max((view.broken for view in self.views), default=0):
             raise ValueError(
                 f"{broken} of {len(self.means)} Gaussians are not finite or have a zero quaternion"
@@ -103,13 +95,13 @@ class ActivatedViews:
         """Blend all views into images [C, H, W, X] and alphas [C, H, W, 1]."""
         self.channels = [self._channels(number, view) for number, view in enumerate(self.views)]
         self.blended = [
-            blend_forward(view, channels, self.threads)
+            views.blend_forward(view, channels, self.threads)
             for view, channels in zip(self.views, self.channels, strict=True)
         ]
         images, alphas = zip(*self.blended, strict=True)
         return np.stack(images), np.stack(alphas)[..., None]
 
-    def _channels(self, number: int, view: Projected) -> np.ndarray:
+    def _channels(self, number: int, view: views.Projected) -> np.ndarray:
         parts = [view.colours] if self.has_harmonics else []
         parts += [self.colours[number]] if self.colours is not None else []
         parts += [view.geometry[: len(view.box), 6:7]] if self.has_depth else []
@@ -123,12 +115,12 @@ class ActivatedViews:
         Those of the other parameters are kept for `project_backward`.
         """
         n, means_px, by_depth, by_colour = len(self.means), [], [], []
-        self.by_view: list[tuple[Parameters, np.ndarray]] = []
+        self.by_view: list[tuple[views.Parameters, np.ndarray]] = []
         for number, view in enumerate(self.views):
             channels, (image, alpha) = self.channels[number], self.blended[number]
             grads = grad_images[number], grad_alphas[number, ..., 0]
-            sums = blend_gradients(view, channels, image, alpha, *grads, self.threads)
-            by_parameter, by_mean_px = project_gradients(view, sums, self.threads)
+            sums = views.blend_gradients(view, channels, image, alpha, *grads, self.threads)
+            by_parameter, by_mean_px = views.project_gradients(view, sums, self.threads)
             self.by_view.append((by_parameter, sums[:n, 0].copy()))
             by_channel = sums[:n, MOMENTS : MOMENTS + channels.shape[1]]
             means_px.append(by_mean_px)
@@ -161,7 +153,7 @@ class ActivatedViews:
             means += by_camera @ view.camera[:9].reshape(3, 3)
         return means.astype(np.float32), quats, scales, opacities, sh
 
-    def _by_position(self, view: Projected, by_mean_px: np.ndarray, by_depth: np.ndarray) -> np.ndarray:
+    def _by_position(self, view: views.Projected, by_mean_px: np.ndarray, by_depth: np.ndarray) -> np.ndarray:
         """Return gradients of the means in camera space [N, 3] from those of projected means and depths."""
         rotation, translation = view.camera[:9].reshape(3, 3), view.camera[9:12]
         x, y, z = (self.means @ rotation.T + translation).T
@@ -175,7 +167,7 @@ def _divided(gradients: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.divide(gradients, values, out=np.zeros_like(values), where=values > MIN_SCALE)
 
 
-def _radii(view: Projected) -> np.ndarray:
+def _radii(view: views.Projected) -> np.ndarray:
     a, b, c, top = view.geometry[: len(view.box), 2:6].astype(np.float64).T
     with np.errstate(all="ignore"):
         scale = 2 * LOG2_E / (4 * a * c - b * b)  # the covariance is the inverse of the conic

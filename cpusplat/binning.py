@@ -8,21 +8,18 @@ from cpusplat.compiled import compiled
 from cpusplat.lanes import bits_ge, lanes, larger, load, prefetch, smaller
 from cpusplat.project import MIN_ALPHA
 
-TILE = 16
-"""Side of a tile, px."""
+TILE = 16  # side of a tile, px
 BLOCK_X = np.tile(np.arange(4, dtype=np.float32) * 4, 4) + np.float32(0.5)
 BLOCK_Y = np.repeat(np.arange(4, dtype=np.float32) * 4, 4) + np.float32(0.5)
 """Centre of the first pixel of each 4x4 block, relative to the tile's corner."""
 _SLACK, _RELATIVE = np.float32(1e-2), np.float32(1e-6)
 """A block is skipped if the exponent is below the cut by more than the sum of an absolute slack and a slack
 proportional to the squared terms of the exponent (float32 rounding: 6e-8)."""
-AHEAD = 16
-"""Rows are prefetched this many list entries ahead."""
+AHEAD = 16  # rows are prefetched this many list entries ahead
 MAX_ENTRIES = 2**22
 """Maximum number of tile list entries in memory: 16 MiB, and 144 MiB of gradients for 3 channels."""
 
-_SPAN = np.float32(3.0)
-"""Distance between a block's first and last pixel centres."""
+_SPAN = np.float32(3.0)  # distance between a block's first and last pixel centres
 _CUT = np.float32(np.log2(MIN_ALPHA))
 
 

@@ -44,12 +44,10 @@ from cpusplat.lanes import (
 )
 from cpusplat.project import MIN_ALPHA, MOMENTS
 
-MAX_ALPHA = 0.999
-"""Maximum alpha of a Gaussian at a pixel; clipped alphas pass no gradient (gsplat: 0.999)."""
+MAX_ALPHA = 0.999  # maximum alpha of a Gaussian at a pixel; clipped alphas pass no gradient (gsplat: 0.999)
 MIN_TRANSMITTANCE = 1e-4
 """Blending stops at a pixel before the Gaussian that would reduce transmittance below this (3DGS, gsplat)."""
-CHUNK = 128
-"""Number of list entries copied at once; with their lists, they take 40 kB for 3 channels."""
+CHUNK = 128  # number of list entries copied at once; with their lists, they take 40 kB for 3 channels
 _CUT = np.float32(np.log2(MIN_ALPHA))
 _TOP = np.float32(MAX_ALPHA)
 _STOP = np.float32(MIN_TRANSMITTANCE)
@@ -59,8 +57,7 @@ LANES = 16
 PIXELS = BLOCKS * LANES
 RECORD = 8
 """Numbers per copied Gaussian: mean x and y from the tile's corner, a, b, c, log2 of peak alpha, 2 spare."""
-GROUP = 4
-"""Number of channels that are summed together in registers."""
+GROUP = 4  # number of channels that are summed together in registers
 
 _NUMBERS = np.arange(LANES, dtype=np.float32)
 _X = np.repeat(BLOCK_X, LANES) + np.tile(_NUMBERS % 4, BLOCKS)

@@ -26,8 +26,7 @@ from numba.core import event
 logger = logging.getLogger(__name__)
 config: Any = numba.config
 
-MAX_IDLE_DAYS = 30.0
-"""Machine code of other versions is deleted if no process has used it for this long."""
+MAX_IDLE_DAYS = 30.0  # machine code of other versions is deleted if no process has used it for this long
 
 _FOLDER = re.compile(r"kernels-[0-9a-f]{16}")
 _lock = threading.Lock()

@@ -414,13 +414,11 @@ def _halved(builder: ir.IRBuilder, vector: ir.Value, combine: Any) -> ir.Value:
 
 @_operation(types.float32, LANES)
 def lane_sum(builder, value):
-    """Return the sum of the lanes."""
     return _halved(builder, value, builder.fadd)
 
 
 @_operation(types.float32, LANES)
 def lane_max(builder, value):
-    """Return the largest lane."""
     return _halved(builder, value, lambda low, high: _chosen(builder, ">", low, high))
 
 

@@ -143,11 +143,7 @@ def _padded(image: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def photometric_loss(
-    image: np.ndarray,
-    target: np.ndarray,
-    *,
-    ssim_weight: float,
-    threads: int = 1,
+    image: np.ndarray, target: np.ndarray, *, ssim_weight: float, threads: int = 1
 ) -> tuple[float, np.ndarray]:
     """Return L = (1 - w) mean |image - target| + w (1 - SSIM), and dL/dimage (3DGS, Eq. 7: w = 0.2).
 

@@ -31,12 +31,9 @@ from cpusplat.lanes import (
     wide,
 )
 
-NEAR, FAR = 0.01, 1e10
-"""Default range of depths (scene units) that are drawn (gsplat: 0.01 and 1e10)."""
-LOW_PASS_PX2 = 0.3
-"""Default variance added to the projected covariance, px^2 (3DGS, gsplat: 0.3)."""
-MIN_ALPHA = 1.0 / 255.0
-"""Smaller alphas are not drawn (3DGS, gsplat: 1 / 255)."""
+NEAR, FAR = 0.01, 1e10  # default range of depths (scene units) that are drawn (gsplat: 0.01 and 1e10)
+LOW_PASS_PX2 = 0.3  # default variance added to the projected covariance, px^2 (3DGS, gsplat: 0.3)
+MIN_ALPHA = 1.0 / 255.0  # smaller alphas are not drawn (3DGS, gsplat: 1 / 255)
 MAX_LOG_SCALE = np.float32(20.0)
 """Scales are clipped at exp(20), 5e8 scene units; clipped scales get no gradient. A Gaussian that wide covers
 any view evenly along that axis; at exp(40) the columns of its pixel box would overflow 64-bit integers.

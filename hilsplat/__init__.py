@@ -22,15 +22,7 @@ if TYPE_CHECKING:
     from hilsplat.base.errors import HilsplatError
     from hilsplat.base.levels import Level
     from hilsplat.evaluate.score import Scores, score
-    from hilsplat.library import (
-        SceneMasks,
-        fit,
-        link,
-        load_gaussians,
-        load_scene,
-        reconstruct,
-        segment,
-    )
+    from hilsplat.library import SceneMasks, fit, link, load_gaussians, load_scene, reconstruct, segment
     from hilsplat.query.hits import Doubt, Hit, Node
     from hilsplat.query.language_scene import LanguageScene, open_scene
     from hilsplat.query.scenes import SceneHit, Scenes, open_scenes

@@ -15,8 +15,7 @@ from pydantic import AfterValidator, Field
 from hilsplat.base.errors import SettingsError
 from hilsplat.settings import HierarchyLosses, Section, Size, knob
 
-OURS = "hilsplat"
-"""The method of this repository; the `field` stage computes its field."""
+OURS = "hilsplat"  # the method of this repository; the `field` stage computes its field
 
 GROUP = "hilsplat.methods"
 

@@ -152,8 +152,7 @@ class RunSettings(StageSettings):
     results: str = knob("results", "results folder, relative to the working folder", pattern="^[^{}<>]+$")
     groups: tuple[str, ...] = knob(("benchmark",), "groups of the scene sheet to run")
     only: tuple[str, ...] = knob(
-        (),
-        "scenes to run, from any group, such as table-1 or synthetic/*; empty: all in `groups`",
+        (), "scenes to run, from any group, such as table-1 or synthetic/*; empty: all in `groups`"
     )
     # The report shows the data root without escaping < and >, so these are not allowed.
     data_root: str = knob("", "folder of published data sets; empty: no published scenes", pattern="^[^<>]*$")

@@ -48,11 +48,8 @@ from hilsplat.splat.fit import fit_gaussians
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply, save_ply
 
-FRAMES = 60
-"""Maximum number of frames of videos, as in `hilsplat new`."""
-
-GIVEN = "given"
-"""Kind of Gaussians that `link` stored, in the JSON file beside the PLY."""
+FRAMES = 60  # maximum number of frames of videos, as in `hilsplat new`
+GIVEN = "given"  # kind of Gaussians that `link` stored, in the JSON file beside the PLY
 
 logger = logging.getLogger(__name__)
 

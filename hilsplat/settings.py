@@ -147,8 +147,7 @@ class GaussiansSettings(Section):
     )
     checkpoint_every: int = knob(1000, "steps between checkpoints", ge=1)
     device: Device = knob(
-        "auto",
-        "cuda: gsplat and torch; auto: cuda if it works and the card has enough free memory, else cpu",
+        "auto", "cuda: gsplat and torch; auto: cuda if it works and the card has enough free memory, else cpu"
     )
 
     @property

@@ -570,9 +570,7 @@ def figures(
     field: PathIn,
     autoencoder: PathIn,
     out: Annotated[
-        Path,
-        typer.Option(help="WebP to write, with registration.webp and fit.webp beside it"),
-        Role.OUTPUT,
+        Path, typer.Option(help="WebP to write, with registration.webp and fit.webp beside it"), Role.OUTPUT
     ],
     settings: of.FiguresSettings,
     evaluate: of.EvaluateSettings,

@@ -8,9 +8,7 @@ from numba import types
 from cpusplat.compiled import compiled
 from hilsplat_world.texture_kernels import albedo, grains, hash01
 
-LANES = 16
-"""Number of rays in a packet."""
-
+LANES = 16  # number of rays in a packet
 _COHERENT = 1 << 16  # from Embree's rtcore_common.h
 
 # Rows of Embree's RTCRayHit16: 12 for the rays and 9 for the hits.

@@ -39,8 +39,7 @@ WAYMO_WORDS = {
 """Text of a whole or part in a street -> Waymo class name, if different. Fences are undefined, because Waymo
 has no class for them."""
 
-COUNTABLE = frozenset({"car", "truck", "bus", "bicyclist", "pedestrian"})
-"""Classes with separate instances."""
+COUNTABLE = frozenset({"car", "truck", "bus", "bicyclist", "pedestrian"})  # classes with separate instances
 
 
 def scannet_ids(text: str) -> tuple[int, int]:

@@ -136,7 +136,6 @@ class Paint:
 
 
 def each_channel(colour: Colour, change: Callable[[float], float]) -> Colour:
-    """Apply a function to each channel of a colour."""
     red, green, blue = colour
     return change(red), change(green), change(blue)
 

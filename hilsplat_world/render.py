@@ -20,12 +20,8 @@ from hilsplat_world.scenes.scene import WorldScene
 RAYS_PER_PIXEL = 9
 """Minimum number of shadow rays and of occlusion rays per pixel, divided among the sub-samples."""
 
-OCCLUSION_REACH = 0.55
-"""Maximum distance at which a surface occludes another, scene units at `Style.scale` 1."""
-
-BAND_RAYS = 1 << 15
-"""Number of camera rays that are shaded at once; each takes 120 bytes of working memory."""
-
+OCCLUSION_REACH = 0.55  # maximum distance at which a surface occludes another, scene units at `Style.scale` 1
+BAND_RAYS = 1 << 15  # number of camera rays that are shaded at once; each takes 120 bytes of working memory
 _LIFT = 2e-3  # offset of a ray's start from the surface, scene units at scale 1
 _HASH_CELLS = 160.0  # cells per unit, at scale 1, of the ray-jitter hash: about one per pixel at 384 px
 

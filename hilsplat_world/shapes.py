@@ -55,7 +55,6 @@ def rotation_about(axis: str, degrees: Number) -> Float[np.ndarray, "3 3"]:
 
 
 def joined(*meshes: Mesh) -> Mesh:
-    """Join several meshes into one."""
     triangles = np.concatenate([mesh.triangles for mesh in meshes])
     return Mesh(triangles, np.concatenate([mesh.normals for mesh in meshes]))
 

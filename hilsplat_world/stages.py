@@ -69,12 +69,7 @@ def consistency(truth: PathIn, masks: PathIn, out: PathOut) -> str:
 
 @stage(command="", scope="scene")
 def tree_truth(
-    scene: PathIn,
-    gaussians: PathIn,
-    truth: PathIn,
-    semantic_tree: PathIn,
-    out: PathOut,
-    threads: Threads = 2,
+    scene: PathIn, gaussians: PathIn, truth: PathIn, semantic_tree: PathIn, out: PathOut, threads: Threads = 2
 ) -> str:
     """Compare the 3D semantic tree with the ground-truth nodes: matches, purity, parents."""
     from hilsplat_world.diagnostics.tree_truth import run_tree_truth

@@ -45,11 +45,8 @@ FAULTS = ("boundary_px", "merge", "split", "missing", "wrong_level", "systematic
 """Settings that change masks; if all are 0, the masks are exact."""
 
 REACH = 3.0  # maximum displacement of a boundary, in standard deviations
-
 WAVES = 48  # number of plane waves that are summed for a boundary's displacement
-
-Borders = dict[int, Counter[int]]
-"""Node -> adjacent sibling -> length of their common border, px."""
+Borders = dict[int, Counter[int]]  # node -> adjacent sibling -> length of their common border, px
 
 
 def run_truth_masks(

@@ -15,8 +15,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
-LFS_BYTES = 20_000
-"""Minimum size of files in Git LFS."""
+LFS_BYTES = 20_000  # minimum size of files in Git LFS
 
 
 def git_sha1(content: bytes) -> str:

@@ -39,11 +39,8 @@ from hilsplat.web.messages import Message
 from hilsplat.web.scene_thread import SceneThread, ShownScene
 from hilsplat.web.server import Ready, answer, files_of, guarded, plain, read, serve, version_sent, view_name
 
-SCORES = 3
-"""Maximum number of mean scores that the page shows."""
-
-MAX_BODY_BYTES = 16 << 20
-"""Maximum size of a request, enough for a COCO file of a whole scene."""
+SCORES = 3  # maximum number of mean scores that the page shows
+MAX_BODY_BYTES = 16 << 20  # maximum size of a request, enough for a COCO file of a whole scene
 
 
 class Stroke(Message):
@@ -194,7 +191,6 @@ class Annotator:
         self.drawing = ThreadPoolExecutor(1, thread_name_prefix="drawing")  # so that saving doesn't wait
 
     def app(self, token: str) -> Guard:
-        """Return the guarded application."""
         get, post = self.thread.get, self.thread.post
         routes = [
             *self.files,

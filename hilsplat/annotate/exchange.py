@@ -30,15 +30,8 @@ from hilsplat.base.errors import HilsplatError, SceneError, first_line, foreign
 from hilsplat.base.images import open_image
 from hilsplat.datasets.generators import GENERATORS
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
+from hilsplat.datasets.images import isat
 from hilsplat.datasets.images.hi import PROPOSED
-from hilsplat.datasets.images.isat import (
-    BACKGROUND,
-    IsatObject,
-    cut_background,
-    fill_polygons,
-    read_object,
-    stated_size,
-)
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.scene.placement import placed, placement
 from hilsplat.scene.scene import Scene
@@ -48,8 +41,7 @@ from hilsplat.web.coco import coco_content, coco_region
 logger = logging.getLogger(__name__)
 
 Kind = Literal["hilsplat", "isat", "labelme", "coco"]
-OURS = {"level", "parent", "origin"}
-"""Our extra keys in the other formats."""
+OURS = {"level", "parent", "origin"}  # our extra keys in the other formats
 
 
 def exported(kind: Kind, known: Mapping[str, Sequence[Label]], cameras: Cameras) -> bytes:
@@ -142,7 +134,7 @@ def _isat(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
                 "category": label.text,
                 "group": label.id,
                 "segmentation": ring,
-                "area": int(fill_polygons([ring], size_hw).sum()),
+                "area": int(isat.fill_polygons([ring], size_hw).sum()),
                 "layer": float(label.level),
                 "bbox": [*points.min(axis=0).tolist(), *points.max(axis=0).tolist()],
                 "iscrowd": 0,
@@ -192,8 +184,7 @@ POLYGONS = {"polygon", "oriented_rectangle", "rotation", "quadrilateral"}
 """Shape types of labelme, and of X-AnyLabeling, which has the same format."""
 
 
-Photos = Mapping[str, Mapping[str, Any]]
-"""Entries of `registration.json`, by view."""
+Photos = Mapping[str, Mapping[str, Any]]  # entries of `registration.json`, by view
 
 
 class Piece(NamedTuple):
@@ -300,17 +291,17 @@ Reader = Callable[[str, Any], Piece | str]
 
 
 def _isat_reader(name: str, content: Mapping[str, Any], cameras: Cameras, photos: Photos) -> Reader:
-    drawn_hw = stated_size(name, content.get("info"))
+    drawn_hw = isat.stated_size(name, content.get("info"))
     view = _view(name, content["info"].get("name"), cameras, photos)
-    things: list[IsatObject] = []
+    things: list[isat.IsatObject] = []
     for entry in content["objects"]:
         with suppress(HilsplatError), foreign(name):  # `read` reports it
-            things.append(read_object(name, entry, drawn_hw, []))
+            things.append(isat.read_object(name, entry, drawn_hw, []))
 
     def read(where: str, entry: Any) -> Piece | str:
-        thing = cut_background(read_object(where, entry, drawn_hw, []), things, drawn_hw)
-        if thing.category == BACKGROUND:
-            return f"of the background ({BACKGROUND}), cut out of the regions below them"
+        thing = isat.cut_background(isat.read_object(where, entry, drawn_hw, []), things, drawn_hw)
+        if thing.category == isat.BACKGROUND:
+            return f"of the background ({isat.BACKGROUND}), cut out of the regions below them"
         # Without our keys, groups are ignored: in LERF-OVS's files, group numbers are not unique.
         number = entry.get("id", entry.get("group") if "level" in entry else None)
         rings = placed_rings(thing.polygons, drawn_hw, cameras[view], where)
@@ -450,7 +441,7 @@ def _photo_size(photos: Photos, view: str) -> dict[str, int]:
 
 def _drawn_hw(where: str, image: Mapping[str, Any], camera: Camera) -> tuple[int, int]:
     """Return the stated size of the image that was drawn on, which may be larger than the view."""
-    size_hw = stated_size(where, image)
+    size_hw = isat.stated_size(where, image)
     placement(camera, size_hw, where)  # raises an error if the shape does not fit
     return size_hw
 

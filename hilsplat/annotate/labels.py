@@ -132,7 +132,6 @@ def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[La
 
 
 def label_path(folder: Path, view: str) -> Path:
-    """Return the path of a view's annotations."""
     return Path(folder) / f"{Path(view).stem}.json"
 
 

@@ -29,8 +29,7 @@ from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 
-MIN_PX = 20
-"""Minimum area of a proposal; smaller proposals are noise."""
+MIN_PX = 20  # minimum area of a proposal; smaller proposals are noise
 MIN_SHARE = 0.05
 """Minimum area of a proposal's pieces and holes, relative to the proposal; smaller ones are noise."""
 SMOOTH_PX = 1.0
@@ -41,11 +40,9 @@ MIN_SEEN = 0.25
 VIEWS_MIB = 512.0
 CACHED_VIEWS = 3
 """Number of photographs whose SAM features are cached: 4 MB each for ViT-B, up to 40 MB for SAM 2."""
-BOX_GRID = 4
-"""Number of prompt points along each side of a box; not all SAM exports accept boxes as prompts."""
+BOX_GRID = 4  # number of prompt points along each side of a box; not all SAM exports accept boxes as prompts
 MAX_OUTLINES = 3
-SAME_IOU = 0.9
-"""Minimum IoU of two masks that count as the same mask."""
+SAME_IOU = 0.9  # minimum IoU of two masks that count as the same mask
 
 
 @dataclass(frozen=True)
@@ -179,7 +176,6 @@ class Proposals:
 
 
 def _visible_mass(weights: sp.csr_matrix) -> np.ndarray:
-    """Return the visible mass of each Gaussian, px."""
     return np.asarray(weights.sum(axis=0)).ravel()
 
 

@@ -20,7 +20,6 @@ from hilsplat.base.errors import ArtifactError, HilsplatError, foreign
 from hilsplat.base.files import regular
 
 ZIP64_BYTES = 2**30  # arrays above this size get an archive entry that may exceed 2 GiB
-
 INDEX = "index.json"  # written last in a folder artifact, so its presence means that the folder is complete
 
 SEALED = (".json", ".npy", ".npz", ".png", ".safetensors")
@@ -31,8 +30,7 @@ OTHER_VERSION = " was written by a different version of hilsplat"
 RECORD = ".provenance.json"
 """Ending of the name of a provenance record, which begins with the artifact's name."""
 
-RUN = ".run.json"
-"""Hidden file in a results folder that records the options of the run that writes to it."""
+RUN = ".run.json"  # hidden file in a results folder that records the options of the run that writes to it
 
 
 def provenance_path(artifact: Path) -> Path:

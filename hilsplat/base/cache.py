@@ -22,8 +22,7 @@ from hilsplat.base.removal import DIGEST, ENTRY, delete, is_tagged, tag
 
 logger = logging.getLogger(__name__)
 
-CHECKPOINTS = "gaussians"
-"""Cache of fit checkpoints; in the others, a missing entry costs only time."""
+CHECKPOINTS = "gaussians"  # cache of fit checkpoints; in the others, a missing entry costs only time
 
 CACHES = (CHECKPOINTS, "masks", "contributions", "clip", "texts", "int8")
 """Folders of entries that may be deleted."""

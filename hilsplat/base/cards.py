@@ -16,7 +16,6 @@ from hilsplat.base.processes import lock
 logger = logging.getLogger(__name__)
 
 MANAGEMENT, CUDA = "libnvidia-ml.so.1", "libcuda.so.1"  # libraries of the driver
-
 _held: list[IO[bytes]] = []  # the lock of this process's card
 
 

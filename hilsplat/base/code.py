@@ -72,11 +72,7 @@ def statements_of(function: Callable[..., Any]) -> str:
 
 def _digests(roots: tuple[Code, ...]) -> dict[str, str]:
     with PARSING:
-        return _closure(tuple(_module(root) for root in roots))
-
-
-def _module(code: Code) -> str:
-    return code.partition(":")[0] if isinstance(code, str) else code.__module__
+        return _closure(tuple(r.partition(":")[0] if isinstance(r, str) else r.__module__ for r in roots))
 
 
 @functools.cache

@@ -33,8 +33,7 @@ MIN_SIDE_PX, MAX_ASPECT = 16, 20  # limits on photographs; all stages were run o
 SLIVER = 0.01
 """Share of transparent pixels up to which a mask counts as opaque, such as one with rounded corners."""
 
-MAX_CLASSES = 20
-"""Maximum number of values in a map of classes; compressed or smooth masks have more."""
+MAX_CLASSES = 20  # maximum number of values in a map of classes; compressed or smooth masks have more
 
 GREY_NOISE = 16
 """Difference between the channels up to which a mask's pixel counts as grey, as after lossy compression."""

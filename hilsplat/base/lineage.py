@@ -324,7 +324,6 @@ def require_size(what: str, size_hw: tuple[int, ...], expected_hw: tuple[int, ..
 
 @functools.cache
 def version_of(distribution: str) -> str | None:
-    """Return the version of an installed distribution, or None."""
     try:
         return metadata.version(distribution)
     except metadata.PackageNotFoundError:

@@ -28,9 +28,7 @@ class LogFormatter(logging.Formatter):  # noqa: TID251
 
 
 LOG_EVERY_S = 5.0  # seconds between progress lines if stderr is not a terminal
-
-BARS = ContextVar("bars", default=True)
-"""Whether loops show bars on a terminal."""
+BARS = ContextVar("bars", default=True)  # whether loops show bars on a terminal
 
 LOG_TAIL_BYTES = 20_000
 PROGRESS = re.compile(
@@ -47,7 +45,6 @@ def last_progress(log: Path) -> tuple[str, int, int] | None:
 
 
 def warnings_in(log: Path) -> list[str]:
-    """Return the warnings in a stage's log."""
     return [match["text"].rstrip() for match in WARNING.finditer(_tail(log, sys.maxsize))]
 
 

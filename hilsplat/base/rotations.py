@@ -23,7 +23,6 @@ def quaternion_of(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "
 def rotate(
     quats: Float64[np.ndarray, "N 4"], vectors: Float64[np.ndarray, "N 3"]
 ) -> Float64[np.ndarray, "N 3"]:
-    """Rotate each vector by its unit quaternion."""
     # v + 2 w (u x v) + 2 u x (u x v)
     u = quats[:, 1:]
     turned = np.cross(u, vectors)

@@ -7,8 +7,7 @@ from jaxtyping import Float32, Float64
 from cpusplat.lanes import WIDTH
 from hilsplat.contributions.kernels import add_columns, normalise, render_rows
 
-MIN_ALPHA = 0.5
-"""Pixels with a smaller alpha are ignored, because their features would be extrapolated."""
+MIN_ALPHA = 0.5  # pixels with a smaller alpha are ignored, because their features would be extrapolated
 
 MIN_LATENT_SHARE = 0.5
 """A pixel has a latent at a level if Gaussians with a latent make up more than this share of its weight."""

@@ -5,11 +5,8 @@ import numpy as np
 from cpusplat.compiled import compiled
 from cpusplat.lanes import WIDTH, add_products, lanes, load, plus, prefetch, store
 
-SUMS = 4
-"""Number of sums per pair that are stored as one vector: one per level, plus padding."""
-
-AHEAD = 8
-"""Weights of W are fetched into the cache this many pixels before they are needed."""
+SUMS = 4  # number of sums per pair that are stored as one vector: one per level, plus padding
+AHEAD = 8  # weights of W are fetched into the cache this many pixels before they are needed
 
 PLACE = np.uint64(2**32 - 1)
 """Bits of a cell (see `transpose`) that contain its place; the higher bits contain its row."""

@@ -14,7 +14,6 @@ from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 
 SIDE_PX = 200  # longer side of the renders in which visibility is measured
-
 MIN_WEIGHT = 1 / 255  # smaller weights of a Gaussian at a pixel are ignored
 
 MIN_VISIBLE_PX = 0.02

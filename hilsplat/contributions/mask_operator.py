@@ -36,7 +36,6 @@ class MaskOperator:
         return MaskOperator(A, level.astype(np.int64) - 1, threads)
 
     def block(self, begin: int, end: int) -> "MaskOperator":
-        """Return the operator of Gaussians begin..end."""
         if end - begin == self.A.shape[1]:
             return self
         return MaskOperator(self.A[:, begin:end], self.level_index, self.threads)

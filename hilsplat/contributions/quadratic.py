@@ -136,8 +136,7 @@ def form(quadratic: Quadratic, features: Float32[np.ndarray, "N 3 D"]) -> float:
     return float(np.multiply(features, quadratic.product(features), dtype=np.float64).sum())
 
 
-Blocks = Sequence[tuple[int, int]]
-"""Ranges of Gaussians that together contain each once, in order."""
+Blocks = Sequence[tuple[int, int]]  # ranges of Gaussians that together contain each once, in order
 
 
 def level_mass(quadratic: Quadratic, blocks: Blocks) -> Float32[np.ndarray, "N 3"]:

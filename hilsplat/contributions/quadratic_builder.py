@@ -29,14 +29,12 @@ that contain no Gaussian visible in a part are skipped, which Morton order makes
 MERGE_AT = 8
 """A block's late pairs are merged with its rows once they exceed its row pairs divided by this number."""
 
-MAX_WEIGHTS = 2**28
-"""Maximum number of non-zeros of W (all views) in memory, 2 GiB."""
+MAX_WEIGHTS = 2**28  # maximum number of non-zeros of W (all views) in memory, 2 GiB
 
 CLEARLY_MORE = 2
 """W is dropped once it has this many times as many non-zeros as G, which grows more slowly with the views."""
 
-CHECKPOINT_SECONDS = 300.0
-"""Seconds between checkpoints of a long pass; short passes write none."""
+CHECKPOINT_SECONDS = 300.0  # seconds between checkpoints of a long pass; short passes write none
 
 ROWS = ("indptr", "indices", "values")
 

@@ -55,8 +55,7 @@ WEIGHTS_PER_PIXEL = 40  # weights per pixel in a typical scene
 BASE_MIB, WEIGHT_BYTES, GAUSSIAN_BYTES = 350, 24, 200
 """Memory of the stage without G and W of all views: of libraries, per weight of a view, and per Gaussian."""
 
-IN_MEMORY = 2**20
-"""G and W of more Gaussians are summed in files."""
+IN_MEMORY = 2**20  # G and W of more Gaussians are summed in files
 
 MAX_WEIGHTS_TOGETHER = 2**25
 """Views with more weights (256 MiB) are prepared one at a time; up to four finished views may be waiting."""
@@ -140,7 +139,6 @@ class Output:
 
 
 def drawn_weights(gaussians: Gaussians, camera: Camera, *, min_weight: float, threads: int) -> sp.csr_matrix:
-    """Return the normalised weights of Gaussians in a view."""
     return normalised_weights(pixel_weights(gaussians, camera, min_weight=min_weight, threads=threads))
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from hilsplat.base.errors import SceneError
+from hilsplat.base.errors import SceneError, shorten_list
 
 ABLATIONS = (
     *("ablation", "components", "cost", "cost-seconds", "pruning", "pruning-seconds"),
@@ -134,5 +134,4 @@ def listing(folder: Path) -> str:
     if not folder.is_dir():
         return f"no folder {folder}"
     names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
-    more = f" and {len(names) - 8} more" if len(names) > 8 else ""
-    return (", ".join(names[:8]) + more) or f"an empty folder {folder}"
+    return shorten_list(names, 8) or f"an empty folder {folder}"

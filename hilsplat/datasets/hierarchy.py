@@ -36,8 +36,6 @@ class AnnotatedNode:
 
 @dataclass(frozen=True)
 class HierarchyAnnotations:
-    """The annotations of one scene."""
-
     folder: Path  # contains the label images
     nodes: tuple[AnnotatedNode, ...]  # by id
     views: Mapping[str, tuple[int, ...]]  # ids of the annotated nodes that are large enough to be scored

@@ -18,8 +18,7 @@ _LISTS = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-
 FRAMES: dict[str, dict[str, list[str]]] = _LISTS["frames"]
 """Labelled frames by data set and scene, as view names."""
 
-PROMPTS: dict[str, dict[str, list[str]]] = _LISTS["prompts"]
-"""Prompts by data set and scene, sorted."""
+PROMPTS: dict[str, dict[str, list[str]]] = _LISTS["prompts"]  # prompts by data set and scene, sorted
 
 PAIRS: dict[str, int] = {"figurines": 56, "ramen": 71, "teatime": 59, "waldo_kitchen": 22}
 """Number of (frame, category) pairs in each LERF-OVS scene: the smallest counts for which whole numbers of

@@ -14,8 +14,7 @@ from hilsplat.scene.sheet import DATA_PREFIX
 
 logger = logging.getLogger(__name__)
 
-LEVELLED = ("hi_lerf", "hi_3dovs")
-"""Data sets whose labels have levels."""
+LEVELLED = ("hi_lerf", "hi_3dovs")  # data sets whose labels have levels
 
 
 def published(source: str) -> tuple[str, str] | None:

@@ -29,11 +29,9 @@ logger = logging.getLogger(__name__)
 CLIP_STATISTICS = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 SIGLIP_STATISTICS = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
 """Mean and deviation of pixels if `preprocessor_config.json` lacks them, as in transformers."""
-SIGLIP_TOKENS = 64
-"""Text length (tokens) of a SigLIP model whose configuration does not specify it."""
+SIGLIP_TOKENS = 64  # text length (tokens) of a SigLIP model whose configuration does not specify it
 NO_PUNCTUATION = str.maketrans("", "", string.punctuation)
-CARD_CROPS, MOST_CROPS = 64, 256
-"""Crops of a card's first call, and maximum of later calls."""
+CARD_CROPS, MOST_CROPS = 64, 256  # crops of a card's first call, and maximum of later calls
 MODEL_PATTERNS = ("*/config.json", "*/*/config.json")  # configurations of the models in `models/`
 
 

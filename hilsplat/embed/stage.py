@@ -16,15 +16,8 @@ from hilsplat.base.lineage import require_size, sha256_of_bytes, sha256_of_file,
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel, unit
+from hilsplat.models import int8
 from hilsplat.models.card import in_turn, recorded
-from hilsplat.models.int8 import (
-    CHECKED_CROPS,
-    WORDS,
-    agreement_of_vectors,
-    int8_network,
-    reduced_precision,
-    use_reduced,
-)
 from hilsplat.models.memory import needs_of
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks, pixel_digests, require_same_masks
@@ -142,16 +135,18 @@ def _choose_precision(
     threads: int,
 ) -> None:
     """Switch the model to a lower precision if the settings require it, or if scene crops agree."""
-    form = reduced_precision(settings.precision, model.model, "vision_model", model.device)
+    form = int8.reduced_precision(settings.precision, model.model, "vision_model", model.device)
     if not form:
         return
     entries = read_index(masks_folder)["views"]
     rows = chosen or {view: np.arange(entries[view]["whole"]) for view in digests}
     pairs = [(view, row) for view in digests for row in rows[view].tolist()]
-    pairs = pairs[:: max(1, len(pairs) // CHECKED_CROPS)][:CHECKED_CROPS]
+    pairs = pairs[:: max(1, len(pairs) // int8.CHECKED_CROPS)][: int8.CHECKED_CROPS]
     if not pairs:
         return
-    reduced = int8_network(model.model, "vision_model", cache) if form == "int8" else model.vision.in_half()
+    reduced = (
+        int8.int8_network(model.model, "vision_model", cache) if form == "int8" else model.vision.in_half()
+    )
     if reduced is None:
         return
 
@@ -168,12 +163,12 @@ def _choose_precision(
 
     def measure() -> dict[str, float]:
         full, lower = map(np.concatenate, zip(*in_order(embed_twice, list(crops), threads), strict=True))
-        return agreement_of_vectors(full, lower, model.embed_texts(list(WORDS)))
+        return int8.agreement_of_vectors(full, lower, model.embed_texts(list(int8.WORDS)))
 
     crops = np.stack(list(map(crop, pairs)))
 
-    inputs = {"model": model.digest, "crops": sha256_of_bytes(crops.tobytes()), "words": WORDS}
-    if use_reduced(form, settings.precision, "CLIP", cache, inputs, measure):
+    inputs = {"model": model.digest, "crops": sha256_of_bytes(crops.tobytes()), "words": int8.WORDS}
+    if int8.use_reduced(form, settings.precision, "CLIP", cache, inputs, measure):
         model.vision, model.precision = reduced, form
 
 

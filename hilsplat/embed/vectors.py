@@ -9,8 +9,7 @@ from hilsplat.base.artifacts import damaged, read_npy, rebuild_command, sealed
 from hilsplat.base.errors import ArtifactError
 from hilsplat.segment.digests import require_same_masks
 
-UNIT_TOLERANCE = 2e-3
-"""Maximum deviation of a vector's length from 1; vectors are stored as float16."""
+UNIT_TOLERANCE = 2e-3  # maximum deviation of a vector's length from 1; vectors are stored as float16
 
 
 def mask_embeddings(clip_folder: Path, folder: Path) -> Float32[np.ndarray, "M C"]:

@@ -30,8 +30,7 @@ from hilsplat.settings import EvaluateSettings
 
 logger = logging.getLogger(__name__)
 
-FOREGROUND = 128
-"""Pixels with a grey value above this are foreground, as in Gaussian Grouping's script."""
+FOREGROUND = 128  # pixels with a grey value above this are foreground, as in Gaussian Grouping's script
 
 
 def run_evaluate_files(

@@ -23,14 +23,12 @@ from hilsplat.evaluate.protocols.views import consistency_rows
 from hilsplat.evaluate.scores import Measured
 from hilsplat.evaluate.tables.means import metric_means
 
-METHOD = "files"
-"""Method in the score rows; the variant is the program's name."""
+METHOD = "files"  # method in the score rows; the variant is the program's name
 
 WORDS = "masks of files"
 """Bracketed suffix of a protocol's name: masks were supplied, so the protocol's map rule was not applied."""
 
-MASK_METRICS = (*cards.MASK, "acc_25", "acc_50")
-"""Metrics of masks; localization needs relevancy maps."""
+MASK_METRICS = (*cards.MASK, "acc_25", "acc_50")  # metrics of masks; localization needs relevancy maps
 
 OF_EVERY_TEXT = (cards.LERF_LANGSPLAT, cards.LERF_OPENGAUSSIAN)
 """Protocols that score every text of a view, merged over levels."""
@@ -113,7 +111,6 @@ def score(predictions: Any, labels: Any, protocol: str = "lerf/langsplat") -> Sc
 def _rows_of_images(
     card: cards.ProtocolCard, predictions: Any, labels: Any
 ) -> Iterator[tuple[str, Measured]]:
-    """Yield the rows of all views."""
     for what, given in (("predictions", predictions), ("labels", labels)):
         if not (isinstance(given, Mapping) and all(isinstance(each, Mapping) for each in given.values())):
             problem, expected = f"the {what} are not arrays by view and text", "{view: {text: array}}"
@@ -283,7 +280,6 @@ def level_rows(answers: Answers, truth: ViewTruth, are_masks: bool = True) -> It
 
 
 def _metrics(card: cards.ProtocolCard, are_masks: bool) -> list[str]:
-    """Return the metrics of a protocol for masks or relevancy."""
     measured = MASK_METRICS if are_masks else (*MASK_METRICS, *cards.LOCALIZATION)
     return [metric for metric in card.metrics if metric in measured]
 
@@ -303,7 +299,6 @@ def _cosine(
 
 
 def _rows_of_points(card: cards.ProtocolCard, predictions: Any, labels: Any) -> Iterator[Measured]:
-    """Yield the rows of labelled points or instances."""
     _, classes = class_set(card.classes)
     is_scan = card is cards.INSTANCES
     given = [np.asarray(each) for each in ((*predictions, *labels) if is_scan else (predictions, labels))]

@@ -21,7 +21,7 @@ from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevanc
 from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
 from hilsplat.evaluate.protocols.points import measure_scene_points
 from hilsplat.evaluate.protocols.view_truth import truths_of
-from hilsplat.evaluate.protocols.views import measure_view, rule_of, text_departures
+from hilsplat.evaluate.protocols.views import departures, measure_view, rule_of
 from hilsplat.evaluate.scores import Measured, Score, write_instances, write_scores
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Cameras
@@ -34,8 +34,7 @@ logger = logging.getLogger(__name__)
 MAX_CAMERA_ERROR_M = 0.1
 """Median camera error above which point scores are meaningless and a warning is logged."""
 
-TIMED_TEXTS = 3
-"""Number of timed queries, all in one view."""
+TIMED_TEXTS = 3  # number of timed queries, all in one view
 
 Annotations = LabelledScene | PointScene | Truth
 """Labels of a published data set, or the ground truth of a generated scene."""
@@ -145,7 +144,8 @@ def point_rows(
         if error > MAX_CAMERA_ERROR_M:
             sentence = "%s: the median camera error is %.2f m, so point scores are meaningless"
             logger.warning(sentence, answers.scene.name, error)
-    how = settings.methods, settings.points, text_departures(settings)
+    # the prompt template changes every cosine
+    how = settings.methods, settings.points, departures(settings, ("template",))
     yield from measure_scene_points(answers, points, transform, extra.points, *how, threads)
 
 

@@ -17,18 +17,8 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.base.lineage import sha256_of_file
 from hilsplat.base.progress import stage_log
 from hilsplat.embed.vectors import mask_embeddings, require_every_vector
+from hilsplat.field import code
 from hilsplat.field.adam import Adam
-from hilsplat.field.code import (
-    NORM_EPS,
-    Autoencoder,
-    Code,
-    Layer,
-    LinearCode,
-    autoencoder_file,
-    layers_of,
-    load_code,
-    unit_rows,
-)
 from hilsplat.field.kernels import swap
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, require_same_masks
 from hilsplat.semantic_tree.tree import SemanticTree
@@ -71,9 +61,9 @@ def run_autoencoder(
         require_every_vector(clip, clip_folder, "autoencoder.targets: mask")
         target = train = clip
     with stage_log("autoencoder", read_index(contributions_folder)["scene"]) as counts:
-        model: Code
+        model: code.Code
         if code_folder is not None:
-            model = load_code(code_folder)
+            model = code.load_code(code_folder)
             expected, found = (train.shape[1], settings.latent), (model.channels, model.latent)
             if found != expected:
                 raise ArtifactError(
@@ -83,7 +73,7 @@ def run_autoencoder(
                     fix="pass the folder of a code for this scene with the same settings",
                 )
         elif settings.code == "pca":
-            model = LinearCode.fit(train, settings.latent)
+            model = code.LinearCode.fit(train, settings.latent)
         else:
             model = train_autoencoder(train, settings, seed)
         latents = model.encode_array(target)
@@ -93,7 +83,7 @@ def run_autoencoder(
         own_cosine = float((model.decode_array(latents[embedded]) * clip[embedded]).sum(axis=1).mean())
         counts |= {"vectors": len(train), "mean decoder cosine": round(cosine, 4)}
         with atomic_folder(out) as folder:
-            model.save(autoencoder_file(folder))
+            model.save(code.autoencoder_file(folder))
             write_npz(folder / "latents.npz", latents=latents)
             write_index(
                 folder,
@@ -105,13 +95,13 @@ def run_autoencoder(
                 masks=len(clip),
                 decoder_cosine=round(cosine, 6),
                 decoder_cosine_own=round(own_cosine, 6),
-                autoencoder_sha256=sha256_of_file(autoencoder_file(folder)),
+                autoencoder_sha256=sha256_of_file(code.autoencoder_file(folder)),
             )
 
 
 def train_autoencoder(
     vectors: Float32[np.ndarray, "B C"], settings: AutoencoderSettings, seed: int
-) -> Autoencoder:
+) -> code.Autoencoder:
     """Train on one scene's unit vectors, using Adam with cosine decay and full batches without replacement.
 
     Identical inputs and seeds produce identical bytes for any number of stage threads (the command line
@@ -125,7 +115,7 @@ def train_autoencoder(
     batch = min(settings.batch, len(data))
     per_epoch = len(data) // batch
     steps = max(settings.epochs * per_epoch, settings.min_steps)
-    arrays = Autoencoder.initial(channels, latent, twister).arrays
+    arrays = code.Autoencoder.initial(channels, latent, twister).arrays
     drawn = {name: values for name, values in arrays.items() if "running" not in name}
     flat = np.concatenate([values.reshape(-1) for values in drawn.values()])
     slope = np.empty_like(flat)
@@ -139,7 +129,7 @@ def train_autoencoder(
         loss_gradients(parameters, chosen, latent, settings.cosine_weight, gradients)
         adam.rate = settings.learning_rate * (1 + math.cos(math.pi * step / steps)) / 2
         adam.step(slope)
-    return Autoencoder(channels, latent, parameters | statistics(parameters, data, latent))
+    return code.Autoencoder(channels, latent, parameters | statistics(parameters, data, latent))
 
 
 def torch_order(count: int, twister: np.random.RandomState) -> Int64[np.ndarray, " n"]:
@@ -169,9 +159,9 @@ def loss_gradients(
     Departs: LangSplat computes the cosine along the batch axis, which compares channels, not vectors.
     """
     channels = vectors.shape[1]
-    encoder, decoder = layers_of(channels, latent)
+    encoder, decoder = code.layers_of(channels, latent)
     codes, to_codes = _forward(parameters, encoder, vectors)
-    latents = unit_rows(codes)
+    latents = code.unit_rows(codes)
     outputs, to_outputs = _forward(parameters, decoder, latents)
     slope = -vectors * np.float32((2 / channels + cosine_weight) / len(vectors))
     slope = _backward(parameters, decoder, to_outputs, _slope_before_unit(outputs, slope), gradients)
@@ -181,7 +171,7 @@ def loss_gradients(
 def statistics(parameters: Arrays, data: Float32[np.ndarray, "B C"], latent: int) -> Arrays:
     """Compute the mean and unbiased variance of all vectors at each BatchNorm, for use after training."""
     running: Arrays = {}
-    encoder, _ = layers_of(data.shape[1], latent)
+    encoder, _ = code.layers_of(data.shape[1], latent)
     values = data
     for layer, after in pairwise(encoder):
         values = _forward(parameters, [layer], values)[0]
@@ -190,7 +180,9 @@ def statistics(parameters: Arrays, data: Float32[np.ndarray, "B C"], latent: int
     return running
 
 
-def _forward(parameters: Arrays, layers: list[Layer], values: np.ndarray) -> tuple[np.ndarray, list[Passed]]:
+def _forward(
+    parameters: Arrays, layers: list[code.Layer], values: np.ndarray
+) -> tuple[np.ndarray, list[Passed]]:
     """Return the layers' outputs, normalised with batch statistics, and the values for the backward pass."""
     passed = []
     for layer in layers:
@@ -207,7 +199,7 @@ def _forward(parameters: Arrays, layers: list[Layer], values: np.ndarray) -> tup
 
 
 def _backward(
-    parameters: Arrays, layers: list[Layer], passed: list[Passed], slope: np.ndarray, gradients: Arrays
+    parameters: Arrays, layers: list[code.Layer], passed: list[Passed], slope: np.ndarray, gradients: Arrays
 ) -> np.ndarray:
     """Compute the gradients of the layers' parameters, and return the gradient of their inputs."""
     for layer, (values, scaled, spread) in zip(layers[::-1], passed[::-1], strict=True):
@@ -236,6 +228,6 @@ def _normalised(values: np.ndarray, weight: np.ndarray, bias: np.ndarray) -> Pas
     """Apply BatchNorm (batch statistics) and ReLU; return normalised inputs, 1 / deviation and outputs."""
     share = np.float32(1 / len(values))
     centred = values - (share * values).sum(axis=0)
-    spread = 1 / np.sqrt((share * np.square(centred)).sum(axis=0) + np.float32(NORM_EPS))
+    spread = 1 / np.sqrt((share * np.square(centred)).sum(axis=0) + np.float32(code.NORM_EPS))
     scaled = centred * spread
     return scaled, spread, np.maximum(scaled * weight + bias, 0)

@@ -120,7 +120,6 @@ def _decode_pieces(rows, layers, values, following, out):
 
 @compiled
 def _terms(values, piece):
-    """Return the terms of one piece, term by term."""
     units = len(values) // ROWS
     terms = np.empty(TERMS * units, np.float32)
     for term in range(TERMS):

@@ -20,8 +20,7 @@ from hilsplat.field.problem import QuadraticProblem
 from hilsplat.field.solver import LBFGS_MEMORY, keep_labelled, solve_field
 from hilsplat.settings import FieldSettings
 
-PROCESS_MIB = 250
-"""Memory of the stage without features: libraries, masks, losses."""
+PROCESS_MIB = 250  # memory of the stage without features: libraries, masks, losses
 
 
 def run_field(

@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 from hilsplat.base.levels import NONE
 
 SOFTENING = 1e-3  # added in quadrature to every distance, so that its logarithm has a finite slope at zero
-
 MIN_LENGTH = 1e-6  # added in quadrature to lengths in denominators, so that the cosine of a zero vector is 0
 
 

@@ -26,10 +26,8 @@ constants.HF_HUB_DISABLE_XET = os.environ["HF_HUB_DISABLE_XET"].upper() in const
 WEIGHTS = ("model.safetensors", "pytorch_model.bin")
 """PyTorch weights that can be exported, in order of preference. The second is a pickle, but transformers
 doesn't run code in it (`weights_only`)."""
-SMALL_BYTES = 50_000_000
-"""Text files above this size are not part of a PyTorch model's tokenizer."""
-TIMEOUT_S = 10.0
-"""Longest wait for the hub's next bytes; huggingface_hub uses the same value for files."""
+SMALL_BYTES = 50_000_000  # text files above this size are not part of a PyTorch model's tokenizer
+TIMEOUT_S = 10.0  # longest wait for the hub's next bytes; huggingface_hub uses the same value for files
 OUT_OF_REACH = (requests.ConnectionError, requests.Timeout, OfflineModeIsEnabled, LocalEntryNotFoundError)
 """Errors raised if the hub cannot be reached."""
 WHOLES = ("onnx/model", "model")
@@ -38,8 +36,6 @@ WHOLES = ("onnx/model", "model")
 
 @dataclass(frozen=True)
 class ModelRequest:
-    """A model to download."""
-
     name: str  # name of the model folder
     repository: str  # owner/name on the hub
     release: Release | None
@@ -74,8 +70,6 @@ def networks_of(kind: str) -> list[tuple[str, ...]]:
 
 @dataclass(frozen=True)
 class HubFile:
-    """A file as listed by the hub."""
-
     path: str
     size: int
     digest: str  # pinned or listed: SHA-256 (64 digits), or git's SHA-1 of a small file (40 digits)

@@ -51,21 +51,15 @@ from hilsplat.models.store import RECOMMENDED, real_model, user_models
 
 logger = logging.getLogger(__name__)
 
-ORIGIN = "origin.json"
-"""File in a model folder that records its origin."""
-STAGING = ".{name}.part"
-"""Name of a download's folder, beside the model's."""
+ORIGIN = "origin.json"  # file in a model folder that records its origin
+STAGING = ".{name}.part"  # name of a download's folder, beside the model's
 KEPT = "transferred data is kept, and the transfer resumes"
-SPARE_BYTES = 200_000_000
-"""Disk space that must remain free after a transfer."""
+SPARE_BYTES = 200_000_000  # disk space that must remain free after a transfer
 EXPORT_FACTOR = 4
 """Disk space for an export, as a multiple of the weights' size: weights, complete network, and its halves."""
-INT8_SHARE = 0.27
-"""Size of int8 networks, relative to float32."""
-BATCHES = {"sam": 16, "clip": 64}
-"""Prompts or crops per call for which the memory is reported."""
-NEEDED = ("optimum-onnx", "transformers", "torch")
-"""Packages that an export requires."""
+INT8_SHARE = 0.27  # size of int8 networks, relative to float32
+BATCHES = {"sam": 16, "clip": 64}  # prompts or crops per call for which the memory is reported
+NEEDED = ("optimum-onnx", "transformers", "torch")  # packages that an export requires
 INSTALL = "pip install --constraint constraints.txt --editable '.[export]'"
 LAST_LINES = 15  # number of lines of the exporter's output shown in an error
 BETWEEN = (

@@ -14,10 +14,8 @@ from hilsplat.base.errors import first_line
 
 logger = logging.getLogger(__name__)
 
-WAITS_S = (1.0, 2.0, 4.0, 8.0)
-"""Waiting times between attempts."""
-MAX_WAIT_S = 120.0
-"""Longest waiting time accepted from a `Retry-After` header."""
+WAITS_S = (1.0, 2.0, 4.0, 8.0)  # waiting times between attempts
+MAX_WAIT_S = 120.0  # longest waiting time accepted from a `Retry-After` header
 BROKEN = (requests.ConnectionError, requests.Timeout, requests.exceptions.ChunkedEncodingError)
 """Errors raised by a broken connection."""
 WRONG_LENGTH = "Consistency check failed"

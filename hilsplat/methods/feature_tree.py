@@ -28,7 +28,6 @@ from hilsplat.settings import FieldSettings, SemanticTreeSettings
 
 CENTRE_OF = 4  # minimum number of Gaussians per k-means centre
 STEPS = 60  # number of L-BFGS steps
-
 RIDGE = 1e-3  # weight of the pull towards the random start; prevents drift in unobserved directions
 
 

@@ -32,15 +32,8 @@ from torch.nn.functional import cross_entropy
 
 from hilsplat.base.levels import LEVELS
 from hilsplat.baselines import TrainedSettings
+from hilsplat.methods.common import training
 from hilsplat.methods.common.groups import kmeans, standardised
-from hilsplat.methods.common.training import (
-    initial_features,
-    nonempty_columns,
-    one_torch_thread,
-    product,
-    train,
-    unit,
-)
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 
 ENTRIES = 128
@@ -89,7 +82,7 @@ def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[n
         codebook, entry[rows] = kmeans(latents[rows], ENTRIES, seed + level.index)
         codebooks.append(codebook)
     views, num, levels = labelled_views(inputs, settings.pixel_step), contributions.num_gaussians, len(LEVELS)
-    codes = initial_features(num, levels * CHANNELS, seed)
+    codes = training.initial_features(num, levels * CHANNELS, seed)
     doubt = torch.full((num, levels), float(np.log(FIRST_UNCERTAINTY / (1 - FIRST_UNCERTAINTY))))
     doubt.requires_grad_()
     with torch.random.fork_rng(devices=()):
@@ -99,9 +92,9 @@ def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[n
     places = torch.from_numpy(standardised(contributions.means()))
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
-        weights, gaussians = nonempty_columns(view.weights)
-        rendered = product(weights, codes[gaussians]).reshape(-1, levels, CHANNELS)
-        uncertainty = product(weights, doubt[gaussians].sigmoid())
+        weights, gaussians = training.nonempty_columns(view.weights)
+        rendered = training.product(weights, codes[gaussians]).reshape(-1, levels, CHANNELS)
+        uncertainty = training.product(weights, doubt[gaussians].sigmoid())
         chosen = torch.from_numpy(random.integers(num, size=min(SAMPLES, num)))
         total = SMOOTHING * smoothing_loss(
             codes[chosen].reshape(-1, CHANNELS),
@@ -112,7 +105,7 @@ def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[n
             inside = view.at(level)
             if len(inside):
                 target = torch.from_numpy(entry[view.rows[view.labels[inside, level.index]]])
-                logits = decoders[level.index](unit(rendered[inside, level.index]))
+                logits = decoders[level.index](training.unit(rendered[inside, level.index]))
                 total = total + index_loss(logits, target, uncertainty[inside, level.index])
         return total
 
@@ -122,8 +115,8 @@ def fit(inputs: MethodInputs, settings: TrainedSettings, seed: int) -> Float32[n
         {"params": networks, "lr": NETWORK_RATE * settings.rate},
         {"params": [doubt], "lr": UNCERTAINTY_RATE},
     ]
-    train(views, groups, loss, settings, seed, PIXELS)
-    with one_torch_thread(), torch.no_grad():
-        unit_codes = unit(codes.reshape(num, levels, CHANNELS))
+    training.train(views, groups, loss, settings, seed, PIXELS)
+    with training.one_torch_thread(), torch.no_grad():
+        unit_codes = training.unit(codes.reshape(num, levels, CHANNELS))
         features = [book[decoders[k](unit_codes[:, k]).argmax(1).numpy()] for k, book in enumerate(codebooks)]
     return np.where(inputs.seen()[..., None], np.stack(features, axis=1), np.float32(0))

@@ -18,13 +18,10 @@ logger = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
 
-CPU = "cpu"
-"""Device on which onnxruntime runs a network; on any other, such as `cuda`, torch does."""
-USED_SHARE = 0.8
-"""Share of the free memory of a card that a call may take, because memory is fragmented."""
+CPU = "cpu"  # device on which onnxruntime runs a network; on any other, such as `cuda`, torch does
+USED_SHARE = 0.8  # share of the free memory of a card that a call may take, because memory is fragmented
 MIB = 2**20
-TURN = RLock()
-"""Held during a call on a card, so that threads share its memory one after the other."""
+TURN = RLock()  # held during a call on a card, so that threads share its memory one after the other
 
 
 @cache

@@ -16,25 +16,15 @@ from pydantic import AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field
 from hilsplat.base.artifacts import read_json
 from hilsplat.base.errors import ArtifactError, ModelError
 from hilsplat.base.lineage import sha256_of_file, sha256_of_json
+from hilsplat.models import layouts
 from hilsplat.models.card import CPU
-from hilsplat.models.layouts import (
-    LAYOUTS,
-    OTHER_TYPES,
-    SECTIONS,
-    SUPPORTED,
-    TORCH_SUFFIXES,
-    Layout,
-    layout_of,
-)
 from hilsplat.models.network import Network
 from hilsplat.models.onnx_graph import Graph, external_files, whole_clip
 from hilsplat.models.store import model_path
 
 OTHER_FOLDER = "choose a folder in a layout listed in docs/models.md"
 WHOLE_COPY = "fetch a complete copy"
-SWITCHES = ("do_resize", "do_rescale", "do_normalize")
-"""Preprocessing steps that our code always performs."""
-
+SWITCHES = ("do_resize", "do_rescale", "do_normalize")  # preprocessing steps that our code always performs
 SAM_SIDE_PX = 1024  # default of `size`
 MAX_SIDE_PX = 4096
 
@@ -75,8 +65,6 @@ class Preprocessing(BaseModel):
 
 @dataclass(frozen=True)
 class ModelFolder:
-    """A complete model folder."""
-
     folder: Path
     layout: str  # key of `LAYOUTS`
     config: dict[str, Any]
@@ -87,12 +75,12 @@ class ModelFolder:
     @property
     def kind(self) -> str:
         """ "sam" or "clip"."""
-        return LAYOUTS[self.layout].kind
+        return layouts.LAYOUTS[self.layout].kind
 
     @property
     def tokenizer(self) -> Path:
         """Tokenizer file of a CLIP model."""
-        return self.folder / LAYOUTS[self.layout].tokenizer
+        return self.folder / layouts.LAYOUTS[self.layout].tokenizer
 
     @cached_property
     def digest(self) -> str:
@@ -102,7 +90,7 @@ class ModelFolder:
 
     def network(self, name: str, changed: Graph | Path | None = None, device: str = CPU) -> Network:
         """Open one of the model's networks, in torch unless on the CPU, and check its inputs and outputs."""
-        network = self.networks[name], LAYOUTS[self.layout].usable[name], changed
+        network = self.networks[name], layouts.LAYOUTS[self.layout].usable[name], changed
         if device == CPU:
             return Network(*network)
         from hilsplat.models.torch_network import TorchNetwork  # torch takes seconds to import
@@ -128,7 +116,7 @@ def open_model_folder(
     if not folder.is_dir():
         raise ModelError(f"model folder {folder} is missing", fix=OTHER_FOLDER + alternative)
     name, config = _read_config(folder, kind, OTHER_FOLDER + alternative)
-    layout = LAYOUTS[name]
+    layout = layouts.LAYOUTS[name]
     ending = f"_{variant}.onnx" if variant else ".onnx"
     networks, missing = {}, []
     for network, spec in layout.usable.items():
@@ -150,7 +138,7 @@ def open_model_folder(
 
 def _read_config(folder: Path, kind: str | None, fix: str) -> tuple[str, dict[str, Any]]:
     """Return a folder's layout and configuration; raise a ModelError for a different kind of model."""
-    supported = SUPPORTED[kind] if kind else "; ".join(SUPPORTED.values())
+    supported = layouts.SUPPORTED[kind] if kind else "; ".join(layouts.SUPPORTED.values())
     try:
         config = read_json(folder / "config.json")
     except ArtifactError as error:
@@ -160,30 +148,30 @@ def _read_config(folder: Path, kind: str | None, fix: str) -> tuple[str, dict[st
             found=", ".join(sorted(path.name for path in folder.iterdir())[:12]) or "an empty folder",
             fix=fix,
         ) from error
-    name, config = layout_of(config), config if isinstance(config, dict) else {}
+    name, config = layouts.layout_of(config), config if isinstance(config, dict) else {}
     model_type = config.get("model_type", name)
-    if name is None or (kind is not None and LAYOUTS[name].kind != kind):
+    if name is None or (kind is not None and layouts.LAYOUTS[name].kind != kind):
         raise ModelError(
             f"model folder {folder} contains a different kind of model",
             expected=supported,
             found=f"model_type {model_type!r}",
-            fix=OTHER_TYPES.get(str(model_type), fix),
+            fix=layouts.OTHER_TYPES.get(str(model_type), fix),
         )
     return name, config
 
 
 def _incomplete(folder: Path, name: str, missing: list[str], alternative: str) -> ModelError:
-    layout = LAYOUTS[name]
+    layout = layouts.LAYOUTS[name]
     files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     variants = _variants(folder, layout)
     if any(file.endswith(".onnx") for file in missing) and variants:
         listed = ", ".join(map(repr, variants))
         what = "suffixes" if any(variants) else "no suffix"
-        fix = f"its networks have {what}: set {SECTIONS[layout.kind]}.variant to one of {listed}"
+        fix = f"its networks have {what}: set {layouts.SECTIONS[layout.kind]}.variant to one of {listed}"
     elif layout.kind == "clip" and whole_clip(folder):
         command = f"hilsplat models split {shlex.quote(str(folder))}"
         fix = f"split its single network into the required two: {command}"
-    elif any(file.endswith(TORCH_SUFFIXES) for file in files) and not any(folder.rglob("*.onnx")):
+    elif any(file.endswith(layouts.TORCH_SUFFIXES) for file in files) and not any(folder.rglob("*.onnx")):
         fix = (
             "these are PyTorch weights, but hilsplat reads ONNX networks: fetch an ONNX export of the model "
             "(hilsplat models get), or export it (docs/models.md)"
@@ -200,7 +188,7 @@ def _incomplete(folder: Path, name: str, missing: list[str], alternative: str) -
     )
 
 
-def _variants(folder: Path, layout: Layout) -> list[str]:
+def _variants(folder: Path, layout: layouts.Layout) -> list[str]:
     """Return the suffixes, such as `fp16`, for which a folder has all networks; "" for the plain names."""
     suffixes = []
     for spec in layout.networks.values():

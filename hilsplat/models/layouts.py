@@ -3,8 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-Axes = tuple[int | None, ...]
-"""Axis lengths of an array; None where the layout does not fix the length."""
+Axes = tuple[int | None, ...]  # axis lengths of an array; None where the layout does not fix the length
 
 
 @dataclass(frozen=True)
@@ -137,7 +136,5 @@ OTHER_TYPES = {
 }
 """Unsupported `model_type` -> which model to use instead."""
 
-SECTIONS = {"sam": "masks", "clip": "clip"}
-"""Settings section that selects the model, by kind."""
-TORCH_SUFFIXES = (".safetensors", ".bin", ".pt", ".pth")
-"""Suffixes of PyTorch weight files."""
+SECTIONS = {"sam": "masks", "clip": "clip"}  # settings section that selects the model, by kind
+TORCH_SUFFIXES = (".safetensors", ".bin", ".pt", ".pth")  # suffixes of PyTorch weight files

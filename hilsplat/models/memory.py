@@ -8,8 +8,7 @@ from hilsplat.base.memory import MIB, available_mib
 from hilsplat.models.folder import ModelFolder, input_side_px
 from hilsplat.models.layouts import LAYOUTS
 
-PROCESS_MIB = 1500
-"""Memory of a stage without its networks: libraries, images, candidates, masks."""
+PROCESS_MIB = 1500  # memory of a stage without its networks: libraries, images, candidates, masks
 ATTENTION_COPIES = 3.5
 """Number of arrays as large as a layer's attention weights that are in memory at once. Measured: 2615 MiB for
 an image in SAM ViT-B, whose attention weights take 768 MiB."""

@@ -25,8 +25,7 @@ logger = logging.getLogger(__name__)
 
 Fast = TypeVar("Fast")
 
-Array = Any
-"""A NumPy array, or on a card a torch tensor, which only code for cards imports."""
+Array = Any  # a NumPy array, or on a card a torch tensor, which only code for cards imports
 EXPORT_AGAIN = "export the model in the layout of the Hugging Face ONNX exports"
 DTYPES = {
     "tensor(float)": np.float32,

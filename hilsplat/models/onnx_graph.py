@@ -17,15 +17,13 @@ from hilsplat.base.errors import ModelError, first_line, foreign
 from hilsplat.base.files import regular
 from hilsplat.base.lineage import sha256_of_bytes, sha256_of_json
 
-WHOLE = "model.onnx"
-"""Network with both halves, in the model folder itself or in its subfolder `onnx/`."""
+WHOLE = "model.onnx"  # network with both halves, in the model folder itself or in its subfolder `onnx/`
 HALVES = {
     "vision_model": (["pixel_values"], "image_embeds"),
     "text_model": (["input_ids", "attention_mask"], "text_embeds"),
 }
 """Inputs and output of each half."""
-POINTER_BYTES = 1024
-"""Size below which a file may be a pointer from a clone without Git LFS."""
+POINTER_BYTES = 1024  # size below which a file may be a pointer from a clone without Git LFS
 SMALL_BYTES = 1024
 """Size below which external values are stored in the network; constants of shapes must be there."""
 OPTIONAL = {"attention_mask"}

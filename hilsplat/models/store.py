@@ -20,8 +20,7 @@ from hilsplat.models.layouts import LAYOUTS, layout_of
 
 MODELS = Path("models")
 """Folder of a project's own models, relative to the working directory of a command or run."""
-AUTO = "auto"
-"""Setting value that selects a pretrained model if one is installed."""
+AUTO = "auto"  # setting value that selects a pretrained model if one is installed
 EMBEDDED = {"sam": "models/sam-tiny", "clip": "models/clip-tiny"}
 """Models of the synthetic world that are included in the project."""
 
@@ -44,8 +43,7 @@ def _releases() -> tuple[Release, ...]:
     return tuple(Release(**{**row, "megabytes": int(row["megabytes"])}) for row in rows)
 
 
-RELEASES = _releases()
-"""Released models, in the order of preference of `auto` within each family."""
+RELEASES = _releases()  # released models, in the order of preference of `auto` within each family
 
 RECOMMENDED = ("sam2.1-hiera-small", "clip-vit-base-patch16")
 """Models that `hilsplat models get` downloads if no name is given; docs/models.md gives the reasons."""

@@ -24,8 +24,7 @@ from hilsplat.models.onnx_graph import Graph, inputs_of
 from hilsplat.models.torch_operators import ON_HOST, OPERATORS
 
 MIN_OPSET = 13  # earlier versions define Softmax differently
-PLANS = 16
-"""Maximum number of input shapes for which a network keeps its list of calls."""
+PLANS = 16  # maximum number of input shapes for which a network keeps its list of calls
 
 
 class Name(str):
@@ -241,7 +240,6 @@ def _repeat(steps: list[Step], values: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def host_tensor(tensor: Any) -> Tensor:
-    """Return a tensor of a graph on the host."""
     return torch.from_numpy(np.array(onnx.numpy_helper.to_array(tensor)))
 
 

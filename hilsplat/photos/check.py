@@ -15,8 +15,7 @@ from jaxtyping import Float32, Float64, UInt8
 from hilsplat.base.errors import shorten_list
 from hilsplat.base.images import resize_to_fit
 
-FEW_PHOTOS = 10
-"""With fewer photographs, large parts of a scene usually appear in at most one photograph."""
+FEW_PHOTOS = 10  # with fewer photographs, large parts of a scene usually appear in at most one photograph
 
 CHECK_SIDE_PX = 800
 FEATURE_SIDE_PX = 640
@@ -32,8 +31,7 @@ DARK_LEVEL = 64
 """A photograph is too dark if 95 % of its pixels are below this level. A lit object on black is not."""
 
 WHITE_LEVEL = 250
-WHITE_SHARE = 0.5
-"""A photograph is over-exposed if more than this share of its pixels is white."""
+WHITE_SHARE = 0.5  # a photograph is over-exposed if more than this share of its pixels is white
 
 FAULTS = (
     "blurred: omit them, or retake them with more light, a steady hand and correct focus",
@@ -47,13 +45,11 @@ SAME_PLACE = 0.01
 """Displacement of matches (90th percentile), as a share of the diagonal, below which two pictures count as
 the same. The median would be too small: around a centred object, half of the matches may barely move."""
 
-MAX_PAIRS = 60
-"""Maximum number of evenly spaced neighbouring pairs to match (5 s at 80 ms per photograph)."""
+MAX_PAIRS = 60  # maximum number of evenly spaced neighbouring pairs to match (5 s at 80 ms per photograph)
 
 NUM_FEATURES = 1000
 RATIO = 0.8
-MIN_MATCHES = 40
-"""Minimum number of verified matches required to measure the motion between two photographs."""
+MIN_MATCHES = 40  # minimum number of verified matches required to measure the motion between two photographs
 
 MATCH_ERROR_PX = 1.5
 TURN_ERROR_PX = 3.0
@@ -65,8 +61,7 @@ MIN_TURN_PAIRS = 3
 FOCALS = (0.6, 0.75, 0.9, 1.1, 1.35, 1.7, 2.2, 3.0)
 """Focal lengths to try, as multiples of the picture's longer side."""
 
-MAX_NAMED = 5
-"""Maximum number of photographs or sizes that a doubt names."""
+MAX_NAMED = 5  # maximum number of photographs or sizes that a doubt names
 
 Features = tuple[Float32[np.ndarray, "_ 2"], Float32[np.ndarray, "_ 128"], tuple[int, int]]
 """SIFT positions in px, RootSIFT descriptors, and height and width of the picture that has them."""

@@ -45,16 +45,12 @@ OPTIONS = {"format_whitelist": "mov,matroska,avi", "protocol_whitelist": "file",
 without playlists; no network; no tracks in external files."""
 
 JPEG_QUALITY = 95
-USUAL_RATE = 30.0
-"""Assumed frames per second for files without a frame rate or timestamps."""
+USUAL_RATE = 30.0  # assumed frames per second for files without a frame rate or timestamps
 
 NUM_CORNERS = 300
 PYRAMID_LEVELS = 4
-LOST = 0.25
-"""Displacement, as a share of the diagonal, assumed if too few corners can be tracked."""
-
-MIN_FOLLOWED = 20
-"""Minimum number of corners tracked forwards and backwards for a valid measurement."""
+LOST = 0.25  # displacement, as a share of the diagonal, assumed if too few corners can be tracked
+MIN_FOLLOWED = 20  # minimum number of corners tracked forwards and backwards for a valid measurement
 
 
 @dataclass(frozen=True)

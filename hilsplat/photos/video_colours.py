@@ -9,24 +9,13 @@ from jaxtyping import Float32, Float64, UInt8, UInt16
 
 from hilsplat.base.images import srgb_codes
 
-PQ, HLG = 16, 18
-"""Transfer characteristics of HDR video (ITU-T H.273): SMPTE ST 2084 and ARIB STD-B67."""
+PQ, HLG = 16, 18  # transfer characteristics of HDR video (ITU-T H.273): SMPTE ST 2084 and ARIB STD-B67
+UNSPECIFIED, BT709, BT601 = 2, 1, 5  # colour matrices (ITU-T H.273)
+WHITE_NITS = 203.0  # luminance of reference white in HDR video (ITU-R BT.2408)
 
-UNSPECIFIED, BT709, BT601 = 2, 1, 5
-"""Colour matrices (ITU-T H.273)."""
-
-WHITE_NITS = 203.0
-"""Luminance of reference white in HDR video (ITU-R BT.2408)."""
-
-HLG_PEAK_NITS = 1000.0
-HLG_SYSTEM_GAMMA = 1.2
-"""Reference display for HLG (ITU-R BT.2100)."""
-
-KNEE = 0.6
-"""Linear light (white = 1) above which HDR highlights are compressed towards 1."""
-
-BAND_ROWS = 32
-"""Number of rows tone-mapped at once, chosen to fit into the processor's cache."""
+HLG_PEAK_NITS, HLG_SYSTEM_GAMMA = 1000.0, 1.2  # reference display for HLG (ITU-R BT.2100)
+KNEE = 0.6  # linear light (white = 1) above which HDR highlights are compressed towards 1
+BAND_ROWS = 32  # number of rows tone-mapped at once, chosen to fit into the processor's cache
 
 BT709_FROM_BT2020: Float64[np.ndarray, "3 3"] = np.array(
     [[1.660491, -0.587641, -0.072850], [-0.124550, 1.132900, -0.008349], [-0.018151, -0.100579, 1.118730]]

@@ -24,11 +24,8 @@ from hilsplat.semantic_tree.export import write_selection_ply
 from hilsplat.splat.gaussians import morton_order
 from hilsplat.splat.spz import fractional_bits, spz_bytes
 
-LISTED = 10
-"""Maximum number of answers in a report."""
-
-MAX_NAME_BYTES = 80
-"""Maximum length of the query's own text in a folder name, bytes."""
+LISTED = 10  # maximum number of answers in a report
+MAX_NAME_BYTES = 80  # maximum length of the query's own text in a folder name, bytes
 
 
 def answer(

@@ -38,8 +38,7 @@ from hilsplat.splat.rasterise.rendering import Rendering, render
 
 logger = logging.getLogger(__name__)
 
-BEST_VIEWS = 3
-"""Maximum number of best views of an answer."""
+BEST_VIEWS = 3  # maximum number of best views of an answer
 
 
 @dataclass(frozen=True)
@@ -81,11 +80,7 @@ class LanguageScene(NodeQueries):
 
     @staticmethod
     def from_parts(
-        parts: SceneParts,
-        settings: EvaluateSettings,
-        *,
-        threads: int = 1,
-        opened: Opened | None = None,
+        parts: SceneParts, settings: EvaluateSettings, *, threads: int = 1, opened: Opened | None = None
     ) -> "LanguageScene":
         """Read each artifact of a scene once, except node names, and check that the artifacts match.
 

@@ -18,8 +18,7 @@ from hilsplat.base.lineage import sha256_of_file
 from hilsplat.web.file_changes import NO_FILE, replacing, version_of
 
 FILE = "names.json"
-MAX_NAME = 80
-"""Maximum number of characters in a name."""
+MAX_NAME = 80  # maximum number of characters in a name
 NAME_RULE = f"at most {MAX_NAME} printable characters, without the separator {PATH_SEPARATOR!r}"
 
 
@@ -44,7 +43,6 @@ class NodeNames:
 
 
 def tree_digest(semantic_tree: Path) -> str:
-    """Return the digest that identifies a semantic tree."""
     return sha256_of_file(Path(semantic_tree) / "tree.npz")
 
 

@@ -9,17 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from hilsplat.base.artifacts import (
-    INDEX,
-    read_index,
-    read_json,
-    read_npy,
-    rebuild_command,
-    sealed,
-    write_index,
-    write_json,
-    write_npy,
-)
+from hilsplat.base import artifacts
 from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.cache import ViewCache
 from hilsplat.base.code import code_digest
@@ -36,8 +26,7 @@ from hilsplat.query.relevancy import margins
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import EvaluateSettings, QuerySettings
 
-CANDIDATES = 5
-"""Number of texts stored for each node, best first."""
+CANDIDATES = 5  # number of texts stored for each node, best first
 
 STANDS_OUT = 0.5
 """Minimum lead of a name's margin over that of the fifth-nearest text (nearer texts include synonyms), in
@@ -122,17 +111,20 @@ class NodeNaming:
         """
         if not folder.is_dir():
             return None
-        index = read_index(folder, "tree_sha256", "clip_sha256", "nodes")
+        index = artifacts.read_index(folder, "tree_sha256", "clip_sha256", "nodes")
         made_for = index["tree_sha256"], index["clip_sha256"]
-        if made_for != (tree_digest(semantic_tree), sha256_of_file(clip_folder / INDEX)):
+        if made_for != (tree_digest(semantic_tree), sha256_of_file(clip_folder / artifacts.INDEX)):
             return None
-        rows = read_json(sealed(folder, "names.json"))
-        fix, expected = partial(rebuild_command, folder), f"{index['nodes']} names, and vectors (W, C)"
+        rows = artifacts.read_json(artifacts.sealed(folder, "names.json"))
+        fix, expected = (
+            partial(artifacts.rebuild_command, folder),
+            f"{index['nodes']} names, and vectors (W, C)",
+        )
         what = f"{folder / 'names.json'} or rivals.npy"
         with foreign(what, ArtifactError, problem="is damaged", expected=expected, fix=fix):
             names = tuple(checked_name(str(row["name"])) for row in rows)
             surfaces = tuple(bool(row["surface"]) for row in rows)
-            rivals = read_npy(sealed(folder, "rivals.npy")).astype(np.float32)
+            rivals = artifacts.read_npy(artifacts.sealed(folder, "rivals.npy")).astype(np.float32)
             if len(rows) != index["nodes"] or rivals.ndim != 2:
                 raise ValueError(f"{len(rows)} names, rivals of shape {rivals.shape}")
         return NodeNaming(names, surfaces, rivals)
@@ -181,14 +173,14 @@ def run_names(
             known = [text for row, text in enumerate(texts) if row not in nearest]
         rivals = known if len(known) >= MIN_ABSENT else []
         rows = named(tree, vocabulary, margin)
-        write_json(folder / "names.json", rows)
-        write_npy(folder / "rivals.npy", of(rivals).astype(np.float16))
+        artifacts.write_json(folder / "names.json", rows)
+        artifacts.write_npy(folder / "rivals.npy", of(rivals).astype(np.float16))
         NodeIndex.of(tree).save(folder)
-        write_index(
+        artifacts.write_index(
             folder,
             {},
             tree_sha256=tree_digest(semantic_tree),
-            clip_sha256=sha256_of_file(clip_folder / INDEX),
+            clip_sha256=sha256_of_file(clip_folder / artifacts.INDEX),
             vocabulary=path.name,
             vocabulary_sha256=sha256_of_file(path),
             nodes=len(tree),

@@ -23,8 +23,7 @@ from hilsplat.scene.finished import is_drawn
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import EvaluateSettings
 
-NAMED = 2.0
-"""Cosine margin of a node for its user-given name: the maximum, so that the node is ranked first."""
+NAMED = 2.0  # cosine margin of a node for its user-given name: the maximum, so that the node is ranked first
 
 ANSWERERS = ("tree", "field")
 

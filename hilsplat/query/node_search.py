@@ -12,8 +12,7 @@ from hilsplat.semantic_tree.tree import SemanticTree
 
 # These values were chosen on development scenes; docs/experiments.md ("Query") compares them with others.
 
-ALIKE = 0.9
-"""Minimum cosine of two nodes' vectors to count as similar, such as objects of the same kind."""
+ALIKE = 0.9  # minimum cosine of two nodes' vectors to count as similar, such as objects of the same kind
 
 ALIKE_REACH = 3.0
 """Nodes that look like the best answer may be this many times as far below it as other nodes."""
@@ -25,8 +24,7 @@ PLAUSIBLE = 0.25
 """A node competes on a path only if its ancestor is at most this fraction of the margin range below the best
 answer to the first text: only the nose of a plausible bear is an answer to "bear > nose"."""
 
-WITHOUT_ANCESTOR = 0.1
-"""Shortfall assumed for a missing ancestor, as a fraction of the margin range."""
+WITHOUT_ANCESTOR = 0.1  # shortfall assumed for a missing ancestor, as a fraction of the margin range
 
 
 @dataclass(frozen=True)

@@ -23,11 +23,8 @@ TRUTH_RGB = (0, 230, 255)
 RELEVANCY_COLOURS = "inferno"
 
 DPI = 110
-TITLE_LETTERS = 110
-"""Maximum number of characters per line of a panel's title."""
-
-MAX_POINTS = 30_000
-"""Maximum number of Gaussians drawn in a top-down map."""
+TITLE_LETTERS = 110  # maximum number of characters per line of a panel's title
+MAX_POINTS = 30_000  # maximum number of Gaussians drawn in a top-down map
 
 
 def grey(image: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:

@@ -31,8 +31,7 @@ LEFT_PX = 24
 TITLE_PX = 20
 HEADING_PX = 26
 MAP_PX = 460
-NAMED = 3
-"""Maximum number of answer names in the title."""
+NAMED = 3  # maximum number of answer names in the title
 
 
 def query_panel(

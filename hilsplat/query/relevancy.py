@@ -20,23 +20,16 @@ from hilsplat.query.relevancy_kernels import lengths_and_generic, texts_relevanc
 ROWS_AT_A_TIME = 1 << 16
 """Number of embeddings or pixels processed at once; it limits the size of products with many texts."""
 
-ERROR = 2e-3
-"""Maximum relevancy error at any pixel if the code is a network."""
-
-RESIDUAL = 5e-5
-"""Maximum root mean square of the decoded vectors' component outside the stored directions."""
-
-SAMPLE = 8192
-"""Number of latents in the sample from which the directions are computed."""
+ERROR = 2e-3  # maximum relevancy error at any pixel if the code is a network
+RESIDUAL = 5e-5  # maximum root mean square of the decoded vectors' component outside the stored directions
+SAMPLE = 8192  # number of latents in the sample from which the directions are computed
 
 STEPS = 32767
 """Number of quantisation steps between coordinates 0 and 1; the rounding error is at most 1.5e-5."""
 
 
 def margins(
-    embeddings: Float[np.ndarray, "B C"],
-    texts: Float[np.ndarray, "T C"],
-    canonical: Float[np.ndarray, "K C"],
+    embeddings: Float[np.ndarray, "B C"], texts: Float[np.ndarray, "T C"], canonical: Float[np.ndarray, "K C"]
 ) -> Float32[np.ndarray, "T B"]:
     """Return the cosine with each text minus the cosine with the nearest canonical phrase, in [-2, 2].
 

@@ -26,8 +26,7 @@ VIEW_CACHE_MIB = 1024.0
 
 Nodes = Sequence[int] | Int64[np.ndarray, " n"]
 
-View = str | Camera
-"""The name of a view of the scene, or any camera in scene coordinates."""
+View = str | Camera  # the name of a view of the scene, or any camera in scene coordinates
 
 
 class Opened:

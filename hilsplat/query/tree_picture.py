@@ -20,12 +20,10 @@ from hilsplat.splat.rasterise.api import project_gaussians
 
 CELL_PX = 84
 GAP_PX = 6
-LABEL_PX = 32
-"""Height of two lines of text: a node's name and number."""
+LABEL_PX = 32  # height of two lines of text: a node's name and number
 
 BLOCK_GAP_PX = 18
-MARGIN_PX = 84
-"""Left margin, for the names of the levels."""
+MARGIN_PX = 84  # left margin, for the names of the levels
 
 ROW_PX = CELL_PX + LABEL_PX + 2 * GAP_PX
 COLUMNS = 18

@@ -17,12 +17,10 @@ from hilsplat.scene.cameras import Cameras, Photo
 from hilsplat.scene.colmap import Points, is_pinhole, pycolmap
 from hilsplat.scene.scene import Scene
 
-MIN_VIEWS_FOR_TEST = 8
-"""Minimum number of views for a test split; with fewer, the fit needs all of them."""
+MIN_VIEWS_FOR_TEST = 8  # minimum number of views for a test split; with fewer, the fit needs all of them
 
-CHECKED_DIRECTIONS = 33
-MAX_SHIFT_PX = 1.0
-"""Directions per side at which a lens must be invertible, and the tolerance."""
+CHECKED_DIRECTIONS = 33  # directions per side at which a lens must be invertible
+MAX_SHIFT_PX = 1.0  # tolerance of that check
 
 WEAK_POINTS_PER_VIEW = 13
 """Fewest points per registered view in any good run on renders; unusable runs had 4 to 18."""

@@ -24,14 +24,12 @@ from hilsplat.scene.scene import Scene
 
 BLOCKS = "blocks.json"
 
-GRID = 32
-"""Cells along the longer side of a view; of the points in a cell, only the nearest counts as seen."""
+GRID = 32  # cells along the longer side of a view; of the points in a cell, only the nearest counts as seen
 
 MAX_POINTS = 200_000
 """Maximum number of sparse points whose visibility is computed; of more, an even sample is used."""
 
-MIN_VIEWS = 3
-"""Minimum number of views per block, as of any scene."""
+MIN_VIEWS = 3  # minimum number of views per block, as of any scene
 
 
 @dataclass(frozen=True)
@@ -78,7 +76,6 @@ class Blocks:
 
 
 def nearest(places: Float[np.ndarray, "n 3"], centres: Float64[np.ndarray, "K 3"]) -> Int64[np.ndarray, " n"]:
-    """Return the row of the nearest centre of each place."""
     distances = [np.square(places - centre).sum(axis=1) for centre in centres]
     return np.argmin(distances, axis=0)
 

@@ -14,8 +14,7 @@ from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 
 MAX_SIDE_PX = 2**15
 LIMITS = {"size_hw": (1, MAX_SIDE_PX)}
-MAX_PARAMETERS = 16
-"""Number of parameters of COLMAP's largest lens model."""
+MAX_PARAMETERS = 16  # number of parameters of COLMAP's largest lens model
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,7 @@ import pycolmap as pycolmap  # noqa: E402
 with suppress(ValueError):  # this is not the main thread
     signal.signal(signal.SIGTERM, _on_sigterm)
 
-Points = tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]
-"""Positions and colours."""
+Points = tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]  # positions and colours
 
 
 def pose_matrix(pose: pycolmap.Rigid3d) -> Float64[np.ndarray, "4 4"]:
@@ -32,8 +31,7 @@ def pose_matrix(pose: pycolmap.Rigid3d) -> Float64[np.ndarray, "4 4"]:
     return np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]])
 
 
-LENGTH_TOLERANCE = 0.01
-"""Maximum deviation of a quaternion's length from 1; programs write at least 3 digits."""
+LENGTH_TOLERANCE = 0.01  # maximum deviation of a quaternion's length from 1; programs write at least 3 digits
 
 
 def rotation_matrix(quat_xyzw: Sequence[float]) -> Float64[np.ndarray, "3 3"]:

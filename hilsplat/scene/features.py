@@ -30,14 +30,12 @@ logger = logging.getLogger(__name__)
 LARGE_CAPTURE = 100
 """Number of views above which matcher "auto" tries likely pairs only, and mapping refines poses less."""
 
-MIN_INLIERS = 12
-"""Minimum number of verified matches per pair (COLMAP: 15)."""
+MIN_INLIERS = 12  # minimum number of verified matches per pair (COLMAP: 15)
 
 PEAK_THRESHOLD = 0.02 / 3 / 2
 """SIFT contrast threshold; half of COLMAP's, because renders and indoor photographs have low contrast."""
 
-MAX_TRIALS = 1000
-"""Maximum RANSAC trials per pair (COLMAP: 10000); pairs without overlap use all of them."""
+MAX_TRIALS = 1000  # maximum RANSAC trials per pair (COLMAP: 10000); pairs without overlap use all of them
 
 MIN_TRIALS = 30
 """Minimum RANSAC trials per pair of matcher "retrieval" (COLMAP: 100); most of its pairs overlap."""

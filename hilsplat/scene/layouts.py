@@ -25,11 +25,8 @@ UNUSED = (*TRAINED, *MAPS)
 PHOTO_FOLDERS = ("images", "input")
 """Folders of photographs: COLMAP's and nerfstudio's, then that of 3DGS's `convert.py`."""
 
-POSES_BOUNDS = "poses_bounds.npy"
-"""Pose file of LLFF."""
-
-NO_POSES = Path("none")
-"""Value used instead of a path to ignore the poses in the folder."""
+POSES_BOUNDS = "poses_bounds.npy"  # pose file of LLFF
+NO_POSES = Path("none")  # value used instead of a path to ignore the poses in the folder
 
 DATAPARSER = "dataparser_transforms.json"
 """File in which nerfstudio records the transform to its training coordinates."""

@@ -19,14 +19,9 @@ from hilsplat.models.onnx_graph import Graph
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.kernels import two_nearest
 
-MAX_ANGLE = 0.7
-"""Maximum angle between matching descriptors, radians (as in COLMAP)."""
-
-MAX_RATIO = 0.8
-"""Maximum ratio of the angles to the nearest and the second-nearest descriptor (as in COLMAP)."""
-
-MIN_MATCHES = 15
-"""Minimum number of matches for a pair to count as matched (as in COLMAP)."""
+MAX_ANGLE = 0.7  # maximum angle between matching descriptors, radians (as in COLMAP)
+MAX_RATIO = 0.8  # maximum ratio of the angles to the nearest and the second-nearest descriptor (as in COLMAP)
+MIN_MATCHES = 15  # minimum number of matches for a pair to count as matched (as in COLMAP)
 
 _CHANNELS = 128
 _LENGTH = 512.0  # length of a descriptor in COLMAP's database

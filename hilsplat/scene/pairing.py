@@ -14,29 +14,14 @@ from jaxtyping import Float32, Int, Int64, UInt8
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-Pair = tuple[int, int]
-"""Rows of two views, the lower one first."""
-
-WORDS = 64
-"""Number of visual words (docs/experiments.md: 32 to 256 words retrieve equally well)."""
-
-SAMPLE_PER_WORD = 256
-"""Number of descriptors per word in the k-means."""
-
-ROUNDS = 10
-"""Iterations of the k-means."""
-
-LENGTH = 4000.0
-"""Length of an appearance vector before rounding; inner products stay below 2**24."""
-
-NEAREST = 20
-"""Number of most similar views to match with each view."""
-
-TIME_STEPS = 5
-"""Each view is matched with this many views taken after it."""
-
-WEAK_PARTNERS = 5
-"""Views with fewer verified partners are matched with more views."""
+Pair = tuple[int, int]  # rows of two views, the lower one first
+WORDS = 64  # number of visual words (docs/experiments.md: 32 to 256 words retrieve equally well)
+SAMPLE_PER_WORD = 256  # number of descriptors per word in the k-means
+ROUNDS = 10  # iterations of the k-means
+LENGTH = 4000.0  # length of an appearance vector before rounding; inner products stay below 2**24
+NEAREST = 20  # number of most similar views to match with each view
+TIME_STEPS = 5  # each view is matched with this many views taken after it
+WEAK_PARTNERS = 5  # views with fewer verified partners are matched with more views
 
 
 def visual_words(sample: UInt8[np.ndarray, "S D"], seed: int) -> Float32[np.ndarray, "W D"]:

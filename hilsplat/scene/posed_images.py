@@ -16,8 +16,7 @@ from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.errors import SceneError
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 
-OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Conversion of camera axes, which is its own inverse."""
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # conversion of camera axes, which is its own inverse
 
 HALF_PIXEL = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
 """Offset added to a K with integer pixel centres; in this project, the first pixel's centre is (0.5, 0.5)."""

@@ -40,11 +40,8 @@ logger = logging.getLogger(__name__)
 LOST_PICTURE = "not_registered.png"
 """Picture written beside the scene folder if too few photographs were registered."""
 
-FEW_FEATURES = 30
-"""With fewer features, a photograph rarely has `MIN_INLIERS` verified matches."""
-
-NEIGHBOURS = 3
-"""Number of registered photographs listed as neighbours of each unregistered one."""
+FEW_FEATURES = 30  # with fewer features, a photograph rarely has `MIN_INLIERS` verified matches
+NEIGHBOURS = 3  # number of registered photographs listed as neighbours of each unregistered one
 
 MAX_ROWS = 12
 """Maximum number of unregistered photographs in the picture, besides separate groups; registration.json lists

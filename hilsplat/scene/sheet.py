@@ -18,25 +18,18 @@ from hilsplat.base.files import IMAGE_SUFFIXES, NAME_RULE, list_images, name_pro
 from hilsplat.base.plugins import entry_points
 from hilsplat.scene.layouts import NO_POSES, contents, has_known_poses, photo_folder
 
-DEFAULT_SHEET = Path("config/scenes.tsv")
-"""Default scene sheet, relative to the project."""
+DEFAULT_SHEET = Path("config/scenes.tsv")  # default scene sheet, relative to the project
 
 COLUMNS = ("dataset", "scene", "group", "source", "unit")
 OPTIONAL_COLUMNS = ("gaussians", "features", "poses")
-NOTHING = ("", "-")
-"""Values that mark an optional cell as empty."""
+NOTHING = ("", "-")  # values that mark an optional cell as empty
 GROUPS = ("benchmark", "development", "dense", "ci", "photos")
 """Groups of the installed sheet, besides those of data sets; a sheet may have more."""
 
 UNITS = ("metre", "arbitrary")
-PHOTOS = "photos"
-"""Data set and group of your own photographs."""
-
-MIN_PHOTOS = 3
-"""Minimum number of photographs for structure from motion."""
-
-DATA_PREFIX = "data:"
-"""Prefix of a source in the folder of published data sets (`data_root`)."""
+PHOTOS = "photos"  # data set and group of your own photographs
+MIN_PHOTOS = 3  # minimum number of photographs for structure from motion
+DATA_PREFIX = "data:"  # prefix of a source in the folder of published data sets (`data_root`)
 GENERATED = re.compile(r"([a-z][a-z0-9_]*):([a-z][a-z0-9_-]*):([0-9]{1,9})")
 
 
@@ -100,11 +93,7 @@ def project_root(sheet: Path) -> Path:
 
 
 def read_sheet(
-    path: Path,
-    checked_groups: Collection[str] | None = None,
-    data_root: str = "",
-    *,
-    text: str | None = None,
+    path: Path, checked_groups: Collection[str] | None = None, data_root: str = "", *, text: str | None = None
 ) -> list[SceneRow]:
     """Read and check the scene sheet: tab-separated, with one header line and `#` for comment lines.
 

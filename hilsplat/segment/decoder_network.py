@@ -13,8 +13,7 @@ from hilsplat.models.onnx_graph import Graph, computed_from, reads_through, with
 from hilsplat.models.repeatable import require_repeatable
 
 POINTS, LABELS, BOXES = "input_points", "input_labels", "input_boxes"
-INSIDE, OUTSIDE, PADDING = 1, 0, -1
-"""Labels of points. SAM adds one padding point to prompts without a box."""
+INSIDE, OUTSIDE, PADDING = 1, 0, -1  # labels of points. SAM adds one padding point to prompts without a box.
 
 
 def repeated(value: Array, number: int) -> Array:

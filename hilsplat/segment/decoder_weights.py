@@ -103,7 +103,6 @@ class DecoderGraph:
         return Attention(*(self.linear(f"{module}/{part}_proj") for part in ("q", "k", "v", out)))
 
     def perceptron(self, module: str) -> list[Linear]:
-        """Return the linear layers of a perceptron, in order."""
         names = ["proj_in", *(f"layers.{number}" for number in range(8)), "proj_out", "lin1", "lin2"]
         layers = [f"{module}/{name}" for name in names if self._find(f"{module}/{name}/MatMul") is not None]
         if not layers:
@@ -147,7 +146,6 @@ class DecoderGraph:
         return node
 
     def _constants(self, node: Any) -> list[np.ndarray]:
-        """Return the constant inputs of a node, in order."""
         return [value for name in node.input if (value := self._constant(name)) is not None]
 
     def _constant(self, name: str) -> np.ndarray | None:

@@ -13,8 +13,7 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.base.lineage import require_made_from, sha256_of_bytes
 from hilsplat.segment.masks import HierarchicalMasks
 
-MASKS_SHA256 = "masks_sha256"
-"""Key of the digest in a view's entry of `index.json`."""
+MASKS_SHA256 = "masks_sha256"  # key of the digest in a view's entry of `index.json`
 
 
 def digest_of(masks: HierarchicalMasks) -> str:

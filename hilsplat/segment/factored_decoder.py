@@ -33,23 +33,13 @@ from hilsplat.base.errors import ModelError
 from hilsplat.models.network import DTYPES, Array, one_thread_session
 from hilsplat.models.onnx_graph import Graph
 from hilsplat.segment import decoder_kernels as kernels
-from hilsplat.segment.decoder_kernels import (
-    FirstLayer,
-    FirstPrompts,
-    MaskImage,
-    MaskPrompts,
-    SecondLayer,
-    SecondPrompts,
-    Upscaling,
-)
 from hilsplat.segment.decoder_network import DecoderNetwork
 from hilsplat.segment.decoder_weights import DecoderGraph, Linear
 
 LOG2_E = np.float32(1 / np.log(2))  # converts scores to base 2
 BLOCK = 64
 """Maximum pixels per block. A block's arrays fit into a core's L2 cache; 128 and 256 are 2 % slower."""
-PROMPTS = 16
-"""Prompts per call, applied to each block one after the other while the block is in the cache."""
+PROMPTS = 16  # prompts per call, applied to each block one after the other while the block is in the cache
 HEADS_PER_ATTENTION = 8  # if the model's configuration doesn't specify them
 
 
@@ -60,9 +50,9 @@ class ImageTerms:
     grid_hw: tuple[int, int]  # size of the image embedding
     keys: Array  # keys and values of the first token-to-pixel attention (`kernels.read_image`)
     values: Array
-    first: FirstLayer
-    second: SecondLayer
-    masks: MaskImage
+    first: kernels.FirstLayer
+    second: kernels.SecondLayer
+    masks: kernels.MaskImage
 
 
 Kept = Mapping[str, Array]
@@ -136,7 +126,7 @@ class FactoredDecoder:
         second, second_bias = graph.upscaling("mask_decoder/upscale_conv2")
         norm = graph.norm("mask_decoder/upscale_layer_norm")
         self._upscale_eps = norm.eps
-        self._upscaling = Upscaling(
+        self._upscaling = kernels.Upscaling(
             norm_scale=norm.scale,
             norm_shift=norm.shift,
             fixed=single(upscale @ b2 + bias),
@@ -173,7 +163,7 @@ class FactoredDecoder:
         def offset(layer: Linear, rows: Array) -> Array:
             return projected(layer, rows) + wide(layer.bias)[:, None]
 
-        first = FirstLayer(
+        first = kernels.FirstLayer(
             queries=blocks(offset(update0.q, x + pe)),
             before=blocks(wide(self._out0) @ xc),
             square=single((xc * xc).sum(axis=0)),
@@ -182,7 +172,7 @@ class FactoredDecoder:
             fixed_keys=blocks(offset(read1.k, pe + b1)),
             values=by_pixel(projected(read1.v, gx)),
         )
-        second = SecondLayer(
+        second = kernels.SecondLayer(
             scaled_queries=blocks(projected(update1.q, gx)),
             fixed_queries=blocks(offset(update1.q, pe + b1)),
             before_first=blocks(wide(self._both[: self.inner]) @ x1),
@@ -208,7 +198,7 @@ class FactoredDecoder:
             values=by_pixel(offset(read0.v, x)),
             first=first,
             second=second,
-            masks=MaskImage(blocks(wide(self._upscale) @ gx1), detail, finest),
+            masks=kernels.MaskImage(blocks(wide(self._upscale) @ gx1), detail, finest),
         )
 
     def decode(
@@ -233,7 +223,7 @@ class FactoredDecoder:
         d0c = centred(d0)
         q = self._attend_tokens(1, q, pe)
         rows = self._scores(read1.q(q + pe))
-        first = FirstPrompts(
+        first = kernels.FirstPrompts(
             update_keys=keys0,
             twice_changes=2 * change0,
             gram=_between(change0, self._gram0),
@@ -256,7 +246,7 @@ class FactoredDecoder:
         d0g, kg = d0c * self._g2, kc * self._g2
         squares = [(x * y).sum(axis=1) for x, y in ((d0c, d0c), (d0c, kc), (kc, kc))]
         rows = self._scores(read2.q(q + pe))
-        second = SecondPrompts(
+        second = kernels.SecondPrompts(
             update_keys=keys1,
             update_low=_low(keys1, self._low_update1, change0),
             update_offset=self._offsets(keys1, update1.q, [d0]),
@@ -320,7 +310,7 @@ class FactoredDecoder:
         return sums.values()
 
     def _update_and_read_first(
-        self, image: ImageTerms, prompts: FirstPrompts, *parts: Array
+        self, image: ImageTerms, prompts: kernels.FirstPrompts, *parts: Array
     ) -> tuple[Array, Array, Array]:
         """Compute the first pixel-to-token attention, its layer norm, and the attention that follows.
 
@@ -334,13 +324,13 @@ class FactoredDecoder:
         sums, s1 = PixelSums(sizes, factors), self._scales(image, number)
         e = np.empty(s1.size * up(factors), np.float32)
         kernels.update_and_read_first(
-            sizes, len(self._bias0), self._eps, image.first, FirstPrompts(*map(flat, prompts)), sums.top,
-            sums.sums, s1.reshape(-1), e,
+            sizes, len(self._bias0), self._eps, image.first, kernels.FirstPrompts(*map(flat, prompts)),
+            sums.top, sums.sums, s1.reshape(-1), e,
         )  # fmt: skip
         return s1, e, sums.values(*parts)
 
     def _update_and_read_second(
-        self, image: ImageTerms, prompts: SecondPrompts, s1: Array, e: Array, *parts: Array
+        self, image: ImageTerms, prompts: kernels.SecondPrompts, s1: Array, e: Array, *parts: Array
     ) -> tuple[Array, Array, Array]:
         """Compute the second layer and the last attention; arguments as in `_update_and_read_first`."""
         number, _, tokens, _ = prompts.update_keys.shape
@@ -349,7 +339,7 @@ class FactoredDecoder:
         sums, s2 = PixelSums(sizes, factors), self._scales(image, number)
         e2 = np.empty(s2.size * up(factors), np.float32)
         kernels.update_and_read_second(
-            sizes, len(self._bias0), self._eps, image.second, SecondPrompts(*map(flat, prompts)),
+            sizes, len(self._bias0), self._eps, image.second, kernels.SecondPrompts(*map(flat, prompts)),
             s1.reshape(-1), e, sums.top, sums.sums, s2.reshape(-1), e2,
         )  # fmt: skip
         return s2, e2, sums.values(*parts)
@@ -376,7 +366,9 @@ class FactoredDecoder:
         factors = flat(through.reshape(number, 2 * self.heads * others, -1).swapaxes(1, 2))
         height, width = (side * (4 if fine else 1) for side in image.grid_hw)
         out = np.empty((number, kept["combine"].shape[1], height, width), np.float32)
-        prompts = MaskPrompts(out.shape[1], factors, *(flat(kept[name]) for name in MaskPrompts._fields[2:]))
+        prompts = kernels.MaskPrompts(
+            out.shape[1], factors, *(flat(kept[name]) for name in kernels.MaskPrompts._fields[2:])
+        )
         kernels.mask_logits(
             self._sizes(image, number, others + 1), fine, self._upscale_eps, self._upscaling, image.masks,
             prompts, flat(kept["s1"]), flat(kept["s2"]), e, up(2 * self.heads * others), image.grid_hw[1],

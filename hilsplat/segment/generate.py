@@ -18,34 +18,21 @@ from hilsplat.base.levels import Level
 from hilsplat.base.lineage import sha256_of_bytes, sha256_of_json
 from hilsplat.models.card import in_turn
 from hilsplat.models.network import Array, on_host
+from hilsplat.segment import sam
 from hilsplat.segment.kernels import cleaned_runs, upscaled_runs
 from hilsplat.segment.masks import HierarchicalMasks, join_rows, take_runs
-from hilsplat.segment.sam import (
-    HEADS,
-    Encoded,
-    Frame,
-    Prompts,
-    SamModel,
-    frame_taps,
-    full_stability,
-    point_grid,
-    positive_boxes,
-    read_logits,
-)
 from hilsplat.segment.suppression import distinct_boxes, last_inside, suppress_boxes, suppress_masks
 from hilsplat.segment.thresholds import Thresholds
 from hilsplat.settings import MasksSettings
 
 LOOSE = 0.1
 """Masks below this predicted IoU or stability (or the settings' threshold, if lower) are not cached."""
-BAND_PX = 3
-"""Logits within this many low-resolution pixels of a mask's edge are kept (see `Candidates`)."""
+BAND_PX = 3  # logits within this many low-resolution pixels of a mask's edge are kept (see `Candidates`)
 REPEAT_IOU = 0.95
 """A preview mask repeats a better one if the IoU of their boxes exceeds this (`distinct_prompts`)."""
 REPEAT_SLACK = 0.05
 """Amount by which a repeated mask's preview stability (from few pixels) may exceed the better mask's."""
-CROP_OVERLAP = 512 / 1500
-"""Overlap of the first layer's crops, as a share of the image's shorter side (SAM)."""
+CROP_OVERLAP = 512 / 1500  # overlap of the first layer's crops, as a share of the image's shorter side (SAM)
 CROP_EDGE_PX = 20
 """A mask is truncated if its box is at most this far from a crop edge that isn't an image edge (SAM)."""
 
@@ -101,7 +88,7 @@ def crop_boxes(
 
 
 def candidates_key(
-    image_sha256: str, model: SamModel, settings: MasksSettings, points: np.ndarray | None = None
+    image_sha256: str, model: sam.SamModel, settings: MasksSettings, points: np.ndarray | None = None
 ) -> str:
     """Return the cache key of a view's candidates, a digest of all inputs of `decode_candidates`."""
     thresholds = model.thresholds(settings)
@@ -140,7 +127,7 @@ def needs_full_size(settings: MasksSettings) -> bool:
 
 def decode_candidates(
     image: UInt8[np.ndarray, "H W 3"],
-    model: SamModel,
+    model: sam.SamModel,
     settings: MasksSettings,
     points: Float[np.ndarray, "P 2"] | None = None,
 ) -> Candidates:
@@ -149,22 +136,22 @@ def decode_candidates(
     `points` (x, y, px; at least one) replace the grid of the whole image; crops keep their grids.
     """
     boxes, _ = crop_boxes((image.shape[0], image.shape[1]), settings.crop_layers)
-    grid = point_grid(settings.points_per_side)
+    grid = sam.point_grid(settings.points_per_side)
     thresholds = model.thresholds(settings)
     batch = model.prompts_per_call(thresholds.points_per_batch, len(grid))
     parts = list[Candidates]()
     for crop, (left, top, right, bottom) in enumerate(boxes):
         encoded = model.encode(np.ascontiguousarray(image[top:bottom, left:right]))
         on_grid = grid * (right - left, bottom - top)
-        prompts: Prompts = {"points": on_grid if points is None or crop else points}
+        prompts: sam.Prompts = {"points": on_grid if points is None or crop else points}
         if uses_preview(model, settings):
             prompts = distinct_prompts(encoded, prompts, model, settings, batch)
 
         def decoded(
             rows: Int64[np.ndarray, " b"],
             number: int,
-            encoded: Encoded = encoded,
-            prompts: Prompts = prompts,
+            encoded: sam.Encoded = encoded,
+            prompts: sam.Prompts = prompts,
             crop: int = crop,
         ) -> Candidates:
             called = {name: rows_of[rows] for name, rows_of in prompts.items()}
@@ -175,15 +162,15 @@ def decode_candidates(
     return Candidates.concatenate(parts)
 
 
-def uses_preview(model: SamModel, settings: MasksSettings) -> bool:
+def uses_preview(model: sam.SamModel, settings: MasksSettings) -> bool:
     """Return whether to skip repeated prompts (requires previews, and suppression of repeats)."""
     may_repeat = settings.generator == "official" or settings.box_nms_iou >= REPEAT_IOU
     return model.previews and not may_repeat
 
 
 def distinct_prompts(
-    encoded: Encoded, prompts: Prompts, model: SamModel, settings: MasksSettings, batch: int
-) -> Prompts:
+    encoded: sam.Encoded, prompts: sam.Prompts, model: sam.SamModel, settings: MasksSettings, batch: int
+) -> sam.Prompts:
     """Preview prompts and drop each one whose masks all repeat better masks of the same head.
 
     Masks are compared by their boxes in the preview, which has every second or fourth row and column of the
@@ -193,10 +180,10 @@ def distinct_prompts(
     iou_floor, stability_floor = floors(model.thresholds(settings))
     measured, previewed = [], []
 
-    def preview(rows: Int64[np.ndarray, " b"], number: int) -> tuple[tuple[np.ndarray, ...], Prompts]:
+    def preview(rows: Int64[np.ndarray, " b"], number: int) -> tuple[tuple[np.ndarray, ...], sam.Prompts]:
         scores, logits, arrays = model.preview(encoded, prompts["points"][rows])
         flat = logits[:number].reshape(-1, *logits.shape[2:])
-        _, stability, boxes = read_logits(flat, settings.stability_offset, encoded.frame)
+        _, stability, boxes = sam.read_logits(flat, settings.stability_offset, encoded.frame)
         found = scores[:number], stability.reshape(number, -1), boxes.reshape(number, -1, 4)
         return found, {name: rows_of[:number] for name, rows_of in arrays.items()}
 
@@ -206,7 +193,7 @@ def distinct_prompts(
     predicted_iou, stability, boxes = map(np.concatenate, zip(*measured, strict=True))
     likely = (predicted_iou >= iou_floor) & (stability >= stability_floor) & boxes.any(axis=2)
     chosen = np.zeros(len(likely), bool)
-    for head in range(len(HEADS)):
+    for head in range(len(sam.HEADS)):
         rows = np.flatnonzero(likely[:, head])
         at = rows, head
         distinct = distinct_boxes(boxes[at], predicted_iou[at], REPEAT_IOU, stability[at], REPEAT_SLACK)
@@ -214,7 +201,7 @@ def distinct_prompts(
     chosen[0] |= not chosen.any()
     names = list(previewed[0])
 
-    def join() -> Prompts:
+    def join() -> sam.Prompts:
         return {name: joined([arrays.pop(name) for arrays in previewed])[chosen] for name in names}
 
     return in_turn(model.device, "masks", join)
@@ -223,7 +210,7 @@ def distinct_prompts(
 def keep_candidates(
     scores: Float32[np.ndarray, "P 3"],
     logits: Float32[Array, "P 3 h w"],
-    frame: Frame,
+    frame: sam.Frame,
     crop: int,
     settings: MasksSettings,
     thresholds: Thresholds,
@@ -232,12 +219,12 @@ def keep_candidates(
     iou_floor, stability_floor = floors(thresholds)
     predicted_iou = scores.reshape(-1)
     flat = logits.reshape(-1, *logits.shape[2:])
-    steps, stability, boxes = read_logits(flat, settings.stability_offset, frame)
+    steps, stability, boxes = sam.read_logits(flat, settings.stability_offset, frame)
     if settings.generator == "official":
-        steps, boxes = flat, positive_boxes(flat)
+        steps, boxes = flat, sam.positive_boxes(flat)
     likely = (predicted_iou >= iou_floor) & boxes.any(axis=1)
     if needs_full_size(settings):
-        stability[likely] = full_stability(on_host(flat[likely]), settings.stability_offset, frame)
+        stability[likely] = sam.full_stability(on_host(flat[likely]), settings.stability_offset, frame)
     rows = np.flatnonzero(likely & (stability >= stability_floor))
     values, offsets, windows = edge_windows(steps, rows, boxes)
     return Candidates(
@@ -245,7 +232,7 @@ def keep_candidates(
         offsets,
         windows,
         np.array(steps.shape[1:], np.int32),
-        np.tile(np.arange(len(HEADS), dtype=np.uint8), len(scores))[rows],
+        np.tile(np.arange(len(sam.HEADS), dtype=np.uint8), len(scores))[rows],
         predicted_iou[rows],
         stability[rows],
         np.full(len(rows), crop, np.uint8),
@@ -290,7 +277,7 @@ def edge_windows(
 
 
 def masks_from_candidates(
-    candidates: Candidates, size_hw: tuple[int, int], model: SamModel, settings: MasksSettings
+    candidates: Candidates, size_hw: tuple[int, int], model: sam.SamModel, settings: MasksSettings
 ) -> HierarchicalMasks:
     """Threshold and upscale candidates, remove small holes and islands, and suppress repeats.
 
@@ -306,7 +293,7 @@ def masks_from_candidates(
     enough = (candidates.predicted_iou > thresholds.predicted_iou_min) | (thresholds.predicted_iou_min == 0)
     enough &= candidates.stability >= thresholds.stability_min
     streams = []
-    for head, level in enumerate(HEADS):
+    for head, level in enumerate(sam.HEADS):
         per_crop, ranks = [], []
         for crop, crop_box in enumerate(boxes):
             rows = np.flatnonzero(enough & (candidates.head == head) & (candidates.crop == crop))
@@ -342,7 +329,7 @@ def _suppressed(
 def _upscale(
     candidates: Candidates,
     rows: Int64[np.ndarray, " m"],
-    frame: Frame,
+    frame: sam.Frame,
     crop_box: Int32[np.ndarray, " 4"],
     size_hw: tuple[int, int],
     level: Level,
@@ -359,7 +346,7 @@ def _upscale(
         candidates.offsets,
         candidates.window_xyxy,
         rows,
-        *frame_taps((low_h, low_w), frame),
+        *sam.frame_taps((low_h, low_w), frame),
         int(crop_box[1]),
         int(crop_box[0]),
         *size_hw,

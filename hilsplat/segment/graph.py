@@ -17,8 +17,7 @@ from hilsplat.segment.masks import HierarchicalMasks, runs_of_labels
 
 WORK_SIDE_PX = 640
 """Longer side to which images are shrunk for segmentation; finer texture doesn't separate object parts."""
-BASE_SCALE = 80.0
-"""Scale `k` of the base segmentation (Felzenszwalb and Huttenlocher), in its colour units."""
+BASE_SCALE = 80.0  # scale `k` of the base segmentation (Felzenszwalb and Huttenlocher), in its colour units
 CONTRAST = 6.0
 """Minimum colour difference (CIELAB) from all neighbours at which a region of exactly a level's minimum size
 stays separate; for larger regions, the difference is inversely proportional to their width."""
@@ -28,8 +27,7 @@ THIN_HURRY = 0.01
 """Factor applied to the cost of merging a seam: seams merge first, into the more similar side."""
 LIGHTNESS = 0.6
 """Weight of lightness relative to a* and b*, because shading changes lightness within an object."""
-CLEAR_EDGE = 40.0
-"""Colour difference across a border at and above which the predicted IoU is 1."""
+CLEAR_EDGE = 40.0  # colour difference across a border at and above which the predicted IoU is 1
 
 
 def segment_graph(

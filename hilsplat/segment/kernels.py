@@ -237,7 +237,6 @@ def cleaned_runs(runs, offsets, width, min_area):
 
 @compiled
 def _bits_set(word):
-    """Count the ones in a 64-bit word."""
     word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
     word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
     word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)

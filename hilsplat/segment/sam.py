@@ -21,15 +21,9 @@ from hilsplat.base.errors import ModelError
 from hilsplat.base.levels import Level
 from hilsplat.base.lineage import sha256_of_bytes
 from hilsplat.base.processes import in_order
+from hilsplat.models import int8
 from hilsplat.models.card import CPU, Batches, in_turn, network_device
 from hilsplat.models.folder import SAM_SIDE_PX, ModelFolder, input_side_px, open_model_folder
-from hilsplat.models.int8 import (
-    CHECKED_GRID,
-    agreement_of_masks,
-    int8_network,
-    reduced_precision,
-    use_reduced,
-)
 from hilsplat.models.layouts import DECODER, PREVIEW
 from hilsplat.models.memory import needs_of
 from hilsplat.models.network import Array, Network, on_host, or_as_exported
@@ -135,13 +129,13 @@ class SamModel:
         self, precision: str, images: Sequence[UInt8[np.ndarray, "H W 3"]], cache: Path, threads: int = 1
     ) -> None:
         """Use a lower precision if `masks.precision` requires it, or if masks of these images agree."""
-        form = reduced_precision(precision, self.model, "vision_encoder", self.device)
+        form = int8.reduced_precision(precision, self.model, "vision_encoder", self.device)
         if not form:
             return
         reduced = self.int8_encoder(cache) if form == "int8" else self.encoder.in_half()
         if reduced is None:
             return
-        grid = point_grid(CHECKED_GRID)
+        grid = point_grid(int8.CHECKED_GRID)
         batch = self.prompts_per_call(self.own.points_per_batch, len(grid))
 
         def masks(work: tuple[np.ndarray, Network]) -> np.ndarray:
@@ -158,17 +152,17 @@ class SamModel:
         def measure() -> dict[str, float]:
             work = [(image, encoder) for encoder in (self.encoder, reduced) for image in images]
             full, lower = np.split(np.stack(list(in_order(masks, work, threads))), 2)
-            return agreement_of_masks(np.concatenate(full), np.concatenate(lower))
+            return int8.agreement_of_masks(np.concatenate(full), np.concatenate(lower))
 
         digests = [sha256_of_bytes(image.tobytes()) for image in images]
-        inputs = {"model": self.digest, "images": digests, "grid": CHECKED_GRID}
-        if use_reduced(form, precision, "SAM's encoder", cache, inputs, measure):
+        inputs = {"model": self.digest, "images": digests, "grid": int8.CHECKED_GRID}
+        if int8.use_reduced(form, precision, "SAM's encoder", cache, inputs, measure):
             self.encoder, self.precision = reduced, form
 
     def int8_encoder(self, cache: Path) -> Network | None:
         """Open the int8 version of the encoder (`models.int8.int8_network`)."""
         exact = [name for name in self.encoder.outputs if name == "image_positional_embeddings"]
-        return int8_network(self.model, "vision_encoder", cache, self._graph, exact)
+        return int8.int8_network(self.model, "vision_encoder", cache, self._graph, exact)
 
     def _open_encoder(self) -> tuple[Graph | None, Network]:
         """Return the encoder, and its graph if a ViT's global attention is computed row by row on a CPU."""

@@ -139,7 +139,6 @@ def _opened_sam(
 
 
 def _graph_masks(scene: Scene, view: str, cache: ViewCache, settings: MasksSettings) -> HierarchicalMasks:
-    """Segment one view with the graph segmenter."""
     arguments = settings.graph_scales, settings.min_area_px
     key = sha256_of_json(
         {

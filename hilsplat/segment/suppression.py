@@ -9,8 +9,7 @@ from hilsplat.segment.masks import HierarchicalMasks
 BOXES_AT_ONCE = 256  # boxes compared with all following ones in one step
 INNER_COVERED = 0.85
 """A mask counts as contained if at least this share of it is inside another mask (LangSplat)."""
-INNER_COVERS = 0.5
-"""A contained mask must cover less than this share of its container (LangSplat)."""
+INNER_COVERS = 0.5  # a contained mask must cover less than this share of its container (LangSplat)
 
 
 def box_iou(boxes_a: Int[np.ndarray, "A 4"], boxes_b: Int[np.ndarray, "B 4"]) -> Float[np.ndarray, "A B"]:

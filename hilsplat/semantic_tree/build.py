@@ -37,17 +37,10 @@ from hilsplat.semantic_tree.tree import LIMITS, SemanticTree, node_boxes
 from hilsplat.semantic_tree.wholes import joined_regions
 from hilsplat.settings import SemanticTreeSettings
 
-APART_DEG = 30.0
-"""Crops with directions at least this far apart do not lower each other's score."""
-
-MIN_NEW = 0.1
-"""Share of a crop's score that remains if a higher-ranked crop has the same direction."""
-
-MAX_RANKED = 32
-"""Number of crops ranked per node."""
-
-MIN_IOU = 1e-3
-"""Lower bound of the IoU in `crop_score`, so that each linked mask has a positive score."""
+APART_DEG = 30.0  # crops with directions at least this far apart do not lower each other's score
+MIN_NEW = 0.1  # share of a crop's score that remains if a higher-ranked crop has the same direction
+MAX_RANKED = 32  # number of crops ranked per node
+MIN_IOU = 1e-3  # lower bound of the IoU in `crop_score`, so that each linked mask has a positive score
 
 logger = logging.getLogger(__name__)
 

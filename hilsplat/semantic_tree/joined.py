@@ -37,8 +37,7 @@ from hilsplat.splat.coordinates import move_gaussians, write_coordinates
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.ply import load_ply, save_ply
 
-SAME = 0.5
-"""Pooled IoU of two nodes' masks in shared views above which the nodes become one."""
+SAME = 0.5  # pooled IoU of two nodes' masks in shared views above which the nodes become one
 
 MIN_KEPT = 0.5
 """Minimum share of a node's visible weight that is kept, summed over the blocks that have the node.

@@ -18,11 +18,8 @@ from hilsplat.semantic_tree.linkage import pooled_linkage
 from hilsplat.semantic_tree.view_pairs import ViewPairs, view_pairs
 from hilsplat.settings import SemanticTreeSettings
 
-MIN_VISIBLE_PX = 0.3
-"""A Gaussian counts as visible in a view if its mass there exceeds this."""
-
-SAMPLED_VIEWS = 8
-"""Number of views whose pairs of masks are counted to estimate the memory of all pairs."""
+MIN_VISIBLE_PX = 0.3  # a Gaussian counts as visible in a view if its mass there exceeds this
+SAMPLED_VIEWS = 8  # number of views whose pairs of masks are counted to estimate the memory of all pairs
 
 PAIR_BYTES, LINKED_PAIR_BYTES = 80, 40
 """Memory per pair of masks while a level is compared, and while it is linked."""
@@ -36,8 +33,7 @@ MIN_COVISIBLE = 0.2
 MIN_MEMBER_SHARE = 0.05
 """A Gaussian joins its best node if that node contains more than this share of its weight."""
 
-MIN_FIT = 0.25
-"""A mask is assigned to its best-fitting node if their IoU in the mask's view exceeds this."""
+MIN_FIT = 0.25  # a mask is assigned to its best-fitting node if their IoU in the mask's view exceeds this
 
 PRIOR_VIEWS = 3
 """Number of average views added to the views that show a node, to limit the influence of a single view."""

@@ -15,14 +15,12 @@ NEAREST = 24
 SPREAD = 24
 """Number of further partners, at equal steps among the remaining views that share Gaussians with it."""
 
-MIN_IOU = 0.01
-"""Minimum IoU of a pair of masks in a larger scene; most pairs that share Gaussians only touch."""
+MIN_IOU = 0.01  # minimum IoU of a pair of masks in a larger scene; most pairs that share Gaussians only touch
 
 MAX_SHARED = 2**29
 """Gaussians are sampled so that at most this many pairs (two views that show a Gaussian) are counted."""
 
-ROWS_AT_A_TIME = 256
-"""Number of views whose shared Gaussians are counted at a time, to bound memory."""
+ROWS_AT_A_TIME = 256  # number of views whose shared Gaussians are counted at a time, to bound memory
 
 
 @dataclass(frozen=True)

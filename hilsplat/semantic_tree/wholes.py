@@ -22,8 +22,7 @@ NEIGHBOURS = 10
 MIN_MASS_PX = 2.0
 """Minimum mass of a neighbouring Gaussian, summed over views; Gaussians with less mass may float anywhere."""
 
-MIN_SHARE = 1e-4
-"""A view shows a region if the region covers more than this share of the view."""
+MIN_SHARE = 1e-4  # a view shows a region if the region covers more than this share of the view
 
 
 def joined_regions(

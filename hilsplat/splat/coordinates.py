@@ -28,8 +28,7 @@ FIX = (
 COPY_AGAIN = "copy it again from nerfstudio"
 KEY = "source_from_scene"
 TOLERANCE = 1e-5  # maximum deviation of a matrix from a scaled rotation, relative to the scale
-MOVED_TOGETHER = 2**16
-"""Number of Gaussians that are moved in float64 at once, to save memory."""
+MOVED_TOGETHER = 2**16  # number of Gaussians that are moved in float64 at once, to save memory
 BEFORE_APPLIED_TRANSFORM = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
 """Transform of COLMAP coordinates by `ns-process-data` versions that do not record `applied_transform`."""
 

@@ -21,8 +21,7 @@ from hilsplat.splat.model import Model
 
 MAX_CLONED_SCALE = 0.01
 """Gaussians whose largest axis exceeds this (in units of the extent) are split; others are cloned (3DGS)."""
-SPLIT_FACTOR = 1.6
-"""The halves of a split Gaussian get its scales divided by this (3DGS: 0.8 x 2)."""
+SPLIT_FACTOR = 1.6  # the halves of a split Gaussian get its scales divided by this (3DGS: 0.8 x 2)
 MAX_SCALE = 0.5
 """Gaussians with a larger axis, in units of the extent, are pruned (3DGS: 0.1, after the first
 opacity reset; larger here, because walls of rooms consist of flat, wide Gaussians)."""

@@ -120,12 +120,7 @@ def scale_at(settings: GaussiansSettings, progress: float, side_px: int) -> floa
 
 @explained_memory(MEMORY_USER, MEMORY_FIX)
 def fit_gaussians(
-    scene: Scene,
-    settings: GaussiansSettings,
-    *,
-    seed: int,
-    threads: int = 1,
-    checkpoint: Path | None = None,
+    scene: Scene, settings: GaussiansSettings, *, seed: int, threads: int = 1, checkpoint: Path | None = None
 ) -> tuple[Gaussians, Float64[np.ndarray, "S 4"]]:
     """Fit Gaussians to the training views of a scene.
 

@@ -114,10 +114,7 @@ def short_round(distances: Float64[np.ndarray, "S S"]) -> list[int]:
 
 
 def write_flyaround(
-    folder: Path,
-    cameras: list[Camera],
-    picture: Callable[[Camera], UInt8[np.ndarray, "H W 3"]],
-    threads: int,
+    folder: Path, cameras: list[Camera], picture: Callable[[Camera], UInt8[np.ndarray, "H W 3"]], threads: int
 ) -> None:
     """Write `flyaround.mp4` and a contact sheet of every tenth frame, `flyaround.png`.
 

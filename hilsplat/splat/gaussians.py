@@ -8,8 +8,7 @@ from jaxtyping import Float, Float32, Int64, UInt64
 from hilsplat.base.arrays import require_arrays
 from hilsplat.base.errors import SettingsError
 
-SH_0 = 0.28209479177387814
-"""Value of the constant harmonic."""
+SH_0 = 0.28209479177387814  # value of the constant harmonic
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,6 @@ def base_rgb(sh: Float32[np.ndarray, "N K 3"]) -> Float32[np.ndarray, "N 3"]:
 
 
 FIELDS = tuple(field.name for field in fields(Gaussians))  # names of the parameter fields
-
 BITS = 21  # bits per coordinate; three coordinates use 63 of a key's 64 bits
 
 

@@ -20,8 +20,7 @@ from hilsplat.splat.rasterise.api import draw
 from hilsplat.splat.rasterise.device import Device
 
 OPACITY_RATE = 0.05  # 3DGS
-SH_REST_SHARE = 1 / 20
-"""Step size of view-dependent harmonics relative to that of the constant ones (3DGS)."""
+SH_REST_SHARE = 1 / 20  # step size of view-dependent harmonics relative to that of the constant ones (3DGS)
 
 TABLES = ("parameters", "first", "second")
 """Arrays by field: the parameters, and the running moments of their gradients."""

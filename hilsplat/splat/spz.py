@@ -26,14 +26,12 @@ HARMONIC_STEP = 8
 COLOUR_SCALE = 0.15
 GZIP_LEVEL = 6
 
-FLIPPED = np.array([1, -1, -1])
-"""Signs that convert our axes (x right, y down, z forward) to those of SPZ."""
+FLIPPED = np.array([1, -1, -1])  # signs that convert our axes (x right, y down, z forward) to those of SPZ
 HARMONIC_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])
 """Sign of each non-constant harmonic when y and z are negated."""
 
 
 def fractional_bits(gaussians: Gaussians) -> int:
-    """Return the number of fractional bits of positions."""
     away = np.linalg.norm(gaussians.means - np.median(gaussians.means, axis=0), axis=1)
     spread = float(np.median(away)) or 1.0
     return int(np.clip(np.ceil(np.log2(STEPS_PER_SPREAD / spread)), 0, 22))

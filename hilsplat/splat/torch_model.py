@@ -33,8 +33,7 @@ PASSING_BYTES = 600
 """Estimated bytes per Gaussian of a step's intermediates: projection, colours, copy of `sh`, tile lists."""
 PIXEL_BYTES = 800
 """Estimated bytes per pixel of the largest view of a step's image, its loss and their gradients."""
-SPARE = 1.1
-"""Estimated factor for memory that torch reserves but cannot use."""
+SPARE = 1.1  # estimated factor for memory that torch reserves but cannot use
 
 
 def bytes_needed(number: int, num_harmonics: int, pixels: list[int]) -> int:

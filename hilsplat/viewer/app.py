@@ -25,22 +25,10 @@ from hilsplat.viewer.frames import faded, painted, pick, within
 from hilsplat.viewer.openapi import description
 from hilsplat.viewer.saved_files import SavedFiles
 from hilsplat.viewer.viewer_scene import ViewerScene
+from hilsplat.web import server
 from hilsplat.web.guard import Guard
 from hilsplat.web.messages import MAX_SIDE_PX
 from hilsplat.web.scene_thread import SceneThread
-from hilsplat.web.server import (
-    Ready,
-    answer,
-    configured,
-    encoded,
-    files_of,
-    guarded,
-    listening_at,
-    plain,
-    read,
-    serve,
-    version_sent,
-)
 
 
 class Viewer:
@@ -53,7 +41,7 @@ class Viewer:
 
     def __init__(self, shown: ViewerScene, *, others: bool = True) -> None:
         self.thread = SceneThread(shown, shown.beside if others else None)
-        self.static, self.files = files_of("index.html", "hilsplat.viewer")
+        self.static, self.files = server.files_of("index.html", "hilsplat.viewer")
 
     def app(self, token: str, *, embedded: bool = False) -> Guard:
         """Return the guarded application, for a standalone page or a frame in another page."""
@@ -77,8 +65,8 @@ class Viewer:
             Route("/api/names", self._names, methods=["PUT"]),
             *SavedFiles(self.thread, self.static).routes(),
         ]
-        routes.append(Route("/openapi.json", lambda request: answer(description(routes))))
-        return guarded(routes, token, wire.MAX_BODY_BYTES, embedded=embedded)
+        routes.append(Route("/openapi.json", lambda request: server.answer(description(routes))))
+        return server.guarded(routes, token, wire.MAX_BODY_BYTES, embedded=embedded)
 
     async def _splats(self, request: Request) -> Response:
         """Send a chunk of the Gaussians as SPZ."""
@@ -90,17 +78,17 @@ class Viewer:
 
     async def _names(self, request: Request) -> Response:
         """Replace the names of a tree's nodes; the `If-Match` header is the version that the page read."""
-        asked = await read(request, wire.Names)
+        asked = await server.read(request, wire.Names)
 
         def write(shown: ViewerScene) -> dict[str, Any]:
             scene = shown.answering(asked.variant)
-            tree, version = shown.parts(asked.variant).semantic_tree, version_sent(request)
+            tree, version = shown.parts(asked.variant).semantic_tree, server.version_sent(request)
             with shown.unchanged():  # otherwise nodes of a rebuilt tree could get the names
                 names = write_names(shown.folder, tree, asked.names, len(scene.tree), version)
             shown.rename(tree, names)
             return {"version": names.version, "names": dict(names.of_node)}
 
-        return answer(await self.thread.do(request, write))
+        return server.answer(await self.thread.do(request, write))
 
 
 def _scenes(shown: ViewerScene, path: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -122,7 +110,7 @@ def _crop(shown: ViewerScene, path: Mapping[str, Any]) -> Response:
     scene = shown.answering(path["variant"])
     node = scene.existing_node(path["node"])
     with shown.unchanged():
-        return plain(encoded(crop(scene, node)), "image/jpeg", cached=True)
+        return server.plain(server.encoded(crop(scene, node)), "image/jpeg", cached=True)
 
 
 def _query(shown: ViewerScene, asked: wire.Query) -> payload.Answer:
@@ -179,7 +167,7 @@ def _frame(shown: ViewerScene, asked: wire.Frame) -> Response:
     """Return a picture of the scene."""
     paint = shown.paint(asked.variant, asked.style)
     pixels = painted(shown.remaining(asked.removed), asked.camera.camera(), paint, shown.threads)
-    return plain(encoded(pixels, asked.image, asked.quality), f"image/{asked.image}")
+    return server.plain(server.encoded(pixels, asked.image, asked.quality), f"image/{asked.image}")
 
 
 def _path(shown: ViewerScene, asked: wire.Film) -> list[dict[str, Any]]:
@@ -195,14 +183,16 @@ def _picture(text: str) -> np.ndarray:
         raise SettingsError("the picture cannot be read", expected=expected) from error
 
 
-def run_view(folder: Path, *, variant: str, port: int, browser: bool, threads: int, on_ready: Ready) -> None:
+def run_view(
+    folder: Path, *, variant: str, port: int, browser: bool, threads: int, on_ready: server.Ready
+) -> None:
     """Serve the page of a scene until Ctrl-C; for arguments and errors, see `ViewerScene` and `serve`."""
     shown = ViewerScene(folder, variant, threads)
     viewer = Viewer(shown)
     viewer.thread.worker.submit(shown.warm_up).result()
     about = f"{shown.scene.name}: {len(shown.gaussians)} Gaussians"
     page = f"view {shown.results.resolve()}"  # which also opens the other scenes of the folder
-    serve(viewer.app, about, page=page, port=port, browser=browser, on_ready=on_ready)
+    server.serve(viewer.app, about, page=page, port=port, browser=browser, on_ready=on_ready)
 
 
 class EmbeddedViewer:
@@ -210,9 +200,9 @@ class EmbeddedViewer:
 
     def __init__(self, viewer: Viewer, text: str, height: int, proxy: str) -> None:
         self.token, self.text, self.height, self.proxy = secrets.token_urlsafe(24), text, height, proxy
-        listening = listening_at(0)
+        listening = server.listening_at(0)
         self.port: int = listening.getsockname()[1]
-        self.server = uvicorn.Server(configured(viewer.app(self.token, embedded=True)))
+        self.server = uvicorn.Server(server.configured(viewer.app(self.token, embedded=True)))
         self.thread = threading.Thread(
             target=self.server.run, kwargs={"sockets": [listening]}, daemon=True, name="hilsplat viewer"
         )

@@ -23,18 +23,14 @@ from hilsplat.viewer.wire import Style, rows_of
 GREY = np.array([0.299, 0.587, 0.114], np.float32)
 TINT = np.float32(0.35)
 """Luminance factor of unselected Gaussians in `tint` mode. The page's shader has the same numbers."""
-GHOST = np.float32(0.08)
-"""Opacity factor of unselected Gaussians in `ghost` mode."""
+GHOST = np.float32(0.08)  # opacity factor of unselected Gaussians in `ghost` mode
 
 MARKED = np.array([255, 0, 160], np.float32) / 255
 MARKED_SHARE = np.float32(0.7)
 """Colour of Gaussians selected for editing, and its weight; `styles.js` has the same numbers."""
 
-NEAR = 0.01
-"""Minimum depth of a Gaussian that can be selected, as in the rasteriser."""
-
-SEEN = 0.05
-"""Minimum alpha of a pixel that can be picked."""
+NEAR = 0.01  # minimum depth of a Gaussian that can be selected, as in the rasteriser
+SEEN = 0.05  # minimum alpha of a pixel that can be picked
 
 
 @dataclass(frozen=True)
@@ -118,10 +114,7 @@ def painted(
 
 
 def within(
-    means: Float32[np.ndarray, "N 3"],
-    camera: Camera,
-    points: Sequence[tuple[float, float]],
-    radius: float,
+    means: Float32[np.ndarray, "N 3"], camera: Camera, points: Sequence[tuple[float, float]], radius: float
 ) -> Bool[np.ndarray, " N"]:
     """Return which points of the scene are projected into a region of a view, up to its pixels.
 

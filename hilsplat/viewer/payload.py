@@ -19,11 +19,8 @@ from hilsplat.splat.gaussians import Gaussians, morton_order
 from hilsplat.viewer.wire import Question
 from hilsplat.web.server import view_name
 
-CHUNK = 65_536
-"""Gaussians per chunk: 16 rows of the page's textures."""
-
-ALIKE = 24
-"""Maximum number of similar nodes in an answer."""
+CHUNK = 65_536  # Gaussians per chunk: 16 rows of the page's textures
+ALIKE = 24  # maximum number of similar nodes in an answer
 
 
 def arrival_order(gaussians: Gaussians) -> Int64[np.ndarray, " N"]:

@@ -40,7 +40,6 @@ class SavedFiles:
         self.films = ThreadPoolExecutor(1, thread_name_prefix="film")
 
     def routes(self) -> list[Route]:
-        """Return the routes of all files."""
         post = self.thread.post
         return [
             post("/api/export/ply", wire.Selection, _ply),
@@ -105,7 +104,6 @@ def _spz(shown: ViewerScene, asked: wire.Edited) -> partial[bytes]:
 
 
 def _boxes(shown: ViewerScene, asked: wire.Selection) -> dict[str, Any]:
-    """Return boxes of nodes."""
     return payload.boxes(*_selected(shown, asked))
 
 

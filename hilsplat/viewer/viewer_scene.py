@@ -12,6 +12,7 @@ from jaxtyping import Bool, UInt8
 
 from hilsplat.base.artifacts import read_index, run_command
 from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError, first_line, nearest
+from hilsplat.base.images import to_uint8
 from hilsplat.base.lineage import sha256_of_file
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.query.language_scene import LanguageScene
@@ -37,8 +38,7 @@ from hilsplat.viewer.frames import Paint, faded, painted, pick
 from hilsplat.viewer.wire import MAX_GAUSSIANS, MAX_NODES, Style, rows_of
 from hilsplat.web.scene_thread import ShownScene
 
-VIEWS_MIB = 256.0
-"""Memory limit for cached per-view results, such as compositing weights."""
+VIEWS_MIB = 256.0  # memory limit for cached per-view results, such as compositing weights
 
 CACHED_RELEVANCIES = 8
 """Number of cached field relevancies (per variant, text and level), each with one byte per Gaussian."""
@@ -153,7 +153,6 @@ class ViewerScene(ShownScene):
         return scene
 
     def parts(self, variant: str) -> SceneParts:
-        """Return the paths of the parts of an opened variant."""
         return self._variants[variant][0]
 
     def rename(self, semantic_tree: Path, names: NodeNames) -> None:
@@ -218,7 +217,6 @@ class ViewerScene(ShownScene):
         return faded(self.gaussians, ~self.marked(removed)) if removed else self.gaussians
 
     def spz(self, rows: np.ndarray) -> bytes:
-        """Return the given Gaussians as SPZ."""
         return spz_bytes(self.gaussians, rows, self._bits)
 
     @cached_property
@@ -229,8 +227,7 @@ class ViewerScene(ShownScene):
 
     def _field_relevancy(self, variant: str, text: str, level: str) -> UInt8[np.ndarray, " N"]:
         """Return `FieldAnswers.gaussian_relevancy`, in steps of 1/255."""
-        relevancy = self.answering(variant).field.gaussian_relevancy(text, level)
-        return (np.clip(relevancy, 0, 1) * 255 + 0.5).astype(np.uint8)
+        return to_uint8(self.answering(variant).field.gaussian_relevancy(text, level))
 
     def _paint(self, variant: str, style: Style) -> Paint | None:
         """Resolve a style for each Gaussian; None means the scene's own colours.

@@ -17,8 +17,7 @@ class StaleFileError(ArtifactError):
     """A file changed after the version to be replaced was read."""
 
 
-NO_FILE = "none"
-"""Version of a file that does not exist."""
+NO_FILE = "none"  # version of a file that does not exist
 
 
 def version_of(path: Path) -> str:

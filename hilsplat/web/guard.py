@@ -14,8 +14,7 @@ from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
-MAX_PATH = 500
-"""Maximum number of characters in a path; Python cannot parse numbers of thousands of digits."""
+MAX_PATH = 500  # maximum number of characters in a path; Python cannot parse numbers of thousands of digits
 CONTENT_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
     "connect-src 'self'; worker-src 'self'; base-uri 'none'; form-action 'none'; "

@@ -27,8 +27,7 @@ from hilsplat.web.file_changes import StaleSceneError
 from hilsplat.web.server import answer, encoded, plain, read, view_name
 
 THUMB_PX = 160
-MOST_OPEN = 2
-"""Maximum number of scenes that a page keeps in memory besides the first."""
+MOST_OPEN = 2  # maximum number of scenes that a page keeps in memory besides the first
 
 
 class ShownScene:
@@ -102,8 +101,7 @@ def _state_of(part: Path) -> tuple[int, int, int] | None:
 
 Shown = TypeVar("Shown", bound=ShownScene)
 Result = TypeVar("Result")
-Work = Callable[[Any, Any], Any]
-"""Function of the scene, and of a path's parameters or a validated body."""
+Work = Callable[[Any, Any], Any]  # function of the scene, and of a path's parameters or a validated body
 
 
 class SceneThread(Generic[Shown]):
@@ -211,7 +209,6 @@ class SceneThread(Generic[Shown]):
 
 
 def _photo(shown: ShownScene, path: Mapping[str, Any]) -> Response:
-    """Return an undistorted photograph."""
     file = shown.scene.image_path(view_name(shown.scene, path["number"]))
     with shown.unchanged(*shown.photographs):
         return plain(file.read_bytes(), "image/png", cached=True)

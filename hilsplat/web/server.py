@@ -37,8 +37,7 @@ STATUS: dict[type, int] = {
 }
 """HTTP status of each error that is sent to the page."""
 
-OWN_PORTS = range(20_000, 30_000)
-"""Ports of pages, below those that Linux and macOS assign to other programs."""
+OWN_PORTS = range(20_000, 30_000)  # ports of pages, below those that Linux and macOS assign to other programs
 
 Ready = Callable[[str], None]
 """Called once a page can be opened, with the text to print, which contains the address."""
@@ -74,7 +73,6 @@ async def _refused(request: Request, error: Exception) -> Response:
 
 
 def as_json(value: Any) -> bytes:
-    """Encode a value as compact JSON."""
     return json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
 
 
@@ -97,7 +95,6 @@ def answer(content: Any) -> Response:
 
 
 def plain(data: bytes, kind: str, status: int = 200, *, cached: bool = False) -> Response:
-    """Return a response with bytes."""
     lasting = "private, max-age=3600" if cached else "no-store"
     return Response(data, status, headers={"content-type": kind, "cache-control": lasting})
 

@@ -20,29 +20,13 @@ from hilsplat.configuration import StageSettings
 from hilsplat.datasets.images.hi import annotated_regions
 from hilsplat.embed.clip import ClipModel
 from hilsplat.embed.langsplat_files import read_view, read_views, require_model
+from hilsplat.scene import layouts
 from hilsplat.scene.assemble import photo_of, pinhole_of
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.colmap import is_pinhole
 from hilsplat.scene.importers.importing import fitted_camera, misfit_notes
 from hilsplat.scene.importers.known_views import KnownView
 from hilsplat.scene.importers.reading import read_source
-from hilsplat.scene.layouts import (
-    DATAPARSER,
-    NO_POSES,
-    UNREAD_GAUSSIANS,
-    dataparser_of,
-    find_known_poses,
-    has_known_poses,
-    is_from_nerfstudio,
-    label_files,
-    langsplat_features,
-    langsplat_level,
-    model_files,
-    photo_folder,
-    ply_header,
-    trained_gaussians,
-    transforms_of,
-)
 from hilsplat.scene.placement import placement
 from hilsplat.scene.view_names import match_names, view_names
 from hilsplat.splat.coordinates import read_gaussians, source_from_ply
@@ -98,7 +82,7 @@ def find_parts(folder: Path, named: dict[str, Path | None], settings: StageSetti
         SceneError: a path is missing, or most views, labels or Gaussians cannot be used.
     """
     for what, path in named.items():
-        if path is not None and path != NO_POSES and not path.exists():
+        if path is not None and path != layouts.NO_POSES and not path.exists():
             raise SceneError(f"--{what} {path} is missing", fix="correct the path, or pass `none`")
     parts = Parts()
     views = _poses(folder, named["poses"], settings, parts)
@@ -111,17 +95,16 @@ def find_parts(folder: Path, named: dict[str, Path | None], settings: StageSetti
 
 
 def _poses(folder: Path, named: Path | None, settings: StageSettings, parts: Parts) -> Views:
-    """Read the poses."""
-    known = find_known_poses(folder, named)
-    if named is not None and (named != NO_POSES or has_known_poses(folder)):
-        parts.columns["poses"] = named if named == NO_POSES else named.resolve()
+    known = layouts.find_known_poses(folder, named)
+    if named is not None and (named != layouts.NO_POSES or layouts.has_known_poses(folder)):
+        parts.columns["poses"] = named if named == layouts.NO_POSES else named.resolve()
     if known is None:
         parts.lines.append("poses: structure from motion")
-        below = [path for path in sorted(folder.glob("*/sparse/**/")) if model_files(path)]
+        below = [path for path in sorted(folder.glob("*/sparse/**/")) if layouts.model_files(path)]
         _name_unused(below, "to use these poses, pass --poses", parts)
         unread = [path for pattern in UNREAD_POSES for path in folder.glob(pattern)]
         _name_unused(unread, "for poses, export a COLMAP model or transforms.json", parts)
-        photos = list_images(photo_folder(folder))
+        photos = list_images(layouts.photo_folder(folder))
         return Views(dict(zip(view_names(photos), photos, strict=True)))
     source, views, max_side_px = read_source(known), Views(), settings.poses.max_side_px
     with_image = {view.image: view for view in source.views if view.image is not None}
@@ -154,16 +137,16 @@ def _poses(folder: Path, named: Path | None, settings: StageSettings, parts: Par
 
 
 def _gaussians(folder: Path, named: dict[str, Path | None], views: Views, parts: Parts) -> None:
-    plys = [named["gaussians"]] if named["gaussians"] is not None else trained_gaussians(folder)
+    plys = [named["gaussians"]] if named["gaussians"] is not None else layouts.trained_gaussians(folder)
     if not plys:
-        others = [path for path in folder.glob("*.ply") if b" f_dc_0\n" in ply_header(path)]
+        others = [path for path in folder.glob("*.ply") if b" f_dc_0\n" in layouts.ply_header(path)]
         _name_unused(others, "to use Gaussians in the coordinates of the poses, pass --gaussians", parts)
-        unread = [path for path in folder.iterdir() if path.suffix.lower() in UNREAD_GAUSSIANS]
+        unread = [path for path in folder.iterdir() if path.suffix.lower() in layouts.UNREAD_GAUSSIANS]
         _name_unused(unread, "for Gaussians, export an uncompressed 3DGS PLY", parts)
-    if not plys or plys[0] == NO_POSES:
+    if not plys or plys[0] == layouts.NO_POSES:
         return
     ply, *others = plys
-    if named["gaussians"] is None and not has_known_poses(folder, named["poses"]):
+    if named["gaussians"] is None and not layouts.has_known_poses(folder, named["poses"]):
         parts.lines.append(f"Gaussians: not used, because they need the poses they were made with: {ply}")
         return
     parts.columns["gaussians"] = ply.resolve()
@@ -171,14 +154,14 @@ def _gaussians(folder: Path, named: dict[str, Path | None], views: Views, parts:
     parts.lines += [f"Gaussians: {len(gaussians)} from {ply}", *(f"  {note}" for note in notes)]
     if names := [str(path.relative_to(folder)) for path in others]:
         parts.lines.append(f"  not used: {shorten_list(names, 5)}")
-    if langsplat_level(ply):
+    if layouts.langsplat_level(ply):
         parts.lines.append("  the three levels of LangSplat share their geometry, so one is enough")
-    if (dataparser := dataparser_of(ply, folder)) is not None:
+    if (dataparser := layouts.dataparser_of(ply, folder)) is not None:
         parts.lines.append(f"  coordinates: nerfstudio's, from {dataparser}")
-    elif is_from_nerfstudio(ply):
-        problem = f"unknown, because the {DATAPARSER} of nerfstudio's run was not found"
+    elif layouts.is_from_nerfstudio(ply):
+        problem = f"unknown, because the {layouts.DATAPARSER} of nerfstudio's run was not found"
         parts.lines.append(f"  coordinates: {problem}; those of the poses are assumed")
-    transform, _ = source_from_ply(ply, dataparser, transforms_of(folder, named["poses"]))
+    transform, _ = source_from_ply(ply, dataparser, layouts.transforms_of(folder, named["poses"]))
     is_solid = gaussians.opacity_logits > 0
     xyz = gaussians.means[is_solid] @ transform[:3, :3].T + transform[:3, 3]
     points = xyz, to_uint8(base_rgb(gaussians.sh[is_solid]))
@@ -192,8 +175,8 @@ def _name_unused(paths: list[Path], advice: str, parts: Parts) -> None:
 
 
 def _features(folder: Path, named: Path | None, views: Views, settings: StageSettings, parts: Parts) -> None:
-    features = langsplat_features(folder) if named is None else named
-    if features is None or features == NO_POSES:
+    features = layouts.langsplat_features(folder) if named is None else named
+    if features is None or features == layouts.NO_POSES:
         return
     train = [view for view in views.photos if view not in views.held_out]
     found, lost = read_views(features, {view: views.cameras.get(view) for view in train})
@@ -217,9 +200,9 @@ def _features(folder: Path, named: Path | None, views: Views, settings: StageSet
 
 def _labels(folder: Path, named: Path | None, views: Views, parts: Parts) -> None:
     """Choose the label files that can be used."""
-    if named == NO_POSES:
+    if named == layouts.NO_POSES:
         return
-    files = label_files(folder, named)
+    files = layouts.label_files(folder, named)
     if not files and named is not None:
         expected = "a .json file for each labelled photograph"
         raise SceneError(f"--labels {named} contains no label file", expected=expected)

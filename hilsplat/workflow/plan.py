@@ -40,11 +40,8 @@ from hilsplat.workflow.scene_data import Job, SceneData, VariantJob, of_variant,
 MIN_PHOTOGRAPHS = 16
 """Minimum number of photographs for key views; with fewer, the key views (half) would link too few masks."""
 
-SCORED = "evaluate"
-"""The stage that reads everything that a variant may change."""
-
-Option = Callable[[Any], Any]
-"""An option of a stage's command: a function of the wildcards."""
+SCORED = "evaluate"  # the stage that reads everything that a variant may change
+Option = Callable[[Any], Any]  # an option of a stage's command: a function of the wildcards
 
 
 LINKING = ("contributions", "coverage_tree", "semantic_tree")
@@ -562,8 +559,7 @@ def _of_variant(name: str) -> list[str]:
     return [artifact for artifact, found in kinds.items() if found and found[-1].scope == "variant"]
 
 
-PARTS = _of_variant(SCORED)
-"""Artifacts of a variant that queries read."""
+PARTS = _of_variant(SCORED)  # artifacts of a variant that queries read
 
 
 def _first_kind(kinds: list[Stage[..., Any]], facts: Facts) -> Stage[..., Any]:

@@ -25,15 +25,13 @@ from hilsplat.base.artifacts import INDEX, parse_json
 from hilsplat.base.errors import KILLED, KILLED_FIX, visible
 from hilsplat.base.progress import last_error, last_progress, warnings_in
 from hilsplat.scene.finished import KEY_VIEWS, command_name, refining
-from hilsplat.stages import all_stages
 from hilsplat.workflow.resources import START_S, JobResources
 from hilsplat.workflow.scene_data import Job
 
 KEPT = ("Nothing to be done", "This was a dry-run")
 """Beginnings of the messages of Snakemake that are printed although they are no warnings."""
 
-PLANNED = frozenset({"run_info", "job_info", "shellcmd"})
-"""Events that a dry run prints."""
+PLANNED = frozenset({"run_info", "job_info", "shellcmd"})  # events that a dry run prints
 
 FOLLOWING = ("At least one job did not complete", "Exiting because a job execution failed")
 """Parts of errors that only repeat that a job has failed."""
@@ -42,12 +40,8 @@ COMMAND_FAILED = "CalledProcessError"
 """Part of an error that quotes the command of a failed job, just before the event of its failure."""
 
 TARGETS = ("all", "everything", "tables", "total")  # entries of the job counts that are not jobs
-
-QUERIED = (stages.semantic_tree.file, stages.clip.file)
-"""Artifacts of a variant that queries need."""
-
-SIGKILL = ("died with <Signals.SIGKILL", "exit status 137")
-"""How Snakemake reports a job that was killed."""
+QUERIED = (stages.semantic_tree.file, stages.clip.file)  # artifacts of a variant that queries need
+SIGKILL = ("died with <Signals.SIGKILL", "exit status 137")  # how Snakemake reports a job that was killed
 
 STARTED = 0.1
 """Share of a loop from which its speed predicts the rest; before, start-up and compilation dominate."""
@@ -75,7 +69,7 @@ class RunningJob:
     @property
     def loop(self) -> str:
         """The loop that takes almost all of the job's time."""
-        stage = all_stages().get(self.rule)
+        stage = stages.all_stages().get(self.rule)
         return stage.loop if stage else ""
 
     def progress(self) -> tuple[str, int, int] | None:
@@ -229,7 +223,7 @@ class RunProgress:
 
     def _hint(self, job: RunningJob) -> list[str]:
         """Return a line when a scene is ready to query, with the query commands once per run."""
-        variant, stage = job.wildcards.get("variant"), all_stages().get(job.rule)
+        variant, stage = job.wildcards.get("variant"), stages.all_stages().get(job.rule)
         if stage is None or stage.file not in QUERIED or variant not in ("default", KEY_VIEWS):
             return []
         others = [name for name in QUERIED if name != stage.file]

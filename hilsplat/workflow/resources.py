@@ -53,13 +53,9 @@ MEAN_SHARE = 0.75
 """Mean number of Gaussians over a fit, as a share of the maximum, reached after about half of the steps."""
 
 MP_PER_THREAD = 2.0  # megapixels of all views per thread
-
 RUNNER_MB = 700  # memory of the two Snakemake processes that a cluster job starts before its stage
-
 BLOCK = 2**20 / 1000  # thousands of Gaussians that the field solves together by default
-
 TIME_FACTOR, LEAST_MINUTES = 6, 10  # ratio of a job's time limit to its estimate, and minimum limit
-
 START_S = 2.0  # seconds to start Python, load libraries and read the inputs of a job
 
 FIT_S_PER_MP, FIT_S_PER_GAUSSIAN, GRAPH_S_PER_MP = 0.14, 0.9e-6, 4.0
@@ -73,7 +69,6 @@ QUERY_S_PER_MP = 0.24
 tree and field (docs/benchmarks.md)."""
 
 NETWORK_S = 10.0  # core seconds to train an autoencoder
-
 EMBEDDED_S = {"masks": 1.5, "clip": 0.1}  # core seconds of the embedded models per view
 
 SAM_S, OTHER_SAM_S = {"huge": 87.0, "large": 44.0, "base": 14.1}, 5.7

@@ -39,7 +39,6 @@ from hilsplat.workflow.summary import summary
 logger = logging.getLogger(__name__)
 
 STATE = Path(".hilsplat")  # folder in the working folder for locks and markers
-
 MARKER = "run-[0-9a-f]{8}"  # name of the file in it that marks a run
 
 UNREGISTERED = "HILSPLAT_UNREGISTERED"

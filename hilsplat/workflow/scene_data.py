@@ -21,8 +21,7 @@ from hilsplat.datasets.sources import absence, image_files, is_exported, label_f
 from hilsplat.scene.layouts import dataparser_of, photo_files, transforms_of
 from hilsplat.scene.sheet import DATA_PREFIX, SceneRow
 
-CATEGORY = b'"category"'
-"""Key of the text of an object in a file of labels."""
+CATEGORY = b'"category"'  # key of the text of an object in a file of labels
 
 MAX_SKEW_S = 60.0
 """How far ahead of this machine's clock the time of a user's file may be; file servers have other clocks."""

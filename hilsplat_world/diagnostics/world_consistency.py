@@ -41,9 +41,7 @@ DEPTH_TOLERANCE = 0.01
 """Maximum relative difference in depth at which two views are taken to show the same surface point."""
 
 MIN_POINTS = 16  # masks with fewer shared points are not compared
-
 MAX_POINTS = 50_000  # maximum number of shared points per pair of views; more are evenly subsampled
-
 TEXTS_PER_LEVEL = 4  # number of texts per level and view; each is queried in two views
 
 

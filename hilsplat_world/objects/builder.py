@@ -17,10 +17,7 @@ from hilsplat_world.shapes import Mesh, joined
 Word = TypeVar("Word")
 
 PARENT_CONTRAST = 24.0  # minimum distance in L*a*b* between a subpart and its part
-
-NEIGHBOUR_CONTRAST = 11.0
-"""Minimum distance in L*a*b* between other adjacent parts and subparts of an object."""
-
+NEIGHBOUR_CONTRAST = 11.0  # minimum distance in L*a*b* between other adjacent parts and subparts of an object
 CORNERS = ((-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0))  # signs of x and y, for legs and wheels
 
 _SHADES = (1.0, 0.85, 1.15, 0.72, 1.3, 0.6, 1.45, 0.5, 1.6)

@@ -9,10 +9,8 @@ from hilsplat_world.shapes import rotation_about
 
 WALL_GAP = 0.03  # distance between furniture and wall, m, which leaves space for the skirting
 PIECE_GAP = 0.05
-PATH_GAP = 0.28
-"""Minimum horizontal distance between the camera path and objects taller than `PATH_LOW`, m."""
-PATH_LOW = 1.16
-"""Height well below all cameras, m; objects up to this height may be under the camera path."""
+PATH_GAP = 0.28  # minimum horizontal distance between the camera path and objects taller than `PATH_LOW`, m
+PATH_LOW = 1.16  # height well below all cameras, m; objects up to this height may be under the camera path
 TRIES = 120
 
 

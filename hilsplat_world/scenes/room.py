@@ -56,8 +56,7 @@ THING_SIZES: dict[str, tuple[float, float]] = {
 """Heights of some things, m; slightly oversized, so that subparts are visible across a room."""
 TOY_SIZE = (0.34, 0.44)  # heights of all other things, m
 MAX_THING_RADIUS = 0.21
-EDGE = 0.03
-"""Minimum distance between things and the edge of their support, or the wall behind a counter, m."""
+EDGE = 0.03  # minimum distance between things and the edge of their support, or the wall behind a counter, m
 MAX_FLAT = 0.05  # maximum height of a flat item above its board for things to be placed on the item, m
 
 WALL_PALE, FLOOR_PALE, CEILING_PALE = 0.6, 0.4, 0.2

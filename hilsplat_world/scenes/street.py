@@ -37,8 +37,7 @@ LANE = 3.2
 KERB = 5.7  # half the width of the road, m: one lane and one parking strip
 FRONT = 8.7  # distance between the house fronts and the middle of the road, m
 WALK_Z = 0.14
-SCALE = 4.0
-"""Value of `Style.scale`: textures and occlusion distance are four times as large as on a table."""
+SCALE = 4.0  # value of `Style.scale`: textures and occlusion distance are four times as large as on a table
 ROAD_X = (-34.0, 50.0)
 DOME_RADIUS = 115.0
 DOME_HEIGHT = 62.0

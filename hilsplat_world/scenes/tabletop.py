@@ -19,8 +19,7 @@ TABLE_RADIUS = 0.9
 ROOM_HALF = 3.0
 FLOOR_Z = -0.75
 WALL_HEIGHT = 3.4
-COVERED_SHARE = 0.58
-"""Share of the table top that the objects' footprints cover if all objects are placed."""
+COVERED_SHARE = 0.58  # share of the table top that the objects' footprints cover if all objects are placed
 MAX_FOOTPRINT = 0.36
 MAX_HEIGHT_TO_FOOTPRINT = 2.7
 GAP = 0.015

@@ -8,15 +8,7 @@ import torch
 from jaxtyping import Float, Float32, Int64, UInt8
 from torch import Tensor
 
-from models.training.data import (
-    LabelledViews,
-    boxes_of,
-    cut_window,
-    nested_targets,
-    normalised,
-    recolour,
-    region_centres,
-)
+from models.training import data
 from models.training.sam import HEADS, MASK_STRIDE, STRIDE, positional_embeddings
 
 MARGIN = 4  # margin around a region's box that is sampled as densely as the box, mask px
@@ -51,11 +43,10 @@ class SamBatch:
     truth: Float[Tensor, "B P 3 K"]  # share of each of these mask pixels in the prompted region, per head
 
     def to(self, device: torch.device) -> "SamBatch":
-        """Return the batch on a device."""
         return SamBatch(**{field.name: getattr(self, field.name).to(device) for field in fields(self)})
 
 
-def class_rows(views: LabelledViews) -> tuple[dict[str, int], list[np.ndarray]]:
+def class_rows(views: data.LabelledViews) -> tuple[dict[str, int], list[np.ndarray]]:
     """Number all texts from 1; return also the class of each node id per view, with 0 (none) at the end."""
     texts = sorted({node.phrases[0] for nodes in views.nodes for node in nodes})
     row = {text: index + 1 for index, text in enumerate(texts)}
@@ -114,7 +105,7 @@ def compared_pixels(
     boxes = np.empty((len(chosen), 4, 4), np.int64)
     boxes[:, 0] = whole
     for head in range(len(HEADS)):
-        region_boxes = boxes_of(blocks[head, :, :, 0])
+        region_boxes = data.boxes_of(blocks[head, :, :, 0])
         for row, node in enumerate(chosen[:, head].tolist()):
             x0, y0, x1, y1 = region_boxes.get(node, whole) if node >= 0 else whole
             boxes[row, head + 1] = (
@@ -161,7 +152,7 @@ def _odd_colours(rng: np.random.Generator, image: UInt8[np.ndarray, "H W 3"]) ->
 
 
 def draw_batch(
-    views: LabelledViews, classes: Sequence[np.ndarray], stage: CropStage, rng: np.random.Generator
+    views: data.LabelledViews, classes: Sequence[np.ndarray], stage: CropStage, rng: np.random.Generator
 ) -> SamBatch:
     """Draw windows with prompts; up to a sixth of the prompts have a second point, inside or outside."""
     rows: list[tuple[np.ndarray, ...]] = []
@@ -169,9 +160,9 @@ def draw_batch(
     centre = slice(STRIDE // 2, None, STRIDE)
     side = stage.crop_px // MASK_STRIDE
     for view in rng.integers(0, len(views), stage.batch).tolist():
-        image, labels, window = cut_window(rng, views.images[view], views.labels[view], stage.crop_px)
-        target = nested_targets(labels)
-        offset, region = region_centres(target[:, centre, centre], STRIDE)
+        image, labels, window = data.cut_window(rng, views.images[view], views.labels[view], stage.crop_px)
+        target = data.nested_targets(labels)
+        offset, region = data.region_centres(target[:, centre, centre], STRIDE)
         place = draw_level_prompts(rng, labels, target, stage.prompts)
         chosen = target[:, place[:, 1], place[:, 0]].T.astype(np.int64)  # (P, 3)
         other = draw_level_prompts(rng, labels, target, stage.prompts)
@@ -184,7 +175,7 @@ def draw_batch(
         windows.append(window)
         rows.append(
             (
-                recolour(rng, _odd_colours(rng, image)),
+                data.recolour(rng, _odd_colours(rng, image)),
                 classes[view][target[:, centre, centre]].astype(np.int64),
                 offset,
                 region.astype(np.float32),
@@ -199,7 +190,7 @@ def draw_batch(
         )
     images, *others = (np.stack(column) for column in zip(*rows, strict=True))
     return SamBatch(
-        torch.from_numpy(normalised(images)).contiguous(memory_format=torch.channels_last),
+        torch.from_numpy(data.normalised(images)).contiguous(memory_format=torch.channels_last),
         positional_embeddings(torch.tensor(windows, dtype=torch.float32), stage.crop_px // STRIDE),
         *(torch.from_numpy(column) for column in others),
     )

@@ -5,14 +5,12 @@ import numpy as np
 from hilsplat.scene.cameras import Camera
 from hilsplat_world.scenes import room, tabletop
 from hilsplat_world.scenes.floorplan import Room
-from hilsplat_world.scenes.room import path_points, room_of
 from hilsplat_world.scenes.scene import WorldScene
 from hilsplat_world.scenes.street import DRIVE_X, FRONT
 from hilsplat_world.views import Sight, on_sphere, square_camera
 
 
 def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int) -> Camera:
-    """Return a random view of a training scene."""
     draw = {"tabletop": _table_sight, "room": _room_sight, "street": _street_sight}[scene.kind]
     sight, fov_deg = draw(scene, rng)
     return square_camera(sight, image_px, fov_deg)
@@ -39,9 +37,9 @@ def _room_sight(scene: WorldScene, rng: np.random.Generator) -> tuple[Sight, flo
 
     The position is inside the room and outside all objects.
     """
-    shell = room_of(scene)
+    shell = room.room_of(scene)
     if rng.random() < 1 / 3:
-        spot = path_points(shell, rng.uniform(0, 360, 1))[0]
+        spot = room.path_points(shell, rng.uniform(0, 360, 1))[0]
         centre = np.array([*spot, rng.uniform(1.3, 1.78)])
         target = np.array([*(-0.5 * spot), room.LOOK_AT_Z]) + rng.uniform(-0.3, 0.3, 3)
     else:
@@ -68,7 +66,7 @@ def _free_centre(
         ):
             return centre
     # No free position near the object was found; the loop is always free.
-    return np.array([*path_points(shell, rng.uniform(0, 360, 1))[0], rng.uniform(1.3, 1.75)])
+    return np.array([*room.path_points(shell, rng.uniform(0, 360, 1))[0], rng.uniform(1.3, 1.75)])
 
 
 def _street_sight(scene: WorldScene, rng: np.random.Generator) -> tuple[Sight, float]:

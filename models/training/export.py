@@ -14,16 +14,8 @@ from hilsplat.base.artifacts import write_json
 from hilsplat.base.atomic import atomic_path
 from hilsplat.models.layouts import DECODER, PREVIEW
 from hilsplat.segment.thresholds import OWN, Thresholds
+from models.training import sam
 from models.training.clip import CROP_PX, DIMENSIONS, Clip
-from models.training.sam import (
-    FRAME_PX,
-    MASK_STRIDE,
-    STRIDE,
-    SamDecoder,
-    SamEncoder,
-    positional_embeddings,
-    shared_features,
-)
 
 MEAN = (0.485, 0.456, 0.406)
 STD = (0.229, 0.224, 0.225)
@@ -52,22 +44,22 @@ class _VisionEncoder(nn.Module):
 
     positional: Tensor
 
-    def __init__(self, encoder: SamEncoder) -> None:
+    def __init__(self, encoder: sam.SamEncoder) -> None:
         super().__init__()
         self.encoder = encoder
         whole = torch.tensor([[0.0, 0.0, 1.0]])
-        self.register_buffer("positional", positional_embeddings(whole, FRAME_PX // STRIDE))
+        self.register_buffer("positional", sam.positional_embeddings(whole, sam.FRAME_PX // sam.STRIDE))
 
     def forward(self, pixel_values: Tensor) -> tuple[Tensor, Tensor]:
         embeddings = self.encoder(pixel_values)
         positional = self.positional.expand(pixel_values.shape[0], -1, -1, -1)
-        return torch.cat([embeddings, positional], dim=1), shared_features(embeddings, positional)
+        return torch.cat([embeddings, positional], dim=1), sam.shared_features(embeddings, positional)
 
 
 class _MaskDecoder(nn.Module):
     """The decoder for the outputs of `_VisionEncoder`, or its preview."""
 
-    def __init__(self, decoder: SamDecoder, preview: bool) -> None:
+    def __init__(self, decoder: sam.SamDecoder, preview: bool) -> None:
         super().__init__()
         self.decoder = decoder
         self.preview = preview
@@ -130,10 +122,10 @@ def export_onnx(
         temporary.write_bytes(model.SerializeToString(deterministic=True))
 
 
-def export_sam(encoder: SamEncoder, decoder: SamDecoder, folder: Path) -> None:
+def export_sam(encoder: sam.SamEncoder, decoder: sam.SamDecoder, folder: Path) -> None:
     """Write `config.json`, `preprocessor_config.json`, the two networks of SAM's layout and the preview."""
     vision, batch = _VisionEncoder(encoder).eval(), {0: "batch"}
-    pixels = torch.zeros(1, 3, FRAME_PX, FRAME_PX)
+    pixels = torch.zeros(1, 3, sam.FRAME_PX, sam.FRAME_PX)
     export_onnx(
         vision,
         {"pixel_values": pixels},
@@ -145,7 +137,7 @@ def export_sam(encoder: SamEncoder, decoder: SamDecoder, folder: Path) -> None:
         place, shared = vision(pixels)
     inputs = {
         # Three prompts of two points each, because axes of length one would be traced as constants.
-        "input_points": torch.full((2, 3, 2, 2), FRAME_PX / 2.0),
+        "input_points": torch.full((2, 3, 2, 2), sam.FRAME_PX / 2.0),
         "input_labels": torch.ones((2, 3, 2), dtype=torch.int64),
         "image_embeddings": place.repeat(2, 1, 1, 1),
         "image_positional_embeddings": shared.repeat(2, 1, 1, 1),
@@ -159,15 +151,15 @@ def export_sam(encoder: SamEncoder, decoder: SamDecoder, folder: Path) -> None:
     config = {
         "model_type": "sam",
         "architectures": ["TinySam"],
-        "image_size": FRAME_PX,
-        "mask_size": FRAME_PX // MASK_STRIDE,
+        "image_size": sam.FRAME_PX,
+        "mask_size": sam.FRAME_PX // sam.MASK_STRIDE,
         "num_multimask_outputs": 3,
         "world_only": True,
         OWN: vars(OWN_THRESHOLDS),
     }
     write_json(folder / "config.json", config)
-    size: dict[str, Any] = {"size": {"longest_edge": FRAME_PX}, "resample": 2}
-    pad = {"do_pad": True, "pad_size": {"height": FRAME_PX, "width": FRAME_PX}}
+    size: dict[str, Any] = {"size": {"longest_edge": sam.FRAME_PX}, "resample": 2}
+    pad = {"do_pad": True, "pad_size": {"height": sam.FRAME_PX, "width": sam.FRAME_PX}}
     preprocessor = {"image_processor_type": "SamImageProcessor", **RGB, **size, **SCALING, **pad}
     write_json(folder / "preprocessor_config.json", preprocessor)
 

@@ -22,9 +22,7 @@ from hilsplat.base.errors import ArtifactError
 logger = logging.getLogger(__name__)
 
 Batch = TypeVar("Batch")
-Curve = list[dict[str, float]]
-"""Learning curve: rows with equal keys; the first key is `step`."""
-
+Curve = list[dict[str, float]]  # learning curve: rows with equal keys; the first key is `step`
 DECAY_SHARE = 0.25  # final share of a budget, during which the learning rate decays
 
 
@@ -100,8 +98,6 @@ class Tuning:
 
 @dataclass
 class Progress:
-    """Progress of a training."""
-
     step: int = 0  # number of finished steps
     minutes: float = 0.0  # their duration over all runs
     decay_from: int = -1  # first step of the learning rate decay, -1 before it

@@ -27,7 +27,6 @@ PER_LEVEL = 8  # maximum number of regions scored per view and level
 
 
 def mean_or_zero(values: Sequence[float] | Shaped[np.ndarray, " n"]) -> float:
-    """Return the mean, or 0 if there are no values."""
     return float(np.mean(values)) if len(values) else 0.0
 
 
@@ -104,10 +103,7 @@ def measure_sam(
         }
         for size, (least, below) in SIZES.items():
             of_size = values[(values[:, 3] >= least) & (values[:, 3] < below), 0]
-            report[level.label] |= {
-                f"iou_{size}": mean_or_zero(of_size),
-                f"n_{size}": len(of_size),
-            }
+            report[level.label] |= {f"iou_{size}": mean_or_zero(of_size), f"n_{size}": len(of_size)}
     return report
 
 

@@ -38,7 +38,6 @@ BAND = 6
 STEM = 24
 WIDTHS = (64, 128, 192, 256)  # channels at strides 4, 8, 16, 32
 DEPTHS = (2, 2, 3, 2)  # residual blocks at the same strides
-
 Embeddings = Float[Tensor, "B C s s"]  # output of the encoder
 Positional = Float[Tensor, "B D s s"]  # output of `positional_embeddings`
 Place = Float[Tensor, "B C_and_D s s"]  # embeddings and positional embeddings

@@ -18,8 +18,6 @@ class TrainingSettings(Section):
     clip_minutes: float = knob(20.0, "training time of CLIP; 0: no limit", unit="min", ge=0)
     clip_steps: int = knob(0, "training steps of CLIP; 0: no limit", ge=0)
     segmented_views: int = knob(
-        600,
-        "number of training views whose masks from the finished segmenter also train CLIP",
-        ge=0,
+        600, "number of training views whose masks from the finished segmenter also train CLIP", ge=0
     )
     device: Literal["cpu", "cuda"] = knob("cpu", "training device")

@@ -13,6 +13,7 @@ from hilsplat.base.errors import ModelError, SettingsError
 from hilsplat.base.lineage import sha256_of_json
 from hilsplat.base.progress import stage_log
 from hilsplat.segment.sam import SamModel
+from models.training import render
 from models.training.card import RECORD, write_clip_card, write_sam_card
 from models.training.crops import list_crops
 from models.training.data import LabelledViews
@@ -20,13 +21,6 @@ from models.training.export import export_clip, export_sam
 from models.training.loop import Budget, Curve
 from models.training.measure_clip import measure_clip, measure_queries
 from models.training.measure_sam import automatic_masks, measure_everything, measure_sam
-from models.training.render import (
-    generator_digest,
-    kind_of_seed,
-    render_training_views,
-    training_seeds,
-    world_vocabulary,
-)
 from models.training.settings import TrainingSettings
 from models.training.train_clip import train_clip
 from models.training.train_sam import train_sam
@@ -123,14 +117,14 @@ def require_own_models(out: Path) -> None:
 
 def render_views(cache: Path, settings: TrainingSettings, seed: int, threads: int) -> Recipe:
     """Return a recipe with its views, and render those that are not in the cache."""
-    train_seeds, other_seeds = training_seeds(settings.scenes, settings.validation_scenes)
+    train_seeds, other_seeds = render.training_seeds(settings.scenes, settings.validation_scenes)
     with stage_log("render", "training scenes") as counts:
-        training = render_training_views(cache, train_seeds, settings.views, threads)
-        unseen = render_training_views(cache, other_seeds, settings.views, threads)
+        training = render.render_training_views(cache, train_seeds, settings.views, threads)
+        unseen = render.render_training_views(cache, other_seeds, settings.views, threads)
         counts["views"], counts["unseen"] = len(training), len(unseen)
-    kinds = [kind_of_seed(seed)[0] for seed in train_seeds]
+    kinds = [render.kind_of_seed(seed)[0] for seed in train_seeds]
     described = {
-        "generator": generator_digest(),
+        "generator": render.generator_digest(),
         "scenes": settings.scenes,
         "views": settings.views,
         "validation_scenes": settings.validation_scenes,
@@ -138,7 +132,7 @@ def render_views(cache: Path, settings: TrainingSettings, seed: int, threads: in
         "validation_seeds": [other_seeds[0], other_seeds[-1]],
         "kinds": {kind: kinds.count(kind) for kind in sorted(set(kinds))},
     }
-    of_view = tuple(kind_of_seed(seed)[0] for seed in other_seeds for _ in range(settings.views))
+    of_view = tuple(render.kind_of_seed(seed)[0] for seed in other_seeds for _ in range(settings.views))
     return Recipe(cache, settings, seed, threads, training, unseen, of_view, described)
 
 
@@ -193,7 +187,7 @@ def _make_clip(out: Path, recipe: Recipe) -> None:
             "texts_competing": len({phrases[0] for phrases in others.phrase_sets}),
         }
         with atomic_folder(out / "clip-tiny") as folder:
-            write_text(folder / "vocabulary.txt", world_vocabulary())
+            write_text(folder / "vocabulary.txt", render.world_vocabulary())
             export_clip(clip, folder)
             write_clip_card(folder, description, curve, metrics)
 

@@ -34,9 +34,7 @@ from tests.conftest import PROJECT
 from tests.workflow.conftest import Project, copy_project, given_to_stranger, with_decoys
 
 DISK_MIB = 1000  # size of the results disk, MiB; the ci configuration needs less than a tenth of it
-
 MAX_FINISHED = 5  # maximum number of complete runs per kill; with more, jobs are not seen
-
 SLACK_S = 3600  # maximum time of a start without a fault, in addition to that of the undisturbed run
 
 

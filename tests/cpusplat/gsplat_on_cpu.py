@@ -9,8 +9,7 @@ import torch
 from gsplat.cuda import _torch_impl as reference
 from torch import Tensor
 
-LEAST_ALPHA, MOST_ALPHA, LEAST_LIGHT = 1 / 255, 0.999, 1e-4
-"""Constants of gsplat's CUDA kernels."""
+LEAST_ALPHA, MOST_ALPHA, LEAST_LIGHT = 1 / 255, 0.999, 1e-4  # constants of gsplat's CUDA kernels
 
 
 def spherical_harmonics(degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:

@@ -283,22 +283,9 @@ def json_object(path: Path) -> dict[str, Any]:
 
 
 TRANSFORMS_KEYS = {
-    *(
-        "frames",
-        "file_path",
-        "transform_matrix",
-        "w",
-        "h",
-        "fl_x",
-        "fl_y",
-        "cx",
-        "cy",
-        "k1",
-        "k2",
-        "k3",
-        "k4",
-    ),
-    *("p1", "p2", "camera_model", "is_fisheye", "ply_file_path", "train_filenames", "val_filenames"),
+    *("frames", "file_path", "transform_matrix", "w", "h", "fl_x", "fl_y", "cx", "cy"),
+    *("k1", "k2", "k3", "k4", "p1", "p2", "camera_model", "is_fisheye"),
+    *("ply_file_path", "train_filenames", "val_filenames"),
     *("test_filenames", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov", "applied_transform", "scale"),
     *("applied_scale", "aabb_scale"),
 }

@@ -11,8 +11,7 @@ from PIL import Image
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 BALL, RADIUS = np.array([0.1, 0.0, 0.4]), 0.4
-SAMPLES = 2
-"""Rays per side of a pixel."""
+SAMPLES = 2  # rays per side of a pixel
 
 
 def cameras(count=9, distance=2.4):

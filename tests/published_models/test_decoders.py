@@ -13,8 +13,7 @@ from hilsplat.segment.sam import SamModel, in_input, point_grid
 from tests.published_models import exports
 from tests.published_models.conftest import Answer, sam2_answer, sam_answer
 
-EXACT = 1e-5
-"""Tolerance of float32; logits are up to 100."""
+EXACT = 1e-5  # tolerance of float32; logits are up to 100
 SLOWER = "runs as exported, and each prompt takes about 6 times as long"
 
 

@@ -20,7 +20,6 @@ from hilsplat.configuration import SECTIONS
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.code import LanguageField
 from hilsplat.scene import cameras
-from hilsplat.scene.cameras import Cameras
 from hilsplat.segment import masks
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.semantic_tree import tree
@@ -134,7 +133,7 @@ def test_every_page_that_the_code_names_exists() -> None:
 
 
 CHECKED = (
-    ("scene/cameras.npz", Cameras, {"size_hw": (1, cameras.MAX_SIDE_PX)}),
+    ("scene/cameras.npz", cameras.Cameras, {"size_hw": (1, cameras.MAX_SIDE_PX)}),
     ("masks/<view>.npz", HierarchicalMasks, masks.LIMITS),
     ("contributions/rows.npz", Contributions, {}),
     ("semantic_tree/tree.npz", SemanticTree, tree.LIMITS),

@@ -32,8 +32,7 @@ PROSE = {
 """What follows the name in sentences about hilsplat."""
 SAFE = {"name", "scene", "requested.name"}
 """Names of scenes and of released models, which contain no character that a shell obeys."""
-TO_SNAKEMAKE = {"--config"}
-"""Options of Snakemake that messages suggest after `--`."""
+TO_SNAKEMAKE = {"--config"}  # options of Snakemake that messages suggest after `--`
 
 
 def texts_of(path: Path) -> list[str]:

@@ -9,7 +9,6 @@ import scipy.sparse as sp
 
 from hilsplat.base.artifacts import read_index, write_index, write_npy, write_npz
 from hilsplat.contributions import stage
-from hilsplat.contributions.stage import run_contributions
 from hilsplat.segment.digests import index_entry
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ContributionsSettings
@@ -133,7 +132,7 @@ def build_two_boxes(
 def build_contributions(world: TwoBoxes) -> Path:
     """Run the contributions stage."""
     out, cache = world.folder / "contributions", world.folder / "cache"
-    run_contributions(world.scene, world.ply, world.masks, out, cache, ContributionsSettings(), 1)
+    stage.run_contributions(world.scene, world.ply, world.masks, out, cache, ContributionsSettings(), 1)
     return out
 
 

@@ -17,8 +17,7 @@ import pytest
 
 from hilsplat.base.atomic import atomic_path
 
-MODELS = ("models/sam-tiny", "models/clip-tiny")
-"""The only models of the checkout that tests use."""
+MODELS = ("models/sam-tiny", "models/clip-tiny")  # the only models of the checkout that tests use
 PACKAGES = ("cpusplat", "hilsplat", "hilsplat_world", "snakemake_logger_plugin_hilsplat")
 PARTS = ("Snakefile", "rules", "workflow", "profiles", "config", *PACKAGES, *MODELS)
 SCENE = Path("results/synthetic/tiny")

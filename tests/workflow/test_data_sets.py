@@ -9,10 +9,7 @@ import pytest
 from hilsplat.evaluate.tables.build import TABLES
 from tests.workflow.conftest import copy_project
 
-LABELS = (
-    "data/lerf_ovs/label/figurines/frame_00041.json",
-    "data/3d_ovs/bed/segmentations/00/banana.png",
-)
+LABELS = ("data/lerf_ovs/label/figurines/frame_00041.json", "data/3d_ovs/bed/segmentations/00/banana.png")
 SCAN = "data/scannet/scans/scene0000_00"
 OTHER_FILES = (
     "data/lerf_ovs/figurines/images/frame_00041.jpg",

@@ -32,8 +32,7 @@ PROPOSED = "proposed"
 MIN_POSED = 0.5
 """Minimum share of annotated photographs with a pose; below it, they probably show another scene."""
 
-MAX_OUTSIDE = 0.01
-"""Share of a child's area that may be outside its parent, to allow for rasterised borders."""
+MAX_OUTSIDE = 0.01  # share of a child's area that may be outside its parent, to allow for rasterised borders
 
 
 def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:

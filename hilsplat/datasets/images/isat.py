@@ -24,8 +24,7 @@ from hilsplat.scene.layouts import read_json_object
 
 Polygon = Float[np.ndarray, "_ 2"] | Int[np.ndarray, "_ 2"] | Sequence[tuple[int, int]]
 
-BACKGROUND = "__background__"
-"""ISAT's category of regions that belong to no object, such as holes."""
+BACKGROUND = "__background__"  # ISAT's category of regions that belong to no object, such as holes
 
 MAX_SIDE_PX = 20_000
 """Limit on the image size stated in a label file; drawing regions at a wrong size could exhaust memory."""
@@ -70,8 +69,6 @@ def trace_polygons(mask: Bool[np.ndarray, "H W"]) -> list[Int[np.ndarray, "_ 2"]
 
 @dataclass(frozen=True, eq=False)
 class IsatObject:
-    """One annotated object."""
-
     category: str  # the text, in composed Unicode
     polygons: tuple[Float[np.ndarray, "_ 2"], ...]  # vertices, px; the region is their filled union
     box_xyxy: Int64[np.ndarray, " 4"]  # whole pixels inside the annotated box, borders included

@@ -11,14 +11,8 @@ from hilsplat.base.errors import SceneError, foreign
 from hilsplat.base.files import list_files
 from hilsplat.base.images import image_size_hw
 from hilsplat.base.levels import composed
+from hilsplat.datasets import labelled
 from hilsplat.datasets.dataset import ABLATIONS, Dataset
-from hilsplat.datasets.labelled import (
-    LabelledRegion,
-    LabelledScene,
-    images_by_view,
-    mask_region,
-    require_images,
-)
 from hilsplat.datasets.published import FRAMES, differences
 from hilsplat.scene.layouts import POSES_BOUNDS
 from hilsplat.scene.placement import SHAPE_TOLERANCE
@@ -27,17 +21,17 @@ from hilsplat.scene.view_names import view_name
 FOREGROUND = 255  # the original loader computes int8(value / 255), which is 0 for smaller values
 
 
-def open_scene(root: Path, scene: str) -> LabelledScene:
+def open_scene(root: Path, scene: str) -> labelled.LabelledScene:
     """Read the segmentations of a scene, such as "bed"; pixels are read when needed.
 
     The regions of a view are in the order of the sorted prompts; a region may have no pixels.
     """
     DATASET.require(root, scene)
     folder = root / scene
-    images = images_by_view(folder / "images")
+    images = labelled.images_by_view(folder / "images")
     prompts = read_classes(folder / "segmentations" / "classes.txt")
     warnings: list[str] = []
-    views: dict[str, tuple[LabelledRegion, ...]] = {}
+    views: dict[str, tuple[labelled.LabelledRegion, ...]] = {}
     places = sorted(
         place
         for place in (folder / "segmentations").iterdir()
@@ -49,13 +43,13 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
             expected="00/, 04/, ...",
             fix="unpack segmentations again",
         )
-    require_images([view_name(place.name) for place in places], images)
+    labelled.require_images([view_name(place.name) for place in places], images)
     for place in places:
         view = view_name(place.name)
         views[view] = _regions(place, prompts, image_size_hw(images[view]), warnings)
     posed = (folder / "sparse").is_dir() or (folder / POSES_BOUNDS).is_file()
     warnings += differences("3d_ovs", scene, {"segmentation": views}, prompts)
-    return LabelledScene("3d_ovs", scene, images, folder if posed else None, views, tuple(warnings))
+    return labelled.LabelledScene("3d_ovs", scene, images, folder if posed else None, views, tuple(warnings))
 
 
 def read_classes(path: Path) -> tuple[str, ...]:
@@ -72,7 +66,7 @@ def read_classes(path: Path) -> tuple[str, ...]:
 
 def _regions(
     place: Path, prompts: tuple[str, ...], image_hw: tuple[int, int], warnings: list[str]
-) -> tuple[LabelledRegion, ...]:
+) -> tuple[labelled.LabelledRegion, ...]:
     files = {composed(path.stem): path for path in list_files(place, {".png"})}
     missing = [prompt for prompt in prompts if prompt not in files]
     extra = sorted(set(files) - set(prompts))
@@ -86,7 +80,7 @@ def _regions(
     if extra:
         warnings.append(f"{place.name}: masks of unknown classes are ignored: {', '.join(extra)}")
     return tuple(
-        mask_region(files[prompt], FOREGROUND, image_hw, warnings, SHAPE_TOLERANCE, min_grey=1)
+        labelled.mask_region(files[prompt], FOREGROUND, image_hw, warnings, SHAPE_TOLERANCE, min_grey=1)
         for prompt in prompts
     )
 

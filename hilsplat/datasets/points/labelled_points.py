@@ -38,8 +38,6 @@ class LabelledPoints:
 
 @dataclass(frozen=True, eq=False)
 class PointScene:
-    """A scene with labelled points."""
-
     name: str
     images: tuple[PosedImage, ...]  # frames without a pose are omitted
     truth: Mapping[str, LabelledPoints]  # by key of `classes.LABELLINGS`; only `evaluate` may read them

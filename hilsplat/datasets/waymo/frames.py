@@ -18,8 +18,7 @@ from hilsplat.scene.posed_images import PosedImage
 
 CAMERAS = dict(enumerate(("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT"), start=1))
 """Name of each camera by its number in the files."""
-TOP = 1
-"""Number of the roof lidar, the only one that has labels and a pose for each pixel."""
+TOP = 1  # number of the roof lidar, the only one that has labels and a pose for each pixel
 CV_FROM_WAYMO = np.array(
     [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
@@ -50,8 +49,6 @@ class LidarFrame:
 
 @dataclass(frozen=True, eq=False)
 class WaymoCamera:
-    """One camera of the car."""
-
     name: str
     # f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3: px with the first pixel's left edge at 0, OpenCV's distortion
     intrinsic: Float[np.ndarray, " 9"]

@@ -14,15 +14,7 @@ from jaxtyping import Float
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.dataset import listing
 from hilsplat.datasets.points.labelled_points import UNPACK_AGAIN, decoding
-from hilsplat.datasets.waymo.frames import (
-    CAMERAS,
-    TOP,
-    CameraShot,
-    LidarFrame,
-    LidarReturn,
-    WaymoCamera,
-    beam_inclinations,
-)
+from hilsplat.datasets.waymo import frames
 
 COMPONENTS = (
     "camera_image",
@@ -85,18 +77,18 @@ def _matrix4(values: Any) -> Float[np.ndarray, "4 4"]:
     return np.reshape(values, (4, 4)).astype(np.float64)
 
 
-def lidar_frames(split: Path, segment: str) -> Iterator[LidarFrame]:
+def lidar_frames(split: Path, segment: str) -> Iterator[frames.LidarFrame]:
     """Yield the labelled frames of a segment, in order."""
     poses = vehicle_poses(split, segment)
     calibration = "[LiDARCalibrationComponent]"
     place, beams = f"{calibration}.extrinsic.transform", f"{calibration}.beam_inclination"
     columns = [place, f"{beams}.min", f"{beams}.max", f"{beams}.values"]
-    lidar = read_component(split, "lidar_calibration", segment, columns, {LASER: TOP})
+    lidar = read_component(split, "lidar_calibration", segment, columns, {LASER: frames.TOP})
     if len(lidar) != 1:
         raise SceneError(
             f"lidar_calibration of {segment} has {len(lidar)} rows for the top lidar", fix=UNPACK_AGAIN
         )
-    labelled = read_component(split, "lidar_segmentation", segment, [FRAME], {LASER: TOP})
+    labelled = read_component(split, "lidar_segmentation", segment, [FRAME], {LASER: frames.TOP})
     for time in sorted(row[FRAME] for row in labelled):
         read = partial(_range_images, split, segment, time)
         images = read("lidar", "LiDARComponent", depth=4)
@@ -105,7 +97,7 @@ def lidar_frames(split: Path, segment: str) -> Iterator[LidarFrame]:
         if time not in poses or pixel_pose is None:
             raise SceneError(f"segment {segment}, frame {time} has labels but no pose", fix=UNPACK_AGAIN)
         returns = tuple(
-            LidarReturn(image.astype(np.float32), label.astype(np.int32))
+            frames.LidarReturn(image.astype(np.float32), label.astype(np.int32))
             for image, label in zip(images, labels, strict=True)
             if image is not None and label is not None
         )
@@ -113,10 +105,10 @@ def lidar_frames(split: Path, segment: str) -> Iterator[LidarFrame]:
             continue
         with decoding(component_path(split, "lidar_calibration", segment)):
             values, lowest, highest = (lidar[0][f"{beams}.{name}"] for name in ("values", "min", "max"))
-            inclinations = beam_inclinations(values, lowest, highest, pixel_pose.shape[0])
+            inclinations = frames.beam_inclinations(values, lowest, highest, pixel_pose.shape[0])
             in_vehicle = _matrix4(lidar[0][place])
         pixel_pose = pixel_pose.astype(np.float32)
-        yield LidarFrame(time, poses[time], in_vehicle, inclinations, pixel_pose, returns)
+        yield frames.LidarFrame(time, poses[time], in_vehicle, inclinations, pixel_pose, returns)
 
 
 def _range_images(
@@ -125,7 +117,7 @@ def _range_images(
     """Return the images (H x W x depth) of the top lidar's returns at a timestamp; None for null values."""
     names = [f"[{component}].range_image_return{number}" for number in range(1, returns + 1)]
     columns = [f"{name}.{part}" for name in names for part in ("values", "shape")]
-    rows = read_component(split, tag, segment, columns, {FRAME: time, LASER: TOP})
+    rows = read_component(split, tag, segment, columns, {FRAME: time, LASER: frames.TOP})
     if len(rows) != 1:
         raise SceneError(
             f"component {tag} of segment {segment} does not match lidar_segmentation",
@@ -146,7 +138,7 @@ def _range_images(
     return images
 
 
-def _cameras(split: Path, segment: str) -> dict[int, WaymoCamera]:
+def _cameras(split: Path, segment: str) -> dict[int, frames.WaymoCamera]:
     base = "[CameraCalibrationComponent]"
     inner = [f"{base}.intrinsic.{name}" for name in INTRINSIC]
     place, width, height = f"{base}.extrinsic.transform", f"{base}.width", f"{base}.height"
@@ -156,14 +148,14 @@ def _cameras(split: Path, segment: str) -> dict[int, WaymoCamera]:
         if not np.isfinite(lenses).all():
             raise ValueError("a lens is not finite")
         return {
-            row[CAMERA]: WaymoCamera(
-                CAMERAS[row[CAMERA]], lens, _matrix4(row[place]), (int(row[height]), int(row[width]))
+            row[CAMERA]: frames.WaymoCamera(
+                frames.CAMERAS[row[CAMERA]], lens, _matrix4(row[place]), (int(row[height]), int(row[width]))
             )
             for row, lens in zip(rows, lenses, strict=True)
         }
 
 
-def camera_shots(split: Path, segment: str, every: int = 1) -> Iterator[CameraShot]:
+def camera_shots(split: Path, segment: str, every: int = 1) -> Iterator[frames.CameraShot]:
     """Yield the images of every n-th frame, sorted by time and camera."""
     cameras = _cameras(split, segment)
     pose = "[CameraImageComponent].pose.transform"
@@ -182,4 +174,4 @@ def camera_shots(split: Path, segment: str, every: int = 1) -> Iterator[CameraSh
         for row in sorted(of_frame, key=lambda row: row[CAMERA]):
             with decoding(component_path(split, "camera_image", segment)):
                 encoded, taken = bytes(row["[CameraImageComponent].image"]), _matrix4(row[pose])
-            yield CameraShot(time, cameras[row[CAMERA]], encoded, taken)
+            yield frames.CameraShot(time, cameras[row[CAMERA]], encoded, taken)

@@ -27,8 +27,7 @@ from hilsplat.settings import EvaluateSettings, FiguresSettings
 
 MAX_COLUMNS = 8
 """Maximum number of methods drawn as columns in the query figure; if there are more, all become rows."""
-VIEWS = 4
-"""Number of views in the one-query figure."""
+VIEWS = 4  # number of views in the one-query figure
 
 
 @dataclass(frozen=True)

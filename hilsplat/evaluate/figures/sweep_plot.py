@@ -10,13 +10,11 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.base.tables import read_csv
 from hilsplat.query.pictures import save_with_pdf
 
-SWEEPS = {"theta": "coverage threshold theta", "omega": "similarity degree Omega"}
-"""Sweep -> axis label."""
+SWEEPS = {"theta": "coverage threshold theta", "omega": "similarity degree Omega"}  # sweep -> axis label
 
 COLUMNS = ("Hi-LERF mIoU", "Hi-LERF HC", "3D-OVS mIoU", "LERF mIoU")
 """Columns that are plotted, each in a colour of its own."""
-LINES = ("-", "--", ":", "-.")
-"""Lines of several curves of a column."""
+LINES = ("-", "--", ":", "-.")  # lines of several curves of a column
 
 Curves = Mapping[str, Mapping[str, list[tuple[float, float]]]]
 

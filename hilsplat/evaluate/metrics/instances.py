@@ -18,8 +18,7 @@ OVERLAPS: tuple[float, ...] = (*np.arange(0.5, 0.95, 0.05).tolist(), 0.25)
 CLASS_STRIDE = 1000
 """A vertex of class c and instance i has the value c * 1000 + i; smaller values mean no object."""
 
-MIN_POINTS = 100
-"""Smaller instances and predictions are ignored."""
+MIN_POINTS = 100  # smaller instances and predictions are ignored
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,7 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int
 
-BOUNDARY_RATIO = 0.02
-"""Boundary width as a fraction of the image diagonal (Cheng et al. 2021)."""
+BOUNDARY_RATIO = 0.02  # boundary width as a fraction of the image diagonal (Cheng et al. 2021).
 
 
 def iou(prediction: Bool[np.ndarray, "H W"], truth: Bool[np.ndarray, "H W"]) -> float:

@@ -13,8 +13,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from hilsplat.base.levels import LEVELS, Level
 
-MAJORITY_REACH_PX = 3
-"""Distance from the centre of the majority window to its sides, px; the window is 7 x 7."""
+MAJORITY_REACH_PX = 3  # distance from the centre of the majority window to its sides, px; the window is 7 x 7
 
 ThresholdOn = Literal["normalised_pm1", "raw"]
 LevelRule = Literal["max", "mean_in_mask"]

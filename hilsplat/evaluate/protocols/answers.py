@@ -16,8 +16,7 @@ from hilsplat.evaluate.scores import Measured
 if TYPE_CHECKING:
     from hilsplat.query.language_scene import LanguageScene
 
-NO_POINTS = np.zeros((0, 2), np.int64)
-"""Peak points of an answer without localization."""
+NO_POINTS = np.zeros((0, 2), np.int64)  # peak points of an answer without localization
 
 
 def relevancy_of(

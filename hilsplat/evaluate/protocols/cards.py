@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import TypeAdapter
+
 from hilsplat.base.errors import ArtifactError
-from hilsplat.base.levels import Level
 from hilsplat.base.tables import described
 from hilsplat.evaluate.metrics.relevancy_rule import RelevancyRule
 
@@ -31,8 +32,7 @@ STATED: dict[str, tuple[Any, Callable[[Any], str]]] = {
 }
 """Setting of `evaluate` -> the value under which the cards hold, and words for any other value in names."""
 
-MIN_REGION_PX = 60
-"""Minimum area of a scored region of a generated scene; published labels have no minimum."""
+MIN_REGION_PX = 60  # minimum area of a scored region of a generated scene; published labels have no minimum
 
 Averaging = Literal["pairs", "classes", "levels", "views", "scenes", "pooled"]
 """How rows are averaged into one number of a table.
@@ -48,8 +48,6 @@ pooled: counts of all scenes are summed first, so each scene is weighted by its 
 
 @dataclass(frozen=True)
 class ProtocolCard:
-    """One protocol."""
-
     full_name: str  # `benchmark/variant@version`; a change below that affects the numbers needs a new version
     metrics: tuple[str, ...]
     averaging: Averaging
@@ -79,19 +77,11 @@ MASK = ("iou", "boundary_iou")
 LOCALIZATION = ("localization_box", "localization_mask")
 
 
-def _card(fields: dict[str, Any]) -> ProtocolCard:
-    if "rule" in fields:
-        rule = dict(fields["rule"])
-        if "levels" in rule:
-            rule["levels"] = tuple(map(Level, rule["levels"]))
-        fields = {**fields, "rule": RelevancyRule(**rule)}
-    united = tuple(map(tuple, fields.get("united", ())))
-    return ProtocolCard(**{**fields, "metrics": tuple(fields["metrics"]), "united": united})
-
-
 _ENTRIES = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))
 _BY_FULL_NAME = {entry["full_name"]: entry for entry in _ENTRIES}
-CARDS: tuple[ProtocolCard, ...] = tuple(_card(described(_BY_FULL_NAME, name)) for name in _BY_FULL_NAME)
+CARDS: tuple[ProtocolCard, ...] = TypeAdapter(tuple[ProtocolCard, ...]).validate_python(
+    [described(_BY_FULL_NAME, name) for name in _BY_FULL_NAME]
+)
 """Every protocol, from `cards.json`; a `rule` there lists the fields that differ from `RelevancyRule`, and
 `like` names a protocol from which omitted values are taken."""
 

@@ -16,7 +16,6 @@ from hilsplat.base.levels import Level
 from hilsplat.datasets.classes import LABELLINGS, SCANNET200_INSTANCES, ClassSet, splits_of
 from hilsplat.datasets.points.labelled_points import LabelledPoints
 from hilsplat.evaluate.metrics import instances, point_classes
-from hilsplat.evaluate.metrics.point_classes import ClassCounts, class_accuracy, class_iou
 from hilsplat.evaluate.protocols.cards import INSTANCES, ProtocolCard
 from hilsplat.evaluate.scores import Measured
 from hilsplat.splat.gaussians import Gaussians
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 
 Mode = Literal["frozen", "nearest"]
 
-MEANS: dict[str, Callable[[ClassCounts], float]] = {
+MEANS: dict[str, Callable[[point_classes.ClassCounts], float]] = {
     "miou_present": point_classes.miou_over_present,
     "macc_present": point_classes.macc_over_present,
     "miou_occurring": point_classes.miou_over_occurring,
@@ -115,11 +114,11 @@ def measure_points(
     Classes absent from ground truth and prediction have no row; a scene without ground truth has no rows.
     `carried` names the mode that transferred predictions to the points, and `words` other departures.
     """
-    counts = ClassCounts.of(truth, prediction, len(classes))
+    counts = point_classes.ClassCounts.of(truth, prediction, len(classes))
     protocol = card.labelled([f"points: {carried}", *words])
     for metric, values, points in (
-        ("class_iou", class_iou(counts), counts.union),
-        ("class_accuracy", class_accuracy(counts), counts.truth),
+        ("class_iou", point_classes.class_iou(counts), counts.union),
+        ("class_accuracy", point_classes.class_accuracy(counts), counts.truth),
     ):
         for row in np.flatnonzero(points):
             value, n = float(values[row]), int(points[row])
@@ -142,7 +141,7 @@ def pooled_points(card: ProtocolCard, rows: Iterable[Any], classes: ClassSet) ->
             hits[place[row.query]] += round(row.value * row.n)
         elif row.metric == "class_accuracy":
             truth[place[row.query]] += row.n
-    counts = ClassCounts(hits, truth, union - truth + hits)
+    counts = point_classes.ClassCounts(hits, truth, union - truth + hits)
     values = {metric: MEANS[metric](counts) for metric in card.metrics if metric in MEANS}
     if "miou_head" in card.metrics:
         for split, members in splits_of(classes).items():

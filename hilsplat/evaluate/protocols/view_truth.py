@@ -20,8 +20,7 @@ from hilsplat.scene.scene import Scene
 
 logger = logging.getLogger(__name__)
 
-EIGHTH = 8
-"""3D-OVS compares masks at one eighth of the image's height and width."""
+EIGHTH = 8  # 3D-OVS compares masks at one eighth of the image's height and width
 
 
 @dataclass(frozen=True)

@@ -47,11 +47,8 @@ MAP_RULE = ("filter_px", "mix", "relevancy_threshold", "threshold_on", "majority
 MAPS_OF_NODES = ("filter_px", "mix")
 """Settings that change localization and diagnostics of nodes, which are selected without thresholds."""
 
-NODES = ("node_select", "ancestors")
-"""Settings that change which nodes answer a text, or a path of one text."""
-
-RELEVANCY = ("canonical", "template", "relevancy_scale")
-"""Settings that change the relevancy itself."""
+NODES = ("node_select", "ancestors")  # settings that change which nodes answer a text, or a path of one text
+RELEVANCY = ("canonical", "template", "relevancy_scale")  # settings that change the relevancy itself
 
 
 def rule_of(settings: EvaluateSettings) -> RelevancyRule:
@@ -80,11 +77,6 @@ def departures(settings: EvaluateSettings, names: Sequence[str]) -> list[str]:
 def given_key(method: str, query: Query) -> tuple[Any, ...]:
     """Return the key of a method's stored answer to a query at its level."""
     return (method, cards.LEVEL_GIVEN.name, query.text, query.level)
-
-
-def text_departures(settings: EvaluateSettings) -> list[str]:
-    """Return a description of the prompt template, which changes every cosine, unless it is the default."""
-    return departures(settings, ("template",))
 
 
 def measure_view(

@@ -2,9 +2,11 @@
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+
+from pydantic import TypeAdapter
 
 from hilsplat.base.tables import described
 
@@ -60,12 +62,8 @@ class TableKind:
 
 
 def _kind(name: str) -> TableKind:
-    fields = {key: _frozen(value) for key, value in described(_DESCRIPTIONS["tables"], name).items()}
-    return TableKind(**{**fields, "footnotes": tuple(NOTES.get(note, note) for note in fields["footnotes"])})
-
-
-def _frozen(value: Any) -> Any:
-    return tuple(map(_frozen, value)) if isinstance(value, list) else value
+    kind = TypeAdapter(TableKind).validate_python(described(_DESCRIPTIONS["tables"], name))
+    return replace(kind, footnotes=tuple(NOTES.get(note, note) for note in kind.footnotes))
 
 
 TABLES: dict[str, TableKind] = {name: _kind(name) for name in _DESCRIPTIONS["tables"]}

@@ -22,8 +22,7 @@ from hilsplat.scene.view_names import match_names, name_parts
 ASPECT_TOLERANCE = 0.01
 """Relative tolerance of an image's aspect ratio: a scaled copy is accepted, a different crop is not."""
 
-MIN_FOCAL, MAX_FOCAL = 0.1, 50
-"""Range of focal lengths, in sides of the image; other numbers aren't px."""
+MIN_FOCAL, MAX_FOCAL = 0.1, 50  # range of focal lengths, in sides of the image; other numbers aren't px
 
 NOTED_OFFSET, MAX_OFFSET = 0.1, 0.25
 """Distances of the principal point from the middle of the image, in its sides, that are noted and refused:
@@ -32,8 +31,7 @@ a centred lens has them if it belongs to an image 1.2 and 1.5 times as large."""
 Lens = tuple[Float64[np.ndarray, "3 3"], tuple[int, int]]
 """Intrinsics K in px, and the height and width of the image that they belong to."""
 
-MAX_COORDINATE = 1e9
-"""Maximum coordinate, in the source's units; beyond it, 32-bit numbers are too coarse."""
+MAX_COORDINATE = 1e9  # maximum coordinate, in the source's units; beyond it, 32-bit numbers are too coarse
 
 
 @dataclass(frozen=True)

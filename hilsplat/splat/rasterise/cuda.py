@@ -19,14 +19,11 @@ from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise.drawn import refuse_broken, weight_matrix
 
 DEVICE = "cuda"  # tests set this to `cpu` and use gsplat's reference implementation in torch
-
 TILE = 16  # side of a gsplat tile, px
 EVERYTHING = 2**31 - 1  # a number larger than any tile's batch index
 
 
 class CardCamera(NamedTuple):
-    """Camera on the device."""
-
     size_hw: tuple[int, int]
     pose: Float[Tensor, "1 4 4"]  # cam_from_world
     K: Float[Tensor, "1 3 3"]

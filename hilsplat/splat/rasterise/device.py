@@ -24,8 +24,7 @@ ABSENT = ("gsplat is not installed", "no NVIDIA driver is installed", "torch ")
 
 TOO_MUCH = "needs more memory than the card has free"
 
-KIND = "cuda"
-"""Kind of `remembered` results about CUDA."""
+KIND = "cuda"  # kind of `remembered` results about CUDA
 
 Device = Literal["cpu", "cuda"]
 Requested = Literal["auto", "cpu", "cuda"]

@@ -13,8 +13,6 @@ from hilsplat.base.errors import HilsplatError
 
 @dataclass(frozen=True)
 class Drawn:
-    """One drawn view."""
-
     image: Float32[np.ndarray, "H W C"]  # premultiplied RGB, then features, without background
     alpha: Float32[np.ndarray, "H W"]  # coverage in [0, 1], the sum of the blending weights
     drawn: Bool[np.ndarray, " N"]  # whether each Gaussian reaches a pixel of the view

@@ -61,9 +61,7 @@ def render(
         raise SettingsError("the background is not a colour", expected="3 numbers", found=repr(background))
     if features is not None and len(features) != len(gaussians):
         raise SettingsError(
-            "features do not match the Gaussians",
-            expected=f"({len(gaussians)}, D)",
-            found=np.shape(features),
+            "features do not match the Gaussians", expected=f"({len(gaussians)}, D)", found=np.shape(features)
         )
     z = gaussians.means @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
     channels = z[:, None] if features is None else np.column_stack([z, features])

@@ -5,14 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from hilsplat.annotate.labels import (
-    Label,
-    cut_to_parents,
-    known_labels,
-    label_path,
-    traced,
-    write_labels,
-)
+from hilsplat.annotate.labels import Label, cut_to_parents, known_labels, label_path, traced, write_labels
 from hilsplat.base.errors import SettingsError
 from hilsplat.datasets.images.hi import regions_of
 from hilsplat.datasets.images.isat import read_isat

@@ -177,10 +177,7 @@ def test_errors_inside_a_new_folder_name_the_final_path(tmp_path: Path, free_mib
         atomic_path(inner / "view.npz"),
     ):
         raise RuntimeError("a library failed")
-    with (
-        pytest.raises(OSError, match="broken") as raised,
-        atomic_path(tmp_path / "a.txt") as temporary,
-    ):
+    with pytest.raises(OSError, match="broken") as raised, atomic_path(tmp_path / "a.txt") as temporary:
         raise OSError(errno.EIO, "broken", str(temporary))
     assert raised.value.filename == str(tmp_path / "a.txt")
     free_mib(5)

@@ -14,7 +14,6 @@ from hilsplat.base import processes, removal
 from hilsplat.base.artifacts import write_text
 from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.errors import system_error
-from hilsplat.base.processes import host_token, remove_leftovers
 
 KILL = """
 import ctypes, errno, os, shutil, signal, sys
@@ -131,8 +130,11 @@ def writers(tmp_path, request) -> Iterator[list[subprocess.Popen]]:
 
 
 def test_unfinished_files_are_kept_while_their_writer_lives_in_any_container(tmp_path, writers):
-    assert remove_leftovers(tmp_path) == []
-    for left, clean_up in ((1, remove_leftovers), (0, lambda folder: write_text(folder / "scene/next", ""))):
+    assert processes.remove_leftovers(tmp_path) == []
+    for left, clean_up in (
+        (1, processes.remove_leftovers),
+        (0, lambda folder: write_text(folder / "scene/next", "")),
+    ):
         writers[left].send_signal(signal.SIGKILL)
         writers[left].wait()
         clean_up(tmp_path)
@@ -141,10 +143,10 @@ def test_unfinished_files_are_kept_while_their_writer_lives_in_any_container(tmp
 
 def test_only_folders_of_unfinished_files_of_this_host_are_removed(tmp_path):
     folder = tmp_path / "d/s"
-    leftover = folder / f".writing-{host_token()}-01234567"
-    (leftover / f".writing-{host_token()}-01234567").mkdir(parents=True)
+    leftover = folder / f".writing-{processes.host_token()}-01234567"
+    (leftover / f".writing-{processes.host_token()}-01234567").mkdir(parents=True)
     (leftover / ".lock").touch()
-    of_user = folder / f".writing-{host_token()}-89abcdef"  # without a lock
+    of_user = folder / f".writing-{processes.host_token()}-89abcdef"  # without a lock
     kept = [folder / ".writing-00000000-01234567", folder / ".masks.lock", folder / "masks", of_user]
     for path in kept:
         path.mkdir()
@@ -152,12 +154,12 @@ def test_only_folders_of_unfinished_files_of_this_host_are_removed(tmp_path):
     (of_others := tmp_path / "of_others").mkdir()
     for name in (".lock", "drawing.png"):
         (of_others / name).touch()
-    kept.append(folder / f".writing-{host_token()}-fedcba98")
+    kept.append(folder / f".writing-{processes.host_token()}-fedcba98")
     kept[-1].symlink_to(of_others)
-    assert remove_leftovers(tmp_path) == [leftover]
+    assert processes.remove_leftovers(tmp_path) == [leftover]
     assert sorted(folder.iterdir()) == sorted(kept)
     assert (of_others / "drawing.png").exists()
-    assert remove_leftovers(tmp_path / "nowhere") == []
+    assert processes.remove_leftovers(tmp_path / "nowhere") == []
 
 
 @pytest.mark.parametrize("is_lock_created", [True, False])
@@ -169,7 +171,7 @@ def test_a_writer_whose_folder_is_removed_before_it_is_locked_takes_another(
 
     def after_a_clean_up(*arguments):
         monkeypatch.undo()
-        assert len(remove_leftovers(tmp_path)) == 1
+        assert len(processes.remove_leftovers(tmp_path)) == 1
         return function(*arguments)
 
     monkeypatch.setattr(module, name, after_a_clean_up)

@@ -5,17 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilsplat.base import ownership
 from hilsplat.base.artifacts import provenance_path, write_index
 from hilsplat.base.atomic import lock_path
 from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.base.images import write_png
-from hilsplat.base.ownership import (
-    SOFTWARE,
-    replaced_files,
-    require_beginning,
-    require_own_picture,
-    require_replaceable,
-)
 from hilsplat.cli.common import require_new_folder
 from hilsplat.stage import PathIn, PathOut, Registry
 from tests.unit.artifact_changes import write_record
@@ -54,13 +48,13 @@ def test_missing_or_empty_outputs_may_be_written(tmp_path):
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder/.snakemake_timestamp").touch()
     (tmp_path / "file").touch()
-    require_replaceable([tmp_path / name for name in ("new", "folder", "file")], "masks", [])
+    ownership.require_replaceable([tmp_path / name for name in ("new", "folder", "file")], "masks", [])
 
 
 def test_a_folder_of_hidden_files_is_not_empty(tmp_path):
     (tmp_path / ".todo").write_text("work")
     with pytest.raises(ArtifactError, match=r"did not write it(.|\n)*a folder of 1 entries: \.todo"):
-        require_replaceable([tmp_path], "masks", [])
+        ownership.require_replaceable([tmp_path], "masks", [])
 
 
 def test_only_outputs_in_the_record_of_the_same_stage_may_be_replaced(photographs, tmp_path):
@@ -69,43 +63,43 @@ def test_only_outputs_in_the_record_of_the_same_stage_may_be_replaced(photograph
     record(out, "gaussians", "report")
     (tmp_path / "report").mkdir()
     (tmp_path / "report/fit.png").write_text("png")
-    require_replaceable([out, tmp_path / "report"], "gaussians", [])
+    ownership.require_replaceable([out, tmp_path / "report"], "gaussians", [])
     with pytest.raises(ArtifactError, match="clip did not write it"):
-        require_replaceable([out], "clip", [])
+        ownership.require_replaceable([out], "clip", [])
     with pytest.raises(ArtifactError, match="photographs exists"):
-        require_replaceable([out, photographs], "gaussians", [])
+        ownership.require_replaceable([out, photographs], "gaussians", [])
 
 
 def test_outputs_of_a_killed_writer_may_be_replaced(photographs):
     lock_path(photographs).write_text("unfinished\n")
-    require_replaceable([photographs], "masks", [])
+    ownership.require_replaceable([photographs], "masks", [])
 
 
 @pytest.mark.parametrize("broken", ["", "{", "[]", '{"stage": "masks"}', '{"stage": "masks", "outputs": 3}'])
 def test_a_broken_record_counts_as_missing(photographs, broken):
     provenance_path(photographs).write_text(broken)
     with pytest.raises(ArtifactError, match="did not write it"):
-        require_replaceable([photographs], "masks", [])
+        ownership.require_replaceable([photographs], "masks", [])
 
 
 def test_an_input_is_never_an_output(photographs, tmp_path):
     record(photographs, "poses")
     with pytest.raises(ArtifactError, match="is an input"):
-        require_replaceable([photographs], "poses", [photographs])
+        ownership.require_replaceable([photographs], "poses", [photographs])
     link = tmp_path / "link"
     link.symlink_to(photographs)
     with pytest.raises(ArtifactError, match="is an input"):
-        require_replaceable([link], "poses", [photographs])
+        ownership.require_replaceable([link], "poses", [photographs])
     record(tmp_path, "poses")
     with pytest.raises(ArtifactError, match="contains the input"):
-        require_replaceable([tmp_path], "poses", [photographs])
+        ownership.require_replaceable([tmp_path], "poses", [photographs])
 
 
 def test_the_working_and_the_home_folder_are_never_outputs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for out, name in ((Path(), "working"), (tmp_path.parent, "working"), (Path.home(), "home")):
         with pytest.raises(ArtifactError, match=f"is or contains the {name} folder"):
-            require_replaceable([out], "masks", [])
+            ownership.require_replaceable([out], "masks", [])
 
 
 def test_an_input_that_changes_during_a_stage_leaves_no_provenance(tmp_path, photographs):
@@ -119,39 +113,39 @@ def test_an_input_that_changes_during_a_stage_leaves_no_provenance(tmp_path, pho
 def test_pictures_replace_only_pictures_of_this_package(tmp_path):
     pixels = np.zeros((8, 8, 3), np.uint8)
     picture, photograph, text = (tmp_path / name for name in ("picture.png", "photograph.png", "thesis.md"))
-    require_own_picture(picture)
-    write_png(picture, pixels, text=SOFTWARE)
-    require_own_picture(picture)
+    ownership.require_own_picture(picture)
+    write_png(picture, pixels, text=ownership.SOFTWARE)
+    ownership.require_own_picture(picture)
     write_png(photograph, pixels)
     (tmp_path / "broken.png").write_text("text")
     for path in (photograph, tmp_path / "broken.png"):
         with pytest.raises(ArtifactError, match="hilsplat did not write it"):
-            require_own_picture(path)
+            ownership.require_own_picture(path)
     with pytest.raises(ArtifactError, match="not a PNG file"):
-        require_own_picture(text)
+        ownership.require_own_picture(text)
 
 
 def test_files_of_a_writer_that_failed_may_be_replaced(tmp_path):
     """A query takes seconds, so that users interrupt it."""
-    with pytest.raises(KeyboardInterrupt), replaced_files(tmp_path, ["panel.png", "selection.ply"]):
+    with pytest.raises(KeyboardInterrupt), ownership.replaced_files(tmp_path, ["panel.png", "selection.ply"]):
         (tmp_path / "panel.png").write_text("half a picture")
         raise KeyboardInterrupt
     for _ in range(2):
-        with replaced_files(tmp_path, ["panel.png", "selection.ply"]):
+        with ownership.replaced_files(tmp_path, ["panel.png", "selection.ply"]):
             (tmp_path / "panel.png").write_text("a picture")
     (tmp_path / "selection.ply").symlink_to("nowhere")
     with pytest.raises(ArtifactError, match=r"did not write(.|\n)*selection\.ply"):
-        replaced_files(tmp_path, ["panel.png", "selection.ply"]).__enter__()
+        ownership.replaced_files(tmp_path, ["panel.png", "selection.ply"]).__enter__()
 
 
 def test_tables_replace_only_tables_with_the_same_header(tmp_path):
     table = tmp_path / "efficiency.csv"
-    require_beginning(table, "stage,seconds")
+    ownership.require_beginning(table, "stage,seconds")
     table.write_text("stage,seconds\nmasks,3\n")
-    require_beginning(table, "stage,seconds")
+    ownership.require_beginning(table, "stage,seconds")
     table.write_text("name,price\n")
     with pytest.raises(ArtifactError, match="did not write it"):
-        require_beginning(table, "stage,seconds")
+        ownership.require_beginning(table, "stage,seconds")
 
 
 def test_a_pdf_beside_a_picture_is_the_users_only_before_the_first_run(tmp_path):
@@ -170,9 +164,9 @@ def test_a_pdf_beside_a_picture_is_the_users_only_before_the_first_run(tmp_path)
 @pytest.mark.parametrize(
     "check",
     [
-        lambda out: require_replaceable([out], "masks", []),
-        require_own_picture,
-        lambda out: require_beginning(out, "a,b"),
+        lambda out: ownership.require_replaceable([out], "masks", []),
+        ownership.require_own_picture,
+        lambda out: ownership.require_beginning(out, "a,b"),
         require_new_folder,
     ],
 )

@@ -6,13 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from cpusplat.compiled import compiled
 from cpusplat.project import matrix_entries
-from hilsplat.base.rotations import (
-    are_rotations,
-    multiply,
-    quaternion_of,
-    rotate,
-    unit_quaternions,
-)
+from hilsplat.base.rotations import are_rotations, multiply, quaternion_of, rotate, unit_quaternions
 
 GENERATOR = np.random.default_rng(3)
 RANDOM = GENERATOR.normal(size=(50, 4)) * GENERATOR.uniform(0.01, 100, (50, 1))

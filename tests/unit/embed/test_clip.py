@@ -15,7 +15,6 @@ from hilsplat.embed.clip import ClipModel, open_clip_of, unit
 from hilsplat.embed.stage import chosen_masks, run_clip
 from hilsplat.models import int8
 from hilsplat.models.folder import open_model_folder
-from hilsplat.models.int8 import reduced_precision, use_reduced
 from hilsplat.models.network import Network
 from hilsplat.segment.digests import digests_in, index_entry
 from hilsplat.settings import ClipSettings
@@ -197,7 +196,7 @@ def test_an_agreement_is_measured_again_by_other_code_or_for_other_inputs(tmp_pa
     measure = Mock(side_effect=[{"cosine": 0.995}, {"cosine": 0.5}, {"cosine": 0.5}])
 
     def is_used(model: str) -> bool:
-        return use_reduced("int8", "auto", "CLIP", tmp_path, {"model": model}, measure)
+        return int8.use_reduced("int8", "auto", "CLIP", tmp_path, {"model": model}, measure)
 
     monkeypatch.setattr(int8, "code_digest", lambda *roots: "code")
     assert [is_used("one"), is_used("one"), is_used("two")] == [True, True, False]
@@ -207,8 +206,8 @@ def test_an_agreement_is_measured_again_by_other_code_or_for_other_inputs(tmp_pa
 
 def test_an_embedded_model_runs_in_float32_with_a_warning_if_int8_is_required(project, caplog):
     embedded = open_model_folder(project / "models/clip-tiny")
-    assert not reduced_precision("auto", embedded, "vision_model") and not caplog.text
-    assert not reduced_precision("int8", embedded, "vision_model")
+    assert not int8.reduced_precision("auto", embedded, "vision_model") and not caplog.text
+    assert not int8.reduced_precision("int8", embedded, "vision_model")
     assert "clip-tiny runs in float32: int8 requires a pretrained model" in caplog.text
 
 

@@ -151,12 +151,7 @@ def test_missing_files_are_reported_and_half_of_the_views_need_them(files, scene
     ("masks", "clip", "error", "words"),
     [
         (("a.1.png", "a.2.png"), ("a.1.png", "a.2.png"), ArtifactError, r"a.1.png, a.2.png"),
-        (
-            ("a.png", "b.png"),
-            ("a.png",),
-            MisalignedArtifactError,
-            "was not made from the masks of view b",
-        ),
+        (("a.png", "b.png"), ("a.png",), MisalignedArtifactError, "was not made from the masks of view b"),
     ],
 )
 def test_views_of_one_stem_and_vectors_of_other_masks_are_refused(ours, tmp_path, masks, clip, error, words):

@@ -31,8 +31,7 @@ from tests.conftest import PROJECT
 from tests.unit.segment.handmade import pack, save_scene, smooth_logits
 from tests.unit.simulated_card import simulated_card
 
-TOLERANCE = 2e-5
-"""Of predicted IoUs and of logits, relative to the largest logit."""
+TOLERANCE = 2e-5  # of predicted IoUs and of logits, relative to the largest logit
 LOOSE = {"predicted_iou_min": 0, "stability_min": 0.1, "nms_score": 0}
 
 

@@ -77,14 +77,10 @@ def test_the_published_clip_gives_what_transformers_gives(clip_parts, tmp_path):
     model, processor, exported = clip_parts
     for file in exported.glob("*.json"):
         shutil.copy(file, tmp_path)
+    pixels, ids = torch.zeros(1, 3, 32, 32), torch.ones((1, 16)).long()
     for name, network, inputs, output in (
-        (
-            "vision_model",
-            model.get_image_features,
-            {"pixel_values": torch.zeros(1, 3, 32, 32)},
-            "image_embeds",
-        ),
-        ("text_model", model.get_text_features, {"input_ids": torch.ones((1, 16)).long()}, "text_embeds"),
+        ("vision_model", model.get_image_features, {"pixel_values": pixels}, "image_embeds"),
+        ("text_model", model.get_text_features, {"input_ids": ids}, "text_embeds"),
     ):
         dynamic = {each: {0: "batch_size"} for each in (*inputs, output)}
         trace(Call(model, network), inputs, [output], dynamic, tmp_path / f"onnx/{name}.onnx")

@@ -16,7 +16,6 @@ from hilsplat.configuration import parse_section
 from hilsplat.field.code import LinearCode
 from hilsplat.methods import laga, legaussians, saga, vch
 from hilsplat.methods.common import groups
-from hilsplat.methods.common.groups import associated_codes, clusters, density_clusters, kmeans
 from hilsplat.methods.common.training import product, train, unit
 from hilsplat.methods.gaussian_grouping import neighbour_loss
 from hilsplat.methods.method import LabelledView, labelled_views
@@ -138,7 +137,7 @@ def test_a_group_has_the_average_code_of_its_best_mask_in_each_view(
     )
     inputs = types.SimpleNamespace(contributions=contributions, latents=np.float32([[1], [5], [2]]))
     features = np.float32([[0], [0], [1]])
-    found = inspect.unwrap(associated_codes)(inputs, np.array([0, 0, -1]), np.arange(3), features)
+    found = inspect.unwrap(groups.associated_codes)(inputs, np.array([0, 0, -1]), np.arange(3), features)
     assert found.tolist() == [[expected], [expected], [0.0]]
 
 
@@ -185,7 +184,7 @@ def test_clusters_of_smaller_distances_are_inside_those_of_larger_ones():
     # two pairs of directions: 20 degrees apart inside a pair, 90 between pairs
     angle = np.deg2rad([0, 20, 90, 110]).repeat(5)
     features = np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
-    found = clusters(features, (1.0, 0.2, 0.01), 0, "cosine")
+    found = groups.clusters(features, (1.0, 0.2, 0.01), 0, "cosine")
     assert [len(np.unique(level)) for level in found.T][1:] == [2, 4]
     for coarse, fine in ((0, 1), (1, 2)):
         assert len(np.unique(found[:, [coarse, fine]], axis=0)) == len(np.unique(found[:, fine]))
@@ -242,9 +241,9 @@ def test_components_split_where_features_jump_and_small_ones_join_the_nearest_la
 
 def test_density_clusters_connect_dense_points_and_ignore_isolated_ones():
     line = np.float32([0, 0.1, 0.2, 0.3, 5, 5.1, 5.2, 9, 0.45])[:, None]  # the last is near one point only
-    assert density_clusters(line, 0.16, 3).tolist() == [-1, 0, 0, 0, -1, 1, -1, -1, -1]
-    assert density_clusters(line, 0.16, 1).tolist() == [0, 0, 0, 0, 1, 1, 1, 2, 0]
-    assert density_clusters(line[:0], 0.1, 3).tolist() == []
+    assert groups.density_clusters(line, 0.16, 3).tolist() == [-1, 0, 0, 0, -1, 1, -1, -1, -1]
+    assert groups.density_clusters(line, 0.16, 1).tolist() == [0, 0, 0, 0, 1, 1, 1, 2, 0]
+    assert groups.density_clusters(line[:0], 0.1, 3).tolist() == []
 
 
 # ---- LEGaussians ----------------------------------------------------------------------------------------
@@ -421,7 +420,7 @@ def test_the_scale_of_a_mask_is_twice_the_spread_of_its_gaussians():
     ],
 )
 def test_centroids_are_the_means_of_groups_and_the_first_is_repeated(rows, count, expected):
-    centroids, nearest = kmeans(np.float32(rows), count, seed=1)
+    centroids, nearest = groups.kmeans(np.float32(rows), count, seed=1)
     assert centroids[nearest] == pytest.approx(np.float32(expected))
     assert centroids.dtype == np.float32 and nearest.dtype == np.int64
     assert (centroids[2:] == centroids[0]).all() and len(np.unique(centroids, axis=0)) == 2
@@ -431,6 +430,6 @@ def test_centroids_are_the_means_of_groups_and_the_first_is_repeated(rows, count
 def test_distant_starts_find_separated_groups_in_one_round(seed):
     rng = np.random.default_rng(seed)
     rows = np.repeat(np.float32([[0, 0], [50, 0], [0, 50]]), 10, axis=0)
-    _, nearest = kmeans(rows + 0.01 * rng.random(rows.shape).astype(np.float32), 3, seed, rounds=1)
+    _, nearest = groups.kmeans(rows + 0.01 * rng.random(rows.shape).astype(np.float32), 3, seed, rounds=1)
     found = nearest.reshape(3, 10)
     assert (found == found[:, :1]).all() and len(np.unique(found)) == 3

@@ -15,7 +15,6 @@ from hilsplat.field.code import Autoencoder, LinearCode
 from hilsplat.methods import dr_splat, langsplat_v2, lifted, occam
 from hilsplat.methods.kernels import weighted_sums
 from hilsplat.methods.langsplat import train
-from hilsplat.methods.langsplat_v2 import as_vectors, cosine_loss, largest_shares
 from hilsplat.methods.method import LabelledView, MethodInputs, run_method
 from hilsplat.scene.cameras import Camera
 
@@ -86,7 +85,7 @@ def test_views_are_drawn_in_random_order_each_once_before_any_is_repeated():
 
 def test_shares_are_the_largest_of_a_softmax_and_the_first_wins_ties():
     logits = np.log(np.float32([[1, 6, 3, 2], [1, 1, 1, 1]]))
-    chosen, shares = largest_shares(logits, 2)
+    chosen, shares = langsplat_v2.largest_shares(logits, 2)
     assert chosen.tolist() == [[1, 2], [0, 1]]
     assert shares.ravel() == pytest.approx([6 / 9, 3 / 9, 0.5, 0.5])
 
@@ -95,14 +94,14 @@ def test_coordinates_keep_the_angles_of_decoded_vectors():
     rng = np.random.default_rng(0)
     vectors = unit(rng.normal(size=(30, 8)) + 2)
     code = LinearCode.fit(vectors, 3)  # fewer directions than the vectors span
-    short = unit(as_vectors(code.encode_array(vectors), code))
+    short = unit(langsplat_v2.as_vectors(code.encode_array(vectors), code))
     decoded = code.decode_array(code.encode_array(vectors))
     assert short.shape == (30, 4)
     assert short @ short.T == pytest.approx(decoded @ decoded.T, abs=1e-5)
 
 
 def test_cosine_loss_matches_hand_computation():
-    loss, gradient = cosine_loss(np.float32([[3, 4]]), np.float32([[1, 0]]))
+    loss, gradient = langsplat_v2.cosine_loss(np.float32([[3, 4]]), np.float32([[1, 0]]))
     assert loss == pytest.approx(1 - 0.6)
     # (0.6 * (0.6, 0.8) - (1, 0)) / 5
     assert gradient[0] == pytest.approx([-0.128, 0.096])
@@ -116,7 +115,7 @@ def test_gradients_of_a_step_match_finite_differences():
     pixels = weights, code.encode_array(unit(rng.normal(size=(5, 6))))
     own = [rng.normal(size=shape).astype(np.float32) for shape in [(3, 6), (6, 4)]]  # logits and codebook
     _, *gradients = langsplat_v2.step(*own, *pixels, code)
-    chosen, _ = largest_shares(own[0])
+    chosen, _ = langsplat_v2.largest_shares(own[0])
     for which, place in [(0, (0, chosen[0, 1])), (0, (2, chosen[2, 3])), (1, (chosen[1, 0], 2))]:
         sides = []
         for move in (1e-2, -1e-2):

@@ -15,8 +15,7 @@ from hilsplat.models.repeatable import random_pixels
 from hilsplat.models.torch_network import TorchNetwork
 from tests.conftest import PROJECT
 
-HERE = "cpu:0"
-"""The CPU as a device of torch; `cpu` means onnxruntime."""
+HERE = "cpu:0"  # the CPU as a device of torch; `cpu` means onnxruntime
 TOLERANCE = 1e-5
 
 BRANCHES = (

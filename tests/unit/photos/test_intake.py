@@ -14,7 +14,6 @@ from PIL import Image
 
 from hilsplat.base.errors import SceneError
 from hilsplat.photos import intake
-from hilsplat.photos.intake import prepared_photographs
 from hilsplat.photos.video import MIN_STEP, displacement, extract_frames
 from hilsplat.photos.video_colours import _pq_light, rgb_pixels, srgb_from_hdr
 from hilsplat.scene.sheet import read_sheet
@@ -253,7 +252,7 @@ def test_an_existing_folder_is_kept_and_other_files_are_refused(tmp_path, sheet)
 
 def test_a_command_that_was_killed_after_it_unpacked_resumes(tmp_path, sheet):
     made, video = tmp_path / "project/photos/desk", write_video(tmp_path / "walk.mp4", pan([0] + [6] * 20))
-    with prepared_photographs(video, made, 10):
+    with intake.prepared_photographs(video, made, 10):
         before = sorted(path.stat().st_mtime_ns for path in made.glob("*.*"))
     report = add_scene(sheet, "desk", video, frames=10)  # no frame is extracted again
     assert report.num_readable == 10 and "already exists and was made from the same files" in str(report)

@@ -5,14 +5,6 @@ import pytest
 
 from hilsplat.scene import matching
 from hilsplat.scene.colmap import pycolmap
-from hilsplat.scene.matching import (
-    MAX_ANGLE,
-    MAX_RATIO,
-    ViewFeatures,
-    match_pairs,
-    mutual_matches,
-    read_features,
-)
 
 
 def descriptors_of(directions):
@@ -24,7 +16,7 @@ def descriptors_of(directions):
 def view_of(descriptors):
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 400.0, 400, 300)
     columns = np.ascontiguousarray(descriptors.T ^ np.uint8(128)).view(np.int8)
-    return ViewFeatures(1, camera, np.zeros((len(descriptors), 2)), descriptors, columns)
+    return matching.ViewFeatures(1, camera, np.zeros((len(descriptors), 2)), descriptors, columns)
 
 
 def two_views(rng, shared, alone):
@@ -46,7 +38,7 @@ def compared_one_by_one(one, other):
             products = second.descriptors.astype(int) @ descriptor
             order = np.argsort(-products, kind="stable")
             angles = np.arccos(np.minimum(products[order[:2]] / 512**2, 1))
-            if angles[0] <= MAX_ANGLE and angles[0] < MAX_RATIO * angles[1]:
+            if angles[0] <= matching.MAX_ANGLE and angles[0] < matching.MAX_RATIO * angles[1]:
                 found[row] = int(order[0])
         return found
 
@@ -59,16 +51,16 @@ def test_matches_are_the_mutual_nearest_of_all(monkeypatch, multiplied):
     if multiplied == "in float32":
         monkeypatch.setattr(matching, "_integer_products", lambda: None)
     one, other = two_views(np.random.default_rng(3), 300, 290)
-    matches = mutual_matches(one, other).tolist()
+    matches = matching.mutual_matches(one, other).tolist()
     assert matches == compared_one_by_one(one, other) and 200 < len(matches) <= 300
 
 
 def test_a_feature_with_two_equally_near_ones_has_no_match():
     descriptors = descriptors_of(np.random.default_rng(5).exponential(1, (40, 128)))
     twice = view_of(np.concatenate([descriptors, descriptors[[7, 31]]]))
-    matched = mutual_matches(view_of(descriptors), twice)
+    matched = matching.mutual_matches(view_of(descriptors), twice)
     assert matched.tolist() == [[row, row] for row in range(40) if row not in (7, 31)]
-    assert len(mutual_matches(view_of(descriptors[:0]), twice)) == 0
+    assert len(matching.mutual_matches(view_of(descriptors[:0]), twice)) == 0
 
 
 def test_verified_matches_are_written(tmp_path):
@@ -89,7 +81,9 @@ def test_verified_matches_are_written(tmp_path):
     options.min_num_inliers, options.ransac.random_seed = 12, 0
     with pycolmap.Database.open(database) as opened:
         pairs = [(0, 1), (0, 2), (1, 2)]
-        assert match_pairs(opened, read_features(opened), pairs, options, threads=2) == [(0, 1)]
+        assert matching.match_pairs(opened, matching.read_features(opened), pairs, options, threads=2) == [
+            (0, 1)
+        ]
         geometries = [opened.read_two_view_geometry(*pair) for pair in ((1, 2), (1, 3))]
     # the third shares 14, one too few
     assert [each.inlier_matches.tolist() for each in geometries] == [[[row, row] for row in range(60)], []]

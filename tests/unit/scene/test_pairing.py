@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from hilsplat.scene import pairing
-from hilsplat.scene.pairing import appearance_vectors, groups_of, joining_pairs, likely_pairs, visual_words
 
 
 def views_of_places(rng, places, each):
@@ -19,7 +18,7 @@ def views_of_places(rng, places, each):
 
 
 def test_views_of_one_place_are_the_most_similar():
-    vectors = appearance_vectors(views_of_places(np.random.default_rng(2), 5, 4), seed=0)
+    vectors = pairing.appearance_vectors(views_of_places(np.random.default_rng(2), 5, 4), seed=0)
     likeness = vectors @ vectors.T
     nearest = np.argsort(-likeness, axis=1)[:, :4]
     assert (nearest // 4 == np.arange(20)[:, None] // 4).all()
@@ -27,7 +26,7 @@ def test_views_of_one_place_are_the_most_similar():
 
 def test_products_of_appearance_vectors_are_exact():
     views = [*views_of_places(np.random.default_rng(3), 4, 3), np.zeros((0, 128), np.uint8)]
-    vectors = appearance_vectors(views, seed=0)
+    vectors = pairing.appearance_vectors(views, seed=0)
     exact = vectors.astype(np.int64) @ vectors.astype(np.int64).T
     assert (vectors @ vectors.T == exact).all() and exact.max() < 2**24
     assert not vectors[-1].any()  # no features
@@ -36,14 +35,14 @@ def test_products_of_appearance_vectors_are_exact():
 
 @pytest.mark.parametrize("count", [0, 3])
 def test_captures_without_features_have_empty_vectors(count):
-    vectors = appearance_vectors([np.zeros((0, 128), np.uint8)] * count, seed=0)
+    vectors = pairing.appearance_vectors([np.zeros((0, 128), np.uint8)] * count, seed=0)
     assert len(vectors) == count and not vectors.any()
 
 
 def test_words_are_the_centres_of_clusters(monkeypatch):
     monkeypatch.setattr(pairing, "WORDS", 2)
     cluster = np.array([[0, 2], [2, 0], [2, 2], [0, 0]], np.uint8)
-    words = visual_words(np.concatenate([cluster, cluster + np.uint8(100)]), seed=0)
+    words = pairing.visual_words(np.concatenate([cluster, cluster + np.uint8(100)]), seed=0)
     assert sorted(words.tolist()) == [[1, 1], [101, 101]]
 
 
@@ -52,12 +51,12 @@ def test_likely_pairs_are_the_most_similar_and_neighbours_in_time(monkeypatch):
     monkeypatch.setattr(pairing, "TIME_STEPS", 1)
     likeness = np.array([[9, 5, 1, 0], [5, 9, 1, 0], [1, 2, 9, 1], [3, 0, 1, 9]], np.float32)
     # the most similar of 0 to 3 are 1, 0, 1 and 0
-    assert likely_pairs(likeness, [2, 3, 1, 0]) == {(0, 1), (1, 2), (0, 3)} | {(2, 3), (1, 3)}
+    assert pairing.likely_pairs(likeness, [2, 3, 1, 0]) == {(0, 1), (1, 2), (0, 3)} | {(2, 3), (1, 3)}
 
 
 def test_groups_are_numbered_by_size():
-    assert groups_of(7, [(4, 6), (2, 4), (1, 3)]).tolist() == [2, 1, 0, 1, 0, 3, 0]
-    assert groups_of(2, []).tolist() == [0, 1]
+    assert pairing.groups_of(7, [(4, 6), (2, 4), (1, 3)]).tolist() == [2, 1, 0, 1, 0, 3, 0]
+    assert pairing.groups_of(2, []).tolist() == [0, 1]
 
 
 def test_other_groups_and_weak_views_are_tried_again(monkeypatch):
@@ -70,5 +69,5 @@ def test_other_groups_and_weak_views_are_tried_again(monkeypatch):
     tried = {*verified, (2, 4)}
     weak = {(4, 5), (0, 4)}  # the tail's next most similar view, and its partner's partners (2 was tried)
     others = {(4, 5), (4, 6)}  # the views of the main group that are most similar to 5 and 6
-    assert joining_pairs(likeness, tried, verified) == weak | others
-    assert joining_pairs(likeness, tried, [*verified, (0, 4), (4, 5), (4, 6)]) == set()
+    assert pairing.joining_pairs(likeness, tried, verified) == weak | others
+    assert pairing.joining_pairs(likeness, tried, [*verified, (0, 4), (4, 5), (4, 6)]) == set()

@@ -19,8 +19,7 @@ from hilsplat.segment.sam import LOGIT_STEP, SamModel
 from hilsplat.settings import MasksSettings
 
 FRAME, LOW = 32, 16
-RADII = (3.0, 6.0, 10.0)
-"""Radii of the disc decoder's masks (subpart, part, whole), px of the 32 px input."""
+RADII = (3.0, 6.0, 10.0)  # radii of the disc decoder's masks (subpart, part, whole), px of the 32 px input
 SCORES = (0.9, 0.8, 0.7)
 
 

@@ -6,13 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from hilsplat.segment.suppression import (
-    box_iou,
-    distinct_boxes,
-    keep_best_masks,
-    suppress_boxes,
-    suppress_masks,
-)
+from hilsplat.segment import suppression
 from hilsplat.settings import MasksSettings
 from tests.unit.segment import official
 from tests.unit.segment.handmade import assert_equal_masks, pack
@@ -25,7 +19,7 @@ scores_of = st.sampled_from([0.1, 0.25, 0.5, 0.75, 1.0])
 def test_box_iou_by_hand():
     a = np.array([[0, 0, 4, 4]])
     b = np.array([[0, 0, 4, 4], [2, 0, 6, 4], [4, 0, 8, 4]])
-    assert box_iou(a, b)[0].tolist() == [1.0, pytest.approx(8 / 24), 0.0]
+    assert suppression.box_iou(a, b)[0].tolist() == [1.0, pytest.approx(8 / 24), 0.0]
 
 
 @pytest.mark.parametrize(
@@ -40,7 +34,7 @@ def test_box_iou_by_hand():
     ],
 )
 def test_boxes_are_dropped_by_better_ones_that_are_kept(boxes, score, iou_max, kept):
-    assert suppress_boxes(np.array(boxes), np.array(score), iou_max).tolist() == kept
+    assert suppression.suppress_boxes(np.array(boxes), np.array(score), iou_max).tolist() == kept
 
 
 def test_a_box_repeats_a_better_one_unless_it_is_more_stable():
@@ -50,7 +44,7 @@ def test_a_box_repeats_a_better_one_unless_it_is_more_stable():
     stability = np.array([0.25, 0.5, 0.75, 0.75 + 2**-20, 0.125])  # exact in binary
     # 1 is best; 0 and 2 repeat it, although 2 is more stable by exactly the slack; 3 is more stable by more
     # than that; 4 has an IoU of 0.8 with all others
-    assert distinct_boxes(boxes, score, 0.85, stability, slack=0.25).tolist() == [1, 3, 4]
+    assert suppression.distinct_boxes(boxes, score, 0.85, stability, slack=0.25).tolist() == [1, 3, 4]
 
 
 @given(st.integers(0, 1000), st.sampled_from([0.2, 0.5, 0.8]), st.sampled_from([0.2, 0.5, 0.8]))
@@ -62,9 +56,9 @@ def test_distinct_boxes_lead_to_the_same_suppression_at_any_threshold(seed, scor
 
     def best(rows: np.ndarray) -> list[int]:
         rows = rows[(score[rows] > score_min) & (stability[rows] >= stability_min)]
-        return rows[suppress_boxes(boxes[rows], score[rows], iou_max=0.7)].tolist()
+        return rows[suppression.suppress_boxes(boxes[rows], score[rows], iou_max=0.7)].tolist()
 
-    assert best(np.sort(distinct_boxes(boxes, score, 0.9, stability))) == best(np.arange(40))
+    assert best(np.sort(suppression.distinct_boxes(boxes, score, 0.9, stability))) == best(np.arange(40))
 
 
 @given(
@@ -76,7 +70,7 @@ def test_distinct_boxes_lead_to_the_same_suppression_at_any_threshold(seed, scor
 )
 def test_kept_masks_equal_langsplats(masks, data, iou_max, score_min, inner):
     score = np.array(data.draw(st.lists(scores_of, min_size=len(masks), max_size=len(masks))))
-    keep = keep_best_masks(
+    keep = suppression.keep_best_masks(
         pack(masks).overlaps_px(), score, iou_max=iou_max, score_min=score_min, inner=inner
     )
     expected = official.suppress(masks, score, MasksSettings(nms_iou=iou_max, nms_inner=inner), score_min)
@@ -90,7 +84,9 @@ def test_result_does_not_depend_on_the_order_of_masks(masks, data):
     level = np.array(data.draw(st.lists(st.integers(1, 3), min_size=number, max_size=number)), np.uint8)
     shuffle = np.array(data.draw(st.permutations(range(number))))
     first, second = (
-        suppress_masks(pack(masks[order], level[order], score[order]), iou_max=0.8, score_min=0.2, inner=0.5)
+        suppression.suppress_masks(
+            pack(masks[order], level[order], score[order]), iou_max=0.8, score_min=0.2, inner=0.5
+        )
         for order in (np.arange(number), shuffle)
     )
     assert_equal_masks(second, first)

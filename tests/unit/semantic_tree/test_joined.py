@@ -43,8 +43,7 @@ REGIONS = (
 PICTURE = painted(REGIONS, (HEIGHT, LENGTH))
 
 BORDER = 58
-OTHERWISE = {"pen": (56, 80)}
-"""Columns of masks that differ in the first block, which reach over the border."""
+OTHERWISE = {"pen": (56, 80)}  # columns of masks that differ in the first block, which reach over the border
 
 VIEWS = tuple(f"{view:03d}.png" for view in range((LENGTH - WINDOW) // STEP + 1))
 DISTANCE = 30.0
@@ -191,10 +190,6 @@ def test_a_joined_scene_gives_the_answers_of_the_whole_scene(project, text):
         assert both >= 0.97 * either or either <= HEIGHT, view  # a column at the edge may be half visible
 
 
-def without_vectors(project: Path) -> None:
-    shutil.rmtree(project / "results/photos/shelf-1/default/clip")
-
-
 def with_another_segmenter(project: Path) -> None:
     masks = project / "results/photos/shelf-1/default/masks"
     index = read_index(masks)
@@ -209,7 +204,7 @@ def with_other_poses(project: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (without_vectors, "shelf-1 is not finished"),
+        (lambda at: shutil.rmtree(at / "results/photos/shelf-1/default/clip"), "shelf-1 is not finished"),
         (with_another_segmenter, "different models or settings"),
         (with_other_poses, "was not made from"),
     ],

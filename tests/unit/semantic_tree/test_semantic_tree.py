@@ -12,13 +12,6 @@ from hilsplat.base.lineage import sha256_of_path
 from hilsplat.semantic_tree import nodes
 from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.semantic_tree.evidence import mask_evidence
-from hilsplat.semantic_tree.nodes import (
-    gaussian_nodes,
-    linked_nodes,
-    nearest_gaussians,
-    node_parents,
-    without_strays,
-)
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.semantic_tree.view_pairs import ViewPairs, view_pairs
 from hilsplat.settings import SemanticTreeSettings
@@ -31,7 +24,9 @@ def test_gaussians_join_the_node_with_the_largest_share(monkeypatch):
         monkeypatch.setattr(nodes, "MIN_MEMBER_SHARE", min_share)
         S, mass = sp.csr_matrix(np.array(weights, np.float32)), np.array(mass, np.float32)
         masks = np.array(cluster), 2, S, np.array(view, np.int32)
-        node, membership = gaussian_nodes(*masks, sp.csr_matrix(mass), mass.sum(axis=0, dtype=np.float64))
+        node, membership = nodes.gaussian_nodes(
+            *masks, sp.csr_matrix(mass), mass.sum(axis=0, dtype=np.float64)
+        )
         return node.tolist(), membership.tolist()
 
     # Gaussian 0 has 9 of 10 px in node 0 and 2 in node 1; Gaussian 1 has too little (2 of 10) in any
@@ -55,13 +50,13 @@ def test_small_pieces_apart_from_their_node_leave_it():
     means = np.zeros((52, 3))
     means[:, 0] = [*range(40), 200, *range(201, 212)]
     node = np.array([0] * 41 + [1] * 11, np.int32)
-    nearest, mass = nearest_gaussians(means, 1), np.full(52, 2.0)
-    kept = without_strays(node, nearest, mass)
+    nearest, mass = nodes.nearest_gaussians(means, 1), np.full(52, 2.0)
+    kept = nodes.without_strays(node, nearest, mass)
     assert kept.tolist() == node.tolist()  # one of forty is more than 2 %
     mass[40] = 1.0
-    assert np.flatnonzero(without_strays(node, nearest, mass) != node).tolist() == [40]
+    assert np.flatnonzero(nodes.without_strays(node, nearest, mass) != node).tolist() == [40]
     node[:] = -1
-    assert (without_strays(node, nearest, mass) == -1).all()
+    assert (nodes.without_strays(node, nearest, mass) == -1).all()
 
 
 def test_a_duplicate_cluster_is_not_a_node():
@@ -73,24 +68,24 @@ def test_a_duplicate_cluster_is_not_a_node():
     masks[:4, 3][~double[:4]] = 0
     mass, rows = sp.csr_matrix(np.ones((4, 10), np.float32)), np.arange(7)
 
-    (found,) = linked_nodes(sp.csr_matrix(masks), mass, view, [rows], SemanticTreeSettings(), 1)
+    (found,) = nodes.linked_nodes(sp.csr_matrix(masks), mass, view, [rows], SemanticTreeSettings(), 1)
     assert found.of_mask.tolist() == [0, -1, 0, -1, 0, -1, 0]
     assert found.of_gaussian.tolist() == [0] * 10
     assert found.membership == pytest.approx(np.where(np.arange(10) == 3, 0.5, 1.0))
     assert len(found.quality) == 1
 
     masks[np.ix_([0, 2], range(4))] = 0  # now it wins all four, and is a node
-    (found,) = linked_nodes(sp.csr_matrix(masks), mass, view, [rows], SemanticTreeSettings(), 1)
+    (found,) = nodes.linked_nodes(sp.csr_matrix(masks), mass, view, [rows], SemanticTreeSettings(), 1)
     assert found.of_gaussian.tolist() == [1] * 4 + [0] * 6
 
 
 def test_a_whole_may_be_the_parent_of_a_subpart():
     node_of_gaussian = np.array([[0, 1, 2], [0, 1, 2], [0, -1, 3], [0, -1, 3], [-1, -1, 4]], np.int32)
     level = np.array([1, 2, 3, 3, 3], np.uint8)
-    assert node_parents(node_of_gaussian, level, np.ones(5), 0.5).tolist() == [-1, 0, 1, 0, -1]
+    assert nodes.node_parents(node_of_gaussian, level, np.ones(5), 0.5).tolist() == [-1, 0, 1, 0, -1]
     # a cover of exactly the threshold is not enough
     half = np.array([[0, 1, -1], [-1, 1, -1]], np.int32)
-    assert node_parents(half, np.array([1, 2], np.uint8), np.ones(2), 0.5).tolist() == [-1, -1]
+    assert nodes.node_parents(half, np.array([1, 2], np.uint8), np.ones(2), 0.5).tolist() == [-1, -1]
 
 
 @pytest.fixture

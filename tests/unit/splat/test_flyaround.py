@@ -7,14 +7,6 @@ from PIL import Image
 
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat import flyaround
-from hilsplat.splat.flyaround import (
-    FRAMES,
-    closed_path,
-    contact_sheet,
-    encoded_film,
-    open_path,
-    write_flyaround,
-)
 from tests.unit.splat.three_gaussians_world import ring
 
 
@@ -25,7 +17,7 @@ def circle(number: int) -> list[Camera]:
 
 def test_the_closed_path_circles_a_ring_once_in_any_order():
     cameras = circle(24)
-    path = closed_path([cameras[row] for row in np.random.default_rng(3).permutation(24)], 60)
+    path = flyaround.closed_path([cameras[row] for row in np.random.default_rng(3).permutation(24)], 60)
     centres = np.stack([camera.centre for camera in path])
     radius = np.linalg.norm(centres[:, :2], axis=1)
     assert 2.85 < radius.min() <= radius.max() < 3.0  # smoothing cuts the corners a little
@@ -45,7 +37,7 @@ def test_the_closed_path_circles_a_ring_once_in_any_order():
 
 def test_an_open_path_goes_through_its_cameras_in_their_order():
     stops = circle(8)[:4]
-    path = open_path(stops, 31)
+    path = flyaround.open_path(stops, 31)
     centres = np.stack([camera.centre for camera in path])
     for stop, frame in zip(stops, (0, 10, 20, 30), strict=True):
         np.testing.assert_allclose(centres[frame], stop.centre, atol=0.05)
@@ -66,14 +58,14 @@ def test_camera_shake_is_smoothed():
     def jerk(cameras: list[Camera]) -> float:
         return np.abs(np.diff([camera.centre for camera in cameras], 2, axis=0)).max()
 
-    assert jerk(closed_path(shaky, 40)) < 0.4 * jerk(shaky)
+    assert jerk(flyaround.closed_path(shaky, 40)) < 0.4 * jerk(shaky)
 
 
 def test_one_camera_is_repeated_and_opposite_cameras_do_not_break_the_path():
     [camera] = circle(1)
-    for stop in closed_path([camera], 5) + open_path([camera, camera], 3):
+    for stop in flyaround.closed_path([camera], 5) + flyaround.open_path([camera, camera], 3):
         np.testing.assert_allclose(stop.cam_from_world, camera.cam_from_world, atol=1e-9)
-    for camera in closed_path(circle(2), 16):
+    for camera in flyaround.closed_path(circle(2), 16):
         assert np.isfinite(camera.cam_from_world).all()
 
 
@@ -84,26 +76,26 @@ def flat_picture(camera: Camera) -> np.ndarray:
 
 def test_the_film_shows_every_frame_and_the_sheet_every_tenth(tmp_path):
     path = circle(12)
-    write_flyaround(tmp_path, path, flat_picture, threads=1)
+    flyaround.write_flyaround(tmp_path, path, flat_picture, threads=1)
     with av.open(tmp_path / "flyaround.mp4") as film:
         shown = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
         assert film.streams.video[0].average_rate == flyaround.FRAMES_PER_S
-    expected = [flat_picture(camera) for camera in closed_path(path, FRAMES)]
-    assert len(shown) == FRAMES
+    expected = [flat_picture(camera) for camera in flyaround.closed_path(path, flyaround.FRAMES)]
+    assert len(shown) == flyaround.FRAMES
     np.testing.assert_allclose(np.array(shown, int), np.array(expected, int), atol=3)
     assert Image.open(tmp_path / "flyaround.png").size == (4 * 52, 3 * 52)
 
 
 def test_odd_sides_are_cropped_and_equal_frames_give_equal_bytes(tmp_path):
     noise = np.random.default_rng(0).integers(0, 255, (3, 47, 61, 3), np.uint8)
-    list(encoded_film(tmp_path / "a.mp4", noise, 24))
+    list(flyaround.encoded_film(tmp_path / "a.mp4", noise, 24))
     with av.open(tmp_path / "a.mp4") as film:
         assert [frame.to_ndarray(format="rgb24").shape for frame in film.decode(video=0)] == [(46, 60, 3)] * 3
     tile = np.random.default_rng(0).integers(0, 255, (15, 20, 3)).repeat(8, axis=0).repeat(8, axis=1)
     frames = [np.roll(tile, 3 * shift, axis=1).astype(np.uint8) for shift in range(40)]
     written = set()
     for _ in range(8):
-        list(encoded_film(tmp_path / "film.mp4", frames, 24))
+        list(flyaround.encoded_film(tmp_path / "film.mp4", frames, 24))
         written.add((tmp_path / "film.mp4").read_bytes())
     assert len(written) == 1
 
@@ -112,7 +104,7 @@ def test_sheet_shrinks_by_averages(monkeypatch):
     monkeypatch.setattr(flyaround, "MAX_SIDE_PX", 4)
     picture = np.zeros((6, 8, 3), np.uint8)
     picture[:, ::2] = 100
-    sheet = contact_sheet([picture, picture], columns=1)
+    sheet = flyaround.contact_sheet([picture, picture], columns=1)
     assert sheet.shape == (2 * 7, 8, 3)
     assert (sheet[:3, :4] == 50).all()
     assert (sheet[3:7] == 255).all()
@@ -120,10 +112,10 @@ def test_sheet_shrinks_by_averages(monkeypatch):
 
 def test_titles_are_above_their_pictures_and_stay_within_them():
     picture = np.full((30, 60, 3), 200, np.uint8)
-    sheet = contact_sheet([picture, picture], 2, ["a", "a very long name of a photograph.jpg"])
+    sheet = flyaround.contact_sheet([picture, picture], 2, ["a", "a very long name of a photograph.jpg"])
     assert sheet.shape == (flyaround.TITLE_PX + 34, 2 * 64, 3)
     titles, below = sheet[: flyaround.TITLE_PX], sheet[flyaround.TITLE_PX :]
-    np.testing.assert_array_equal(below, contact_sheet([picture, picture], 2))
+    np.testing.assert_array_equal(below, flyaround.contact_sheet([picture, picture], 2))
     is_drawn = (titles < 128).any(axis=(0, 2))
     assert is_drawn[:10].any() and not is_drawn[10:64].any()
     assert is_drawn[64:].sum() > 20 and not is_drawn[124:].any()

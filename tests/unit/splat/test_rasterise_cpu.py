@@ -15,7 +15,6 @@ from hilsplat.base.errors import DeviceError
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.rasterise import cuda, device, parity
 from hilsplat.splat.rasterise.api import draw, pixel_weights
-from hilsplat.splat.rasterise.device import choose_device
 from tests.unit.splat.rasterise_scenes import camera, random_gaussians
 
 
@@ -98,11 +97,11 @@ def test_without_cuda_auto_selects_the_cpu_and_cuda_is_an_error(card, monkeypatc
     card(None)
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     with caplog.at_level(logging.INFO):
-        assert choose_device("auto") == choose_device("auto") == "cpu"
+        assert device.choose_device("auto") == device.choose_device("auto") == "cpu"
     assert caplog.text.count("rasterising on cpu (device: auto") == 1
     assert "finds no CUDA device" in caplog.text
     with pytest.raises(DeviceError, match=r"device: cuda was requested(?s:.*)finds no CUDA device(?s:.*)gpu"):
-        choose_device("cuda")
+        device.choose_device("cuda")
 
 
 @pytest.mark.parametrize(
@@ -118,16 +117,16 @@ def test_without_cuda_auto_selects_the_cpu_and_cuda_is_an_error(card, monkeypatc
 )
 def test_a_failing_build_of_gsplat_is_tried_once_and_selects_the_cpu(card, caplog, kernels, words):
     loads = card(kernels)
-    assert choose_device("auto") == "cpu"
+    assert device.choose_device("auto") == "cpu"
     (line,) = [each.message for each in caplog.records if each.levelname == "WARNING"]
     assert line.startswith("rasterising on cpu") and words in line
     assert "the CUDA kernels of gsplat cannot be compiled" in line
     in_another_process()
-    assert choose_device("auto") == "cpu" and len(loads) == 1
+    assert device.choose_device("auto") == "cpu" and len(loads) == 1
     with pytest.raises(DeviceError, match=r"cannot be compiled(?s:.*)a CUDA toolkit on a machine"):
-        choose_device("cuda")
+        device.choose_device("cuda")
     device.forget_cuda()  # as `hilsplat doctor` does
-    assert choose_device("auto") == "cpu" and len(loads) == 2
+    assert device.choose_device("auto") == "cpu" and len(loads) == 2
 
 
 def test_a_folder_of_cuda_without_a_compiler_is_no_toolkit(monkeypatch, tmp_path):
@@ -153,13 +152,13 @@ def test_a_card_that_is_full_for_a_while_is_used_afterwards(card, monkeypatch, c
     card(object(), run)
     message = "the card cannot run gsplat's kernels: CUDA error: out of memory"
     if requested == "auto":
-        assert choose_device("auto") == "cpu" and message in caplog.text
+        assert device.choose_device("auto") == "cpu" and message in caplog.text
     else:
         with pytest.raises(DeviceError, match=message):
-            choose_device("cuda")
+            device.choose_device("cuda")
     error.clear()
     in_another_process()
-    assert choose_device(requested) == "cuda"
+    assert device.choose_device(requested) == "cuda"
 
 
 def test_a_build_that_failed_for_one_card_is_tried_for_another(card, monkeypatch):
@@ -167,13 +166,13 @@ def test_a_build_that_failed_for_one_card_is_tried_for_another(card, monkeypatch
     for name in ("0", "0", "1"):
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", name)
         in_another_process()
-        assert choose_device("auto") == "cpu"
+        assert device.choose_device("auto") == "cpu"
     assert len(loads) == 2
 
 
 def test_a_self_test_that_fails_selects_the_cpu(card, caplog):
     card(object())
-    assert choose_device("auto") == "cpu"  # this gsplat cannot render
+    assert device.choose_device("auto") == "cpu"  # this gsplat cannot render
     assert "the self-test on CUDA failed: " in caplog.text
 
 
@@ -190,7 +189,7 @@ def warned() -> bool:
 def test_a_driver_that_cannot_be_used_selects_the_cpu_with_a_warning(card, monkeypatch, caplog, is_available):
     card(object())
     monkeypatch.setattr("torch.cuda.is_available", is_available)
-    assert choose_device("auto") == "cpu"
+    assert device.choose_device("auto") == "cpu"
     (line,) = [each.message for each in caplog.records if each.levelname == "WARNING"]
     assert ": the driver is " in line and "more" not in line
 
@@ -198,4 +197,4 @@ def test_a_driver_that_cannot_be_used_selects_the_cpu_with_a_warning(card, monke
 def test_the_cpu_is_selected_without_a_check_for_cuda(monkeypatch):
     monkeypatch.setattr(device, "cuda_problem", lambda: pytest.fail("it ran"))
     monkeypatch.setattr(device, "CHOSEN", {})
-    assert choose_device("cpu") == "cpu"
+    assert device.choose_device("cpu") == "cpu"

@@ -11,7 +11,6 @@ from hilsplat_world.scenes.kinds import KINDS
 from models.training import render
 from models.training.cameras import training_camera
 from models.training.card import RECORD, digests
-from models.training.render import phrases_of, scene_of_seed, training_seeds
 from models.training.settings import TrainingSettings
 from models.training.train import train_models
 from tests.unit.world.scenes import built
@@ -19,8 +18,8 @@ from tests.unit.world.scenes import built
 
 def test_no_scene_is_both_trained_and_measured_on():
     with pytest.raises(SceneError, match="not in the training split"):
-        scene_of_seed(201)
-    trained, measured = training_seeds(5, 3)
+        render.scene_of_seed(201)
+    trained, measured = render.training_seeds(5, 3)
     assert trained == [1_000_000, 1_000_001, 1_000_002, 1_000_003, 1_000_004]
     assert measured == [1_999_997, 1_999_998, 1_999_999]
 
@@ -42,7 +41,7 @@ def test_a_part_may_be_named_without_its_object():
         AnnotatedNode(0, 1, -1, "bear", ("teddy",)),
         AnnotatedNode(1, 2, 0, "bear head", ("head of the bear", "head of the teddy")),
     )
-    whole, part = phrases_of(nodes)
+    whole, part = render.phrases_of(nodes)
     assert whole.phrases == ("bear", "teddy")
     assert part.phrases == ("bear head", "head of the bear", "head of the teddy", "head")
 

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import pytest
 
 from hilsplat.workflow import estimate
-from hilsplat.workflow.estimate import RunEstimate
 from hilsplat.workflow.resources import NODES, PICTURE_S, START_S, JobResources, Size
 from tests.unit.workflow.plans import BENCHMARK, plan_of
 from tests.unit.workflow.test_resources import plan
@@ -27,7 +26,7 @@ def resources(tmp_path, monkeypatch):
 def test_jobs_are_summed_by_data_set(resources, monkeypatch):
     assert 0.05 < estimate.machine_scale(estimate.start_probe()) < 20
     monkeypatch.setattr(estimate, "machine_scale", lambda probe: 0.5)
-    run = RunEstimate(resources)
+    run = estimate.RunEstimate(resources)
     assert run.lines() == []
     for scene in SCENES:
         run.add("poses", scene, 1000)
@@ -77,7 +76,7 @@ def test_time_on_a_card_grows_with_the_work(photographs, monkeypatch):
     assert resources.card_seconds("clip", row) == pytest.approx(START_S + 0.002 * nodes)
     assert resources.card_seconds("field", row) is None
     # variants that only filter the same candidates use cached ones
-    run = RunEstimate(resources)
+    run = estimate.RunEstimate(resources)
     job = {"dataset": "photos", "scene": "desk"}
     for variant in ("default", "default"):
         run.add("masks", {**job, "variant": variant}, 1000)

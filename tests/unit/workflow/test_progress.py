@@ -13,7 +13,6 @@ from hilsplat.base.artifacts import write_index
 from hilsplat.base.progress import LOG_FORMAT
 from hilsplat.stages import all_stages, stage_of
 from hilsplat.workflow import progress
-from hilsplat.workflow.progress import Estimates, ProgressDisplay, RunProgress, duration
 from hilsplat.workflow.resources import JobResources
 from tests.unit.workflow.plans import BENCHMARK, plan_of
 
@@ -49,12 +48,12 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def run(clock, monkeypatch) -> RunProgress:
+def run(clock, monkeypatch) -> progress.RunProgress:
     """A run of three jobs of two threads each, on two cores."""
-    estimates = Estimates()
+    estimates = progress.Estimates()
     estimates.resources = FixedResources()
     monkeypatch.setattr(progress, "estimates", estimates)
-    found = RunProgress(clock)
+    found = progress.RunProgress(clock)
     found.cores = 2
     return found
 
@@ -62,9 +61,9 @@ def run(clock, monkeypatch) -> RunProgress:
 class Screen:
     """The display of a run, and its output."""
 
-    def __init__(self, run: RunProgress, stream: io.StringIO) -> None:
+    def __init__(self, run: progress.RunProgress, stream: io.StringIO) -> None:
         self.stream = stream
-        self.display = ProgressDisplay(stream, logging.Formatter().format, run)
+        self.display = progress.ProgressDisplay(stream, logging.Formatter().format, run)
 
     def tell(self, event: str = "", text: str = "a block", level: int = 20, **more: object) -> None:
         record = logging.LogRecord("snakemake", level, more.pop("path", __file__), 1, text, None, None)
@@ -283,8 +282,8 @@ def test_the_loop_of_a_stage_is_one_that_it_runs(stage):
     ("seconds", "text"), [(44, "40 s"), (500, "8 min"), (7700, "2 h 10 min"), (10700, "3 h")]
 )
 def test_durations_are_rounded_to_the_accuracy_of_an_estimate(seconds, text):
-    assert duration(float(seconds)) == f"about {text}"
-    assert duration(3.0) == "less than 10 s"
+    assert progress.duration(float(seconds)) == f"about {text}"
+    assert progress.duration(3.0) == "less than 10 s"
 
 
 def test_benchmark_files_of_earlier_runs_correct_the_estimates(tmp_path, monkeypatch):
@@ -302,7 +301,7 @@ def test_benchmark_files_of_earlier_runs_correct_the_estimates(tmp_path, monkeyp
     }.items():
         (folder / f"benchmarks/{name}.jsonl").write_text(content)
     resources = JobResources(plan_of(tmp_path, BENCHMARK[:1]))
-    estimates = Estimates(resources)
+    estimates = progress.Estimates(resources)
     estimates.learn_from_benchmarks()
     assert estimates.seconds("poses") == pytest.approx(90)
     slower = 90 / resources.core_seconds("poses", resources.plan.rows[0])

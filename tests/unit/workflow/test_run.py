@@ -14,7 +14,6 @@ from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.cli.main import app
 from hilsplat.workflow import run as runs
 from hilsplat.workflow.plan import Plan
-from hilsplat.workflow.run import STATE
 from tests.unit.workflow.plans import write_sheet
 
 HOLD = """
@@ -158,13 +157,13 @@ def test_the_locks_of_a_dead_run_are_removed_once(folder, started, unlocked):
     leave_marker()
     runs.run([], [], [])
     assert unlocked == ["unlock"]
-    assert list(STATE.glob("run-*")) == []
+    assert list(runs.STATE.glob("run-*")) == []
 
 
 def leave_marker(host: str = "") -> None:
     """Leave the marker of a run that was killed."""
-    STATE.mkdir(exist_ok=True)
-    (STATE / "run-00000001").write_text(host or socket.gethostname())
+    runs.STATE.mkdir(exist_ok=True)
+    (runs.STATE / "run-00000001").write_text(host or socket.gethostname())
 
 
 @pytest.mark.parametrize("is_marked", [False, True])
@@ -192,7 +191,7 @@ def test_the_locks_of_another_machine_stay(folder, started, unlocked, caplog):
     runs.run([], [], [])
     assert unlocked == [] and "another machine may be running" in caplog.text
     runs.run([], [], ["--unlock"])
-    assert "unlock" in unlocked and list(STATE.glob("run-*")) == []
+    assert "unlock" in unlocked and list(runs.STATE.glob("run-*")) == []
 
 
 def test_options_of_the_command_need_no_separator(folder, started, monkeypatch):

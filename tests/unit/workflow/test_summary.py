@@ -10,7 +10,6 @@ from hilsplat.base.artifacts import write_json
 from hilsplat.base.tables import write_csv
 from hilsplat.workflow import run as runs
 from hilsplat.workflow import summary as summaries
-from hilsplat.workflow.summary import summary
 from tests.unit.workflow.plans import plan_of
 
 ROWS = ("photos desk photos photos metre", "photos chair photos photos metre")
@@ -28,7 +27,7 @@ def project(desk, tmp_path, monkeypatch) -> Path:
 
 def described(project: Path, *rows: str) -> dict[str, str]:
     """First word of each line of the summary -> the rest."""
-    lines = summary(plan_of(project, rows or ROWS, groups=["photos"]))
+    lines = summaries.summary(plan_of(project, rows or ROWS, groups=["photos"]))
     assert lines[0] == "photos/desk:"
     return {line.split()[0]: line.split(maxsplit=1)[1] for line in lines[1:]}
 
@@ -79,7 +78,7 @@ def test_many_scenes_share_a_table(project):
     for name in ("a", "b", "c"):
         shutil.copytree("results/photos/desk/scene", f"results/photos/{name}/scene")
     rows = tuple(f"photos {name} photos photos metre" for name in ("a", "b", "c", "desk"))
-    lines = summary(plan_of(project, rows, groups=["photos"]))
+    lines = summaries.summary(plan_of(project, rows, groups=["photos"]))
     assert [line.split()[0] for line in lines] == [
         "scene",
         *(f"photos/{name}" for name in ("a", "b", "c", "desk")),
@@ -89,14 +88,14 @@ def test_many_scenes_share_a_table(project):
 def test_very_many_scenes_are_only_counted(project, monkeypatch):
     monkeypatch.setattr(summaries, "TABLED", 0)
     monkeypatch.setattr(summaries, "DETAILED", 0)
-    lines = summary(plan_of(project, ROWS, groups=["photos"]))
+    lines = summaries.summary(plan_of(project, ROWS, groups=["photos"]))
     assert lines == ["1 scenes have poses; to list them: hilsplat scenes --results results"]
 
 
 def test_a_run_of_files_describes_their_scenes_only(project):
     shutil.copytree("results/photos/desk/scene", "results/photos/chair/scene")
     found = plan_of(project, ROWS, groups=["photos"])
-    lines = summary(found, ["results/photos/chair/scene", "results/tables/lerf.csv"])
+    lines = summaries.summary(found, ["results/photos/chair/scene", "results/tables/lerf.csv"])
     assert [line for line in lines if line.endswith(":")] == ["photos/chair:"]
 
 

@@ -10,7 +10,6 @@ from hilsplat.scene.cameras import Camera
 from hilsplat_world import render
 from hilsplat_world.paints import Paint
 from hilsplat_world.rays import RayCaster
-from hilsplat_world.render import label_view, render_and_label, render_view
 from hilsplat_world.scenes.kinds import scene_cameras
 from hilsplat_world.scenes.scene import Style
 from hilsplat_world.shapes import box, joined
@@ -33,7 +32,7 @@ def test_label_image_of_a_box_is_its_analytic_projection():
     scene = scene_of(box((1.0, 0.6, 0.4)))
     x = np.arange(64) + 0.5 - 32
     expected = (np.abs(x)[None, :] < 8.571) & (np.abs(x)[:, None] < 5.714)
-    labels = label_view(scene, camera)
+    labels = render.label_view(scene, camera)
     assert np.array_equal(labels[0] == 0, expected)
     assert (labels[1:] == -1).all()
     assert true_depth(scene.caster, camera)[32, 32] == pytest.approx(3.5, abs=1e-5)
@@ -55,7 +54,7 @@ def test_a_surface_point_has_one_colour_in_all_views():
     found = []
     for side in (-1, 1):
         camera = camera_at((0.3 * side, -2.2, 3.0), (0.0, -0.9, 0.0), 136, 16)
-        image = render_view(scene, camera, 3).astype(np.float64)
+        image = render.render_view(scene, camera, 3).astype(np.float64)
         # Interpolated between pixel centres, which lie at +0.5.
         column, row = projected(camera, points) - 0.5
         found.append(np.stack([map_coordinates(c, [row, column], order=1) for c in np.moveaxis(image, 2, 0)]))
@@ -71,7 +70,7 @@ def test_the_floor_below_a_slab_is_in_shadow():
     scene = scene_of(mesh, style=Style(light_position=(0.0, 0.0, 4.0)))
     camera = camera_at((2.0, 0, 0.5))
     columns, rows = projected(camera, np.array([[0.0, 0.0, 0.0], [0.0, 0.8, 0.0]])).astype(int)
-    under, beside = render_view(scene, camera, 3)[rows, columns].mean(axis=1)
+    under, beside = render.render_view(scene, camera, 3)[rows, columns].mean(axis=1)
     assert under < 0.75 * beside
 
 
@@ -85,20 +84,20 @@ def test_vectorised_grain_is_bit_identical_to_fractal_noise():
 def test_image_and_labels_do_not_depend_on_the_height_of_bands(monkeypatch, samples):
     scene = built("tabletop", objects=3)
     camera = scene_cameras(scene, 12, 48, 100.0)["005.png"]
-    plain = render_view(scene, camera, samples), label_view(scene, camera)
+    plain = render.render_view(scene, camera, samples), render.label_view(scene, camera)
     for rays in (1, 48 * 5 * samples**2, 10**9):
         monkeypatch.setattr(render, "BAND_RAYS", rays)
-        assert all(map(np.array_equal, render_and_label(scene, camera, samples), plain))
+        assert all(map(np.array_equal, render.render_and_label(scene, camera, samples), plain))
 
 
 def test_omitted_shadow_rays_do_not_change_the_image(monkeypatch):
     mesh = joined(box((4, 4, 0.1), (0, 0, -0.05)), box((0.6, 0.6, 0.6), (0, 0, 0.8)))
     scene = scene_of(mesh, style=Style(light_position=(1.0, 0.0, 4.0)))
     camera = camera_at((-2.0, 0, 0.9))
-    image = render_view(scene, camera, 3)
+    image = render.render_view(scene, camera, 3)
     # Every hit then receives light and sky.
     monkeypatch.setattr(render, "receivers", lambda prim, *_: (np.flatnonzero(prim >= 0),) * 2)
-    assert np.array_equal(image, render_view(scene, camera, 3))
+    assert np.array_equal(image, render.render_view(scene, camera, 3))
 
 
 def test_ring_cameras_alternate_in_elevation_and_an_arc_is_centred_on_the_front():

@@ -6,7 +6,6 @@ import pytest
 
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat_world import lidar
-from hilsplat_world.lidar import ABOVE_CAMERA_M, BEAMS, INCLINATION_DEG, MAX_RANGE_M, scan_street
 from hilsplat_world.render import label_view, render_view
 from hilsplat_world.scenes.kinds import scene_cameras
 from hilsplat_world.scenes.scene import WorldScene
@@ -86,18 +85,18 @@ def test_cameras_of_the_drive_are_outside_all_objects(street, centres):
 
 
 def test_noise_has_the_stated_deviation_and_a_share_of_returns_is_dropped(street, centres, monkeypatch):
-    scan = scan_street(street, centres)
+    scan = lidar.scan_street(street, centres)
     monkeypatch.setattr(lidar, "RANGE_NOISE_M", 0.0)
-    exact = scan_street(street, centres)
+    exact = lidar.scan_street(street, centres)
     monkeypatch.setattr(lidar, "LOST_SHARE", 0.0)
-    full = scan_street(street, centres)
+    full = lidar.scan_street(street, centres)
     assert len(scan.points) / len(full.points) == pytest.approx(0.95, abs=0.01)
     texts = {street.nodes[node].text for node in np.unique(full.node_ids[:, 0])}
     assert "sky" not in texts and {"road", "sidewalk", "building"} <= texts
-    assert scan.origins == pytest.approx(centres[[0, 10, 20, 29, 39]] + [0, 0, ABOVE_CAMERA_M])
+    assert scan.origins == pytest.approx(centres[[0, 10, 20, 29, 39]] + [0, 0, lidar.ABOVE_CAMERA_M])
     # A scanner h above the road meets it with a beam d degrees down at range h / sin(d).
-    low, high = INCLINATION_DEG
-    drop = exact.range_m * np.sin(np.radians(low + (exact.beam + 0.5) / BEAMS * (high - low)))
+    low, high = lidar.INCLINATION_DEG
+    drop = exact.range_m * np.sin(np.radians(low + (exact.beam + 0.5) / lidar.BEAMS * (high - low)))
     on_road = exact.node_ids[:, 0] == next(node.id for node in street.nodes if node.text == "road")
     # Repaired patches are up to 6 mm above the road.
     assert on_road.sum() > 1000 and np.abs(exact.origins[exact.pose_index, 2] + drop)[on_road].max() < 0.01
@@ -106,11 +105,11 @@ def test_noise_has_the_stated_deviation_and_a_share_of_returns_is_dropped(street
     assert np.array_equal(scan.node_ids, exact.node_ids)  # noise moves points and changes no label
     error = (scan.range_m - exact.range_m).astype(np.float64)
     assert error.std() == pytest.approx(0.015, rel=0.1) and abs(error.mean()) < 0.001
-    assert scan.range_m.max() < MAX_RANGE_M + 0.1
+    assert scan.range_m.max() < lidar.MAX_RANGE_M + 0.1
 
 
 def test_visible_points_have_the_label_of_their_pixel(street, cameras, centres):
-    scan = scan_street(street, centres)
+    scan = lidar.scan_street(street, centres)
     assert 50_000 < len(scan.points) < 150_000
     for name in ("004.png", "021.png"):
         camera = cameras[name]

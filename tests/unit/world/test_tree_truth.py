@@ -12,7 +12,6 @@ from hilsplat.datasets.hierarchy import AnnotatedNode, HierarchyAnnotations
 from hilsplat.query.names import NodeNames
 from hilsplat.query.tree_picture import CELL_PX, GAP_PX, LABEL_PX, tree_picture
 from hilsplat_world.diagnostics import tree_truth
-from hilsplat_world.diagnostics.tree_truth import measure_tree
 from tests.unit.evaluate.plain_tree import plain_tree
 
 TRUTH = HierarchyAnnotations(
@@ -41,7 +40,7 @@ def test_faults_are_counted_one_by_one():
     # The chest is split into nodes of 3 and 1 Gaussians; the larger also has one of the bear. The parent of
     # the head is the chest.
     nodes = [[0, 3, -1]] * 2 + [[0, -1, -1]] + [[1, -1, -1]] * 4 + [[2, -1, -1]]
-    found = measure_tree(tree_of(nodes, [1, 1, 1, 2], [-1, -1, -1, 1]), VOTES, TRUTH)
+    found = tree_truth.measure_tree(tree_of(nodes, [1, 1, 1, 2], [-1, -1, -1, 1]), VOTES, TRUTH)
     whole = found[Level.WHOLE]
     # bear: 3 of 4, IoU 3/4; chest: 3 shared of a union of 5
     values = [whole.precision, whole.recall, whole.mean_iou, whole.purity]

@@ -20,8 +20,7 @@ CATEGORIES = {"chair": (2, 5), "mattress": (1191, 4), "wall": (1, 1), "gizmo": (
 XYZ = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [5, 5, 5]], np.float32)
 FACES = np.array([[0, 1, 2], [1, 3, 2]], np.int32)
 OBJECTS = ("wall", "mattress", "chair")
-OWNER = np.array([0, 0, 1, 2, -1], np.int32)
-"""Object of each vertex; the last has none."""
+OWNER = np.array([0, 0, 1, 2, -1], np.int32)  # object of each vertex; the last has none
 
 
 def turned(degrees: float) -> np.ndarray:

@@ -25,8 +25,7 @@ from hilsplat.scene.exporting import pinhole_model
 from hilsplat.scene.layouts import POSES_BOUNDS
 from hilsplat.scene.posed_images import PosedImage
 
-MAX_POINTS = 5000
-"""Maximum number of sparse points in a COLMAP model, sampled evenly from the mesh."""
+MAX_POINTS = 5000  # maximum number of sparse points in a COLMAP model, sampled evenly from the mesh
 
 
 @dataclass(frozen=True, eq=False)

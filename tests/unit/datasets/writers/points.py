@@ -48,8 +48,7 @@ def write_ply(
     PlyData(elements, byte_order="<").write(path)
 
 
-SEGMENT_STEP = 7
-"""Step between segment ids, which are not contiguous in real scans either."""
+SEGMENT_STEP = 7  # step between segment ids, which are not contiguous in real scans either
 
 
 def write_label_table(root: Path, categories: Mapping[str, tuple[int, int]]) -> None:
@@ -107,8 +106,7 @@ def write_scan(
     write_text(folder / f"{scan}.aggregation.json", json.dumps({"segGroups": groups}))
 
 
-NUMBERS = {name: number for number, name in waymo.CAMERAS.items()}
-"""Number of each camera of Waymo."""
+NUMBERS = {name: number for number, name in waymo.CAMERAS.items()}  # number of each camera of Waymo
 
 UNDEFINED, NO_OBJECT = -1, -2
 """Class of an object without a class in Replica, and of object 0, which means no object."""
@@ -226,8 +224,7 @@ def _write_component(split: Path, segment: str, tag: str, rows: Sequence[Mapping
 
 
 VEHICLE_FROM_CAM = np.array([[1.0, 0, 0, 1.5], [0, 1, 0, 0], [0, 0, 1, 2.1], [0, 0, 0, 1]])
-LIDAR_AT = (1.4, 0.0, 2.2)
-"""Position of the lidar on the vehicle, metres."""
+LIDAR_AT = (1.4, 0.0, 2.2)  # position of the lidar on the vehicle, metres
 FRAME_MICROS = 100_000
 
 

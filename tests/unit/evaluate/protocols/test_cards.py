@@ -9,15 +9,7 @@ import pytest
 
 import hilsplat
 from hilsplat.base.errors import ArtifactError
-from hilsplat.evaluate.protocols.cards import (
-    CARDS,
-    INSTANCES,
-    LERF_LANGSPLAT,
-    LEVEL_GIVEN,
-    PATH,
-    TREE_NODES,
-    card_of,
-)
+from hilsplat.evaluate.protocols import cards
 from hilsplat.evaluate.protocols.points import class_set
 from hilsplat.evaluate.protocols.views import label_of
 from hilsplat.evaluate.score import SCORED
@@ -67,18 +59,18 @@ def digests(folder):
     constant = np.full((3, *SIZE), 0.5, np.float32)
     scene.maps = {"A": rng.integers(0, 9, constant.shape) / np.float32(8), "B": constant[:, ::-1] / 2}
     scene.maps |= {"b1": constant, "x": scene.maps["A"][::-1]}
-    flat = tuple(card for card in CARDS if card.averaging in ("pairs", "classes"))
+    flat = tuple(card for card in cards.CARDS if card.averaging in ("pairs", "classes"))
     rows = [((key[1].split(" ")[0], *key), value) for key, value in measured(scene, truth, flat).items()]
     for name, card in SCORED.items():
         predictions, labels = {"v": {"cup": box((2, 9), (3, 9))}}, {"v": {"cup": box((3, 9), (0, 8))}}
         if card.classes:
             ids = [0, *class_set(card.classes)[1].ids[:6]]
             labels, predictions = rng.choice(ids[:-1], 2000), rng.choice(ids, 2000)
-        if card is INSTANCES:
+        if card is cards.INSTANCES:
             classes, counts = rng.choice(ids, 9), rng.integers(0, 2, 2000)
             masks = (labels == classes[:, None]) & (rng.random((9, 2000)) > 0.3)
             labels, predictions = (labels, counts), (masks, classes, rng.integers(1, 5, 9) / 4)
-        if card is not LEVEL_GIVEN:
+        if card is not cards.LEVEL_GIVEN:
             scores = hilsplat.score(predictions, labels, name)
             rows += [((name, *key), value) for key, value in scores.means.items()]
     explanations = {"selection", "source", "public"}
@@ -87,7 +79,7 @@ def digests(folder):
             sorted((key, repr(value)) for key, value in asdict(card).items() if key not in explanations),
             sorted((key, f"{value:.4f}") for key, value in rows if key[0] == card.full_name),
         )
-        for card in CARDS
+        for card in cards.CARDS
     }
     return {name: hashlib.sha256(repr(each).encode()).hexdigest()[:8] for name, each in decided.items()}
 
@@ -103,8 +95,8 @@ PUBLIC = re.compile(r"[\w.-]+/[\w.-]+@[0-9a-f]{7} \S+\.(py|cc)(:\w+)?")
 
 
 def test_cards_are_named_after_benchmark_and_variant_and_state_their_source():
-    assert len({card.name for card in CARDS}) == len(CARDS)
-    for card in CARDS:
+    assert len({card.name for card in cards.CARDS}) == len(cards.CARDS)
+    for card in cards.CARDS:
         assert re.fullmatch("[^/]+/[^/]+", card.name)
         assert card.selection and card.source
         assert not card.classes or class_set(card.classes)[1].name == card.classes
@@ -118,7 +110,7 @@ def test_the_documentation_lists_every_protocol_with_its_public_function():
         if re.match(r"\| `[\w/-]+@\d", line):
             names, public, *_ = (cell.strip() for cell in line.strip("|").split("|"))
             rows |= dict.fromkeys(re.findall(r"`([^`]+)`", names), public.strip("`"))
-    assert rows == {card.full_name: card.public or "none" for card in CARDS}
+    assert rows == {card.full_name: card.public or "none" for card in cards.CARDS}
 
 
 CHANGED = {"filter_px": 20, "threshold_on": "raw", "node_select": 0.7, "relevancy_scale": 5}
@@ -128,17 +120,17 @@ RULE = {"mix": False, "relevancy_threshold": 0.5, "majority": False, "level_rule
 @pytest.mark.parametrize(
     ("card", "method", "settings", "departures"),
     [
-        (LERF_LANGSPLAT, "field", {}, ""),
-        (TREE_NODES, "tree", {}, ""),
-        (LERF_LANGSPLAT, "field", CHANGED, " (filter 20, raw, relevancy scale 5)"),
-        (LERF_LANGSPLAT, "field", RULE, " (no mix, threshold 0.5, no majority, mean_in_mask)"),
-        (TREE_NODES, "tree", {"ancestors": 0}, " (ancestors 0)"),
+        (cards.LERF_LANGSPLAT, "field", {}, ""),
+        (cards.TREE_NODES, "tree", {}, ""),
+        (cards.LERF_LANGSPLAT, "field", CHANGED, " (filter 20, raw, relevancy scale 5)"),
+        (cards.LERF_LANGSPLAT, "field", RULE, " (no mix, threshold 0.5, no majority, mean_in_mask)"),
+        (cards.TREE_NODES, "tree", {"ancestors": 0}, " (ancestors 0)"),
         # labels may lack a part's whole, so its path has one text
-        (PATH, "tree-path", {"ancestors": 0}, " (ancestors 0)"),
+        (cards.PATH, "tree-path", {"ancestors": 0}, " (ancestors 0)"),
         # nodes are not thresholded, so the scale of the threshold doesn't affect them
-        (LEVEL_GIVEN, "tree", CHANGED, " (filter 20, node share 0.7, relevancy scale 5)"),
-        (LEVEL_GIVEN, "truth", CHANGED, ""),
-        (LEVEL_GIVEN, "tree", {"canonical": ("object", "scene")}, " (canonical object+scene)"),
+        (cards.LEVEL_GIVEN, "tree", CHANGED, " (filter 20, node share 0.7, relevancy scale 5)"),
+        (cards.LEVEL_GIVEN, "truth", CHANGED, ""),
+        (cards.LEVEL_GIVEN, "tree", {"canonical": ("object", "scene")}, " (canonical object+scene)"),
     ],
 )
 def test_rows_name_the_settings_that_affect_them(card, method, settings, departures):
@@ -146,6 +138,6 @@ def test_rows_name_the_settings_that_affect_them(card, method, settings, departu
 
 
 def test_the_label_of_a_row_identifies_its_protocol():
-    assert card_of("lerf/langsplat@3 (filter 20, raw)") is LERF_LANGSPLAT
+    assert cards.card_of("lerf/langsplat@3 (filter 20, raw)") is cards.LERF_LANGSPLAT
     with pytest.raises(ArtifactError, match=r"no protocol 'lerf/langsplat@9'"):
-        card_of("lerf/langsplat@9")
+        cards.card_of("lerf/langsplat@9")
