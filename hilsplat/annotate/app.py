@@ -40,7 +40,7 @@ from hilsplat.web.scene_thread import SceneThread, ShownScene
 from hilsplat.web.server import Ready, answer, files_of, guarded, plain, read, serve, version_sent, view_name
 
 SCORES = 3
-"""Maximum number of mean scores that the page shows."""
+"""Maximum number of methods whose mean scores the page shows."""
 
 MAX_BODY_BYTES = 16 << 20
 """Maximum size of a request, enough for a COCO file of a whole scene."""
@@ -165,7 +165,7 @@ class OpenedScene(ShownScene):
         return {**super().news(), "labels": self.versions()}
 
     def scores(self) -> str:
-        """Return the first mean scores that the last run saved, in one line; empty if there are none."""
+        """Return each method's mean over the most queries, from the last run, in one line; empty if there is none."""
         means = self.folder / "scores.csv"
         if not means.is_file():
             return ""
@@ -173,7 +173,11 @@ class OpenedScene(ShownScene):
             rows = [row for row in read_csv(means, None, rebuild_command(means)) if row.get("mIoU")]
         except ArtifactError as error:
             return first_line(error)
-        shown = [f"{row['method']} {row['mIoU']} % ({row['protocol']})" for row in rows[:SCORES]]
+        best: dict[str, dict[str, str]] = {}
+        own = [(row.get("labels") == "annotated", row.get("queries", "").zfill(9)) for row in rows]
+        for _, row in sorted(zip(own, rows, strict=True), key=lambda pair: pair[0], reverse=True):
+            best.setdefault(row["method"], row)
+        shown = [f"{row['method']} {row['mIoU']} % ({row['protocol']})" for row in [*best.values()][:SCORES]]
         more = [f"all in {means.with_suffix('.md')}"] if len(rows) > SCORES else []
         scored = means.stat().st_mtime
         is_old = any(path.stat().st_mtime > scored for path in self.labels.glob("*.json"))

@@ -66,7 +66,7 @@ def models_check(
     from hilsplat.embed.model_check import check_model, check_models
 
     if folder is None:
-        refuse_options(context, ("variant",), "the check of one folder")
+        refuse_options(context, ("variant",), "one folder")
     text, num_failed = (check_model(folder, variant), 0) if folder is not None else check_models()
     echo(text)
     if num_failed:
@@ -113,7 +113,7 @@ def cache_prune(
     from hilsplat.base.cache import prune_cache, size_table
 
     if days is None and max_mib is None:
-        refuse_options(context, ("stage",), "entries beyond a limit, with --days or --max-mib")
+        refuse_options(context, ("stage",), "--days or --max-mib")
     number, freed_mib = prune_cache(context.obj, stage or [], days=days, max_mib=max_mib)
     echo(f"deleted {number} files, {freed_mib:.1f} MiB\n{size_table(context.obj)}")
 

@@ -1,6 +1,7 @@
 """Commands that use a finished scene, check results or the machine, or print all settings."""
 
 import json
+import shlex
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -19,7 +20,7 @@ def query(
     context: typer.Context,
     scene: SceneName,
     text: Annotated[
-        str | None, typer.Argument(help="what to look for; 'bear > nose' finds the noses of bears")
+        list[str] | None, typer.Argument(help="what to look for; 'bear > nose' finds the noses of bears")
     ] = None,
     all_scenes: Annotated[
         bool, typer.Option("--all", help="rank all finished scenes: --all TEXT, or --all 'photos/*' TEXT")
@@ -55,25 +56,27 @@ def query(
     """
     if all_scenes:
         of_one = ("out", "masks", "spz", "view", "views", "answerer", "threads")
-        refuse_options(context, of_one, "queries of one scene, without --all")
+        refuse_options(context, of_one, "one scene, without --all")
         from hilsplat.query.scenes import open_scenes, report_of
 
-        pattern, wanted = ("*", scene) if text is None else (scene, text)
+        pattern, wanted = (scene, " ".join(text)) if text else ("*", scene)
         scenes = open_scenes(results, pattern, variant)
         hits = scenes.query(wanted, level, threshold=threshold, limit=limit)
         rows = [hit.as_json() for hit in hits]
         echo(json.dumps(rows, indent=1) if as_json else report_of(scenes, wanted, hits))
         return
-    refuse_options(context, ("limit", "as_json"), "queries of all scenes, with --all")
-    if text is None:
-        raise SettingsError(f"there is no text to search for in {scene}", fix="hilsplat query SCENE TEXT")
+    refuse_options(context, ("limit", "as_json"), "--all")
+    folder = scene_folder(scene, results)
+    if not text:
+        fix = f"hilsplat query {shlex.quote(scene)} TEXT"
+        raise SettingsError(f"there is no text to search for in {scene}", fix=fix)
     if masks is not None:
         require_new_folder(masks, "--masks")
     from hilsplat.query.answer import answer
 
     for found in answer(
-        scene_folder(scene, results),
-        text,
+        folder,
+        " ".join(text),
         level=level,
         variant=variant,
         views=views,
@@ -222,7 +225,7 @@ def export(
     if form != "labels":
         refuse_options(context, ("data_root",), "--as labels")
     if form not in ("tree", "langsplat") and not any(crop.values()):
-        refuse_options(context, ("variant",), "--as tree, --as langsplat, --only, --without and --clean")
+        refuse_options(context, ("variant",), "--as tree, --as langsplat, --only, --without or --clean")
     folder = scene_folder(scene, results)
     if out is not None:
         require_new_folder(out)

@@ -1,7 +1,6 @@
 """The scenes of a results folder: what each can answer, its size, and the quality of its fit and tree."""
 
 import logging
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 from hilsplat.base.errors import ArtifactError, HilsplatError, nearest
@@ -12,7 +11,7 @@ from hilsplat.evaluate.protocols.cards import BY_NAME, card_of
 from hilsplat.evaluate.scores import read_scores
 from hilsplat.evaluate.tables.means import metric_means
 from hilsplat.query.scene_state import SceneState
-from hilsplat.scene.finished import scenes_in
+from hilsplat.scene.finished import matching_scenes, scenes_in
 
 logger = logging.getLogger(__name__)
 
@@ -42,7 +41,7 @@ def run_scenes(results: Path, pattern: str, out: Path | None) -> str:
         ArtifactError: no scene matches, or `out` is another file.
     """
     names = scenes_in(results)
-    chosen = [name for name in names if any(fnmatchcase(each, pattern) for each in (name, Path(name).name))]
+    chosen = matching_scenes(names, pattern)
     if not chosen:
         raise ArtifactError(
             f"{results} has no scene that matches {pattern!r}",

@@ -1,7 +1,9 @@
 """Locations of a finished scene's artifacts, and the settings that produced them."""
 
 import logging
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -124,6 +126,11 @@ def scenes_in(results: Path) -> list[str]:
     """Return the names, `<dataset>/<scene>`, of the scenes of a results folder that have poses."""
     places = [path for path in results.glob("*/*") if (path / "scene" / INDEX).is_file()]
     return sorted(f"{path.parent.name}/{path.name}" for path in places)
+
+
+def matching_scenes(names: Iterable[str], pattern: str) -> list[str]:
+    """Return the scenes, `<dataset>/<scene>`, of which the name, data set or scene matches (`fnmatch`)."""
+    return [name for name in names if any(fnmatchcase(each, pattern) for each in (name, *name.split("/")))]
 
 
 def command_name(folder: Path) -> str:
