@@ -101,9 +101,7 @@ class SceneViews:
         if isinstance(view, Camera):
             return view
         if view not in self.names:
-            raise SettingsError(
-                f"{self.scene.name} has no view {view!r}", expected=nearest(view, self.names)
-            )
+            raise SettingsError(f"{self.scene.name} has no view {view!r}", expected=nearest(view, self.names))
         return self.scene.cameras[view]
 
     def cached(self, kind: str, view: View, compute: Callable[[], Any], *more: Any) -> Any:

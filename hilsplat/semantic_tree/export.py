@@ -82,7 +82,9 @@ def _write(
 
     vertex = PlyData.read(str(ply))["vertex"].data[rows]
     rgb = base_rgb(np.stack([vertex[f"f_dc_{band}"] for band in range(3)], axis=1)[:, None])
-    columns = columns | dict(zip(("red", "green", "blue"), np.rint(255 * rgb.T).astype(np.uint8), strict=True))
+    columns = columns | dict(
+        zip(("red", "green", "blue"), np.rint(255 * rgb.T).astype(np.uint8), strict=True)
+    )
     types = [(name, column.dtype.str) for name, column in columns.items()]
     table = np.empty(len(vertex), [*vertex.dtype.descr, *types])
     for name in (*vertex.dtype.names, *columns):

@@ -593,6 +593,22 @@ def require_variant_sections(run: RunSettings) -> None:
                 )
 
 
+def without_effect(plan: Plan, given: Mapping[str, Any]) -> list[str]:
+    """Return a line for each setting of a configuration's layer that `overrides` replace in all scenes."""
+    scopes, lines = list(dict.fromkeys(plan.scopes(row) for row in plan.scenes)), []
+    for section in (name for name in SECTIONS if given.get(name)):
+        own, used = (
+            getattr(plan.run, section),
+            [getattr(plan.run.stages(scopes=each), section) for each in scopes],
+        )
+        for name in given[section]:
+            if all(getattr(each, name, None) != getattr(own, name) for each in used):
+                places = [each for each in scopes[0] if name in plan.run.overrides[each].get(section, {})]
+                key = f"{section}.{name}"
+                lines.append(f"{key} has no effect, because overrides.{places[-1]}.{key} replaces it")
+    return lines
+
+
 def without_scene(run: RunSettings, rows: Iterable[SceneRow]) -> list[str]:
     """Return a line for each scene in `overrides`, `queries` and `sweep_scenes` that is not in the rows.
 

@@ -28,10 +28,10 @@ from hilsplat.base.errors import HilsplatError, SettingsError, nearest
 from hilsplat.base.files import INSTALLED, project_path
 from hilsplat.base.processes import PARENT, end_with_workflow, lock, remove_leftovers
 from hilsplat.base.removal import delete
-from hilsplat.configuration import CONFIG, first_unusable, merged_config, parse_run
+from hilsplat.configuration import CONFIG, first_unusable, merged_config, parse_run, read_config
 from hilsplat.scene.sheet import DEFAULT_SHEET, SceneRow, is_pattern, matches_of, read_sheet
 from hilsplat.workflow.estimate import forecasts
-from hilsplat.workflow.plan import Plan
+from hilsplat.workflow.plan import Plan, without_effect
 from hilsplat.workflow.records import outdated
 from hilsplat.workflow.summary import summary
 
@@ -163,6 +163,7 @@ def run(
         fix = "change to that folder first (cd), or pass --config results=FOLDER"
         raise HilsplatError("hilsplat run works in the current folder; --directory is refused", fix=fix)
     configs = [_config_file(path) for path in (*configs, *given.configfile)]
+    given.config = [_nested(word) for word in given.config]
     try:  # as Snakemake does: values are strings, and mappings of one key are merged
         words = [word.partition("=") for word in given.config]
         overrides = [{key: yaml.load(value, yaml.BaseLoader)} for key, _, value in words]
@@ -187,6 +188,10 @@ def run(
         given.config.append(f"only={json.dumps(scenes)}")
         settings["only"] = scenes
     plan = Plan(settings)
+    for line in (line for path in configs for line in without_effect(plan, read_config(path))):
+        logger.warning("%s", line)
+    for line in (line for layer in overrides for line in without_effect(plan, layer)):
+        raise SettingsError(f"--config: {line}", fix="set the other key instead")
     command = ["snakemake", "--snakefile", str(_snakefile(configs)), *others]
     command += ["--configfile", *map(str, configs)] if configs else []
     command += ["--config", *given.config] if given.config else []
@@ -214,15 +219,23 @@ def run(
     return 0
 
 
+def _nested(word: str) -> str:
+    """Return `gaussians={"iterations": 300}` for `gaussians.iterations=300`; other words are unchanged."""
+    key, equals, value = word.partition("=")
+    first, *names = key.split(".")
+    for name in reversed(names):
+        value = f"{{{json.dumps(name)}: {value}}}"
+    return first + equals + value if equals else word
+
+
 def _config_file(name: Path) -> Path:
     """Return the path of a configuration file; `ci` means `config/ci.yaml`, here or in the installation."""
     named = CONFIG.with_name(f"{name.name}.yaml")
+    if "=" in str(name) and not name.exists():
+        fix = f"pass keys after --: hilsplat run -- --config {name}"
+        raise SettingsError(f"{name} is not a file", fix=fix)
     if name.suffix or len(name.parts) != 1 or name.exists():
         return project_path(name)
-    if "=" in str(name):
-        raise SettingsError(
-            f"{name} is not a file", fix=f"pass keys after --: hilsplat run -- --config {name}"
-        )
     if not (found := project_path(named)).exists():
         known = {
             path.stem for folder in (Path(), INSTALLED) for path in (folder / named).parent.glob("*.yaml")

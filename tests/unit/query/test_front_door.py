@@ -219,7 +219,11 @@ def test_a_clean_export_leaves_out_gaussians_of_no_node(copied, elsewhere, capsy
     ("command", "option", "purpose"),
     [
         *(
-            (("query", "DESK", "mug", "--all", *option.split()), option.split()[0], "one scene, without --all")
+            (
+                ("query", "DESK", "mug", "--all", *option.split()),
+                option.split()[0],
+                "one scene, without --all",
+            )
             for option in ("--masks m", "--spz", "--out o", "--view 0", "--views 2", "--answerer tree")
         ),
         (("query", "DESK", "mug", "--json"), "--json", "--all"),
