@@ -165,7 +165,7 @@ class OpenedScene(ShownScene):
         return {**super().news(), "labels": self.versions()}
 
     def scores(self) -> str:
-        """Return each method's mean over the most queries, from the last run, in one line; empty if there is none."""
+        """Return each method's mean over the most queries in one line; empty if no run has saved any."""
         means = self.folder / "scores.csv"
         if not means.is_file():
             return ""

@@ -16,7 +16,7 @@ from hilsplat.cli.common import (
     refuse_options,
     require_new_folder,
 )
-from hilsplat.cli.user_commands import scene_folder
+from hilsplat.cli.user_commands import SceneName, scene_folder
 from hilsplat.stage import DEFAULT_CACHE, DataRoot, Threads
 from hilsplat.stages import joined, label_fits, names
 
@@ -145,7 +145,7 @@ def datasets_check(
 
 @datasets_app.command("fits")
 def datasets_fits(
-    scene: Annotated[str, typer.Argument(help="scene with a tree in the results folder, as dataset/scene")],
+    scene: SceneName,
     labels: Annotated[
         str | None, typer.Option(help="labels with levels, such as hi_lerf/figurines; default: your own")
     ] = None,
@@ -169,7 +169,7 @@ def datasets_fits(
 
 @blocks_app.command("split")
 def blocks_split(
-    scene: Annotated[str, typer.Argument(help="scene with finished poses, such as photos/house")],
+    scene: SceneName,
     blocks: Annotated[int, typer.Option(min=2, help="number of blocks")],
     out: Annotated[Path | None, typer.Option(help="new folder; default: blocks/SCENE")] = None,
     share: Annotated[

@@ -267,6 +267,9 @@ def test_a_scene_is_found_by_its_name_alone(desk_project, tmp_path):
         ("view", "dask", "--no-browser"),
         ("annotate", "photos/dask"),
         ("export", "dask"),
+        ("datasets", "fits", "dask"),
+        ("blocks", "split", "dask", "--blocks", "2"),
+        *(("world", command, "dask") for command in ("show", "masks", "inconsistency", "semantic-tree")),
     ],
 )
 def test_a_wrong_scene_name_suggests_the_right_one_in_every_command(desk_project, monkeypatch, command):
