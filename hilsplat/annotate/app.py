@@ -4,7 +4,6 @@ All geometry is computed here, with the polygon filling used in evaluation; the 
 """
 
 import shlex
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated, Any, get_args
@@ -231,7 +230,7 @@ class Annotator:
         return answer(await self.thread.do(request, write))
 
 
-def _all_labels(opened: OpenedScene, of: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _all_labels(opened: OpenedScene) -> list[dict[str, Any]]:
     """Return the annotations and file version of every view, in view order."""
     versions, known = opened.versions(), opened.known()  # in this order
     return [
@@ -300,8 +299,7 @@ def _import(opened: OpenedScene, asked: Files) -> dict[str, Any]:
     return {"views": views, "added": added, "known": known, "notes": notes}
 
 
-def _export(opened: OpenedScene, of: Mapping[str, Any]) -> Response:
-    kind = of["kind"]
+def _export(opened: OpenedScene, kind: str) -> Response:
     if kind not in get_args(Kind):
         raise SettingsError(f"unknown format {kind!r}", expected=", ".join(get_args(Kind)))
     data = exported(kind, opened.known(), opened.scene.cameras)

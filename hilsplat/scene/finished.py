@@ -141,9 +141,7 @@ def command_name(folder: Path) -> str:
 def require_scene_folder(folder: Path) -> None:
     """Raise ArtifactError, with known scenes, if a folder does not exist or contains scenes."""
     parents = folder.absolute().parents
-    inside = scenes_in(folder) or [
-        name for name in scenes_in(parents[0]) if name.startswith(f"{folder.name}/")
-    ]
+    inside = scenes_in(folder) or matching_scenes(scenes_in(parents[0]), f"{folder.name}/*")
     if folder.is_dir() and not inside:
         return
     known = inside or scenes_in(parents[0]) or scenes_in(parents[1])  # results/desk, or results/photos/desk

@@ -74,17 +74,18 @@ def _write(
     out: Path,
     comments: Sequence[str] = (),
 ) -> None:
-    """Copy rows of a PLY, with additional columns, and a comment that states the coordinates.
+    """Copy rows of a PLY, with a comment that states the coordinates and, if any, additional columns.
 
-    Programs for points (MeshLab, CloudCompare, Blender) need the colours, which Gaussian viewers ignore.
+    With these, it also has colours, which Gaussian viewers ignore, for programs that read points.
     """
     from plyfile import PlyData, PlyElement
 
     vertex = PlyData.read(str(ply))["vertex"].data[rows]
-    rgb = base_rgb(np.stack([vertex[f"f_dc_{band}"] for band in range(3)], axis=1)[:, None])
-    columns = columns | dict(
-        zip(("red", "green", "blue"), np.rint(255 * rgb.T).astype(np.uint8), strict=True)
-    )
+    if columns:
+        rgb = base_rgb(np.stack([vertex[f"f_dc_{band}"] for band in range(3)], axis=1)[:, None])
+        columns = columns | dict(
+            zip(("red", "green", "blue"), np.rint(255 * rgb.T).astype(np.uint8), strict=True)
+        )
     types = [(name, column.dtype.str) for name, column in columns.items()]
     table = np.empty(len(vertex), [*vertex.dtype.descr, *types])
     for name in (*vertex.dtype.names, *columns):

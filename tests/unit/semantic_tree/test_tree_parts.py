@@ -91,7 +91,7 @@ def test_an_exported_tree_or_selection_is_a_valid_3dgs_ply(tmp_path):
     for level in Level:
         assert np.array_equal(vertex[f"node_{level.label}"], nodes[:, level.index])
     np.testing.assert_array_equal(load_ply(out).means, means)
-    write_selection_ply(ply, np.array([1, 3]), tmp_path / "selection.ply")
+    write_selection_ply(ply, np.array([1, 3]), tmp_path / "selection.ply", np.ones(2, np.int32))
     selected = load_ply(tmp_path / "selection.ply")
     assert selected.means[:, 0].tolist() == [3, 9]
     for name, expected in zip(("red", "green", "blue"), base_rgb(selected.sh).T, strict=True):
