@@ -146,10 +146,11 @@ def require_scene_folder(folder: Path) -> None:
         return
     known = inside or scenes_in(parents[0]) or scenes_in(parents[1])  # results/desk, or results/photos/desk
     name = f"{folder.parent.name}/{folder.name}"
+    first = "correct the name" if known else "change to the folder of the project"
     raise ArtifactError(
         f"{folder} is a folder of scenes, not a scene" if inside else f"scene folder {folder} is missing",
         expected=nearest(name, known) if known else "a run's folder results/<dataset>/<scene>, or a copy",
-        fix="correct the name, or make the scene: hilsplat run SCENE; to list all: hilsplat scenes",
+        fix=f"{first}, or make the scene: hilsplat run SCENE; to list all: hilsplat scenes",
     )
 
 

@@ -283,6 +283,9 @@ def test_a_wrong_scene_name_suggests_the_right_one_in_every_command(desk_project
     ):
         with pytest.raises(ArtifactError, match="did you mean 'photos/desk'"):
             open_it()
+    monkeypatch.chdir("tests")
+    with pytest.raises(ArtifactError, match=r"is missing(.|\n)*change to the folder of the project"):
+        run(*command)
 
 
 def test_export_writes_the_tree_to_any_folder_without_files(desk, elsewhere, capsys):
