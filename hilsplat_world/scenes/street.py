@@ -308,8 +308,7 @@ def drive_sights(scene: WorldScene, views: int, arc_deg: float | int) -> tuple[l
     because a drive is not a ring.
     """
     rng, pitch_rng = np.random.default_rng([scene.seed, 25]), np.random.default_rng([scene.seed, 26])
-    length = DRIVE_X[1] - DRIVE_X[0]
-    step = min(MAX_STEP, length / max(1, views - 1))
+    step = min(MAX_STEP, (DRIVE_X[1] - DRIVE_X[0]) / max(1, views - 1))
     start = (DRIVE_X[0] + DRIVE_X[1] - step * (views - 1)) / 2
     sights = []
     for i in range(views):
