@@ -299,7 +299,7 @@ def _import(opened: OpenedScene, asked: Files) -> dict[str, Any]:
     return {"views": views, "added": added, "known": known, "notes": notes}
 
 
-def _export(opened: OpenedScene, kind: str) -> Response:
+def _export(opened: OpenedScene, kind: Kind) -> Response:
     if kind not in get_args(Kind):
         raise SettingsError(f"unknown format {kind!r}", expected=", ".join(get_args(Kind)))
     data = exported(kind, opened.known(), opened.scene.cameras)

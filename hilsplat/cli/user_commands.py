@@ -274,11 +274,9 @@ def _export(
     else:
         from hilsplat.scene.exporting import write_colmap, write_nerfstudio
 
-        write, what = {
-            "colmap": (write_colmap, "images and sparse/0"),
-            "nerfstudio": (write_nerfstudio, "images, transforms.json and points.ply"),
-        }[form]
-        write(opened, out)
+        is_colmap = form == "colmap"
+        what = "images and sparse/0" if is_colmap else "images, transforms.json and points.ply"
+        (write_colmap if is_colmap else write_nerfstudio)(opened, out)
     return f"wrote {what} of {views} views to {out}"
 
 

@@ -169,7 +169,8 @@ def _add_fixtures(work: _Furnishing) -> None:
     along = float(work.rng.uniform(-0.3, 0.3))
     for name, base_z in (("window", 0.92), ("curtain", 0.84)):
         model = work.assembly.draw(name)
-        spot = room.at_wall(window_wall, along, size_of(model)[0] / 2)
+        size = size_of(model)
+        spot = room.at_wall(window_wall, along, size[0] / 2)
         work.put(model, spot, yaw, base_z)
     plan.taken.append(turned_space(spot, size, yaw, base_z))
 
