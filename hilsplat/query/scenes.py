@@ -254,8 +254,7 @@ def open_scenes(results: Path | str = "results", pattern: str = "*", variant: st
 
 def report_of(scenes: Scenes, text: str, hits: Sequence[SceneHit]) -> str:
     """Return answers, doubts and skipped scenes as text."""
-    asked = counted(len(scenes.found), "scene")
-    lines = [f"{counted(len(hits), 'answer')} to {text!r} in {asked}"]
+    lines = [f"{counted(len(hits), 'answer')} to {text!r} in {counted(len(scenes.found), 'scene')}"]
     if hits:
         columns = "score", "scene", "node", "level", "name", "picture"
         rows = [

@@ -105,8 +105,7 @@ def run_poses(
         except RegistrationError as error:
             if lost.exists():
                 shutil.copyfile(lost, picture)
-                where = "shows the unregistered photographs"
-                error.add_line("picture", f"{picture} {where}")
+                error.add_line("picture", f"{picture} shows the unregistered photographs")
             raise
         report = posed[3]
         for warning in report["warnings"]:

@@ -198,8 +198,7 @@ def _features(folder: Path, named: Path | None, views: Views, settings: StageSet
     train = [view for view in views.photos if view not in views.held_out]
     found, lost = read_views(features, {view: views.cameras.get(view) for view in train})
     parts.columns["features"] = features.resolve()
-    count = f"{len(found)} of {len(train)} views"
-    parts.lines.append(f"features: {features}: masks and vectors of {count}")
+    parts.lines.append(f"features: {features}: masks and vectors of {len(found)} of {len(train)} views")
     if lost:
         parts.lines.append(f"  left out: {shorten_list(lost, 5)}")
     if not found:

@@ -491,8 +491,7 @@ class Plan:
 
     def crops_tree(self, job: VariantJob) -> list[str]:
         """Return the input of `clip`: the semantic tree that selects crops; empty to embed all masks."""
-        by_node = self.stages(job).clip.crops == "nodes"
-        return [self.shared_path("semantic_tree", job)] if by_node else []
+        return [self.shared_path("semantic_tree", job)] if self.stages(job).clip.crops == "nodes" else []
 
     def first_code(self, job: VariantJob) -> list[str]:
         """Return the input of `autoencoder`: the code of the same masks with levels by head, if there is one.

@@ -28,7 +28,7 @@ from hilsplat.base.errors import HilsplatError, SettingsError, nearest
 from hilsplat.base.files import INSTALLED, project_path
 from hilsplat.base.processes import PARENT, end_with_workflow, lock, remove_leftovers
 from hilsplat.base.removal import delete
-from hilsplat.configuration import CONFIG, first_unusable, merged_config, parse_run, read_config
+from hilsplat.configuration import CONFIG, SECTIONS, first_unusable, merged_config, parse_run, read_config
 from hilsplat.scene.sheet import DEFAULT_SHEET, SceneRow, is_pattern, matches_of, read_sheet
 from hilsplat.workflow.estimate import forecasts
 from hilsplat.workflow.plan import Plan, without_effect
@@ -188,8 +188,9 @@ def run(
         given.config.append(f"only={json.dumps(scenes)}")
         settings["only"] = scenes
     plan = Plan(settings)
-    for line in (line for path in configs for line in without_effect(plan, read_config(path))):
-        logger.warning("%s", line)
+    for layer in (_edited(), *map(read_config, configs)):
+        for line in without_effect(plan, layer):
+            logger.warning("%s", line)
     for line in (line for layer in overrides for line in without_effect(plan, layer)):
         raise SettingsError(f"--config: {line}", fix="set the other key instead")
     command = ["snakemake", "--snakefile", str(_snakefile(configs)), *others]
@@ -217,6 +218,16 @@ def run(
     for line in summary(plan, [target for target in targets if target.startswith(files)]):
         logger.info("%s", line)
     return 0
+
+
+def _edited() -> dict[str, dict[str, Any]]:
+    """Return the settings of the project's config.yaml that differ from the installed one."""
+    own, installed = read_config(project_path(CONFIG)), read_config(INSTALLED / CONFIG)
+    return {
+        section: {name: each for name, each in values.items() if installed.get(section, {}).get(name) != each}
+        for section, values in own.items()
+        if section in SECTIONS and values
+    }
 
 
 def _nested(word: str) -> str:

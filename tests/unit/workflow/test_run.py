@@ -228,7 +228,9 @@ def test_values_on_the_command_line_are_read_as_snakemake_reads_them(folder, sta
 
 
 def test_a_setting_that_overrides_replace_in_all_scenes_is_refused_or_reported(folder, started, caplog):
-    Path("config/config.yaml").write_text("variants: {}\noverrides: {benchmark: {masks: {theta: 0.7}}}\n")
+    text = "variants: {}\noverrides: {benchmark: {masks: {theta: 0.7}}}\n"
+    text += "masks: {points_per_side: 32}\nevaluate: {methods: [tree]}\n"
+    Path("config/config.yaml").write_text(text)
     line = r"masks\.theta has no effect, because overrides\.benchmark\.masks\.theta replaces it"
     with pytest.raises(SettingsError, match=line):
         runs.run(["two"], [], ["-n", "--config", "masks.theta=0.8"])
@@ -238,6 +240,10 @@ def test_a_setting_that_overrides_replace_in_all_scenes_is_refused_or_reported(f
     Path("config/mine.yaml").write_text("masks: {theta: 0.8, min_area_px: 5}\n")
     runs.run([], [Path("mine")], ["-n"])
     assert re.search(line, caplog.text) and "min_area_px" not in caplog.text
+    caplog.clear()
+    Path("config/config.yaml").write_text(text.replace("masks: {points", "masks: {theta: 0.6, points"))
+    runs.run([], [], ["-n"])
+    assert re.search(line, caplog.text)
 
 
 def test_the_snakefile_is_beside_the_configuration_or_the_installed_one(
