@@ -129,7 +129,7 @@ def scenes_in(results: Path) -> list[str]:
 
 
 def matching_scenes(names: Iterable[str], pattern: str) -> list[str]:
-    """Return the scenes, `<dataset>/<scene>`, of which the name, data set or scene matches (`fnmatch`)."""
+    """Return the scenes, `<dataset>/<scene>`, with a name, data set or scene that matches (`fnmatch`)."""
     return [name for name in names if any(fnmatchcase(each, pattern) for each in (name, *name.split("/")))]
 
 
