@@ -596,15 +596,14 @@ def without_effect(plan: Plan, given: Mapping[str, Any]) -> list[str]:
     """Return a line for each setting of a configuration's layer that `overrides` replace in all scenes."""
     scopes, lines = list(dict.fromkeys(plan.scopes(row) for row in plan.scenes)), []
     for section in (name for name in SECTIONS if given.get(name)):
-        own, used = (
-            getattr(plan.run, section),
-            [getattr(plan.run.stages(scopes=each), section) for each in scopes],
-        )
+        own = getattr(plan.run, section)
+        used = [getattr(plan.run.stages(scopes=each), section) for each in scopes]
         for name in given[section]:
             if all(getattr(each, name, None) != getattr(own, name) for each in used):
-                places = [each for each in scopes[0] if name in plan.run.overrides[each].get(section, {})]
+                places = [each for each in reversed(scopes[0]) if section in plan.run.overrides[each]]
+                place = max(places, key=lambda each: name in plan.run.overrides[each][section])
                 key = f"{section}.{name}"
-                lines.append(f"{key} has no effect, because overrides.{places[-1]}.{key} replaces it")
+                lines.append(f"{key} has no effect, because overrides.{place}.{key} replaces it")
     return lines
 
 

@@ -237,6 +237,9 @@ def test_a_setting_that_overrides_replace_in_all_scenes_is_refused_or_reported(f
     runs.run([], [], ["-n", "--config", "masks.theta=0.7", "masks.min_area_px=5"])
     runs.run([], [], ["-n", "--config", "overrides.benchmark.masks.theta=0.8"])
     assert len(started) == 2 and not caplog.text
+    methods = ["method={name: langsplat, steps: 50}", "overrides={benchmark: {method: {name: lifted}}}"]
+    with pytest.raises(SettingsError, match=r"method\.name has no effect"):
+        runs.run([], [], ["-n", "--config", *methods])
     Path("config/mine.yaml").write_text("masks: {theta: 0.8, min_area_px: 5}\n")
     runs.run([], [Path("mine")], ["-n"])
     assert re.search(line, caplog.text) and "min_area_px" not in caplog.text
