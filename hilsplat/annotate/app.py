@@ -271,8 +271,7 @@ def _segment(opened: OpenedScene, asked: Segment) -> list[dict[str, Any]]:
 def _carry(opened: OpenedScene, asked: Carry) -> list[dict[str, Any]]:
     """Return objects of other views, transferred to a view, as proposals; nothing is written."""
     with opened.unchanged():
-        view = view_name(opened.scene, asked.view)
-        carried = opened.proposals.carried(opened.known(), asked.ids, view)
+        carried = opened.proposals.carried(opened.known(), asked.ids, view_name(opened.scene, asked.view))
     return [{**label.model_dump(), "polygons": polygons, "origin": "proposed"} for label, polygons in carried]
 
 

@@ -91,14 +91,14 @@ def query(
         echo(found)
 
 
-def scene_folder(scene: str, results: Path) -> Path:
+def scene_folder(scene: str, results: Path, variant: str = "") -> Path:
     """Return the folder of a scene (name, dataset/scene or path).
 
     Raises:
-        ArtifactError: there is no such scene; the message lists those of the results.
+        ArtifactError: there is no such scene or, if given, variant; the message lists those that exist.
         SettingsError: the name is ambiguous.
     """
-    from hilsplat.scene.finished import require_scene_folder, scenes_in
+    from hilsplat.scene.finished import require_scene_folder, require_variant, scenes_in
 
     found = [name for name in scenes_in(results) if scene in (name, name.partition("/")[2])]
     if len(found) > 1:
@@ -107,6 +107,8 @@ def scene_folder(scene: str, results: Path) -> Path:
     named = results / (found[0] if found else scene)
     folder = Path(scene) if not named.is_dir() and Path(scene).is_dir() else named
     require_scene_folder(folder)
+    if variant:
+        require_variant(folder, variant)
     return folder
 
 
@@ -301,7 +303,7 @@ def view(
     """
     from hilsplat.viewer.app import run_view
 
-    folder = scene_folder(scene, results)
+    folder = scene_folder(scene, results, variant)
     run_view(folder, variant=variant, port=port, browser=browser, threads=threads, on_ready=echo)
 
 
@@ -322,6 +324,6 @@ def annotate(
     from hilsplat.annotate.app import run_annotate
     from hilsplat.scene.scene import Scene
 
-    folder = scene_folder(scene, results)
+    folder = scene_folder(scene, results, variant)
     labels = data_root / "annotated" / Scene.load(folder / "scene").name
     run_annotate(folder, labels, variant=variant, port=port, browser=browser, threads=threads, on_ready=echo)

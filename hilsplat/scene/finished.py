@@ -64,13 +64,7 @@ class FinishedScene:
             ArtifactError: the folder, the variant or a part is missing.
         """
         require_scene_folder(folder)
-        finished = finished_variants(folder)
-        if finished and not (folder / variant).exists():
-            raise ArtifactError(
-                f"{folder} has no variant {variant!r}",
-                expected=f"one of {', '.join(finished)}",
-                fix="list it under ablation_variants and run the workflow",
-            )
+        require_variant(folder, variant)
         own, scores = (folder / variant / name for name in ("field.safetensors", "scores.csv"))
         field = _recorded_input(scores, "field", folder) or own
         if field != own and own.exists() and own.stat().st_mtime > provenance_path(scores).stat().st_mtime:
@@ -152,6 +146,17 @@ def require_scene_folder(folder: Path) -> None:
         expected=nearest(name, known) if known else "a run's folder results/<dataset>/<scene>, or a copy",
         fix=f"{first}, or make the scene: hilsplat run SCENE; to list all: hilsplat scenes",
     )
+
+
+def require_variant(folder: Path, variant: str) -> None:
+    """Raise ArtifactError if other variants of a scene accept queries, and this one doesn't exist."""
+    finished = finished_variants(folder)
+    if finished and not (folder / variant).exists():
+        raise ArtifactError(
+            f"{folder} has no variant {variant!r}",
+            expected=nearest(variant, finished),
+            fix="correct the name, or list it under ablation_variants and run the workflow",
+        )
 
 
 def refining(folder: Path) -> str:

@@ -259,8 +259,7 @@ def _shape_notes(views: Views, view: str, drawn_hw: tuple[int, int], path: Path)
         HilsplatError: labels don't have the shape of their photograph or undistorted view.
     """
     if (camera := views.cameras.get(view)) is None:
-        photo_hw = image_size_hw(views.photos[view], upright=True)
-        camera = Camera(view, np.eye(4), np.eye(3), photo_hw)
+        camera = Camera(view, np.eye(4), np.eye(3), image_size_hw(views.photos[view], upright=True))
     try:
         placement(camera, drawn_hw, f"label file {path}")
     except MisalignedArtifactError as error:

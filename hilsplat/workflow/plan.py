@@ -419,8 +419,7 @@ class Plan:
                 waiting += stage.inputs
         sections = {name for stage in stages.values() for name in stage.sections.values()}
         values = {name: getattr(settings, name) for name in sorted(sections)}
-        is_random = any(section.is_random for section in values.values())
-        seed = self.run.seed_of(variant) if is_random else None
+        seed = self.run.seed_of(variant) if any(each.is_random for each in values.values()) else None
         return Identity(tuple(sorted(stages)), tuple(values.items()), seed)
 
     def scopes(self, row: SceneRow) -> tuple[str, ...]:

@@ -241,6 +241,14 @@ def test_options_without_effect_are_refused(desk, elsewhere, command, option, pu
     assert not list(elsewhere.iterdir()) and not (desk / "export").exists()
 
 
+@pytest.mark.parametrize(
+    "command", [("query", "mug"), ("view", "--no-browser"), ("annotate", "--no-browser")]
+)
+def test_a_variant_that_does_not_exist_is_refused(desk, elsewhere, command):
+    with pytest.raises(ArtifactError, match=r"has no variant 'defalt'(.|\n)*did you mean 'default'"):
+        run(command[0], str(desk), *command[1:], "--variant", "defalt")
+
+
 @pytest.mark.parametrize(("out", "masks"), [("a", "a"), ("a/b", "a"), ("a", "a/panel.png"), ("a/../c", "c")])
 def test_masks_do_not_replace_the_picture_of_their_answer(desk, elsewhere, out, masks):
     with pytest.raises(SettingsError, match="would replace"):
