@@ -156,8 +156,7 @@ def _posed(
                     fix="compute poses: hilsplat.reconstruct(...), or pass poses=",
                 )
             name, out = f"{PHOTOS}/{base.name if folder else source.stem}", base / "scene"
-            number = _threads(threads)
-            stages.poses(images, out, section, name=name, poses=poses, seed=seed, threads=number)
+            stages.poses(images, out, section, name=name, poses=poses, seed=seed, threads=_threads(threads))
         scene = Scene.load(out)
         weakref.finalize(scene, files.pop_all().close)
     return scene

@@ -6,59 +6,55 @@ from typing import Annotated
 import typer
 
 from hilsplat.cli.common import Results, echo
+from hilsplat.cli.user_commands import SceneName, scene_folder
 from hilsplat.stage import Threads
 from hilsplat_world.stages import consistency, mask_truth, tree_truth
 
 app = typer.Typer(help="Make and inspect scenes of the synthetic world.", no_args_is_help=True)
 
-
-SceneWithMasks = Annotated[str, typer.Argument(help="synthetic scene that has masks, as dataset/scene")]
 MeasuredVariant = Annotated[str, typer.Option(help="variant that is measured")]
 
 
 @app.command("show")
-def show(
-    scene: Annotated[str, typer.Argument(help="finished synthetic scene, as dataset/scene")],
-    results: Results = Path("results"),
-) -> None:
+def show(scene: SceneName, results: Results = Path("results")) -> None:
     """Write a contact sheet to world.png: views, labels by level, and the tree with its texts."""
     from hilsplat_world.pictures import show_world
 
-    target = results / scene / "world.png"
-    show_world(results / scene / "world", target)
+    folder = scene_folder(scene, results)
+    target = folder / "world.png"
+    show_world(folder / "world", target)
     echo(f"wrote {target}")
 
 
 @app.command("inconsistency")
 def inconsistency(
-    scene: SceneWithMasks, variant: MeasuredVariant = "default", results: Results = Path("results")
+    scene: SceneName, variant: MeasuredVariant = "default", results: Results = Path("results")
 ) -> None:
     """Measure, using exact geometry, how often a surface point has different masks in neighbouring views.
 
     Writes consistency.csv beside the masks.
     """
-    folder = results / scene
-    echo(
-        consistency(folder / "world/truth", folder / variant / "masks", folder / variant / "consistency.csv")
-    )
+    folder = scene_folder(scene, results)
+    measured = folder / variant
+    echo(consistency(folder / "world/truth", measured / "masks", measured / "consistency.csv"))
 
 
 @app.command("masks")
 def masks(
-    scene: SceneWithMasks,
+    scene: SceneName,
     variant: MeasuredVariant = "default",
     results: Results = Path("results"),
     out: Annotated[Path | None, typer.Option(help="PNG, CSV and PDF; default: beside the masks")] = None,
 ) -> None:
     """Compare masks with ground-truth regions at each level, and draw the errors."""
-    folder = results / scene
+    folder = scene_folder(scene, results)
     target = out or folder / variant / "masks_truth.png"
     echo(mask_truth(folder / "scene", folder / "world/truth", folder / variant / "masks", target))
 
 
 @app.command("semantic-tree")
 def semantic_tree(
-    scene: Annotated[str, typer.Argument(help="synthetic scene that has a tree, as dataset/scene")],
+    scene: SceneName,
     variant: MeasuredVariant = "default",
     results: Results = Path("results"),
     threads: Threads = 2,
@@ -67,7 +63,6 @@ def semantic_tree(
 
     Writes tree_truth.csv beside the tree.
     """
-    folder, tree = results / scene, results / scene / variant / "semantic_tree"
-    target = tree.with_name("tree_truth.csv")
-    ply, truth = folder / "gaussians.ply", folder / "world/truth"
-    echo(tree_truth(folder / "scene", ply, truth, tree, target, threads))
+    folder = scene_folder(scene, results)
+    ply, truth, tree = folder / "gaussians.ply", folder / "world/truth", folder / variant / "semantic_tree"
+    echo(tree_truth(folder / "scene", ply, truth, tree, tree.with_name("tree_truth.csv"), threads))

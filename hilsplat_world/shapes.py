@@ -266,8 +266,7 @@ def loft(sections: Sequence[Sequence[Point] | np.ndarray]) -> Mesh:
             j = (i + 1) % len(low)
             triangles += [np.stack([low[i], low[j], high[j]]), np.stack([low[i], high[j], high[i]])]
     solid = np.stack(triangles)
-    middle = solid.reshape(-1, 3).mean(axis=0)
-    corners = solid - middle
+    corners = solid - solid.reshape(-1, 3).mean(axis=0)
     if np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) < 0:
         solid = solid[:, ::-1]
     return _flat(solid)

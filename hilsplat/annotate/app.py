@@ -4,7 +4,6 @@ All geometry is computed here, with the polygon filling used in evaluation; the 
 """
 
 import shlex
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated, Any, get_args
@@ -39,7 +38,7 @@ from hilsplat.web.messages import Message
 from hilsplat.web.scene_thread import SceneThread, ShownScene
 from hilsplat.web.server import Ready, answer, files_of, guarded, plain, read, serve, version_sent, view_name
 
-SCORES = 3  # maximum number of mean scores that the page shows
+SCORES = 3  # maximum number of methods whose mean scores the page shows
 MAX_BODY_BYTES = 16 << 20  # maximum size of a request, enough for a COCO file of a whole scene
 
 
@@ -162,7 +161,7 @@ class OpenedScene(ShownScene):
         return {**super().news(), "labels": self.versions()}
 
     def scores(self) -> str:
-        """Return the first mean scores that the last run saved, in one line; empty if there are none."""
+        """Return each method's mean over the most queries in one line; empty if no run has saved any."""
         means = self.folder / "scores.csv"
         if not means.is_file():
             return ""
@@ -170,7 +169,11 @@ class OpenedScene(ShownScene):
             rows = [row for row in read_csv(means, None, rebuild_command(means)) if row.get("mIoU")]
         except ArtifactError as error:
             return first_line(error)
-        shown = [f"{row['method']} {row['mIoU']} % ({row['protocol']})" for row in rows[:SCORES]]
+        best: dict[str, dict[str, str]] = {}
+        own = [(row.get("labels") == "annotated", row.get("queries", "").zfill(9)) for row in rows]
+        for _, row in sorted(zip(own, rows, strict=True), key=lambda pair: pair[0], reverse=True):
+            best.setdefault(row["method"], row)
+        shown = [f"{row['method']} {row['mIoU']} % ({row['protocol']})" for row in [*best.values()][:SCORES]]
         more = [f"all in {means.with_suffix('.md')}"] if len(rows) > SCORES else []
         scored = means.stat().st_mtime
         is_old = any(path.stat().st_mtime > scored for path in self.labels.glob("*.json"))
@@ -223,7 +226,7 @@ class Annotator:
         return answer(await self.thread.do(request, write))
 
 
-def _all_labels(opened: OpenedScene, of: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _all_labels(opened: OpenedScene) -> list[dict[str, Any]]:
     """Return the annotations and file version of every view, in view order."""
     versions, known = opened.versions(), opened.known()  # in this order
     return [
@@ -264,8 +267,7 @@ def _segment(opened: OpenedScene, asked: Segment) -> list[dict[str, Any]]:
 def _carry(opened: OpenedScene, asked: Carry) -> list[dict[str, Any]]:
     """Return objects of other views, transferred to a view, as proposals; nothing is written."""
     with opened.unchanged():
-        view = view_name(opened.scene, asked.view)
-        carried = opened.proposals.carried(opened.known(), asked.ids, view)
+        carried = opened.proposals.carried(opened.known(), asked.ids, view_name(opened.scene, asked.view))
     return [{**label.model_dump(), "polygons": polygons, "origin": "proposed"} for label, polygons in carried]
 
 
@@ -292,8 +294,7 @@ def _import(opened: OpenedScene, asked: Files) -> dict[str, Any]:
     return {"views": views, "added": added, "known": known, "notes": notes}
 
 
-def _export(opened: OpenedScene, of: Mapping[str, Any]) -> Response:
-    kind = of["kind"]
+def _export(opened: OpenedScene, kind: Kind) -> Response:
     if kind not in get_args(Kind):
         raise SettingsError(f"unknown format {kind!r}", expected=", ".join(get_args(Kind)))
     data = exported(kind, opened.known(), opened.scene.cameras)

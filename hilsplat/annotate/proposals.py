@@ -164,7 +164,7 @@ class Proposals:
         for view, label in annotated.items():
             weights = self._weights(view)
             inside += weights.T @ label.mask(self.scene.cameras[view].size_hw).ravel().astype(np.float32)
-            total += self.cache.get(("mass", view), partial(_visible_mass, weights))
+            total += self.cache.get(("mass", view), partial(weights.sum, axis=0)).A1  # visible mass, px
         return (inside > 0.5 * total).astype(np.float32), (total > 0).astype(np.float32)
 
     def _weights(self, view: str) -> sp.csr_matrix:
@@ -173,10 +173,6 @@ class Proposals:
         camera, threads = self.scene.cameras[view], self.threads
         draw = partial(pixel_weights, self.gaussians, camera, min_weight=min_weight, threads=threads)
         return self.cache.get(("weights", view), lambda: normalised_weights(draw()))
-
-
-def _visible_mass(weights: sp.csr_matrix) -> np.ndarray:
-    return np.asarray(weights.sum(axis=0)).ravel()
 
 
 def _proposals(regions: Sequence[tuple[str, str, Level, np.ndarray]]) -> list[Proposal]:

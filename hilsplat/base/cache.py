@@ -43,8 +43,8 @@ def size_table(folder: Path) -> str:
     for name, files in caches(folder).items():
         size_mib = sum(stat.st_size for stat in stats_of(files).values()) / 2**20
         total += size_mib
-        lines.append(f"{name:<14} {len(files):>7} files {size_mib:>9.1f} MiB")
-    return "\n".join([*lines, f"{'all':<14} {'':>13} {total:>9.1f} MiB"])
+        lines.append(f"{name:<18} {len(files):>7} files {size_mib:>9.1f} MiB")
+    return "\n".join([*lines, f"{'all':<18} {'':>13} {total:>9.1f} MiB"])
 
 
 def prune_cache(

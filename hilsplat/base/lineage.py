@@ -163,8 +163,7 @@ class Inputs:
 
     def require_unchanged(self) -> None:
         """Raise HilsplatError if an input changed; files with the same size, time and inode are skipped."""
-        now = self._signatures()
-        changed = sorted({file for file, _ in self._files.items() ^ now.items()})
+        changed = sorted({file for file, _ in self._files.items() ^ self._signatures().items()})
         for name, path in self._paths.items() if changed else ():
             if self._record(path) != self.records[name]:
                 raise HilsplatError(

@@ -78,9 +78,9 @@ def require_new_folder(out: Path, option: str = "--out") -> None:
 def refuse_options(context: typer.Context, names: Iterable[str], purpose: str) -> None:
     """Raise SettingsError if one of these options was given, because it would be ignored."""
     for parameter in context.command.params:
-        source = context.get_parameter_source(parameter.name or "")
+        source, option = context.get_parameter_source(parameter.name or ""), parameter.opts[0]
         if parameter.name in names and source and source.name == "COMMANDLINE":
-            raise SettingsError(f"{parameter.opts[0]} is for {purpose}", fix=f"leave out {parameter.opts[0]}")
+            raise SettingsError(f"{option} is for {purpose}", fix=f"use {purpose}, or leave out {option}")
 
 
 def echo(text: object) -> None:

@@ -16,7 +16,7 @@ from hilsplat.cli.common import (
     refuse_options,
     require_new_folder,
 )
-from hilsplat.cli.user_commands import scene_folder
+from hilsplat.cli.user_commands import SceneName, scene_folder
 from hilsplat.stage import DEFAULT_CACHE, DataRoot, Threads
 from hilsplat.stages import joined, label_fits, names
 
@@ -66,7 +66,7 @@ def models_check(
     from hilsplat.embed.model_check import check_model, check_models
 
     if folder is None:
-        refuse_options(context, ("variant",), "the check of one folder")
+        refuse_options(context, ("variant",), "one folder")
     text, num_failed = (check_model(folder, variant), 0) if folder is not None else check_models()
     echo(text)
     if num_failed:
@@ -113,7 +113,7 @@ def cache_prune(
     from hilsplat.base.cache import prune_cache, size_table
 
     if days is None and max_mib is None:
-        refuse_options(context, ("stage",), "entries beyond a limit, with --days or --max-mib")
+        refuse_options(context, ("stage",), "--days or --max-mib")
     number, freed_mib = prune_cache(context.obj, stage or [], days=days, max_mib=max_mib)
     echo(f"deleted {number} files, {freed_mib:.1f} MiB\n{size_table(context.obj)}")
 
@@ -145,7 +145,7 @@ def datasets_check(
 
 @datasets_app.command("fits")
 def datasets_fits(
-    scene: Annotated[str, typer.Argument(help="scene with a tree in the results folder, as dataset/scene")],
+    scene: SceneName,
     labels: Annotated[
         str | None, typer.Option(help="labels with levels, such as hi_lerf/figurines; default: your own")
     ] = None,
@@ -169,7 +169,7 @@ def datasets_fits(
 
 @blocks_app.command("split")
 def blocks_split(
-    scene: Annotated[str, typer.Argument(help="scene with finished poses, such as photos/house")],
+    scene: SceneName,
     blocks: Annotated[int, typer.Option(min=2, help="number of blocks")],
     out: Annotated[Path | None, typer.Option(help="new folder; default: blocks/SCENE")] = None,
     share: Annotated[

@@ -1,6 +1,7 @@
 """Commands that use a finished scene, check results or the machine, or print all settings."""
 
 import json
+import shlex
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -19,7 +20,7 @@ def query(
     context: typer.Context,
     scene: SceneName,
     text: Annotated[
-        str | None, typer.Argument(help="what to look for; 'bear > nose' finds the noses of bears")
+        list[str] | None, typer.Argument(help="what to look for; 'bear > nose' finds the noses of bears")
     ] = None,
     all_scenes: Annotated[
         bool, typer.Option("--all", help="rank all finished scenes: --all TEXT, or --all 'photos/*' TEXT")
@@ -55,25 +56,27 @@ def query(
     """
     if all_scenes:
         of_one = ("out", "masks", "spz", "view", "views", "answerer", "threads")
-        refuse_options(context, of_one, "queries of one scene, without --all")
+        refuse_options(context, of_one, "one scene, without --all")
         from hilsplat.query.scenes import open_scenes, report_of
 
-        pattern, wanted = ("*", scene) if text is None else (scene, text)
+        pattern, wanted = (scene, " ".join(text)) if text else ("*", scene)
         scenes = open_scenes(results, pattern, variant)
         hits = scenes.query(wanted, level, threshold=threshold, limit=limit)
         rows = [hit.as_json() for hit in hits]
         echo(json.dumps(rows, indent=1) if as_json else report_of(scenes, wanted, hits))
         return
-    refuse_options(context, ("limit", "as_json"), "queries of all scenes, with --all")
-    if text is None:
-        raise SettingsError(f"there is no text to search for in {scene}", fix="hilsplat query SCENE TEXT")
+    refuse_options(context, ("limit", "as_json"), "--all")
+    folder = scene_folder(scene, results)
+    if not text:
+        fix = f"hilsplat query {shlex.quote(scene)} TEXT"
+        raise SettingsError(f"there is no text to search for in {scene}", fix=fix)
     if masks is not None:
         require_new_folder(masks, "--masks")
     from hilsplat.query.answer import answer
 
     for found in answer(
-        scene_folder(scene, results),
-        text,
+        folder,
+        " ".join(text),
         level=level,
         variant=variant,
         views=views,
@@ -88,14 +91,14 @@ def query(
         echo(found)
 
 
-def scene_folder(scene: str, results: Path) -> Path:
+def scene_folder(scene: str, results: Path, variant: str = "") -> Path:
     """Return the folder of a scene (name, dataset/scene or path).
 
     Raises:
-        ArtifactError: there is no such scene; the message lists those of the results.
+        ArtifactError: there is no such scene or, if given, variant; the message lists those that exist.
         SettingsError: the name is ambiguous.
     """
-    from hilsplat.scene.finished import require_scene_folder, scenes_in
+    from hilsplat.scene.finished import require_scene_folder, require_variant, scenes_in
 
     found = [name for name in scenes_in(results) if scene in (name, name.partition("/")[2])]
     if len(found) > 1:
@@ -104,6 +107,8 @@ def scene_folder(scene: str, results: Path) -> Path:
     named = results / (found[0] if found else scene)
     folder = Path(scene) if not named.is_dir() and Path(scene).is_dir() else named
     require_scene_folder(folder)
+    if variant:
+        require_variant(folder, variant)
     return folder
 
 
@@ -222,7 +227,7 @@ def export(
     if form != "labels":
         refuse_options(context, ("data_root",), "--as labels")
     if form not in ("tree", "langsplat") and not any(crop.values()):
-        refuse_options(context, ("variant",), "--as tree, --as langsplat, --only, --without and --clean")
+        refuse_options(context, ("variant",), "--as tree, --as langsplat, --only, --without or --clean")
     folder = scene_folder(scene, results)
     if out is not None:
         require_new_folder(out)
@@ -271,11 +276,9 @@ def _export(
     else:
         from hilsplat.scene.exporting import write_colmap, write_nerfstudio
 
-        write, what = {
-            "colmap": (write_colmap, "images and sparse/0"),
-            "nerfstudio": (write_nerfstudio, "images, transforms.json and points.ply"),
-        }[form]
-        write(opened, out)
+        is_colmap = form == "colmap"
+        what = "images and sparse/0" if is_colmap else "images, transforms.json and points.ply"
+        (write_colmap if is_colmap else write_nerfstudio)(opened, out)
     return f"wrote {what} of {views} views to {out}"
 
 
@@ -300,7 +303,7 @@ def view(
     """
     from hilsplat.viewer.app import run_view
 
-    folder = scene_folder(scene, results)
+    folder = scene_folder(scene, results, variant)
     run_view(folder, variant=variant, port=port, browser=browser, threads=threads, on_ready=echo)
 
 
@@ -321,6 +324,6 @@ def annotate(
     from hilsplat.annotate.app import run_annotate
     from hilsplat.scene.scene import Scene
 
-    folder = scene_folder(scene, results)
+    folder = scene_folder(scene, results, variant)
     labels = data_root / "annotated" / Scene.load(folder / "scene").name
     run_annotate(folder, labels, variant=variant, port=port, browser=browser, threads=threads, on_ready=echo)

@@ -57,8 +57,7 @@ class HierarchyAnnotations:
     def mask(self, view: str, ids: Iterable[int]) -> Bool[np.ndarray, "H W"]:
         """Return the union of the nodes' regions in a view; all nodes must have the same level."""
         ids = tuple(ids)
-        level = Level(self.nodes[ids[0]].level)
-        return np.isin(self.label_image(view, level), ids)
+        return np.isin(self.label_image(view, Level(self.nodes[ids[0]].level)), ids)
 
     def path_of(self, node_id: int) -> tuple[str, ...]:
         """Return the texts from the whole down to the node, such as ("bear", "head", "nose")."""

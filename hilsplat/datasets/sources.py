@@ -103,8 +103,7 @@ def image_files(source: str, data_root: str) -> tuple[Path, ...]:
     files, root = set[Path](), dataset.root(data_root)
     for place in dataset.needs(root, scene):
         files.update(files_of(root / place))
-    labels = label_files(name, data_root)
-    return tuple(sorted(files.difference(labels)))
+    return tuple(sorted(files.difference(label_files(name, data_root))))
 
 
 def is_exported(source: str) -> bool:

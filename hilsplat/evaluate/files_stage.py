@@ -81,8 +81,7 @@ def run_evaluate_files(
             if any((predictions / file).is_file() for card in extra.points for file in _files_of(card)):
                 points = exact.points()
             else:
-                min_px = min_region_px or EvaluateSettings().min_region_px
-                views = truths_of(truth, Scene.load(scene), min_px)
+                views = truths_of(truth, Scene.load(scene), min_region_px or EvaluateSettings().min_region_px)
         else:
             dataset, labelled, extra = ExtraProtocols.open(labels, data_root)
             for sentence in labelled.warnings:

@@ -1,7 +1,6 @@
 """The scenes of a results folder: what each can answer, its size, and the quality of its fit and tree."""
 
 import logging
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 from hilsplat.base.errors import ArtifactError, HilsplatError, nearest
@@ -12,7 +11,7 @@ from hilsplat.evaluate.protocols.cards import BY_NAME, card_of
 from hilsplat.evaluate.scores import read_scores
 from hilsplat.evaluate.tables.means import metric_means
 from hilsplat.query.scene_state import SceneState
-from hilsplat.scene.finished import scenes_in
+from hilsplat.scene.finished import matching_scenes, scenes_in
 
 logger = logging.getLogger(__name__)
 
@@ -42,7 +41,7 @@ def run_scenes(results: Path, pattern: str, out: Path | None) -> str:
         ArtifactError: no scene matches, or `out` is another file.
     """
     names = scenes_in(results)
-    chosen = [name for name in names if any(fnmatchcase(each, pattern) for each in (name, Path(name).name))]
+    chosen = matching_scenes(names, pattern)
     if not chosen:
         raise ArtifactError(
             f"{results} has no scene that matches {pattern!r}",
@@ -76,6 +75,7 @@ def scene_lines(results: Path, names: list[str]) -> tuple[list[str], list[list[o
         known = [name, scene.state, train, test, scene.fit.get("gaussians", ""), psnr_db, *nodes]
         rows.append([*known, iou, megabytes, scene.date, scene.models])
         views = sum(scene.views.values()) or ""
+        psnr_db += " (training)" if scene.fit.get("split") == "train" else ""  # higher than in held-out views
         shown.append((name, scene.state, views, psnr_db, iou, megabytes, scene.date, scene.models))
     return aligned_table(shown, WORDS), rows
 

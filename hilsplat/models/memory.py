@@ -73,8 +73,7 @@ def needs_of(
     if not isinstance(vision, dict):
         image, as_exported = side * side * UNKNOWN_BYTES_PER_PX / MIB, True
     elif model.kind == "clip":
-        tokens = (side / _patch_px(vision)) ** 2
-        image = 2 * _attention_mib(vision, side) + CLIP_TOKEN_MIB * tokens
+        image = 2 * _attention_mib(vision, side) + CLIP_TOKEN_MIB * (side / _patch_px(vision)) ** 2
     elif model.layout == "sam" and not as_exported:
         patches = side / _patch_px(vision)
         features = patches**2 * vision.get("hidden_size", 768) * 4 / MIB

@@ -215,8 +215,7 @@ class TorchNetwork(Network):
                 del attributes[key]
         if node.op_type == "Split":
             attributes["outputs"] = len(node.output)
-        outputs = [name for name in node.output if name]
-        return Step(node.op_type, arguments, attributes, outputs, [])
+        return Step(node.op_type, arguments, attributes, [name for name in node.output if name], [])
 
     def _upload(self, name: str, known: Constants) -> Tensor:
         """Return a constant on the device; weights are uploaded once for all shapes of inputs."""

@@ -56,8 +56,7 @@ class SceneState:
             state = "tree of key views" if used == early else "tree, field" if field.is_file() else "tree"
         else:
             state = "Gaussians" if report.is_file() else "poses" if has_poses else "no poses"
-        has_masks = (used / "masks" / INDEX).is_file()
-        models = [masks_label(used / "masks")] if has_masks else []
+        models = [masks_label(used / "masks")] if (used / "masks" / INDEX).is_file() else []
         models += [Path(read_index(used / "clip", "model")["model"]).name] if has_clip else []
         stats = stats_of(files_below(folder))
         times = [stat.st_mtime for path, stat in stats.items() if path.name.endswith(RECORD)]

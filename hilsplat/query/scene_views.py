@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64, UInt8
 
-from hilsplat.base.errors import SettingsError
+from hilsplat.base.errors import SettingsError, nearest
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.scene.cameras import Camera, Cameras
@@ -100,11 +100,7 @@ class SceneViews:
         if isinstance(view, Camera):
             return view
         if view not in self.names:
-            raise SettingsError(
-                f"{self.scene.name} has no view {view!r}",
-                expected=f"one of {', '.join(self.names[:3])}, ... ({len(self.names)} views)",
-                found=view,
-            )
+            raise SettingsError(f"{self.scene.name} has no view {view!r}", expected=nearest(view, self.names))
         return self.scene.cameras[view]
 
     def cached(self, kind: str, view: View, compute: Callable[[], Any], *more: Any) -> Any:

@@ -5,7 +5,6 @@ import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from hilsplat.query.node_names import NodeNaming
 from hilsplat.query.node_queries import NodeQueries, caution_of
 from hilsplat.query.node_search import NodeHits
 from hilsplat.query.relevancy import relevancy_of_margins
-from hilsplat.scene.finished import FinishedScene, changed_input, scenes_in
+from hilsplat.scene.finished import FinishedScene, changed_input, matching_scenes, scenes_in
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import EvaluateSettings
 
@@ -219,7 +218,7 @@ def open_scenes(results: Path | str = "results", pattern: str = "*", variant: st
     its index was rebuilt or removed since, or if its CLIP model is not found.
 
     Args:
-        pattern: scenes to search, such as `photos/*` or `kitchen-?`; the data set may be omitted.
+        pattern: scenes to search, such as `photos`, `photos/desk` or `kitchen-?`.
 
     Raises:
         ArtifactError: no scene matches, or none is finished.
@@ -227,10 +226,8 @@ def open_scenes(results: Path | str = "results", pattern: str = "*", variant: st
     results, skipped, found = Path(results).absolute(), dict[str, str](), list[FoundScene]()
     models: dict[tuple[str, str], ClipModel] = {}
     names = scenes_in(results)
-    for name in names:
+    for name in matching_scenes(names, pattern):
         folder = results / name
-        if not (fnmatchcase(name, pattern) or fnmatchcase(folder.name, pattern)):
-            continue
         try:
             finished = FinishedScene.locate(folder, variant)
             clip, settings = finished.parts.clip, finished.evaluate_settings()
@@ -257,8 +254,7 @@ def open_scenes(results: Path | str = "results", pattern: str = "*", variant: st
 
 def report_of(scenes: Scenes, text: str, hits: Sequence[SceneHit]) -> str:
     """Return answers, doubts and skipped scenes as text."""
-    asked = counted(len(scenes.found), "scene")
-    lines = [f"{counted(len(hits), 'answer')} to {text!r} in {asked}"]
+    lines = [f"{counted(len(hits), 'answer')} to {text!r} in {counted(len(scenes.found), 'scene')}"]
     if hits:
         columns = "score", "scene", "node", "level", "name", "picture"
         rows = [

@@ -150,8 +150,7 @@ def normalising_similarity(
     sources keep the metre. If `turn` is set, +z becomes the cameras' up direction, because structure from
     motion produces an arbitrary rotation; imported poses keep their axes.
     """
-    rotations = cam_from_source[:, :3, :3]
-    centres = -np.einsum("vji,vj->vi", rotations, cam_from_source[:, :3, 3])
+    centres = -np.einsum("vji,vj->vi", cam_from_source[:, :3, :3], cam_from_source[:, :3, 3])
     origin = np.median(points if len(points) else centres, axis=0)
     distance = float(np.median(np.linalg.norm(centres - origin, axis=1)))
     scale = 1.0 if metric or distance < 1e-9 else 1.0 / distance

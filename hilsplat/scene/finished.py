@@ -1,7 +1,9 @@
 """Locations of a finished scene's artifacts, and the settings that produced them."""
 
 import logging
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from hilsplat.base.artifacts import INDEX, provenance_path, read_index, run_command
@@ -60,13 +62,7 @@ class FinishedScene:
             ArtifactError: the folder, the variant or a part is missing.
         """
         require_scene_folder(folder)
-        finished = finished_variants(folder)
-        if finished and not (folder / variant).exists():
-            raise ArtifactError(
-                f"{folder} has no variant {variant!r}",
-                expected=f"one of {', '.join(finished)}",
-                fix="list it under ablation_variants and run the workflow",
-            )
+        require_variant(folder, variant)
         own, scores = (folder / variant / name for name in ("field.safetensors", "scores.csv"))
         field = _recorded_input(scores, "field", folder) or own
         if field != own and own.exists() and own.stat().st_mtime > provenance_path(scores).stat().st_mtime:
@@ -119,6 +115,11 @@ def scenes_in(results: Path) -> list[str]:
     return sorted(f"{path.parent.name}/{path.name}" for path in places)
 
 
+def matching_scenes(names: Iterable[str], pattern: str) -> list[str]:
+    """Return the scenes, `<dataset>/<scene>`, with a name, data set or scene that matches (`fnmatch`)."""
+    return [name for name in names if any(fnmatchcase(each, pattern) for each in (name, *name.split("/")))]
+
+
 def command_name(folder: Path) -> str:
     """Return a scene's name in commands: `<dataset>/<scene>`, or its path if it is not in results/."""
     return str(folder.relative_to("results") if folder.parts[0] == "results" else folder)
@@ -127,18 +128,28 @@ def command_name(folder: Path) -> str:
 def require_scene_folder(folder: Path) -> None:
     """Raise ArtifactError, with known scenes, if a folder does not exist or contains scenes."""
     parents = folder.absolute().parents
-    inside = scenes_in(folder) or [
-        name for name in scenes_in(parents[0]) if name.startswith(f"{folder.name}/")
-    ]
+    inside = scenes_in(folder) or matching_scenes(scenes_in(parents[0]), f"{folder.name}/*")
     if folder.is_dir() and not inside:
         return
     known = inside or scenes_in(parents[0]) or scenes_in(parents[1])  # results/desk, or results/photos/desk
     name = f"{folder.parent.name}/{folder.name}"
+    first = "correct the name" if known else "change to the folder of the project"
     raise ArtifactError(
         f"{folder} is a folder of scenes, not a scene" if inside else f"scene folder {folder} is missing",
         expected=nearest(name, known) if known else "a run's folder results/<dataset>/<scene>, or a copy",
-        fix="correct the name, or make the scene: hilsplat run SCENE; to list all: hilsplat scenes",
+        fix=f"{first}, or make the scene: hilsplat run SCENE; to list all: hilsplat scenes",
     )
+
+
+def require_variant(folder: Path, variant: str) -> None:
+    """Raise ArtifactError if other variants of a scene accept queries, and this one doesn't exist."""
+    finished = finished_variants(folder)
+    if finished and not (folder / variant).exists():
+        raise ArtifactError(
+            f"{folder} has no variant {variant!r}",
+            expected=nearest(variant, finished),
+            fix="correct the name, or list it under ablation_variants and run the workflow",
+        )
 
 
 def refining(folder: Path) -> str:

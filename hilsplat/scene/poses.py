@@ -102,8 +102,7 @@ def run_poses(
         except RegistrationError as error:
             if lost.exists():
                 shutil.copyfile(lost, picture)
-                where = "shows the unregistered photographs"
-                error.add_line("picture", f"{picture} {where}")
+                error.add_line("picture", f"{picture} shows the unregistered photographs")
             raise
         report = posed[3]
         for warning in report["warnings"]:
@@ -356,7 +355,7 @@ def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> None:
     for view in alone[:MAX_ROWS]:
         entry = views[view]
         counts = {near["view"]: near["matches"] for near in entry["belongs_near"]}
-        neighbours = [(near, f"{near}: {count} shared matches") for near, count in counts.items()]
+        neighbours = [(near, f"{views[near]['file']}: {n} shared matches") for near, n in counts.items()]
         rows.append([(view, f"{entry['file']}: {entry['why_not'].partition(':')[0]}"), *neighbours])
     figure = Figure(figsize=(12, 1.2 + 2.1 * len(rows)), layout="constrained")
     limit = f" (the first {MAX_ROWS})" if len(alone) > MAX_ROWS else ""

@@ -175,10 +175,10 @@ def choose_scenes(
 
 
 def matches_of(rows: Iterable[SceneRow], names: Iterable[str]) -> dict[str, list[SceneRow]]:
-    """Map each name or pattern to the scenes whose name or `<dataset>/<scene>` it matches (`fnmatch`)."""
+    """Map each name or pattern to the scenes whose name, data set or both it matches (`fnmatch`)."""
     by_name: dict[str, list[SceneRow]] = {}
     for row in rows:
-        for name in (row.scene, row.name):
+        for name in (row.scene, row.dataset, row.name):
             by_name.setdefault(name, []).append(row)
     found = {name: fnmatch.filter(by_name, name) if is_pattern(name) else [name] for name in names}
     return {name: [row for each in same for row in by_name.get(each, ())] for name, same in found.items()}

@@ -9,7 +9,7 @@ from jaxtyping import Int32, UInt8
 from matplotlib.colors import hsv_to_rgb
 
 from hilsplat.base.artifacts import read_index, read_npz, sealed
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.errors import ArtifactError, nearest
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.ownership import SOFTWARE, require_own_picture
@@ -138,9 +138,7 @@ def masks_overview(
     views = list(read_index(masks_folder)["views"])
     chosen = view or views[len(views) // 2]
     if chosen not in views:
-        raise ArtifactError(
-            f"{masks_folder} has no view {chosen}", expected=f"one of {', '.join(views[:8])}, ..."
-        )
+        raise ArtifactError(f"{masks_folder} has no view {chosen!r}", expected=nearest(chosen, views))
     masks = HierarchicalMasks.load(masks_folder / f"{chosen}.npz")
     image = Scene.load(scene_folder).image(chosen)
     write_png(out_png, masks_picture(image, masks), text=SOFTWARE)

@@ -12,6 +12,7 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.lineage import require_made_from, sha256_of_file
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.splat.coordinates import source_comments
+from hilsplat.splat.gaussians import base_rgb
 
 
 def readable_nodes(tree: SemanticTree) -> list[dict[str, Any]]:
@@ -73,11 +74,20 @@ def _write(
     out: Path,
     comments: Sequence[str] = (),
 ) -> None:
-    """Copy rows of a PLY, with additional int32 columns, and a comment that states the coordinates."""
+    """Copy rows of a PLY, with a comment that states the coordinates and, if any, additional columns.
+
+    With these, it also has colours, which Gaussian viewers ignore, for programs that read points.
+    """
     from plyfile import PlyData, PlyElement
 
     vertex = PlyData.read(str(ply))["vertex"].data[rows]
-    table = np.empty(len(vertex), [*vertex.dtype.descr, *((name, "<i4") for name in columns)])
+    if columns:
+        rgb = base_rgb(np.stack([vertex[f"f_dc_{band}"] for band in range(3)], axis=1)[:, None])
+        columns = columns | dict(
+            zip(("red", "green", "blue"), np.rint(255 * rgb.T).astype(np.uint8), strict=True)
+        )
+    types = [(name, column.dtype.str) for name, column in columns.items()]
+    table = np.empty(len(vertex), [*vertex.dtype.descr, *types])
     for name in (*vertex.dtype.names, *columns):
         table[name] = columns[name] if name in columns else vertex[name]
     with atomic_path(out) as temporary:

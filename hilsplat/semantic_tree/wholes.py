@@ -117,5 +117,4 @@ def joined(
 
 def _side(share: Float64[np.ndarray, " V"]) -> float:
     """Return the square root of a region's mean area share in the views that show it; 0 if unseen."""
-    visible = share > MIN_SHARE
-    return float(np.sqrt(share.sum() / max(visible.sum(), 1)))
+    return float(np.sqrt(share.sum() / max((share > MIN_SHARE).sum(), 1)))

@@ -4,7 +4,6 @@ import base64
 import io
 import secrets
 import threading
-from collections.abc import Mapping
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -49,8 +48,8 @@ class Viewer:
         routes = [
             *self.files,
             *self.thread.routes(),
-            get("/api/scenes", _scenes),
-            get("/api/variant/{variant}", _variant),
+            get("/api/scenes", ViewerScene.listed),
+            get("/api/variant/{variant}", ViewerScene.described_variant),
             Route("/api/splats/{chunk:int}", self._splats),
             get("/api/nodes/{variant}", _nodes),
             get("/api/crop/{variant}/{node:int}", _crop, behind=True),
@@ -91,26 +90,16 @@ class Viewer:
         return server.answer(await self.thread.do(request, write))
 
 
-def _scenes(shown: ViewerScene, path: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the scenes of the results folder, with the state and date of `hilsplat scenes`."""
-    return shown.listed()
+def _nodes(shown: ViewerScene, variant: str) -> bytes:
+    return payload.packed_nodes(shown.answering(variant).tree, shown.order)
 
 
-def _variant(shown: ViewerScene, path: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the nodes of a variant's semantic tree, in row order."""
-    return shown.described_variant(path["variant"])
-
-
-def _nodes(shown: ViewerScene, path: Mapping[str, Any]) -> bytes:
-    return payload.packed_nodes(shown.answering(path["variant"]).tree, shown.order)
-
-
-def _crop(shown: ViewerScene, path: Mapping[str, Any]) -> Response:
+def _crop(shown: ViewerScene, variant: str, node: int) -> Response:
     """Return a node in the photograph in which it is largest."""
-    scene = shown.answering(path["variant"])
-    node = scene.existing_node(path["node"])
+    scene = shown.answering(variant)
     with shown.unchanged():
-        return server.plain(server.encoded(crop(scene, node)), "image/jpeg", cached=True)
+        picture = crop(scene, scene.existing_node(node))
+        return server.plain(server.encoded(picture), "image/jpeg", cached=True)
 
 
 def _query(shown: ViewerScene, asked: wire.Query) -> payload.Answer:

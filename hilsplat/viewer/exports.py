@@ -51,8 +51,7 @@ def masks_zip(scene: LanguageScene, groups: Sequence[NodeGroup]) -> Steps:
         of_views = mask_files(scene, groups)
         for done, files in enumerate(of_views, 1):
             for name, data in files.items():
-                is_png = name.endswith(".png")
-                place, how = (f"masks/{name}", zipfile.ZIP_STORED) if is_png else (name, None)
+                place, how = (f"masks/{name}", zipfile.ZIP_STORED) if name.endswith(".png") else (name, None)
                 archive.writestr(place, data, how)
             yield done, total
     return content.getvalue()

@@ -119,8 +119,7 @@ def box_corners(rows: Float32[np.ndarray, "n 5 3"]) -> list[list[list[float]]]:
     """Return the eight corners of each stored oriented box (`OrientedBox.corners`, many at once)."""
     unit = OrientedBox.from_array(np.vstack([np.zeros(3), np.eye(3), np.ones(3)])).corners()
     boxes = rows.astype(np.float64)
-    corners = boxes[:, :1] + (unit * boxes[:, 4:]) @ boxes[:, 1:4]
-    return np.round(corners, 5).tolist()
+    return np.round(boxes[:, :1] + (unit * boxes[:, 4:]) @ boxes[:, 1:4], 5).tolist()
 
 
 class FoundNode(TypedDict):

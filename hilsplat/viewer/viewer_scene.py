@@ -169,7 +169,7 @@ class ViewerScene(ShownScene):
         return payload.described_scene(self.scene, self.gaussians) | state
 
     def described_variant(self, variant: str) -> dict[str, Any]:
-        """Describe a variant: its nodes, and the models of its masks and vectors."""
+        """Describe a variant: its nodes, in row order, and the models of its masks and vectors."""
         scene, parts = self.answering(variant), self.parts(variant)
         with self.unchanged():
             models = {"clip": Path(read_index(parts.clip)["model"]).name, "masks": masks_label(parts.masks)}

@@ -6,7 +6,7 @@ Slow work that only needs arrays is returned as a `partial`, and then runs on an
 """
 
 import asyncio
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from functools import partial
@@ -101,7 +101,8 @@ def _state_of(part: Path) -> tuple[int, int, int] | None:
 
 Shown = TypeVar("Shown", bound=ShownScene)
 Result = TypeVar("Result")
-Work = Callable[[Any, Any], Any]  # function of the scene, and of a path's parameters or a validated body
+Work = Callable[..., Any]
+"""Function of the scene, and of a validated body or a path's parameters, which are keywords."""
 
 
 class SceneThread(Generic[Shown]):
@@ -122,7 +123,7 @@ class SceneThread(Generic[Shown]):
         """Return the routes that both pages have."""
         return [
             self.get("/api/scene", self._reopened),
-            self.get("/api/changes", lambda shown, path: shown.news()),
+            self.get("/api/changes", lambda shown: shown.news()),
             self.get("/api/photo/{number:int}", _photo, behind=True),
             self.get("/api/thumb/{number:int}", _thumb, behind=True),
         ]
@@ -153,9 +154,11 @@ class SceneThread(Generic[Shown]):
         worker: ThreadPoolExecutor | None = None,
         behind: bool = False,
     ) -> Response:
-        asked = request.path_params if kind is None else await read(request, kind)
+        body = [] if kind is None else [await read(request, kind)]
         async with self.behind if behind else nullcontext():
-            return answer(await self.do(request, lambda shown: work(shown, asked), worker))
+            return answer(
+                await self.do(request, lambda shown: work(shown, *body, **request.path_params), worker)
+            )
 
     async def do(
         self, request: Request, work: Callable[[Shown], Result], worker: ThreadPoolExecutor | None = None
@@ -199,7 +202,7 @@ class SceneThread(Generic[Shown]):
                 del self.opened[oldest]
         return self.opened[name]
 
-    def _reopened(self, shown: Shown, path: Mapping[str, Any]) -> dict[str, Any]:
+    def _reopened(self, shown: Shown) -> dict[str, Any]:
         """Describe the scene: views, Gaussians, variants; if it has changed, it is reopened."""
         if not shown.changed():
             return shown.described()
@@ -208,14 +211,14 @@ class SceneThread(Generic[Shown]):
         return self.opened[name].described()
 
 
-def _photo(shown: ShownScene, path: Mapping[str, Any]) -> Response:
-    file = shown.scene.image_path(view_name(shown.scene, path["number"]))
+def _photo(shown: ShownScene, number: int) -> Response:
+    file = shown.scene.image_path(view_name(shown.scene, number))
     with shown.unchanged(*shown.photographs):
         return plain(file.read_bytes(), "image/png", cached=True)
 
 
-def _thumb(shown: ShownScene, path: Mapping[str, Any]) -> Response:
-    view = view_name(shown.scene, path["number"])
+def _thumb(shown: ShownScene, number: int) -> Response:
+    view = view_name(shown.scene, number)
     with shown.unchanged(*shown.photographs):
         small = resize_to_fit(shown.scene.image(view), THUMB_PX)
     return plain(encoded(small), "image/jpeg", cached=True)

@@ -6,7 +6,9 @@ import socket
 import webbrowser
 import zlib
 from collections.abc import Callable
+from contextlib import suppress
 from importlib.resources import files
+from threading import Thread
 from typing import Any, TypeVar
 
 import cv2
@@ -38,6 +40,9 @@ STATUS: dict[type, int] = {
 """HTTP status of each error that is sent to the page."""
 
 OWN_PORTS = range(20_000, 30_000)  # ports of pages, below those that Linux and macOS assign to other programs
+
+TEXT_BROWSERS = ("www-browser", "links", "elinks", "lynx", "w3m")
+"""Browsers that take the terminal and cannot show the pages; `webbrowser` finds them on servers."""
 
 Ready = Callable[[str], None]
 """Called once a page can be opened, with the text to print, which contains the address."""
@@ -160,6 +165,7 @@ def serve(
     address = f"http://127.0.0.1:{listening.getsockname()[1]}/?token={token}"
     config = configured(app(token))
     on_ready(f"{about} at {address}\nPress Ctrl-C to stop")
-    if browser:
-        webbrowser.open(address)
+    with suppress(webbrowser.Error):  # none is installed
+        if browser and getattr(webbrowser.get(), "name", "") not in TEXT_BROWSERS:
+            Thread(target=webbrowser.open, args=(address,), daemon=True).start()  # may wait for its end
     uvicorn.Server(config).run(sockets=[listening])

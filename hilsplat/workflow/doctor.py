@@ -122,10 +122,8 @@ def models() -> Iterator[Finding]:
             yield Finding("models", "fault", str(error), f"hilsplat models get {shlex.quote(folder.name)}")
             continue
         sound = f"{folder} works on the CPU{'' if card_problem() else ' and the GPU'}"
-        problem = f"{folder}: {apart}" if apart else ""
-        yield verdict(
-            "models", problem, sound, "set masks.device and clip.device: cpu, and report this output"
-        )
+        fix = "set masks.device and clip.device: cpu, and report this output"
+        yield verdict("models", f"{folder}: {apart}" if apart else "", sound, fix)
     if missing:
         names = " and no ".join(family.upper() for family in sorted(missing))
         problem = f"no {names} for photographs: answers about them are meaningless"
@@ -149,13 +147,12 @@ def space() -> Iterator[Finding]:
     folder = existing_folder(plan.results)
     free, needed = shutil.disk_usage(folder).free / 2**30, disk_mb * 1e6 / 2**30
     text = f"{free:.1f} GiB free in {folder}; results of {len(plan.scenes)} scenes need about {needed:.1f}"
-    problem = "" if free > needed else text
-    yield verdict("disk", problem, text, "free up space, or set results to a folder on another disk")
-    most, rule, scene = memory
-    own = machine_mib()
+    fix = "free up space, or set results to a folder on another disk"
+    yield verdict("disk", "" if free > needed else text, text, fix)
+    (most, rule, scene), own = memory, machine_mib()
     text = f"{own / 1024:.1f} GiB; the largest job, {rule} of {scene}, needs about {most / 1024:.1f}"
-    problem = "" if own > most else text
-    yield verdict("memory", problem, text, "lower poses.max_side_px or gaussians.max_gaussians")
+    fix = "lower poses.max_side_px or gaussians.max_gaussians"
+    yield verdict("memory", "" if own > most else text, text, fix)
 
 
 def writing() -> Iterator[Finding]:

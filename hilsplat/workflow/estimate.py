@@ -60,10 +60,8 @@ class RunEstimate:
         disk_mb, core_s = self.resources.disk_mb(rule, job), self.resources.core_seconds(rule, job)
         card_s, candidates = self.resources.card_seconds(rule, job), self.resources.candidates(rule, job)
         if candidates in self._candidates:  # another variant's job leaves them in the cache
-            core_s, card_s = (
-                START_S + PICTURE_S * self.resources.size(self.resources.plan.row(job)).views,
-                None,
-            )
+            views = self.resources.size(self.resources.plan.row(job)).views
+            core_s, card_s = START_S + PICTURE_S * views, None
         elif candidates is not None:
             self._candidates.add(candidates)
         self._jobs[job.dataset].append(JobEstimate(scene, disk_mb, memory_mb, core_s, card_s))

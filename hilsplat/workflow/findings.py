@@ -181,8 +181,7 @@ def _features(folder: Path, named: Path | None, views: Views, settings: StageSet
     train = [view for view in views.photos if view not in views.held_out]
     found, lost = read_views(features, {view: views.cameras.get(view) for view in train})
     parts.columns["features"] = features.resolve()
-    count = f"{len(found)} of {len(train)} views"
-    parts.lines.append(f"features: {features}: masks and vectors of {count}")
+    parts.lines.append(f"features: {features}: masks and vectors of {len(found)} of {len(train)} views")
     if lost:
         parts.lines.append(f"  left out: {shorten_list(lost, 5)}")
     if not found:
@@ -243,8 +242,7 @@ def _shape_notes(views: Views, view: str, drawn_hw: tuple[int, int], path: Path)
         HilsplatError: labels don't have the shape of their photograph or undistorted view.
     """
     if (camera := views.cameras.get(view)) is None:
-        photo_hw = image_size_hw(views.photos[view], upright=True)
-        camera = Camera(view, np.eye(4), np.eye(3), photo_hw)
+        camera = Camera(view, np.eye(4), np.eye(3), image_size_hw(views.photos[view], upright=True))
     try:
         placement(camera, drawn_hw, f"label file {path}")
     except MisalignedArtifactError as error:

@@ -416,8 +416,7 @@ class Plan:
                 waiting += stage.inputs
         sections = {name for stage in stages.values() for name in stage.sections.values()}
         values = {name: getattr(settings, name) for name in sorted(sections)}
-        is_random = any(section.is_random for section in values.values())
-        seed = self.run.seed_of(variant) if is_random else None
+        seed = self.run.seed_of(variant) if any(each.is_random for each in values.values()) else None
         return Identity(tuple(sorted(stages)), tuple(values.items()), seed)
 
     def scopes(self, row: SceneRow) -> tuple[str, ...]:
@@ -488,8 +487,7 @@ class Plan:
 
     def crops_tree(self, job: VariantJob) -> list[str]:
         """Return the input of `clip`: the semantic tree that selects crops; empty to embed all masks."""
-        by_node = self.stages(job).clip.crops == "nodes"
-        return [self.shared_path("semantic_tree", job)] if by_node else []
+        return [self.shared_path("semantic_tree", job)] if self.stages(job).clip.crops == "nodes" else []
 
     def first_code(self, job: VariantJob) -> list[str]:
         """Return the input of `autoencoder`: the code of the same masks with levels by head, if there is one.
@@ -587,6 +585,21 @@ def require_variant_sections(run: RunSettings) -> None:
                     expected=f"one of {', '.join(sorted(sections))}",
                     fix="put it under overrides for a group or a scene, or in a separate configuration",
                 )
+
+
+def without_effect(plan: Plan, given: Mapping[str, Any]) -> list[str]:
+    """Return a line for each setting of a configuration's layer that `overrides` replace in all scenes."""
+    scopes, lines = list(dict.fromkeys(plan.scopes(row) for row in plan.scenes)), []
+    for section in (name for name in SECTIONS if given.get(name)):
+        own = getattr(plan.run, section)
+        used = [getattr(plan.run.stages(scopes=each), section) for each in scopes]
+        for name in given[section]:
+            if all(getattr(each, name, None) != getattr(own, name) for each in used):
+                places = [each for each in reversed(scopes[0]) if section in plan.run.overrides[each]]
+                place = max(places, key=lambda each: name in plan.run.overrides[each][section])
+                key = f"{section}.{name}"
+                lines.append(f"{key} has no effect, because overrides.{place}.{key} replaces it")
+    return lines
 
 
 def without_scene(run: RunSettings, rows: Iterable[SceneRow]) -> list[str]:

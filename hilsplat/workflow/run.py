@@ -29,10 +29,10 @@ from hilsplat.base.errors import HilsplatError, SettingsError, nearest
 from hilsplat.base.files import INSTALLED, project_path
 from hilsplat.base.processes import PARENT, end_with_workflow, lock, remove_leftovers
 from hilsplat.base.removal import delete
-from hilsplat.configuration import CONFIG, first_unusable, merged_config, parse_run
+from hilsplat.configuration import CONFIG, SECTIONS, first_unusable, merged_config, parse_run, read_config
 from hilsplat.scene.sheet import DEFAULT_SHEET, SceneRow, is_pattern, matches_of, read_sheet
 from hilsplat.workflow.estimate import forecasts
-from hilsplat.workflow.plan import Plan
+from hilsplat.workflow.plan import Plan, without_effect
 from hilsplat.workflow.records import outdated
 from hilsplat.workflow.summary import summary
 
@@ -162,6 +162,7 @@ def run(
         fix = "change to that folder first (cd), or pass --config results=FOLDER"
         raise HilsplatError("hilsplat run works in the current folder; --directory is refused", fix=fix)
     configs = [_config_file(path) for path in (*configs, *given.configfile)]
+    given.config = [_nested(word) for word in given.config]
     try:  # as Snakemake does: values are strings, and mappings of one key are merged
         words = [word.partition("=") for word in given.config]
         overrides = [{key: yaml.load(value, yaml.BaseLoader)} for key, _, value in words]
@@ -186,6 +187,11 @@ def run(
         given.config.append(f"only={json.dumps(scenes)}")
         settings["only"] = scenes
     plan = Plan(settings)
+    for layer in (_edited(), *map(read_config, configs)):
+        for line in without_effect(plan, layer):
+            logger.warning("%s", line)
+    for line in (line for layer in overrides for line in without_effect(plan, layer)):
+        raise SettingsError(f"--config: {line}", fix="set the other key instead")
     command = ["snakemake", "--snakefile", str(_snakefile(configs)), *others]
     command += ["--configfile", *map(str, configs)] if configs else []
     command += ["--config", *given.config] if given.config else []
@@ -213,14 +219,33 @@ def run(
     return 0
 
 
+def _edited() -> dict[str, dict[str, Any]]:
+    """Return the settings of the project's config.yaml that differ from the installed one."""
+    own, installed = read_config(project_path(CONFIG)), read_config(INSTALLED / CONFIG)
+    return {
+        section: {name: each for name, each in values.items() if installed.get(section, {}).get(name) != each}
+        for section, values in own.items()
+        if section in SECTIONS and values
+    }
+
+
+def _nested(word: str) -> str:
+    """Return `gaussians={"iterations": 300}` for `gaussians.iterations=300`; other words are unchanged."""
+    key, equals, value = word.partition("=")
+    first, *names = key.split(".")
+    for name in reversed(names):
+        value = f"{{{json.dumps(name)}: {value}}}"
+    return first + equals + value if equals else word
+
+
 def _config_file(name: Path) -> Path:
     """Return the path of a configuration file; `ci` means `config/ci.yaml`, here or in the installation."""
     named = CONFIG.with_name(f"{name.name}.yaml")
-    if name.suffix or len(name.parts) != 1 or name.exists():
-        return project_path(name)
-    if "=" in str(name):
+    if "=" in str(name) and not name.exists():
         command = f"hilsplat run -- --config {shlex.quote(str(name))}"
         raise SettingsError(f"{name} is not a file", fix=f"pass keys after --: {command}")
+    if name.suffix or len(name.parts) != 1 or name.exists():
+        return project_path(name)
     if not (found := project_path(named)).exists():
         known = {
             path.stem for folder in (Path(), INSTALLED) for path in (folder / named).parent.glob("*.yaml")

@@ -265,8 +265,7 @@ def curtain(b: Builder) -> None:
         hem = panel.subpart("hem, border")
         for i in range(folds):
             y = side * (opening / 2 + (i + 0.5) * fold)
-            swell = b.between(0.8, 1.1)
-            oval = (0.036 * swell / 0.06, fold * 0.6 / 0.06, 1.0)
+            oval = (0.036 * b.between(0.8, 1.1) / 0.06, fold * 0.6 / 0.06, 1.0)
             panel.put(cloth, cylinder(0.06, hem_height, drop + 0.065, 18).scaled(*oval).moved(0.075, y, 0))
             hem.put(trim, cylinder(0.063, 0, hem_height + 0.004, 18).scaled(*oval).moved(0.075, y, 0))
         middle = side * (opening / 2 + folds * fold / 2)

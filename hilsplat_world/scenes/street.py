@@ -178,8 +178,7 @@ def build_street(seed: int, objects: int) -> WorldScene:
         "scene street:%d: %d of %d vehicles and people placed (%s), %d pieces of furniture, %d buildings",
         seed, len(placed), objects, ", ".join(thing.name for thing in placed), furniture, houses,
     )  # fmt: skip
-    style = _daylight(np.random.default_rng([seed, 24]))
-    return street.assembly.finished(objects, placed, style)
+    return street.assembly.finished(objects, placed, _daylight(np.random.default_rng([seed, 24])))
 
 
 def _add_buildings(street: _Street) -> int:
@@ -295,8 +294,7 @@ def _daylight(rng: np.random.Generator) -> Style:
     sun *= SUN_DISTANCE**2 / 13.0
     sky = np.array([0.40, 0.45, 0.54]) * rng.uniform(0.9, 1.1)
     ground = sky * np.array([0.62, 0.56, 0.48])
-    exposure = float(rng.uniform(1.0, 1.15))
-    return Style.of(SUN_DISTANCE * toward, 14.0, sun, sky, ground, exposure, SCALE, 45.0)
+    return Style.of(SUN_DISTANCE * toward, 14.0, sun, sky, ground, float(rng.uniform(1.0, 1.15)), SCALE, 45.0)
 
 
 def drive_sights(scene: WorldScene, views: int, arc_deg: float | int) -> tuple[list[Sight], float]:
@@ -307,8 +305,7 @@ def drive_sights(scene: WorldScene, views: int, arc_deg: float | int) -> tuple[l
     because a drive is not a ring.
     """
     rng, pitch_rng = np.random.default_rng([scene.seed, 25]), np.random.default_rng([scene.seed, 26])
-    length = DRIVE_X[1] - DRIVE_X[0]
-    step = min(MAX_STEP, length / max(1, views - 1))
+    step = min(MAX_STEP, (DRIVE_X[1] - DRIVE_X[0]) / max(1, views - 1))
     start = (DRIVE_X[0] + DRIVE_X[1] - step * (views - 1)) / 2
     sights = []
     for i in range(views):

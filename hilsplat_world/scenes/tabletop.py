@@ -185,8 +185,7 @@ def _lamplight(rng: np.random.Generator) -> Style:
     position = np.array([away * np.cos(azimuth), away * np.sin(azimuth), rng.uniform(3.2, 4.2)])
     radius = float(rng.uniform(0.25, 0.75))
     ground = sky * np.array([0.58, 0.5, 0.42])
-    exposure = float(rng.uniform(1.15, 1.5))
-    return Style.of(position, radius, light, sky, ground, exposure)
+    return Style.of(position, radius, light, sky, ground, float(rng.uniform(1.15, 1.5)))
 
 
 def ring_sights(scene: WorldScene, views: int, arc_deg: float | int) -> tuple[list[Sight], float]:

@@ -111,8 +111,7 @@ def compared_pixels(
             boxes[row, head + 1] = (
                 max(0, x0 - MARGIN), max(0, y0 - MARGIN), min(width, x1 + MARGIN), min(height, y1 + MARGIN)
             )  # fmt: skip
-    component = np.arange(count) % 4
-    drawn = boxes[:, component]  # (P, K, 4)
+    drawn = boxes[:, np.arange(count) % 4]  # (P, K, 4)
     x = (drawn[..., 0] + rng.random(drawn.shape[:2]) * (drawn[..., 2] - drawn[..., 0])).astype(np.int64)
     y = (drawn[..., 1] + rng.random(drawn.shape[:2]) * (drawn[..., 3] - drawn[..., 1])).astype(np.int64)
     b = boxes[:, None]  # (P, 1, 4, 4)

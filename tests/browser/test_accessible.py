@@ -62,6 +62,10 @@ def test_the_picture_and_controls_are_large_enough_with_large_text_and_on_a_phon
     box = page.locator("#view").bounding_box()
     assert box["height"] > 250 and box["width"] > 300
     assert page.evaluate("document.documentElement.scrollWidth") <= 640
+    page.locator("#save summary").click()
+    menu = page.get_by_role("group", name="Save").bounding_box()
+    assert menu["y"] + menu["height"] <= 360
+    page.keyboard.press("Escape")
     assert page.phone_fits()
     low = """[...document.querySelectorAll('#tools select, #tools summary, #tools button, #views button')]
         .filter((each) => each.getBoundingClientRect().height > 0 && each.getBoundingClientRect().height < 24)

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import zipfile
+from urllib.parse import urlencode
 
 import av
 import pytest
@@ -39,6 +40,16 @@ def test_kept_queries_have_colours_and_can_be_hidden_and_dropped(opened, desk_ad
     assert show.get_attribute("aria-pressed") == "false"
     page.wait_for_timeout(900)
     assert page.chips().count() == 1
+    asked = [("keep", json.dumps({"text": text, "level": "auto"})) for text in ("word " * 60, *"abcdefghijk")]
+    page = page.beside(f"{page.url.partition('#')[0]}#{urlencode(asked)}")
+    page.until(lambda: page.chips().count() == 12)
+    colours = page.locator("#kept .swatch").evaluate_all("all => all.map((one) => one.style.cssText)")
+    assert len(set(colours)) == 12
+    for button in (page.locator("#kept .swatch"), page.get_by_role("button", name=re.compile("Remove"))):
+        assert all(box >= 20 for box in button.evaluate_all("all => all.map((one) => one.offsetWidth)"))
+    page.ask_and_wait("book")
+    page.get_by_role("button", name="Keep").click()
+    page.get_by_text("At most 12 queries can be kept").wait_for()
 
 
 def test_the_overlap_of_two_queries_is_reported(opened, desk_address):

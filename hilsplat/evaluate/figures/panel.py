@@ -203,8 +203,7 @@ def draw_queries(
     rule = rule_of(evaluate)
     for axes, row in zip(grid, track(rows, "queries drawn"), strict=True):
         image = answers.views.image(row.view)
-        last = row.path[-1]
-        relevancy = np.asarray(answers.field.relevancy([last], row.view))[0]
+        relevancy = np.asarray(answers.field.relevancy(row.path[-1:], row.view))[0]
         hits = row.hits(answers)
         level = row.level or hits.level
         smoothed = SmoothedRelevancy.of(relevancy, rule)

@@ -68,8 +68,7 @@ def miou_over_occurring(counts: ClassCounts, among: Bool[np.ndarray, " K"] | Non
     A class that is only predicted counts as 0. Source: ScanNet/ScanNet `evaluate_semantic_label.py`, pooled
     over all scans. `among` selects classes, such as the head, common or tail of ScanNet200.
     """
-    ious = class_iou(counts)
-    return _mean(ious[(counts.union > 0) & (True if among is None else among)])
+    return _mean(class_iou(counts)[(counts.union > 0) & (True if among is None else among)])
 
 
 def miou_over_all(counts: ClassCounts) -> float:

@@ -82,8 +82,7 @@ def threshold_mask(
     if on == "raw":
         return relevancy > threshold
     shifted = relevancy - relevancy.min()
-    normalised = shifted / (shifted.max() + 1e-9)
-    return np.clip(2 * normalised - 1, 0, 1) > threshold
+    return np.clip(2 * (shifted / (shifted.max() + 1e-9)) - 1, 0, 1) > threshold
 
 
 def majority_smooth(mask: Bool[np.ndarray, "H W"], border: Border = "langsplat") -> Bool[np.ndarray, "H W"]:

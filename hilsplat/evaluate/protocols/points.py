@@ -166,8 +166,7 @@ def measure_instances(
         parts[f"ap_{split}"] = precisions[np.array(members), :-1]
     protocol = INSTANCES.labelled([f"points: {carried}"])
     for metric, part in parts.items():
-        value = instances.mean_precision(part)
-        yield Measured(method, "", "", metric, protocol, value, len(scans))
+        yield Measured(method, "", "", metric, protocol, instances.mean_precision(part), len(scans))
 
 
 def classes_of_points(

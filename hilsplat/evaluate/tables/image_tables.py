@@ -51,8 +51,7 @@ def frames_blocks(_: TableKind, sources: Sources) -> list[Block]:
             texts.setdefault((row.dataset, row.scene, row.view), set()).add((row.query, row.level))
     views: dict[str, dict[str, list[str]]] = {}
     for (dataset, scene, view), of_view in sorted(texts.items()):
-        name = view.rpartition(".")[0] or view
-        cell = f"{name} ({counted(len(of_view), 'text')})"
+        cell = f"{view.rpartition('.')[0] or view} ({counted(len(of_view), 'text')})"
         views.setdefault(dataset, {}).setdefault(scene, []).append(cell)
     blocks = []
     for dataset, of_scenes in views.items():

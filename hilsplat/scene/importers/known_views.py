@@ -258,8 +258,7 @@ def read_colmap(known: KnownPoses) -> Source:
         if image.camera_id not in model.lenses:
             raise SceneError(f"view {image.name} has camera {image.camera_id}, which the model lacks")
         camera = as_camera(model.lenses[image.camera_id])
-        is_test = image.name in held_out
-        return KnownView(image.name, files[image.name], camera, image.cam_from_world, is_test)
+        return KnownView(image.name, files[image.name], camera, image.cam_from_world, image.name in held_out)
 
     num_lost = 0
     for image in sorted(model.images, key=lambda image: image.name):

@@ -8,8 +8,6 @@ import { inOrder } from "./latest.js";
 import { answererOf, failed, keptIn, level, main, page, panes, start, tell, threshold, variantOf } from "./state.js";
 import { KEPT, shownHits } from "./styles.js";
 
-const MOST = 12;
-
 // A query's settings without its answerer.
 export const asking = (text) => ({ text, level: level(), ...(threshold() === null ? {} : { threshold: threshold() }),
   ...($("here").checked && page.camera.view >= 0 ? { view: page.camera.view } : {}) });
@@ -20,17 +18,13 @@ async function answered(query) {
   query.answers = answers;
 }
 
-// Return the colour used by the fewest kept queries.
-function freeColour() {
-  const used = KEPT.map((_, k) => page.kept.filter((query) => query.colour === k).length);
-  return used.indexOf(Math.min(...used));
-}
+const freeColour = () => KEPT.findIndex((_, k) => page.kept.every((query) => query.colour !== k));
 
 const next = inOrder(failed);   // of two at once, the second finds the first
 export const keep = (asked, shown = true) => next(() => keepNext(asked, shown));
 
 async function keepNext(asked, shown) {
-  if (page.kept.length >= MOST) { tell(`At most ${MOST} queries can be kept: remove one first.`, true); return false; }
+  if (page.kept.length >= KEPT.length) { tell(`At most ${KEPT.length} queries can be kept: remove one first.`, true); return false; }
   const same = page.kept.findIndex((query) => JSON.stringify(query.asked) === JSON.stringify(asked)), query = same < 0 ? { asked, shown, colour: freeColour() } : page.kept[same];
   await answered(query);
   if (same < 0) page.kept.push(query);

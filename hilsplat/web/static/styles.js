@@ -3,8 +3,9 @@
 export const ANSWER = [255, 122, 0], CHOSEN = [58, 150, 255], HOVER = [255, 225, 70], SHARED = [255, 255, 255];
 // Gaussians selected for editing, and the weight of their colour.
 export const MARKED = [255, 0, 160], MARKED_SHARE = 0.7;
-// Colours of kept queries.
-export const KEPT = [[0, 200, 140], [235, 120, 200], [70, 215, 235], [180, 215, 50], [160, 120, 255], [235, 80, 80]];
+// Colours of kept queries, of which there are at most as many.
+export const KEPT = [[0, 200, 140], [235, 120, 200], [70, 215, 235], [180, 215, 50], [160, 120, 255], [235, 80, 80],
+  [0, 105, 75], [145, 45, 110], [15, 105, 145], [100, 120, 0], [80, 40, 180], [145, 25, 30]];
 const STOPS = [[0, 0, 4], [31, 12, 72], [85, 15, 109], [136, 34, 106], [186, 54, 85], [227, 89, 51], [249, 140, 10], [249, 201, 50], [252, 255, 164]];
 
 export const RAMP = (() => {

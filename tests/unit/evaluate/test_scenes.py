@@ -56,6 +56,12 @@ def test_each_scene_has_a_row_with_what_its_run_has_computed(results, capsys):
     assert printed[0].split() == ["scene", "state", "views", "PSNR", "mIoU", "MB", "date", "models"]
     assert printed[3].split()[:6] == ["rooms/one", "tree,", "field", "6", "21.46", "0.6500"]
     assert printed[3].endswith(f"{date}  graph, colours")
+    write_json(
+        results / "rooms/one/gaussians/report.json", {"psnr_db": 33.4, "gaussians": 864, "split": "train"}
+    )
+    app(["scenes", "rooms/one", "--results", str(results)], standalone_mode=False)
+    assert "33.40 (training)" in capsys.readouterr().out
+    write_json(results / "rooms/one/gaussians/report.json", {"psnr_db": 21.456, "gaussians": 864})
     scores = results / "rooms/one/default/scores.csv"  # of an earlier release
     scores.write_text(scores.read_text().replace("lerf/tree-nodes@6", "lerf/tree-nodes@5"))
     app(["scenes", "rooms/o*", "--results", str(results)], standalone_mode=False)

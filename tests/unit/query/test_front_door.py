@@ -143,7 +143,7 @@ def test_the_example_of_the_docs_runs(named_desk, project, monkeypatch, capsys):
 
 
 def test_query_reports_the_answer_and_saves_its_masks_and_compressed_gaussians(desk, elsewhere, capsys):
-    run("query", str(desk), "mug > handle", "--out", "answer", "--masks", "masks", "--spz")
+    run("query", str(desk), "mug", ">", "handle", "--out", "answer", "--masks", "masks", "--spz")
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "1 answer to 'mug > handle' in photos/desk; lengths in scene units"
     assert lines[2].split()[1] == "part"
@@ -219,22 +219,34 @@ def test_a_clean_export_leaves_out_gaussians_of_no_node(copied, elsewhere, capsy
     ("command", "option", "purpose"),
     [
         *(
-            (("query", "DESK", "mug", "--all", *option.split()), option.split()[0], "queries of one scene")
+            (
+                ("query", "DESK", "mug", "--all", *option.split()),
+                option.split()[0],
+                "one scene, without --all",
+            )
             for option in ("--masks m", "--spz", "--out o", "--view 0", "--views 2", "--answerer tree")
         ),
-        (("query", "DESK", "mug", "--json"), "--json", "queries of all scenes"),
-        (("query", "DESK", "mug", "--limit", "3"), "--limit", "queries of all scenes"),
+        (("query", "DESK", "mug", "--json"), "--json", "--all"),
+        (("query", "DESK", "mug", "--limit", "3"), "--limit", "--all"),
         (("export", "DESK", "--as", "colmap", "--variant", "nope"), "--variant", "--as tree, --as langsplat"),
         (("export", "DESK", "--as", "ply", "--variant", "nope"), "--variant", "--as tree, --as langsplat"),
         (("export", "DESK", "--as", "tree", "--data-root", "."), "--data-root", "--as labels"),
-        (("models", "check", "--variant", "fp16"), "--variant", "the check of one folder"),
-        (("cache", "prune", "--stage", "masks"), "--stage", "entries beyond a limit"),
+        (("models", "check", "--variant", "fp16"), "--variant", "one folder"),
+        (("cache", "prune", "--stage", "masks"), "--stage", "--days or --max-mib"),
     ],
 )
 def test_options_without_effect_are_refused(desk, elsewhere, command, option, purpose):
-    with pytest.raises(SettingsError, match=f"{option} is for {purpose}"):
+    with pytest.raises(SettingsError, match=f"{option} is for {purpose}(.|\n)*fix +use {purpose}"):
         run(*(str(desk) if word == "DESK" else word for word in command))
     assert not list(elsewhere.iterdir()) and not (desk / "export").exists()
+
+
+@pytest.mark.parametrize(
+    "command", [("query", "mug"), ("view", "--no-browser"), ("annotate", "--no-browser")]
+)
+def test_a_variant_that_does_not_exist_is_refused(desk, elsewhere, command):
+    with pytest.raises(ArtifactError, match=r"has no variant 'defalt'(.|\n)*did you mean 'default'"):
+        run(command[0], str(desk), *command[1:], "--variant", "defalt")
 
 
 @pytest.mark.parametrize(("out", "masks"), [("a", "a"), ("a/b", "a"), ("a", "a/panel.png"), ("a/../c", "c")])
@@ -263,6 +275,9 @@ def test_a_scene_is_found_by_its_name_alone(desk_project, tmp_path):
         ("view", "dask", "--no-browser"),
         ("annotate", "photos/dask"),
         ("export", "dask"),
+        ("datasets", "fits", "dask"),
+        ("blocks", "split", "dask", "--blocks", "2"),
+        *(("world", command, "dask") for command in ("show", "masks", "inconsistency", "semantic-tree")),
     ],
 )
 def test_a_wrong_scene_name_suggests_the_right_one_in_every_command(desk_project, monkeypatch, command):
@@ -276,6 +291,9 @@ def test_a_wrong_scene_name_suggests_the_right_one_in_every_command(desk_project
     ):
         with pytest.raises(ArtifactError, match="did you mean 'photos/desk'"):
             open_it()
+    monkeypatch.chdir("tests")
+    with pytest.raises(ArtifactError, match=r"is missing(.|\n)*change to the folder of the project"):
+        run(*command)
 
 
 def test_export_writes_the_tree_to_any_folder_without_files(desk, elsewhere, capsys):

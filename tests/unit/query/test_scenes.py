@@ -68,7 +68,8 @@ def test_answers_are_those_of_each_scene_alone_best_scene_first(results, opened,
 
 
 def test_a_pattern_a_limit_and_a_threshold_restrict_the_answers_of_a_small_index(results):
-    rooms = hilsplat.open_scenes(results, "rooms/*")
+    rooms = hilsplat.open_scenes(results, "rooms")  # a data set
+    assert str(rooms.found) == str(hilsplat.open_scenes(results, "rooms/*").found)
     assert {hit.scene.partition("/")[0] for hit in rooms.query("mug", limit=SCENES)} == {"rooms"}
     assert len(rooms.query("mug", limit=3)) == 3
     assert [found.name for found in hilsplat.open_scenes(results, "desk-3").found] == ["rooms/desk-3"]
@@ -148,5 +149,7 @@ def test_the_command_prints_a_table_or_json(changed, capsys):
     (row,) = json.loads(capsys.readouterr().out)
     assert (row["scene"], row["level"]) == ("photos/desk-4", "whole")
     assert row["doubts"] == ["'unicorn' may not be in the scene: the model's vocabulary lacks 'unicorn'"]
-    with pytest.raises(SettingsError, match="there is no text to search for in mug"):
+    with pytest.raises(SettingsError, match="there is no text to search for in desk-4"):
+        app(["query", "desk-4", *place], standalone_mode=False)
+    with pytest.raises(ArtifactError, match=r"mug is missing(.|\n)*photos/desk-4"):
         app(["query", "mug", *place], standalone_mode=False)

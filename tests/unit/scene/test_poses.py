@@ -181,9 +181,13 @@ def test_the_picture_has_a_row_for_each_lost_view(tmp_path):
     lost = {"registered": False, "file": "a.jpg", "why_not": "too few matches: none"}
     near = [{"view": "2.png", "matches": 20}]
     views = {"0.png": {**lost, "belongs_near": near}, "1.png": {**lost, "belongs_near": []}}
-    report = {"images": 3, "views": {**views, "2.png": {"registered": True}}}
-    plot_lost(tmp_path / "lost.png", tmp_path, report)
-    assert Image.open(tmp_path / "lost.png").size == (1200, 120 + 2 * 210)
+    pictures = []
+    for file in ("b.jpg", "c.jpg"):  # titles are names of the user's files
+        report = {"images": 3, "views": {**views, "2.png": {"registered": True, "file": file}}}
+        plot_lost(tmp_path / file, tmp_path, report)
+        pictures.append((tmp_path / file).read_bytes())
+    assert Image.open(tmp_path / "b.jpg").size == (1200, 120 + 2 * 210)
+    assert pictures[0] != pictures[1]
 
 
 def test_an_unrelated_photograph_is_shown_in_the_report(tmp_path):

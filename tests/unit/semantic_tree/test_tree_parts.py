@@ -14,6 +14,7 @@ from hilsplat.semantic_tree.export import write_selection_ply, write_tree_ply
 from hilsplat.semantic_tree.guided_masks import guided_points
 from hilsplat.semantic_tree.nodes import nest_nodes, renumbered_without_empty
 from hilsplat.semantic_tree.tree import OrientedBox, ViewNodes, oriented_box
+from hilsplat.splat.gaussians import base_rgb
 from hilsplat.splat.ply import load_ply, save_ply
 from tests.unit.evaluate.plain_tree import plain_tree
 from tests.unit.round_gaussians import round_gaussians
@@ -90,8 +91,12 @@ def test_an_exported_tree_or_selection_is_a_valid_3dgs_ply(tmp_path):
     for level in Level:
         assert np.array_equal(vertex[f"node_{level.label}"], nodes[:, level.index])
     np.testing.assert_array_equal(load_ply(out).means, means)
-    write_selection_ply(ply, np.array([1, 3]), tmp_path / "selection.ply")
-    assert load_ply(tmp_path / "selection.ply").means[:, 0].tolist() == [3, 9]
+    write_selection_ply(ply, np.array([1, 3]), tmp_path / "selection.ply", np.ones(2, np.int32))
+    selected = load_ply(tmp_path / "selection.ply")
+    assert selected.means[:, 0].tolist() == [3, 9]
+    for name, expected in zip(("red", "green", "blue"), base_rgb(selected.sh).T, strict=True):
+        found = PlyData.read(tmp_path / "selection.ply")["vertex"][name]
+        assert found.dtype == np.uint8 and np.array_equal(found, np.rint(255 * expected))
     save_ply(ply, round_gaussians(means + 1))  # as many Gaussians
     with pytest.raises(MisalignedArtifactError, match=r"semantic tree was not made from .*\.ply"):
         write_tree_ply(ply, tree, out)

@@ -1,11 +1,19 @@
-"""Ports of the pages."""
+"""Ports of the pages, and the browser that opens them."""
 
+import os
+import re
+import signal
 import socket
+import subprocess
+import sys
+import time
+from urllib.request import urlopen
 
 import pytest
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.web.server import listening_at
+from tests.conftest import PROJECT
 
 
 def test_a_taken_port_is_refused_and_a_free_one_sends_without_delay():
@@ -13,3 +21,24 @@ def test_a_taken_port_is_refused_and_a_free_one_sends_without_delay():
         listening_at(taken.getsockname()[1])
     with listening_at(0) as listening:  # asyncio turns off Nagle's algorithm only for this protocol
         assert listening.proto == socket.IPPROTO_TCP
+
+
+@pytest.mark.parametrize("name", ["w3m", "firefox"])
+def test_the_page_is_served_while_a_browser_waits(desk, tmp_path, name):
+    (tmp_path / name).write_text('#!/bin/sh\necho opened > "$0.txt"\nexec sleep 25\n')
+    (tmp_path / name).chmod(0o700)
+    kept = {key: value for key, value in os.environ.items() if "DISPLAY" not in key and key != "BROWSER"}
+    environment = {**kept, "PATH": f"{tmp_path}:/bin", "TERM": "xterm", "PYTHONPATH": str(PROJECT)}
+    if name == "firefox":
+        environment["BROWSER"] = str(tmp_path / name)
+    command = [sys.executable, "-u", "-c", "from hilsplat.cli.main import main; main()", "view", str(desk)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as server:
+        try:
+            address = re.search(r"http://\S+", server.stdout.readline()).group()
+            with urlopen(address, timeout=20) as reply:
+                assert reply.status == 200
+            while name == "firefox" and not (tmp_path / "firefox.txt").exists():
+                time.sleep(0.1)
+        finally:
+            server.send_signal(signal.SIGINT)
+    assert not (tmp_path / "w3m.txt").exists()

@@ -1,6 +1,7 @@
 """`hilsplat run` before Snakemake starts: locks, recovery, options."""
 
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -228,10 +229,33 @@ def test_a_run_records_installed_configurations_by_name_for_the_commands_of_mess
 def test_values_on_the_command_line_are_read_as_snakemake_reads_them(folder, started, monkeypatch):
     plans: list[Plan] = []
     monkeypatch.setattr(runs, "outdated", lambda plan, **_: plans.append(plan) or {})
-    values = ["results=2026-11-30", "masks={levels: tree}", "masks={theta: 0.8}"]
+    values = ["results=2026-11-30", "masks={levels: tree}", "masks={theta: 0.8}", "masks.min_area_px=5"]
     runs.run([], [], ["-n", "--config", *values])
     masks = plans[0].run.masks
     assert (plans[0].run.results, masks.levels, masks.theta) == ("2026-11-30", "tree", 0.8)
+    assert masks.min_area_px == 5 and 'masks={"min_area_px": 5}' in started[0]
+
+
+def test_a_setting_that_overrides_replace_in_all_scenes_is_refused_or_reported(folder, started, caplog):
+    text = "variants: {}\noverrides: {benchmark: {masks: {theta: 0.7}}}\n"
+    text += "masks: {points_per_side: 32}\nevaluate: {methods: [tree]}\n"
+    Path("config/config.yaml").write_text(text)
+    line = r"masks\.theta has no effect, because overrides\.benchmark\.masks\.theta replaces it"
+    with pytest.raises(SettingsError, match=line):
+        runs.run(["two"], [], ["-n", "--config", "masks.theta=0.8"])
+    runs.run([], [], ["-n", "--config", "masks.theta=0.7", "masks.min_area_px=5"])
+    runs.run([], [], ["-n", "--config", "overrides.benchmark.masks.theta=0.8"])
+    assert len(started) == 2 and not caplog.text
+    methods = ["method={name: langsplat, steps: 50}", "overrides={benchmark: {method: {name: lifted}}}"]
+    with pytest.raises(SettingsError, match=r"method\.name has no effect"):
+        runs.run([], [], ["-n", "--config", *methods])
+    Path("config/mine.yaml").write_text("masks: {theta: 0.8, min_area_px: 5}\n")
+    runs.run([], [Path("mine")], ["-n"])
+    assert re.search(line, caplog.text) and "min_area_px" not in caplog.text
+    caplog.clear()
+    Path("config/config.yaml").write_text(text.replace("masks: {points", "masks: {theta: 0.6, points"))
+    runs.run([], [], ["-n"])
+    assert re.search(line, caplog.text)
 
 
 def test_the_snakefile_is_beside_the_configuration_or_the_installed_one(
