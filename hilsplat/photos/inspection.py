@@ -14,7 +14,10 @@ from hilsplat.scene.features import exif_focal_px
 from hilsplat.scene.layouts import has_known_poses, photo_folder
 from hilsplat.scene.view_names import view_names
 
-OTHER_PHOTO_SUFFIXES = frozenset({".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".gif", ".jxl"})
+OTHER_PHOTO_SUFFIXES = frozenset(
+    {".dng", ".nef", ".nrw", ".cr2", ".cr3", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".gpr"}
+    | {".insp", ".jp2", ".exr", ".hdr", ".psd", ".gif", ".jxl"}
+)
 """Suffixes of unsupported photograph formats. Such files are counted and reported as skipped."""
 
 

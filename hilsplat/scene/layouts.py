@@ -16,7 +16,10 @@ from hilsplat.base.lineage import visible_files
 TRAINED = ("output", "outputs", "exports", "language_features")
 """Folders that 3DGS, nerfstudio and LangSplat write beside photographs."""
 
-MAPS = ("label", "segmentations", "test_mask", "mask", "masks", "depth", "depths", "normals")
+MAPS = (
+    *("label", "labels", "label-filt", "instance", "instance-filt", "segmentations", "confidence"),
+    *("test_mask", "mask", "masks", "resized_anon_masks", "depth", "depths", "depth_maps", "normals"),
+)
 """Folders of labels and maps, whose files are named after the photographs. Scaled copies are in `masks_4`."""
 
 UNUSED = (*TRAINED, *MAPS)
@@ -37,7 +40,7 @@ DATAPARSER = "dataparser_transforms.json"
 EXPORTED = ("exports/*/splat.ply", "exports/splat.ply", "splat.ply", "point_cloud.ply")
 """Paths of a PLY exported by nerfstudio or a viewer; a PLY written by 3DGS is preferred."""
 
-UNREAD_GAUSSIANS = (".spz", ".splat", ".ksplat", ".sog", ".glb", ".gltf")
+UNREAD_GAUSSIANS = (".spz", ".splat", ".ksplat", ".sog", ".lcc", ".psht", ".usdz", ".glb", ".gltf")
 """Suffixes of other formats of Gaussians, which are not read."""
 
 HEADER_BYTES = 2**14  # maximum length of the part of a PLY's header that is searched
@@ -157,8 +160,8 @@ def photo_folder(folder: Path) -> Path:
     """Return the folder of a source's photographs.
 
     It is the source itself or, if that has fewer images, its `images/` or `input/` (in any case); else a
-    phone export's images; else the only folder with images up to two levels below. Of several such folders,
-    none is chosen (`folders_with_images` lists them).
+    phone export's images; else the only folder with images up to two levels below, maps apart. Of several
+    such folders, none is chosen (`contents` lists them).
     """
     num_images = len(list_images(folder))
     for name in PHOTO_FOLDERS:
@@ -169,8 +172,8 @@ def photo_folder(folder: Path) -> Path:
         return folder
     if export := polycam_folders(folder) or record3d_export(folder):
         return export[0]
-    folders = folders_with_images(folder)
-    return next(iter(folders)) if len(folders) == 1 else folder
+    below = {path.parent for path in used_images(folder) if len(path.relative_to(folder).parts) <= 3}
+    return below.pop() if len(below) == 1 else folder
 
 
 def images_below(folder: Path) -> list[Path]:
@@ -183,25 +186,16 @@ def used_images(folder: Path) -> list[Path]:
     return [
         path
         for path in images_below(folder)
-        if re.sub(r"_\d$", "", path.relative_to(folder).parts[0].lower()) not in UNUSED
+        if all(re.sub(r"_\d$", "", part.lower()) not in UNUSED for part in path.relative_to(folder).parts)
     ]
-
-
-def folders_with_images(folder: Path) -> dict[Path, int]:
-    """Return the number of images of each folder with images, up to two levels below a source."""
-    counts = Counter(path.parent for path in images_below(folder))
-    return {
-        below: count
-        for below, count in sorted(counts.items())
-        if 1 <= len(parts := below.relative_to(folder).parts) <= 2 and not set(parts) & set(TRAINED)
-    }
 
 
 def contents(folder: Path) -> str:
     """Return what a folder without usable photographs contains, for messages."""
     kinds = Counter(file.suffix.lower() or "no suffix" for file in folder.iterdir() if file.is_file())
     items = [f"{count} files ({kind})" for kind, count in sorted(kinds.items())]
-    items += [f"{count} images in {below}/" for below, count in folders_with_images(folder).items()]
+    places = Counter(path.parent for path in images_below(folder) if path.parent != folder)
+    items += [f"{count} images in {below}/" for below, count in sorted(places.items())]
     return ", ".join(items[:8]) or "nothing"
 
 

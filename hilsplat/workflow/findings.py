@@ -16,6 +16,7 @@ from hilsplat.base.errors import (
 )
 from hilsplat.base.files import list_images
 from hilsplat.base.images import image_size_hw, read_image, to_uint8
+from hilsplat.base.lineage import visible_files
 from hilsplat.configuration import StageSettings
 from hilsplat.datasets.images.hi import annotated_regions
 from hilsplat.embed.clip import ClipModel
@@ -53,8 +54,16 @@ MAX_UNDISTORTION = 0.1
 few percent; 4:3 and 3:2 differ by 12 %."""
 
 
-UNREAD_POSES = ("*.xml", "cameras.json", "*.nvm", "bundle.out", "*.sfm")
-"""Poses that Metashape, 3DGS, VisualSFM, Bundler and Meshroom write."""
+UNREAD_POSES = (
+    *("*.xml", "cameras.json", "*.nvm", "*.out", "*.sfm", "*.xmp", "*.csv", "sfm_data*.json"),
+    *("meta_data.json", "reconstruction.json", "cameras*.npz", "traj*.txt", "groundtruth.txt", "*.sens"),
+)
+"""Poses that Metashape, 3DGS, VisualSFM, Bundler, Meshroom, RealityCapture, OpenMVG, SDFStudio, OpenSfM and
+NeuS write, and those of Replica, TUM and ScanNet."""
+
+
+CHECKPOINTS = (".pth", ".pt", ".ckpt")
+"""Suffixes of checkpoints of 3DGS, gsplat and nerfstudio."""
 
 
 @dataclass
@@ -105,8 +114,8 @@ def find_parts(folder: Path, named: dict[str, Path | None], settings: StageSetti
     _gaussians(folder, named, views, parts)
     _features(folder, named["features"], views, settings, parts)
     _labels(folder, named["labels"], views, parts)
-    if skipped := [path.name for path in sorted(folder.rglob("*.pth"))[:3]]:
-        parts.lines.append(f"skipped, because pickle files can run code: {', '.join(skipped)}")
+    if skipped := [path.name for path in visible_files(folder) if path.suffix in CHECKPOINTS]:
+        parts.lines.append(f"skipped, because pickle files can run code: {shorten_list(skipped)}")
     return parts
 
 
@@ -117,8 +126,10 @@ def _poses(folder: Path, named: Path | None, settings: StageSettings, parts: Par
         parts.columns["poses"] = named if named == NO_POSES else named.resolve()
     if known is None:
         parts.lines.append("poses: structure from motion")
-        below = [path for path in sorted(folder.glob("*/sparse/**/")) if model_files(path)]
-        _name_unused(below, "to use these poses, pass --poses", parts)
+        files = visible_files(folder)
+        models = {path.parent for path in files if path.stem == "cameras" and model_files(path.parent)}
+        below = [path for path in files if path.match("transforms*.json")]
+        _name_unused([*models, *below], "to use these poses, pass --poses", parts)
         unread = [path for pattern in UNREAD_POSES for path in folder.glob(pattern)]
         _name_unused(unread, "for poses, export a COLMAP model or transforms.json", parts)
         photos = list_images(photo_folder(folder))
@@ -156,9 +167,10 @@ def _poses(folder: Path, named: Path | None, settings: StageSettings, parts: Par
 def _gaussians(folder: Path, named: dict[str, Path | None], views: Views, parts: Parts) -> None:
     plys = [named["gaussians"]] if named["gaussians"] is not None else trained_gaussians(folder)
     if not plys:
-        others = [path for path in folder.glob("*.ply") if b" f_dc_0\n" in ply_header(path)]
+        files = visible_files(folder)
+        others = [path for path in files if path.suffix == ".ply" and b" f_dc_0" in ply_header(path)]
         _name_unused(others, "to use Gaussians in the coordinates of the poses, pass --gaussians", parts)
-        unread = [path for path in folder.iterdir() if path.suffix.lower() in UNREAD_GAUSSIANS]
+        unread = [path for path in files if path.suffix.lower() in UNREAD_GAUSSIANS]
         _name_unused(unread, "for Gaussians, export an uncompressed 3DGS PLY", parts)
     if not plys or plys[0] == NO_POSES:
         return

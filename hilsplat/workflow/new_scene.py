@@ -143,7 +143,7 @@ def _check(report: PhotoReport, have_poses: bool, min_share: float) -> None:
             f"{report.folder} has too few photographs",
             expected=f"at least {MIN_PHOTOS} (20 or more are better)",
             found="; ".join([distinct, contents(report.folder), *unreadable]),
-            fix="add photographs of the same scene, or record a longer video while walking around it",
+            fix="pass the folder of the photographs, add others of the same scene, or record a video",
         )
 
 

@@ -222,6 +222,9 @@ def test_a_dry_run_of_an_archive_leaves_nothing(kind, tmp_path):
         ("images", "images_2", "images_4"),
         ("DCIM/100APPLE",),
         ("photos", "output/renders", ".thumbnails"),
+        ("photos", "masks"),
+        ("rgb", "depth", "confidence"),
+        ("scan/color", "scan/label-filt", "scan/masks_2"),
     ],
 )
 def test_photographs_are_found_where_people_have_them(folders, tmp_path):
@@ -301,17 +304,22 @@ def test_unknown_coordinates_of_a_nerfstudio_export_are_stated(tmp_path):
 
 def test_poses_and_gaussians_that_are_not_used_are_named_with_what_to_do(tmp_path):
     folder = photographs(tmp_path / "a")
-    for name in ("cameras.xml", "scene.spz", "points.ply"):
+    for name in ("cameras.xml", "photos.out", "scene.spz", "points.ply", "transforms_old.json", "ckpt.pt"):
         (folder / name).write_bytes(b"ply\n")
     model(folder, "colmap/sparse/0")
-    gaussians(folder / "Scan.ply", 3)
+    model(folder, "dslr/colmap")
+    gaussians(folder / "results/ply/Scan.ply", 3)
     lines = new(folder, tmp_path / "p", "--dry-run").output.splitlines()
-    assert lines[:5] == [
+    found = f"{folder}/colmap/sparse/0, {folder}/dslr/colmap, {folder}/transforms_old.json"
+    ply = f"{folder}/results/ply/Scan.ply"
+    assert lines[:6] == [
         "poses: structure from motion",
-        f"  not used: {folder}/colmap/sparse/0; to use these poses, pass --poses",
-        f"  not used: {folder}/cameras.xml; for poses, export a COLMAP model or transforms.json",
-        f"  not used: {folder}/Scan.ply; to use Gaussians in the coordinates of the poses, pass --gaussians",
+        f"  not used: {found}; to use these poses, pass --poses",
+        f"  not used: {folder}/cameras.xml, {folder}/photos.out; "
+        "for poses, export a COLMAP model or transforms.json",
+        f"  not used: {ply}; to use Gaussians in the coordinates of the poses, pass --gaussians",
         f"  not used: {folder}/scene.spz; for Gaussians, export an uncompressed 3DGS PLY",
+        "skipped, because pickle files can run code: ckpt.pt",
     ]
 
 
