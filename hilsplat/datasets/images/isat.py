@@ -133,7 +133,7 @@ def stated_size(where: str, content: Any) -> tuple[int, int]:
             f"{where} does not state a valid image size",
             expected=f"height and width in pixels, at most {MAX_SIDE_PX}",
             found=f"height {sides[0]!r}, width {sides[1]!r}",
-            fix="export the labels again, with the size of the image",
+            fix="export the labels again, with the size of the image, or as COCO",
         )
     return int(sides[0]), int(sides[1])
 
