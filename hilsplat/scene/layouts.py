@@ -239,7 +239,8 @@ def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | No
         return None
     if named is not None:
         return _named_poses(folder, named)
-    poses: list[tuple[str, tuple[Path, ...]]] = [("colmap", (model,)) for model in colmap_models(folder)]
+    models = colmap_models(folder / "sparse")
+    poses: list[tuple[str, tuple[Path, ...]]] = [("colmap", (model,)) for model in models]
     if (folder / "transforms.json").is_file():
         poses.append(("transforms", (folder / "transforms.json",)))
     if (folder / "transforms_train.json").is_file():
@@ -270,6 +271,8 @@ def _named_poses(folder: Path, named: Path) -> KnownPoses:
     if model_files(named):
         return KnownPoses(folder, "colmap", (named,))
     known = find_known_poses(named) if named.is_dir() else None
+    if known is None and (models := colmap_models(named)):
+        return KnownPoses(folder, "colmap", (models[0],), tuple(models[1:]))
     if known is None or known.kind not in ("colmap", "transforms"):
         raise SceneError(
             f"{named} has no poses for {folder}",
@@ -292,9 +295,9 @@ def model_files(folder: Path) -> list[Path]:
     return []
 
 
-def colmap_models(folder: Path) -> list[Path]:
-    """Return the folders of the COLMAP models in `sparse/`, those with the most images first."""
-    folders = [*sorted((folder / "sparse").glob("*/")), folder / "sparse"]
+def colmap_models(sparse: Path) -> list[Path]:
+    """Return the COLMAP models in a folder and the folders in it, those with the most images first."""
+    folders = [*sorted(sparse.glob("*/")), sparse]
     return sorted((model for model in folders if model_files(model)), key=lambda model: -_num_images(model))
 
 

@@ -257,7 +257,7 @@ def _labels(folder: Path, named: Path | None, views: Views, parts: Parts) -> Non
         raise SceneError(
             f"only {len(parts.labels)} of {len(files)} label files in {files[0].parent} can be used",
             found=shorten_list(lost, 5),
-            fix="export the labels again, or pass --labels none",
+            fix="export them again, or pass --labels none and import them later with hilsplat annotate",
         )
     count = f"{num_regions} regions in {len(parts.labels)} photographs"
     parts.lines.append(f"labels: {count}, used for evaluation: {files[0].parent}")

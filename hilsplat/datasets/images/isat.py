@@ -106,7 +106,7 @@ def read_isat(path: Path, image: Path | None = None) -> IsatFile:
             f"label file {path} has no `objects` list",
             expected="an ISAT file with the keys info and objects",
             found=f"keys {', '.join(content)}",
-            fix="convert labels from other tools (labelme, COCO) to ISAT",
+            fix="import the labels of other tools (labelme, COCO) with hilsplat annotate",
         )
     size_hw = stated_size(f"label file {path}", content.get("info"))
     warnings: list[str] = []
