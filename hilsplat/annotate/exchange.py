@@ -224,18 +224,13 @@ def imported(
             the annotations are invalid, or none can be used.
     """
     readers = {"shapes": _labelme_reader, "annotations": _coco_reader, "objects": _isat_reader}
-    as_coco = "export the annotations as COCO"
-    with foreign(name, expected="a complete JSON file of ISAT, labelme, COCO or hilsplat", fix=as_coco):
+    expected = "JSON with the key 'objects' (ISAT, hilsplat), 'shapes' (labelme) or 'annotations' (COCO)"
+    with foreign(name, expected=expected, fix="export the annotations as COCO"):
         content = parse_json(text)
         keys = content if isinstance(content, dict) else {}
         kind = next((key for key in readers if isinstance(keys.get(key), list)), None)
         if kind is None:
-            raise SceneError(
-                f"{name} has an unknown format",
-                expected="the key 'objects' (ISAT, hilsplat), 'shapes' (labelme) or 'annotations' (COCO)",
-                found=f"keys {', '.join(keys)}" if keys else type(content).__name__,
-                fix=as_coco,
-            )
+            raise ValueError(f"it has an unknown format, with the keys {', '.join(keys) or 'none'}")
         read = readers[kind](name, content, cameras, photos or {})
     pieces: dict[str, list[Piece]] = {}
     left: Counter[str] = Counter()

@@ -115,10 +115,11 @@ def view_names(sources: Sequence[Path]) -> list[str]:
         ]
     for name, count in Counter(names).items():
         if count > 1:
-            files = [str(source) for source, other in zip(sources, names, strict=True) if other == name]
+            same = [source for source, other in zip(sources, names, strict=True) if other == name]
+            folder = os.path.commonpath([source.parent for source in same])
             raise SceneError(
-                f"{count} images have the same view name {name}",
-                found=", ".join(files),
+                f"{count} images in {folder} have the same view name {name}",
+                found=", ".join(os.path.relpath(source, folder) for source in same),
                 fix="rename or remove all but one: views are named after the file without its suffix",
             )
     return names
