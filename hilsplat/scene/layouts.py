@@ -28,6 +28,9 @@ UNUSED = (*TRAINED, *MAPS)
 PHOTO_FOLDERS = ("images", "input")
 """Folders of photographs: COLMAP's and nerfstudio's, then that of 3DGS's `convert.py`."""
 
+MIN_PHOTOS = 3
+"""Minimum number of photographs for structure from motion."""
+
 POSES_BOUNDS = "poses_bounds.npy"
 """Pose file of LLFF."""
 
@@ -159,20 +162,21 @@ def label_files(folder: Path, named: Path | None = None) -> list[Path]:
 def photo_folder(folder: Path) -> Path:
     """Return the folder of a source's photographs.
 
-    It is the source itself or, if that has fewer images, its `images/` or `input/` (in any case); else a
-    phone export's images; else the only folder with images up to two levels below, maps apart. Of several
-    such folders, none is chosen (`contents` lists them).
+    It is the source itself or, if that has fewer images, its `images/` or `input/` (in any case). If the
+    source has fewer than `MIN_PHOTOS`, it is a phone export's images, or else the only folder with images up
+    to two levels below, maps apart. Of several such folders, none is chosen (`contents` lists them).
     """
     num_images = len(list_images(folder))
     for name in PHOTO_FOLDERS:
         for below in sorted(folder.iterdir()):
             if below.name.lower() == name and below.is_dir() and len(list_images(below)) > num_images:
                 return below
-    if num_images:
+    if num_images >= MIN_PHOTOS:
         return folder
     if export := polycam_folders(folder) or record3d_export(folder):
         return export[0]
-    below = {path.parent for path in used_images(folder) if len(path.relative_to(folder).parts) <= 3}
+    images = used_images(folder)
+    below = {path.parent for path in images if 2 <= len(path.relative_to(folder).parts) <= 3}
     return below.pop() if len(below) == 1 else folder
 
 

@@ -32,9 +32,6 @@ UNITS = ("metre", "arbitrary")
 PHOTOS = "photos"
 """Data set and group of your own photographs."""
 
-MIN_PHOTOS = 3
-"""Minimum number of photographs for structure from motion."""
-
 DATA_PREFIX = "data:"
 """Prefix of a source in the folder of published data sets (`data_root`)."""
 GENERATED = re.compile(r"([a-z][a-z0-9_]*):([a-z][a-z0-9_-]*):([0-9]{1,9})")

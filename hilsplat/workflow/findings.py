@@ -72,11 +72,13 @@ class Parts:
 
     Attributes:
         columns: paths for the scene sheet, by column.
+        posed: images with known poses.
         labels: label files to copy, and the names of the copies, which are those of the views.
         lines: what was found, used and left out, for the user.
     """
 
     columns: dict[str, Path] = field(default_factory=dict)
+    posed: list[Path] = field(default_factory=list)
     labels: dict[Path, str] = field(default_factory=dict)
     lines: list[str] = field(default_factory=list)
 
@@ -149,13 +151,15 @@ def _poses(folder: Path, named: Path | None, settings: StageSettings, parts: Par
         K, size_hw = lens.calibration_matrix(), (lens.height, lens.width)
         views.cameras[name] = Camera(name, np.eye(4), K, size_hw, photo)
     source.require_most(settings.poses.min_registered_share, known.files[0], images=True)
-    views.posed = source.views
+    views.posed, parts.posed = source.views, [*views.photos.values()]
     parts.lines.append(f"poses: {', '.join(map(str, known.files))}: {len(views.cameras)} views with an image")
     if missing := source.without_image:
         parts.lines.append(f"  left out: {len(missing)} views without an image: {shorten_list(missing, 5)}")
     if source.left_out:
         reasons = shorten_list([*source.left_out.values()], 5)
         parts.lines.append(f"  left out: {len(source.left_out)} views: {reasons}")
+    if source.unposed:
+        parts.lines.append(f"  left out: {len(source.unposed)} images without a pose")
     if views.held_out:
         parts.lines.append(f"  {len(views.held_out)} views are held out for tests by the source's own split")
     count = "none; they are triangulated" if source.points is None else f"{len(source.points[0])}"

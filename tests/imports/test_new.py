@@ -233,11 +233,24 @@ def test_photographs_are_found_where_people_have_them(folders, tmp_path):
     assert photo_folder(tmp_path) == tmp_path / folders[0]
 
 
+def test_with_known_poses_the_images_that_have_one_are_reported(tmp_path):
+    model(tmp_path)
+    photographs(tmp_path / "images")
+    for place, count in ((".", 4), ("images/more", 3)):
+        photographs(tmp_path / place, count)
+    world.save(tmp_path / "images", {"900": np.zeros((HEIGHT, WIDTH), np.uint8)})
+    report = str(add_scene(tmp_path / "p/scenes.tsv", "a", tmp_path))
+    assert f"6 photographs in {tmp_path}/images\n" in report
+    assert "  left out: 1 images without a pose\n" in report
+
+
 def test_a_stray_picture_beside_a_folder_of_photographs_is_not_the_set(tmp_path):
     photographs(tmp_path / "images")
     photographs(tmp_path, 1)
     report = add_scene(tmp_path / "p/scenes.tsv", "a", tmp_path)
     assert report.num_readable == 6 and report.folder == tmp_path / "images"
+    (tmp_path / "images").rename(tmp_path / "scan")
+    assert add_scene(tmp_path / "p/scenes.tsv", "b", tmp_path).folder == tmp_path / "scan"
 
 
 @pytest.mark.parametrize("places", [["monday", "tuesday"], ["DCIM/100APPLE", "DCIM/101APPLE"]])

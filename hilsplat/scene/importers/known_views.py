@@ -70,6 +70,7 @@ class Source:
         points: sparse points; None if the source has none.
         left_out: why a view cannot be used, by name.
         notes: what else in the source is not used, one sentence each.
+        unposed: names of images that no view has.
         has_split: the source lists its training views, which may be all views.
     """
 
@@ -77,6 +78,7 @@ class Source:
     points: Points | None = None
     left_out: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    unposed: list[str] = field(default_factory=list)
     has_split: bool = False
 
     def add(self, name: str, described: Callable[..., KnownView], *args: Any) -> None:
