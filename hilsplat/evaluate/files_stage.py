@@ -11,7 +11,7 @@ import pandas as pd
 from jaxtyping import Bool, Float64, Int64
 
 from hilsplat.base.artifacts import read_npz
-from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, SettingsError
+from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, SettingsError, foreign
 from hilsplat.base.files import list_masks
 from hilsplat.base.images import image_size_hw, read_mask
 from hilsplat.base.progress import stage_log
@@ -219,15 +219,9 @@ def read_point_classes(path: Path, num_points: int) -> Int64[np.ndarray, " P"]:
         ArtifactError: the file is missing or malformed.
         MisalignedArtifactError: the number of points differs.
     """
-    words = _text(path).split()
-    try:
-        values = np.array(words, dtype=np.int64)
-    except (ValueError, OverflowError) as error:
-        raise ArtifactError(
-            f"{path} does not have one integer per line",
-            found=str(error),
-            fix="write one class id per line, 0 for none",
-        ) from error
+    fix = "write one class id per line, 0 for none"
+    with foreign(path, ArtifactError, expected="one integer per line", fix=fix):
+        values = np.array(_text(path).split(), dtype=np.int64)
     if len(values) != num_points:
         raise MisalignedArtifactError(
             f"{path} does not match the labelled points",
@@ -292,7 +286,5 @@ def _as_mask(array: np.ndarray, where: str) -> Bool[np.ndarray, "h w"]:
 
 
 def _text(path: Path) -> str:
-    try:
+    with foreign(path, ArtifactError, fix="write it as UTF-8 text"):
         return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ArtifactError(f"{path} cannot be read: {error}", fix="write it as UTF-8 text") from error

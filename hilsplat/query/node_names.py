@@ -22,7 +22,7 @@ from hilsplat.base.artifacts import (
 from hilsplat.base.atomic import atomic_folder
 from hilsplat.base.cache import ViewCache
 from hilsplat.base.code import code_digest
-from hilsplat.base.errors import ArtifactError, SettingsError
+from hilsplat.base.errors import ArtifactError, SettingsError, foreign
 from hilsplat.base.files import regular
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.lineage import sha256_of_file, sha256_of_json
@@ -69,12 +69,8 @@ class Vocabulary:
         Raises:
             SettingsError: the file cannot be read or contains no text, or a section or name is invalid.
         """
-        try:
+        with foreign(f"the vocabulary {path}", SettingsError, fix="save it as UTF-8 text"):
             lines = regular(Path(path)).read_text(encoding="utf-8-sig").splitlines()
-        except (OSError, UnicodeDecodeError) as error:
-            raise SettingsError(
-                f"the vocabulary {path} cannot be read: {error}", expected="a UTF-8 text file"
-            ) from error
         texts: dict[str, dict[str, None]] = {section: {} for section in SECTIONS}
         section = SECTIONS[0]
         for number, line in enumerate(lines, 1):

@@ -176,8 +176,8 @@ def photo_folder(folder: Path) -> Path:
     if export := polycam_folders(folder) or record3d_export(folder):
         return export[0]
     images = used_images(folder)
-    below = {path.parent for path in images if 2 <= len(path.relative_to(folder).parts) <= 3}
-    return below.pop() if len(below) == 1 else folder
+    places = {path.parent for path in images if 2 <= len(path.relative_to(folder).parts) <= 3}
+    return places.pop() if len(places) == 1 else folder
 
 
 def images_below(folder: Path) -> list[Path]:

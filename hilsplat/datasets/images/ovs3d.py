@@ -7,7 +7,7 @@ with ground truth `any grey`. A missing file or folder, or an unusable classes.t
 
 from pathlib import Path
 
-from hilsplat.base.errors import SceneError
+from hilsplat.base.errors import SceneError, foreign
 from hilsplat.base.files import list_files
 from hilsplat.base.images import image_size_hw
 from hilsplat.base.levels import composed
@@ -60,18 +60,13 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
 
 def read_classes(path: Path) -> tuple[str, ...]:
     """Return the prompts of `classes.txt`: stripped, without empty lines, sorted (capitals first)."""
-    try:
+    expected = "one class per line, without duplicates"
+    with foreign(path, expected=expected, fix="unpack segmentations again"):
         lines = [composed(line.strip()) for line in path.read_text(encoding="utf-8-sig").splitlines()]
         prompts = sorted(line for line in lines if line)
         twice = sorted({prompt for prompt in prompts if prompts.count(prompt) > 1})
         if not prompts or twice:
             raise ValueError(f"duplicates: {', '.join(twice)}" if twice else "no classes")
-    except (OSError, ValueError) as error:
-        raise SceneError(
-            f"{path} is not a valid list of classes: {error}",
-            expected="one class per line, without duplicates",
-            fix="unpack segmentations again",
-        ) from error
     return tuple(prompts)
 
 
