@@ -130,7 +130,7 @@ def _poses(folder: Path, named: Path | None, settings: StageSettings, parts: Par
         parts.lines.append("poses: structure from motion")
         files = visible_files(folder)
         models = {path.parent for path in files if path.stem == "cameras" and model_files(path.parent)}
-        below = [path for path in files if path.match("transforms*.json")]
+        below = [path for path in files if path.match("transform*.json")]
         _name_unused([*models, *below], "to use these poses, pass --poses", parts)
         unread = [path for pattern in UNREAD_POSES for path in folder.glob(pattern)]
         _name_unused(unread, "for poses, export a COLMAP model or transforms.json", parts)
