@@ -362,10 +362,14 @@ def photo_files(folder: Path, named: Path | None = None) -> list[Path]:
     return sorted(path for path in files if path.is_file())
 
 
+BESIDE = re.compile(r"\..*|__MACOSX|.*\.(md|pdf|txt)", re.IGNORECASE)
+"""Files and folders that archives have beside the folder that wraps the others."""
+
+
 def unwrapped(folder: Path) -> Path:
     """Return the folder with the actual files, because archives often wrap them in a single folder."""
     while not list_images(folder) and not has_known_poses(folder):
-        inside = [path for path in folder.iterdir() if not path.name.startswith(".")]
+        inside = [path for path in folder.iterdir() if not BESIDE.fullmatch(path.name)]
         if len(inside) != 1 or not inside[0].is_dir() or inside[0].name.lower() in PHOTO_FOLDERS:
             break
         folder = inside[0]

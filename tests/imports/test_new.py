@@ -264,6 +264,8 @@ def test_several_folders_of_photographs_are_listed(places, tmp_path):
 def test_poses_in_a_single_folder_below_are_found(tmp_path):
     photographs(tmp_path / "desk/desk/images")
     model(tmp_path / "desk/desk")
+    (tmp_path / "desk/__MACOSX").mkdir()
+    (tmp_path / "desk/README.md").write_text("# Desk")
     report = add_scene(tmp_path / "p/config/scenes.tsv", "a", tmp_path / "desk")
     assert "6 views with an image" in str(report)
     (row,) = read_sheet(tmp_path / "p/config/scenes.tsv")
