@@ -41,11 +41,12 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tu
         raise SceneError(
             f"{source} is missing", fix="pass a folder of photographs, a video, or a zip of photographs"
         )
+    source = unwrapped(source) if source.is_dir() else source
     videos = _videos_of(source)
     if source.is_dir() and not videos:
         beside = list_files(photo_folder(source), VIDEO_SUFFIXES)
         note = f"{len(beside)} videos beside the photographs (Live Photos) are not used"
-        yield unwrapped(source), [note] if beside else []
+        yield source, [note] if beside else []
         return
     if not videos and source.suffix.lower() not in (".zip", ".r3d"):
         fix = "pass the folder that contains the photographs; unpack other archives than .zip first"
