@@ -28,9 +28,6 @@ UPRIGHT = dict(zip(range(2, 9), (Image.Transpose(move) for move in (0, 3, 1, 5, 
 PROFILE_MODES = {b"RGB ": "RGB", b"GRAY": "L", b"CMYK": "CMYK"}
 """Pillow's mode of a colour profile, by the colour space in its header."""
 
-HDR = (16, 18)
-"""Transfer characteristics of HEIF pictures of Canon's and Sony's cameras: PQ and HLG (ITU-T H.273)."""
-
 MIN_SIDE_PX, MAX_ASPECT = 16, 20  # limits on photographs; all stages were run on 16 x 16 and 320 x 16 px
 
 SLIVER = 0.01
@@ -245,7 +242,8 @@ def _frames(image: Image.Image) -> int:
 def _to_srgb(image: Image.Image, info: Mapping[Any, Any], file: object) -> Image.Image:
     """Convert to sRGB with the embedded profile, or else PNG's gamma; without valid ones, assume sRGB."""
     profile = info.get("icc_profile")
-    if not profile and (info.get("nclx_profile") or {}).get("transfer_characteristics") in HDR:
+    nclx = info.get("nclx_profile") or {}
+    if not profile and nclx.get("transfer_characteristics") in (16, 18):  # ITU-T H.273
         raise ValueError("its colours are HDR (PQ or HLG); export it as JPEG")
     base = {"RGBA": "RGB", "P": "RGB", "LA": "L", "1": "L"}.get(image.mode, image.mode)
     if profile and PROFILE_MODES.get(profile[16:20], base) == base:  # grey images may carry a profile of RGB

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from hilsplat.base.artifacts import write_text
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.errors import ArtifactError, foreign
 from hilsplat.base.files import regular
 
 FORMULA = r"(?='*(?![-+][\d.]+(e[-+]?\d+)?( ± [\d.]+)?\Z)[=+\-@\t\r\n](?s:.))"
@@ -29,15 +29,13 @@ def read_csv(path: Path, columns: Sequence[str] | None, fix: str) -> list[dict[s
 
     ArtifactError, with `fix`, is raised if the file is missing or damaged, or has different columns.
     """
-    try:
+    if not Path(path).exists():
+        raise ArtifactError(f"{path} is missing", fix=fix)
+    with foreign(path, ArtifactError, fix=fix):
         with regular(Path(path)).open(encoding="utf-8", newline="") as stream:
             lines = [line for line in csv.reader(stream) if line]
         header, *rows = ([re.sub(f"^'{FORMULA}", "", cell) for cell in line] for line in lines)
         table = [dict(zip(header, row, strict=True)) for row in rows]
-    except FileNotFoundError as error:
-        raise ArtifactError(f"{path} is missing", fix=fix) from error
-    except (ValueError, OSError, csv.Error) as error:
-        raise ArtifactError(f"{path} cannot be read: {error}", fix=fix) from error
     if columns is not None and tuple(header) != tuple(columns):
         raise ArtifactError(
             f"{path} has unexpected columns", expected=", ".join(columns), found=", ".join(header), fix=fix

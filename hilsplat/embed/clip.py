@@ -12,7 +12,7 @@ from jaxtyping import Float16, Float32, Int64, UInt8
 from tokenizers import Tokenizer
 
 from hilsplat.base.artifacts import read_index, read_json
-from hilsplat.base.errors import MisalignedArtifactError, ModelError, SettingsError
+from hilsplat.base.errors import MisalignedArtifactError, ModelError, SettingsError, foreign
 from hilsplat.base.files import INSTALLED
 from hilsplat.models.card import CPU, Batches, in_turn, network_device
 from hilsplat.models.folder import WHOLE_COPY, ModelFolder, input_side_px, open_model_folder
@@ -57,10 +57,8 @@ class ClipModel:
         self.std = np.array(preprocessing.get("image_std", std), np.float32)
         self.rescale = np.float32(preprocessing.get("rescale_factor", 1 / 255))
         path = model.tokenizer
-        try:
+        with foreign(path, ModelError, fix=WHOLE_COPY):
             self.tokenizer = Tokenizer.from_file(str(path))
-        except Exception as error:  # the tokenizers package raises bare Exception
-            raise ModelError(f"{path} cannot be read: {error}", fix=WHOLE_COPY) from error
         if not self.tokenizer.get_vocab_size(with_added_tokens=False):
             raise ModelError(f"{path} contains no words", fix=WHOLE_COPY)
         fixed = self.text.fixed_axis(self.ids, 1)

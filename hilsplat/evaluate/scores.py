@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
 
 from hilsplat.base.artifacts import read_npz, rebuild_command, write_npz
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.errors import ArtifactError, foreign
 from hilsplat.base.tables import read_csv, write_csv
 from hilsplat.evaluate.metrics.instances import InstanceMatches
 from hilsplat.evaluate.protocols.cards import card_of
@@ -70,10 +70,8 @@ def read_scores(paths: Iterable[Path]) -> "pd.DataFrame":
     rows: list[dict[str, object]] = []
     for path in paths:
         found = read_csv(path, COLUMNS, rebuild_command(path))
-        try:
+        with foreign(path, ArtifactError, fix=rebuild_command(path)):
             rows += [{**row, "value": float(row["value"]), "n": int(row["n"])} for row in found]
-        except ValueError as error:
-            raise ArtifactError(f"{path} cannot be read: {error}", fix=rebuild_command(path)) from error
     return pd.DataFrame(rows, columns=list(COLUMNS)).astype({"value": float, "n": int})
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hilsplat.base.atomic import atomic_path
-from hilsplat.base.errors import ModelError, first_line
+from hilsplat.base.errors import ModelError, first_line, foreign
 from hilsplat.base.files import regular
 from hilsplat.base.lineage import sha256_of_bytes, sha256_of_json
 
@@ -387,10 +387,8 @@ def split_clip(folder: Path) -> list[Path]:
             f"model folder {folder} has no {WHOLE} to split",
             fix="export the model first: optimum-cli export onnx --model NAME FOLDER (docs/models.md)",
         )
-    try:
+    with foreign(f"network {whole}", ModelError):
         model = onnx.load(str(whole), load_external_data=False)
-    except Exception as error:  # protobuf and onnx raise errors without a common base
-        raise ModelError(f"network {whole} cannot be read: {error}", fix="export it again") from error
     inputs, outputs = ({value.name for value in part} for part in (model.graph.input, model.graph.output))
     missing = {name for needed, _ in HALVES.values() for name in needed} - inputs - OPTIONAL
     missing |= {output for _, output in HALVES.values()} - outputs

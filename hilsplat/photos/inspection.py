@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from hilsplat.base.errors import ImageError, first_line, shorten_list
-from hilsplat.base.files import list_images
+from hilsplat.base.files import list_files, list_images
 from hilsplat.base.images import opened_image, orientation, read_image, require_usable_size
 from hilsplat.base.lineage import sha256_of_file
 from hilsplat.base.progress import track
@@ -107,13 +107,12 @@ def inspect_photos(folder: Path, posed: Sequence[Path] = ()) -> PhotoReport:
         by_digest[sha256_of_file(path)].append(name)
     copies = {name for names in by_digest.values() for name in names[1:]}
     distinct = [photo for photo in checked if photo.name not in copies]
-    suffixes = Counter(path.suffix.lower() for path in folder.iterdir() if path.is_file())
     return PhotoReport(
         folder=folder,
         sizes=dict(sizes),
         unreadable=tuple(unreadable),
         num_rotated=num_rotated,
         duplicates=tuple(tuple(names) for names in by_digest.values() if len(names) > 1),
-        passed_over={suffix: count for suffix, count in suffixes.items() if suffix in OTHER_PHOTO_SUFFIXES},
+        passed_over=Counter(path.suffix.lower() for path in list_files(folder, OTHER_PHOTO_SUFFIXES)),
         doubts=tuple(photo_doubts(distinct, have_poses=have_poses)),
     )

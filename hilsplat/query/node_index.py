@@ -8,7 +8,7 @@ from jaxtyping import Int32
 
 from hilsplat.base.arrays import build_checked, read_tensors, require_types, write_tensors
 from hilsplat.base.artifacts import rebuild_command
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.errors import ArtifactError, foreign
 from hilsplat.semantic_tree.tree import LIMITS, SemanticTree
 
 FILE = "nodes.safetensors"
@@ -53,11 +53,9 @@ class NodeIndex:
         """Read the file; raise ArtifactError if it is missing, damaged or from a different version."""
         path = Path(folder) / FILE
         arrays, about = read_tensors(path)
-        try:
+        with foreign(path, ArtifactError, fix=rebuild_command(path)):
             views = tuple(about.pop("views_of_scene"))
             own = {name: arrays.pop(name) for name in ("gaussians", "best_view")}
-        except KeyError as error:
-            raise ArtifactError(f"{path} lacks {error}", fix=rebuild_command(path)) from error
         require_types(NodeIndex, own, path, {"best_view": (0, len(views) - 1)})
         about["view_names"] = ()
         return NodeIndex(build_checked(SemanticTree, arrays, about, path, LIMITS), **own, views=views)

@@ -175,8 +175,7 @@ def photo_folder(folder: Path) -> Path:
         return folder
     if export := polycam_folders(folder) or record3d_export(folder):
         return export[0]
-    images = used_images(folder)
-    places = {path.parent for path in images if 2 <= len(path.relative_to(folder).parts) <= 3}
+    places = {path.parent for path in used_images(folder) if 2 <= len(path.relative_to(folder).parts) <= 3}
     return places.pop() if len(places) == 1 else folder
 
 

@@ -62,21 +62,19 @@ UNREAD_POSES = (
 NeuS write, and those of Replica, TUM and ScanNet."""
 
 
-CHECKPOINTS = (".pth", ".pt", ".ckpt")
-"""Suffixes of checkpoints of 3DGS, gsplat and nerfstudio."""
-
-
 @dataclass
 class Parts:
     """What is used with a folder of photographs.
 
     Attributes:
+        files: all files in the folder.
         columns: paths for the scene sheet, by column.
         posed: images with known poses.
         labels: label files to copy, and the names of the copies, which are those of the views.
         lines: what was found, used and left out, for the user.
     """
 
+    files: list[Path]
     columns: dict[str, Path] = field(default_factory=dict)
     posed: list[Path] = field(default_factory=list)
     labels: dict[Path, str] = field(default_factory=dict)
@@ -111,12 +109,12 @@ def find_parts(folder: Path, named: dict[str, Path | None], settings: StageSetti
     for what, path in named.items():
         if path is not None and path != NO_POSES and not path.exists():
             raise SceneError(f"--{what} {path} is missing", fix="correct the path, or pass `none`")
-    parts = Parts()
+    parts = Parts(visible_files(folder))
     views = _poses(folder, named["poses"], settings, parts)
     _gaussians(folder, named, views, parts)
     _features(folder, named["features"], views, settings, parts)
     _labels(folder, named["labels"], views, parts)
-    if skipped := [path.name for path in visible_files(folder) if path.suffix in CHECKPOINTS]:
+    if skipped := [path.name for path in parts.files if path.suffix in (".pth", ".pt", ".ckpt")]:
         parts.lines.append(f"skipped, because pickle files can run code: {shorten_list(skipped)}")
     return parts
 
@@ -128,9 +126,8 @@ def _poses(folder: Path, named: Path | None, settings: StageSettings, parts: Par
         parts.columns["poses"] = named if named == NO_POSES else named.resolve()
     if known is None:
         parts.lines.append("poses: structure from motion")
-        files = visible_files(folder)
-        models = {path.parent for path in files if path.stem == "cameras" and model_files(path.parent)}
-        below = [path for path in files if path.match("transform*.json")]
+        models = {path.parent for path in parts.files if path.stem == "cameras" and model_files(path.parent)}
+        below = [path for path in parts.files if path.match("transform*.json")]
         _name_unused([*models, *below], "to use these poses, pass --poses", parts)
         unread = [path for pattern in UNREAD_POSES for path in folder.glob(pattern)]
         _name_unused(unread, "for poses, export a COLMAP model or transforms.json", parts)
@@ -171,10 +168,9 @@ def _poses(folder: Path, named: Path | None, settings: StageSettings, parts: Par
 def _gaussians(folder: Path, named: dict[str, Path | None], views: Views, parts: Parts) -> None:
     plys = [named["gaussians"]] if named["gaussians"] is not None else trained_gaussians(folder)
     if not plys:
-        files = visible_files(folder)
-        others = [path for path in files if path.suffix == ".ply" and b" f_dc_0" in ply_header(path)]
+        others = [path for path in parts.files if path.suffix == ".ply" and b" f_dc_0" in ply_header(path)]
         _name_unused(others, "to use Gaussians in the coordinates of the poses, pass --gaussians", parts)
-        unread = [path for path in files if path.suffix.lower() in UNREAD_GAUSSIANS]
+        unread = [path for path in parts.files if path.suffix.lower() in UNREAD_GAUSSIANS]
         _name_unused(unread, "for Gaussians, export an uncompressed 3DGS PLY", parts)
     if not plys or plys[0] == NO_POSES:
         return
