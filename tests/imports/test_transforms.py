@@ -60,6 +60,7 @@ FORMS = {  # the lens, the keys that describe it, and the least PSNR
     "focal lengths in px": (PLAIN, NUMBERS, 45),
     "no size": (PLAIN, LENS, 45),
     "sizes as floats": (PLAIN, {"w": float(WIDTH), "h": float(HEIGHT), **LENS}, 45),
+    "lens of a larger image": (SQUARE, {"width": 2 * WIDTH, "height": 2 * HEIGHT, "fl_x": 2 * FX}, 45),
     "only fl_x": (SQUARE, {**SIZE, "fl_x": FX}, 45),
     "only fl_y": (SQUARE, {**SIZE, "fl_y": FX}, 45),
     "camera_angle_x": (SQUARE, {**SIZE, "camera_angle_x": angle(WIDTH, FX)}, 45),
