@@ -298,6 +298,18 @@ def test_archives_made_on_windows_are_unpacked(name, tmp_path):
     assert add_scene(tmp_path / "p/scenes.tsv", "a", tmp_path / "a.zip").num_readable == 6
 
 
+def test_names_in_archives_of_macos_are_utf_8_without_its_flag(tmp_path):
+    archive_with(tmp_path, "K\u00fcche {}")
+    content = (tmp_path / "a.zip").read_bytes()
+    for start in (b"PK\3\4\x14\0\0", b"PK\1\2\x14\3\x14\0\0"):
+        assert content.count(start + b"\x08") == 6
+        content = content.replace(start + b"\x08", start + b"\0")
+    (tmp_path / "a.zip").write_bytes(content)
+    add_scene(tmp_path / "p/scenes.tsv", "a", tmp_path / "a.zip")
+    names = {path.name for path in (tmp_path / "p/photos/a").glob("*.jpg")}
+    assert len(names) == 6 and all(name.startswith("K\u00fcche 0") for name in names)
+
+
 def test_other_programs_gaussians_without_poses_are_named_but_not_used(tmp_path):
     folder = photographs(tmp_path / "a")
     gaussians(folder / "point_cloud.ply", 3)
