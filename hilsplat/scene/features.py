@@ -91,8 +91,7 @@ def exif_focal_px(path: Path, size_hw: tuple[int, int]) -> float | None:
     stored = (number(ExifTags.Base.ExifImageWidth), number(ExifTags.Base.ExifImageHeight))
     stored_px = max(stored) or max(size)
     focal_px = focal_px or number(ExifTags.Base.FocalLength) * pixels_per_mm * max(size_hw) / stored_px
-    # Beyond these limits, COLMAP registers no photograph.
-    return focal_px if 0.1 < focal_px / max(size_hw) < 10 else None
+    return focal_px if 0.1 < focal_px / max(size_hw) < 10 else None  # COLMAP registers no others
 
 
 def exif_time(path: Path) -> str:

@@ -164,7 +164,7 @@ def photo_folder(folder: Path) -> Path:
 
     It is the source itself or, if that has fewer images, its `images/` or `input/` (in any case). If the
     source has fewer than `MIN_PHOTOS`, it is a phone export's images, or else the only folder with images up
-    to two levels below, maps apart. Of several such folders, none is chosen (`contents` lists them).
+    to two levels below, maps apart, if it has more. Of several such folders, none is chosen.
     """
     num_images = len(list_images(folder))
     for name in PHOTO_FOLDERS:
@@ -175,8 +175,9 @@ def photo_folder(folder: Path) -> Path:
         return folder
     if export := polycam_folders(folder) or record3d_export(folder):
         return export[0]
-    places = {path.parent for path in used_images(folder) if 2 <= len(path.relative_to(folder).parts) <= 3}
-    return places.pop() if len(places) == 1 else folder
+    images = [path for path in used_images(folder) if 2 <= len(path.relative_to(folder).parts) <= 3]
+    has_one_place = len({path.parent for path in images}) == 1
+    return images[0].parent if has_one_place and len(images) > num_images else folder
 
 
 def images_below(folder: Path) -> list[Path]:
