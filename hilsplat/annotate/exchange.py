@@ -216,17 +216,13 @@ def imported(
             the annotations are invalid, or none can be used.
     """
     readers = {"shapes": _labelme_reader, "annotations": _coco_reader, "objects": _isat_reader}
-    with foreign(name, expected="a complete JSON file"):
+    expected = "JSON with the key 'objects' (ISAT, hilsplat), 'shapes' (labelme) or 'annotations' (COCO)"
+    with foreign(name, expected=expected, fix="export the annotations as COCO"):
         content = parse_json(text)
         keys = content if isinstance(content, dict) else {}
         kind = next((key for key in readers if isinstance(keys.get(key), list)), None)
         if kind is None:
-            raise SceneError(
-                f"{name} has an unknown format",
-                expected="the key 'objects' (ISAT, hilsplat), 'shapes' (labelme) or 'annotations' (COCO)",
-                found=f"keys {', '.join(keys)}" if keys else type(content).__name__,
-                fix="export the annotations as COCO",
-            )
+            raise ValueError(f"it has an unknown format, with the keys {', '.join(keys) or 'none'}")
         read = readers[kind](name, content, cameras, photos or {})
     pieces: dict[str, list[Piece]] = {}
     left: Counter[str] = Counter()
@@ -363,15 +359,15 @@ def _labelme_mask(
 
 def _coco_reader(name: str, content: Mapping[str, Any], cameras: Cameras, photos: Photos) -> Reader:
     images, categories = _by_id(content["images"]), _by_id(content["categories"])
-    used = {repr(entry.get("image_id")) for entry in content["annotations"] if isinstance(entry, dict)}
+    used = {_id(entry.get("image_id")) for entry in content["annotations"] if isinstance(entry, dict)}
     files = {str(image.get("file_name")) for number, image in images.items() if number in used}
     views = _matched(files, cameras, photos)
     num_files = Counter(views.values())
     foreign_names = ", ".join(sorted(file for file in files if views[file] is None)[:3])
 
     def read(where: str, entry: Any) -> Piece | str:
-        image = images.get(repr(entry.get("image_id")), {})
-        text = categories.get(repr(entry.get("category_id")), {}).get("name")
+        image = images.get(_id(entry.get("image_id")), {})
+        text = categories.get(_id(entry.get("category_id")), {}).get("name")
         view, region = views.get(str(image.get("file_name"))), entry.get("segmentation")
         if view is None:
             return f"of images that are not in the scene ({foreign_names or 'unknown ids'})"
@@ -379,7 +375,7 @@ def _coco_reader(name: str, content: Mapping[str, Any], cameras: Cameras, photos
             return "of different images whose names fit the same photograph"
         if not isinstance(text, str | int):
             return "of unknown categories"
-        if not region:
+        if not region or entry.get("isbbox"):  # coco-annotator writes the corners of boxes as a region
             return "without a region (boxes, keypoints)"
         if image.get("height") is image.get("width") is None:
             image = _photo_size(photos, view)
@@ -392,9 +388,14 @@ def _coco_reader(name: str, content: Mapping[str, Any], cameras: Cameras, photos
 def _by_id(rows: Sequence[Any]) -> dict[str, dict[str, Any]]:
     """Return rows by id; an id that different rows have is omitted."""
     rows = [row for row in rows if isinstance(row, dict)]
-    by_id = {repr(row.get("id")): row for row in rows}
-    twice = {number for row in rows if by_id[number := repr(row.get("id"))] != row}
+    by_id = {_id(row.get("id")): row for row in rows}
+    twice = {number for row in rows if by_id[number := _id(row.get("id"))] != row}
     return {number: row for number, row in by_id.items() if number not in twice}
+
+
+def _id(value: Any) -> str:
+    """Return an id as text: spreadsheets and databases turn 7 into 7.0 or "7"."""
+    return str(value).removesuffix(".0")
 
 
 def _coco_mask(where: str, region: Any, image: Mapping[str, Any], camera: Camera) -> Bool[np.ndarray, "H W"]:

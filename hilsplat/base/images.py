@@ -227,6 +227,9 @@ def _is_animation(image: Image.Image) -> bool:
 def _to_srgb(image: Image.Image, info: Mapping[Any, Any], file: object) -> Image.Image:
     """Convert to sRGB with the embedded profile, or else PNG's gamma; without valid ones, assume sRGB."""
     profile = info.get("icc_profile")
+    nclx = info.get("nclx_profile") or {}
+    if not profile and nclx.get("transfer_characteristics") in (16, 18):  # ITU-T H.273
+        raise ValueError("its colours are HDR (PQ or HLG); export it as JPEG")
     base = {"RGBA": "RGB", "P": "RGB", "LA": "L", "1": "L"}.get(image.mode, image.mode)
     if profile and PROFILE_MODES.get(profile[16:20], base) == base:  # grey images may carry a profile of RGB
         colours = image if base == image.mode else image.convert(base)

@@ -23,7 +23,7 @@ from hilsplat.datasets.dataset import SceneReport
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.layouts import find_known_poses
 from hilsplat.scene.placement import placement
-from hilsplat.scene.view_names import view_name
+from hilsplat.scene.view_names import view_name, view_names
 
 if TYPE_CHECKING:  # imports pycolmap, which evaluation doesn't need
     from hilsplat.scene.importers.known_views import KnownView
@@ -179,24 +179,14 @@ class LabelledScene:
 
 def images_by_view(folder: Path) -> dict[str, Path]:
     """Return a folder's images by view, sorted by stem; raise SceneError if it has none or a stem repeats."""
-    files = list_images(folder) if folder.is_dir() else []
+    files = sorted(list_images(folder) if folder.is_dir() else [], key=lambda path: path.stem)
     if not files:
         raise SceneError(
             f"{folder} {'has no images' if folder.is_dir() else 'is missing'}",
             expected="the scene's images (.jpg or .png)",
             fix="unpack the whole archive again",
         )
-    images: dict[str, Path] = {}
-    for path in sorted(files, key=lambda path: path.stem):
-        view = view_name(path.stem)
-        if view in images:
-            raise SceneError(
-                f"the names of two images in {folder} differ only in their suffix",
-                found=f"{images[view].name}, {path.name}",
-                fix="remove one of them: labels are matched by file name without the suffix",
-            )
-        images[view] = path
-    return images
+    return dict(zip(view_names(files), files, strict=True))
 
 
 def mask_region(

@@ -217,15 +217,9 @@ def read_point_classes(path: Path, num_points: int) -> Int64[np.ndarray, " P"]:
         ArtifactError: the file is missing or malformed.
         MisalignedArtifactError: the number of points differs.
     """
-    words = _text(path).split()
-    try:
-        values = np.array(words, dtype=np.int64)
-    except (ValueError, OverflowError) as error:
-        raise ArtifactError(
-            f"{path} does not have one integer per line",
-            found=str(error),
-            fix="write one class id per line, 0 for none",
-        ) from error
+    fix = "write one class id per line, 0 for none"
+    with foreign(path, ArtifactError, expected="one integer per line", fix=fix):
+        values = np.array(_text(path).split(), dtype=np.int64)
     if len(values) != num_points:
         raise MisalignedArtifactError(
             f"{path} does not match the labelled points",

@@ -4,6 +4,7 @@ Thresholds were chosen on three sets of real photographs that all register, on b
 over-exposed copies of them, and on pictures from a camera that only rotates (values: docs/scene.md).
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -40,6 +41,9 @@ FAULTS = (
     "exactly twice as wide as high: cut 360-degree panoramas into views of about 90 degrees",
 )
 """Faults of a photograph, and what to do."""
+
+OF_OTHERS = re.compile(r"(\.(jpe?g|png|tiff?|heic))?([._-](mask|depth|normal|edited))?$", re.IGNORECASE)
+"""What masks, maps and edited copies have behind the name of their photograph."""
 
 SAME_PLACE = 0.01
 """Displacement of matches (90th percentile), as a share of the diagonal, below which two pictures count as
@@ -110,6 +114,9 @@ def photo_doubts(photos: Sequence[CheckedPhoto], *, have_poses: bool) -> list[st
     doubts = []
     if len(photos) < FEW_PHOTOS:
         doubts.append(f"only {len(photos)} photographs: take 20 or more, less than 10 degrees apart")
+    by_stem = {photo.name.rpartition(".")[0]: photo.name for photo in photos}
+    if copies := [by_stem[s] for s in by_stem if s != (plain := OF_OTHERS.sub("", s)) and plain in by_stem]:
+        doubts.append(f"{_listed(copies, photos)} named like masks or copies of others: move them elsewhere")
     for fault in FAULTS:
         if names := [photo.name for photo in photos if fault in photo.faults]:
             doubts.append(f"{_listed(names, photos)} {fault}")

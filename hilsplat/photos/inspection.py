@@ -1,20 +1,25 @@
 """Report on a folder of photographs: what can be read, and what is likely to fail."""
 
+import os
 from collections import Counter, defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from hilsplat.base.errors import ImageError, first_line, shorten_list
-from hilsplat.base.files import list_images
+from hilsplat.base.files import list_files, list_images
 from hilsplat.base.images import opened_image, orientation, read_image, require_usable_size
 from hilsplat.base.lineage import sha256_of_file
 from hilsplat.base.progress import track
 from hilsplat.photos.check import CheckedPhoto, checked_photo, matched_rows, photo_doubts
 from hilsplat.scene.features import exif_focal_px
-from hilsplat.scene.layouts import has_known_poses, photo_folder
+from hilsplat.scene.layouts import photo_folder
 from hilsplat.scene.view_names import view_names
 
-OTHER_PHOTO_SUFFIXES = frozenset({".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".gif", ".jxl"})
+OTHER_PHOTO_SUFFIXES = frozenset(
+    {".dng", ".nef", ".nrw", ".cr2", ".cr3", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".gpr"}
+    | {".insp", ".jp2", ".exr", ".hdr", ".psd", ".gif", ".jxl"}
+)
 """Suffixes of unsupported photograph formats. Such files are counted and reported as skipped."""
 
 
@@ -66,47 +71,48 @@ class PhotoReport:
         return "\n".join(lines)
 
 
-def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
-    """Decode all photographs in a folder (or its `images/`), and report its contents and likely problems.
+def inspect_photos(folder: Path, posed: Sequence[Path] = ()) -> PhotoReport:
+    """Decode the `posed` images or, if no poses are known, all photographs in a folder (`photo_folder`).
 
-    If given, `poses` are used instead of those in the folder (`has_known_poses`).
+    Report their contents and likely problems.
 
     Raises:
         SceneError: a photograph has an unusable name, or two photographs differ only in their suffix.
     """
-    photos = list_images(photo_folder(folder))
+    photos = [*posed] or list_images(photo_folder(folder))
+    folder = Path(os.path.commonpath([path.parent for path in photos])) if photos else photo_folder(folder)
     view_names(photos)
     sizes: Counter[tuple[int, int]] = Counter()
     unreadable: list[tuple[str, str]] = []
     by_digest: dict[str, list[str]] = defaultdict(list)
     num_rotated = 0
     checked: list[CheckedPhoto] = []
-    matched, have_poses = matched_rows(len(photos)), has_known_poses(folder, poses)
+    matched, have_poses = matched_rows(len(photos)), bool(posed)
     for row, path in enumerate(track(photos, "photographs checked")):
+        name = path.relative_to(folder).as_posix()
         try:
             pixels = read_image(path)
             require_usable_size(path, pixels.shape[:2])
         except ImageError as error:
-            reason = first_line(error.__cause__ or error).replace(str(path), path.name)
+            reason = first_line(error.__cause__ or error).replace(str(path), name)
             size = f" ({path.stat().st_size} bytes)" if path.exists() else ""
-            unreadable.append((path.name, reason + size))
+            unreadable.append((name, reason + size))
             continue
         size_hw = (pixels.shape[0], pixels.shape[1])
         sizes[size_hw] += 1
         with opened_image(path) as image:
             num_rotated += orientation(image) > 1
         is_matched = row in matched and not have_poses
-        checked.append(checked_photo(path.name, pixels, exif_focal_px(path, size_hw), is_matched=is_matched))
-        by_digest[sha256_of_file(path)].append(path.name)
+        checked.append(checked_photo(name, pixels, exif_focal_px(path, size_hw), is_matched=is_matched))
+        by_digest[sha256_of_file(path)].append(name)
     copies = {name for names in by_digest.values() for name in names[1:]}
     distinct = [photo for photo in checked if photo.name not in copies]
-    suffixes = Counter(path.suffix.lower() for path in photo_folder(folder).iterdir() if path.is_file())
     return PhotoReport(
-        folder=photo_folder(folder),
+        folder=folder,
         sizes=dict(sizes),
         unreadable=tuple(unreadable),
         num_rotated=num_rotated,
         duplicates=tuple(tuple(names) for names in by_digest.values() if len(names) > 1),
-        passed_over={suffix: count for suffix, count in suffixes.items() if suffix in OTHER_PHOTO_SUFFIXES},
+        passed_over=Counter(path.suffix.lower() for path in list_files(folder, OTHER_PHOTO_SUFFIXES)),
         doubts=tuple(photo_doubts(distinct, have_poses=have_poses)),
     )

@@ -6,7 +6,7 @@ import struct
 import zipfile
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path, PurePosixPath
 
 from hilsplat.base.artifacts import read_memo, write_json
@@ -41,11 +41,12 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tu
         raise SceneError(
             f"{source} is missing", fix="pass a folder of photographs, a video, or a zip of photographs"
         )
+    source = unwrapped(source) if source.is_dir() else source
     videos = _videos_of(source)
     if source.is_dir() and not videos:
         beside = list_files(photo_folder(source), VIDEO_SUFFIXES)
         note = f"{len(beside)} videos beside the photographs (Live Photos) are not used"
-        yield unwrapped(source), [note] if beside else []
+        yield source, [note] if beside else []
         return
     if not videos and source.suffix.lower() not in (".zip", ".r3d"):
         fix = "pass the folder that contains the photographs; unpack other archives than .zip first"
@@ -153,17 +154,17 @@ def _check_entries(archive: Path, entries: list[zipfile.ZipInfo]) -> None:
         )
     names: set[str] = set()
     for entry in entries:
+        if not entry.flag_bits & 0x800:
+            with suppress(UnicodeError):  # macOS writes UTF-8, but doesn't set its flag
+                entry.filename = entry.filename.encode("cp437").decode()
         entry.filename = entry.filename.replace("\\", "/")  # written on Windows
         name = PurePosixPath(entry.filename)
-        if is_outside(entry.filename) or ".." in name.parts:
-            problem = "would be unpacked outside the folder"
-        elif stat.S_ISLNK(entry.external_attr >> 16):
-            problem = "is a link"
-        elif entry.flag_bits & 1:
-            problem = "is encrypted"
-        elif str(name) in names:
-            problem = "occurs twice"
-        else:
-            names.add(str(name))
-            continue
-        raise SceneError(f"archive {archive}: entry {entry.filename!r} {problem}", fix=fix)
+        faults = {
+            "would be unpacked outside the folder": is_outside(entry.filename) or ".." in name.parts,
+            "is a link": stat.S_ISLNK(entry.external_attr >> 16),
+            "is encrypted": entry.flag_bits & 1,
+            "occurs twice": str(name) in names,
+        }
+        if problem := next((fault for fault, is_found in faults.items() if is_found), ""):
+            raise SceneError(f"archive {archive}: entry {entry.filename!r} {problem}", fix=fix)
+        names.add(str(name))

@@ -82,14 +82,14 @@ def exif_focal_px(path: Path, size_hw: tuple[int, int]) -> float | None:
             return 0.0
         return value if np.isfinite(value) and value > 0 else 0.0
 
-    if focal := number(ExifTags.Base.FocalLengthIn35mmFilm):
-        return focal / DIAGONAL_35MM * float(np.hypot(*size_hw))
+    focal_px = number(ExifTags.Base.FocalLengthIn35mmFilm) / DIAGONAL_35MM * float(np.hypot(*size_hw))
     unit_mm = PLANE_UNIT_MM.get(int(number(ExifTags.Base.FocalPlaneResolutionUnit)), 25.4)
     pixels_per_mm = number(ExifTags.Base.FocalPlaneXResolution) / unit_mm
     # The resolution refers to the image stored by the camera; programs that downscale it keep these tags.
     stored = (number(ExifTags.Base.ExifImageWidth), number(ExifTags.Base.ExifImageHeight))
     stored_px = max(stored) or max(size)
-    return number(ExifTags.Base.FocalLength) * pixels_per_mm * max(size_hw) / stored_px or None
+    focal_px = focal_px or number(ExifTags.Base.FocalLength) * pixels_per_mm * max(size_hw) / stored_px
+    return focal_px if 0.1 < focal_px / max(size_hw) < 10 else None  # COLMAP registers no others
 
 
 def exif_time(path: Path) -> str:

@@ -16,7 +16,10 @@ from hilsplat.base.lineage import visible_files
 TRAINED = ("output", "outputs", "exports", "language_features")
 """Folders that 3DGS, nerfstudio and LangSplat write beside photographs."""
 
-MAPS = ("label", "segmentations", "test_mask", "mask", "masks", "depth", "depths", "normals")
+MAPS = (
+    *("label", "labels", "label-filt", "instance", "instance-filt", "segmentations", "confidence"),
+    *("test_mask", "mask", "masks", "resized_anon_masks", "depth", "depths", "depth_maps", "normals"),
+)
 """Folders of labels and maps, whose files are named after the photographs. Scaled copies are in `masks_4`."""
 
 UNUSED = (*TRAINED, *MAPS)
@@ -25,6 +28,7 @@ UNUSED = (*TRAINED, *MAPS)
 PHOTO_FOLDERS = ("images", "input")
 """Folders of photographs: COLMAP's and nerfstudio's, then that of 3DGS's `convert.py`."""
 
+MIN_PHOTOS = 3  # minimum number of photographs for structure from motion
 POSES_BOUNDS = "poses_bounds.npy"  # pose file of LLFF
 NO_POSES = Path("none")  # value used instead of a path to ignore the poses in the folder
 
@@ -34,7 +38,7 @@ DATAPARSER = "dataparser_transforms.json"
 EXPORTED = ("exports/*/splat.ply", "exports/splat.ply", "splat.ply", "point_cloud.ply")
 """Paths of a PLY exported by nerfstudio or a viewer; a PLY written by 3DGS is preferred."""
 
-UNREAD_GAUSSIANS = (".spz", ".splat", ".ksplat", ".sog", ".glb", ".gltf")
+UNREAD_GAUSSIANS = (".spz", ".splat", ".ksplat", ".sog", ".lcc", ".psht", ".usdz", ".glb", ".gltf")
 """Suffixes of other formats of Gaussians, which are not read."""
 
 HEADER_BYTES = 2**14  # maximum length of the part of a PLY's header that is searched
@@ -151,21 +155,22 @@ def label_files(folder: Path, named: Path | None = None) -> list[Path]:
 def photo_folder(folder: Path) -> Path:
     """Return the folder of a source's photographs.
 
-    It is the source itself or, if that has fewer images, its `images/` or `input/` (in any case); else a
-    phone export's images; else the only folder with images up to two levels below. Of several such folders,
-    none is chosen (`folders_with_images` lists them).
+    It is the source itself or, if that has fewer images, its `images/` or `input/` (in any case). If the
+    source has fewer than `MIN_PHOTOS`, it is a phone export's images, or else the only folder with images up
+    to two levels below, maps apart, if it has more. Of several such folders, none is chosen.
     """
     num_images = len(list_images(folder))
     for name in PHOTO_FOLDERS:
         for below in sorted(folder.iterdir()):
             if below.name.lower() == name and below.is_dir() and len(list_images(below)) > num_images:
                 return below
-    if num_images:
+    if num_images >= MIN_PHOTOS:
         return folder
     if export := polycam_folders(folder) or record3d_export(folder):
         return export[0]
-    folders = folders_with_images(folder)
-    return next(iter(folders)) if len(folders) == 1 else folder
+    images = [path for path in used_images(folder) if 2 <= len(path.relative_to(folder).parts) <= 3]
+    has_one_place = len({path.parent for path in images}) == 1
+    return images[0].parent if has_one_place and len(images) > num_images else folder
 
 
 def images_below(folder: Path) -> list[Path]:
@@ -178,25 +183,16 @@ def used_images(folder: Path) -> list[Path]:
     return [
         path
         for path in images_below(folder)
-        if re.sub(r"_\d$", "", path.relative_to(folder).parts[0].lower()) not in UNUSED
+        if all(re.sub(r"_\d$", "", part.lower()) not in UNUSED for part in path.relative_to(folder).parts)
     ]
-
-
-def folders_with_images(folder: Path) -> dict[Path, int]:
-    """Return the number of images of each folder with images, up to two levels below a source."""
-    counts = Counter(path.parent for path in images_below(folder))
-    return {
-        below: count
-        for below, count in sorted(counts.items())
-        if 1 <= len(parts := below.relative_to(folder).parts) <= 2 and not set(parts) & set(TRAINED)
-    }
 
 
 def contents(folder: Path) -> str:
     """Return what a folder without usable photographs contains, for messages."""
     kinds = Counter(file.suffix.lower() or "no suffix" for file in folder.iterdir() if file.is_file())
     items = [f"{count} files ({kind})" for kind, count in sorted(kinds.items())]
-    items += [f"{count} images in {below}/" for below, count in folders_with_images(folder).items()]
+    places = Counter(path.parent for path in images_below(folder) if path.parent != folder)
+    items += [f"{count} images in {below}/" for below, count in sorted(places.items())]
     return ", ".join(items[:8]) or "nothing"
 
 
@@ -240,7 +236,8 @@ def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | No
         return None
     if named is not None:
         return _named_poses(folder, named)
-    poses: list[tuple[str, tuple[Path, ...]]] = [("colmap", (model,)) for model in colmap_models(folder)]
+    models = colmap_models(folder / "sparse")
+    poses: list[tuple[str, tuple[Path, ...]]] = [("colmap", (model,)) for model in models]
     if (folder / "transforms.json").is_file():
         poses.append(("transforms", (folder / "transforms.json",)))
     if (folder / "transforms_train.json").is_file():
@@ -271,6 +268,8 @@ def _named_poses(folder: Path, named: Path) -> KnownPoses:
     if model_files(named):
         return KnownPoses(folder, "colmap", (named,))
     known = find_known_poses(named) if named.is_dir() else None
+    if known is None and (models := colmap_models(named)):
+        return KnownPoses(folder, "colmap", (models[0],), tuple(models[1:]))
     if known is None or known.kind not in ("colmap", "transforms"):
         raise SceneError(
             f"{named} has no poses for {folder}",
@@ -293,9 +292,9 @@ def model_files(folder: Path) -> list[Path]:
     return []
 
 
-def colmap_models(folder: Path) -> list[Path]:
-    """Return the folders of the COLMAP models in `sparse/`, those with the most images first."""
-    folders = [*sorted((folder / "sparse").glob("*/")), folder / "sparse"]
+def colmap_models(sparse: Path) -> list[Path]:
+    """Return the COLMAP models in a folder and the folders in it, those with the most images first."""
+    folders = [*sorted(sparse.glob("*/")), sparse]
     return sorted((model for model in folders if model_files(model)), key=lambda model: -_num_images(model))
 
 
@@ -356,10 +355,14 @@ def photo_files(folder: Path, named: Path | None = None) -> list[Path]:
     return sorted(path for path in files if path.is_file())
 
 
+BESIDE = re.compile(r"\..*|__MACOSX|.*\.(md|pdf|txt)", re.IGNORECASE)
+"""Files and folders that archives have beside the folder that wraps the others."""
+
+
 def unwrapped(folder: Path) -> Path:
     """Return the folder with the actual files, because archives often wrap them in a single folder."""
     while not list_images(folder) and not has_known_poses(folder):
-        inside = [path for path in folder.iterdir() if not path.name.startswith(".")]
+        inside = [path for path in folder.iterdir() if not BESIDE.fullmatch(path.name)]
         if len(inside) != 1 or not inside[0].is_dir() or inside[0].name.lower() in PHOTO_FOLDERS:
             break
         folder = inside[0]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.features import LARGE_CAPTURE, MIN_INLIERS, incremental_options
-from hilsplat.scene.sheet import MIN_PHOTOS
+from hilsplat.scene.layouts import MIN_PHOTOS
 
 INIT_MIN_INLIERS = 50  # minimum number of matches in a model's first pair (COLMAP: 100)
 POSE_MIN_INLIERS = 15  # minimum number of visible points needed to pose each additional view (COLMAP: 30)

@@ -30,9 +30,8 @@ from hilsplat.scene.features import (
     prepare_images,
 )
 from hilsplat.scene.importers.importing import import_poses
-from hilsplat.scene.layouts import find_known_poses, photo_folder
+from hilsplat.scene.layouts import MIN_PHOTOS, find_known_poses, photo_folder
 from hilsplat.scene.mapping import map_views
-from hilsplat.scene.sheet import MIN_PHOTOS
 from hilsplat.settings import PosesSettings
 
 logger = logging.getLogger(__name__)

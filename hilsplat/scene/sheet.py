@@ -28,7 +28,6 @@ GROUPS = ("benchmark", "development", "dense", "ci", "photos")
 
 UNITS = ("metre", "arbitrary")
 PHOTOS = "photos"  # data set and group of your own photographs
-MIN_PHOTOS = 3  # minimum number of photographs for structure from motion
 DATA_PREFIX = "data:"  # prefix of a source in the folder of published data sets (`data_root`)
 GENERATED = re.compile(r"([a-z][a-z0-9_]*):([a-z][a-z0-9_-]*):([0-9]{1,9})")
 

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from itertools import takewhile
 from pathlib import Path
+from urllib.parse import unquote
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES
@@ -35,7 +36,7 @@ def name_parts(name: str) -> tuple[str, ...]:
     return tuple(parts)
 
 
-ADDED = re.compile(r"^[0-9a-f]{8}-|_(?:jpe?g|png)\.rf\.[0-9a-f]{32}$")
+ADDED = re.compile(r"^[0-9a-f]{8}-|(_(jpe?g|png|tiff?|bmp|webp|heic))+\.rf\.[0-9a-z]{20,}$")
 """What Label Studio puts before, and Roboflow behind, the name of an uploaded picture."""
 
 
@@ -52,7 +53,7 @@ def match_names(names: Iterable[str], candidates: Iterable[str]) -> dict[str, st
     "rig/cam1/a.png", but not "cam2/a.png". Of several candidates, the one with the most equal folders is
     meant, then the one in the fewest folders, then the one with the same suffix and case. View names have
     their folders as a prefix: "cam1/a.jpg" may be "cam1_a.png". If nothing fits, what upload pages `ADDED` is
-    ignored.
+    ignored, and the name is read as an address: "/data/local-files/?d=cam1/a%20b.jpg" is "cam1/a b.jpg".
     """
     by_last: dict[str, list[tuple[tuple[str, ...], str]]] = {}
     for candidate in candidates:
@@ -60,9 +61,9 @@ def match_names(names: Iterable[str], candidates: Iterable[str]) -> dict[str, st
             by_last.setdefault(parts[-1], []).append((parts, candidate))
 
     def match(name: str) -> str | None:
-        parts = name_parts(name)
         last, suffix = re.split(r"[/\\]", name)[-1], name.casefold().rpartition(".")[2]
-        for wanted in (parts, (*parts[:-1], ADDED.sub("", parts[-1]))) if parts else ():
+        forms = name_parts(name), name_parts(unquote(name.replace("?d=", "/").partition("?")[0]))
+        for wanted in (forms[0], *((*parts[:-1], ADDED.sub("", parts[-1])) for parts in forms if parts)):
             ranked = []
             for length in range(1, len(wanted) + 1):
                 for other, candidate in by_last.get("_".join(wanted[-length:]), ()):
@@ -114,10 +115,11 @@ def view_names(sources: Sequence[Path]) -> list[str]:
         ]
     for name, count in Counter(names).items():
         if count > 1:
-            files = [str(source) for source, other in zip(sources, names, strict=True) if other == name]
+            same = [source for source, other in zip(sources, names, strict=True) if other == name]
+            folder = os.path.commonpath([source.parent for source in same])
             raise SceneError(
-                f"{count} images have the same view name {name}",
-                found=", ".join(files),
+                f"{count} images in {folder} have the same view name {name}",
+                found=", ".join(os.path.relpath(source, folder) for source in same),
                 fix="rename or remove all but one: views are named after the file without its suffix",
             )
     return names

@@ -16,6 +16,7 @@ from hilsplat.base.errors import (
 )
 from hilsplat.base.files import list_images
 from hilsplat.base.images import image_size_hw, read_image, to_uint8
+from hilsplat.base.lineage import visible_files
 from hilsplat.configuration import StageSettings
 from hilsplat.datasets.images.hi import annotated_regions
 from hilsplat.embed.clip import ClipModel
@@ -37,8 +38,12 @@ MAX_UNDISTORTION = 0.1
 few percent; 4:3 and 3:2 differ by 12 %."""
 
 
-UNREAD_POSES = ("*.xml", "cameras.json", "*.nvm", "bundle.out", "*.sfm")
-"""Poses that Metashape, 3DGS, VisualSFM, Bundler and Meshroom write."""
+UNREAD_POSES = (
+    *("*.xml", "cameras.json", "*.nvm", "*.out", "*.sfm", "*.xmp", "*.csv", "sfm_data*.json"),
+    *("meta_data.json", "reconstruction.json", "cameras*.npz", "traj*.txt", "groundtruth.txt", "*.sens"),
+)
+"""Poses that Metashape, 3DGS, VisualSFM, Bundler, Meshroom, RealityCapture, OpenMVG, SDFStudio, OpenSfM and
+NeuS write, and those of Replica, TUM and ScanNet."""
 
 
 @dataclass
@@ -46,12 +51,16 @@ class Parts:
     """What is used with a folder of photographs.
 
     Attributes:
+        files: all files in the folder.
         columns: paths for the scene sheet, by column.
+        posed: images with known poses.
         labels: label files to copy, and the names of the copies, which are those of the views.
         lines: what was found, used and left out, for the user.
     """
 
+    files: list[Path]
     columns: dict[str, Path] = field(default_factory=dict)
+    posed: list[Path] = field(default_factory=list)
     labels: dict[Path, str] = field(default_factory=dict)
     lines: list[str] = field(default_factory=list)
 
@@ -84,13 +93,13 @@ def find_parts(folder: Path, named: dict[str, Path | None], settings: StageSetti
     for what, path in named.items():
         if path is not None and path != layouts.NO_POSES and not path.exists():
             raise SceneError(f"--{what} {path} is missing", fix="correct the path, or pass `none`")
-    parts = Parts()
+    parts = Parts(visible_files(folder))
     views = _poses(folder, named["poses"], settings, parts)
     _gaussians(folder, named, views, parts)
     _features(folder, named["features"], views, settings, parts)
     _labels(folder, named["labels"], views, parts)
-    if skipped := [path.name for path in sorted(folder.rglob("*.pth"))[:3]]:
-        parts.lines.append(f"skipped, because pickle files can run code: {', '.join(skipped)}")
+    if skipped := [path.name for path in parts.files if path.suffix in (".pth", ".pt", ".ckpt")]:
+        parts.lines.append(f"skipped, because pickle files can run code: {shorten_list(skipped)}")
     return parts
 
 
@@ -100,8 +109,11 @@ def _poses(folder: Path, named: Path | None, settings: StageSettings, parts: Par
         parts.columns["poses"] = named if named == layouts.NO_POSES else named.resolve()
     if known is None:
         parts.lines.append("poses: structure from motion")
-        below = [path for path in sorted(folder.glob("*/sparse/**/")) if layouts.model_files(path)]
-        _name_unused(below, "to use these poses, pass --poses", parts)
+        models = {
+            path.parent for path in parts.files if path.stem == "cameras" and layouts.model_files(path.parent)
+        }
+        below = [path for path in parts.files if path.match("transform*.json")]
+        _name_unused([*models, *below], "to use these poses, pass --poses", parts)
         unread = [path for pattern in UNREAD_POSES for path in folder.glob(pattern)]
         _name_unused(unread, "for poses, export a COLMAP model or transforms.json", parts)
         photos = list_images(layouts.photo_folder(folder))
@@ -121,13 +133,15 @@ def _poses(folder: Path, named: Path | None, settings: StageSettings, parts: Par
         K, size_hw = lens.calibration_matrix(), (lens.height, lens.width)
         views.cameras[name] = Camera(name, np.eye(4), K, size_hw, photo)
     source.require_most(settings.poses.min_registered_share, known.files[0], images=True)
-    views.posed = source.views
+    views.posed, parts.posed = source.views, [*views.photos.values()]
     parts.lines.append(f"poses: {', '.join(map(str, known.files))}: {len(views.cameras)} views with an image")
     if missing := source.without_image:
         parts.lines.append(f"  left out: {len(missing)} views without an image: {shorten_list(missing, 5)}")
     if source.left_out:
         reasons = shorten_list([*source.left_out.values()], 5)
         parts.lines.append(f"  left out: {len(source.left_out)} views: {reasons}")
+    if source.unposed:
+        parts.lines.append(f"  left out: {len(source.unposed)} images without a pose")
     if views.held_out:
         parts.lines.append(f"  {len(views.held_out)} views are held out for tests by the source's own split")
     count = "none; they are triangulated" if source.points is None else f"{len(source.points[0])}"
@@ -139,9 +153,11 @@ def _poses(folder: Path, named: Path | None, settings: StageSettings, parts: Par
 def _gaussians(folder: Path, named: dict[str, Path | None], views: Views, parts: Parts) -> None:
     plys = [named["gaussians"]] if named["gaussians"] is not None else layouts.trained_gaussians(folder)
     if not plys:
-        others = [path for path in folder.glob("*.ply") if b" f_dc_0\n" in layouts.ply_header(path)]
+        others = [
+            path for path in parts.files if path.suffix == ".ply" and b" f_dc_0" in layouts.ply_header(path)
+        ]
         _name_unused(others, "to use Gaussians in the coordinates of the poses, pass --gaussians", parts)
-        unread = [path for path in folder.iterdir() if path.suffix.lower() in layouts.UNREAD_GAUSSIANS]
+        unread = [path for path in parts.files if path.suffix.lower() in layouts.UNREAD_GAUSSIANS]
         _name_unused(unread, "for Gaussians, export an uncompressed 3DGS PLY", parts)
     if not plys or plys[0] == layouts.NO_POSES:
         return
@@ -227,7 +243,7 @@ def _labels(folder: Path, named: Path | None, views: Views, parts: Parts) -> Non
         raise SceneError(
             f"only {len(parts.labels)} of {len(files)} label files in {files[0].parent} can be used",
             found=shorten_list(lost, 5),
-            fix="export the labels again, or pass --labels none",
+            fix="export them again, or pass --labels none and import them later with hilsplat annotate",
         )
     count = f"{num_regions} regions in {len(parts.labels)} photographs"
     parts.lines.append(f"labels: {count}, used for evaluation: {files[0].parent}")

@@ -15,10 +15,9 @@ from hilsplat.base.removal import undone_on_error
 from hilsplat.configuration import StageSettings
 from hilsplat.photos.inspection import PhotoReport, inspect_photos
 from hilsplat.photos.intake import prepared_photographs
-from hilsplat.scene.layouts import contents, has_known_poses
+from hilsplat.scene.layouts import MIN_PHOTOS, contents
 from hilsplat.scene.sheet import (
     COLUMNS,
-    MIN_PHOTOS,
     NOTHING,
     PHOTOS,
     content_lines,
@@ -85,9 +84,9 @@ def add_scene(
                 parts = find_parts(folder, named, settings)
                 annotated = root / "annotated" / PHOTOS / name
                 copied_labels = _labels_to_copy(annotated, parts)
-                report = inspect_photos(folder, poses)
+                report = inspect_photos(folder, parts.posed)
                 report = replace(report, notes=(*notes, *parts.lines), columns=parts.columns)
-                _check(report, has_known_poses(folder, poses), settings.poses.min_registered_share)
+                _check(report, bool(parts.posed), settings.poses.min_registered_share)
                 if dry_run:
                     return report
                 if copied_labels:
@@ -143,7 +142,7 @@ def _check(report: PhotoReport, have_poses: bool, min_share: float) -> None:
             f"{report.folder} has too few photographs",
             expected=f"at least {MIN_PHOTOS} (20 or more are better)",
             found="; ".join([distinct, contents(report.folder), *unreadable]),
-            fix="add photographs of the same scene, or record a longer video while walking around it",
+            fix="pass the folder of the photographs, add others of the scene, or record a longer video",
         )
 
 

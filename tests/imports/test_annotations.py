@@ -95,6 +95,7 @@ BLOB = np.random.default_rng(0).random(SIZE) < 0.3
         (coco([flat(200, 80, 280, 160)], image={"height": 240, "width": 320}), box(50, 20, 70, 40)),
         (coco([flat(25, 10, 35, 20)], image={"height": 30, "width": 40}), box(50, 20, 70, 40)),
         (coco([flat(50, 20, 70, 40)], image={"height": 60.0, "width": 80.0}), box(50, 20, 70, 40)),
+        (coco([flat(50, 20, 70, 40)], image_id=7.0, category_id="0"), box(50, 20, 70, 40)),
         # The size of run lengths is that of the mask that a network made.
         (coco({"size": [120, 160], "counts": runs_of(BLOB.repeat(2, 0).repeat(2, 1))}), BLOB),
     ],
@@ -178,7 +179,11 @@ def test_labelme_shapes_of_a_group_are_one_object_and_drawings_may_have_another_
         ("images\\1/90fbb0c7-IMG_0001.jpg", 0),  # Label Studio
         ("..\\..\\label-studio\\media\\upload\\4\\cb0618f6-IMG_0002.jpg", 1),
         ("/data/upload/4/cb0618f6-IMG_0002.jpg", 1),
+        ("/data/local-files/?d=IMG_0002.jpg", 1),
+        ("https://bucket.s3.amazonaws.com/1/IMG%5F0002.jpg?X-Amz-Expires=60", 1),
         ("IMG_0001_jpg.rf.0123456789abcdef0123456789abcdef.jpg", 0),  # Roboflow
+        ("IMG_0001_JPG_jpg.rf.0123456789abcdef0123456789abcdef.jpg", 0),
+        ("IMG_0001_heic_jpg.rf.0BRnP3vTq8YcJm2XzK5w.jpg", 0),
         ("cam1/a.jpg", 2),
         ("C:\\scans\\cam1\\a.jpg", 2),
     ],
@@ -238,6 +243,7 @@ def changed(content, key, rows):
     [
         (coco(GOOD, []), 1, "1 of 2 annotations are left out: 1 without a region (boxes, keypoints)"),
         (coco(GOOD, None, {}), 1, "2 without a region"),
+        (changed(coco(GOOD), "annotations", coco(GOOD, isbbox=True)["annotations"]), 1, "1 without a region"),
         (coco(GOOD, [[3, 3, 9, 9]]), 1, "1 without pixels"),
         (coco(GOOD, [[3, 3, 9]]), 1, "1 invalid"),
         (coco(GOOD, GOOD, [[0, 0, 900, 0, 900, 90]]), 2, "far outside the image of 80 x 60 px"),
@@ -304,6 +310,7 @@ RUNS = {"size": list(SIZE), "counts": runs_of(BLOB)}
         (coco({**RUNS, "counts": ""}), "damaged"),
         (coco({**RUNS, "size": [20_000, 20_000]}), "20000 x 20000"),
         ({"objects": [], "size": {}}, "valid image size"),  # Supervisely
+        ({"annotations": [{}], "item": {}}, "'images' is missing(.|\n)*export the annotations as COCO"),  # V7
         ([{"data": {}}], "unknown format(.|\n)*export the annotations as COCO"),  # Label Studio's own JSON
     ],
 )  # fmt: skip

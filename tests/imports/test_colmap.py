@@ -188,6 +188,7 @@ def test_the_model_with_the_most_images_is_taken_and_others_are_named(models, ch
             rewrite_as_binary(tmp_path / model)
     known = find_known_poses(tmp_path)
     assert known.files == (tmp_path / chosen,)
+    assert chosen == "." or find_known_poses(tmp_path, tmp_path / "sparse").files == known.files
     source = read_source(known)
     assert len(source.views) == max(models.values())
     assert {note.partition(" also has poses")[0] for note in source.notes} == {
@@ -262,6 +263,7 @@ def test_rigs_whose_cameras_share_file_names_keep_every_view(tmp_path, imported)
 
 RIG = {f"cam{1 + number // 3}/{number % 3}.png": number for number in range(6)}
 FLAT = {f"{number}.png": number for number in range(6)}
+MAPS = {f"depth {number}": f"scan/depth/{number}.png" for number in range(6)}
 
 
 @pytest.mark.parametrize(
@@ -281,13 +283,17 @@ FLAT = {f"{number}.png": number for number in range(6)}
         ([*FLAT], {"2.png": "images/2.JPEG", "3.png": "images/3.PNG"}, set()),
         ([*FLAT], {name: f"input/{name}" for name in FLAT}, set()),
         ([*FLAT], {name: f"DCIM/10{name[0]}/{name}" for name in FLAT}, set()),
+        # Maps beside the photographs are not meant.
+        ([*FLAT], {name: f"scan/color/{name}" for name in FLAT} | MAPS, set()),
     ],
 )
 def test_a_missing_picture_is_not_replaced_by_one_in_another_folder(names, moved, missing, tmp_path):
     """`moved` maps pictures to other files than `images/<name>`, or to None if they are deleted."""
     pictures = FLAT if names[-1] in FLAT else RIG
     files = {name: moved.get(name, f"images/{name}") for name in pictures}
-    world.save(tmp_path, {file: PICTURES[pictures[name]] for name, file in files.items() if file}, suffix="")
+    shown = {file: PICTURES[pictures[name]] for name, file in files.items() if file}
+    maps = {file: PICTURES[0] for name, file in moved.items() if name in MAPS}
+    world.save(tmp_path, shown | maps, suffix="")
     poses = dict(zip(names, POSES, strict=False))
     world.write_colmap(tmp_path / "sparse/0", LENS, (WIDTH, HEIGHT), poses, POINTS)
     views = {view.name: view.image for view in read_source(find_known_poses(tmp_path)).views}

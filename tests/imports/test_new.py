@@ -222,6 +222,9 @@ def test_a_dry_run_of_an_archive_leaves_nothing(kind, tmp_path):
         ("images", "images_2", "images_4"),
         ("DCIM/100APPLE",),
         ("photos", "output/renders", ".thumbnails"),
+        ("photos", "masks"),
+        ("rgb", "depth", "confidence"),
+        ("scan/color", "scan/label-filt", "scan/masks_2"),
     ],
 )
 def test_photographs_are_found_where_people_have_them(folders, tmp_path):
@@ -230,11 +233,24 @@ def test_photographs_are_found_where_people_have_them(folders, tmp_path):
     assert photo_folder(tmp_path) == tmp_path / folders[0]
 
 
+def test_with_known_poses_the_images_that_have_one_are_reported(tmp_path):
+    model(tmp_path)
+    photographs(tmp_path / "images")
+    for place, count in ((".", 4), ("images/more", 3)):
+        photographs(tmp_path / place, count)
+    world.save(tmp_path / "images", {"900": np.zeros((HEIGHT, WIDTH), np.uint8)})
+    report = str(add_scene(tmp_path / "p/scenes.tsv", "a", tmp_path))
+    assert f"6 photographs in {tmp_path}/images\n" in report
+    assert "  left out: 1 images without a pose\n" in report
+
+
 def test_a_stray_picture_beside_a_folder_of_photographs_is_not_the_set(tmp_path):
     photographs(tmp_path / "images")
     photographs(tmp_path, 1)
     report = add_scene(tmp_path / "p/scenes.tsv", "a", tmp_path)
     assert report.num_readable == 6 and report.folder == tmp_path / "images"
+    (tmp_path / "images").rename(tmp_path / "scan")
+    assert add_scene(tmp_path / "p/scenes.tsv", "b", tmp_path).folder == tmp_path / "scan"
 
 
 @pytest.mark.parametrize("places", [["monday", "tuesday"], ["DCIM/100APPLE", "DCIM/101APPLE"]])
@@ -248,6 +264,8 @@ def test_several_folders_of_photographs_are_listed(places, tmp_path):
 def test_poses_in_a_single_folder_below_are_found(tmp_path):
     photographs(tmp_path / "desk/desk/images")
     model(tmp_path / "desk/desk")
+    (tmp_path / "desk/__MACOSX").mkdir()
+    (tmp_path / "desk/README.md").write_text("# Desk")
     report = add_scene(tmp_path / "p/config/scenes.tsv", "a", tmp_path / "desk")
     assert "6 views with an image" in str(report)
     (row,) = read_sheet(tmp_path / "p/config/scenes.tsv")
@@ -280,6 +298,18 @@ def test_archives_made_on_windows_are_unpacked(name, tmp_path):
     assert add_scene(tmp_path / "p/scenes.tsv", "a", tmp_path / "a.zip").num_readable == 6
 
 
+def test_names_in_archives_of_macos_are_utf_8_without_its_flag(tmp_path):
+    archive_with(tmp_path, "K\u00fcche {}")
+    content = (tmp_path / "a.zip").read_bytes()
+    for start in (b"PK\3\4\x14\0\0", b"PK\1\2\x14\3\x14\0\0"):
+        assert content.count(start + b"\x08") == 6
+        content = content.replace(start + b"\x08", start + b"\0")
+    (tmp_path / "a.zip").write_bytes(content)
+    add_scene(tmp_path / "p/scenes.tsv", "a", tmp_path / "a.zip")
+    names = {path.name for path in (tmp_path / "p/photos/a").glob("*.jpg")}
+    assert len(names) == 6 and all(name.startswith("K\u00fcche 0") for name in names)
+
+
 def test_other_programs_gaussians_without_poses_are_named_but_not_used(tmp_path):
     folder = photographs(tmp_path / "a")
     gaussians(folder / "point_cloud.ply", 3)
@@ -301,17 +331,22 @@ def test_unknown_coordinates_of_a_nerfstudio_export_are_stated(tmp_path):
 
 def test_poses_and_gaussians_that_are_not_used_are_named_with_what_to_do(tmp_path):
     folder = photographs(tmp_path / "a")
-    for name in ("cameras.xml", "scene.spz", "points.ply"):
+    for name in ("cameras.xml", "photos.out", "scene.spz", "points.ply", "transforms_old.json", "ckpt.pt"):
         (folder / name).write_bytes(b"ply\n")
     model(folder, "colmap/sparse/0")
-    gaussians(folder / "Scan.ply", 3)
+    model(folder, "dslr/colmap")
+    gaussians(folder / "results/ply/Scan.ply", 3)
     lines = new(folder, tmp_path / "p", "--dry-run").output.splitlines()
-    assert lines[:5] == [
+    found = f"{folder}/colmap/sparse/0, {folder}/dslr/colmap, {folder}/transforms_old.json"
+    ply = f"{folder}/results/ply/Scan.ply"
+    assert lines[:6] == [
         "poses: structure from motion",
-        f"  not used: {folder}/colmap/sparse/0; to use these poses, pass --poses",
-        f"  not used: {folder}/cameras.xml; for poses, export a COLMAP model or transforms.json",
-        f"  not used: {folder}/Scan.ply; to use Gaussians in the coordinates of the poses, pass --gaussians",
+        f"  not used: {found}; to use these poses, pass --poses",
+        f"  not used: {folder}/cameras.xml, {folder}/photos.out; "
+        "for poses, export a COLMAP model or transforms.json",
+        f"  not used: {ply}; to use Gaussians in the coordinates of the poses, pass --gaussians",
         f"  not used: {folder}/scene.spz; for Gaussians, export an uncompressed 3DGS PLY",
+        "skipped, because pickle files can run code: ckpt.pt",
     ]
 
 

@@ -60,6 +60,7 @@ FORMS = {  # the lens, the keys that describe it, and the least PSNR
     "focal lengths in px": (PLAIN, NUMBERS, 45),
     "no size": (PLAIN, LENS, 45),
     "sizes as floats": (PLAIN, {"w": float(WIDTH), "h": float(HEIGHT), **LENS}, 45),
+    "lens of a larger image": (SQUARE, {"width": 2 * WIDTH, "height": 2 * HEIGHT, "fl_x": 2 * FX}, 45),
     "only fl_x": (SQUARE, {**SIZE, "fl_x": FX}, 45),
     "only fl_y": (SQUARE, {**SIZE, "fl_y": FX}, 45),
     "camera_angle_x": (SQUARE, {**SIZE, "camera_angle_x": angle(WIDTH, FX)}, 45),
@@ -220,11 +221,20 @@ def test_the_test_frames_of_scannetpp_are_held_out(tmp_path, imported):
     "name",
     [
         *("./images/{}.png", "images/{}", "{}.png", "images\\{}.png", "IMAGES/{}.PNG", ".\\images\\{}"),
-        *("/data/x/{}.png", "C:\\scans\\desk\\{}.jpg", "../images/{}.png", "colmap/images/{}.jpg"),
+        *(
+            "https://x.org/images/{}.png?v=1",
+            "/data/x/{}.png",
+            "C:\\scans\\desk\\{}.jpg",
+            "../images/{}.png",
+            "colmap/images/{}.jpg",
+        ),
     ],
 )
 def test_names_of_images_are_matched(name, tmp_path, imported):
-    views, *_ = imported(write(tmp_path / "in", PLAIN, NUMBERS, "ab", name=name))
+    folder = write(tmp_path / "in", PLAIN, NUMBERS, "ab", name=name)
+    if name == "images/{}":  # PNG is meant, as in Blender
+        world.save(folder / "images", {"a": np.zeros((HEIGHT, WIDTH), np.uint8)}, suffix=".jpg")
+    views, *_ = imported(folder)
     world.require_right(views, right("ab"), 45)
 
 

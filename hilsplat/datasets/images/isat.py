@@ -103,7 +103,7 @@ def read_isat(path: Path, image: Path | None = None) -> IsatFile:
             f"label file {path} has no `objects` list",
             expected="an ISAT file with the keys info and objects",
             found=f"keys {', '.join(content)}",
-            fix="convert labels from other tools (labelme, COCO) to ISAT",
+            fix="import the labels of other tools (labelme, COCO) with hilsplat annotate",
         )
     size_hw = stated_size(f"label file {path}", content.get("info"))
     warnings: list[str] = []
@@ -130,7 +130,7 @@ def stated_size(where: str, content: Any) -> tuple[int, int]:
             f"{where} does not state a valid image size",
             expected=f"height and width in pixels, at most {MAX_SIDE_PX}",
             found=f"height {sides[0]!r}, width {sides[1]!r}",
-            fix="export the labels again, with the size of the image",
+            fix="export the labels again, with the size of the image, or as COCO",
         )
     return int(sides[0]), int(sides[1])
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from hilsplat.base.errors import ImageError, shorten_list
-from hilsplat.base.files import is_outside, list_images
+from hilsplat.base.files import is_outside
 from hilsplat.base.images import (
     image_size_hw,
     opened_image,
@@ -69,9 +69,6 @@ def import_poses(
         source.notes += misfit_notes([view for view, _ in posed], points, "points")
     else:
         source.notes += few_points_doubt(points_per_view)
-    beside = known.root / "images"
-    images = list_images(beside) if known.kind == "colmap" and beside.is_dir() else []
-    unposed = [path.name for path in images if path not in files]
     warnings = [*source.notes, *(f"left out: {reason}" for reason in source.left_out.values())]
     if turned:
         warnings.append(
@@ -81,8 +78,8 @@ def import_poses(
     if missing:
         named = shorten_list(missing, 20)
         warnings.append(f"{len(missing)} of {total} posed views have no image file: {named}")
-    if unposed:
-        warnings.append(f"{len(unposed)} images have no pose and are skipped")
+    if source.unposed:
+        warnings.append(f"{len(source.unposed)} images have no pose and are skipped")
     origin = ", ".join(
         path.relative_to(known.root).as_posix() if known.root in path.parents else path.name
         for path in known.files
@@ -91,7 +88,7 @@ def import_poses(
         "scene": name,
         "poses": f"imported from {origin}",
         "seed": seed,
-        "images": total + len(unposed),
+        "images": total + len(source.unposed),
         "registered": len(views),
         "models": [len(views)],
         "points": len(points[0]),
@@ -99,7 +96,7 @@ def import_poses(
         "points_per_view": points_per_view,
         "mean_reprojection_error_px": _mean_error_px(source),
         "warnings": warnings,
-        "views": _view_entries(posed, source, missing, unposed),
+        "views": _view_entries(posed, source, missing),
     }
     names = [view.view for view in views]
     train = {path.stem for path in (known.root / "images_train").glob("*")}  # of Gaussian Grouping's data
@@ -119,15 +116,15 @@ def _mean_error_px(source: Source) -> float | None:
 
 
 def _view_entries(
-    posed: Sequence[tuple[KnownView, PosedView]], source: Source, missing: list[str], unposed: list[str]
+    posed: Sequence[tuple[KnownView, PosedView]], source: Source, missing: list[str]
 ) -> dict[str, dict[str, Any]]:
-    """Return the report on each view; `missing` views have no image, and `unposed` images no view."""
+    """Return the report on each view and each image without a view; `missing` views have no image."""
     entries: dict[str, dict[str, Any]] = {}
     for described, view in posed:
         name = Path(described.name).name if is_outside(described.name) else described.name
         entries[view.view] = {"file": name, "registered": True, **described.report}
     reasons = source.left_out | dict.fromkeys(missing, "its image file is missing")
-    reasons |= {file: "the source has no pose for it" for file in unposed if file not in reasons}
+    reasons |= dict.fromkeys(source.unposed, "the source has no pose for it")
     for file, reason in reasons.items():
         entries.setdefault(file, {"file": file, "registered": False, "why_not": reason})
     return entries

@@ -15,7 +15,7 @@ from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.cameras import MAX_SIDE_PX
 from hilsplat.scene.colmap import Points, as_camera, pycolmap
 from hilsplat.scene.importers.colmap_model import ModelImage, read_model
-from hilsplat.scene.layouts import KnownPoses, used_images
+from hilsplat.scene.layouts import KnownPoses, photo_folder, used_images
 from hilsplat.scene.posed_images import rigid_pose
 from hilsplat.scene.view_names import match_names, name_parts
 
@@ -68,6 +68,7 @@ class Source:
         points: sparse points; None if the source has none.
         left_out: why a view cannot be used, by name.
         notes: what else in the source is not used, one sentence each.
+        unposed: names of images that no view has.
         has_split: the source lists its training views, which may be all views.
     """
 
@@ -75,6 +76,7 @@ class Source:
     points: Points | None = None
     left_out: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    unposed: list[str] = field(default_factory=list)
     has_split: bool = False
 
     def add(self, name: str, described: Callable[..., KnownView], *args: Any) -> None:
@@ -143,7 +145,7 @@ class Source:
                 f"{len(reasons)} of {total} views of {files} cannot be used",
                 expected=f"at least {min_share:.0%} of the views (poses.min_registered_share)",
                 found="\n            ".join(reasons[:3]) + more,
-                fix="export the poses again, with their images in the same folder or its images/ folder",
+                fix="export the poses again, with each image once: in the same folder or its images/ folder",
             )
 
 
@@ -210,7 +212,7 @@ def find_images(root: Path, names: Sequence[str]) -> dict[str, Path | None]:
     Raises:
         SceneError: a path leads outside the folder, which has no such image.
     """
-    bases, ends = (root / "images", root), ("", *sorted(IMAGE_SUFFIXES))
+    bases, ends = (root / "images", root), ("", ".png", *sorted(IMAGE_SUFFIXES))  # Blender writes PNG
     images: dict[str, Path | None] = {}
     for name in names:
         plain = name.replace("\\", "/")
@@ -291,7 +293,7 @@ def read_llff(known: KnownPoses) -> Source:
     last two are the near and far depths. The lens is SIMPLE_PINHOLE with its centre in the middle, for the
     image size on disk; an image of another shape than stated is noted.
     """
-    path, folder = known.files[0], known.root / "images"
+    path = known.files[0]
     expected = "finite numbers of shape (images, 17)"
     with foreign(path, expected=expected, fix="unpack it again"), path.open("rb") as stream:
         rows = np.load(stream, allow_pickle=False)
@@ -299,7 +301,7 @@ def read_llff(known: KnownPoses) -> Source:
             raise ValueError("bytes follow its array")
         if rows.shape[1:] != (17,) or rows.dtype.kind not in "fiu" or not np.isfinite(rows).any():
             raise ValueError(f"it does not contain LLFF poses, but {rows.dtype} of shape {rows.shape}")
-    images = list_images(folder if folder.is_dir() else known.root)
+    images = list_images(photo_folder(known.root))
     if len(images) != len(rows):
         raise SceneError(
             f"{path} has {len(rows)} poses for {len(images)} images",

@@ -5,6 +5,7 @@ from contextlib import suppress
 import numpy as np
 
 from hilsplat.base.errors import ImageError, SceneError
+from hilsplat.base.files import list_images
 from hilsplat.base.images import image_size_hw
 from hilsplat.scene.importers.known_views import KnownView, Source, check_centres, read_colmap, read_llff
 from hilsplat.scene.importers.phones import read_polycam, read_record3d
@@ -38,7 +39,11 @@ def read_source(known: KnownPoses) -> Source:
         raise SceneError(
             f"all {len(poses)} views of {known.files[0]} have the same pose", fix="export it again"
         )
+    used = {view.image for view in source.views}
     _keep_one_view_per_image(source)
+    if known.kind == "colmap" and (beside := known.root / "images").is_dir():
+        others = [path.name for path in list_images(beside) if path not in used]
+        source.unposed = [name for name in others if name not in source.left_out]
     source.notes += check_centres({view.name: view.lens for view in source.views if view.image is not None})
     source.notes += _size_notes(source)
     source.notes += [f"{other} also has poses, which are not used" for other in known.others]

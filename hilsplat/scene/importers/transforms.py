@@ -35,8 +35,8 @@ COEFFICIENTS = {"OPENCV": ("k1", "k2", "p1", "p2", "k3"), "OPENCV_FISHEYE": ("k1
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 
 # applied_transform and applied_scale are used for Gaussians, see `splat/coordinates.py`.
-USED = """frames file_path transform_matrix w h cx cy k1 k2 k3 k4 p1 p2 camera_model is_fisheye ply_file_path
-applied_transform applied_scale test_frames"""
+USED = """frames file_path transform_matrix w h width height cx cy k1 k2 k3 k4 p1 p2 camera_model is_fisheye
+ply_file_path applied_transform applied_scale test_frames"""
 HARMLESS = """aabb_scale scale offset n_frames up sharpness rotation render_aabb orientation_override
 colmap_im_id depth_file_path depth_path depth_unit_scale_factor integer_depth_scale enable_depth_loading
 normal_file_path sharpen white_transparent black_transparent timestamp auto_scale_poses_override center_method
@@ -133,7 +133,7 @@ def _lens(where: str, frame: Mapping[str, Any], image: Path | None, notes: list[
                 expected="; ".join(f"{lens} with {' '.join(keys)}" for lens, keys in COEFFICIENTS.items()),
                 fix="undistort the images first",
             )
-        width, height = values.get("w"), values.get("h")
+        width, height = values.get("w", values.get("width")), values.get("h", values.get("height"))
         if width is None or height is None:
             height, width = image_size_hw(image) if image is not None else (2, 2)  # not used without an image
         width, height = int(width), int(height)

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,7 @@ from hilsplat.base.images import read_image
 
 pillow_heif.register_heif_opener()  # for writing; reading registers it itself
 
+SRGB = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 GREY = np.array([[0, 128, 255], [10, 20, 30]], np.uint8)
 
 
@@ -98,11 +100,25 @@ def gradient() -> Image.Image:
     return Image.fromarray(np.stack([x * 6, y * 10, 0 * x], axis=-1).astype(np.uint8))
 
 
-@pytest.mark.parametrize("suffix", [".heic", ".HEIF", ".avif", ".webp", ".TIF", ".JPG", ".bmp"])
+@pytest.mark.parametrize(
+    "suffix", [".heic", ".HEIF", ".hif", ".avif", ".webp", ".TIF", ".JPG", ".jfif", ".bmp"]
+)
 def test_phone_and_web_formats_are_listed_and_read(tmp_path, suffix):
     path = saved(tmp_path, gradient(), suffix, quality=95)
     assert list_images(tmp_path) == [path]
     assert np.abs(read_image(path).astype(int) - np.asarray(gradient())).mean() < 4
+
+
+@pytest.mark.parametrize(
+    ("transfer", "profile", "is_read"),
+    [(13, b"", True), (1, b"", True), (16, b"", False), (18, b"", False), (16, SRGB, True)],
+)
+def test_hdr_pictures_of_cameras_are_refused_and_not_shown_dull(transfer, profile, is_read, tmp_path):
+    file = pillow_heif.from_pillow(gradient())
+    file.info.update({"icc_profile": profile} if profile else {})
+    file.save(tmp_path / "a.hif", quality=-1, color_primaries=1, transfer_characteristics=transfer)
+    with nullcontext() if is_read else pytest.raises(ImageError, match="its colours are HDR"):
+        assert read_image(tmp_path / "a.hif").shape == (24, 40, 3)
 
 
 def test_reading_heif_needs_no_preparation(tmp_path, project):

@@ -92,6 +92,14 @@ def test_faulty_photographs_are_named(moving, photos):
     assert wide.startswith("1 of 12 photographs (2.jpg) is exactly twice as wide as high: cut 360-")
 
 
+@pytest.mark.parametrize("name", ["1.mask.png", "1_MASK.jpg", "1.jpg.png", "1.jpg.mask.png", "1-edited.jpg"])
+def test_masks_and_copies_of_other_photographs_are_named(photos, name):
+    named = [*photos[:2], replace(photos[2], name=name), *photos[3:]]
+    (doubt,) = photo_doubts(named, have_poses=False)
+    assert doubt.startswith(f"1 of 12 photographs ({name}) is named like masks or copies of others")
+    assert photo_doubts(named[2:], have_poses=False) == []
+
+
 def test_photographs_from_one_place_are_named(moving):
     shifted = [np.roll(picture, 1, axis=1) for picture in moving]
     pictures = [picture for pair in zip(moving, shifted, strict=True) for picture in pair]

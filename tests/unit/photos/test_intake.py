@@ -215,10 +215,12 @@ def sheet(tmp_path):
 
 
 def test_a_folder_of_videos_is_one_capture_and_a_static_one_leaves_no_files(tmp_path, sheet):
-    (tmp_path / "clips").mkdir()
+    (tmp_path / "DCIM/clips").mkdir(parents=True)
     for number, left in enumerate((0, 300)):
-        write_video(tmp_path / "clips" / f"{number}.mp4", pan([left] + [6] * 20))
-    report = add_scene(sheet, "desk", tmp_path / "clips", frames=10)
+        write_video(tmp_path / "DCIM/clips" / f"{number}.mp4", pan([left] + [6] * 20))
+    report = add_scene(sheet, "desk", tmp_path / "DCIM", frames=10)
+    again = str(add_scene(sheet.with_name("b.tsv"), "desk", tmp_path / "DCIM/clips", frames=10, dry_run=True))
+    assert "10 frames of 0.mp4, 1.mp4 extracted to" in again
     assert report.sizes == {(240, 320): 10}
     assert "10 frames of 0.mp4, 1.mp4 extracted to" in str(report)
     origin = json.loads((tmp_path / "project/photos/desk/origin.json").read_text())

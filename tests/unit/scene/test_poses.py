@@ -304,7 +304,7 @@ def test_without_an_equivalent_the_sensor_resolution_is_used(tmp_path, unit, res
     assert exif_focal_px(shrunk, (300, 400)) == pytest.approx(50)
 
 
-@pytest.mark.parametrize("focal", [IFDRational(5), IFDRational(1, 0)])
-def test_without_usable_tags_there_is_no_focal_length(tmp_path, focal):
-    path = photograph(tmp_path / "a.jpg", FocalLength=focal, FocalLengthIn35mmFilm=0)
+@pytest.mark.parametrize(("focal", "film"), [(IFDRational(5), 0), (IFDRational(1, 0), 0), (5, 65535), (5, 1)])
+def test_without_usable_tags_there_is_no_focal_length(tmp_path, focal, film):
+    path = photograph(tmp_path / "a.jpg", FocalLength=focal, FocalLengthIn35mmFilm=film)
     assert exif_focal_px(path, (300, 400)) is None

@@ -230,7 +230,8 @@ def test_inspection_finds_damaged_turned_and_copied_photographs(tmp_path):
     whole = (folder / "2.jpg").read_bytes()
     (folder / "truncated.jpg").write_bytes(whole[: len(whole) // 2])
     (folder / "text.png").write_text("no image")
-    (folder / "raw.nef").write_bytes(b"x")
+    for name in ("raw.nef", "raw.RW2"):
+        (folder / name).write_bytes(b"x")
 
     report = inspect_photos(tmp_path)  # the folder above images/ works too
     assert report.folder == folder
@@ -241,7 +242,7 @@ def test_inspection_finds_damaged_turned_and_copied_photographs(tmp_path):
     assert list(unreadable) == ["empty.jpg", "text.png", "truncated.jpg"]
     assert unreadable["empty.jpg"] == "cannot identify image file 'empty.jpg' (0 bytes)"
     assert "truncated" in unreadable["truncated.jpg"]
-    assert report.passed_over == {".nef": 1}
+    assert report.passed_over == {".nef": 1, ".rw2": 1}
     assert "5 photographs in" in str(report) and "4  of 40 x 30 px" in str(report)
     assert "1  are copies of others: 1.jpg = copy.jpg" in str(report)
     many = str(replace(report, duplicates=(("a.jpg", "b.jpg", "c.jpg"),) * 8))

@@ -179,6 +179,8 @@ def test_llff_rows_are_in_the_order_of_whole_file_names(bed):
     posed = posed_images(bed, "3D-OVS")
     found = [posed[f"{stem}.png"].cam_from_source for stem in ("a (1)", "a-1", "a", "a_1")]
     np.testing.assert_array_equal(found, before)
+    (bed / "images").rename(bed / "images_4")
+    assert posed_images(bed, "3D-OVS").keys() == posed.keys()
 
 
 ENTRY = np.arange(17)
