@@ -30,11 +30,11 @@ def blob_logits(
     """Return logits of wobbly discs, float32 (K, h, w), with SAM's slope at the border, 5 per pixel."""
     y, x = np.mgrid[: size_hw[0], : size_hw[1]].astype(np.float32)
     out = np.empty((len(radii), *size_hw), np.float32)
-    for place, ((cx, cy), radius) in enumerate(zip(centres_xy, radii, strict=True)):
+    for row, ((cx, cy), radius) in enumerate(zip(centres_xy, radii, strict=True)):
         angle = np.arctan2(y - cy, x - cx)
         phases = rng.uniform(0, 2 * np.pi, 3)
         wobble = sum(np.sin((2 + k) * angle + phase) / (2 + k) for k, phase in enumerate(phases))
-        out[place] = 5 * (radius * (1 + 0.3 * wobble) - np.hypot(x - cx, y - cy))
+        out[row] = 5 * (radius * (1 + 0.3 * wobble) - np.hypot(x - cx, y - cy))
     return out
 
 

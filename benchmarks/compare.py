@@ -103,10 +103,10 @@ def main() -> int:
                 print(f"pair {pair + 1} of {given.pairs}: {which}", file=sys.stderr)
                 out = Path(scratch, f"{which}-{pair}")
                 runs[which].append(run_benchmarks(trees[which], out, options))
-    found = paired(runs["before"], runs["now"])
+    pairs = paired(runs["before"], runs["now"])
     head = ("case", f"{given.base}, ms", "now, ms", "ratio: median pair (all)", "")
-    print(markdown_table(head, [each.row() for each in found]))
-    slower = [each.case for each in found if each.verdict == "slower"]
+    print(markdown_table(head, [comparison.row() for comparison in pairs]))
+    slower = [comparison.case for comparison in pairs if comparison.verdict == "slower"]
     print(f"\nslower: {', '.join(slower) or 'nothing'}")
     return 1 if slower else 0
 

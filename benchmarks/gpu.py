@@ -205,12 +205,12 @@ def copied_mb(profile: torch.profiler.profile) -> dict[str, float]:
 
 def fit(device: str, sizes: Sizes, models: Path | None) -> dict[str, Any]:
     """A fit on the CPU and on the card, from the same scene: seconds and training PSNR."""
-    found = {name: fitted(name, *sizes.fit) for name in ("cpu", "cuda")}
-    if not found["cuda"]["psnr_db"] > found["cpu"]["psnr_db"] - MAX_PSNR_LOSS_DB:
-        raise RuntimeError(f"the fit on the card is worse than on the CPU: {found}")
+    fits = {name: fitted(name, *sizes.fit) for name in ("cpu", "cuda")}
+    if not fits["cuda"]["psnr_db"] > fits["cpu"]["psnr_db"] - MAX_PSNR_LOSS_DB:
+        raise RuntimeError(f"the fit on the card is worse than on the CPU: {fits}")
     if sizes.long_fit is not None:
-        found["cuda, long"] = fitted("cuda", *sizes.long_fit)
-    return found
+        fits["cuda, long"] = fitted("cuda", *sizes.long_fit)
+    return fits
 
 
 def fitted(device: str, number: int, views: int, side_px: int, iterations: int) -> dict[str, float]:
@@ -293,15 +293,15 @@ def contributions(device: str, sizes: Sizes, models: Path | None) -> dict[str, A
     from benchmarks.large_scene import make, stages
 
     number, views, width, masks = sizes.contributions
-    found = {}
+    seconds = {}
     with tempfile.TemporaryDirectory() as temporary:
         out, threads = Path(temporary), CORES
         make(out, number, views, (width * 3 // 4, width), masks, threads)
         for name in ("cpu", "cuda"):
             begun = time.perf_counter()
             stages(out, threads, name)["contributions"]()
-            found[f"{name}_s"] = time.perf_counter() - begun
-    return found
+            seconds[f"{name}_s"] = time.perf_counter() - begun
+    return seconds
 
 
 def slots(device: str, sizes: Sizes, models: Path | None) -> dict[str, Any]:
@@ -376,11 +376,11 @@ def estimate_of(results: dict[str, Any]) -> dict[str, Any]:
     known = json.loads(ESTIMATE.read_text(encoding="utf-8"))
     sam_s = dict(known["sam_picture_s"])
     crop_s = known["clip_crop_s"]
-    for name, found in results["networks"].items():
-        if isinstance(found, dict) and "picture_ms" in found:
-            sam_s[next(word for word in sam_s if word in name)] = found["picture_ms"] / 1e3
-        elif isinstance(found, dict) and "crop_ms" in found:
-            crop_s = min(found["crop_ms"].values()) / 1e3
+    for name, result in results["networks"].items():
+        if isinstance(result, dict) and "picture_ms" in result:
+            sam_s[next(word for word in sam_s if word in name)] = result["picture_ms"] / 1e3
+        elif isinstance(result, dict) and "crop_ms" in result:
+            crop_s = min(result["crop_ms"].values()) / 1e3
     return {
         "card": results["machine"]["card"],
         "measured": True,
@@ -417,19 +417,19 @@ def main() -> int:
     results = {}
     # a part that fails on a card may leave it unusable for its process
     for together in [[name] for name in names] if given.device == "cuda" else [names]:
-        for name, found in run_parts(together, given.device, given.models).items():
-            results[name], state = found, "FAILED" if "failed" in found else "passed"
-            print(f"{name:<14} {state} {found['part_s']:6.1f} s", flush=True)
+        for name, result in run_parts(together, given.device, given.models).items():
+            results[name], state = result, "FAILED" if "failed" in result else "passed"
+            print(f"{name:<14} {state} {result['part_s']:6.1f} s", flush=True)
     write_json(given.out / "gpu.json", results)
-    failed = {name: found["failed"] for name, found in results.items() if "failed" in found}
+    failed = {name: result["failed"] for name, result in results.items() if "failed" in result}
     rows: list[tuple[str, ...]] = [
         (
             name,
             "failed" if name in failed else "",
-            f"{found['part_s']:.0f}",
-            json.dumps({key: value for key, value in found.items() if key not in ("failed", "part_s")}),
+            f"{result['part_s']:.0f}",
+            json.dumps({key: value for key, value in result.items() if key not in ("failed", "part_s")}),
         )
-        for name, found in results.items()
+        for name, result in results.items()
     ]
     write_text(given.out / "gpu.md", markdown_table(("part", "", "s", "results"), rows) + "\n")
     print(f"wrote {given.out / 'gpu.json'} and {given.out / 'gpu.md'}")

@@ -65,11 +65,11 @@ SERIES["gaussians"] = [Size(gaussians=gaussians, views=48) for gaussians in GAUS
 def measured(size: Size, folder: Path) -> dict[str, list[float]]:
     """Return seconds, CPU seconds and peak MiB of every stage; existing timings are reused."""
     name = f"{size.gaussians}-{size.views}-{size.pixels}-{size.masks}"
-    kept = folder / name / "times.json"
-    if not kept.exists():
+    recorded = folder / name / "times.json"
+    if not recorded.exists():
         command = [sys.executable, "-m", "benchmarks.large_scene", str(folder / name), *size.options()]
         subprocess.run(command, check=True, stdout=sys.stderr)
-    return json.loads(kept.read_text(encoding="utf-8"))
+    return json.loads(recorded.read_text(encoding="utf-8"))
 
 
 def exponent(sizes: list[float], values: list[float]) -> float:
@@ -81,12 +81,12 @@ def draw(series: dict[str, dict[str, dict[str, list[float]]]]) -> Figure:
     """Draw a column per quantity, seconds above and peak memory below, with the exponent of each line."""
     figure = Figure(figsize=(3.6 * len(series), 6.4), layout="constrained")
     panels = figure.subplots(len(MEASURES), len(series), sharey="row", squeeze=False)
-    for column, (quantity, found) in enumerate(series.items()):
-        sizes = found["size"]["values"]
+    for column, (quantity, measures) in enumerate(series.items()):
+        sizes = measures["size"]["values"]
         for row, measure in enumerate(MEASURES):
             axes = panels[row, column]
             for stage in STAGES:
-                values = found[stage][measure]
+                values = measures[stage][measure]
                 (line,) = axes.loglog(sizes, values, marker="o", markersize=3, label=stage.replace("_", " "))
                 axes.annotate(
                     f"{exponent(sizes, values):.1f}".replace("-0.0", "0.0"),

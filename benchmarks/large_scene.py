@@ -69,8 +69,8 @@ def made_gaussians(number: int) -> tuple[Gaussians, np.ndarray]:
     way /= np.linalg.norm(way, axis=1, keepdims=True)
     centre = np.stack([ball % ROWS - ROWS / 2, ball // ROWS - ROWS / 2, np.full(on_balls, RADIUS)], axis=1)
     on_floor = number - on_balls
-    place = rng.uniform(-ROWS * 0.6, ROWS * 0.6, (on_floor, 2))
-    floor = np.concatenate([place, np.zeros((on_floor, 1))], axis=1)
+    positions = rng.uniform(-ROWS * 0.6, ROWS * 0.6, (on_floor, 2))
+    floor = np.concatenate([positions, np.zeros((on_floor, 1))], axis=1)
     half = 2 * ball + (way[:, 2] > 0)
     eighth = 4 * half + 2 * (way[:, 0] > 0) + (way[:, 1] > 0)
     labels = np.full((number, len(LEVELS)), -1, np.int32)
@@ -125,19 +125,19 @@ def make(out: Path, number: int, views: int, size_hw: tuple[int, int], masks: in
             for which in LEVELS:
                 label = np.where(front >= 0, labels[front, which.index], -1)
                 area = np.bincount(label[label >= 0], minlength=len(things[which.index]))
-                kept = np.argsort(-area, kind="stable")[: masks // len(LEVELS)]
-                for thing in kept[area[kept] >= MIN_AREA_PX]:
+                largest = np.argsort(-area, kind="stable")[: masks // len(LEVELS)]
+                for thing in largest[area[largest] >= MIN_AREA_PX]:
                     dense.append((label == thing).reshape(size_hw))
                     level.append(which)
                     vectors.append(things[which.index][thing] + 0.7 * rng.normal(size=CHANNELS))
             ones = np.ones(len(dense), np.float32)
-            found = HierarchicalMasks.from_dense(np.stack(dense), np.array(level, np.uint8), ones, ones)
-            found.save(masks_folder / f"{name}.npz")
+            drawn = HierarchicalMasks.from_dense(np.stack(dense), np.array(level, np.uint8), ones, ones)
+            drawn.save(masks_folder / f"{name}.npz")
             unit = np.stack(vectors)
             unit /= np.linalg.norm(unit, axis=1, keepdims=True)
             write_npy(clip_folder / f"{name}.npy", unit.astype(np.float16))
-            index_of_masks[name] = index_entry(found)
-            index_of_clip[name] = {MASKS_SHA256: digest_of(found), "masks": len(found)}
+            index_of_masks[name] = index_entry(drawn)
+            index_of_clip[name] = {MASKS_SHA256: digest_of(drawn), "masks": len(drawn)}
         print(f"{nonzeros / views / size_hw[0] / size_hw[1]:.1f} Gaussians per pixel")
         write_index(masks_folder, index_of_masks, scene="made/large", segmenter="made", model="")
         write_index(clip_folder, index_of_clip, scene="made/large", dim=CHANNELS, model="")
@@ -149,9 +149,9 @@ def front_gaussian(weights) -> np.ndarray:
     counts = np.diff(weights.indptr)
     filled = np.flatnonzero(counts)
     largest = np.maximum.reduceat(weights.data, weights.indptr[filled])
-    place = np.flatnonzero(weights.data == np.repeat(largest, counts[filled]))
-    pixel = np.repeat(filled, counts[filled])[place]
-    front[pixel] = weights.indices[place]
+    entries = np.flatnonzero(weights.data == np.repeat(largest, counts[filled]))
+    pixel = np.repeat(filled, counts[filled])[entries]
+    front[pixel] = weights.indices[entries]
     return front
 
 

@@ -83,8 +83,8 @@ def main() -> None:
     for name in sys.argv[1:]:
         measure(Path(name), levels, missed)
     rows = [
-        (level.label, *map(str, (own.top1, own.top5, own.named, own.right, own.doubted)))
-        for level, own in levels.items()
+        (level.label, *map(str, (counts.top1, counts.top5, counts.named, counts.right, counts.doubted)))
+        for level, counts in levels.items()
     ]
     head = ("level", "top-1", "top-5", "named", "of the named, right", "present, doubted")
     print(markdown_table(head, rows, 1))

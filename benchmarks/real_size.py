@@ -138,19 +138,19 @@ def measure(step: str, models: Path, photograph: Path, points: int) -> dict[str,
     from hilsplat.settings import ClipSettings, MasksSettings
 
     image = resize_to_fit(read_image(photograph), MAX_SIDE_PX)
-    found: dict[str, float] = {}
+    figures: dict[str, float] = {}
 
     def clocked(name: str, work):
         start = time.process_time()
         result = work()
-        found[f"{name}_s"] = time.process_time() - start
+        figures[f"{name}_s"] = time.process_time() - start
         return result
 
     if step == "clip":
         masks = segment_graph(image, MasksSettings().graph_scales, MasksSettings().min_area_px)
         clip = _picture_half(Network(models / "vision_model.onnx", LAYOUTS["clip"].networks["vision_model"]))
         clocked("clip", lambda: clip.embed_masks(image, masks, ClipSettings()))
-        found["masks"] = len(masks)
+        figures["masks"] = len(masks)
     else:
         model, settings = SamModel.load(models), MasksSettings(points_per_side=points)
         encode = model.encode
@@ -160,7 +160,7 @@ def measure(step: str, models: Path, photograph: Path, points: int) -> dict[str,
 
         model.encode = clocked_encode  # type: ignore[method-assign]
         clocked("view", lambda: decode_candidates(image, model, settings))
-    return found | {"peak_mib": status_mib("VmHWM")}
+    return figures | {"peak_mib": status_mib("VmHWM")}
 
 
 def compare_decoders(models: Path, photograph: Path, points: int) -> dict[str, float]:
@@ -182,18 +182,18 @@ def compare_decoders(models: Path, photograph: Path, points: int) -> dict[str, f
     at = in_input(point_grid(points) * (image.shape[1], image.shape[0]), encoded.frame)
     at = at[np.random.default_rng(0).permutation(len(at))[:many]]
     step = model.decoder.prompts_per_call or 8
-    found: dict[str, list[float]] = {"plain_ms": [], "preview_ms": [], "masks_ms": []}
+    times: dict[str, list[float]] = {"plain_ms": [], "preview_ms": [], "masks_ms": []}
     apart = {"iou": 0.0, "logits": 0.0}
     for _ in range(rounds):
         clock = time.process_time()
         plain = [model.decoder(encoded.features, at[k : k + step, None]) for k in range(0, many, step)]
-        found["plain_ms"].append(time.process_time() - clock)
+        times["plain_ms"].append(time.process_time() - clock)
         clock = time.process_time()
         calls = [model.factored.decode(encoded.terms, at[k : k + 16], fine=False) for k in range(0, many, 16)]
-        found["preview_ms"].append(time.process_time() - clock)
+        times["preview_ms"].append(time.process_time() - clock)
         clock = time.process_time()
         logits = np.concatenate([model.factored.logits(encoded.terms, kept) for _, _, kept in calls])
-        found["masks_ms"].append(time.process_time() - clock)
+        times["masks_ms"].append(time.process_time() - clock)
         iou = np.concatenate([call[0] for call in calls])
         plain_logits = np.concatenate([each[1] for each in plain])
         apart["iou"] = float(np.abs(iou - np.concatenate([each[0] for each in plain])).max())
@@ -202,7 +202,7 @@ def compare_decoders(models: Path, photograph: Path, points: int) -> dict[str, f
     apart |= {"mask_px": unequal.size, "unequal_px": int(unequal.sum())}
     apart["tie"] = float(np.abs(plain_logits[unequal]).max(initial=0))
     apart["spread"] = float(plain_logits.std())
-    medians = {name: 1e3 * float(np.median(each)) / many for name, each in found.items()}
+    medians = {name: 1e3 * float(np.median(each)) / many for name, each in times.items()}
     mean = medians["preview_ms"] + KEPT * medians["masks_ms"]
     return {**medians, "mean_ms": mean, "ratio": medians["plain_ms"] / mean, **apart}
 

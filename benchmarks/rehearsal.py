@@ -56,8 +56,8 @@ def make_project(folder: Path, models: dict[str, Path], regions: Path, precision
     (folder / "models").mkdir()
     for name in ("sam-tiny", "clip-tiny"):
         (folder / "models" / name).symlink_to(PROJECT / "models" / name)
-    for kind, place in models.items():
-        (folder / "models" / f"rehearsal-{kind}").symlink_to(place.resolve())
+    for kind, folder_of_model in models.items():
+        (folder / "models" / f"rehearsal-{kind}").symlink_to(folder_of_model.resolve())
     (folder / "patch").mkdir()
     (folder / "patch/sitecustomize.py").write_text(PATCH.format(regions=str(regions)))
     if precision == "auto":
@@ -77,7 +77,7 @@ def rehearse(folder: Path, photographs: Path, options: list[str], cores: int) ->
     subprocess.run([*command, "models", "check"], cwd=folder, env=plain, check=True)
     subprocess.run([*command, "new", name, str(photographs)], cwd=folder, env=environment, check=True)
     begin = time.monotonic()
-    found: dict[str, float] = {}
+    moments: dict[str, float] = {}
     run = [*command, "run", SCENE, *options, "--", "--cores", str(cores)]
     with subprocess.Popen(
         run, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -88,11 +88,11 @@ def rehearse(folder: Path, photographs: Path, options: list[str], cores: int) ->
             print(f"{now:6.0f} s  {line}", end="", flush=True)
             for what, words in (("first answer", READY), ("final tree", COMPLETE)):
                 if words in line:
-                    found.setdefault(what, now)
-    found["end"] = time.monotonic() - begin
+                    moments.setdefault(what, now)
+    moments["end"] = time.monotonic() - begin
     if process.returncode:
         sys.exit("the run failed")
-    return found
+    return moments
 
 
 def stage_table(folder: Path) -> str:
@@ -127,9 +127,9 @@ def main() -> None:
     given.folder.mkdir(parents=True)
     folder = given.folder.resolve()
     options = make_project(folder, models, models_folder / "regions", given.precision)
-    found = rehearse(folder, given.photographs.resolve(), options, given.cores)
+    moments = rehearse(folder, given.photographs.resolve(), options, given.cores)
     print(stage_table(folder))
-    print(", ".join(f"{what} after {seconds:.0f} s" for what, seconds in found.items()))
+    print(", ".join(f"{what} after {seconds:.0f} s" for what, seconds in moments.items()))
 
 
 if __name__ == "__main__":

@@ -143,8 +143,8 @@ def run(folder: Path, settings: PosesSettings, threads: int) -> dict[str, str]:
     mapped = _clocks()
     poses = {models[0].images[i].name: models[0].images[i] for i in models[0].reg_image_ids()}
     names = tuple(sorted(poses))
-    found = np.stack([pose_matrix(poses[name].cam_from_world()) for name in names])
-    error = scene_from_true(true, Cameras(names, found, true.K[: len(names)], true.size_hw[: len(names)]))[1]
+    fitted = np.stack([pose_matrix(poses[name].cam_from_world()) for name in names])
+    error = scene_from_true(true, Cameras(names, fitted, true.K[: len(names)], true.size_hw[: len(names)]))[1]
     with pycolmap.Database.open(database) as opened:
         numbers = {image.image_id: true.names.index(image.name) for image in opened.read_all_images()}
         pair_ids, inliers = opened.read_two_view_geometry_num_inliers()

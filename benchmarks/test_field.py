@@ -52,8 +52,8 @@ def open_scene(code_name: str, threads: int = 1) -> LanguageScene:
     """Return a scene whose latents have three numbers (network) or sixteen (pca)."""
     gaussians, camera = random_scene(GAUSSIANS, SIZE_HW, sh_degree=0)
     rng = np.random.default_rng(0)
-    place = gaussians.means @ camera.K.T
-    x, y = (place[:, k] / place[:, 2] / SIZE_HW[1 - k] for k in (0, 1))
+    projected = gaussians.means @ camera.K.T
+    x, y = (projected[:, k] / projected[:, 2] / SIZE_HW[1 - k] for k in (0, 1))
     node_of_gaussian = np.zeros((len(gaussians), 3), np.int32)
     level, parent, first = [], [], 0
     for index, (down, across) in enumerate(BLOCKS):
@@ -184,11 +184,11 @@ def test_linkage_of_a_synthetic_scene(benchmark):
     visible = sp.csr_matrix(visible)
 
     def link_three_levels() -> int:
-        found = 0
+        num_nodes = 0
         for _ in LEVELS:
             evidence = mask_evidence(shares, np.ones(60_000), visible, view, view_pairs(visible), 0.2)
-            found += pooled_linkage(evidence, 0.3)()[0].max() + 1
-        return found
+            num_nodes += pooled_linkage(evidence, 0.3)()[0].max() + 1
+        return num_nodes
 
     benchmark.extra_info |= {"case": LINKAGE, "count": 3000, "of": "masks"}
     assert benchmark.pedantic(link_three_levels, rounds=3) == 75
@@ -200,8 +200,8 @@ def test_conjugate_gradient(benchmark):
     gaussians, camera = random_scene(60_000, (256, 256), sh_degree=0)
     W = sp.vstack([pixel_weights(gaussians, camera, min_weight=1 / 255)] * 8, format="csr")
     labels = np.random.default_rng(0).integers(0, 30, (W.shape[0], 3)) + np.array([0, 30, 60])
-    place = np.arange(W.shape[0])
-    B = sum(sp.csr_matrix((np.ones(len(place)), (labels[:, k], place)), (90, len(place))) for k in range(3))
+    rows = np.arange(W.shape[0])
+    B = sum(sp.csr_matrix((np.ones(len(rows)), (labels[:, k], rows)), (90, len(rows))) for k in range(3))
     n = np.asarray(B.sum(axis=1)).ravel().astype(np.float32)
     A = sp.csr_matrix(sp.diags(1 / n) @ B @ W, dtype=np.float32)
     latents = unit(np.random.default_rng(1).normal(size=(90, 8)))

@@ -84,7 +84,7 @@ def opened(browser: Any, folder: Path, painter: str) -> dict[str, float]:
         page.locator("#text").fill(TEXT)
         answer = timed_redraw(page, lambda: page.keyboard.press("Enter"))
         heap = counter.send("Runtime.getHeapUsage")
-        found = {
+        scenes = {
             "sent": sum(sent) / 1e6,
             "first": first,
             "whole": whole,
@@ -94,7 +94,7 @@ def opened(browser: Any, folder: Path, painter: str) -> dict[str, float]:
             "server": server.memory_info().rss / 2**20,
         }
         page.close()
-    return found
+    return scenes
 
 
 def dragged(page: Any) -> None:

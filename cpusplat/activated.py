@@ -22,7 +22,7 @@ def as_array(name: str, values: Any, *shape: int | None, dtype: type = np.float3
         values = values.detach().numpy()
     array: np.ndarray = np.ascontiguousarray(values, dtype)
     if len(array.shape) != len(shape) or any(
-        size not in (None, own) for size, own in zip(shape, array.shape, strict=True)
+        size not in (None, side) for size, side in zip(shape, array.shape, strict=True)
     ):
         expected = ", ".join("any" if size is None else str(size) for size in shape)
         raise ValueError(f"{name} has the shape {list(array.shape)}; expected [{expected}]")

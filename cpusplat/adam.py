@@ -56,10 +56,10 @@ def adam_step(
         raise ValueError(f"expected contiguous float32 arrays [N] and t >= 1; found {found}, t = {t}")
     repeated = np.tile(np.asarray(rates, np.float32), WIDTH) / np.float32(1 - BETA1**t)
     root_of_rest2 = float(np.sqrt(1 - BETA2**t))
-    whole, rest = divmod(len(values), WIDTH)
+    whole, tail = divmod(len(values), WIDTH)
     over_ranges(_adam_chunks, whole, threads, *arrays, repeated, root_of_rest2)
-    if rest:
-        last = [np.concatenate([array[-rest:], np.zeros(WIDTH - rest, np.float32)]) for array in arrays]
+    if tail:
+        last = [np.concatenate([array[-tail:], np.zeros(WIDTH - tail, np.float32)]) for array in arrays]
         _adam_chunks(0, 1, *last, np.roll(repeated, -WIDTH * whole), root_of_rest2)
         for array, chunk in zip(arrays, last, strict=True):
-            array[-rest:] = chunk[:rest]
+            array[-tail:] = chunk[:tail]

@@ -327,9 +327,9 @@ def blend_backward(
                             to = LANES * channel
                             store(colour_sums, to, load(colour_sums, to) + weight * grad)
                     seen = weight * shade
-                    rest = load(to_come, spot) - seen
-                    store(to_come, spot, rest)
-                    v = seen - rest * here * reciprocal(lanes(_ONE) - here)
+                    behind = load(to_come, spot) - seen
+                    store(to_come, spot, behind)
+                    v = seen - behind * here * reciprocal(lanes(_ONE) - here)
                     v = keep_lt(uncut, lanes(_TOP), keep_gt(weight, zero, v))
                     vx, vy = v * dx, v * dy
                     s = s + v
@@ -452,7 +452,7 @@ def sparse_rows(
 def _rank(held, first, size, rank):
     """Count the smaller columns for each entry of a row; bits read as floats keep the order of columns."""
     for begin in range(0, size, LANES):
-        own, smaller = load(held, first + begin), lanes(_ZERO)
+        depths, smaller = load(held, first + begin), lanes(_ZERO)
         for k in range(first, first + size):
-            smaller = smaller + keep_gt(own, lanes(held[k]), lanes(_ONE))
+            smaller = smaller + keep_gt(depths, lanes(held[k]), lanes(_ONE))
         store(rank, begin, smaller)

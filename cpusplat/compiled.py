@@ -51,9 +51,9 @@ def _folder_of(package: str) -> str:
     It is in `NUMBA_CACHE_DIR` if that is set, else in the package if it can be written, else in the user's
     cache folder.
     """
-    own = Path(__file__).parent
-    root = Path(next(iter(getattr(sys.modules.get(package), "__path__", [own]))))
-    files = sorted({*own.glob("*.py"), *_kernel_modules(root)})
+    this_package = Path(__file__).parent
+    root = Path(next(iter(getattr(sys.modules.get(package), "__path__", [this_package]))))
+    files = sorted({*this_package.glob("*.py"), *_kernel_modules(root)})
     digest = hashlib.sha256()
     for file in files:
         # with the time: if a file is edited while a process starts, and restored later, it counts as new

@@ -12,7 +12,7 @@ from cpusplat.lanes import LANES, WIDTH, splat
 _HAS_AVX512 = bool(binding.get_host_cpu_features().get("avx512f"))
 """With AVX-512, a core has 32 registers of 16 numbers each; without it, 16 registers of at most 8 numbers."""
 
-MOST_ROWS = 8 if _HAS_AVX512 else 6
+MAX_ROWS = 8 if _HAS_AVX512 else 6
 WIDE_COLUMNS = 2 * WIDTH if _HAS_AVX512 else WIDTH  # rows and columns whose sums fit into the registers
 
 
@@ -57,8 +57,8 @@ def rows_of_products(rows: int) -> Any:
                     at = builder.add(x_first, builder.mul(loop.index, x_next))
                     loaded = [builder.load(each, align=4) for each in vectors(x_data, at, count)]
                     for number, total in enumerate(sums):
-                        place = builder.add(starts[number // count], loop.index)
-                        factor = builder.load(builder.gep(a_data, [place]))
+                        index = builder.add(starts[number // count], loop.index)
+                        factor = builder.load(builder.gep(a_data, [index]))
                         same = splat(builder, factor)
                         product = builder.fmul(same, loaded[number % count], flags=("contract",))
                         added = builder.fadd(builder.load(total), product, flags=("contract",))

@@ -102,8 +102,8 @@ def _pointer(
 
 
 def _load(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-    place = _pointer(context, builder, sig.args[0], args[0], args[1], sig.return_type)
-    return builder.load(place, align=sig.args[0].dtype.bitwidth // 8)
+    address = _pointer(context, builder, sig.args[0], args[0], args[1], sig.return_type)
+    return builder.load(address, align=sig.args[0].dtype.bitwidth // 8)
 
 
 def _is_flat(array: Any) -> bool:
@@ -176,8 +176,8 @@ def store(typingctx, array, index, value):
         return None
 
     def codegen(context, builder, sig, args):
-        place = _pointer(context, builder, sig.args[0], args[0], args[1], value)
-        builder.store(args[2], place, align=array.dtype.bitwidth // 8)
+        address = _pointer(context, builder, sig.args[0], args[0], args[1], value)
+        builder.store(args[2], address, align=array.dtype.bitwidth // 8)
         return context.get_dummy_value()
 
     return types.void(array, types.intp, value), codegen
@@ -214,13 +214,13 @@ def add_products(typingctx, sums, at, a, b, c, scale):
         number, lane = ir.DoubleType(), ir.IntType(32)
         four = ir.VectorType(number, 4)
         data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        place = builder.bitcast(builder.gep(data, [args[1]]), four.as_pointer())
+        address = builder.bitcast(builder.gep(data, [args[1]]), four.as_pointer())
         weights = ir.Constant(four, [ir.Constant(number, 0.0)] * 4)
         for index, value in enumerate(args[2:5]):
             weights = builder.insert_element(weights, value, ir.Constant(lane, index))
-        before = builder.load(place, align=8)
+        before = builder.load(address, align=8)
         products = builder.fmul(weights, splat(builder, args[5], 4))
-        builder.store(builder.fadd(before, products), place, align=8)
+        builder.store(builder.fadd(before, products), address, align=8)
         return builder.extract_element(before, ir.Constant(lane, 0))
 
     return types.float64(sums, types.intp, *[types.float64] * 4), codegen
@@ -246,11 +246,11 @@ def exp2_negative(builder, value):
     the exponent bits. Lanes outside the range get an arbitrary, possibly infinite number and no trap.
     """
     whole = builder.fptosi(value, _INTS)
-    rest = builder.fsub(value, builder.sitofp(whole, _VECTOR))
+    fraction = builder.fsub(value, builder.sitofp(whole, _VECTOR))
     # Chebyshev fit of 2**f over [-1, 0], degree 6
     result = _constant(_EXP2[-1])
     for coefficient in reversed(_EXP2[:-1]):
-        product = builder.fmul(result, rest, flags=_FLAGS)
+        product = builder.fmul(result, fraction, flags=_FLAGS)
         result = builder.fadd(product, _constant(coefficient), flags=_FLAGS)
     bits = builder.shl(builder.add(whole, _constant(127, _INTS)), _constant(23, _INTS))
     return builder.fmul(result, builder.bitcast(bits, _VECTOR))
@@ -323,8 +323,8 @@ def prefetch(typingctx, array, index):
         byte = ir.IntType(8).as_pointer()
         kind = ir.FunctionType(ir.VoidType(), [byte, _INT, _INT, _INT])
         fetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        place = builder.bitcast(builder.gep(data, [args[1]]), byte)
-        builder.call(fetch, [place, *(ir.Constant(_INT, flag) for flag in (0, 3, 1))])
+        address = builder.bitcast(builder.gep(data, [args[1]]), byte)
+        builder.call(fetch, [address, *(ir.Constant(_INT, flag) for flag in (0, 3, 1))])
         return context.get_dummy_value()
 
     return types.void(array, types.intp), codegen

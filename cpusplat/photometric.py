@@ -126,10 +126,10 @@ def _gradient_rows(begin, end, num, stride, image, target, slopes, l1_weight, ss
 def _require_alike(image: np.ndarray, target: np.ndarray) -> None:
     """Raise ValueError unless both are images of one size; the loops do not check bounds."""
     are_images = all(
-        each.ndim == 3 and each.shape[2] == 3 and each.dtype.kind == "f" for each in (image, target)
+        array.ndim == 3 and array.shape[2] == 3 and array.dtype.kind == "f" for array in (image, target)
     )
     if not are_images or image.shape != target.shape or not image.size:
-        found = " and ".join(f"{each.dtype} {list(each.shape)}" for each in (image, target))
+        found = " and ".join(f"{array.dtype} {list(array.shape)}" for array in (image, target))
         raise ValueError(f"expected two float images [H, W, 3] of one size, in [0, 1]; found {found}")
 
 

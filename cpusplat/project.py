@@ -302,7 +302,7 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
     fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
     rows, columns, basis = aligned(LANES * ROW), aligned(LANES * ROW), aligned(16 * LANES)
     rows[:] = 0.0
-    found, zero = np.empty(7 * LANES), lanes(np.float32(0))
+    projected, zero = np.empty(7 * LANES), lanes(np.float32(0))
     tables = means.reshape(-1), log_scales.reshape(-1), quats.reshape(-1), sh.reshape(-1)
     flat_geometry = geometry.reshape(-1)
     numbers, broken = 3 * sh.shape[1], 0
@@ -318,9 +318,9 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
             if k < 11 or k >= SH_COLUMN:
                 finite = finite + load(columns, k * LANES) * zero
         (x, y, z), (qw, qx, qy, qz), norm, towards, _ = _place(columns, camera)
-        store(found, 0, z)
+        store(projected, 0, z)
         # also NaN if the quaternion has zero length
-        store(found, LANES, norm * 0.0 + wide(finite))
+        store(projected, LANES, norm * 0.0 + wide(finite))
         r00, r01, r02, r10, r11, r12, r20, r21, r22 = matrix_entries(qw, qx, qy, qz)
         inverse_z = 1.0 / z
         ray_x = _clamped(x * inverse_z, camera[19], camera[20])
@@ -340,11 +340,11 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
         top = _log2_sigmoid(load(columns, 10 * LANES))
         # the level set alpha = MIN_ALPHA has half-widths sqrt(q cov), slightly enlarged against rounding
         q = 2.0 * LN_2 * (wide(top) - LOG2_MIN_ALPHA)
-        store(found, 2 * LANES, determinant)
-        store(found, 3 * LANES, px)
-        store(found, 4 * LANES, py)
-        store(found, 5 * LANES, root(q * xx) + 1e-2)
-        store(found, 6 * LANES, root(q * yy) + 1e-2)
+        store(projected, 2 * LANES, determinant)
+        store(projected, 3 * LANES, px)
+        store(projected, 4 * LANES, py)
+        store(projected, 5 * LANES, root(q * xx) + 1e-2)
+        store(projected, 6 * LANES, root(q * yy) + 1e-2)
         store(columns, 0, narrow(px))
         store(columns, 1 * LANES, narrow(py))
         store(columns, 2 * LANES, narrow(0.5 * LOG2_E * yy * inverse))
@@ -355,10 +355,10 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
         _sh_basis(narrow(towards[0]), narrow(towards[1]), narrow(towards[2]), degree, basis)
         red, green, blue = zero + 0.5, zero + 0.5, zero + 0.5
         for k in range((degree + 1) * (degree + 1)):
-            each, at = load(basis, k * LANES), (SH_COLUMN + 3 * k) * LANES
-            red = red + each * load(columns, at)
-            green = green + each * load(columns, at + LANES)
-            blue = blue + each * load(columns, at + 2 * LANES)
+            coefficient, at = load(basis, k * LANES), (SH_COLUMN + 3 * k) * LANES
+            red = red + coefficient * load(columns, at)
+            green = green + coefficient * load(columns, at + LANES)
+            blue = blue + coefficient * load(columns, at + 2 * LANES)
         store(columns, 8 * LANES, larger(red, zero))
         store(columns, 9 * LANES, larger(green, zero))
         store(columns, 10 * LANES, larger(blue, zero))
@@ -367,13 +367,13 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
         for lane in range(count):
             i = first + lane
             box[i, 0], box[i, 1], box[i, 2], box[i, 3] = 0, -1, 0, -1
-            if found[LANES + lane] != 0.0:  # includes NaN
+            if projected[LANES + lane] != 0.0:  # includes NaN
                 broken += 1
                 continue
-            if not (near < found[lane] < far and 0.0 < found[2 * LANES + lane] < np.inf):
+            if not (near < projected[lane] < far and 0.0 < projected[2 * LANES + lane] < np.inf):
                 continue
-            x, y = found[3 * LANES + lane], found[4 * LANES + lane]
-            half_x, half_y = found[5 * LANES + lane], found[6 * LANES + lane]
+            x, y = projected[3 * LANES + lane], projected[4 * LANES + lane]
+            half_x, half_y = projected[5 * LANES + lane], projected[6 * LANES + lane]
             # also false if the peak is below MIN_ALPHA, where the half-widths are NaN
             if not (x + half_x > 0.0 and x - half_x < width and y + half_y > 0.0 and y - half_y < height):
                 continue
@@ -514,12 +514,12 @@ def project_backward(begin, end, num_bases, tables, degree, camera, geometry, su
         ux, uy, uz = narrow(vx), narrow(vy), narrow(vz)
         _sh_basis(ux, uy, uz, degree, basis)
         for k in range(bases):
-            each, at = load(basis, k * LANES), (SH_COLUMN + 3 * k) * LANES
+            coefficient, at = load(basis, k * LANES), (SH_COLUMN + 3 * k) * LANES
             pull = red * load(columns, at) + green * load(columns, at + LANES)
             store(pulls, k * LANES, pull + blue * load(columns, at + 2 * LANES))
-            store(columns, at, each * red)
-            store(columns, at + LANES, each * green)
-            store(columns, at + 2 * LANES, each * blue)
+            store(columns, at, coefficient * red)
+            store(columns, at + LANES, coefficient * green)
+            store(columns, at + 2 * LANES, coefficient * blue)
         for k in range(SH_COLUMN + 3 * bases, SH_COLUMN + numbers):
             store(columns, k * LANES, zero)
         if degree > 0:

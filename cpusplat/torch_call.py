@@ -45,8 +45,8 @@ class _Projection(torch.autograd.Function):
         _require_first_order()
         _ = ctx.saved_tensors
         by_mean_px, by_depth, by_link = (grad.numpy() for grad in grads)
-        found = ctx.views.project_backward(by_mean_px, by_depth, bool(by_link[0]))
-        *by_parameter, by_sh = map(torch.from_numpy, found)
+        gradients = ctx.views.project_backward(by_mean_px, by_depth, bool(by_link[0]))
+        *by_parameter, by_sh = map(torch.from_numpy, gradients)
         return None, *by_parameter, by_sh if ctx.views.has_harmonics else None
 
 
@@ -61,7 +61,7 @@ class _Blending(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         _require_first_order()
-        found = ctx.views.blend_backward(*(grad.contiguous().numpy() for grad in grads))
-        by_mean_px, by_depth, by_colour = map(torch.from_numpy, found)
+        gradients = ctx.views.blend_backward(*(grad.contiguous().numpy() for grad in grads))
+        by_mean_px, by_depth, by_colour = map(torch.from_numpy, gradients)
         by_colour = by_colour.sum(dim=0) if ctx.has_shared_colours else by_colour
         return None, by_mean_px, by_depth, torch.ones(1), by_colour if ctx.has_colours else None

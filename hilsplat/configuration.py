@@ -25,7 +25,7 @@ from hilsplat.settings import LARGEST, Section, knob
 CONFIG = Path("config/config.yaml")
 """The project's configuration; files given with `--configfile` override it."""
 
-LONGEST_SHOWN = 120  # maximum number of characters of a value in a message
+MAX_SHOWN = 120  # maximum number of characters of a value in a message
 
 
 class CoreSettings(Section):
@@ -121,7 +121,7 @@ def settings_error(error: ValidationError, where: str, model: type[BaseModel]) -
     lines = []
     for problem in error.errors():
         path = [str(part) for part in problem["loc"]]
-        place = ".".join([where, *path] if where else path)
+        key = ".".join([where, *path] if where else path)
         if problem["type"] == "extra_forbidden":
             section: Any = model
             for part in path[:-1]:
@@ -129,11 +129,11 @@ def settings_error(error: ValidationError, where: str, model: type[BaseModel]) -
             known = sorted(section.model_fields)
             near = difflib.get_close_matches(path[-1], known, n=1)
             hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(known)}"
-            lines.append(f"{place}: unknown key; {hint}")
+            lines.append(f"{key}: unknown key; {hint}")
         else:
             found = json.dumps(problem.get("input"), default=str)
-            found = found if len(found) <= LONGEST_SHOWN else f"{found[:LONGEST_SHOWN]}..."
-            lines.append(f"{place}: {problem['msg']}; found {found}")
+            found = found if len(found) <= MAX_SHOWN else f"{found[:MAX_SHOWN]}..."
+            lines.append(f"{key}: {problem['msg']}; found {found}")
     return SettingsError("the settings are not valid:\n  " + "\n  ".join(lines))
 
 
@@ -241,8 +241,8 @@ class RunSettings(StageSettings):
 
 def seed_parts(name: str) -> tuple[str, int]:
     """Split a variant name into the variant and its seed number (0 if the name has none)."""
-    found = SEEDED.fullmatch(name)
-    return (found[1], int(found[2])) if found else (name, 0)
+    match = SEEDED.fullmatch(name)
+    return (match[1], int(match[2])) if match else (name, 0)
 
 
 def parse_run(config: dict[str, Any]) -> RunSettings:
@@ -312,27 +312,27 @@ class _UniqueKeys(yaml.SafeLoader):  # type: ignore[misc]
 def read_config(path: Path) -> dict[str, Any]:
     """Read a configuration file; raise SettingsError if it is missing or not a YAML mapping."""
     try:
-        found = yaml.load(regular(Path(path)).read_text(encoding="utf-8"), _UniqueKeys)
+        content = yaml.load(regular(Path(path)).read_text(encoding="utf-8"), _UniqueKeys)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        position = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         fault = "cannot be used" if isinstance(error, yaml.constructor.ConstructorError) else "is not YAML"
         raise SettingsError(
-            f"{path}{place} {fault}: {error.problem or error.context}",
+            f"{path}{position} {fault}: {error.problem or error.context}",
             fix="indent with spaces, close brackets and quotes, and quote strings with colons or braces",
         ) from error
     except FileNotFoundError as error:
         raise SettingsError(f"{path} is missing", fix="correct the path") from error
     except (yaml.YAMLError, ValueError, RecursionError, OSError) as error:  # ValueError: bad date or UTF-8
         raise SettingsError(f"{path} cannot be read: {error}", fix="save it as YAML in UTF-8") from error
-    if not isinstance(found, dict):
-        kind = "nothing" if found is None else type(found).__name__
+    if not isinstance(content, dict):
+        kind = "nothing" if content is None else type(content).__name__
         raise SettingsError(f"{path} does not contain settings", expected="lines like key: value", found=kind)
     try:
-        json.dumps(found, default=str)
+        json.dumps(content, default=str)
     except (ValueError, RecursionError, TypeError) as error:  # a self-referencing alias; a list as key
         raise SettingsError(f"{path} cannot be used: {error}", fix="remove aliases and list keys") from error
-    return found
+    return content
 
 
 def merged_config(paths: Sequence[Path], *overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -391,10 +391,10 @@ def knob_table() -> str:
     return "\n".join(lines)
 
 
-def _entry(place: str, field: FieldInfo) -> tuple[str, str]:
+def _entry(key: str, field: FieldInfo) -> tuple[str, str]:
     """Return the line with a setting's facts, and its description."""
     extra = field.json_schema_extra
-    assert isinstance(extra, dict), place  # every field is defined with `knob`
+    assert isinstance(extra, dict), key  # every field is defined with `knob`
     choices: list[str] = []
     limits = [*field.metadata]
     is_union = get_origin(field.annotation) in (Union, UnionType)
@@ -410,5 +410,5 @@ def _entry(place: str, field: FieldInfo) -> tuple[str, str]:
         if hasattr(limit, attribute) and getattr(limit, attribute) != LARGEST
     )
     facts = ["|".join(choices), bounds, extra["unit"], f"origin: {extra['origin']}"]
-    shown = "; ".join(str(fact) for fact in facts if fact)
-    return f"{place} = {field.default!r}  ({shown})", str(field.description)
+    details = "; ".join(str(fact) for fact in facts if fact)
+    return f"{key} = {field.default!r}  ({details})", str(field.description)

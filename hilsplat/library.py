@@ -287,18 +287,18 @@ def link(
             fix="give the same folder to `reconstruct` or `load_scene`, and to `link`",
         )
     with _running(progress), _folder(cache) as cached, _folder(folder) as base:
-        own, ply = base / "default", base / "gaussians.ply"
-        parts = SceneParts(scene.folder, ply, own / "semantic_tree", None, None, own / "clip", own / "masks")
+        out, ply = base / "default", base / "gaussians.ply"
+        parts = SceneParts(scene.folder, ply, out / "semantic_tree", None, None, out / "clip", out / "masks")
         save_ply(ply, gaussians)
         write_coordinates(ply, scene, gaussians, {"kind": GIVEN})
         write_masks(parts.masks, scene, masks.items(), len(masks), **masks.origin)
-        contributions = own / "contributions"
+        contributions = out / "contributions"
         weights = of.ContributionsSettings(keep="none")
         stages.contributions(scene.folder, ply, parts.masks, contributions, weights, cached, number)
         stages.semantic_tree(contributions, parts.masks, parts.semantic_tree, section, number)
         stages.clip(scene.folder, parts.masks, parts.clip, clip, parts.semantic_tree, cached, number)
         naming = of.QuerySettings(), of.EvaluateSettings(), cached
-        stages.names(parts.semantic_tree, parts.clip, own / "names", *naming)
+        stages.names(parts.semantic_tree, parts.clip, out / "names", *naming)
         linked = LanguageScene.of(FinishedScene(base, "default", parts), threads=number)
     if linked.caution:
         logger.warning("%s: %s", scene.name, linked.caution)

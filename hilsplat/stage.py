@@ -218,8 +218,8 @@ class Registry:
 
 def metadata_of(hint: Any) -> tuple[Any, ...]:
     """Return what a hint is annotated with, also if it is a part of a union with None."""
-    own = getattr(hint, "__metadata__", ())
-    return own or tuple(value for part in get_args(hint) for value in getattr(part, "__metadata__", ()))
+    metadata = getattr(hint, "__metadata__", ())
+    return metadata or tuple(value for part in get_args(hint) for value in getattr(part, "__metadata__", ()))
 
 
 def models_of(sections: Sequence[Section]) -> dict[str, Path]:

@@ -72,7 +72,7 @@ def nearest_hits(scene, origins, directions, triangle, u, v, distance):
 
 
 @compiled
-def blocked_rays(scene, origins, directions, reach, found):
+def blocked_rays(scene, origins, directions, reach, is_blocked):
     packet, valid, arguments = _new_packet(_RAY_ROWS)
     for first in range(0, len(directions), LANES):
         count = _load(packet, valid, origins, directions, first)
@@ -80,7 +80,7 @@ def blocked_rays(scene, origins, directions, reach, found):
             packet[_FAR, lane] = reach[first + lane]
         _occluded(valid.ctypes.data, scene, packet.ctypes.data, arguments.ctypes.data)
         for lane in range(count):
-            found[first + lane] = packet[_FAR, lane] < 0  # Embree marks a hit with -inf
+            is_blocked[first + lane] = packet[_FAR, lane] < 0  # Embree marks a hit with -inf
 
 
 @compiled

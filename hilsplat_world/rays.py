@@ -83,9 +83,9 @@ class RayCaster:
         reach: Float32[np.ndarray, " R"],
     ) -> Bool[np.ndarray, " R"]:
         """Return whether each ray hits something within `reach`, a multiple of its direction's length."""
-        found = np.empty(len(directions), np.bool_)
-        blocked_rays(self._scene, *_rows(origins, directions), reach, found)
-        return found
+        is_blocked = np.empty(len(directions), np.bool_)
+        blocked_rays(self._scene, *_rows(origins, directions), reach, is_blocked)
+        return is_blocked
 
 
 def _rows(*vectors: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -173,12 +173,12 @@ class OpenedScene(ShownScene):
         own = [(row.get("labels") == "annotated", row.get("queries", "").zfill(9)) for row in rows]
         for _, row in sorted(zip(own, rows, strict=True), key=lambda pair: pair[0], reverse=True):
             best.setdefault(row["method"], row)
-        shown = [f"{row['method']} {row['mIoU']} % ({row['protocol']})" for row in [*best.values()][:SCORES]]
+        lines = [f"{row['method']} {row['mIoU']} % ({row['protocol']})" for row in [*best.values()][:SCORES]]
         more = [f"all in {means.with_suffix('.md')}"] if len(rows) > SCORES else []
         scored = means.stat().st_mtime
         is_old = any(path.stat().st_mtime > scored for path in self.labels.glob("*.json"))
         old = ["of earlier annotations: the next run updates them"] if is_old else []
-        return "; ".join([*shown, *more, *old]) if shown else ""
+        return "; ".join([*lines, *more, *old]) if lines else ""
 
     def known(self) -> dict[str, list[Label]]:
         """Return the annotations of all annotated views."""

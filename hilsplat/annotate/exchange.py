@@ -63,10 +63,10 @@ def exported(kind: Kind, known: Mapping[str, Sequence[Label]], cameras: Cameras)
 
 def _accepted(known: Mapping[str, Sequence[Label]]) -> dict[str, list[Label]]:
     """Return the labels without proposals, which other programs would take as ground truth; log how many."""
-    kept = {view: [label for label in labels if label.origin != PROPOSED] for view, labels in known.items()}
-    if count := sum(len(labels) - len(kept[view]) for view, labels in known.items()):
+    drawn = {view: [label for label in labels if label.origin != PROPOSED] for view, labels in known.items()}
+    if count := sum(len(labels) - len(drawn[view]) for view, labels in known.items()):
         logger.warning("%d unaccepted proposals are not exported; accept them with: hilsplat annotate", count)
-    return {view: labels for view, labels in kept.items() if labels}
+    return {view: labels for view, labels in drawn.items() if labels}
 
 
 def export_labels(scene: Scene, folder: Path, data_root: Path, out: Path) -> int:

@@ -99,7 +99,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
     Names such as `photos/desk` are also compared by their last parts.
     """
     names = list(known)
-    parts = {part: each for each in names for part in (each.rpartition("/")[2], each)}
+    parts = {part: full for full in names for part in (full.rpartition("/")[2], full)}
     for part in (name, name.rpartition("/")[2]):
         if near := difflib.get_close_matches(part, parts, n=1):
             return f"did you mean {parts[near[0]]!r}?"

@@ -9,11 +9,11 @@ from typing import Any, Generic, TypeVar
 Part = TypeVar("Part")
 
 
-def load(place: str) -> Any:
+def load(reference: str) -> Any:
     """Import the object named by "module:name" or "module"."""
-    module, _, name = place.partition(":")
-    found = importlib.import_module(module)
-    return getattr(found, name) if name else found
+    module, _, name = reference.partition(":")
+    imported = importlib.import_module(module)
+    return getattr(imported, name) if name else imported
 
 
 class Plugins(Mapping[str, Part], Generic[Part]):

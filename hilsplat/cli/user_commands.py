@@ -74,7 +74,7 @@ def query(
         require_new_folder(masks, "--masks")
     from hilsplat.query.answer import answer
 
-    for found in answer(
+    for line in answer(
         folder,
         " ".join(text),
         level=level,
@@ -88,7 +88,7 @@ def query(
         spz=spz,
         threads=threads,
     ):
-        echo(found)
+        echo(line)
 
 
 def scene_folder(scene: str, results: Path, variant: str = "") -> Path:
@@ -100,11 +100,11 @@ def scene_folder(scene: str, results: Path, variant: str = "") -> Path:
     """
     from hilsplat.scene.finished import require_scene_folder, require_variant, scenes_in
 
-    found = [name for name in scenes_in(results) if scene in (name, name.partition("/")[2])]
-    if len(found) > 1:
-        expected = f"one of {', '.join(found)}"
+    matching = [name for name in scenes_in(results) if scene in (name, name.partition("/")[2])]
+    if len(matching) > 1:
+        expected = f"one of {', '.join(matching)}"
         raise SettingsError(f"{scene!r} matches several scenes", expected=expected)
-    named = results / (found[0] if found else scene)
+    named = results / (matching[0] if matching else scene)
     folder = Path(scene) if not named.is_dir() and Path(scene).is_dir() else named
     require_scene_folder(folder)
     if variant:

@@ -20,8 +20,8 @@ def normalised_weights(weights: sp.csr_matrix) -> sp.csr_matrix:
     below `MIN_ALPHA` become empty rows. The sum excludes weights that the rasteriser dropped as too small.
     """
     weights.sort_indices()
-    kept = normalise(weights.indptr, weights.indices, weights.data, MIN_ALPHA)
-    arrays = (weights.data[:kept], weights.indices[:kept], weights.indptr)
+    num_entries = normalise(weights.indptr, weights.indices, weights.data, MIN_ALPHA)
+    arrays = (weights.data[:num_entries], weights.indices[:num_entries], weights.indptr)
     return sp.csr_matrix(arrays, shape=weights.shape, copy=False)
 
 

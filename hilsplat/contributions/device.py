@@ -31,9 +31,9 @@ def normalised_entries(weights: Entries) -> Entries:
     pixel, count = weights.pixel, weights.start.diff()
     alpha = torch.segment_reduce(weights.weight.double(), "sum", lengths=count)
     covered = alpha >= MIN_ALPHA
-    kept = covered[pixel]
+    used = covered[pixel]
     weight = (weights.weight / alpha[pixel]).float()
-    return Entries(starts_of(count * covered), weights.gaussian[kept], weight[kept], weights.num_gaussians)
+    return Entries(starts_of(count * covered), weights.gaussian[used], weight[used], weights.num_gaussians)
 
 
 def view_contributions(view: str, weights: Entries, masks: HierarchicalMasks) -> dict[str, np.ndarray]:

@@ -29,7 +29,7 @@ def summed_masks(first, last, runs, offsets, level_index, labels, half, indptr, 
         counts (masks x 2) of painted pixels and of painted pixels in the half; row sizes; columns; sums over
         raw masks, painted pixels, and painted pixels in the half (entries x 3, float64, in pixel order).
     """
-    sums, found = np.zeros(num_gaussians * SUMS), np.empty(num_gaussians, np.int32)
+    sums, gaussians = np.zeros(num_gaussians * SUMS), np.empty(num_gaussians, np.int32)
     counts = np.zeros((last - first, 2), np.int64)
     sizes = np.zeros(last - first, np.int64)
     columns, values = np.empty(1024, np.int32), np.empty((1024, 3))
@@ -51,14 +51,14 @@ def summed_masks(first, last, runs, offsets, level_index, labels, half, indptr, 
                     j = np.uint64(indices[k])  # unsigned: skips the check for negative indices
                     at, weight = np.int64(j) * SUMS, np.float64(data[k])
                     if add_products(sums, at, 1.0, painted, in_half, weight) == 0:
-                        found[count] = np.int32(j)
+                        gaussians[count] = np.int32(j)
                         count += 1
-        found[:count] = np.sort(found[:count])
+        gaussians[:count] = np.sort(gaussians[:count])
         if done + count > len(columns):
             columns, values = enlarged(columns, values, done, 2 * (done + count))
         for k in range(count):
-            at = np.int64(found[k]) * SUMS
-            columns[done + k] = found[k]
+            at = np.int64(gaussians[k]) * SUMS
+            columns[done + k] = gaussians[k]
             values[done + k] = sums[at : at + 3]
             sums[at : at + SUMS] = 0
         done += count
@@ -96,11 +96,11 @@ def transpose(indptr, indices, begins, cells):
 
 
 @compiled
-def enlarged(indices, values, kept, room):
+def enlarged(indices, values, count, room):
     """Return larger copies of both arrays with their first `kept` entries."""
     more_indices = np.empty(room, np.int32)
     more_values = np.empty((room, values.shape[1]), np.float64)
-    more_indices[:kept], more_values[:kept] = indices[:kept], values[:kept]
+    more_indices[:count], more_values[:count] = indices[:count], values[:count]
     return more_indices, more_values
 
 
@@ -134,21 +134,21 @@ def add_to_block(
     for i in range(begin, end):
         first, last = row_indptr[i - begin], row_indptr[i - begin + 1]
         old, old_end = late_indptr[i - begin], late_indptr[i - begin + 1]
-        known, shown = last - first + old_end - old, begins[i] < begins[i + 1]
+        known, is_seen = last - first + old_end - old, begins[i] < begins[i + 1]
         count = known
-        if shown:
+        if is_seen:
             _number(first, last, row_indices, row_values, 0, number, sums)
             _number(old, old_end, late_indices, late_values, last - first, number, sums)
         for t in range(begins[i], begins[i + 1]):
-            p, place = cells[t] >> np.uint64(32), cells[t] & PLACE
+            p, entry = cells[t] >> np.uint64(32), cells[t] & PLACE
             ahead = np.int64(cells[min(t + AHEAD, len(cells) - 1)] & PLACE)
             prefetch(indices, ahead)
             prefetch(data, ahead)
-            weight = np.float64(data[place])
+            weight = np.float64(data[entry])
             whole = weight if valid[p, 0] else 0.0
             part_weight = weight if valid[p, 1] else 0.0
             subpart = weight if valid[p, 2] else 0.0
-            for k in range(place, np.uint64(indptr[p + 1])):
+            for k in range(entry, np.uint64(indptr[p + 1])):
                 j = np.uint64(indices[k])  # unsigned: skips the check for negative indices
                 at = np.int64(number[j])
                 if at == 0:
@@ -164,22 +164,22 @@ def add_to_block(
         size = old_end - old + count
         if done + size > len(out_indices):
             out_indices, out_values = enlarged(out_indices, out_values, done, 2 * (done + size))
-        if shown:
+        if is_seen:
             for k in range(first, last):
                 number[row_indices[k]] = 0
                 for level in range(levels):
                     row_values[k, level] = sums[(k - first + 1) * SUMS + level]
             new = 0
-            for place in range(done, done + size):
+            for entry in range(done, done + size):
                 if new < count and (old == old_end or fresh[new] < late_indices[old]):
                     column = fresh[new]
                     new += 1
                 else:
                     column = late_indices[old]
                     old += 1
-                out_indices[place] = column
+                out_indices[entry] = column
                 for level in range(levels):
-                    out_values[place, level] = sums[np.int64(number[column]) * SUMS + level]
+                    out_values[entry, level] = sums[np.int64(number[column]) * SUMS + level]
                 number[column] = 0
         else:
             out_indices[done : done + size] = late_indices[old:old_end]
@@ -265,17 +265,17 @@ def weights_product(level, last, first, across, indptr, indices, data, valid, fe
     past = first + len(out) // (3 * width)
     for p in range(len(indptr) - 1):
         begin, end = indptr[p], indptr[p + 1]
-        own = columns_below(first, begin, end, indices)
-        own_end = columns_below(past, own, end, indices)
-        if own == own_end or not valid[p, level]:
+        own_begin = columns_below(first, begin, end, indices)
+        own_end = columns_below(past, own_begin, end, indices)
+        if own_begin == own_end or not valid[p, level]:
             continue
         for c in range(level * width, last * width, WIDTH):
             total = lanes(np.float32(0))
-            for k in range(begin, own) if across else range(own, own_end):
+            for k in range(begin, own_begin) if across else range(own_begin, own_end):
                 total = plus(total, lanes(data[k]), load(features, np.int64(indices[k]) * 3 * width + c))
             for k in range(own_end, end if across else own_end):
                 total = plus(total, lanes(data[k]), load(features, np.int64(indices[k]) * 3 * width + c))
-            for k in range(own, own_end):
+            for k in range(own_begin, own_end):
                 to = (indices[k] - first) * 3 * width + c
                 store(out, to, plus(load(out, to), lanes(data[k]), total))
 
@@ -300,10 +300,10 @@ def wide_mask_means(first, last, indptr, indices, data, level_index, features, w
             some = at[m - first]
             stop = at[m - first] = columns_below(begin + BLOCK, some, indptr[m + 1], indices)
             for c in range(0, width if some < stop else 0, WIDTH):
-                place = level_index[m] * width + c
+                mean = level_index[m] * width + c
                 total = load(out, m * width + c)
                 for k in range(some, stop):
-                    there = np.int64(indices[k]) * 3 * width + place
+                    there = np.int64(indices[k]) * 3 * width + mean
                     total = plus(total, lanes(data[k]), load(features, there))
                 store(out, m * width + c, total)
 
@@ -320,10 +320,10 @@ def spread_rows(begin, end, indptr, indices, data, level_index, values, width, o
             some = at[m]
             stop = at[m] = columns_below(min(block + BLOCK, end), some, indptr[m + 1], indices)
             for c in range(0, width if some < stop else 0, WIDTH):
-                place = level_index[m] * width + c
+                mean = level_index[m] * width + c
                 value = load(values, m * width + c)
                 for k in range(some, stop):
-                    there = np.int64(indices[k]) * 3 * width + place
+                    there = np.int64(indices[k]) * 3 * width + mean
                     store(out, there, plus(load(out, there), lanes(data[k]), value))
 
 
@@ -349,8 +349,8 @@ def gram_product(begin, end, first, indptr, indices, values, features, width, ou
         for c in range(0, width, WIDTH):
             here = i * row + c
             a, b, d = load(features, here), load(features, here + width), load(features, here + 2 * width)
-            own = here - origin
-            whole, part, subpart = load(out, own), load(out, own + width), load(out, own + 2 * width)
+            offset = here - origin
+            whole, part, subpart = load(out, offset), load(out, offset + width), load(out, offset + 2 * width)
             for k in range(indptr[i], indptr[i + 1]):
                 if indices[k] >= past:
                     break
@@ -364,9 +364,9 @@ def gram_product(begin, end, first, indptr, indices, values, features, width, ou
                     store(out, other, plus(load(out, other), u, a))
                     store(out, other + width, plus(load(out, other + width), v, b))
                     store(out, other + 2 * width, plus(load(out, other + 2 * width), w, d))
-            store(out, own, whole)
-            store(out, own + width, part)
-            store(out, own + 2 * width, subpart)
+            store(out, offset, whole)
+            store(out, offset + width, part)
+            store(out, offset + 2 * width, subpart)
 
 
 @compiled

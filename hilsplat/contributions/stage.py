@@ -258,9 +258,9 @@ def run_contributions(
         if settings.keep != "none":
             quadratic = builder.finish()
             quadratic.save(folder)
-            kept = "G" if isinstance(quadratic, Gram) else "W"
-            nonzeros |= {"W": builder.weights_nonzeros, kept: quadratic.nonzeros}
-            counts |= {"kept": kept, "nonzeros": quadratic.nonzeros}
+            matrix = "G" if isinstance(quadratic, Gram) else "W"
+            nonzeros |= {"W": builder.weights_nonzeros, matrix: quadratic.nonzeros}
+            counts |= {"kept": matrix, "nonzeros": quadratic.nonzeros}
         counts["from_cache"] = store.hits
         write_index(
             folder,

@@ -87,8 +87,8 @@ def labelled_rows(weights: sp.csr_matrix, labels: Int32[np.ndarray, "P 3"]) -> S
     sizes = np.diff(weights.indptr)
     valid = (labels >= 0) & (sizes > 0)[:, None]
     rows = np.flatnonzero(valid.any(axis=1))
-    kept = move_to_front(rows, weights.indptr, weights.indices, weights.data)
+    num_entries = move_to_front(rows, weights.indptr, weights.indices, weights.data)
     indptr = np.concatenate([[0], np.cumsum(sizes[rows])])
-    arrays = (weights.data[:kept], weights.indices[:kept], indptr.astype(weights.indptr.dtype))
+    arrays = (weights.data[:num_entries], weights.indices[:num_entries], indptr.astype(weights.indptr.dtype))
     matrix = sp.csr_matrix(arrays, shape=(len(rows), weights.shape[1]), copy=False)
     return StackedWeights(matrix, valid[rows])

@@ -30,8 +30,8 @@ class ClassSet:
         """Map the data set's point labels to 1 .. K, or to 0 if their class is not in the set."""
         order = np.argsort(self.ids)
         ids = np.asarray(self.ids)[order]
-        place = np.minimum(np.searchsorted(ids, file_labels), len(ids) - 1)
-        return np.where(ids[place] == file_labels, order[place] + 1, 0).astype(np.int32)
+        index = np.minimum(np.searchsorted(ids, file_labels), len(ids) - 1)
+        return np.where(ids[index] == file_labels, order[index] + 1, 0).astype(np.int32)
 
 
 _LISTS = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))

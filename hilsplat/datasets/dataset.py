@@ -76,8 +76,8 @@ class Dataset:
     def missing(self, root: Path, scene: str) -> tuple[str, ...]:
         """Return the required paths of a scene that are missing below the data set's folder `root`."""
         # `normpath` resolves `..` even if the folder before it does not exist.
-        paths = {place: Path(os.path.normpath(root / place)) for place in self.needs(root, scene)}
-        return tuple(place for place, path in paths.items() if not path.exists())
+        paths = {name: Path(os.path.normpath(root / name)) for name in self.needs(root, scene)}
+        return tuple(name for name, path in paths.items() if not path.exists())
 
     def found(self, root: Path) -> tuple[str, ...]:
         """Return the known scenes that have all required paths."""
@@ -92,9 +92,9 @@ class Dataset:
         fixes = dict.fromkeys(_folders(root), f"move its contents to {root}")
         fixes[data_root] = f"rename it to {root.name} if necessary, and set data_root to its parent folder"
         fixes |= {deeper / root.name: f"set data_root to {deeper}" for deeper in _folders(data_root)}
-        for place, fix in fixes.items():
-            if self._has_begun(place):
-                raise SceneError(f"{self.title} is in the wrong place", expected=root, found=place, fix=fix)
+        for folder, fix in fixes.items():
+            if self._has_begun(folder):
+                raise SceneError(f"{self.title} is in the wrong place", expected=root, found=folder, fix=fix)
         raise SceneError(
             f"{data_root} does not contain {self.title}",
             expected=f"{root}, containing at least one of: {', '.join(self.scenes[:8])}",
@@ -106,7 +106,7 @@ class Dataset:
         """Raise SceneError if a scene lacks a required path, for instance if it was only partly unpacked."""
         missing = self.missing(root, scene)
         if missing:
-            here = [place for place in self.needs(root, scene) if place not in missing]
+            here = [name for name in self.needs(root, scene) if name not in missing]
             raise SceneError(
                 f"scene {scene} of {self.title} is incomplete in {root}",
                 expected=f"also {', '.join(missing)}",
@@ -116,8 +116,8 @@ class Dataset:
 
     def has_part(self, root: Path, scene: str) -> bool:
         """Return whether a required path of a scene exists; paths outside `root` are ignored."""
-        inside = [place for place in self.needs(root, scene) if not place.startswith("..")]
-        return any((root / place).exists() for place in inside)
+        inside = [name for name in self.needs(root, scene) if not name.startswith("..")]
+        return any((root / name).exists() for name in inside)
 
     def _has_begun(self, root: Path) -> bool:
         """Return whether a folder contains part of a known scene or, if no scenes are known, any scene."""

@@ -67,7 +67,7 @@ def generator_of(source: str) -> tuple[Generator, Generated]:
     generated = generated_of(source)
     generator = GENERATORS[generated.generator] if generated else None
     if generated is None or generator is None or generated.kind not in generator.kinds:
-        kinds = [f"{name}:{kind}:<seed>" for name, found in GENERATORS.items() for kind in found.kinds]
+        kinds = [f"{name}:{kind}:<seed>" for name, other in GENERATORS.items() for kind in other.kinds]
         raise SceneError(
             f"{source!r} does not name a generated scene",
             expected=f"one of {', '.join(kinds)}",

@@ -139,11 +139,11 @@ class LabelledScene:
         missing = [view for view in self.views if view not in names]
         lacking = f"labelled views of {self.dataset}/{self.scene} have no pose: {', '.join(missing)}"
         if len(posed) < self.min_posed * len(self.views):
-            shown = [*sorted(names)[:5], *(["..."] if len(names) > 5 else [])]
+            listed = [*sorted(names)[:5], *(["..."] if len(names) > 5 else [])]
             raise SceneError(
                 lacking,
                 expected=f"a pose for {self.min_posed:.0%} of the {len(self.views)} labelled views",
-                found=f"{len(names)} posed views: {', '.join(shown)}",
+                found=f"{len(names)} posed views: {', '.join(listed)}",
                 fix="use the poses included in the data set, or register these images",
             )
         if missing:

@@ -32,13 +32,13 @@ def absence(source: str, data_root: str) -> str | None:
     root = Path(data_root).expanduser()
     if not root.is_dir():
         return f"data_root {data_root} is not a folder"
-    place = published(source)
-    if place is None:
+    names = published(source)
+    if names is None:
         folder = root / source.removeprefix(DATA_PREFIX)
         return None if folder.is_dir() else f"{folder} is missing"
-    dataset = dataset_of(place[0])
+    dataset = dataset_of(names[0])
     try:
-        dataset.require(dataset.locate(root), place[1])
+        dataset.require(dataset.locate(root), names[1])
     except SceneError as error:
         return in_one_line(error)
     return None
@@ -55,12 +55,12 @@ def unlisted(sources: Collection[str], groups: Collection[str], data_root: str) 
     `data_root` is empty if not set.
     """
     open_ended = [DATASETS[name] for name in groups if is_open_ended(name)]
-    found = [
+    available = [
         f"{dataset.name}/{scene}"
         for dataset in (open_ended if data_root else ())
         for scene in dataset.found(dataset.root(data_root))
     ]
-    return [name for name in found if DATA_PREFIX + name not in sources]
+    return [name for name in available if DATA_PREFIX + name not in sources]
 
 
 def label_sets(source: str, data_root: str, row: str) -> tuple[str, ...]:
@@ -73,19 +73,19 @@ def label_sets(source: str, data_root: str, row: str) -> tuple[str, ...]:
     """
     own_name = f"annotated/{row}"
     root = dataset_of("annotated").root(data_root).parent
-    own = (own_name,) if any((root / own_name).glob("*.json")) else ()
-    if not own and any(Path(own_name).glob("*.json")):
+    own_labels = (own_name,) if any((root / own_name).glob("*.json")) else ()
+    if not own_labels and any(Path(own_name).glob("*.json")):
         raise SettingsError(
             f"the annotations in {own_name} are not scored, because {root} has a folder `annotated` too",
             fix=f"move {own_name} to {root / own_name}",
         )
-    place = published(source)
-    if place is None or absence(source, data_root) is not None:
-        return own
-    name, scene = place
+    names = published(source)
+    if names is None or absence(source, data_root) is not None:
+        return own_labels
+    name, scene = names
     others = [dataset for dataset in DATASETS.values() if dataset.images_of == name]
     more = [dataset.name for dataset in others if not dataset.missing(dataset.root(data_root), scene)]
-    return (f"{name}/{scene}", *own, *(f"{other}/{scene}" for other in more))
+    return (f"{name}/{scene}", *own_labels, *(f"{other}/{scene}" for other in more))
 
 
 def label_files(labels: str, data_root: str) -> tuple[Path, ...]:
@@ -101,15 +101,15 @@ def image_files(source: str, data_root: str) -> tuple[Path, ...]:
     name = source.removeprefix(DATA_PREFIX)
     dataset, scene = scene_of(name)
     files, root = set[Path](), dataset.root(data_root)
-    for place in dataset.needs(root, scene):
-        files.update(files_of(root / place))
+    for folder in dataset.needs(root, scene):
+        files.update(files_of(root / folder))
     return tuple(sorted(files.difference(label_files(name, data_root))))
 
 
 def is_exported(source: str) -> bool:
     """Return whether images and poses must first be exported: true for data sets with labelled points."""
-    place = published(source)
-    return place is not None and dataset_of(place[0]).labels == "points"
+    names = published(source)
+    return names is not None and dataset_of(names[0]).labels == "points"
 
 
 def export_images(name: str, data_root: Path, out: Path) -> None:

@@ -31,7 +31,7 @@ SIGLIP_STATISTICS = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
 """Mean and deviation of pixels if `preprocessor_config.json` lacks them, as in transformers."""
 SIGLIP_TOKENS = 64  # text length (tokens) of a SigLIP model whose configuration does not specify it
 NO_PUNCTUATION = str.maketrans("", "", string.punctuation)
-CARD_CROPS, MOST_CROPS = 64, 256  # crops of a card's first call, and maximum of later calls
+CARD_CROPS, MAX_CROPS = 64, 256  # crops of a card's first call, and maximum of later calls
 MODEL_PATTERNS = ("*/config.json", "*/*/config.json")  # configurations of the models in `models/`
 
 
@@ -103,7 +103,7 @@ class ClipModel:
 
     @cached_property
     def _on_card(self) -> Batches:
-        return Batches(CARD_CROPS, self.device, MOST_CROPS, section="clip")
+        return Batches(CARD_CROPS, self.device, MAX_CROPS, section="clip")
 
     def _pad_id(self, text_config: dict[str, Any]) -> int:
         """Return the padding token's id from the tokenizer, else its configuration, else the model's."""
@@ -124,8 +124,8 @@ class ClipModel:
         Errors as in `open_model_folder` and `network_device`.
         """
         opened = open_model_folder(folder, "clip", variant=variant)
-        place = network_device(device, "clip", needs_of(opened, CARD_CROPS).card_mib)
-        model = ClipModel(opened, device=place)
+        chosen_device = network_device(device, "clip", needs_of(opened, CARD_CROPS).card_mib)
+        model = ClipModel(opened, device=chosen_device)
         _ = model.vision  # open and check it now
         return model
 

@@ -115,19 +115,19 @@ def read_views(
     Raises:
         ArtifactError: less than `MIN_SHARE` of the views can be used, or two views share their files.
     """
-    found, lost = {}, []
+    maps, lost = {}, []
     for view in track(stems_of([*cameras]), "LangSplat's files"):
         try:
-            found[view] = read_view(folder, view, cameras[view], levels)
+            maps[view] = read_view(folder, view, cameras[view], levels)
         except HilsplatError as error:
             lost.append(in_one_line(error))
-    if len(found) < MIN_SHARE * len(cameras):
+    if len(maps) < MIN_SHARE * len(cameras):
         raise ArtifactError(
-            f"{folder} has usable maps of only {len(found)} of {len(cameras)} training views",
+            f"{folder} has usable maps of only {len(maps)} of {len(cameras)} training views",
             found="; ".join(lost[:3]),
             fix="pass the language_features folder that LangSplat wrote for the same images",
         )
-    return found, lost
+    return maps, lost
 
 
 def run_imported_masks(scene_folder: Path, files: Path, out: Path, levels: MasksSettings = OF_HEADS) -> None:

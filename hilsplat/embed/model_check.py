@@ -89,10 +89,10 @@ def card_disagreement(folder: Path, device: str = "cuda") -> str | None:
         is_sam = model.kind == "sam"
         on_card = SamModel(model, device).encoder if is_sam else ClipModel(model, device=device).vision
         pixels = random_pixels(on_card, input_side_px(model))
-        found = in_turn(device, SECTIONS[model.kind], lambda: on_card(**pixels))
+        on_device = in_turn(device, SECTIONS[model.kind], lambda: on_card(**pixels))
     except HilsplatError as error:
         return f"{device}: {in_one_line(error)}"
-    pairs = zip(model.network(IMAGE_NETWORKS[model.kind])(**pixels), found, strict=True)
+    pairs = zip(model.network(IMAGE_NETWORKS[model.kind])(**pixels), on_device, strict=True)
     difference = max(float(np.linalg.norm(a - b)) / max(float(np.linalg.norm(a)), 1e-12) for a, b in pairs)
     if difference <= MAX_CARD_DIFFERENCE:
         return None

@@ -64,13 +64,13 @@ def read_costs(scores: Iterable[Path]) -> list[Cost]:
         if not rows:  # a scene without labels
             continue
         jobs = jobs_of(Path(path))
-        place = rows[0]["dataset"], rows[0]["scene"], rows[0]["variant"]
+        names = rows[0]["dataset"], rows[0]["scene"], rows[0]["variant"]
         times = _seconds(jobs, PREPARATION), _seconds(jobs, TRAINING)
         training = [jobs[stage] for stage in TRAINING if stage in jobs]
         peak_mib = 0.0 if None in training else max((job.peak_mib for job in training if job), default=0.0)
         query_s = {row["method"]: float(row["seconds"]) for row in rows}
         unrecorded = tuple(stage for stage, job in jobs.items() if job is None)
-        costs.append(Cost(*place, *times, peak_mib or math.nan, query_s, unrecorded))
+        costs.append(Cost(*names, *times, peak_mib or math.nan, query_s, unrecorded))
     return costs
 
 
@@ -152,8 +152,8 @@ def read_benchmark(path: Path, results: Path) -> list[Job]:
     Raises:
         ArtifactError: a line is not a JSON object with a time.
     """
-    place = path.relative_to(results).parts[:-2]
-    dataset, scene, variant = (*place, "", "", "")[:3]
+    folders = path.relative_to(results).parts[:-2]
+    dataset, scene, variant = (*folders, "", "", "")[:3]
     jobs = []
     for line in path.read_text(encoding="utf-8").splitlines():
         problem = "is not a valid benchmark file"

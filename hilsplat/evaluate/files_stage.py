@@ -106,7 +106,7 @@ def run_evaluate_files(
                 rows.append(("", result))
             else:
                 matches[dataset, name, method, "-", METHOD] = result
-        scans = {scene: found for (_, scene, *_), found in matches.items()}
+        scans = {scene: of_scene for (_, scene, *_), of_scene in matches.items()}
         precisions = measure_instances(METHOD, scans, "files") if scans else ()
         rows += [("", row) for row in precisions if not math.isnan(row.value)]
         score = partial(Score, dataset=dataset, scene=name, variant=method, masks="-")

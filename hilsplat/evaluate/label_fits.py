@@ -52,22 +52,22 @@ class Fits:
 def add_view(
     fits: Mapping[Level, Fits],
     regions: list[tuple[LabelledRegion, Bool[np.ndarray, "H W"]]],
-    found: Mapping[Level, Bool[np.ndarray, "M P"]],
+    masks: Mapping[Level, Bool[np.ndarray, "M P"]],
 ) -> None:
     """Compare the regions of a view with the masks or nodes at each level."""
     ious = {
-        level: iou_matrix(np.stack([mask.ravel() for _, mask in regions]), found[level]) for level in LEVELS
+        level: iou_matrix(np.stack([mask.ravel() for _, mask in regions]), masks[level]) for level in LEVELS
     }
     bests: dict[tuple[str, ...], np.ndarray] = {}
     for row, (region, _) in enumerate(regions):
         level = region.level
         if level is None:
             continue
-        own = ious[level][row]
-        fits[level].best.append(float(own.max(initial=0)))
-        fits[level].anywhere.append(max(float(ious[each][row].max(initial=0)) for each in LEVELS))
-        if own.max(initial=0) > 0:
-            bests[region.path] = found[level][int(own.argmax())]
+        of_region = ious[level][row]
+        fits[level].best.append(float(of_region.max(initial=0)))
+        fits[level].anywhere.append(max(float(ious[other][row].max(initial=0)) for other in LEVELS))
+        if of_region.max(initial=0) > 0:
+            bests[region.path] = masks[level][int(of_region.argmax())]
     for region, _ in regions:  # if two objects share a path, the path refers to the last object
         parent, child = bests.get(region.path[:-1]), bests.get(region.path)
         if region.level is not None and len(region.path) > 1:
@@ -77,12 +77,12 @@ def add_view(
 
 def nodes_of_view(tree: SemanticTree, weights: sp.csr_matrix) -> dict[Level, np.ndarray]:
     """Return the pixels in which each visible node has more than half of the weight, by level."""
-    found = {}
+    by_level = {}
     for level in LEVELS:
-        shown = ViewNodes.of(weights, tree.node_of_gaussian[:, level.index])
-        labels = shown.labels((1, weights.shape[0]))
-        found[level] = labels == np.unique(labels[labels != NONE])[:, None]
-    return found
+        view_nodes = ViewNodes.of(weights, tree.node_of_gaussian[:, level.index])
+        labels = view_nodes.labels((1, weights.shape[0]))
+        by_level[level] = labels == np.unique(labels[labels != NONE])[:, None]
+    return by_level
 
 
 def masks_of_view(path: Path) -> dict[Level, Bool[np.ndarray, "M P"]]:
@@ -124,17 +124,17 @@ def run_label_fits(
                 continue
             split = "held out" if scene.split[view] == "test" else "training"
             raw = pixel_weights(gaussians, camera, min_weight=tree.min_weight, threads=threads)
-            found = {"nodes": nodes_of_view(tree, normalised_weights(raw))}
+            by_source = {"nodes": nodes_of_view(tree, normalised_weights(raw))}
             if (masks / f"{view}.npz").is_file():
-                found[f"masks, {masks_label(masks)}"] = masks_of_view(masks / f"{view}.npz")
-            for what, by_level in found.items():
+                by_source[f"masks, {masks_label(masks)}"] = masks_of_view(masks / f"{view}.npz")
+            for what, by_level in by_source.items():
                 add_view(fits[what, split], regions, by_level)
         counts["views"] = len(views)
     rows = [
-        [scene.name, what, split, level.label, *each[level].row()]
-        for (what, split), each in sorted(fits.items())
+        [scene.name, what, split, level.label, *fit[level].row()]
+        for (what, split), fit in sorted(fits.items())
         for level in LEVELS
-        if each[level].best
+        if fit[level].best
     ]
     write_csv(out, COLUMNS, rows)
     return markdown_table(COLUMNS, rows, 4)

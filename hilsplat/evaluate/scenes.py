@@ -58,7 +58,7 @@ def run_scenes(results: Path, pattern: str, out: Path | None) -> str:
 def scene_lines(results: Path, names: list[str]) -> tuple[list[str], list[list[object]]]:
     """Return the lines of a table of scenes, and the rows of its CSV."""
     rows: list[list[object]] = []
-    shown: list[tuple[object, ...]] = [SHOWN]
+    lines: list[tuple[object, ...]] = [SHOWN]
     for name in names:
         try:
             scene = SceneState.read(results / name)
@@ -66,7 +66,7 @@ def scene_lines(results: Path, names: list[str]) -> tuple[list[str], list[list[o
         except HilsplatError as error:
             logger.warning("%s: %s", name, error)
             rows.append([name, "damaged", *[""] * (len(COLUMNS) - 2)])
-            shown.append((name, "damaged", *[""] * (len(SHOWN) - 2)))
+            lines.append((name, "damaged", *[""] * (len(SHOWN) - 2)))
             continue
         train, test = (scene.views[split] or "" for split in ("train", "test"))
         psnr = scene.fit.get("psnr_db")
@@ -76,8 +76,8 @@ def scene_lines(results: Path, names: list[str]) -> tuple[list[str], list[list[o
         rows.append([*known, iou, megabytes, scene.date, scene.models])
         views = sum(scene.views.values()) or ""
         psnr_db += " (training)" if scene.fit.get("split") == "train" else ""  # higher than in held-out views
-        shown.append((name, scene.state, views, psnr_db, iou, megabytes, scene.date, scene.models))
-    return aligned_table(shown, WORDS), rows
+        lines.append((name, scene.state, views, psnr_db, iou, megabytes, scene.date, scene.models))
+    return aligned_table(lines, WORDS), rows
 
 
 def _tree_iou(scores: Path) -> str:

@@ -104,15 +104,15 @@ def score(predictions: Any, labels: Any, protocol: str = "lerf/langsplat") -> Sc
             fix="check the labels' texts, levels and class ids",
         )
     frame = pd.DataFrame([{**vars(row), "scene": "", "view": view} for view, row in rows])
-    shown = frame[["view", "query", "level", "metric", "value", "n"]].to_dict("records")
-    return Scores(rows[0][1].protocol, metric_means(card, frame), tuple(shown))
+    records = frame[["view", "query", "level", "metric", "value", "n"]].to_dict("records")
+    return Scores(rows[0][1].protocol, metric_means(card, frame), tuple(records))
 
 
 def _rows_of_images(
     card: cards.ProtocolCard, predictions: Any, labels: Any
 ) -> Iterator[tuple[str, Measured]]:
     for what, given in (("predictions", predictions), ("labels", labels)):
-        if not (isinstance(given, Mapping) and all(isinstance(each, Mapping) for each in given.values())):
+        if not (isinstance(given, Mapping) and all(isinstance(value, Mapping) for value in given.values())):
             problem, expected = f"the {what} are not arrays by view and text", "{view: {text: array}}"
             raise SettingsError(problem, expected=expected, found=type(given).__name__)
     if lacking := sorted(set(labels) ^ set(predictions)):
@@ -139,7 +139,7 @@ def _rows_of_images(
 
 def _truth_of(card: cards.ProtocolCard, view: str, regions: Mapping[str, Any]) -> ViewTruth:
     """Return a view's ground truth from regions by text, or by path from the whole down."""
-    found = []
+    regions_of_view = []
     for name, region in regions.items():
         mask = np.asarray(region)
         if mask.dtype != bool or mask.ndim != 2 or not mask.size:
@@ -153,15 +153,15 @@ def _truth_of(card: cards.ProtocolCard, view: str, regions: Mapping[str, Any]) -
             raise SettingsError(f"{view}: label {name!r} has more than {len(LEVELS)} levels")
         level = Level(len(path)) if _has_levels(card) else None
         pixels = partial(np.asarray, mask)
-        found.append(LabelledRegion(path[-1], mask.shape, pixels, level=level, path=path))
-    sizes = sorted({region.size_hw for region in found})
+        regions_of_view.append(LabelledRegion(path[-1], mask.shape, pixels, level=level, path=path))
+    sizes = sorted({region.size_hw for region in regions_of_view})
     if len(sizes) != 1:
         raise MisalignedArtifactError(
             f"{view}: the labels differ in size" if sizes else f"{view}: there are no labels",
             expected="regions of one size, that of the predictions",
             found=", ".join(map(str, sizes)) or None,
         )
-    return ViewTruth.of_regions(found, sizes[0])
+    return ViewTruth.of_regions(regions_of_view, sizes[0])
 
 
 def _are_masks(card: cards.ProtocolCard, answers: Mapping[str, Mapping[tuple[str, str], np.ndarray]]) -> bool:
@@ -186,7 +186,7 @@ def _are_masks(card: cards.ProtocolCard, answers: Mapping[str, Mapping[tuple[str
         raise SettingsError(
             f"{card.full_name} cannot score these predictions",
             expected="only masks, or only relevancy under a protocol that has a rule for it: "
-            + ", ".join(name for name, each in SCORED.items() if rule_of(each)),
+            + ", ".join(name for name, other in SCORED.items() if rule_of(other)),
         )
     return kinds != {"f"}
 
@@ -301,11 +301,11 @@ def _cosine(
 def _rows_of_points(card: cards.ProtocolCard, predictions: Any, labels: Any) -> Iterator[Measured]:
     _, classes = class_set(card.classes)
     is_scan = card is cards.INSTANCES
-    given = [np.asarray(each) for each in ((*predictions, *labels) if is_scan else (predictions, labels))]
+    given = [np.asarray(values) for values in ((*predictions, *labels) if is_scan else (predictions, labels))]
     given = [array if array.size else array.astype(np.int64) for array in given]  # NumPy reads [] as floats
     sizes = dict(zip("MP", given[0].shape, strict=False)) if is_scan else {"P": given[1].size}
     axes, ids = (("MP", "M", "M", "P", "P"), (1, 3, 4)) if is_scan else (("P", "P"), (0, 1))
-    shapes = [tuple(sizes.get(axis) for axis in each) for each in axes]
+    shapes = [tuple(sizes.get(axis) for axis in names) for names in axes]
     fits = [array.shape for array in given] == shapes and all(given[row].dtype.kind in "iu" for row in ids)
     if is_scan and fits:  # masks of ids, such as -1 for none, would be read as masks of all points
         fits = given[0].dtype == bool or not given[0].size

@@ -69,9 +69,9 @@ def read_scores(paths: Iterable[Path]) -> "pd.DataFrame":
 
     rows: list[dict[str, object]] = []
     for path in paths:
-        found = read_csv(path, COLUMNS, fix := rebuild_command(path))
+        records = read_csv(path, COLUMNS, fix := rebuild_command(path))
         with foreign(path, ArtifactError, fix=fix):
-            rows += [{**row, "value": float(row["value"]), "n": int(row["n"])} for row in found]
+            rows += [{**row, "value": float(row["value"]), "n": int(row["n"])} for row in records]
     return pd.DataFrame(rows, columns=list(COLUMNS)).astype({"value": float, "n": int})
 
 
@@ -80,18 +80,18 @@ def write_instances(
 ) -> None:
     """Write matches, keyed by (data set, scene, variant, masks, method), beside a score file."""
     arrays: dict[str, Any] = {}
-    for key, found in matches.items():  # a program's name may contain a slash, as in "w/ SAM"
-        place = "/".join(part.replace("%", "%25").replace("/", "%2F") for part in key)
-        arrays |= {f"{place}/{field}": array for field, array in vars(found).items()}
+    for key, of_key in matches.items():  # a program's name may contain a slash, as in "w/ SAM"
+        prefix = "/".join(part.replace("%", "%25").replace("/", "%2F") for part in key)
+        arrays |= {f"{prefix}/{field}": array for field, array in vars(of_key).items()}
     write_npz(Path(scores).with_name(name), **arrays)
 
 
 def read_instances(scores: Iterable[Path]) -> dict[tuple[str, ...], InstanceMatches]:
     """Read the matches beside score files, keyed by (data set, scene, variant, masks, method)."""
-    found: dict[tuple[str, ...], dict[str, Any]] = {}
+    by_key: dict[tuple[str, ...], dict[str, Any]] = {}
     files = [file for path in scores for file in (path.with_name(INSTANCES), path.with_suffix(OF_FILES))]
     for file in filter(Path.is_file, files):
         for name, array in read_npz(file).items():
             *key, part = map(unquote, name.split("/"))
-            found.setdefault(tuple(key), {})[part] = array
-    return {key: InstanceMatches(**arrays) for key, arrays in found.items()}
+            by_key.setdefault(tuple(key), {})[part] = array
+    return {key: InstanceMatches(**arrays) for key, arrays in by_key.items()}

@@ -91,10 +91,10 @@ def distinct(
     """
     unit = unit_rows(means)
     alike = (unit @ unit.T > most_alike) & (depth == 0)
-    kept = np.zeros(len(means), bool)
+    is_distinct = np.zeros(len(means), bool)
     for row in range(len(means)):
-        kept[row] = not (alike[row] & kept).any()
-    return np.flatnonzero(kept)
+        is_distinct[row] = not (alike[row] & is_distinct).any()
+    return np.flatnonzero(is_distinct)
 
 
 def instance_term(
@@ -174,9 +174,9 @@ class Contrast:
         if settings.weight_part:
             loss, (by_mean, by_half, by_other) = part_term(means, halves, others, self.relations, settings)
             total += settings.weight_part * loss
-            n, half, rest = self._counts()
-            by_means += settings.weight_part * (by_mean + n / rest * by_other)
-            by_halves = settings.weight_part * (by_half - half / rest * by_other)
+            n, half, outside = self._counts()
+            by_means += settings.weight_part * (by_mean + n / outside * by_other)
+            by_halves = settings.weight_part * (by_half - half / outside * by_other)
         gradient = self.masks.spread(by_means.astype(np.float32))
         if by_halves is not None:
             gradient += self.half_masks.spread(by_halves.astype(np.float32))
@@ -188,8 +188,8 @@ class Contrast:
         halves = self.half_masks.means(features).astype(np.float64)
         if self.others is not None:
             means, halves = means + self.others[0], halves + self.others[1]
-        n, half, rest = self._counts()
-        return means, halves, (n * means - half * halves) / rest
+        n, half, outside = self._counts()
+        return means, halves, (n * means - half * halves) / outside
 
     def _counts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return pixel counts of each mask, its random half and its other half (at least 1), as columns."""

@@ -3,7 +3,7 @@
 import numpy as np
 
 from cpusplat.compiled import compiled
-from cpusplat.lane_products import MOST_ROWS, WIDE_COLUMNS, rows_of_products
+from cpusplat.lane_products import MAX_ROWS, WIDE_COLUMNS, rows_of_products
 from cpusplat.lanes import (
     WIDTH,
     bits_ge,
@@ -18,7 +18,7 @@ from cpusplat.lanes import (
 )
 
 ROWS = 4 * WIDTH  # rows processed together; for each such block, weights are read from L2 once
-UNITS = MOST_ROWS  # outputs of a layer that are summed together; layers are padded to a multiple of this
+UNITS = MAX_ROWS  # outputs of a layer that are summed together; layers are padded to a multiple of this
 LATENT = 3  # longest latents that are decoded by pieces; longer ones have many more pieces
 TERMS = LATENT + 1  # terms of an affine function: its value at the anchor, and its derivatives
 PIECES = ROWS // TERMS  # pieces that are computed together
@@ -38,14 +38,14 @@ def through_layers(rows, widths, weights, biases, out):
     for begin in range(0, len(left), ROWS):
         some = left[begin : begin + ROWS]
         for channel in range(widths[0]):
-            for place, row in enumerate(some):
-                values[channel * ROWS + place] = rows[row, channel]
-        found = _outputs(layers, values, following, no_planes)
+            for lane, row in enumerate(some):
+                values[channel * ROWS + lane] = rows[row, channel]
+        decoded = _outputs(layers, values, following, no_planes)
         for first in range(0, len(some), WIDTH):
             for channel in range(0, wide, WIDTH):
-                transpose(found, channel * ROWS + first, ROWS, block, channel, wide)
-            for place, row in enumerate(some[first : first + WIDTH]):
-                _write_unit(block[place * wide : (place + 1) * wide], out[row])
+                transpose(decoded, channel * ROWS + first, ROWS, block, channel, wide)
+            for lane, row in enumerate(some[first : first + WIDTH]):
+                _write_unit(block[lane * wide : (lane + 1) * wide], out[row])
 
 
 @compiled
@@ -81,8 +81,8 @@ def _outputs(layers, values, following, planes):
                     store(following, at, if_on)
             plane += outputs * ROWS
         elif layer < len(widths) - 2:
-            for place in range(outputs * ROWS):
-                following[place] = max(following[place], np.float32(0))
+            for position in range(outputs * ROWS):
+                following[position] = max(following[position], np.float32(0))
         bias += outputs
         values, following = following, values
     return values
@@ -100,8 +100,8 @@ def _decode_pieces(rows, layers, values, following, out):
     points, caught = np.zeros(LATENT * step, np.float32), WORTHWHILE
     while caught >= WORTHWHILE and len(left) > WORTHWHILE:
         for channel in range(widths[0]):
-            for place, row in enumerate(left):
-                points[channel * step + place] = rows[row, channel]
+            for number, row in enumerate(left):
+                points[channel * step + number] = rows[row, channel]
         anchors = (2 * np.arange(PIECES) + 1) * len(left) // (2 * PIECES)
         values[: widths[0] * ROWS] = 0
         for piece, anchor in enumerate(anchors):
@@ -160,8 +160,8 @@ def _decode_piece(planes, outputs, points, anchor, taken, left, out):
                 z = lanes(points[2 * step + point] - z0)
                 for at in range(0, wide, WIDTH):
                     value = load(outputs, at) + load(outputs, wide + at) * x
-                    rest = load(outputs, 2 * wide + at) * y + load(outputs, 3 * wide + at) * z
-                    store(row, at, value + rest)
+                    yz_terms = load(outputs, 2 * wide + at) * y + load(outputs, 3 * wide + at) * z
+                    store(row, at, value + yz_terms)
                 _write_unit(row, out[left[point]])
 
 

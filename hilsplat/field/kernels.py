@@ -7,7 +7,7 @@ import numpy as np
 from cpusplat.compiled import compiled
 
 BETA1, BETA2 = 0.9, 0.999  # decay rates of the moments, as in torch
-LEAST_MOMENT = np.float32(1e-36)  # smaller moments are set to 0
+MIN_MOMENT = np.float32(1e-36)  # smaller moments are set to 0
 
 
 @compiled(error_model="numpy")
@@ -19,17 +19,17 @@ def adam_step(values, gradient, first, second, rate, scale, eps):
         m = np.float32(BETA1) * first[k] + np.float32(1 - BETA1) * g
         v = np.float32(BETA2) * second[k] + np.float32(1 - BETA2) * g * g
         # Processors are many times slower with subnormal numbers, which moments of unused units reach.
-        first[k] = m if abs(m) > LEAST_MOMENT else np.float32(0)
-        second[k] = v if v > LEAST_MOMENT else np.float32(0)
+        first[k] = m if abs(m) > MIN_MOMENT else np.float32(0)
+        second[k] = v if v > MIN_MOMENT else np.float32(0)
         values[k] -= rate * first[k] / (np.sqrt(second[k]) * scale + eps)
 
 
 @compiled
 def swap(order, drawn):
     """Swap each element with itself or a later element, chosen by random draws."""
-    for place in range(len(drawn)):
-        other = place + np.int64(drawn[place]) % (len(order) - place)
-        order[place], order[other] = order[other], order[place]
+    for at in range(len(drawn)):
+        other = at + np.int64(drawn[at]) % (len(order) - at)
+        order[at], order[other] = order[other], order[at]
 
 
 # One-pass updates and sums over a whole field, without temporaries of that size. They are memory-bound: three

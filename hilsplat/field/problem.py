@@ -101,11 +101,11 @@ class QuadraticProblem:
         """
         total, means = 0.0, np.zeros(self.latents.shape)
         for begin, end in self.blocks:
-            own = features[begin:end]
-            total += form(self.quadratic.block(begin, end), own)
+            of_block = features[begin:end]
+            total += form(self.quadratic.block(begin, end), of_block)
             if len(self.blocks) > 1:
-                total += float(channel_dots(own, self.quadratic.across(begin, end, features)).sum())
-            means += self.masks.block(begin, end).means(own.astype(np.float64))
+                total += float(channel_dots(of_block, self.quadratic.across(begin, end, features)).sum())
+            means += self.masks.block(begin, end).means(of_block.astype(np.float64))
         pixels = self.pixels[:, None].astype(np.float64)
         linear = float((pixels * means * self.latents).sum())
         constant = float((pixels * np.square(self.latents, dtype=np.float64)).sum())

@@ -39,22 +39,22 @@ def solve_field(
     operators = contrast.masks, contrast.half_masks
     means = [operator.means(features) for operator in operators]
     for begin, end in track(problem.blocks, "blocks of the field"):
-        own = [operator.block(begin, end) for operator in operators]
-        rest = [total - part.means(features[begin:end]) for total, part in zip(means, own, strict=True)]
+        parts = [operator.block(begin, end) for operator in operators]
+        outer = [total - part.means(features[begin:end]) for total, part in zip(means, parts, strict=True)]
         block = replace(
             problem,
-            masks=own[0],
+            masks=parts[0],
             quadratic=problem.quadratic.block(begin, end),
             mass=problem.mass[begin:end],
             lifted=problem.lifted[begin:end],
             blocks=((0, end - begin),),
-            others=(problem.quadratic.across(begin, end, features), rest[0]),
+            others=(problem.quadratic.across(begin, end, features), outer[0]),
         )
-        of_block = replace(contrast, masks=own[0], half_masks=own[1], others=(rest[0], rest[1]))
+        of_block = replace(contrast, masks=parts[0], half_masks=parts[1], others=(outer[0], outer[1]))
         for phase, solved in _phases(block, of_block):
             last = phase, solved
         features[begin:end] = last[1]
-        means = [fixed + part.means(last[1]) for fixed, part in zip(rest, own, strict=True)]
+        means = [fixed + part.means(last[1]) for fixed, part in zip(outer, parts, strict=True)]
     report[last[0]] = problem.terms(features) | contrast.values(features)
     return features, report | {"blocks": len(problem.blocks)}
 
@@ -67,14 +67,14 @@ def _phases(
     flat = -1, problem.latents.shape[1]  # a shape with one row per Gaussian and level
     # L-BFGS needs much memory, so its variables are only the features visible in masks, scaled by the square
     # root of the mass, which makes the quadratic part nearly isotropic.
-    shown = np.flatnonzero(problem.mass)
-    root = np.sqrt(problem.mass.reshape(-1)[shown])[:, None]
+    seen = np.flatnonzero(problem.mass)
+    root = np.sqrt(problem.mass.reshape(-1)[seen])[:, None]
     inverse_root = np.zeros(problem.mass.shape, np.float32)
-    inverse_root.reshape(-1)[shown] = (1 / np.maximum(root, 1e-10))[:, 0]
+    inverse_root.reshape(-1)[seen] = (1 / np.maximum(root, 1e-10))[:, 0]
     right = problem.right_side()
 
     def unscale(scaled: np.ndarray) -> None:
-        features.reshape(flat)[shown] = scaled * inverse_root.reshape(-1)[shown][:, None]
+        features.reshape(flat)[seen] = scaled * inverse_root.reshape(-1)[seen][:, None]
 
     def objective(scaled: np.ndarray) -> tuple[float, np.ndarray]:
         unscale(scaled)
@@ -83,7 +83,7 @@ def _phases(
         contrastive, gradient = contrast.weighted(features)
         add_slope(np.float32(2 / total), curved, right, inverse_root, gradient)
         del curved
-        return value + contrastive, gradient.reshape(flat)[shown]
+        return value + contrastive, gradient.reshape(flat)[seen]
 
     yield "lifted", problem.lifted
     if settings.cg_steps and any(problem.weights):
@@ -93,7 +93,7 @@ def _phases(
         features = problem.lifted.copy()
     if (settings.weight_instance or settings.weight_part) and settings.lbfgs_steps:
         first_step = total / (2 * max(sum(problem.weights), 1e-3))
-        unscale(lbfgs(objective, features.reshape(flat)[shown] * root, settings.lbfgs_steps, first_step))
+        unscale(lbfgs(objective, features.reshape(flat)[seen] * root, settings.lbfgs_steps, first_step))
         yield "after_lbfgs", features
 
 

@@ -199,13 +199,13 @@ def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
     layout, ending = LAYOUTS[kind], f"_{variant}" if variant else ""
     for networks in (networks_of(kind), [WHOLES if kind in ("clip", "siglip") else ()]):
         present = [
-            [place for place in places if f"{place}{ending}.onnx" in listing.files] for places in networks
+            [stem for stem in places if f"{stem}{ending}.onnx" in listing.files] for places in networks
         ]
         if all(present):
             chosen = [places[0] for places in present]
             listing.require(*layout.described)
             plain = [*layout.described, *(path for path in layout.beside if path in listing.files)]
-            files = {f"{place}{ending}.onnx": f"{place}.onnx" for place in chosen}
+            files = {f"{stem}{ending}.onnx": f"{stem}.onnx" for stem in chosen}
             # external weights keep their names, because the networks refer to them by name
             prefixes = tuple(f"{network}{mark}data" for network in files for mark in "_.")
             weights = [path for path in listing.files if path.startswith(prefixes)]

@@ -244,12 +244,12 @@ def _install(download: Download) -> str:
         if download.choice.exported:
             versions = {"exported": export_networks(staging, folder)}
         else:
-            for path, place in files.items():
-                (folder / place).parent.mkdir(parents=True, exist_ok=True)
+            for path, target in files.items():
+                (folder / target).parent.mkdir(parents=True, exist_ok=True)
                 try:
-                    (folder / place).hardlink_to(staging / path)
+                    (folder / target).hardlink_to(staging / path)
                 except OSError:  # the file system has no hard links
-                    shutil.copyfile(staging / path, folder / place)
+                    shutil.copyfile(staging / path, folder / target)
         report = _complete(folder, download.target, listing.require(*sorted(files)), listing, **versions)
         _keep_others(download.target, folder)
     delete(staging, STAGING.format(name=re.escape(download.target.name)))
@@ -345,7 +345,7 @@ def _complete(folder: Path, target: Path, files: list[HubFile], listing: Listing
 @contextmanager
 def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
     """Convert errors from the network, the hub and a full disk into errors with a fix."""
-    place = f"{constants.ENDPOINT}/{requested.repository}"
+    url = f"{constants.ENDPOINT}/{requested.repository}"
     try:
         with explain_full_disk(models / requested.name):
             yield
@@ -353,19 +353,19 @@ def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
         answered = reason_of(error)
         for kind, problem, fix in BETWEEN:
             if isinstance(answered, kind):
-                problem = f"{requested.repository} cannot be downloaded: {problem} {place}"
+                problem = f"{requested.repository} cannot be downloaded: {problem} {url}"
                 raise DownloadError(problem, found=_innermost(error), fix=fix) from error
         if isinstance(answered, requests.HTTPError) and answered.response is not None:
-            raise _refused(answered, answered.response, requested.repository, place) from error
+            raise _refused(answered, answered.response, requested.repository, url) from error
         families = [requested.release.family] if requested.release else ["sam", "clip"]
         ending = f"_{requested.variant}.onnx" if requested.variant else ".onnx"
         networks = [f"{places[0]}{ending}" for family in families for places in networks_of(family)]
         files = [*(file for family in families for file in LAYOUTS[family].described), *networks]
         raise DownloadError(
-            f"{requested.repository} cannot be downloaded: {type(error).__name__}, {place} is unreachable",
+            f"{requested.repository} cannot be downloaded: {type(error).__name__}, {url} is unreachable",
             found="HF_HUB_OFFLINE is set" if constants.HF_HUB_OFFLINE else _innermost(error),
             fix=f"run the command again when the hub is reachable ({KEPT}; HF_ENDPOINT sets a mirror, "
-            f"HTTPS_PROXY a proxy), or download these files from {place} into {models / requested.name}: "
+            f"HTTPS_PROXY a proxy), or download these files from {url} into {models / requested.name}: "
             f"{', '.join(dict.fromkeys(files))}",
         ) from error
     except OSError as error:
@@ -379,26 +379,26 @@ def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
 
 
 def _refused(
-    error: requests.HTTPError, response: requests.Response, repository: str, place: str
+    error: requests.HTTPError, response: requests.Response, repository: str, url: str
 ) -> DownloadError:
     """Return the error for a response with a status other than 2xx; `place` is the repository's page."""
     status, found = f"({response.status_code} {first_line(response.reason)})", str(response.url)
     if isinstance(error, GatedRepoError):
         problem = f"{repository} requires you to accept its terms before downloading {status}"
-        fix = f"accept them at {place}, run `hf auth login` or set HF_TOKEN, and run the command again"
+        fix = f"accept them at {url}, run `hf auth login` or set HF_TOKEN, and run the command again"
     elif isinstance(error, RepositoryNotFoundError):
         problem = f"the hub has no repository {repository}, or it is private {status}"
-        fix = f"correct the name (hilsplat models list), or log in (`hf auth login`, HF_TOKEN) to use {place}"
+        fix = f"correct the name (hilsplat models list), or log in (`hf auth login`, HF_TOKEN) to use {url}"
     elif response.status_code == requests.codes.too_many_requests:
         problem = f"the hub refused {repository}: too many requests {status}"
         found = f"Retry-After: {first_line(response.headers.get('Retry-After', 'not stated'))}"
         fix = f"run the command again later ({KEPT}); `hf auth login` or HF_TOKEN raises the limit"
     elif response.status_code in (requests.codes.unauthorized, requests.codes.forbidden):
         problem = f"the hub denies access to {repository} {status}"
-        fix = f"see {place}; run `hf auth login`, or set HF_TOKEN to a token with access"
+        fix = f"see {url}; run `hf auth login`, or set HF_TOKEN to a token with access"
     elif response.status_code == requests.codes.not_found:
         problem = f"the hub does not have this revision or file of {repository} {status}"
-        fix = f"correct the name or --revision ({place} lists what exists); --revision main is the newest"
+        fix = f"correct the name or --revision ({url} lists what exists); --revision main is the newest"
     else:
         problem = f"the hub failed to serve {repository} {status}"
         fix = f"run the command again later: {KEPT}"

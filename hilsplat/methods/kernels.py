@@ -97,7 +97,7 @@ def weighted_sums(indptr, indices, data, wide, features, out):
 
 @compiled
 def largest_entries(logits, chosen, shares):
-    kept = chosen.shape[1]
+    count = chosen.shape[1]
     for g in range(len(logits)):
         row, best = logits[g], chosen[g]
         held = 0
@@ -105,16 +105,16 @@ def largest_entries(logits, chosen, shares):
             at = held
             while at > 0 and row[e] > row[best[at - 1]]:
                 at -= 1
-            if at < kept:
-                held = min(held + 1, kept)
+            if at < count:
+                held = min(held + 1, count)
                 for k in range(held - 1, at, -1):
                     best[k] = best[k - 1]
                 best[at] = e
         total = np.float32(0)
-        for k in range(kept):
+        for k in range(count):
             shares[g, k] = np.exp(row[best[k]] - row[best[0]])
             total += shares[g, k]
-        for k in range(kept):
+        for k in range(count):
             shares[g, k] /= total
 
 

@@ -63,9 +63,9 @@ class MaskHalves:
         pixels = np.bincount(labels[labels >= 0], minlength=size).reshape(-1, 2)
         of_image = pixels * settings.pixel_step**2
         rows, areas = np.arange(len(level)), (of_image.sum(axis=1), of_image[:, 1])
-        found = view_relations(rows, level, parent, *areas, settings, latents)
+        of_view = view_relations(rows, level, parent, *areas, settings, latents)
         relations = (
-            replace(found, parts=tuple(part for part in found.parts if level[part[0][0]] == int(of)))
+            replace(of_view, parts=tuple(part for part in of_view.parts if level[part[0][0]] == int(of)))
             for of in LEVELS
         )
         sums = sp.hstack([indicator @ view.weights for indicator in painted], format="csr")
@@ -95,7 +95,7 @@ class HierarchyTerms:
             divided.append(MaskHalves.of(view, in_half, *masks, settings))
         num_pixels = sum(int(view.pixels.sum()) for view in divided)
         num_instance = sum(len(view.relations[0].rows) > 1 for view in divided)
-        num_part = sum(len(found.parts) for view in divided for found in view.relations)
+        num_part = sum(len(relations.parts) for view in divided for relations in view.relations)
         return HierarchyTerms(divided, settings, num_pixels, max(num_instance, 1), max(num_part, 1))
 
     def gradient(
@@ -178,8 +178,8 @@ def train(
         painted.append([(rows := view.at(level), labels[rows, level.index]) for level in LEVELS])
     by_l1 = terms is None or terms.settings.language == "l1"
     # Levels that don't interact are trained one after the other, because their arrays then stay in the cache.
-    groups = [[own] for own in levels] if terms is None else [levels]
-    turns = (own for group in groups for _ in range(settings.steps) for own in group)
+    groups = [[member] for member in levels] if terms is None else [levels]
+    turns = (member for group in groups for _ in range(settings.steps) for member in group)
     for level, adam, order, num_views in track(turns, "steps", total=settings.steps * len(levels)):
         number = next(order)
         weights, attraction, offsets = views[number].weights, 0.0, np.zeros(0, np.float32)

@@ -78,12 +78,12 @@ def instance_features(
     means_of = {view.number: A[view.rows] for view in views}
 
     def loss(view: LabelledView, _: np.random.Generator, done: float) -> Tensor:
-        shown = (unit(features).reshape(num, -1) + 1) / 2
-        rendered = product(view.weights, shown).reshape(-1, levels, CHANNELS)
-        means = product(means_of[view.number], shown).reshape(-1, levels, CHANNELS)
+        colours = (unit(features).reshape(num, -1) + 1) / 2
+        rendered = product(view.weights, colours).reshape(-1, levels, CHANNELS)
+        means = product(means_of[view.number], colours).reshape(-1, levels, CHANNELS)
         level = contributions.level[view.rows]
         used = contributions.pixels[view.rows] > 0
-        total = shown.sum() * 0
+        total = colours.sum() * 0
         for at_level in LEVELS:
             label = torch.from_numpy(view.labels[:, at_level.index].astype(np.int64))
             inside = label >= 0

@@ -49,7 +49,7 @@ def has_kernels(version: tuple[int, int], built_for: Sequence[str]) -> bool:
     """
     built = [(name.startswith("compute"), divmod(int(re.sub(r"\D", "", name)), 10)) for name in built_for]
     return not built or any(
-        each <= version and (is_compiled_later or each[0] == version[0]) for is_compiled_later, each in built
+        arch <= version and (is_compiled_later or arch[0] == version[0]) for is_compiled_later, arch in built
     )
 
 
@@ -183,11 +183,11 @@ class Batches:
             torch.cuda.reset_peak_memory_stats(self.device)
             before = torch.cuda.memory_allocated(self.device)
             result = work(rows, number)
-            each = (torch.cuda.max_memory_allocated(self.device) - before) / MIB / len(rows)
-            fitting = int(USED_SHARE * free_mib(self.device) / max(each, 1e-3))
+            mib_per_item = (torch.cuda.max_memory_allocated(self.device) - before) / MIB / len(rows)
+            fitting = int(USED_SHARE * free_mib(self.device) / max(mib_per_item, 1e-3))
             self.size = max(1, min(self.most, fitting))
             self._is_measured = True
-            logger.debug("%s: %.0f MiB per item, %d items per call", self.section, each, self.size)
+            logger.debug("%s: %.0f MiB per item, %d items per call", self.section, mib_per_item, self.size)
             return result
 
     def _shrink(self, number: int, problem: str) -> None:

@@ -120,7 +120,7 @@ def open_model_folder(
     ending = f"_{variant}.onnx" if variant else ".onnx"
     networks, missing = {}, []
     for network, spec in layout.usable.items():
-        paths = [folder / f"{place}{ending}" for place in spec.places]
+        paths = [folder / f"{stem}{ending}" for stem in spec.places]
         existing = next(filter(Path.is_file, paths), None)
         if existing is not None:
             networks[network] = existing
@@ -193,8 +193,8 @@ def _variants(folder: Path, layout: layouts.Layout) -> list[str]:
     suffixes = []
     for spec in layout.networks.values():
         endings = set[str]()
-        for place in spec.places:
-            endings |= {path.stem.removeprefix(Path(place).name) for path in folder.glob(f"{place}*.onnx")}
+        for stem in spec.places:
+            endings |= {path.stem.removeprefix(Path(stem).name) for path in folder.glob(f"{stem}*.onnx")}
         suffixes.append({ending[1:] for ending in endings if ending[:1] in ("", "_")})
     return sorted(set.intersection(*suffixes))
 

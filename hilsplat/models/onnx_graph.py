@@ -56,9 +56,9 @@ class Graph:
             initializers = {tensor.name for tensor in model.graph.initializer}
             weights = {}
             for tensor in tensors_of(model.graph):
-                if (place := location_of(tensor)) is None:
+                if (location := location_of(tensor)) is None:
                     continue
-                content, dtype = _external_bytes(path, tensor, place), _native_dtype(tensor)
+                content, dtype = _external_bytes(path, tensor, location), _native_dtype(tensor)
                 # constants of nodes and packed types cannot be passed to onnxruntime separately
                 if dtype is None or tensor.name not in initializers or content.size < SMALL_BYTES:
                     _inline(tensor, content)

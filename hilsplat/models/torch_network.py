@@ -42,7 +42,7 @@ class Step:
     last_used: list[str]  # values that no later step reads
 
     def run(self, values: dict[str, Tensor]) -> Any:
-        given = [values[each] if isinstance(each, Name) else each for each in self.arguments]
+        given = [values[argument] if isinstance(argument, Name) else argument for argument in self.arguments]
         return OPERATORS[self.operator](*given, **self.attributes)
 
 
@@ -84,12 +84,15 @@ class TorchNetwork(Network):
     def _open(self, source: Graph | Path) -> None:
         self._graph = source if isinstance(source, Graph) else Graph.read(source)
         graph = self._graph.model.graph
-        self._opset = opset = max(each.version for each in self._graph.model.opset_import if not each.domain)
+        self._opset = opset = max(
+            entry.version for entry in self._graph.model.opset_import if not entry.domain
+        )
         if opset < MIN_OPSET:
             raise self._refused(f"its opset {opset} is older than {MIN_OPSET}")
         constants = {tensor.name for tensor in graph.initializer}
         inputs, outputs = map(
-            _declared, ([each for each in graph.input if each.name not in constants], graph.output)
+            _declared,
+            ([declared for declared in graph.input if declared.name not in constants], graph.output),
         )
         self.inputs, self.outputs = inputs, outputs
 
@@ -146,7 +149,7 @@ class TorchNetwork(Network):
             if node.op_type == "If":
                 chosen = self._branch(node, known)
                 uses.subtract(inputs_of(node))
-                uses.update(name for each in chosen for name in inputs_of(each))
+                uses.update(name for chosen_node in chosen for name in inputs_of(chosen_node))
                 nodes.extendleft(reversed(chosen))
                 continue
             # the result is known if the inputs are, or if it depends only on their shapes
@@ -154,11 +157,11 @@ class TorchNetwork(Network):
             step = self._step(node, known, values, is_known)
             try:
                 with torch.autocast(self.device.type, torch.float16, self.half and not is_known):
-                    found = step.run(values)
+                    outputs = step.run(values)
             except (TypeError, NotImplementedError) as error:
                 raise self._refused(f"{node.op_type} in an unknown form ({first_line(error)})") from error
-            found = found if isinstance(found, tuple | list) else [found]
-            (known if is_known else values).update(zip(step.outputs, found, strict=True))
+            outputs = outputs if isinstance(outputs, tuple | list) else [outputs]
+            (known if is_known else values).update(zip(step.outputs, outputs, strict=True))
             uses.subtract(inputs_of(node))
             step.last_used.extend(
                 name
@@ -187,7 +190,7 @@ class TorchNetwork(Network):
         results = zip(graph.output, node.output, strict=True)
         return [
             *graph.node,
-            *(onnx.helper.make_node("Identity", [each.name], [name]) for each, name in results),
+            *(onnx.helper.make_node("Identity", [result.name], [name]) for result, name in results),
         ]
 
     def _step(self, node: Any, known: Constants, values: dict[str, Tensor], is_known: bool) -> Step:
@@ -208,7 +211,7 @@ class TorchNetwork(Network):
             else:
                 arguments.append(known[name] if is_known else self._upload(name, known))
         schema = onnx.defs.get_schema(node.op_type, self._opset, node.domain)
-        attributes = {each.name: _value(each) for each in node.attribute}
+        attributes = {attribute.name: _value(attribute) for attribute in node.attribute}
         for key, known_attribute in schema.attributes.items():
             default = known_attribute.default_value
             if default.type and attributes.get(key) == _value(default):
@@ -228,11 +231,11 @@ class TorchNetwork(Network):
 
 def _repeat(steps: list[Step], values: dict[str, Tensor]) -> dict[str, Tensor]:
     for step in steps:
-        found = step.run(values)
-        if isinstance(found, tuple | list):
-            values.update(zip(step.outputs, found, strict=True))
+        outputs = step.run(values)
+        if isinstance(outputs, tuple | list):
+            values.update(zip(step.outputs, outputs, strict=True))
         else:
-            values[step.outputs[0]] = found
+            values[step.outputs[0]] = outputs
         for name in step.last_used:
             del values[name]
     return values
@@ -259,14 +262,13 @@ def tensor_of(value: np.ndarray | Tensor, dtype: type) -> Tensor:
 
 def _declared(values: Any) -> dict[str, Declared]:
     """Return the inputs or outputs that a graph declares, as onnxruntime describes them."""
-    found = {}
+    declared = {}
     for value in values:
         kind = value.type.tensor_type
         axes = [
-            each.dim_value if each.HasField("dim_value") else each.dim_param or None
-            for each in kind.shape.dim
+            dim.dim_value if dim.HasField("dim_value") else dim.dim_param or None for dim in kind.shape.dim
         ]
-        found[value.name] = Declared(
+        declared[value.name] = Declared(
             f"tensor({onnx.TensorProto.DataType.Name(kind.elem_type).lower()})", axes
         )
-    return found
+    return declared

@@ -93,8 +93,8 @@ def checked_photo(
     grey = cv2.cvtColor(resize_to_fit(pixels, CHECK_SIDE_PX), cv2.COLOR_RGB2GRAY)
     is_dark, is_white = np.percentile(grey, 95) < DARK_LEVEL, (grey >= WHITE_LEVEL).mean() > WHITE_SHARE
     height, width = pixels.shape[:2]
-    found = (blur(grey) > BLURRED, is_dark, is_white, width == 2 * height)
-    faults = tuple(fault for fault, is_found in zip(FAULTS, found, strict=True) if is_found)
+    observed = (blur(grey) > BLURRED, is_dark, is_white, width == 2 * height)
+    faults = tuple(fault for fault, is_found in zip(FAULTS, observed, strict=True) if is_found)
     features = _features(resize_to_fit(grey, FEATURE_SIDE_PX)) if is_matched else None
     return CheckedPhoto(name, (height, width), focal_px, faults, features)
 

@@ -125,8 +125,8 @@ def report(
     for hit in hits:
         position = ", ".join(f"{value:.2f}" for value in hit.centroid)
         size = " x ".join(f"{side:.2f}" for side in hit.oriented_box.size)
-        own = str(hit.node), hit.level.label, f"{hit.score:.2f}", position, size, hit.name or "?"
-        rows.append((*own, ", ".join(hit.best_views)))
+        cells = str(hit.node), hit.level.label, f"{hit.score:.2f}", position, size, hit.name or "?"
+        rows.append((*cells, ", ".join(hit.best_views)))
     lines = [f"{counted(len(hits), 'answer')} to {text!r} in {searched}; lengths in {lengths}"]
     lines += aligned_table(rows, words)
     if more := len(nodes.ids) - len(hits):

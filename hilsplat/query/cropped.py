@@ -23,20 +23,20 @@ def remaining_rows(
     Raises:
         SettingsError: nothing matches a query, a node doesn't exist, or no Gaussian remains.
     """
-    kept = np.full(len(scene.gaussians), not only)
+    is_kept = np.full(len(scene.gaussians), not only)
     lines = []
     for keeps, whats in ((True, only), (False, without)):
         for what in whats:
             rows, line = _found(scene, what)
-            kept[rows] = keeps
+            is_kept[rows] = keeps
             lines.append(f"{'only' if keeps else 'without'} {line}")
     if clean:
         loose = scene.views.loose
-        kept &= ~loose
+        is_kept &= ~loose
         lines.append(f"without {counted(int(loose.sum()), 'Gaussian')} of no node")
-    if not kept.any():
+    if not is_kept.any():
         raise SettingsError("no Gaussian remains", fix="keep more, or remove less")
-    return np.flatnonzero(kept), lines
+    return np.flatnonzero(is_kept), lines
 
 
 def _found(scene: LanguageScene, what: str) -> tuple[Int64[np.ndarray, " g"], str]:
@@ -45,8 +45,8 @@ def _found(scene: LanguageScene, what: str) -> tuple[Int64[np.ndarray, " g"], st
         nodes, doubts = [scene.existing_node(int(what))], ""
         named = f"node {what} ({scene.name_of(nodes[0]) or '?'})"
     else:
-        found = scene.select(what)
-        nodes, hits = found.ids.tolist(), scene.hits_of(found, len(found.ids))
+        selection = scene.select(what)
+        nodes, hits = selection.ids.tolist(), scene.hits_of(selection, len(selection.ids))
         if not hits:
             raise SettingsError(
                 f"nothing in {scene.scene.name} matches {what!r}",

@@ -54,7 +54,7 @@ class NodeIndex:
         arrays, about = read_tensors(path)
         with readable(path):
             views = tuple(about.pop("views_of_scene"))
-            own = {name: arrays.pop(name) for name in ("gaussians", "best_view")}
-        require_types(NodeIndex, own, path, {"best_view": (0, len(views) - 1)})
+            of_index = {name: arrays.pop(name) for name in ("gaussians", "best_view")}
+        require_types(NodeIndex, of_index, path, {"best_view": (0, len(views) - 1)})
         about["view_names"] = ()
-        return NodeIndex(build_checked(SemanticTree, arrays, about, path, LIMITS), **own, views=views)
+        return NodeIndex(build_checked(SemanticTree, arrays, about, path, LIMITS), **of_index, views=views)

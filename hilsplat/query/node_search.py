@@ -113,14 +113,14 @@ def search(
     margin = margin.astype(np.float64)
     anywhere = margin[:, visible].max(axis=1, initial=-np.inf).tolist()
     if len(path) == 1:
-        (own,) = margin
-        level = automatic_level(tree, own, visible) if level is None else level
+        (margin_of_text,) = margin
+        level = automatic_level(tree, margin_of_text, visible) if level is None else level
         nodes = tree.nodes_of(level)
         candidates = nodes[visible[nodes]]
-        value = own + ancestors * ancestor_margins(tree, own)
+        value = margin_of_text + ancestors * ancestor_margins(tree, margin_of_text)
         spread = np.ptp(value[nodes]) if len(nodes) else 0.0
         chosen = _near_best(value, candidates, vectors, (1 - threshold) * spread)
-        best = float(own[candidates].max(initial=-np.inf))
+        best = float(margin_of_text[candidates].max(initial=-np.inf))
         return NodeHits(chosen, value[chosen], "flat", (TextAnswer(path[0], level, best, *anywhere),))
     ways = [way for way in combinations(LEVELS, len(path)) if level in (None, way[-1])]
     if not ways:
@@ -151,9 +151,9 @@ def _near_best(
     """
     if not len(candidates):
         return np.zeros(0, np.int64)
-    own = value[candidates]
-    below = own.max() - own
-    is_alike = vectors[candidates] @ vectors[candidates[own.argmax()]] >= ALIKE
+    values = value[candidates]
+    below = values.max() - values
+    is_alike = vectors[candidates] @ vectors[candidates[values.argmax()]] >= ALIKE
     is_near = below <= np.where(is_alike, ALIKE_REACH, 1.0) * reach
     chosen = candidates[is_near]
     return chosen[np.lexsort((chosen, below[is_near]))].astype(np.int64)

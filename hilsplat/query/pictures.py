@@ -97,9 +97,9 @@ def show_from_above(
     low, high = np.minimum(low, flat_cameras[:, :2].min(0)), np.maximum(high, flat_cameras[:, :2].max(0))
     colours = 0.5 * base_rgb(gaussians.sh) + 0.45
     visible = np.flatnonzero((gaussians.opacities > 0.3) & ~selected)
-    shown = visible[:: max(1, len(visible) // MAX_POINTS)]
-    shown = shown[np.argsort(flat[shown, 2], kind="stable")]
-    axes.scatter(flat[shown, 0], flat[shown, 1], s=1.5, c=colours[shown].clip(0, 1), linewidths=0)
+    drawn = visible[:: max(1, len(visible) // MAX_POINTS)]
+    drawn = drawn[np.argsort(flat[drawn, 2], kind="stable")]
+    axes.scatter(flat[drawn, 0], flat[drawn, 1], s=1.5, c=colours[drawn].clip(0, 1), linewidths=0)
     axes.scatter(flat[selected, 0], flat[selected, 1], s=4, color="#ff7a00", linewidths=0)
     axes.scatter(flat_cameras[:, 0], flat_cameras[:, 1], s=10, color="#333333", marker="^", linewidths=0)
     margin = 0.05 * (high - low).max()

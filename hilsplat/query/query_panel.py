@@ -54,7 +54,7 @@ def query_panel(
     called = f" ({', '.join([*names[:NAMED], *(['…'] if names[NAMED:] else [])])})" if names else ""
     title = f"“{text}” in {scene.scene.name}: {count}{called}{note}"
     texts = [title, scene.caution_about(text), *map(str, doubts_of(hits))]
-    heading = [line for each in texts for line in wrap(each, TITLE_LETTERS)]
+    heading = [line for query_text in texts for line in wrap(query_text, TITLE_LETTERS)]
     height, width = scene.scene.cameras[views[0]].size_hw
     row_px = TITLE_PX + round(CELL_PX * height / width) + GAP_PX
     upper_px = HEADING_PX * len(heading) + GAP_PX + len(views) * row_px

@@ -42,8 +42,8 @@ class SceneState:
         Raises:
             ArtifactError: an artifact is damaged.
         """
-        own, early = folder / "default", folder / KEY_VIEWS
-        used = own if (own / "clip" / INDEX).is_file() or not (early / "clip" / INDEX).is_file() else early
+        full, early = folder / "default", folder / KEY_VIEWS
+        used = full if (full / "clip" / INDEX).is_file() or not (early / "clip" / INDEX).is_file() else early
         has_poses, has_tree, has_clip = (
             (path / INDEX).is_file() for path in (folder / "scene", used / "semantic_tree", used / "clip")
         )
@@ -52,7 +52,7 @@ class SceneState:
             views[view["split"]] += 1
         report = folder / "gaussians/report.json"
         if has_tree and has_clip:
-            field = own / "field.safetensors"
+            field = full / "field.safetensors"
             state = "tree of key views" if used == early else "tree, field" if field.is_file() else "tree"
         else:
             state = "Gaussians" if report.is_file() else "poses" if has_poses else "no poses"

@@ -54,16 +54,17 @@ class ViewStore:
     def get(self, key: tuple[Any, ...], compute: Callable[[], Any]) -> Any:
         """Return the cached value, or compute and cache it; the second item of a key is the view."""
         # Single operations on a dict are atomic, so several threads may read a scene.
-        found = self._values.pop(key, None)
-        if found is None:
+        entry = self._values.pop(key, None)
+        if entry is None:
             value = compute()
-            found = value, _nbytes(value)
-        self._values[key] = found
+            entry = value, _nbytes(value)
+        self._values[key] = entry
         while (
-            len(kept := list(self._values.items())) > 1 and sum(item[1][1] for item in kept) > self._max_bytes
+            len(items := list(self._values.items())) > 1
+            and sum(item[1][1] for item in items) > self._max_bytes
         ):
-            self._values.pop(kept[0][0], None)
-        return found[0]
+            self._values.pop(items[0][0], None)
+        return entry[0]
 
     def forget(self, view: str) -> None:
         """Drop the results of a view."""
@@ -206,7 +207,7 @@ def _within(numbers: Any, count: int, what: str) -> Int64[np.ndarray, " k"]:
     are_right = array.ndim == 1 and (array.dtype.kind in "iu" or not array.size)
     if not are_right or not ((array >= 0) & (array < count)).all():
         listed = array.tolist()
-        wrong = next((each for each in listed if each not in range(count)), listed[0])
+        wrong = next((item for item in listed if item not in range(count)), listed[0])
         raise SettingsError(f"{what} {wrong!r} does not exist", expected=f"integers from 0 to {count - 1}")
     return array.astype(np.int64)
 

@@ -163,15 +163,15 @@ class Scenes:
             return scene.find(text, level=level, threshold=threshold)
 
         best: list[tuple[float, str, FoundScene]] = []
-        for found in self.found:
-            with self._skipping(found.name):
-                best += [(-score, found.name, found) for score in _scores(answers(found.opened()), found, 1)]
+        for entry in self.found:
+            with self._skipping(entry.name):
+                best += [(-score, entry.name, entry) for score in _scores(answers(entry.opened()), entry, 1)]
         hits: dict[str, list[SceneHit]] = {}
-        for _, name, found in sorted(best, key=lambda each: each[:2]):
+        for _, name, entry in sorted(best, key=lambda each: each[:2]):
             if len(hits) < limit:
                 with self._skipping(name):
-                    scene = found.opened(found.naming())
-                    hits[name] = _hits_of(found, scene, answers(scene), scene.caution_about(text), each)
+                    scene = entry.opened(entry.naming())
+                    hits[name] = _hits_of(entry, scene, answers(scene), scene.caution_about(text), each)
         return [hit for of_scene in hits.values() for hit in of_scene]
 
     @contextmanager

@@ -149,9 +149,9 @@ def split_scene(scene: Scene, out: Path, count: int, min_share: float) -> Blocks
     images, region = posed_images(scene, scene.cameras.cam_from_world), nearest(points, centres)
     with atomic_folder(out) as folder:
         for number, centre in enumerate(centres.tolist()):
-            name, own = f"{scene.name.split('/')[-1]}-{number}", owner == number
-            borrowed = names[is_in[:, number] & ~own]
-            blocks.blocks[name] = Block(tuple(centre), tuple(names[own].tolist()), tuple(borrowed.tolist()))
+            name, owned = f"{scene.name.split('/')[-1]}-{number}", owner == number
+            borrowed = names[is_in[:, number] & ~owned]
+            blocks.blocks[name] = Block(tuple(centre), tuple(names[owned].tolist()), tuple(borrowed.tolist()))
             of_block = np.flatnonzero(is_in[:, number])
             is_used = region == number
             is_used[np.concatenate([seen[view] for view in of_block])] = True

@@ -63,10 +63,10 @@ class FinishedScene:
         """
         require_scene_folder(folder)
         require_variant(folder, variant)
-        own, scores = (folder / variant / name for name in ("field.safetensors", "scores.csv"))
-        field = _recorded_input(scores, "field", folder) or own
-        if field != own and own.exists() and own.stat().st_mtime > provenance_path(scores).stat().st_mtime:
-            field = own  # it is not scored yet
+        new, scores = (folder / variant / name for name in ("field.safetensors", "scores.csv"))
+        field = _recorded_input(scores, "field", folder) or new
+        if field != new and new.exists() and new.stat().st_mtime > provenance_path(scores).stat().st_mtime:
+            field = new  # it is not scored yet
         clip = folder / variant / "clip"
         if variant == "default" and not (clip.exists() or field.exists()):
             early = folder / KEY_VIEWS / "clip"
@@ -94,9 +94,9 @@ class FinishedScene:
         A scene without labels has no scores, but its nodes were named, and its panel drawn, with the same
         settings.
         """
-        own, scene = self.folder / self.variant, self.folder.resolve()
+        variant_folder, scene = self.folder / self.variant, self.folder.resolve()
         panel = scene.parent.parent / "figures" / scene.parent.name / scene.name / "panel.webp"
-        records = map(read_provenance, (own / "scores.csv", own / "names", panel))
+        records = map(read_provenance, (variant_folder / "scores.csv", variant_folder / "names", panel))
         settings = next((record.settings.get("evaluate", {}) for record in records if record), None)
         if settings is None:
             logger.warning(
@@ -195,7 +195,7 @@ def changed_input(artifact: Path, folder: Path) -> str:
             if read.sha256 is None:
                 continue  # files of a user, which only the workflow compares
             places = [folder / Path(*Path(read.path).parts[-count:]) for count in (2, 1)]
-            path = next((place for place in places if provenance_path(place).is_file()), None)
+            path = next((candidate for candidate in places if provenance_path(candidate).is_file()), None)
             if path is None or path in seen:
                 continue
             made = read_provenance(path)

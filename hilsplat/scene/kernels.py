@@ -18,11 +18,11 @@ def two_nearest(products, first, best, second, column, best_of_column, second_of
             row_of_column[j] = i if value > before else row_of_column[j]
             best_of_column[j] = max(before, value)
             largest = max(largest, value)
-        below, place, ties = np.int32(-1), np.int32(columns), np.int32(0)
+        below, nearest, ties = np.int32(-1), np.int32(columns), np.int32(0)
         for j in range(columns):
             value = np.int32(row[j])
             is_largest = value == largest
             below = max(below, np.int32(-1) if is_largest else value)
-            place = min(place, np.int32(j) if is_largest else np.int32(columns))
+            nearest = min(nearest, np.int32(j) if is_largest else np.int32(columns))
             ties = np.int32(ties + (np.int32(1) if is_largest else np.int32(0)))
-        best[i], second[i], column[i] = largest, largest if ties > 1 else below, place
+        best[i], second[i], column[i] = largest, largest if ties > 1 else below, nearest

@@ -148,8 +148,8 @@ def label_files(folder: Path, named: Path | None = None) -> list[Path]:
     """Return the label files in a named folder, or else those in or beside a LERF-OVS scene."""
     folder = folder.resolve()
     places = (folder / "label", folder.parent / "label" / folder.name) if named is None else (named,)
-    found = (sorted(place.glob("[!.]*.json")) for place in places)  # archives of macOS have hidden ones
-    return next(filter(None, found), [])
+    files = (sorted(path.glob("[!.]*.json")) for path in places)  # archives of macOS have hidden ones
+    return next(filter(None, files), [])
 
 
 def photo_folder(folder: Path) -> Path:

@@ -74,8 +74,8 @@ def match_pairs(
 
     verified = []
     with pycolmap.DatabaseTransaction(database):
-        found = zip(pairs, in_order(match, pairs, threads), strict=True)
-        for (one, other), (matches, geometry) in found:
+        matched = zip(pairs, in_order(match, pairs, threads), strict=True)
+        for (one, other), (matches, geometry) in matched:
             numbers = views[one].image_id, views[other].image_id
             database.write_matches(*numbers, matches)
             database.write_two_view_geometry(*numbers, geometry)
@@ -155,5 +155,5 @@ def _integer_products() -> onnxruntime.InferenceSession | None:
     session = one_thread_session(Graph(model, {}))
     rows = np.full((_BLOCK, _CHANNELS), 255, np.uint8)
     columns = np.repeat(np.array([[-128, 127]], np.int8), _CHANNELS, axis=0)
-    found = session.run(None, {"rows": rows, "columns": columns})[0]
-    return session if (found == [0, 255 * 255 * _CHANNELS]).all() else None
+    products = session.run(None, {"rows": rows, "columns": columns})[0]
+    return session if (products == [0, 255 * 255 * _CHANNELS]).all() else None

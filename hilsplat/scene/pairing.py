@@ -51,8 +51,8 @@ def appearance_vectors(
 ) -> Float32[np.ndarray, "V WD"]:
     """Return the appearance vector of each view, given its descriptors; 0 for views without features."""
     rng = np.random.default_rng(seed)
-    each = max(1, WORDS * SAMPLE_PER_WORD // max(1, len(descriptors)))
-    sample = [rows[rng.permutation(len(rows))[:each]] for rows in descriptors if len(rows)]
+    per_photo = max(1, WORDS * SAMPLE_PER_WORD // max(1, len(descriptors)))
+    sample = [rows[rng.permutation(len(rows))[:per_photo]] for rows in descriptors if len(rows)]
     if not sample:
         return np.zeros((len(descriptors), 1), np.float32)
     words = visual_words(np.concatenate(sample), seed)

@@ -246,8 +246,10 @@ def _why_not(
     if entry["matched_views"] == 0:
         return f"too few matches: no other view shares at least {MIN_INLIERS} verified matches with it"
     if entry["group"] != main_group:
-        rest = f"its group of {groups[entry['group']]} photographs shares no verified matches with the others"
-        return f"another place, or too little overlap: {rest}"
+        reason = (
+            f"its group of {groups[entry['group']]} photographs shares no verified matches with the others"
+        )
+        return f"another place, or too little overlap: {reason}"
     for number, names in enumerate(members[1:], start=2):
         if view in names:
             return f"in model {number} ({len(names)} views), not in the largest model"
@@ -270,8 +272,8 @@ def separate_groups(views: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
     groups: dict[int, list[str]] = {}
     for view, entry in views.items():
         groups.setdefault(entry.get("group", 0), []).append(view)
-    found = [groups[number] for number in sorted(groups) if number and len(groups[number]) >= MIN_PHOTOS]
-    return found if len(found) > 1 else []
+    separate = [groups[number] for number in sorted(groups) if number and len(groups[number]) >= MIN_PHOTOS]
+    return separate if len(separate) > 1 else []
 
 
 def lost_alone(views: Mapping[str, Mapping[str, Any]], groups: Sequence[Sequence[str]]) -> list[str]:
@@ -346,10 +348,10 @@ def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> None:
 
     rows: list[list[tuple[str, str]]] = []  # pictures: view, title
     for number, group in enumerate(groups, 1):
-        shown = [group[place * len(group) // COLUMNS] for place in range(min(COLUMNS, len(group)))]
+        drawn = [group[column * len(group) // COLUMNS] for column in range(min(COLUMNS, len(group)))]
         state = "registered" if any(views[view]["registered"] for view in group) else "not registered"
-        first = f"group {number}: {len(group)} photographs, {state}: {views[shown[0]]['file']}"
-        rows.append([(shown[0], first), *((view, views[view]["file"]) for view in shown[1:])])
+        first = f"group {number}: {len(group)} photographs, {state}: {views[drawn[0]]['file']}"
+        rows.append([(drawn[0], first), *((view, views[view]["file"]) for view in drawn[1:])])
     alone = lost_alone(views, groups)
     for view in alone[:MAX_ROWS]:
         entry = views[view]

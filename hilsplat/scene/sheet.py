@@ -179,8 +179,8 @@ def matches_of(rows: Iterable[SceneRow], names: Iterable[str]) -> dict[str, list
     for row in rows:
         for name in (row.scene, row.dataset, row.name):
             by_name.setdefault(name, []).append(row)
-    found = {name: fnmatch.filter(by_name, name) if is_pattern(name) else [name] for name in names}
-    return {name: [row for each in same for row in by_name.get(each, ())] for name, same in found.items()}
+    matches = {name: fnmatch.filter(by_name, name) if is_pattern(name) else [name] for name in names}
+    return {name: [row for match in same for row in by_name.get(match, ())] for name, same in matches.items()}
 
 
 def is_pattern(name: str) -> bool:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cpusplat.compiled import compiled
-from cpusplat.lane_products import MOST_ROWS, WIDE_COLUMNS, rows_of_products
+from cpusplat.lane_products import MAX_ROWS, WIDE_COLUMNS, rows_of_products
 from cpusplat.lanes import (
     WIDTH,
     exp2_negative,
@@ -102,10 +102,10 @@ def multiply(y, y0, y_step, a, a0, a_step, x, x0, x_step, rows, inner, columns, 
         while r < rows:
             left = rows - r
             to, of, at = y0 + r * y_step + c, a0 + r * a_step, x0 + c
-            if left >= 8 and MOST_ROWS == 8:
+            if left >= 8 and MAX_ROWS == 8:
                 eight_rows(y, to, y_step, a, of, a_step, x, at, x_step, inner, begin, wide)
                 r += 8
-            elif left == 7 and MOST_ROWS == 8:
+            elif left == 7 and MAX_ROWS == 8:
                 seven_rows(y, to, y_step, a, of, a_step, x, at, x_step, inner, begin, wide)
                 r += 7
             elif left == 6 or left > 8:
@@ -154,8 +154,8 @@ def by_head(y, y0, a, a0, x, x0, heads, rows, inner, columns):
 @compiled
 def multiply_below(y, y_step, a, a0, x, rows, columns):
     """Add to `y` the product of a square matrix's lower triangle and `x`."""
-    for r in range(0, rows, MOST_ROWS):
-        many = min(MOST_ROWS, rows - r)
+    for r in range(0, rows, MAX_ROWS):
+        many = min(MAX_ROWS, rows - r)
         multiply(y, r * y_step, y_step, a, a0 + r * rows, rows, x, 0, y_step, many, r + many, columns, False)
 
 
@@ -372,8 +372,8 @@ def update_and_read_first(sizes, channels, eps, image, prompt, top, sums, s1_out
                 total = load(image.square, p) + load_same(prompt.square, i)
                 total = total + lanes(TWO) * (load(image.cross, p) + load(last, c))
                 for f in range(factors):
-                    own = load(y, f * pixels + c) + load_same(prompt.linear, i * factors + f)
-                    total = total + load(e, f * pixels + c) * own
+                    term = load(y, f * pixels + c) + load_same(prompt.linear, i * factors + f)
+                    total = total + load(e, f * pixels + c) * term
                 scale = lanes(ONE) / root(total * share + small)
                 store(s1, c, scale)
                 store(s1_out, (i * blocks + b) * pixels + c, scale)
@@ -426,8 +426,8 @@ def update_and_read_second(sizes, channels, eps, image, prompt, s1_in, e_in, top
             for c in range(0, pixels, WIDTH):
                 scale = load(s1, c)
                 for f in range(both):
-                    own = load(y, f * pixels + c) + load_same(prompt.linear, 2 * (i * both + f))
-                    store(y, f * pixels + c, scale * own + load_same(prompt.linear, 2 * (i * both + f) + 1))
+                    term = load(y, f * pixels + c) + load_same(prompt.linear, 2 * (i * both + f))
+                    store(y, f * pixels + c, scale * term + load_same(prompt.linear, 2 * (i * both + f) + 1))
             multiply_below(y, pixels, prompt.gram, i * both * both, e, both, pixels)
             inner, at_last = heads * dim, 2 * i * heads * dim
             dense(last, 0, prompt.last, at_last, image.before_first, base, 1, inner, pixels, True)
@@ -515,7 +515,7 @@ def mask_logits(sizes, fine, eps, weights, image, prompt, s1_in, s2_in, e_in, pa
     out_width = grid_width * step
     out_size = blocks * pixels * step * step
     x, y = np.empty(wide * pixels, np.float32), np.empty(narrow * pixels, np.float32)
-    found = np.empty(masks * pixels, np.float32)
+    of_cells = np.empty(masks * pixels, np.float32)
     s12, s2 = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
     share, small = lanes(np.float32(1 / wide)), lanes(np.float32(eps))
     for b in range(blocks):
@@ -529,12 +529,12 @@ def mask_logits(sizes, fine, eps, weights, image, prompt, s1_in, s2_in, e_in, pa
                     scale, second = load(s12, c), load(s2, c)
                     for f in range(wide):
                         k = i * 4 * wide + row + f
-                        place = (b * 4 * wide + row + f) * pixels + c
-                        value = scale * (load(image.scaled, place) + load_same(prompt.both_scales, k))
+                        index = (b * 4 * wide + row + f) * pixels + c
+                        value = scale * (load(image.scaled, index) + load_same(prompt.both_scales, k))
                         value = value + second * load_same(prompt.second_scale, k)
                         value = value + load_same(weights.fixed, row + f)
                         if len(image.detail):
-                            value = value + load(image.detail, place)
+                            value = value + load(image.detail, index)
                         store(x, f * pixels + c, value)
                 of = (i * 4 * wide + row) * both
                 dense(x, 0, prompt.factors, of, e_in, at * padded, wide, both, pixels, False)
@@ -554,14 +554,14 @@ def mask_logits(sizes, fine, eps, weights, image, prompt, s1_in, s2_in, e_in, pa
                         for c in range(0, pixels, WIDTH):
                             value = load(y, f * pixels + c) + load_same(weights.bias, f)
                             if len(image.finest):
-                                place = ((b * 4 + big) * 4 + little) * narrow + f
-                                value = value + load(image.finest, place * pixels + c)
+                                index = ((b * 4 + big) * 4 + little) * narrow + f
+                                value = value + load(image.finest, index * pixels + c)
                             store(y, f * pixels + c, gelu(value))
-                    dense(found, 0, prompt.combine, i * masks * narrow, y, 0, masks, narrow, pixels, True)
+                    dense(of_cells, 0, prompt.combine, i * masks * narrow, y, 0, masks, narrow, pixels, True)
                     shift = (2 * (big // 2) + little // 2) * out_width + 2 * (big % 2) + little % 2
                     for m in range(masks):
                         to = (i * masks + m) * out_size + shift
                         for p in range(pixels):
                             q = b * pixels + p
-                            place = to + (q // grid_width) * step * out_width + (q % grid_width) * step
-                            out[place] = found[m * pixels + p]
+                            index = to + (q // grid_width) * step * out_width + (q % grid_width) * step
+                            out[index] = of_cells[m * pixels + p]

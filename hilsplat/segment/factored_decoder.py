@@ -91,7 +91,7 @@ class FactoredDecoder:
         _relax_shapes(self._graphs[0])
         self._tokens, self._image_side = (one_thread_session(subgraph) for subgraph in self._graphs)
         self.inner = len(self._reads[0].q.bias)
-        tokens0, tokens9 = (self._token_rows(np.full((1, 2), place)) for place in (0.0, 9.0))
+        tokens0, tokens9 = (self._token_rows(np.full((1, 2), position)) for position in (0.0, 9.0))
         is_constant = (tokens0 == tokens9).all(axis=-1).reshape(-1)
         self._iou_token = int(np.argmin(is_constant)) - 5  # SAM 2 has a token for the object score before it
         self.dim = self.inner // heads

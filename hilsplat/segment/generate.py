@@ -187,8 +187,8 @@ def distinct_prompts(
         found = scores[:number], stability.reshape(number, -1), boxes.reshape(number, -1, 4)
         return found, {name: rows_of[:number] for name, rows_of in arrays.items()}
 
-    for found, arrays in model.batches("previews", batch)(len(prompts["points"]), preview):
-        measured.append(found)
+    for measures, arrays in model.batches("previews", batch)(len(prompts["points"]), preview):
+        measured.append(measures)
         previewed.append(dict(arrays))
     predicted_iou, stability, boxes = map(np.concatenate, zip(*measured, strict=True))
     likely = (predicted_iou >= iou_floor) & (stability >= stability_floor) & boxes.any(axis=2)

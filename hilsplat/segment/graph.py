@@ -114,9 +114,9 @@ def neighbours(
         border = first != second
         pairs.append(np.sort(np.stack([first[border], second[border]], axis=1), axis=1))
         contrasts.append(contrast[border].astype(np.float64))
-    unique, place = np.unique(np.concatenate(pairs), axis=0, return_inverse=True)
-    sums = np.bincount(place.reshape(-1), weights=np.concatenate(contrasts), minlength=len(unique))
-    counts = np.bincount(place.reshape(-1), minlength=len(unique))
+    unique, edge = np.unique(np.concatenate(pairs), axis=0, return_inverse=True)
+    sums = np.bincount(edge.reshape(-1), weights=np.concatenate(contrasts), minlength=len(unique))
+    counts = np.bincount(edge.reshape(-1), minlength=len(unique))
     borders = zip(sums.tolist(), counts.tolist(), strict=True)
     return dict(zip(map(tuple, unique.tolist()), borders, strict=True))
 

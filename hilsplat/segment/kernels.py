@@ -49,8 +49,8 @@ def upscaled_runs(
     reader = np.searchsorted(first_x, np.arange(low_w + 1))
     out, count = np.empty(max(1024, 64 * len(rows)), np.uint32), 0
     out_offsets = np.zeros(len(rows) + 1, np.int64)
-    for place in range(len(rows)):
-        row = rows[place]
+    for out_row in range(len(rows)):
+        row = rows[out_row]
         x0, y0, x1, y1 = windows[row]
         wide = x1 - x0
         window = logits[offsets[row] : offsets[row + 1]].reshape(y1 - y0, wide)
@@ -110,7 +110,7 @@ def upscaled_runs(
             last, inside = last_end, False
         if last < height * width:
             out, count = _push(out, count, height * width - last)
-        out_offsets[place + 1] = count
+        out_offsets[out_row + 1] = count
     return out[:count].copy(), out_offsets
 
 
@@ -122,9 +122,9 @@ def areas_and_boxes(runs, offsets, width):
     for k in range(number):
         x0, y0, x1, y1 = width, -1, 0, 0
         at = np.int64(0)
-        for place in range(offsets[k], offsets[k + 1]):
-            stop = at + runs[place]
-            if (place - offsets[k]) % 2 == 1 and stop > at:
+        for run in range(offsets[k], offsets[k + 1]):
+            stop = at + runs[run]
+            if (run - offsets[k]) % 2 == 1 and stop > at:
                 area[k] += stop - at
                 row, last_row = at // width, (stop - 1) // width
                 if y0 < 0:
@@ -198,13 +198,13 @@ def cleaned_runs(runs, offsets, width, min_area):
         value = np.empty(most, np.bool_)
         segments = 0
         at = np.int64(0)
-        for place in range(len(mine)):  # split runs at the ends of rows
-            end = at + mine[place]
+        for run in range(len(mine)):  # split runs at the ends of rows
+            end = at + mine[run]
             while at < end:
                 line = at // width
                 cut = min(end, (line + 1) * width)
                 row[segments], start[segments], stop[segments] = line, at - line * width, cut - line * width
-                value[segments] = place % 2 == 1
+                value[segments] = run % 2 == 1
                 segments += 1
                 at = cut
         row, start, stop, value = row[:segments], start[:segments], stop[:segments], value[:segments]
@@ -270,7 +270,7 @@ def shared_pixels(runs, offsets, boxes, height, width):
     words = (width + 63) // 64
     band = max(1, min(height, BAND_WORDS // max(1, number * words)))
     bits = np.zeros((number, band, words), np.uint64)
-    place, at = offsets[:-1].copy(), np.zeros(number, np.int64)  # current run of each mask, the run's start
+    run, at = offsets[:-1].copy(), np.zeros(number, np.int64)  # current run of each mask, the run's start
     active = np.empty(number, np.int64)
     for top in range(0, height, band):
         bottom = min(height, top + band)
@@ -281,9 +281,9 @@ def shared_pixels(runs, offsets, boxes, height, width):
             active[num_active] = k
             num_active += 1
             bits[k] = 0
-            while place[k] < offsets[k + 1]:
-                end = at[k] + runs[place[k]]
-                if (place[k] - offsets[k]) % 2 == 1:
+            while run[k] < offsets[k + 1]:
+                end = at[k] + runs[run[k]]
+                if (run[k] - offsets[k]) % 2 == 1:
                     start, stop = max(at[k], top * width), min(end, bottom * width)
                     while start < stop:
                         line = start // width
@@ -293,7 +293,7 @@ def shared_pixels(runs, offsets, boxes, height, width):
                 if end > bottom * width:
                     break  # continues in the next band
                 at[k] = end
-                place[k] += 1
+                run[k] += 1
         for first in range(num_active):
             i = active[first]
             for second in range(first, num_active):
@@ -319,8 +319,8 @@ def paint_runs(runs, offsets, order, canvas):
     """Write each row number of `order` to the pixels of its mask in the flat canvas; later rows win."""
     for row in order:
         at = np.int64(0)
-        for place in range(offsets[row], offsets[row + 1]):
-            stop = at + runs[place]
-            if (place - offsets[row]) % 2 == 1:
+        for run in range(offsets[row], offsets[row + 1]):
+            stop = at + runs[run]
+            if (run - offsets[row]) % 2 == 1:
                 canvas[at:stop] = row
             at = stop

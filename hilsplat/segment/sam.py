@@ -69,7 +69,7 @@ Prompts = Mapping[str, Array]
 prompts, the arrays that the factored decoder keeps."""
 
 
-MOST_PROMPTS = 256  # per call on a card
+MAX_PROMPTS = 256  # per call on a card
 CHECKED_PROMPTS, AGREEMENT = 2, 1e-4
 """Number of prompts for checking the factored decoder against the network, and the maximum difference."""
 
@@ -273,7 +273,7 @@ class SamModel:
         if self.device == CPU:
             return Batches(size, is_padded=True)
         if what not in self._batches:
-            most = size if self.decoder.prompts_per_call and not self.factored else MOST_PROMPTS
+            most = size if self.decoder.prompts_per_call and not self.factored else MAX_PROMPTS
             self._batches[what] = Batches(size, self.device, most, is_padded=self.factored is None)
         return self._batches[what]
 

@@ -30,11 +30,11 @@ def own_thresholds(model: ModelFolder) -> Thresholds:
 
     A ModelError is raised for an unknown key or a value out of range.
     """
-    own: Any = model.config.get(OWN, {})
+    thresholds: Any = model.config.get(OWN, {})
     names = vars(REAL_SAM)
     what = f"{model.folder / 'config.json'}: {OWN}"
     with foreign(what, ModelError, problem="is invalid", fix="correct or remove it"):
-        if not isinstance(own, dict) or not own.keys() <= names.keys():
+        if not isinstance(thresholds, dict) or not thresholds.keys() <= names.keys():
             raise ValueError(f"known keys are {', '.join(names)}")
-        settings = MasksSettings(**own)
-        return replace(REAL_SAM, **{name: getattr(settings, name) for name in own})
+        settings = MasksSettings(**thresholds)
+        return replace(REAL_SAM, **{name: getattr(settings, name) for name in thresholds})

@@ -27,10 +27,10 @@ def on_device(value: Any, device: torch.device) -> Any:
     if isinstance(value, np.ndarray):
         return torch.from_numpy(np.array(value)).to(device)
     if isinstance(value, list):
-        return [on_device(each, device) for each in value]
+        return [on_device(item, device) for item in value]
     if not isinstance(value, Linear | Norm | Attention | Upscaling):
         return value
-    names = value._fields if isinstance(value, Upscaling) else [each.name for each in fields(value)]
+    names = value._fields if isinstance(value, Upscaling) else [field.name for field in fields(value)]
     return type(value)(*(on_device(getattr(value, name), device) for name in names))
 
 
@@ -213,10 +213,10 @@ class TorchDecoder(FactoredDecoder):
         if len(terms.finest):
             y = y + terms.finest.view(4, 4, narrow, pixels)[:parts, :parts]
         masks = kept["combine"]
-        found = masks @ F.gelu(y).permute(0, 3, 1, 2, 4).flatten(2)
+        of_cells = masks @ F.gelu(y).permute(0, 3, 1, 2, 4).flatten(2)
         height, width = image.grid_hw
         if not fine:
-            return found.view(number, -1, height, width)
+            return of_cells.view(number, -1, height, width)
         # (n, M, dy, dx, dy of the second upscaling, dx, H, W) -> (n, M, 4 H, 4 W)
-        found = found.view(number, masks.shape[1], 2, 2, 2, 2, height, width)
-        return found.permute(0, 1, 6, 2, 4, 7, 3, 5).reshape(number, -1, 4 * height, 4 * width)
+        of_cells = of_cells.view(number, masks.shape[1], 2, 2, 2, 2, height, width)
+        return of_cells.permute(0, 1, 6, 2, 4, 7, 3, 5).reshape(number, -1, 4 * height, 4 * width)

@@ -91,10 +91,10 @@ def mask_evidence(
     partners = (pairs.indptr, pairs.partners, pairs.mirror), row_start
     sizes, full = np.zeros(row_start[-1]), np.zeros(num)
     size_views = np.empty(row_start[-1], np.int32)
-    shown = visible.indptr, visible.indices
-    over_ranges(seen_sizes, num_views, threads, masks, shown, partners, sizes, size_views, full)
+    gaussian_views = visible.indptr, visible.indices
+    over_ranges(seen_sizes, num_views, threads, masks, gaussian_views, partners, sizes, size_views, full)
     least = min_covisible * full
-    rest = partners, sizes, least, pairs.min_iou
-    blocks = over_ranges(shared_pairs, num_views, threads, masks, *rest)
+    arguments = partners, sizes, least, pairs.min_iou
+    blocks = over_ranges(shared_pairs, num_views, threads, masks, *arguments)
     sizes[sizes < np.repeat(least, np.diff(row_start))] = 0.0
     return Evidence(tuple(MaskPairs(*block) for block in blocks), row_start, size_views, sizes, view)

@@ -94,12 +94,12 @@ class FinishedBlock:
         views = require_same_masks(parts.masks, contributions.folder)
         whole_from_block = np.linalg.inv(Scene.load(parts.scene).scene_from_source)
         gaussians = move_gaussians(load_ply(parts.gaussians), whole_from_block)
-        kept = np.flatnonzero(blocks.owner_of(gaussians.means) == number)
+        owned = np.flatnonzero(blocks.owner_of(gaussians.means) == number)
         mass = column_sums(contributions.matrix("mass"))
         node, mass_of_node = tree.node_of_gaussian, np.repeat(mass[:, None], len(LEVELS), axis=1)
-        total, own = (
+        total, own_mass = (
             np.bincount(node[rows][node[rows] != NONE], mass_of_node[rows][node[rows] != NONE], len(tree))
-            for rows in (slice(None), kept)
+            for rows in (slice(None), owned)
         )
 
         def numbered(nodes: np.ndarray) -> Any:
@@ -109,14 +109,14 @@ class FinishedBlock:
             parts,
             replace(
                 tree,
-                node_of_gaussian=numbered(node[kept]),
-                membership=tree.membership[kept],
+                node_of_gaussian=numbered(node[owned]),
+                membership=tree.membership[owned],
                 node_of_mask=numbered(tree.node_of_mask),
                 linked_node=numbered(tree.linked_node),
             ),
-            Gaussians(*(getattr(gaussians, name)[kept] for name in FIELDS)),
-            mass[kept],
-            own / np.maximum(total, 1e-12),
+            Gaussians(*(getattr(gaussians, name)[owned] for name in FIELDS)),
+            mass[owned],
+            own_mass / np.maximum(total, 1e-12),
             digests_in(parts.masks),
             dict(zip(views, contributions.rows_of_views(), strict=True)),
             contributions.area_px,
@@ -143,9 +143,9 @@ def same_nodes(
         overlap_px: pixels that masks of two nodes share, over all shared views.
         area_px: pixels of each node's masks in each shared view.
     """
-    pairs, shown = overlap_px.tocoo(), (area_px > 0).astype(np.float64)
+    pairs, is_shown = overlap_px.tocoo(), (area_px > 0).astype(np.float64)
     first, second = pairs.row, pairs.col
-    sums = area_px[first].multiply(shown[second]) + shown[first].multiply(area_px[second])
+    sums = area_px[first].multiply(is_shown[second]) + is_shown[first].multiply(area_px[second])
     union = np.asarray(sums.sum(axis=1)).ravel() - pairs.data
     same = pairs.data > SAME * union
     graph = sp.csr_matrix((np.ones(same.sum()), (first[same], second[same])), shape=overlap_px.shape)
@@ -159,9 +159,9 @@ def matched_nodes(blocks: Sequence[FinishedBlock]) -> Int64[np.ndarray, " T"]:
     none = np.zeros(0, np.int64)
     overlaps, areas = [(none, none, none)], [(none, none, none)]
     for column, view in enumerate(track(views, "shared views")):
-        shown = [block.linked_masks(view) for block in blocks if view in block.digests]
-        areas += [(nodes, np.full(len(nodes), column), masks.area_px) for nodes, masks in shown]
-        for (nodes, masks), (others, of_others) in itertools.combinations(shown, 2):
+        of_blocks = [block.linked_masks(view) for block in blocks if view in block.digests]
+        areas += [(nodes, np.full(len(nodes), column), masks.area_px) for nodes, masks in of_blocks]
+        for (nodes, masks), (others, of_others) in itertools.combinations(of_blocks, 2):
             px = HierarchicalMasks.concatenate([masks, of_others]).overlaps_px()[: len(masks), len(masks) :]
             row, col = np.nonzero(np.where(masks.level[:, None] == of_others.level, px, 0))
             overlaps.append((nodes[row], others[col], px[row, col]))
@@ -280,17 +280,17 @@ def run_joined(blocks_folder: Path, scene_folder: Path, finished: Sequence[Path]
 
 def _require_same_settings(blocks: Sequence[FinishedBlock]) -> None:
     """Raise MisalignedArtifactError if the results of the blocks cannot be mixed."""
-    found = {}
+    settings = {}
     for block in blocks:
         masks, clip = read_index(block.parts.masks), read_index(block.parts.clip)
         models = {"segmenter": masks["segmenter"], "SAM": masks["model_sha256"], "CLIP": clip["model_sha256"]}
-        rest = {"min_weight": block.tree.min_weight, "degree": block.gaussians.sh_degree}
-        found[block.parts.scene.parent.name] = {**models, **rest}
-    if any(values != next(iter(found.values())) for values in found.values()):
+        properties = {"min_weight": block.tree.min_weight, "degree": block.gaussians.sh_degree}
+        settings[block.parts.scene.parent.name] = {**models, **properties}
+    if any(values != next(iter(settings.values())) for values in settings.values()):
         raise MisalignedArtifactError(
             "the blocks were run with different models or settings",
             expected="the same models and settings in all blocks",
-            found="; ".join(f"{name}: {values}" for name, values in found.items()),
+            found="; ".join(f"{name}: {values}" for name, values in settings.items()),
             fix="run the blocks again with the same configuration",
         )
 

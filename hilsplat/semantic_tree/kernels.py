@@ -103,11 +103,11 @@ def seen_sizes(begin, end, masks, visible, pairs, out, out_views, full):
 
 
 @compiled
-def _more_pairs(firsts, seconds, sums, kept, room):
+def _more_pairs(firsts, seconds, sums, count, room):
     """Return larger copies of three arrays with their first `kept` entries."""
     more = np.empty(room, np.int32)
-    more[:kept] = firsts[:kept]
-    return more, *enlarged(seconds, sums, kept, room)
+    more[:count] = firsts[:count]
+    return more, *enlarged(seconds, sums, count, room)
 
 
 @compiled
@@ -192,10 +192,10 @@ def add_neighbours(firsts, seconds, sums, stop, ids, values):
     """Add these pairs to the runs of neighbours of both masks, which end at `stop`."""
     for k in range(len(firsts)):
         a, b = np.int64(firsts[k]), np.int64(seconds[k])
-        for own, other in ((a, b), (b, a)):
-            ids[stop[own]] = other
-            values[stop[own], 0], values[stop[own], 1] = sums[k, 0], sums[k, 1]
-            stop[own] += 1
+        for node, other in ((a, b), (b, a)):
+            ids[stop[node]] = other
+            values[stop[node], 0], values[stop[node], 1] = sums[k, 0], sums[k, 1]
+            stop[node] += 1
 
 
 @compiled
@@ -259,14 +259,14 @@ def _place(view, begin, end, views):
     while begin + step <= end and views[begin + step - 1] < view:
         begin += step
         step *= 2
-    place, above = begin, min(begin + step - 1, end)
-    while place < above:
-        middle = (place + above) // 2
+    first, above = begin, min(begin + step - 1, end)
+    while first < above:
+        middle = (first + above) // 2
         if views[middle] < view:
-            place = middle + 1
+            first = middle + 1
         else:
             above = middle
-    return place, place < end and views[place] == view
+    return first, first < end and views[first] == view
 
 
 @compiled
@@ -325,15 +325,15 @@ def _unite(i, j, used, runs):
     """Add the run of `i` to that of `j`, in place or after position `used`; return the runs and `used`."""
     start, stop, ids, values = runs[:4]
     more, most = (j, i) if stop[i] - start[i] > stop[j] - start[j] else (i, j)
-    place, is_inside = start[most], True
+    at, is_inside = start[most], True
     for k in range(start[more], stop[more]):
-        place, is_there = _place(ids[k], place, stop[most], ids)
+        at, is_there = _place(ids[k], at, stop[most], ids)
         is_inside = is_inside and is_there
     if is_inside:
-        place = start[most]
+        at = start[most]
         for k in range(start[more], stop[more]):
-            place, _ = _place(ids[k], place, stop[most], ids)
-            values[place] += values[k]
+            at, _ = _place(ids[k], at, stop[most], ids)
+            values[at] += values[k]
         start[j], stop[j] = start[most], stop[most]
         start[i], stop[i] = 0, 0
         return runs, used
@@ -444,13 +444,13 @@ def summed_by_node(indptr, indices, data, node_of_gaussian):
             node = node_of_gaussian[indices[k]]
             if node < 0:
                 continue
-            place = first
-            while place < done and nodes[place] != node:
-                place += 1
-            if place == done:
-                nodes[place], shares[place] = node, np.float32(0)
+            at = first
+            while at < done and nodes[at] != node:
+                at += 1
+            if at == done:
+                nodes[at], shares[at] = node, np.float32(0)
                 done += 1
-            shares[place] += data[k]
+            shares[at] += data[k]
         out_indptr[p + 1] = done
     return out_indptr, nodes[:done].copy(), shares[:done].copy()
 

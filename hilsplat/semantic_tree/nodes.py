@@ -158,10 +158,10 @@ def linked_nodes(
         linked: list[Future[Any]] = []
         for rows in rows_of_levels:
             wait(() if meanwhile else linked)
-            found = evidence(rows)
+            of_level = evidence(rows)
             wait(linked)
-            linked.append(linker.submit(pooled_linkage(found, settings.link_threshold)))
-            del found
+            linked.append(linker.submit(pooled_linkage(of_level, settings.link_threshold)))
+            del of_level
         wait(linked if threads == 1 else ())
         for rows, clusters in zip(rows_of_levels, linked, strict=True):
             yield nodes(rows, *clusters.result())

@@ -43,8 +43,8 @@ class ViewPairs:
         """Return the pairs that contain one of these views; other views keep only themselves."""
         num = len(self.indptr) - 1
         row, chosen = np.repeat(np.arange(num), np.diff(self.indptr)), np.isin(np.arange(num), views)
-        kept = chosen[row] | chosen[self.partners] | (row == self.partners)
-        entries = np.ones(kept.sum(), np.int8), (row[kept], self.partners[kept])
+        is_chosen = chosen[row] | chosen[self.partners] | (row == self.partners)
+        entries = np.ones(is_chosen.sum(), np.int8), (row[is_chosen], self.partners[is_chosen])
         return _symmetric(sp.csr_matrix(entries, shape=(num, num)), self.min_iou)
 
 
@@ -67,8 +67,8 @@ def view_pairs(visible: sp.csr_matrix) -> ViewPairs:
         lengths = [len(views) for views in chosen]
         indptr = np.concatenate([[0], np.cumsum(lengths)])
         columns = np.concatenate(chosen)
-        own = sp.csr_matrix((np.ones(len(columns), np.int8), columns, indptr), shape=(num, num))
-        pattern = (own + own.T + sp.eye(num, dtype=np.int8)).tocsr()
+        upper = sp.csr_matrix((np.ones(len(columns), np.int8), columns, indptr), shape=(num, num))
+        pattern = (upper + upper.T + sp.eye(num, dtype=np.int8)).tocsr()
     return _symmetric(pattern, 0.0 if num <= MAX_ALL else MIN_IOU)
 
 
@@ -77,9 +77,9 @@ def _symmetric(pattern: sp.csr_matrix, min_iou: float) -> ViewPairs:
     pattern.sort_indices()
     row = np.repeat(np.arange(pattern.shape[0]), np.diff(pattern.indptr))
     # Sorting the entries by column, then row lists the mirror entries of the rows in order.
-    place = np.empty(len(row), np.int64)
-    place[np.lexsort((row, pattern.indices))] = np.arange(len(row))
-    mirror = place - pattern.indptr[pattern.indices]
+    position = np.empty(len(row), np.int64)
+    position[np.lexsort((row, pattern.indices))] = np.arange(len(row))
+    mirror = position - pattern.indptr[pattern.indices]
     return ViewPairs(pattern.indptr.astype(np.int64), pattern.indices.astype(np.int32), mirror, min_iou)
 
 
@@ -101,6 +101,6 @@ def _chosen(shared: Int32[np.ndarray, " V"]) -> Int64[np.ndarray, " K"]:
     """Return the partners of a view with `shared` Gaussians in each view; on a tie, the lowest views."""
     order = np.argsort(-shared, kind="stable")
     order = order[shared[order] > 0]
-    nearest, rest = order[: NEAREST + 1], order[NEAREST + 1 :]
-    steps = np.linspace(0, len(rest) - 1, min(SPREAD, len(rest))).round().astype(np.int64)
-    return np.sort(np.concatenate([nearest, rest[steps]]))
+    nearest, farther = order[: NEAREST + 1], order[NEAREST + 1 :]
+    steps = np.linspace(0, len(farther) - 1, min(SPREAD, len(farther))).round().astype(np.int64)
+    return np.sort(np.concatenate([nearest, farther[steps]]))

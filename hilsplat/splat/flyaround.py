@@ -173,10 +173,10 @@ def contact_sheet(
         return sheet
     image, font = Image.fromarray(sheet), ImageFont.load_default(TITLE_PX - GAP_PX)
     for title, (y, x) in zip(titles, places, strict=True):
-        shown = title
-        while len(shown) > 1 and font.getlength(shown) > width - GAP_PX:
-            shown = f"…{shown[2:]}"
-        ImageDraw.Draw(image).text((x, y), shown, fill=(0, 0, 0), font=font)
+        text = title
+        while len(text) > 1 and font.getlength(text) > width - GAP_PX:
+            text = f"…{text[2:]}"
+        ImageDraw.Draw(image).text((x, y), text, fill=(0, 0, 0), font=font)
     return np.asarray(image)
 
 

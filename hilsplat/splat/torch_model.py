@@ -160,7 +160,7 @@ def photometric_loss(
     if fused_ssim is None:
         similarity = ssim(image, target)
     else:
-        similarity = fused_ssim(*(each.permute(2, 0, 1)[None].contiguous() for each in (image, target)))
+        similarity = fused_ssim(*(picture.permute(2, 0, 1)[None].contiguous() for picture in (image, target)))
     return (1 - ssim_weight) * (image - target).abs().mean() + ssim_weight * (1 - similarity)
 
 

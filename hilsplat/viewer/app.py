@@ -145,11 +145,11 @@ def _members(shown: ViewerScene, asked: wire.Members) -> bytes:
 
 def _within(shown: ViewerScene, asked: wire.Region) -> bytes:
     """Return one bit for each Gaussian: whether its centre is in a region of a picture."""
-    found = within(shown.gaussians.means, asked.camera.camera(), asked.points, asked.radius)
+    inside = within(shown.gaussians.means, asked.camera.camera(), asked.points, asked.radius)
     paint = shown.paint(asked.variant, asked.style)
     if paint is not None:
-        found &= ~paint.hidden
-    return shown.bits_of(found)
+        inside &= ~paint.hidden
+    return shown.bits_of(inside)
 
 
 def _frame(shown: ViewerScene, asked: wire.Frame) -> Response:

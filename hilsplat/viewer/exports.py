@@ -51,8 +51,8 @@ def masks_zip(scene: LanguageScene, groups: Sequence[NodeGroup]) -> Steps:
         of_views = mask_files(scene, groups)
         for done, files in enumerate(of_views, 1):
             for name, data in files.items():
-                place, how = (f"masks/{name}", zipfile.ZIP_STORED) if name.endswith(".png") else (name, None)
-                archive.writestr(place, data, how)
+                entry, how = (f"masks/{name}", zipfile.ZIP_STORED) if name.endswith(".png") else (name, None)
+                archive.writestr(entry, data, how)
             yield done, total
     return content.getvalue()
 

@@ -110,8 +110,8 @@ def _boxes(shown: ViewerScene, asked: wire.Selection) -> dict[str, Any]:
 def _masks(shown: ViewerScene, asked: wire.Selection) -> exports.Steps:
     scene, groups = _selected(shown, asked)
     if asked.removed:
-        rest = replace(scene.views, gaussians=shown.remaining(asked.removed), cache=ViewStore(VIEWS_MIB))
-        scene = replace(scene, views=rest)
+        views = replace(scene.views, gaussians=shown.remaining(asked.removed), cache=ViewStore(VIEWS_MIB))
+        scene = replace(scene, views=views)
     return exports.masks_zip(scene, groups)
 
 
@@ -126,10 +126,10 @@ def _rows(shown: ViewerScene, asked: wire.Edited) -> tuple[np.ndarray, np.ndarra
     if not isinstance(asked, wire.Selection):
         return np.sort(shown.kept_rows(asked.removed)), None
     rows, labels = exports.labelled(*_selected(shown, asked))
-    kept = ~shown.marked(asked.removed)[rows]
-    if not kept.any():
+    remains = ~shown.marked(asked.removed)[rows]
+    if not remains.any():
         raise SettingsError("no Gaussian remains to be saved", fix="undo the removal, or select other nodes")
-    return rows[kept], labels[kept]
+    return rows[remains], labels[remains]
 
 
 def _selected(shown: ViewerScene, asked: wire.Selection) -> tuple[LanguageScene, list[NodeGroup]]:

@@ -207,10 +207,10 @@ class ViewerScene(ShownScene):
 
     def kept_rows(self, removed: str) -> np.ndarray:
         """Return the rows of the Gaussians that remain, in the page's order; raise SettingsError if none."""
-        kept = self.order[~self.marked(removed)[self.order]]
-        if not len(kept):
+        rows = self.order[~self.marked(removed)[self.order]]
+        if not len(rows):
             raise SettingsError("every Gaussian is removed", fix="undo, or restore some Gaussians")
-        return kept
+        return rows
 
     def _remaining(self, removed: str) -> Gaussians:
         """Return all Gaussians, removed ones invisible: rows keep their numbers."""

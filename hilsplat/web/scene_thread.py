@@ -27,7 +27,7 @@ from hilsplat.web.file_changes import StaleSceneError
 from hilsplat.web.server import answer, encoded, plain, read, view_name
 
 THUMB_PX = 160
-MOST_OPEN = 2  # maximum number of scenes that a page keeps in memory besides the first
+MAX_OPEN = 2  # maximum number of scenes that a page keeps in memory besides the first
 
 
 class ShownScene:
@@ -198,7 +198,7 @@ class SceneThread(Generic[Shown]):
             if self.named is None:
                 raise SettingsError(f"this page has no scene {name!r}", fix="reload the page")
             self.opened[name] = self.named(name)
-            for oldest in [name for name in self.opened if name][:-MOST_OPEN]:
+            for oldest in [name for name in self.opened if name][:-MAX_OPEN]:
                 del self.opened[oldest]
         return self.opened[name]
 

@@ -58,11 +58,11 @@ def libraries() -> Iterator[Finding]:
         if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
             continue
         number += 1
-        found = version_of(requirement.name)
-        if found is None:
+        installed = version_of(requirement.name)
+        if installed is None:
             wrong.append(f"{requirement.name} is missing")
-        elif not requirement.specifier.contains(found, prereleases=True):
-            wrong.append(f"{requirement.name} {found} does not satisfy {requirement.specifier}")
+        elif not requirement.specifier.contains(installed, prereleases=True):
+            wrong.append(f"{requirement.name} {installed} does not satisfy {requirement.specifier}")
     fix = "pip install --upgrade hilsplat, with the repository's constraints.txt"
     yield verdict("libraries", "; ".join(wrong), f"{number} libraries in the required versions", fix)
 
@@ -149,10 +149,10 @@ def space() -> Iterator[Finding]:
     text = f"{free:.1f} GiB free in {folder}; results of {len(plan.scenes)} scenes need about {needed:.1f}"
     fix = "free up space, or set results to a folder on another disk"
     yield verdict("disk", "" if free > needed else text, text, fix)
-    (most, rule, scene), own = memory, machine_mib()
-    text = f"{own / 1024:.1f} GiB; the largest job, {rule} of {scene}, needs about {most / 1024:.1f}"
+    (most, rule, scene), ram = memory, machine_mib()
+    text = f"{ram / 1024:.1f} GiB; the largest job, {rule} of {scene}, needs about {most / 1024:.1f}"
     fix = "lower poses.max_side_px or gaussians.max_gaussians"
-    yield verdict("memory", "" if own > most else text, text, fix)
+    yield verdict("memory", "" if ram > most else text, text, fix)
 
 
 def writing() -> Iterator[Finding]:

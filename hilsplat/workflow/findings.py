@@ -195,14 +195,14 @@ def _features(folder: Path, named: Path | None, views: Views, settings: StageSet
     if features is None or features == layouts.NO_POSES:
         return
     train = [view for view in views.photos if view not in views.held_out]
-    found, lost = read_views(features, {view: views.cameras.get(view) for view in train})
+    maps, lost = read_views(features, {view: views.cameras.get(view) for view in train})
     parts.columns["features"] = features.resolve()
-    parts.lines.append(f"features: {features}: masks and vectors of {len(found)} of {len(train)} views")
+    parts.lines.append(f"features: {features}: masks and vectors of {len(maps)} of {len(train)} views")
     if lost:
         parts.lines.append(f"  left out: {shorten_list(lost, 5)}")
-    if not found:
+    if not maps:
         return
-    view = max(found, key=lambda view: len(found[view][0]))
+    view = max(maps, key=lambda view: len(maps[view][0]))
     try:
         model = ClipModel.load(Path(settings.clip.model), settings.clip.variant)
         masks, vectors = read_view(features, view)

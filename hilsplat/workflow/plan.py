@@ -118,8 +118,8 @@ class Plan:
         require_variant_sections(run)
         sheet = project_path(run.scenes)
         rows = read_sheet(sheet, run.groups, run.data_root)
-        found = unlisted({row.source for row in rows}, run.groups, run.data_root)
-        self.rows = (*rows, *(row_of_data(name, run.data_root) for name in found))
+        names_of_data = unlisted({row.source for row in rows}, run.groups, run.data_root)
+        self.rows = (*rows, *(row_of_data(name, run.data_root) for name in names_of_data))
         self.ignored = without_scene(run, [*self.rows, *read_sheet(INSTALLED / DEFAULT_SHEET, ())])
         self.data = SceneData(self.rows, run.data_root, self.path)
         chosen = choose_scenes(self.rows, run.groups, run.only)
@@ -168,7 +168,7 @@ class Plan:
         self._files = [(stage.scope, stage.file) for stage in all_stages().values()]
         names = {row.name for row in self.rows}
         places = [self.results / dataset for dataset in sorted({row.dataset for row in self.rows})]
-        inside = [path for place in places if place.is_dir() for path in place.iterdir()]
+        inside = [path for folder in places if folder.is_dir() for path in folder.iterdir()]
         self._unlisted = {f"{path.parent.name}/{path.name}" for path in inside} - names
         self._first_alike = functools.cache(self._first_with_equal_identity)
         for row in self.scenes:
@@ -176,11 +176,11 @@ class Plan:
 
     def absent_lines(self) -> list[str]:
         """Return a line for each data set with skipped scenes, or for each reason if there are several."""
-        found: dict[tuple[str, str], list[str]] = {}
+        skipped: dict[tuple[str, str], list[str]] = {}
         for name, reason in self.absent.items():
             dataset, _, scene = name.partition("/")
-            found.setdefault((dataset, reason), []).append(scene)
-        return [f"{data} ({shorten_list(names)}) is skipped: {why}" for (data, why), names in found.items()]
+            skipped.setdefault((dataset, reason), []).append(scene)
+        return [f"{data} ({shorten_list(names)}) is skipped: {why}" for (data, why), names in skipped.items()]
 
     def require_usable(self, *, devices: bool) -> None:
         """Check that the models exist and, with `devices`, that this machine has the configured devices."""
@@ -188,11 +188,11 @@ class Plan:
         for row in self.scenes:
             for variant in self.run.variant_names():
                 where.setdefault(self.stages_of(variant, self.scopes(row)), f"{row.name}, variant {variant}")
-        for stages, place in where.items():
-            check_models(stages, place)
-            check_stages(stages, place)
+        for stages, origin in where.items():
+            check_models(stages, origin)
+            check_stages(stages, origin)
             if devices:
-                check_device(stages, place)
+                check_device(stages, origin)
 
     def path(self, job: Job, *parts: str) -> str:
         return "/".join([self.run.results, job.dataset, job.scene, *parts])
@@ -378,7 +378,7 @@ class Plan:
         folder = Path(self.path(row))
         inside = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
         places = {"scene": [folder], "variant": [folder / name for name in self._variants if name in inside]}
-        paths = [place / file for scope, file in self._files for place in places.get(scope, ())]
+        paths = [root / file for scope, file in self._files for root in places.get(scope, ())]
         return [path for path in dict.fromkeys(paths) if path.exists()]
 
     def compared_scores(self, job: Job) -> list[str]:
@@ -497,10 +497,10 @@ class Plan:
         stages, situation = self.stages(job), self.situation(self.row(job))
         if stages.masks.levels == "head" or stages.autoencoder.targets != "mask":
             return []
-        own = self._code_identity(job.variant, *situation)
+        identity = self._code_identity(job.variant, *situation)
         for name in self.run.every_variant():
             is_by_head = self.stages_of(name, situation[0]).masks.levels == "head"
-            if is_by_head and self._code_identity(name, *situation) == own:
+            if is_by_head and self._code_identity(name, *situation) == identity:
                 return [self.path(job, name, "autoencoder")]
         return []
 
@@ -527,9 +527,9 @@ class Plan:
             masks = self.identity("masks", name, *situation)
             return self.run.seed_of(name), masks, self._code_identity(name, *situation)
 
-        own = start_of(job.variant)
+        start = start_of(job.variant)
         for name in self.run.every_variant():
-            if self.stages_of(name, situation[0]).method.name == "langsplat" and start_of(name) == own:
+            if self.stages_of(name, situation[0]).method.name == "langsplat" and start_of(name) == start:
                 return [self.path(job, name, "field.safetensors")]
         raise SettingsError(
             f"{job.dataset}/{job.scene}, variant {job.variant}: field.start is langsplat, but no variant has "
@@ -554,7 +554,7 @@ class Plan:
 def _of_variant(name: str) -> list[str]:
     """Return the artifacts of a variant that a stage needs."""
     kinds = {artifact: kinds_of(artifact) for artifact in stage_of(name).needs}
-    return [artifact for artifact, found in kinds.items() if found and found[-1].scope == "variant"]
+    return [artifact for artifact, stages in kinds.items() if stages and stages[-1].scope == "variant"]
 
 
 PARTS = _of_variant(SCORED)  # artifacts of a variant that queries read
@@ -623,7 +623,7 @@ def without_scene(run: RunSettings, rows: Iterable[SceneRow]) -> list[str]:
         **dict.fromkeys(run.sweep_scenes, ("sweep_scenes", [row.scene for row in rows])),
     }
     lines = []
-    for key, (where, names) in sorted((key, found) for key, found in known.items() if key not in found[1]):
+    for key, (where, names) in sorted((key, value) for key, value in known.items() if key not in value[1]):
         line = f"the configuration ({where}) names the scene {key!r}, which is not in {run.scenes}"
         if near := difflib.get_close_matches(key, names, n=1, cutoff=0.85):
             raise SettingsError(line, expected=f"did you mean {near[0]!r}?", fix="correct or remove the name")

@@ -74,8 +74,8 @@ class RunningJob:
 
     def progress(self) -> tuple[str, int, int] | None:
         """Return the loop, items done and total items from the log, or None outside a loop."""
-        found = last_progress(self.log) if self.log is not None else None
-        return found if found is not None and found[1] < found[2] else None
+        latest = last_progress(self.log) if self.log is not None else None
+        return latest if latest is not None and latest[1] < latest[2] else None
 
 
 class Estimates:
@@ -172,12 +172,12 @@ class RunProgress:
 
     def errors(self) -> list[str]:
         """Return the errors of the jobs that failed and were not repeated, each once."""
-        found: dict[str, str] = {}
+        messages: dict[str, str] = {}
         for job in self.failures.values():
             error = last_error(job.log) if job.log is not None else ""
             where = f"; its log is {job.log}" if job.log is not None else ""
-            found.setdefault(error or job.name, f"{job.name} failed{where}\n{error}".rstrip())
-        return [*found.values()]
+            messages.setdefault(error or job.name, f"{job.name} failed{where}\n{error}".rstrip())
+        return [*messages.values()]
 
     def end(self, number: int) -> list[str]:
         """End a job, and return the lines to print."""
@@ -320,5 +320,5 @@ def duration(seconds: float) -> str:
     minutes = round(seconds / 60)
     if minutes < 90:
         return f"about {max(minutes, 1)} min"
-    hours, rest = divmod(round(minutes, -1), 60)
-    return f"about {hours} h {rest} min" if rest else f"about {hours} h"
+    hours, minutes_left = divmod(round(minutes, -1), 60)
+    return f"about {hours} h {minutes_left} min" if minutes_left else f"about {hours} h"

@@ -117,10 +117,10 @@ class Records:
             path, sizes = artifact.parent / name, written.bytes
             if not path.exists():
                 return f"{path.name} is missing"
-            found = sizes_of(path)
-            if gone := sorted(sizes.keys() - found.keys()):
+            current = sizes_of(path)
+            if gone := sorted(sizes.keys() - current.keys()):
                 return f"{gone[0]} is missing from {path.name}"
-            if wrong := sorted(file for file in found if sizes.get(file) != found[file]):
+            if wrong := sorted(file for file in current if sizes.get(file) != current[file]):
                 return f"{path.name if wrong[0] == '.' else wrong[0]} was changed after it was written"
             written_ns = provenance_path(artifact).stat().st_mtime_ns
             is_older = all(file.stat().st_mtime_ns <= written_ns for file in files_of(path))
@@ -171,9 +171,9 @@ class Records:
 
     def _written_results(self, artifact: Path, record: Provenance) -> Path:
         """Return the results folder as an artifact's writer named it, given by the option `--out`."""
-        words, place = record.command, artifact.relative_to(self.results).parts
+        words, relative = record.command, artifact.relative_to(self.results).parts
         out = Path(words[words.index("--out") + 1]).parts if "--out" in words[:-1] else ()
-        return Path(*out[: -len(place)]) if out[-len(place) :] == place else Path("results")
+        return Path(*out[: -len(relative)]) if out[-len(relative) :] == relative else Path("results")
 
     def _job_of(self, artifact: Path) -> VariantJob | None:
         """Return the job of an artifact that belongs to a scene of the plan."""

@@ -55,7 +55,7 @@ MEAN_SHARE = 0.75
 MP_PER_THREAD = 2.0  # megapixels of all views per thread
 RUNNER_MB = 700  # memory of the two Snakemake processes that a cluster job starts before its stage
 BLOCK = 2**20 / 1000  # thousands of Gaussians that the field solves together by default
-TIME_FACTOR, LEAST_MINUTES = 6, 10  # ratio of a job's time limit to its estimate, and minimum limit
+TIME_FACTOR, MIN_MINUTES = 6, 10  # ratio of a job's time limit to its estimate, and minimum limit
 START_S = 2.0  # seconds to start Python, load libraries and read the inputs of a job
 
 FIT_S_PER_MP, FIT_S_PER_GAUSSIAN, GRAPH_S_PER_MP = 0.14, 0.9e-6, 4.0
@@ -170,7 +170,7 @@ class JobResources:
 
         def needed(wildcards: Any, threads: int, attempt: int) -> int:
             seconds = self.core_seconds(rule, wildcards) / threads if hasattr(wildcards, "scene") else 0.0
-            minutes = max(LEAST_MINUTES, TIME_FACTOR * seconds / 60)
+            minutes = max(MIN_MINUTES, TIME_FACTOR * seconds / 60)
             return math.ceil(minutes / 5) * 5 * 2 ** (attempt - 1)
 
         return needed

@@ -180,7 +180,7 @@ def run(
     files, names = f"{chosen.results}/", {row.name for row in rows}
     targets = [str(Path(target)) for target in targets]  # shells complete folders with a slash
     targets = [name if (name := target.removeprefix(files)) in names else target for target in targets]
-    scenes = [target for target, found in matches_of(rows, targets).items() if found]
+    scenes = [target for target, rows_of_target in matches_of(rows, targets).items() if rows_of_target]
     named = [each for each in targets if each not in scenes and not each.startswith(files)]
     _require_known(named, rows, chosen.results)
     if scenes:
@@ -197,10 +197,10 @@ def run(
     command += ["--config", *given.config] if given.config else []
     if given.cores or not _has(others, *ELSEWHERE, "--jobs", "-j"):
         command += ["--cores", given.cores or str(_all_cores())]
-    for place in (Path.cwd(), Path(".snakemake")):
-        if place.exists() and not os.access(place, os.W_OK):
+    for folder in (Path.cwd(), Path(".snakemake")):
+        if folder.exists() and not os.access(folder, os.W_OK):
             fix = "run in a folder of your own: hilsplat init there, or copy config/ to it"
-            raise HilsplatError(f"{place} cannot be written, but Snakemake keeps its state there", fix=fix)
+            raise HilsplatError(f"{folder} cannot be written, but Snakemake keeps its state there", fix=fix)
     if _has(others, "-n", "--dry-run", "--dryrun"):
         return _start(command, plan, targets, scenes, given.forcerun, every_byte)
     with _locked_results(plan.results):
@@ -246,14 +246,14 @@ def _config_file(name: Path) -> Path:
         raise SettingsError(f"{name} is not a file", fix=f"pass keys after --: {command}")
     if name.suffix or len(name.parts) != 1 or name.exists():
         return project_path(name)
-    if not (found := project_path(named)).exists():
+    if not (file := project_path(named)).exists():
         known = {
             path.stem for folder in (Path(), INSTALLED) for path in (folder / named).parent.glob("*.yaml")
         }
         raise SettingsError(
             f"no configuration is named {str(name)!r}", expected=nearest(str(name), sorted(known))
         )
-    return found
+    return file
 
 
 def _require_known(targets: Sequence[str], rows: Sequence[SceneRow], results: str) -> None:
@@ -284,8 +284,8 @@ def _start(
     wrong = outdated(plan, every_byte=every_byte)
     if wrong:
         lines = _snakemake(command, "--summary", *ending).stdout.splitlines()
-        kept = {line.split("\t")[0] for line in lines if line.endswith("\tno update")}
-        wrong = {output: reason for output, reason in wrong.items() if output in kept}
+        unchanged = {line.split("\t")[0] for line in lines if line.endswith("\tno update")}
+        wrong = {output: reason for output, reason in wrong.items() if output in unchanged}
     for output, reason in wrong.items():
         logger.warning("rebuilding %s: %s", output, reason)
     rebuilt = ["--forcerun", *forced, *wrong] if forced or wrong else []

@@ -97,12 +97,12 @@ class SceneData:
         """Return the parameter function for the digest of a user's files; Snakemake compares only times."""
 
         def digest(job: Job) -> str:
-            found = files(job)
-            if isinstance(found, str):
-                found = []  # a folder that a rule writes
-            _require_past(found)
+            paths = files(job)
+            if isinstance(paths, str):
+                paths = []  # a folder that a rule writes
+            _require_past(paths)
             memo = Path(self.path(job)).parents[1] / ".cache/inputs" / job.dataset / f"{job.scene}.json"
-            return self._digest(memo if found else None, *found)
+            return self._digest(memo if paths else None, *paths)
 
         return digest
 
@@ -172,10 +172,10 @@ class SceneData:
 
     def label_files(self, job: Job) -> list[str]:
         """Return the label files, which only evaluation reads, so that editing one reruns no other stage."""
-        found = (
+        label_paths = (
             path for labels in self.labels(self.row(job)) for path in label_files(labels, self.data_root)
         )
-        return [portable(path.resolve()) for path in found]
+        return [portable(path.resolve()) for path in label_paths]
 
     def num_labelled(self, row: SceneRow) -> int:
         """Return the number of labelled regions in a scene's images: objects in JSON files, or mask files.

@@ -27,8 +27,8 @@ Gaussian Splatting has 23 to 29 dB on its photographs (Kerbl et al. 2023, Tab. 1
 
 def summary(plan: Plan, files: Sequence[str] = ()) -> list[str]:
     """Return the summary of a plan's scenes that have poses; if files were made, only of theirs."""
-    found = set(scenes_in(plan.results))
-    rows = [row for row in plan.scenes if row.name in found]
+    existing = set(scenes_in(plan.results))
+    rows = [row for row in plan.scenes if row.name in existing]
     if files:
         rows = [row for row in rows if any(file.startswith(f"{plan.path(row)}/") for file in files)]
     if len(rows) > TABLED:
@@ -55,7 +55,7 @@ def _scene(plan: Plan, row: SceneRow) -> list[str]:
         return [f"{row.name}:", *(f"  {line}" for line in str(error).splitlines())]
     counts = ", ".join(f"{number} {level}" for level, number in scene.nodes.items())
     pictures = ", ".join(sorted(path.name for path in figures.glob("*.webp")))
-    table = aligned_table([[*scores[0]], *([*each.values()] for each in scores)], TEXTS) if scores else []
+    table = aligned_table([[*scores[0]], *([*cells.values()] for cells in scores)], TEXTS) if scores else []
     uses = f'hilsplat query {name} "..."  or  hilsplat view {name}'
     facts = {
         "poses": _poses(scene),

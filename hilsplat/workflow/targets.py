@@ -41,8 +41,8 @@ def absent(plan: Plan, table: str) -> list[str]:
     sources = {data_of(row) for row in plan.rows}
     for row in plan.rows:
         reason = plan.data.absence(row)
-        place = published(row.source)
-        if place and table in DATASETS[place[0]].tables and reason is not None:
+        names = published(row.source)
+        if names and table in DATASETS[names[0]].tables and reason is not None:
             by_dataset.setdefault(row.dataset, []).append((row.scene, reason))
     sentences = [
         f"{name}: no labelled segment was found in {plan.run.data_root or 'data_root, which is not set'}."
@@ -66,16 +66,16 @@ def data_of(row: SceneRow) -> str:
     """Return the name of a scene's data in tables: its kind of generated scene, or its published data set."""
     if row.generated:
         return row.generated.kind
-    place = published(row.source)
-    return place[0] if place else ""
+    names = published(row.source)
+    return names[0] if names else ""
 
 
 def tables_of(row: SceneRow) -> tuple[str, ...]:
     """Return the names of the tables that show a scene with published or generated labels."""
     if row.generated:
         return GENERATORS[row.generated.generator].kinds[row.generated.kind].tables
-    place = published(row.source)
-    return DATASETS[place[0]].tables if place else ()
+    names = published(row.source)
+    return DATASETS[names[0]].tables if names else ()
 
 
 def tables(plan: Plan) -> list[str]:
@@ -117,11 +117,11 @@ def compared_means(plan: Plan, job: Job) -> list[str]:
 
 def figures(plan: Plan) -> list[str]:
     """Return panels, node names, masks against ground truth and, for sweep scenes, method comparisons."""
-    found = []
+    paths = []
     for row in plan.scenes:
         compared = not plan.run.sweep_scenes or row.scene in plan.run.sweep_scenes
         generated = GENERATORS[row.generated.generator].pictures if row.generated else ()
         pictures = ["panel", *generated, *(["comparison"] if compared else [])]
-        found += [f"{plan.run.results}/figures/{row.name}/{picture}.webp" for picture in pictures]
-        found.append(plan.path(row, "default/names"))
-    return found
+        paths += [f"{plan.run.results}/figures/{row.name}/{picture}.webp" for picture in pictures]
+        paths.append(plan.path(row, "default/names"))
+    return paths

@@ -55,8 +55,8 @@ def bed(b: Builder) -> None:
     share = b.between(0.56, 0.64)
     start = length / 2 - share * length
     size = (share * length - 0.03, width + 0.02, mattress + 0.02)
-    place = (start + share * length / 2 - 0.02, 0, middle + 0.025)
-    bedding.subpart("blanket, duvet, comforter", blanket_paint, box(size, place, 0.05))
+    position = (start + share * length / 2 - 0.02, 0, middle + 0.025)
+    bedding.subpart("blanket, duvet, comforter", blanket_paint, box(size, position, 0.05))
     shape = box((0.2, width + 0.03, mattress + 0.05), (start, 0, middle + 0.025), 0.05)
     bedding.subpart("fold, turned sheet", "plain", shape)
     case, trim = b.paints("cloth", "plain")
@@ -99,10 +99,10 @@ def sofa(b: Builder) -> None:
         shape = box((depth * 0.7, arm_w + 0.03, 0.05), (0.08, y, arm_z + 0.005), 0.015)
         arm.subpart("arm pad, arm cover", pad_paint, shape)
     side = -1 if b.chance(0.5) else 1
-    place = (front - 0.42, side * (inner / 2 - 0.19), seat_z + 0.34)
-    shape = _pillow((0.13, 0.38, 0.38)).turned("y", -14).moved(*place)
+    position = (front - 0.42, side * (inner / 2 - 0.19), seat_z + 0.34)
+    shape = _pillow((0.13, 0.38, 0.38)).turned("y", -14).moved(*position)
     pillow = b.part("pillow, throw pillow", "cloth", shape)
-    shape = ellipsoid((0.04, 0.075, 0.075), (0.08, 0, 0)).turned("y", -14).moved(*place)
+    shape = ellipsoid((0.04, 0.075, 0.075), (0.08, 0, 0)).turned("y", -14).moved(*position)
     pillow.subpart("button, knot", "plain", shape)
 
 
@@ -139,9 +139,9 @@ def desk(b: Builder) -> None:
         unit.subpart("handle, pull", metal, shape)
     leg_paint, foot_paint = b.paints("metal", "plain")
     for x in (-1, 1):
-        place = (x * (depth / 2 - 0.06), -width / 2 + 0.06)
-        leg = b.part("leg", leg_paint, box((0.06, 0.06, height - 0.15), (*place, (height + 0.06) / 2), 0.008))
-        leg.subpart("foot, leg tip", foot_paint, box((0.085, 0.085, 0.11), (*place, 0.055), 0.01))
+        spot = (x * (depth / 2 - 0.06), -width / 2 + 0.06)
+        leg = b.part("leg", leg_paint, box((0.06, 0.06, height - 0.15), (*spot, (height + 0.06) / 2), 0.008))
+        leg.subpart("foot, leg tip", foot_paint, box((0.085, 0.085, 0.11), (*spot, 0.055), 0.01))
 
 
 def nightstand(b: Builder) -> None:
@@ -217,8 +217,8 @@ def door(b: Builder) -> None:
     for y in (-1.0, 1.0):
         for low, high in ((0.14, 0.44), (0.5, 0.94)):
             size = (0.02, width * 0.36, (high - low) * height)
-            place = (0.042, y * width * 0.23, (low + high) / 2 * height)
-            leaf.subpart("panel, inlay", panel_paint, box(size, place, 0.008))
+            position = (0.042, y * width * 0.23, (low + high) / 2 * height)
+            leaf.subpart("panel, inlay", panel_paint, box(size, position, 0.008))
     y = -width / 2 + 0.07
     handle = b.part("handle, latch", metal, box((0.02, 0.055, 0.22), (0.048, y, 1.02), 0.006))
     path = [(0.05, y, 1.05), (0.1, y, 1.05), (0.105, y + 0.06, 1.05), (0.1, y + 0.15, 1.05)]
@@ -283,7 +283,7 @@ def picture(b: Builder) -> None:
         shape = box((0.04, width, border), (0.02, 0, height / 2 + side * (height - border) / 2), 0.012)
         frame.put(wood, shape)
     places = [(0.024, y * (width - border) / 2, height / 2 + z * (height - border) / 2) for y, z in CORNERS]
-    corners = [box((0.05, border * 1.35, border * 1.35), place, 0.012) for place in places]
+    corners = [box((0.05, border * 1.35, border * 1.35), corner, 0.012) for corner in places]
     frame.subpart("corners, ornaments", accent, *corners)
     shape = box((0.02, width - border, height - border), (0.01, 0, height / 2))
     canvas = b.part("canvas, painting", "plain blue pink yellow beige teal white", shape)
@@ -304,7 +304,7 @@ def mirror(b: Builder) -> None:
     rim = b.part("frame, rim", rim_paint, lathe(profile, 48).turned("y", 90).moved(0, 0, r))
     angles = [np.pi / 4 * i for i in range(8)]
     places = [(0.035, (r - 0.025) * np.cos(a), r + (r - 0.025) * np.sin(a)) for a in angles]
-    rim.subpart("beads, studs", "ceramic", *[sphere(0.034, place, 16) for place in places])
+    rim.subpart("beads, studs", "ceramic", *[sphere(0.034, position, 16) for position in places])
     pane = b.part("glass, looking glass", glass, disc(r - 0.045, 0.0, 0.02, 40).moved(0, 0, r))
     shape = box((0.008, 0.07, r * 1.1), (0.02, 0, 0)).turned("x", 32).moved(0, 0.02, r)
     pane.subpart("glint, reflection", "plain white yellow beige", shape)
@@ -341,8 +341,8 @@ def _book_row(b: Builder, depth: float, width: float, bottom: float, clear: floa
         if y + thick > end:
             break
         deep = depth * b.between(0.68, 0.8)
-        place = (-depth / 2 + 0.04 + deep / 2, mirror * (y + thick / 2), bottom + tall / 2)
-        shape = box((deep, thick, tall), place, 0.006)
+        position = (-depth / 2 + 0.04 + deep / 2, mirror * (y + thick / 2), bottom + tall / 2)
+        shape = box((deep, thick, tall), position, 0.006)
         books.subpart("book", b.paint("cloth" if b.chance(0.3) else "plain"), shape)
         y += thick + 0.004
 
@@ -355,8 +355,8 @@ def _crates(b: Builder, depth: float, width: float, bottom: float, gap: float) -
         shape = box((depth * 0.82, crate_w, crate_h), (0.01, y, bottom + crate_h / 2), 0.012)
         crate = b.part("box, storage box, basket", cloth, shape)
         size = (0.025, crate_w * 0.45, crate_h * 0.4)
-        place = (0.01 + depth * 0.41, y, bottom + crate_h * 0.55)
-        crate.subpart("label, tag", label, box(size, place, 0.005))
+        position = (0.01 + depth * 0.41, y, bottom + crate_h * 0.55)
+        crate.subpart("label, tag", label, box(size, position, 0.005))
 
 
 def refrigerator(b: Builder) -> None:
@@ -440,7 +440,7 @@ def tv_stand(b: Builder) -> None:
     body = b.part("body, case", wood, box((depth, width, height - 0.1), (0, 0, height / 2 + 0.02), 0.01))
     body.subpart("top, board", "stone", box((depth + 0.04, width + 0.04, 0.04), (0, 0, height - 0.02), 0.01))
     places = [(x * (depth / 2 - 0.06), y * (width / 2 - 0.07), 0.04) for x, y in CORNERS]
-    body.subpart("feet, legs", "metal", *[box((0.06, 0.06, 0.08), place) for place in places])
+    body.subpart("feet, legs", "metal", *[box((0.06, 0.06, 0.08), corner) for corner in places])
     tall = height - 0.16
     for side in (-1, 1):
         y, w = side * width * 0.33, width * 0.3

@@ -131,13 +131,13 @@ def plant(b: Builder) -> None:
     crown = b.part("crown, leaves, foliage", leaf, shape)
     for i in range(5):
         a = 2 * np.pi * i / 5 + b.between(0, 0.8)
-        place = (size * 0.72 * np.cos(a), size * 0.72 * np.sin(a), top + size * b.between(0.35, 0.75))
-        crown.put(leaf, sphere(size * 0.52, place))
+        position = (size * 0.72 * np.cos(a), size * 0.72 * np.sin(a), top + size * b.between(0.35, 0.75))
+        crown.put(leaf, sphere(size * 0.52, position))
     for i in range(5):
         a, up = 2 * np.pi * i / 5 + b.between(0, 0.5), b.between(0.15, 1.0)
         flat = size * 1.1 * np.cos(up)
-        place = (flat * np.cos(a), flat * np.sin(a), top + size * 0.75 + size * np.sin(up) * 0.95)
-        crown.subpart("flower, blossom", petal, sphere(0.085, place, 16))
+        position = (flat * np.cos(a), flat * np.sin(a), top + size * 0.75 + size * np.sin(up) * 0.95)
+        crown.subpart("flower, blossom", petal, sphere(0.085, position, 16))
 
 
 def clock(b: Builder) -> None:
@@ -167,10 +167,10 @@ def clock(b: Builder) -> None:
         hands.put(accent, shape.turned("x", angle).moved(z=z))
     hands.put(accent, disc(0.07, 0, 0.05, 16, 0.01).moved(x + 0.02, 0, z))
     for side in (-1, 1):
-        place = (0, side * r * 0.62, z + r * 0.86)
+        position = (0, side * r * 0.62, z + r * 0.86)
         dome = lathe([(0, 0), (0.19, 0), (0.175, 0.09), (0.1, 0.16), (0, 0.18)]).turned("x", -side * 32)
-        bell = b.part("bell, alarm bell", metal, dome.moved(*place))
-        top = np.array(place) + np.array([0, side * np.sin(np.radians(32)), np.cos(np.radians(32))]) * 0.19
+        bell = b.part("bell, alarm bell", metal, dome.moved(*position))
+        top = np.array(position) + np.array([0, side * np.sin(np.radians(32)), np.cos(np.radians(32))]) * 0.19
         bell.subpart("knob, button", dark, sphere(0.078, tuple(top)))
 
 

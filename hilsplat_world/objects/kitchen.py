@@ -82,7 +82,7 @@ def cake(b: Builder) -> None:
     upper.subpart("glaze, topping", "snow", lathe(profile))
     away, angles = (r + r2) / 2, [2 * np.pi * i / 6 for i in range(6)]
     places = [(away * np.cos(a) * 1.02, away * np.sin(a) * 1.02, top + 0.075) for a in angles]
-    lower.subpart("cherries, berries", cherry, *[sphere(0.068, place, 16) for place in places])
+    lower.subpart("cherries, berries", cherry, *[sphere(0.068, position, 16) for position in places])
     candle = b.part("candle", "ceramic", cylinder(0.062, top2 + 0.02, top2 + 0.25))
     shape = lathe([(0, 0), (0.09, 0.07), (0.065, 0.14), (0, 0.24)]).moved(z=top2 + 0.25)
     candle.subpart("flame, fire", "plain yellow orange", shape)
@@ -101,7 +101,7 @@ def frying_pan(b: Builder) -> None:
     shape = ellipsoid((0.13, 0.13, 0.085), (-0.02, 0.02, 0.085))
     egg.subpart("yolk, egg yellow", "plastic yellow orange", shape)
     places = [(-0.18 + 0.09 * k, -0.26 + 0.02 * (k % 2), 0.075 + 0.02 * (k % 2)) for k in range(5)]
-    strips = [box((0.095, 0.13, 0.05), place, 0.01) for place in places]
+    strips = [box((0.095, 0.13, 0.05), position, 0.01) for position in places]
     bacon = b.part("bacon, bacon strip", "plain red brown pink", *strips)
     fat = box((0.47, 0.075, 0.05), (0, -0.25, 0.115), 0.01)
     bacon.subpart("fat, fat stripe", "plain beige white yellow orange", fat)
@@ -202,8 +202,8 @@ def ice_cream(b: Builder) -> None:
     profile = [(r * 0.8, -0.06), (r * 0.74, 0.05), (r * 0.45, 0.17), (0, 0.21)]
     shapes = [lathe(profile, 28).moved(z=z + r * 0.86 + 0.02)]
     for a in (0.3, 1.6, 2.8, 4.1, 5.2):
-        place = (r * 0.72 * np.cos(a), r * 0.72 * np.sin(a), z + r * 0.72)
-        shapes.append(ellipsoid((0.06, 0.06, 0.1), place))
+        position = (r * 0.72 * np.cos(a), r * 0.72 * np.sin(a), z + r * 0.72)
+        shapes.append(ellipsoid((0.06, 0.06, 0.1), position))
     top.subpart("sauce, syrup", "plastic brown red purple black", *shapes)
     top.subpart("cherry, berry", "plastic red pink green", sphere(0.1, (0, 0, z + r * 1.62 + 0.02)))
     shape = cylinder(0.055, 0, 0.46, 16).turned("y", -24).moved(-0.1, 0.03, z + 0.16)

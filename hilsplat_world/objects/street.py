@@ -199,7 +199,7 @@ def fence(b: Builder) -> None:
     boards = b.part("panel, boards", rails, *shapes)
     count = int(length / 0.22)
     places = [(0.04, length * ((i + 0.5) / count - 0.5), 0.55) for i in range(count)]
-    boards.subpart("slats, pickets", wood, *[box((0.05, 0.13, 0.94), place) for place in places])
+    boards.subpart("slats, pickets", wood, *[box((0.05, 0.13, 0.94), position) for position in places])
     stone = b.paint("stone grey brown")
     for y in (-length / 2, length / 2):
         pillar = b.part("post, fence post", stone, box((0.22, 0.22, 1.2), (0, y, 0.6), 0.02))

@@ -162,8 +162,8 @@ def draw_batch(
         image, labels, window = data.cut_window(rng, views.images[view], views.labels[view], stage.crop_px)
         target = data.nested_targets(labels)
         offset, region = data.region_centres(target[:, centre, centre], STRIDE)
-        place = draw_level_prompts(rng, labels, target, stage.prompts)
-        chosen = target[:, place[:, 1], place[:, 0]].T.astype(np.int64)  # (P, 3)
+        prompts = draw_level_prompts(rng, labels, target, stage.prompts)
+        chosen = target[:, prompts[:, 1], prompts[:, 0]].T.astype(np.int64)  # (P, 3)
         other = draw_level_prompts(rng, labels, target, stage.prompts)
         same = target[:, other[:, 1], other[:, 0]].T
         second = np.where(same[:, 0] == chosen[:, 0], 1, np.where(same[:, 2] == chosen[:, 2], -1, 0))
@@ -179,7 +179,7 @@ def draw_batch(
                 offset,
                 region.astype(np.float32),
                 region_edges(blocks),
-                np.stack([place, other], axis=1).astype(np.float32) + np.float32(0.5),
+                np.stack([prompts, other], axis=1).astype(np.float32) + np.float32(0.5),
                 np.stack([np.ones_like(second), second], axis=1).astype(np.int64),
                 (chosen >= 0).astype(np.float32),
                 places,

@@ -130,9 +130,9 @@ def region_centres(
     for head, target in enumerate(targets):
         ids = target.reshape(-1) + 1
         counts = np.bincount(ids).clip(1)
-        for axis, place in enumerate((x, y)):
-            mean = np.bincount(ids, place.reshape(-1)) / counts
-            offsets[2 * head + axis] = (mean[ids].reshape(height, width) - place) / UNIT_PX
+        for axis, coordinates in enumerate((x, y)):
+            mean = np.bincount(ids, coordinates.reshape(-1)) / counts
+            offsets[2 * head + axis] = (mean[ids].reshape(height, width) - coordinates) / UNIT_PX
     return offsets, targets >= 0
 
 

@@ -149,12 +149,12 @@ def shared_features(embeddings: Embeddings, positional: Positional) -> Shared:
     side = int(embeddings.shape[-1]) * (STRIDE // MASK_STRIDE)
     here = positional[:, :2]
     centres = embeddings[:, PACKED : PACKED + OFFSETS] + here.repeat(1, len(HEADS), 1, 1)
-    place = functional.interpolate(
+    positions = functional.interpolate(
         torch.cat([here, centres], dim=1), size=(side, side), mode="bilinear", align_corners=False
     )
-    squared = place[:, 2:].square()
+    squared = positions[:, 2:].square()
     squared = squared[:, 0::2] + squared[:, 1::2]
-    return torch.cat([pixel, place, squared, torch.ones_like(pixel[:, :1])], dim=1)
+    return torch.cat([pixel, positions, squared, torch.ones_like(pixel[:, :1])], dim=1)
 
 
 class SamDecoder(nn.Module):

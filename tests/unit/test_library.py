@@ -79,7 +79,7 @@ def test_objects_are_one_line_each_and_cameras_are_found_by_name_and_row(desk, s
 
 @pytest.mark.parametrize("iterations", [40, None])
 def test_a_fit_equals_that_of_the_stage(scene, tmp_path, monkeypatch, iterations):
-    monkeypatch.setattr("hilsplat.splat.steps.LEAST_FIT_STEPS", 20)
+    monkeypatch.setattr("hilsplat.splat.steps.MIN_FIT_STEPS", 20)
     settings = {"max_gaussians": 500, "densify_every": 10, "device": "cpu"}
     settings |= {} if iterations else {"steps_per_view": 5}
     found = hilsplat.fit(scene, iterations, seed=3, threads=2, **settings)

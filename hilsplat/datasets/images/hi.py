@@ -152,8 +152,8 @@ def parents_of(
         if not isinstance(parent, int) or parent not in objects:
             warnings.append(f"{where}: parent {parent!r} does not exist")
         elif objects[parent].keys["level"] != level - 1:
-            found = objects[parent].keys["level"]
-            warnings.append(f"{where}, level {level}: parent {parent} has level {found}")
+            level_of_parent = objects[parent].keys["level"]
+            warnings.append(f"{where}, level {level}: parent {parent} has level {level_of_parent}")
         else:
             parents[number] = parent
     return parents

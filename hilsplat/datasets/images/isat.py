@@ -114,7 +114,7 @@ def read_isat(path: Path, image: Path | None = None) -> IsatFile:
         read_object(f"{path}, object {number}", entry, size_hw, warnings)
         for number, entry in enumerate(content["objects"])
     ]
-    objects = tuple(cut_background(each, things, size_hw) for each in things if each.category != BACKGROUND)
+    objects = tuple(cut_background(item, things, size_hw) for item in things if item.category != BACKGROUND)
     if image is not None:
         warnings += check_label_size(f"label file {path}", size_hw, image_size_hw(image))
     return IsatFile(path, size_hw, objects, tuple(warnings))
@@ -185,7 +185,7 @@ def _polygons(where: str, value: Any) -> tuple[Float[np.ndarray, "_ 2"], ...]:
     try:
         nested = isinstance(value[0][0], list)
         polygons = tuple(np.array(points, dtype=np.float64) for points in (value if nested else [value]))
-        usable = all(each.shape == (len(each), 2) and (abs(each) < 2**31).all() for each in polygons)
+        usable = all(ring.shape == (len(ring), 2) and (abs(ring) < 2**31).all() for ring in polygons)
     except (TypeError, IndexError, KeyError, ValueError):
         usable = False
     if not usable:

@@ -45,10 +45,10 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
     require_images(masks, images)
     warnings: list[str] = []
     views: dict[str, tuple[LabelledRegion, ...]] = {}
-    for view, place in masks.items():
+    for view, source in masks.items():
         image_hw = image_size_hw(images[view])
         regions = []
-        for path in list_masks(place):
+        for path in list_masks(source):
             if "." in path.stem:  # the published evaluation truncates names at a dot
                 raise SceneError(
                     f"the file name of mask {path} has a dot before the suffix",
@@ -58,7 +58,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
                 )
             regions.append(mask_region(path, FOREGROUND, image_hw, warnings))
         if not regions:
-            raise SceneError(f"{place} has no masks", expected="<prompt>.png", fix="unpack test_mask again")
+            raise SceneError(f"{source} has no masks", expected="<prompt>.png", fix="unpack test_mask again")
         views[view] = tuple(regions)
     read = LabelledScene("lerf_mask", scene, images, folder, views)
     warnings += differences("lerf_mask", scene, {}, read.prompts)
@@ -67,17 +67,17 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
 
 def _mask_folders(folder: Path, test: tuple[str, ...]) -> dict[str, Path]:
     """Return the mask folder of each test view; folder i belongs to `test[i]`."""
-    places = [place for place in folder.iterdir() if place.is_dir() and not place.name.startswith(".")]
-    numbers = sorted((int(place.name), place) for place in places if place.name.isdecimal())
-    strange = sorted(place.name for place in places if not place.name.isdecimal())
+    places = [entry for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith(".")]
+    numbers = sorted((int(entry.name), entry) for entry in places if entry.name.isdecimal())
+    strange = sorted(entry.name for entry in places if not entry.name.isdecimal())
     if strange or [number for number, _ in numbers] != list(range(len(test))):
         raise SceneError(
             f"the folders in {folder} do not match the test views",
             expected=f"0 to {len(test) - 1}, for {', '.join(test[:10])}{', ...' if len(test) > 10 else ''}",
-            found=", ".join([place.name for _, place in numbers] + strange) or "no folders",
+            found=", ".join([entry.name for _, entry in numbers] + strange) or "no folders",
             fix="unpack test_mask, images_train and sparse again, from the same release",
         )
-    return {view: place for view, (_, place) in zip(test, numbers, strict=True)}
+    return {view: entry for view, (_, entry) in zip(test, numbers, strict=True)}
 
 
 DATASET = Dataset(

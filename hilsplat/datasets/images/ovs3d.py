@@ -33,9 +33,9 @@ def open_scene(root: Path, scene: str) -> labelled.LabelledScene:
     warnings: list[str] = []
     views: dict[str, tuple[labelled.LabelledRegion, ...]] = {}
     places = sorted(
-        place
-        for place in (folder / "segmentations").iterdir()
-        if place.is_dir() and not place.name.startswith((".", "__"))
+        entry
+        for entry in (folder / "segmentations").iterdir()
+        if entry.is_dir() and not entry.name.startswith((".", "__"))
     )
     if not places:
         raise SceneError(
@@ -43,10 +43,10 @@ def open_scene(root: Path, scene: str) -> labelled.LabelledScene:
             expected="00/, 04/, ...",
             fix="unpack segmentations again",
         )
-    labelled.require_images([view_name(place.name) for place in places], images)
-    for place in places:
-        view = view_name(place.name)
-        views[view] = _regions(place, prompts, image_size_hw(images[view]), warnings)
+    labelled.require_images([view_name(entry.name) for entry in places], images)
+    for entry in places:
+        view = view_name(entry.name)
+        views[view] = _regions(entry, prompts, image_size_hw(images[view]), warnings)
     posed = (folder / "sparse").is_dir() or (folder / POSES_BOUNDS).is_file()
     warnings += differences("3d_ovs", scene, {"segmentation": views}, prompts)
     return labelled.LabelledScene("3d_ovs", scene, images, folder if posed else None, views, tuple(warnings))
@@ -65,20 +65,20 @@ def read_classes(path: Path) -> tuple[str, ...]:
 
 
 def _regions(
-    place: Path, prompts: tuple[str, ...], image_hw: tuple[int, int], warnings: list[str]
+    folder: Path, prompts: tuple[str, ...], image_hw: tuple[int, int], warnings: list[str]
 ) -> tuple[labelled.LabelledRegion, ...]:
-    files = {composed(path.stem): path for path in list_files(place, {".png"})}
+    files = {composed(path.stem): path for path in list_files(folder, {".png"})}
     missing = [prompt for prompt in prompts if prompt not in files]
     extra = sorted(set(files) - set(prompts))
     if missing:
         raise SceneError(
-            f"{place} has no masks for: {', '.join(missing)}",
+            f"{folder} has no masks for: {', '.join(missing)}",
             expected="one <class>.png for every line of classes.txt",
             found=f"classes not in classes.txt: {', '.join(extra)}" if extra else f"{len(files)} masks",
             fix="use the same spelling in classes.txt and the file names, or unpack segmentations again",
         )
     if extra:
-        warnings.append(f"{place.name}: masks of unknown classes are ignored: {', '.join(extra)}")
+        warnings.append(f"{folder.name}: masks of unknown classes are ignored: {', '.join(extra)}")
     return tuple(
         labelled.mask_region(files[prompt], FOREGROUND, image_hw, warnings, SHAPE_TOLERANCE, min_grey=1)
         for prompt in prompts

@@ -45,7 +45,7 @@ def find_sequence(root: Path, scene: str) -> tuple[Path, tuple[str, str, str]]:
     The folder is `room0` (NICE-SLAM), `room_0/imap/00` (vMAP) or `room_0/Sequence_1`.
     """
     places = (scene.replace("_", ""), f"{scene}/imap/00", f"{scene}/Sequence_1")
-    folders = [root / place for place in places if (root / place).is_dir()]
+    folders = [root / name for name in places if (root / name).is_dir()]
     for folder in folders:
         for layout in LAYOUTS:
             if (folder / layout[0]).is_file() and (folder / layout[1]).is_dir():

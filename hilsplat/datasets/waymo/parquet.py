@@ -81,8 +81,8 @@ def lidar_frames(split: Path, segment: str) -> Iterator[frames.LidarFrame]:
     """Yield the labelled frames of a segment, in order."""
     poses = vehicle_poses(split, segment)
     calibration = "[LiDARCalibrationComponent]"
-    place, beams = f"{calibration}.extrinsic.transform", f"{calibration}.beam_inclination"
-    columns = [place, f"{beams}.min", f"{beams}.max", f"{beams}.values"]
+    extrinsic, beams = f"{calibration}.extrinsic.transform", f"{calibration}.beam_inclination"
+    columns = [extrinsic, f"{beams}.min", f"{beams}.max", f"{beams}.values"]
     lidar = read_component(split, "lidar_calibration", segment, columns, {LASER: frames.TOP})
     if len(lidar) != 1:
         raise SceneError(
@@ -106,7 +106,7 @@ def lidar_frames(split: Path, segment: str) -> Iterator[frames.LidarFrame]:
         with decoding(component_path(split, "lidar_calibration", segment)):
             values, lowest, highest = (lidar[0][f"{beams}.{name}"] for name in ("values", "min", "max"))
             inclinations = frames.beam_inclinations(values, lowest, highest, pixel_pose.shape[0])
-            in_vehicle = _matrix4(lidar[0][place])
+            in_vehicle = _matrix4(lidar[0][extrinsic])
         pixel_pose = pixel_pose.astype(np.float32)
         yield frames.LidarFrame(time, poses[time], in_vehicle, inclinations, pixel_pose, returns)
 
@@ -141,15 +141,18 @@ def _range_images(
 def _cameras(split: Path, segment: str) -> dict[int, frames.WaymoCamera]:
     base = "[CameraCalibrationComponent]"
     inner = [f"{base}.intrinsic.{name}" for name in INTRINSIC]
-    place, width, height = f"{base}.extrinsic.transform", f"{base}.width", f"{base}.height"
-    rows = read_component(split, "camera_calibration", segment, [CAMERA, *inner, place, width, height])
+    extrinsic, width, height = f"{base}.extrinsic.transform", f"{base}.width", f"{base}.height"
+    rows = read_component(split, "camera_calibration", segment, [CAMERA, *inner, extrinsic, width, height])
     with decoding(component_path(split, "camera_calibration", segment), expected="cameras 1 to 5 and lenses"):
         lenses = np.array([[row[name] for name in inner] for row in rows], dtype=np.float64)
         if not np.isfinite(lenses).all():
             raise ValueError("a lens is not finite")
         return {
             row[CAMERA]: frames.WaymoCamera(
-                frames.CAMERAS[row[CAMERA]], lens, _matrix4(row[place]), (int(row[height]), int(row[width]))
+                frames.CAMERAS[row[CAMERA]],
+                lens,
+                _matrix4(row[extrinsic]),
+                (int(row[height]), int(row[width])),
             )
             for row, lens in zip(rows, lenses, strict=True)
         }

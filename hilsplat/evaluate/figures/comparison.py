@@ -41,10 +41,10 @@ class Answerer:
     def masks(self, rows: Sequence[Shown], evaluate: EvaluateSettings) -> list[Bool[np.ndarray, "H W"]]:
         """Return the answer to each query in its view, at its level if it has one."""
         if self.method == "tree":
-            return [shown.tree_mask(self.scene) for shown in rows]
+            return [query_row.tree_mask(self.scene) for query_row in rows]
         rule, texts_of = rule_of(evaluate), defaultdict[str, list[str]](list)
-        for shown in rows:
-            texts_of[shown.view].append(shown.path[-1])
+        for query_row in rows:
+            texts_of[query_row.view].append(query_row.path[-1])
         maps = {  # one call for all texts of a view, because each call decodes the view's pixels
             view: dict(zip(texts, np.asarray(self.scene.field.relevancy(texts, view)), strict=True))
             for view, texts in texts_of.items()
@@ -115,10 +115,10 @@ def run_comparison(
         columns = []
         for variant in track(list(variants), "variants compared"):  # one in memory at a time
             answers = open_variant(folder, variant, opened, threads)
-            for method in [each for each in ("tree", "field") if each in answers.settings.methods]:
+            for method in [name for name in ("tree", "field") if name in answers.settings.methods]:
                 one = Answerer(row_name(variant, method, names), method, answers)
-                shown = one.masks(rows, evaluate), one.masks(several, evaluate), one.features(view)
-                columns.append(Column(one.title, *shown))
+                pictures = one.masks(rows, evaluate), one.masks(several, evaluate), one.features(view)
+                columns.append(Column(one.title, *pictures))
         save_with_pdf(draw_methods(scene, image, columns, rows), out)
         save_with_pdf(draw_views(scene, image, columns, several), Path(out).with_name("views.webp"))
         save_with_pdf(draw_features(scene, image, columns, view), Path(out).with_name("features.webp"))
@@ -127,8 +127,8 @@ def run_comparison(
 
 def open_variant(folder: Path, variant: str, opened: Opened, threads: int) -> LanguageScene:
     """Open a variant of a scene with its own evaluation settings; files in `opened` are not read again."""
-    found = FinishedScene.locate(folder, variant)
-    return LanguageScene.from_parts(found.parts, found.evaluate_settings(), threads=threads, opened=opened)
+    scene = FinishedScene.locate(folder, variant)
+    return LanguageScene.from_parts(scene.parts, scene.evaluate_settings(), threads=threads, opened=opened)
 
 
 def over_views(
@@ -142,19 +142,19 @@ def over_views(
         return []
     levelled = [row for row in rows if row.level in (Level.PART, Level.SUBPART)]
     chosen = levelled[0] if levelled else rows[0]
-    found = [chosen]
+    chosen_rows = [chosen]
     for view, truth_of in truths.items():
-        if view != chosen.view and len(found) < VIEWS:
+        if view != chosen.view and len(chosen_rows) < VIEWS:
             known = truth_of()
             for query in known.queries or known.categories:
                 if (query.text, query.level) == (chosen.text, chosen.level):
-                    found.append(Shown(chosen.text, chosen.path, chosen.level, view, query.truth))
+                    chosen_rows.append(Shown(chosen.text, chosen.path, chosen.level, view, query.truth))
     others = scene.views()
     for number in range(VIEWS):
         view = others[number * len(others) // VIEWS]
-        if len(found) < VIEWS and view not in {row.view for row in found}:
-            found.append(Shown(chosen.text, chosen.path, chosen.level, view, None))
-    return found
+        if len(chosen_rows) < VIEWS and view not in {row.view for row in chosen_rows}:
+            chosen_rows.append(Shown(chosen.text, chosen.path, chosen.level, view, None))
+    return chosen_rows
 
 
 def draw_methods(
@@ -173,11 +173,11 @@ def draw_methods(
         show(axes[0], paint_answer(photograph, None, row.truth), query + row.title)
         if not many:
             label_left(axes[0], row.text, row.level, letters=24)
-        for place, column in zip(axes[1:], columns, strict=True):
+        for axis, column in zip(axes[1:], columns, strict=True):
             mask = column.answers[number]
             score = row.score(mask)
             named = score if many else f"{column.title}\n{score}".rstrip()
-            show(place, paint_answer(photograph, mask, row.truth), named)
+            show(axis, paint_answer(photograph, mask, row.truth), named)
     if many:
         for axes, column in zip(grid[1:, 0], columns, strict=True):
             label_left(axes, column.title)
@@ -193,12 +193,12 @@ def draw_views(
     for number, row in enumerate(rows):
         photograph = image(row.view)
         show(grid[0][number], paint_answer(photograph, None, row.truth), row.view)
-        for place, column in enumerate(columns, start=1):
+        for position, column in enumerate(columns, start=1):
             mask = column.in_views[number]
-            show(grid[place][number], paint_answer(photograph, mask, row.truth), row.score(mask))
+            show(grid[position][number], paint_answer(photograph, mask, row.truth), row.score(mask))
     label_left(grid[0][0], "photograph")
-    for place, column in enumerate(columns, start=1):
-        label_left(grid[place][0], column.title)
+    for position, column in enumerate(columns, start=1):
+        label_left(grid[position][0], column.title)
     return figure
 
 

@@ -56,8 +56,8 @@ class Shown:
 
         A query without an annotated level is used as written.
         """
-        own = self.level is None or by_path
-        return answers.select(self.path if own else self.path[-1:], level=self.level, view=self.view)
+        is_exact = self.level is None or by_path
+        return answers.select(self.path if is_exact else self.path[-1:], level=self.level, view=self.view)
 
     @property
     def title(self) -> str:
@@ -115,24 +115,24 @@ def annotated_rows(truths: Mapping[str, Callable[[], ViewTruth]], settings: Figu
 
     Labels without levels form one group.
     """
-    found: dict[Level | None, dict[str, list[tuple[int, Shown]]]] = {}
+    by_level: dict[Level | None, dict[str, list[tuple[int, Shown]]]] = {}
     for view, truth_of in truths.items():
         truth = truth_of()
         for query in truth.queries or truth.categories:
-            shown = Shown(query.text, query.paths[0], query.level, view, query.truth)
+            row = Shown(query.text, query.paths[0], query.level, view, query.truth)
             area = int(np.count_nonzero(query.truth))
-            found.setdefault(query.level, {}).setdefault(query.text, []).append((area, shown))
+            by_level.setdefault(query.level, {}).setdefault(query.text, []).append((area, row))
     rows = []
     for level in (*LEVELS, None):
-        texts = found.get(level, {})
+        texts = by_level.get(level, {})
         for places in texts.values():
-            places.sort(key=lambda place: (-place[0], place[1].view))
+            places.sort(key=lambda candidate: (-candidate[0], candidate[1].view))
         ordered = sorted(texts, key=lambda text: (-texts[text][0][0], text))
         limit = settings.queries_per_level * (len(LEVELS) if level is None else 1)
         count = min(limit, len(ordered))
         for number in range(count):  # the largest, then evenly spaced down the list
             places = texts[ordered[number * len(ordered) // count]]
-            rows += [shown for _, shown in places[: settings.views]]
+            rows += [row for _, row in places[: settings.views]]
     return rows
 
 
@@ -215,14 +215,14 @@ def draw_queries(
         pictures.append(("field", field_mask))
         show(axes[0], paint_answer(image, None, row.truth), row.title)
         label_left(axes[0], row.text, level, letters=20)
-        for place, (name, mask) in zip(axes[1:], pictures, strict=False):
+        for axis, (name, mask) in zip(axes[1:], pictures, strict=False):
             score = row.score(mask)
-            show(place, paint_answer(image, mask, row.truth), f"{name}: {score}" if score else name)
+            show(axis, paint_answer(image, mask, row.truth), f"{name}: {score}" if score else name)
         if len(points):
             axes[len(pictures)].plot(*points[0], "o", **RING)
         low, high = float(relevancy.min()), float(relevancy.max())
-        for each in LEVELS:
-            top = float(relevancy[each.index].max())
-            picture = paint_relevancy(image, relevancy[each.index], low, high)
-            title = f"relevancy, {each.label}: {top:.2f}"
-            show(axes[columns - 3 + each.index], picture, title, bold=each is level)
+        for each_level in LEVELS:
+            top = float(relevancy[each_level.index].max())
+            picture = paint_relevancy(image, relevancy[each_level.index], low, high)
+            title = f"relevancy, {each_level.label}: {top:.2f}"
+            show(axes[columns - 3 + each_level.index], picture, title, bold=each_level is level)

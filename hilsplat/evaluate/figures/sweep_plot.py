@@ -43,10 +43,10 @@ def read_curves(table: Path) -> Curves:
         named = re.fullmatch(r"\w+ = ([0-9.]+)(?:, )?(.*)", row["method"])
         departures = (row.get("protocol") or "").partition(" (")[2].removesuffix(")")
         for column in COLUMNS:
-            if named and (shown := re.match(r"[-0-9.]+", row.get(column) or "")):
+            if named and (number := re.match(r"[-0-9.]+", row.get(column) or "")):
                 curve = ", ".join(filter(None, (column, named[2], row.get("masks"), departures)))
                 curves = panels.setdefault(f"{row['kind']}: {row['data']}", {})
-                curves.setdefault(curve, []).append((float(named[1]), float(shown[0])))
+                curves.setdefault(curve, []).append((float(named[1]), float(number[0])))
     return panels
 
 

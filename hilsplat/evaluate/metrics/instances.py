@@ -66,11 +66,11 @@ def match_instances(
     ids, instance_of_point = np.unique(truth, return_inverse=True)
     sizes = np.bincount(instance_of_point, minlength=len(ids))
     points = masks.sum(axis=1)
-    kept = np.flatnonzero((points >= min_points) & np.isin(classes, class_ids))
+    usable = np.flatnonzero((points >= min_points) & np.isin(classes, class_ids))
     # [kept prediction, true instance]: points in common
     common = np.array(
-        [np.bincount(instance_of_point[masks[row]], minlength=len(ids)) for row in kept], dtype=np.int64
-    ).reshape(len(kept), len(ids))
+        [np.bincount(instance_of_point[masks[row]], minlength=len(ids)) for row in usable], dtype=np.int64
+    ).reshape(len(usable), len(ids))
     of_class = ids // CLASS_STRIDE
     void = ~np.isin(of_class, class_ids)
 
@@ -78,21 +78,21 @@ def match_instances(
     misses = np.zeros((len(class_ids), len(OVERLAPS)), dtype=np.int64)
     has_truth = np.zeros(len(class_ids), dtype=bool)
     for class_index, class_id in enumerate(class_ids):
-        own = np.flatnonzero(of_class == class_id)
-        large = sizes[own] >= min_points
-        predictions = np.flatnonzero(classes[kept] == class_id)
+        members = np.flatnonzero(of_class == class_id)
+        large = sizes[members] >= min_points
+        predictions = np.flatnonzero(classes[usable] == class_id)
         has_truth[class_index] = large.any()
-        shared = common[np.ix_(predictions, own)]
-        area = points[kept[predictions]]
-        overlap = shared / (area[:, None] + sizes[own][None, :] - shared)
+        shared = common[np.ix_(predictions, members)]
+        area = points[usable[predictions]]
+        overlap = shared / (area[:, None] + sizes[members][None, :] - shared)
         ignored = (common[predictions][:, void].sum(axis=1) + shared[:, ~large].sum(axis=1)) / area
-        confidence = confidences[kept[predictions]].astype(float)
+        confidence = confidences[usable[predictions]].astype(float)
         for overlap_index, threshold in enumerate(OVERLAPS):
             scored, missed = _matches(overlap > threshold, large, ignored > threshold, confidence)
             misses[class_index, overlap_index] = missed
-            entries += [(class_index, overlap_index, *each) for each in scored]
-    found = np.array(entries, dtype="i8, i8, f8, ?")
-    return InstanceMatches(found["f0"], found["f1"], found["f2"], found["f3"], misses, has_truth)
+            entries += [(class_index, overlap_index, *entry) for entry in scored]
+    table = np.array(entries, dtype="i8, i8, f8, ?")
+    return InstanceMatches(table["f0"], table["f1"], table["f2"], table["f3"], misses, has_truth)
 
 
 def _matches(

@@ -163,12 +163,12 @@ def relevancy_mask(
     if level is not None:
         return mask_of(level)
     if rule.level_rule == "max":
-        return mask_of(max(rule.levels, key=lambda each: (smoothed.mixed[each.index].max(), each)))
-    masks = {each: mask_of(each) for each in rule.levels}
+        return mask_of(max(rule.levels, key=lambda choice: (smoothed.mixed[choice.index].max(), choice)))
+    masks = {choice: mask_of(choice) for choice in rule.levels}
 
     def mean_in_mask(level: Level) -> float:
         if not masks[level].any():
             return np.inf if rule.empty_wins else -np.inf
         return float(smoothed.mixed[level.index][masks[level]].mean())
 
-    return masks[max(rule.levels, key=lambda each: (mean_in_mask(each), each))]
+    return masks[max(rule.levels, key=lambda choice: (mean_in_mask(choice), choice))]

@@ -28,14 +28,14 @@ def relevancy_of(
         ArtifactError: a relevancy is NaN.
     """
     render = scene.field.relevancy if method == "field" else scene.node_relevancy_map
-    found = np.asarray(render(tuple(texts), view), dtype=np.float32)
-    if np.isnan(found).any():
+    relevancy = np.asarray(render(tuple(texts), view), dtype=np.float32)
+    if np.isnan(relevancy).any():
         raise ArtifactError(
-            f"the relevancy of view {view} is NaN at {np.isnan(found).sum()} pixels",
+            f"the relevancy of view {view} is NaN at {np.isnan(relevancy).sum()} pixels",
             expected="a finite relevancy everywhere",
             fix="check the scene's field and CLIP vectors for NaN",
         )
-    return found
+    return relevancy
 
 
 def peaks_of_answer(

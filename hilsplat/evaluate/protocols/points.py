@@ -80,8 +80,8 @@ def gaussians_of_points(
     from scipy.spatial import cKDTree  # importing takes 0.2 s and is needed only for points
 
     tree = cKDTree(gaussians.means[opaque].astype(float))
-    _, place = tree.query(points.astype(float), workers=threads)
-    return opaque[place].astype(np.int64), np.ones(len(points), dtype=bool)
+    _, nearest = tree.query(points.astype(float), workers=threads)
+    return opaque[nearest].astype(np.int64), np.ones(len(points), dtype=bool)
 
 
 def classify(features: Float[np.ndarray, "P D"], texts: Float[np.ndarray, "K D"]) -> Int32[np.ndarray, " P"]:
@@ -134,13 +134,13 @@ def pooled_points(card: ProtocolCard, rows: Iterable[Any], classes: ClassSet) ->
     The counts are exact up to 10**6 points per class and scene, because files keep six decimals.
     """
     hits, truth, union = np.zeros((3, len(classes)), dtype=np.int64)
-    place = {text: row for row, text in enumerate(classes.texts)}
+    row_of_text = {text: row for row, text in enumerate(classes.texts)}
     for row in rows:
         if row.metric == "class_iou":
-            union[place[row.query]] += row.n
-            hits[place[row.query]] += round(row.value * row.n)
+            union[row_of_text[row.query]] += row.n
+            hits[row_of_text[row.query]] += round(row.value * row.n)
         elif row.metric == "class_accuracy":
-            truth[place[row.query]] += row.n
+            truth[row_of_text[row.query]] += row.n
     counts = point_classes.ClassCounts(hits, truth, union - truth + hits)
     values = {metric: MEANS[metric](counts) for metric in card.metrics if metric in MEANS}
     if "miou_head" in card.metrics:
@@ -197,9 +197,9 @@ def node_instances(
     tree = scene.tree
     nodes = tree.nodes_of(LEVEL)
     cosines = tree.clip[nodes].astype(np.float32) @ scene.clip.embed_texts(list(classes.texts)).T
-    own = tree.node_of_gaussian[gaussian, LEVEL.index]
+    node = tree.node_of_gaussian[gaussian, LEVEL.index]
     class_ids = np.array(classes.ids)[cosines.argmax(axis=1)]
-    return instance_scan(truth, classes, own[None] == nodes[:, None], class_ids, cosines.max(axis=1))
+    return instance_scan(truth, classes, node[None] == nodes[:, None], class_ids, cosines.max(axis=1))
 
 
 def instance_scan(

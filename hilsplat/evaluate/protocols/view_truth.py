@@ -132,9 +132,9 @@ class ViewTruth:
         The answer to "leg" covers chair and table legs; the chair's part excludes the annotated table.
         """
         parent = path[:-1]
-        alike = [each for each in self.regions if len(each) == len(path) > 1 and each[-1] == path[-1]]
-        parents = {each[:-1] for each in alike} - {parent}
-        others = [self.regions[each] for each in parents if each in self.regions]
+        alike = [other for other in self.regions if len(other) == len(path) > 1 and other[-1] == path[-1]]
+        parents = {other[:-1] for other in alike} - {parent}
+        others = [self.regions[other] for other in parents if other in self.regions]
         if not others or parent not in self.regions:
             return answer
         return answer & ~(np.any(others, axis=0) & ~self.regions[parent])

@@ -64,14 +64,14 @@ def label_of(
     """
     if method == "truth":
         return card.labelled(of_truth)
-    own = MAP_RULE if method == "field" else (*MAPS_OF_NODES, *NODES)
-    return card.labelled([*departures(settings, (*own, *RELEVANCY)), *of_truth])
+    of_method = MAP_RULE if method == "field" else (*MAPS_OF_NODES, *NODES)
+    return card.labelled([*departures(settings, (*of_method, *RELEVANCY)), *of_truth])
 
 
 def departures(settings: EvaluateSettings, names: Sequence[str]) -> list[str]:
     """Return descriptions of those settings whose values the cards do not state."""
-    found = ((getattr(settings, name), *cards.STATED[name]) for name in names)
-    return [describe(value) for value, stated, describe in found if value != stated]
+    values = ((getattr(settings, name), *cards.STATED[name]) for name in names)
+    return [describe(value) for value, stated, describe in values if value != stated]
 
 
 def given_key(method: str, query: Query) -> tuple[Any, ...]:
@@ -104,10 +104,10 @@ def measure_view(
         nodes = relevancy_of(scene, "tree", texts, view) if needs_nodes else None
         for row, category in enumerate(chunk):
             queries = [query for query in truth.queries if query.text == category.text]
-            for method, found in (("field", fields), ("tree", nodes)):
-                if found is None or method not in settings.methods:
+            for method, maps in (("field", fields), ("tree", nodes)):
+                if maps is None or method not in settings.methods:
                     continue
-                mask, smooth = None, smoothing_of(found[row])
+                mask, smooth = None, smoothing_of(maps[row])
                 if category.truth.any():
                     smoothed = smooth(rule)
                     flat, answer = cards.LERF_LANGSPLAT, partial(relevancy_mask, smoothed, rule=rule)
@@ -115,8 +115,8 @@ def measure_view(
                         flat, answer = cards.TREE_NODES, partial(answers.of_nodes, (category.text,))
                         yield from answers.scene_wide_rows(queries)
                         mask = answer(None)
-                    yield from answers.rows(method, flat, found[row], smoothed, answer, category, queries)
-                yield from flat_views.add(method, found[row], smooth, mask, category, queries)
+                    yield from answers.rows(method, flat, maps[row], smoothed, answer, category, queries)
+                yield from flat_views.add(method, maps[row], smooth, mask, category, queries)
             if nodes is not None and "tree-path" in settings.methods:
                 yield from answers.path_rows(nodes[row], queries)
     yield from flat_views.finish()

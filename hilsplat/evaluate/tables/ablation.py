@@ -64,8 +64,8 @@ def step_cells(
     pairs = ["scene", "seed"] if set(part["seed"]) == set(others["seed"]) else ["scene"]
     cells = {"step from": Cell(measured.row_name(before, "field", labels))}
     for name, metric in (("mIoU step", "iou"), ("HC step", "hc_containment")):
-        own, other = (measured.level_averages(rows, metric, pairs) for rows in (part, others))
-        cells[name] = mean_difference(list(100 * (own - other).dropna()))
+        averages, other = (measured.level_averages(rows, metric, pairs) for rows in (part, others))
+        cells[name] = mean_difference(list(100 * (averages - other).dropna()))
     return cells
 
 
@@ -74,8 +74,8 @@ def mean_difference(differences: list[float]) -> Cell:
     if not differences:
         return Cell()
     mean = statistics.fmean(differences)
-    shown = f"{round(mean, 1) + 0.0:+.1f}"  # never "-0.0"
+    text = f"{round(mean, 1) + 0.0:+.1f}"  # never "-0.0"
     if len(differences) == 1:
-        return Cell(shown, mean)
+        return Cell(text, mean)
     error = statistics.stdev(differences) / math.sqrt(len(differences))
-    return Cell(f"{shown} ± {error:.1f}", mean, spread=error)
+    return Cell(f"{text} ± {error:.1f}", mean, spread=error)

@@ -24,7 +24,9 @@ def cost_blocks(kind: TableKind, sources: Sources) -> list[Block]:
     for data, answers in by_answer(sources).items():
         rows, scenes = [], {cost.scene for *_, costs in answers for cost in costs}
         for variant, method, costs in answers:
-            of_scenes = {cost.scene: [each for each in costs if each.scene == cost.scene] for cost in costs}
+            of_scenes = {
+                cost.scene: [other for other in costs if other.scene == cost.scene] for cost in costs
+            }
             times = {scene: time_cells(of_scene, method) for scene, of_scene in of_scenes.items()}
             queries = {f"{scene} query (s)": cells["Query (s)"] for scene, cells in times.items()}
             names = {"Method": row_name(variant, method, sources.labels)}

@@ -61,9 +61,9 @@ def csv_rows(table: Table) -> tuple[list[str], list[list[str]]]:
             values.setdefault(key, column)
     rows = []
     for block in table.blocks:
-        own = by_key(block)
+        rows_by_key = by_key(block)
         for row in block.rows:
-            cells = [row.cell(own[key]) if key in own else Cell() for key in values]
+            cells = [row.cell(rows_by_key[key]) if key in rows_by_key else Cell() for key in values]
             notes = " ".join(dict.fromkeys(cell.note for cell in cells if cell.note))
             texts = [_csv_value(cell, block.kind) for cell in cells]
             rows.append([block.kind, block.data, *(row.names.get(n, "") for n in names), *texts, notes])
@@ -101,9 +101,9 @@ def as_markdown(table: Table) -> str:
         header = " | ".join(map(plain_markdown, [*names, *values]))
         lines += [f"## {plain_markdown(block.title)}", "", f"| {header} |"]
         lines.append("|" + "---|" * len(names) + "---:|" * len(values))
-        for texts, shown in shown_rows(block, notes):
+        for texts, ranked in shown_rows(block, notes):
             cells = [plain_markdown(text) for text in texts]
-            for text, rank, note in shown:
+            for text, rank, note in ranked:
                 raised = f"<sup>{note}</sup>" if note else ""
                 cells.append(marks[rank].format(plain_markdown(text)) + raised)
             lines.append("| " + " | ".join(cells) + " |")
@@ -141,9 +141,9 @@ def as_latex(table: Table) -> str:
         lines += [r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"]
         lines += [rf"\begin{{tabular}}{{{'l' * len(names)}{'r' * len(values)}}}", r"\toprule"]
         lines += [latex_row(list(map(latex_text, [*names, *values]))), r"\midrule"]
-        for texts, shown in shown_rows(block, notes):
+        for texts, ranked in shown_rows(block, notes):
             cells = [latex_text(text) for text in texts]
-            for text, rank, note in shown:
+            for text, rank, note in ranked:
                 raised = rf"\textsuperscript{{{note}}}" if note else ""
                 cells.append(marks[rank] % latex_text(text) + raised)
             lines.append(latex_row(cells))
@@ -164,9 +164,9 @@ def as_html(table: Table) -> str:
         lines += [f'<th class="name">{html.escape(name)}</th>' for name in block.names()]
         lines += [f"<th>{html.escape(column)}</th>" for column in block.filled_columns()]
         lines += ["</tr></thead>", "<tbody>"]
-        for texts, shown in shown_rows(block, notes):
+        for texts, ranked in shown_rows(block, notes):
             cells = [f'<td class="name">{html.escape(text)}</td>' for text in texts]
-            for text, rank, note in shown:
+            for text, rank, note in ranked:
                 mark = f' class="rank{rank}"' if rank else ""
                 raised = f"<sup>{note}</sup>" if note else ""
                 cells.append(f"<td{mark}>{html.escape(text)}{raised}</td>")

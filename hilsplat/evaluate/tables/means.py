@@ -46,7 +46,7 @@ def mean_rows(scores: "pd.DataFrame", labels: Mapping[str, str]) -> list[list[st
         scores: rows of one scene (`read_scores`).
         labels: variant -> its name; a variant without one keeps its own.
     """
-    found, of_several = [], scores["dataset"].nunique() > 1
+    entries, of_several = [], scores["dataset"].nunique() > 1
     keys = ["variant", "method", "dataset", "protocol"]
     for (variant, method, dataset, protocol), part in scores.groupby(keys, sort=True):
         means = _means(protocol, part)
@@ -56,8 +56,8 @@ def mean_rows(scores: "pd.DataFrame", labels: Mapping[str, str]) -> list[list[st
         row = {column: "" if cell.value is None else cell.text for column, cell in means.items()}
         row |= {"method": row_name(variant, method, labels), "protocol": protocol}
         row |= {"queries": str(queries or ""), "labels": dataset if of_several else ""}
-        found.append((row_place(variant, method, labels), dataset, protocol, row))
-    rows = [row for *_, row in sorted(found, key=lambda each: each[:3])]
+        entries.append((row_place(variant, method, labels), dataset, protocol, row))
+    rows = [row for *_, row in sorted(entries, key=lambda entry: entry[:3])]
     columns = [column for column in COLUMNS if any(row.get(column) for row in rows)]
     return [columns, *([row.get(column, "") for column in columns] for row in rows)] if rows else []
 
@@ -68,7 +68,7 @@ def _means(protocol: str, part: "pd.DataFrame") -> dict[str, Cell]:
     means = metric_means(card, part)
 
     def cell(metrics: Sequence[str]) -> Cell:
-        return Cell.percent(means.get(next((each for each in metrics if each in card.metrics), ""), math.nan))
+        return Cell.percent(means.get(next((name for name in metrics if name in card.metrics), ""), math.nan))
 
     cells = {column: cell(metrics) for column, metrics in METRICS.items()}
     if card.averaging == "levels":
@@ -89,7 +89,7 @@ def metric_means(card: ProtocolCard, part: "pd.DataFrame") -> dict[str, float]:
         return pooled_points(card, part.itertuples(), class_set(card.classes)[1])
     means: dict[str, float] = {}
     measured = part["metric"].unique()
-    for metric in (each for each in card.metrics if each in measured and not each.startswith("class_")):
+    for metric in (name for name in card.metrics if name in measured and not name.startswith("class_")):
         if part.loc[part["metric"] == metric, "level"].any():
             of_levels = level_values(part, metric)
             means[metric] = sum(of_levels.values()) / len(of_levels)

@@ -74,9 +74,9 @@ def measured_blocks(
                 is_ranked = method != "truth" and not made_from_truth(masks)
                 group = (label if kind.ranked_by_protocol else "") if is_ranked else None
                 order = row_place(variant, method, sources.labels)
-                place = made_from_truth(masks), _protocol_place(label), *order, masks, label
+                sort_key = made_from_truth(masks), _protocol_place(label), *order, masks, label
                 scenes = part["scene"], selected["scene"], kind.averaged
-                rows.append((place, row_of(names, cells, str(data), *scenes, group)))
+                rows.append((sort_key, row_of(names, cells, str(data), *scenes, group)))
             if rows:
                 distinct = without_repeats([row for _, row in sorted(rows, key=lambda pair: pair[0])])
                 columns = kind.columns_of(selected["scene"])
@@ -88,7 +88,7 @@ def of_comparable_seeds(part: "pd.DataFrame") -> "pd.DataFrame":
     """Return a row's scores without seeds that lack scenes, whose means are of something else."""
     scenes = {seed: set(of_seed["scene"]) for seed, of_seed in part.groupby("seed", sort=True)}
     most = max(scenes.values(), key=len)
-    return part[part["seed"].isin([seed for seed, found in scenes.items() if found == most])]
+    return part[part["seed"].isin([seed for seed, count in scenes.items() if count == most])]
 
 
 def _row_names(
@@ -130,8 +130,8 @@ def row_of(
     number = len(every & set(scenes))
     if number == len(every):
         return Row(names, cells, group)
-    own = tuple(f"{scene} " for scene in set(scenes))
-    averages = tuple(column for column in cells if not column.startswith(own))
+    prefixes = tuple(f"{scene} " for scene in set(scenes))
+    averages = tuple(column for column in cells if not column.startswith(prefixes))
     return Row({**names, "Scenes": f"{number} of {len(every)}"}, cells, group, averages)
 
 
@@ -170,8 +170,8 @@ def without_repeats(rows: Sequence[Row]) -> tuple[Row, ...]:
 def row_place(variant: str, method: str, labels: Mapping[str, str]) -> tuple[int, str, int]:
     """Return the sort key of a row: the default variant, then variants in label order, then others."""
     order, methods = ["default", *labels], list(ANSWERS)
-    place = order.index(variant) if variant in order else len(order)
-    return place, variant, methods.index(method) if method in methods else len(methods)
+    rank = order.index(variant) if variant in order else len(order)
+    return rank, variant, methods.index(method) if method in methods else len(methods)
 
 
 def row_name(variant: str, method: str, labels: Mapping[str, str]) -> str:

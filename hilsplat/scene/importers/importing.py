@@ -175,8 +175,8 @@ def misfit_notes(views: Sequence[KnownView], points: Points, what: str) -> list[
     others = np.roll(colours, len(colours) // 2, axis=0)
     problem = f"only {len(pixels)} of {len(xyz)} are inside {len(rows)} images"
     if len(pixels) >= MIN_INSIDE:
-        own, other = (np.median(np.abs(pixels - each).mean(axis=1)) for each in (colours, others))
-        if own < MAX_MISFIT * other or not np.ptp(rgb, axis=0).any():
+        misfit, other = (np.median(np.abs(pixels - expected).mean(axis=1)) for expected in (colours, others))
+        if misfit < MAX_MISFIT * other or not np.ptp(rgb, axis=0).any():
             return []
         problem = "their colours are not those of their pixels"
     return [f"the {what} don't match the images: {problem}. Are poses and {what} in the same coordinates?"]

@@ -219,12 +219,12 @@ def find_images(root: Path, names: Sequence[str]) -> dict[str, Path | None]:
         paths = [] if is_outside(name) else [base / f"{plain}{end}" for base in bases for end in ends]
         images[name] = next((path for path in paths if path.is_file()), None)
     if missing := [name for name, image in images.items() if image is None]:
-        found = {image: image.relative_to(root).as_posix() for image in images.values() if image is not None}
-        below = {path.relative_to(root).as_posix(): path for path in used_images(root) if path not in found}
+        listed = {image: image.relative_to(root).as_posix() for image in images.values() if image is not None}
+        below = {path.relative_to(root).as_posix(): path for path in used_images(root) if path not in listed}
         homes: dict[tuple[str, ...], set[tuple[str, ...]]] = {}
         for name, image in images.items():
             if image is not None:
-                homes.setdefault(name_parts(name)[:-1], set()).add(name_parts(found[image])[:-1])
+                homes.setdefault(name_parts(name)[:-1], set()).add(name_parts(listed[image])[:-1])
         for name, match in match_names(missing, below).items():
             home = homes.get(name_parts(name)[:-1])
             if match is None:

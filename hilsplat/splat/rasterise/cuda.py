@@ -34,7 +34,7 @@ class CardCamera(NamedTuple):
         """Copy a camera to the device."""
         arrays = camera.cam_from_world[None], camera.K[None], camera.centre
         return CardCamera(
-            camera.size_hw, *(torch.tensor(each, dtype=torch.float32, device=DEVICE) for each in arrays)
+            camera.size_hw, *(torch.tensor(array, dtype=torch.float32, device=DEVICE) for array in arrays)
         )
 
 
@@ -56,7 +56,7 @@ class Entries(NamedTuple):
     def on_host(self) -> csr_matrix:
         """Return the weights as a matrix (pixels x Gaussians)."""
         weights, columns, start = (
-            each.cpu().numpy() for each in (self.weight, self.gaussian.int(), self.start)
+            tensor.cpu().numpy() for tensor in (self.weight, self.gaussian.int(), self.start)
         )
         return weight_matrix(weights, columns, start, self.num_gaussians)
 
@@ -143,8 +143,8 @@ def pixel_weights(g: dict[str, Tensor], camera: CardCamera, min_weight: float) -
     alpha = (g["opacity_logits"].sigmoid()[who] * torch.exp(-power)).clamp_max(MAX_ALPHA).double()
     count = torch.bincount(pixel, minlength=height * width)
     weight = alpha * _light_before(alpha, count)
-    kept = (weight >= min_weight) & (weight > 0)
-    pixel, who, weight = pixel[kept], who[kept], weight[kept]
+    is_used = (weight >= min_weight) & (weight > 0)
+    pixel, who, weight = pixel[is_used], who[is_used], weight[is_used]
     order = torch.argsort(pixel * len(g["means"]) + who)
     count = torch.bincount(pixel, minlength=height * width)
     return Entries(starts_of(count), who[order], weight[order].float(), len(g["means"]))

@@ -6,7 +6,7 @@ import pytest
 
 from hilsplat.query.scene_state import SceneState
 from hilsplat.viewer.viewer_scene import ViewerScene
-from hilsplat.web.scene_thread import MOST_OPEN
+from hilsplat.web.scene_thread import MAX_OPEN
 from tests.unit.artifact_changes import write_again
 from tests.unit.viewer.conftest import browsing
 
@@ -56,7 +56,7 @@ def test_a_scene_that_is_not_listed_or_has_no_gaussians_is_refused(client, name)
 
 
 def test_a_scene_that_was_closed_is_opened_again_in_the_same_state(client, three_scenes):
-    names = [f"photos/copy-{number}" for number in range(MOST_OPEN + 1)]
+    names = [f"photos/copy-{number}" for number in range(MAX_OPEN + 1)]
     for name in names:
         shutil.copytree(three_scenes / "photos/other", three_scenes / name)
     states = [client.get("/api/scene", params={"scene": name}).json()["of"] for name in names]
