@@ -284,5 +284,5 @@ def _as_mask(array: np.ndarray, where: str) -> Bool[np.ndarray, "h w"]:
 
 
 def _text(path: Path) -> str:
-    with foreign(path, ArtifactError, fix="write it as UTF-8 text"):
+    with foreign(path, ArtifactError, fix="write it, as UTF-8 text"):
         return path.read_text(encoding="utf-8-sig")

@@ -1,6 +1,5 @@
 """Server of the annotation page: access, versions of saved files, shapes, proposals, transfer to views."""
 
-import asyncio
 import errno
 import json
 import os
@@ -9,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from anyio.from_thread import start_blocking_portal
 from starlette.testclient import TestClient
 
 from hilsplat.annotate.app import Annotator, OpenedScene
@@ -125,7 +125,8 @@ def test_a_page_that_is_closed_while_it_sends_leaves_no_traceback(desk, labels):
         sent.append(message["type"])
 
     sent: list[str] = []
-    asyncio.run(app(scope, receive, send))
+    with start_blocking_portal() as portal:  # in a thread: browser tests leave a loop in this one
+        portal.call(app, scope, receive, send)
     assert sent == ["http.response.start", "http.response.body"]
 
 

@@ -254,7 +254,7 @@ def test_instances_in_scannets_format_are_matched(data_set, tmp_path):
         ("instances.txt", "only-a-mask.txt\n", "line 1 of .* does not describe an instance"),
         ("instances.txt", "nyu40.txt 2 nan\n", "line 1 of .* does not describe an instance"),
         ("instances.txt", f"nyu40.txt {10**30} 0.5\n", "line 1 of .* does not describe an instance"),
-        ("instances.txt", "no.txt 2 0.9\n", "no.txt cannot be read"),
+        ("instances.txt", "no.txt 2 0.9\n", "no.txt is missing"),
         ("other.txt", "1\n", "has no point labels"),
     ],
 )

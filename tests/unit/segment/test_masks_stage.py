@@ -121,7 +121,7 @@ def test_discs_nest_in_the_tree_and_the_overview_shows_them(scene, tmp_path, set
     # four chains of three discs: four rows of three thumbnails
     trees = read_image(tmp_path / "masks_tree.png")
     assert trees.shape == (4 * (THUMB_PX + 6) + 6, 3 * 2 * THUMB_PX, 3)
-    with pytest.raises(ArtifactError, match=r"has no view 7\.png"):
+    with pytest.raises(ArtifactError, match=r"has no view '7\.png'"):
         masks_overview(scene, masks_folder, tmp_path / "masks.png", view="7.png")
 
 
