@@ -132,6 +132,8 @@ def save_figure(figure: Figure, out: Path) -> None:
 
 def save_with_pdf(figure: Figure, out: Path) -> None:
     """Write a PNG or WebP and, beside it, a PDF; identical figures produce identical bytes."""
+    for part in figure.subfigs:  # by chance, the layout puts a corner of its background at 0 or at -0
+        part.patch.set_visible(False)
     save_figure(figure, out)
     with atomic_path(Path(out).with_suffix(".pdf")) as temporary:
         about = {"Creator": None, "Producer": None, "CreationDate": None}
