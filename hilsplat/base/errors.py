@@ -185,7 +185,7 @@ class MisalignedArtifactError(ArtifactError):
     """Two artifacts do not belong together: their rows, sizes or digests differ."""
 
 
-OF_CONTENT = (ArtifactError, ImageError, ModelError, SceneError)
+OF_CONTENT = (ArtifactError, ImageError, ModelError, SceneError)  # errors about a file's content
 
 
 class DiskSpaceError(HilsplatError):

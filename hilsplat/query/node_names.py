@@ -116,11 +116,9 @@ class NodeNaming:
         if made_for != (tree_digest(semantic_tree), sha256_of_file(clip_folder / artifacts.INDEX)):
             return None
         rows = artifacts.read_json(artifacts.sealed(folder, "names.json"))
-        fix, expected = (
-            partial(artifacts.rebuild_command, folder),
-            f"{index['nodes']} names, and vectors (W, C)",
-        )
+        fix = partial(artifacts.rebuild_command, folder)
         what = f"{folder / 'names.json'} or rivals.npy"
+        expected = f"{index['nodes']} names, and vectors (W, C)"
         with foreign(what, ArtifactError, problem="is damaged", expected=expected, fix=fix):
             names = tuple(checked_name(str(row["name"])) for row in rows)
             surfaces = tuple(bool(row["surface"]) for row in rows)

@@ -591,14 +591,14 @@ def without_effect(plan: Plan, given: Mapping[str, Any]) -> list[str]:
     """Return a line for each setting of a configuration's layer that `overrides` replace in all scenes."""
     scopes, lines = list(dict.fromkeys(plan.scopes(row) for row in plan.scenes)), []
     for section in (name for name in SECTIONS if given.get(name)):
-        own = getattr(plan.run, section)
-        used = [getattr(plan.run.stages(scopes=each), section) for each in scopes]
+        unreplaced = getattr(plan.run, section)
+        used = [getattr(plan.run.stages(scopes=keys), section) for keys in scopes]
         for name in given[section]:
-            if all(getattr(each, name, None) != getattr(own, name) for each in used):
-                places = [each for each in reversed(scopes[0]) if section in plan.run.overrides[each]]
-                place = max(places, key=lambda each: name in plan.run.overrides[each][section])
-                key = f"{section}.{name}"
-                lines.append(f"{key} has no effect, because overrides.{place}.{key} replaces it")
+            if all(getattr(values, name, None) != getattr(unreplaced, name, None) for values in used):
+                replacing = [key for key in reversed(scopes[0]) if section in plan.run.overrides[key]]
+                scope = max(replacing, key=lambda key: name in plan.run.overrides[key][section])
+                setting = f"{section}.{name}"
+                lines.append(f"{setting} has no effect, because overrides.{scope}.{setting} replaces it")
     return lines
 
 

@@ -223,7 +223,7 @@ def _edited() -> dict[str, dict[str, Any]]:
     """Return the settings of the project's config.yaml that differ from the installed one."""
     own, installed = read_config(project_path(CONFIG)), read_config(INSTALLED / CONFIG)
     return {
-        section: {name: each for name, each in values.items() if installed.get(section, {}).get(name) != each}
+        section: {key: new for key, new in values.items() if installed.get(section, {}).get(key) != new}
         for section, values in own.items()
         if section in SECTIONS and values
     }
