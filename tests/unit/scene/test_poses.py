@@ -150,7 +150,9 @@ def found(registered, models):
     return {"images": 10, "registered": registered, "models": models, "warnings": [], "views": views}
 
 
-def test_too_few_registered_photographs_are_refused_with_all_reasons():
+def test_too_few_registered_photographs_are_refused_with_all_reasons(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # a configuration that was run here would be in the advice
+
     def check(registered, models):
         settings = PosesSettings(min_registered_share=0.7)
         out, report = Path("results/photos/test/scene"), found(registered, models)
