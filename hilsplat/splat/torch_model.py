@@ -113,7 +113,7 @@ class TorchModel(Model):
         for name in FIELDS:
             adam(
                 [self.parameters[name]],
-                [gradients[name]],
+                [gradients[name].contiguous()],  # fused Adam ignores strides on a CPU
                 [self.first[name]],
                 [self.second[name]],
                 [],

@@ -280,6 +280,15 @@ def test_the_self_test_passes_with_gsplats_reference():
     assert parity.disagreement("cpu", "cuda") is None
 
 
+def test_the_layout_of_gradients_does_not_matter(monkeypatch):
+    def transposed(*arguments: object) -> list[torch.Tensor]:
+        return [values.mT.contiguous().mT if values.ndim > 1 else values for values in grad(*arguments)]
+
+    grad = torch.autograd.grad
+    monkeypatch.setattr(torch.autograd, "grad", transposed)
+    assert parity.disagreement("cpu", "cuda") is None
+
+
 @pytest.mark.parametrize(
     ("module", "name", "value", "what"),
     [
