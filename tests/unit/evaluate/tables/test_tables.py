@@ -17,9 +17,9 @@ from hilsplat.datasets.classes import SCANNET200_INSTANCES
 from hilsplat.evaluate.metrics.instances import match_instances
 from hilsplat.evaluate.protocols.cards import INSTANCES, LERF_MASK, OVS_ARGMAX
 from hilsplat.evaluate.scores import write_instances, write_scores
-from hilsplat.evaluate.tables.ablation import mean_difference
 from hilsplat.evaluate.tables.build import TABLES, published_values, run_table
 from hilsplat.evaluate.tables.formats import latex_text
+from hilsplat.evaluate.tables.image_tables import mean_difference
 from hilsplat.evaluate.tables.measured import table_value
 from hilsplat.evaluate.tables.point_tables import bootstrap_mean
 from hilsplat.evaluate.tables.rows import Block, Cell, Row, read_published
