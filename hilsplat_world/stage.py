@@ -18,8 +18,7 @@ from hilsplat.datasets.hierarchy import write_hierarchy
 from hilsplat_world.lidar import scan_street
 from hilsplat_world.objects.catalogue import GENERATOR_VERSION
 from hilsplat_world.render import render_and_label
-from hilsplat_world.scenes.kinds import KINDS, build_scene, scene_cameras
-from hilsplat_world.seeds import TRAINING_SEEDS, split_of_seed
+from hilsplat_world.scenes.kinds import KINDS, TRAINING_SEEDS, build_scene, scene_cameras, split_of_seed
 from hilsplat_world.settings import WorldSettings
 from hilsplat_world.truth import MIN_SUBPART_AREA, annotated_nodes, write_mesh
 

@@ -14,14 +14,21 @@ from hilsplat.base.files import regular
 FORMULA = r"(?='*(?![-+][\d.]+(e[-+]?\d+)?( ± [\d.]+)?\Z)[=+\-@\t\r\n](?s:.))"
 """Beginning of a text, but not of a number, that a spreadsheet would run, perhaps after our apostrophes."""
 
+FORMULA_BEGINS = tuple("'=+-@\t\r\n")  # first letters of such texts
+
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Write a header and rows with an apostrophe before formulas; identical rows produce identical bytes."""
     lines: list[str] = []
     writer = csv.writer(SimpleNamespace(write=lines.append))  # its lines end in CRLF; else it quotes no CR
     for row in (columns, *rows):
-        writer.writerow([re.sub(f"^{FORMULA}", "'", cell) if isinstance(cell, str) else cell for cell in row])
+        writer.writerow([_inert(cell) if isinstance(cell, str) else cell for cell in row])
     write_text(path, "".join(line.removesuffix("\r\n") + "\n" for line in lines))
+
+
+def _inert(cell: str) -> str:
+    """Put an apostrophe before a formula; most cells begin with another letter, and matching takes long."""
+    return re.sub(f"^{FORMULA}", "'", cell) if cell.startswith(FORMULA_BEGINS) else cell
 
 
 def read_csv(path: Path, columns: Sequence[str] | None, fix: str) -> list[dict[str, str]]:
@@ -32,7 +39,10 @@ def read_csv(path: Path, columns: Sequence[str] | None, fix: str) -> list[dict[s
     with foreign(path, ArtifactError, fix=fix):
         with regular(Path(path)).open(encoding="utf-8", newline="") as stream:
             lines = [line for line in csv.reader(stream) if line]
-        header, *rows = ([re.sub(f"^'{FORMULA}", "", cell) for cell in line] for line in lines)
+        header, *rows = (
+            [re.sub(f"^'{FORMULA}", "", cell) if cell.startswith("'") else cell for cell in line]
+            for line in lines
+        )
         table = [dict(zip(header, row, strict=True)) for row in rows]
     if columns is not None and tuple(header) != tuple(columns):
         raise ArtifactError(

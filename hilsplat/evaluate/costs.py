@@ -150,17 +150,15 @@ def read_benchmark(path: Path, results: Path) -> list[Job]:
     """Read the jobs of `<dataset>/<scene>[/<variant>]/benchmarks/<stage>.jsonl`, one per line.
 
     Raises:
-        ArtifactError: a line is not a JSON object with a time.
+        ArtifactError: there is no line, or one is not a JSON object with a time.
     """
     folders = path.relative_to(results).parts[:-2]
     dataset, scene, variant = (*folders, "", "", "")[:3]
     jobs = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        problem = "is not a valid benchmark file"
-        with foreign(path, ArtifactError, problem=problem, fix="run its stage again"):
+    with foreign(path, ArtifactError, problem="is not a valid benchmark file", fix="run its stage again"):
+        for line in path.read_text(encoding="utf-8").splitlines() or [""]:
             record = parse_json(line)
-            elapsed_s = float(record["s"])
-        sampled = (record.get("cpu_time"), record.get("max_rss"))  # "-" or null if Snakemake could not sample
-        numbers = (float(value) if isinstance(value, int | float) else 0.0 for value in sampled)
-        jobs.append(Job(path.stem, dataset, scene, variant, elapsed_s, *numbers))
+            sampled = (record.get("cpu_time"), record.get("max_rss"))  # "-" or null if Snakemake couldn't
+            numbers = (float(value) if isinstance(value, int | float) else 0.0 for value in sampled)
+            jobs.append(Job(path.stem, dataset, scene, variant, float(record["s"]), *numbers))
     return jobs

@@ -2,8 +2,7 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -32,47 +31,42 @@ COLUMNS = (
 )
 
 
-@dataclass
-class Fits:
-    """Results for the regions of one level, collected over views."""
-
-    best: list[float] = field(default_factory=list)  # IoU of the best mask or node of the same level, or 0
-    anywhere: list[float] = field(default_factory=list)  # IoU of the best mask or node of any level
-    # regions with a parent: share of the best mask that is in the parent's best mask; 0 if either is missing
-    containment: list[float] = field(default_factory=list)
-
-    def row(self) -> list[str]:
-        """Return the number of regions, mean IoUs, shares with an IoU of at least 0.5, and containment."""
-        best, anywhere = np.array(self.best), np.array(self.anywhere)
-        shares = [best.mean(), (best >= FIT_IOU).mean(), anywhere.mean(), (anywhere >= FIT_IOU).mean()]
-        nested = f"{np.mean(self.containment):.3f}" if self.containment else ""
-        return [str(len(best)), *(f"{share:.3f}" for share in shares), nested]
-
-
-def add_view(
-    fits: Mapping[Level, Fits],
+def region_fits(
     regions: list[tuple[LabelledRegion, Bool[np.ndarray, "H W"]]],
     masks: Mapping[Level, Bool[np.ndarray, "M P"]],
-) -> None:
-    """Compare the regions of a view with the masks or nodes at each level."""
-    ious = {
-        level: iou_matrix(np.stack([mask.ravel() for _, mask in regions]), masks[level]) for level in LEVELS
+) -> Iterator[tuple[Level, tuple[float, float, float]]]:
+    """Yield the level of each region of a view that has one, and how the masks or nodes fit the region.
+
+    The numbers are the highest IoU with a mask of the same level, that with a mask of any level, and the
+    share of the best mask that is in the parent's best mask: 0 if either is missing, nan without a parent.
+    """
+    flat = np.stack([mask.ravel() for _, mask in regions])
+    ious = {level: iou_matrix(flat, masks[level]) for level in LEVELS}
+    levelled = [(row, region, region.level) for row, (region, _) in enumerate(regions) if region.level]
+    best = {  # if two objects share a path, the path refers to the last object
+        region.path: masks[level][int(ious[level][row].argmax())]
+        for row, region, level in levelled
+        if ious[level][row].max(initial=0) > 0
     }
-    bests: dict[tuple[str, ...], np.ndarray] = {}
-    for row, (region, _) in enumerate(regions):
-        level = region.level
-        if level is None:
-            continue
-        of_region = ious[level][row]
-        fits[level].best.append(float(of_region.max(initial=0)))
-        fits[level].anywhere.append(max(float(ious[other][row].max(initial=0)) for other in LEVELS))
-        if of_region.max(initial=0) > 0:
-            bests[region.path] = masks[level][int(of_region.argmax())]
-    for region, _ in regions:  # if two objects share a path, the path refers to the last object
-        parent, child = bests.get(region.path[:-1]), bests.get(region.path)
-        if region.level is not None and len(region.path) > 1:
+    for row, region, level in levelled:
+        highest = {other: float(ious[other][row].max(initial=0)) for other in LEVELS}
+        inside = math.nan
+        if len(region.path) > 1:
+            parent, child = best.get(region.path[:-1]), best.get(region.path)
             inside = 0.0 if parent is None or child is None else float((parent & child).sum() / child.sum())
-            fits[region.level].containment.append(inside)
+        yield level, (highest[level], max(highest.values()), inside)
+
+
+def summary(fits: list[tuple[float, float, float]]) -> list[str]:
+    """Return the number of regions, mean IoUs, shares with an IoU of at least 0.5, and mean containment."""
+    best, anywhere, inside = np.array(fits).T
+    shares = [best.mean(), (best >= FIT_IOU).mean(), anywhere.mean(), (anywhere >= FIT_IOU).mean()]
+    nested = inside[~np.isnan(inside)]
+    return [
+        str(len(fits)),
+        *(f"{share:.3f}" for share in shares),
+        f"{nested.mean():.3f}" if len(nested) else "",
+    ]
 
 
 def nodes_of_view(tree: SemanticTree, weights: sp.csr_matrix) -> dict[Level, np.ndarray]:
@@ -112,7 +106,7 @@ def run_label_fits(
     scene, labelled = Scene.load(scene_folder), open_labelled(labels, data_root)
     views = list(truths_of(labelled, scene, 0))  # raises if they don't fit
     tree, gaussians = SemanticTree.load(semantic_tree), load_ply(gaussians_ply)
-    fits = defaultdict[tuple[str, str], dict[Level, Fits]](lambda: {level: Fits() for level in LEVELS})
+    fits = defaultdict[tuple[str, str, Level], list[tuple[float, float, float]]](list)
     with stage_log("label_fits", scene.name) as counts:
         for view in track(views, "views compared"):
             camera = scene.cameras[view]
@@ -128,13 +122,12 @@ def run_label_fits(
             if (masks / f"{view}.npz").is_file():
                 by_source[f"masks, {masks_label(masks)}"] = masks_of_view(masks / f"{view}.npz")
             for what, by_level in by_source.items():
-                add_view(fits[what, split], regions, by_level)
+                for level, fit in region_fits(regions, by_level):
+                    fits[what, split, level].append(fit)
         counts["views"] = len(views)
     rows = [
-        [scene.name, what, split, level.label, *fit[level].row()]
-        for (what, split), fit in sorted(fits.items())
-        for level in LEVELS
-        if fit[level].best
+        [scene.name, what, split, level.label, *summary(of_group)]
+        for (what, split, level), of_group in sorted(fits.items())
     ]
     write_csv(out, COLUMNS, rows)
     return markdown_table(COLUMNS, rows, 4)

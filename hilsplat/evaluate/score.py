@@ -112,7 +112,10 @@ def _rows_of_images(
     card: cards.ProtocolCard, predictions: Any, labels: Any
 ) -> Iterator[tuple[str, Measured]]:
     for what, given in (("predictions", predictions), ("labels", labels)):
-        if not (isinstance(given, Mapping) and all(isinstance(value, Mapping) for value in given.values())):
+        views = list(given.values()) if isinstance(given, Mapping) else [given]
+        if not all(
+            isinstance(view, Mapping) and all(isinstance(text, str) for text in view) for view in views
+        ):
             problem, expected = f"the {what} are not arrays by view and text", "{view: {text: array}}"
             raise SettingsError(problem, expected=expected, found=type(given).__name__)
     if lacking := sorted(set(labels) ^ set(predictions)):
@@ -170,7 +173,8 @@ def _are_masks(card: cards.ProtocolCard, answers: Mapping[str, Mapping[tuple[str
     for view, of_view in answers.items():
         for (level, text), answer in of_view.items():
             kind = answer.dtype.kind
-            is_map = kind == "f" and answer.ndim == 3 and bool((answer < np.inf).all())  # False for NaN
+            is_map = kind == "f" and answer.ndim == 3 and answer.size > 0
+            is_map = is_map and bool((answer < np.inf).all())  # False for NaN
             is_map = is_map and (
                 is_argmax or (len(answer) == len(LEVELS) and bool(np.isfinite(answer).all()))
             )
@@ -287,21 +291,24 @@ def _metrics(card: cards.ProtocolCard, are_masks: bool) -> list[str]:
 def _cosine(
     answers: Answers, texts: Sequence[str], pixels: Int64[np.ndarray, " P"]
 ) -> Float[np.ndarray, "K L P"]:
-    """Return cosines at pixels; a mask counts as 1 inside and -inf outside, where a pixel is then a miss."""
+    """Return cosines at pixels: those of a mask are 1 and -inf; those at levels that a text lacks, -inf."""
     of_texts = [answers[key] for text in texts if (key := ("", text)) in answers]
     count = max((answer.shape[0] for answer in of_texts if answer.ndim == 3), default=1)
     cosines = np.full((len(texts), count, len(pixels)), -np.inf)
     for row, text in enumerate(texts):
         if (answer := answers.get(("", text))) is not None:
             values = answer if answer.ndim == 3 else np.where(answer, 1.0, -np.inf)[None]
-            cosines[row] = values.reshape(len(values), -1)[:, pixels]
+            cosines[row, : len(values)] = values.reshape(len(values), -1)[:, pixels]
     return cosines
 
 
 def _rows_of_points(card: cards.ProtocolCard, predictions: Any, labels: Any) -> Iterator[Measured]:
     _, classes = class_set(card.classes)
     is_scan = card is cards.INSTANCES
-    given = [np.asarray(values) for values in ((*predictions, *labels) if is_scan else (predictions, labels))]
+    parts = [
+        list(part) if is_scan and isinstance(part, tuple | list) else [part] for part in (predictions, labels)
+    ]
+    given = [np.asarray(values) for part in parts for values in part]
     given = [array if array.size else array.astype(np.int64) for array in given]  # NumPy reads [] as floats
     sizes = dict(zip("MP", given[0].shape, strict=False)) if is_scan else {"P": given[1].size}
     axes, ids = (("MP", "M", "M", "P", "P"), (1, 3, 4)) if is_scan else (("P", "P"), (0, 1))

@@ -175,8 +175,9 @@ def scene_from_true(true: Cameras, found: Cameras) -> tuple[Float64[np.ndarray, 
     there = np.stack([found[name].centre for name in shared])
     here_mean, there_mean = here.mean(axis=0), there.mean(axis=0)
     turned = (here - here_mean) @ rotation.T
-    spread = np.square(turned).sum()
-    scale = (turned * (there - there_mean)).sum() / spread if spread > 0 else 0.0
+    # rounding separates equal centres
+    at_a_point = any(np.ptp(centres, axis=0).max() <= 1e-9 * abs(centres).max() for centres in (here, there))
+    scale = 0.0 if at_a_point else (turned * (there - there_mean)).sum() / np.square(turned).sum()
     if scale <= 0:
         raise MisalignedArtifactError(
             "no similarity transform maps the ground-truth cameras to the scene's cameras",

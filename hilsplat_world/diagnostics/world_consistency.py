@@ -2,7 +2,6 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -45,8 +44,7 @@ MAX_POINTS = 50_000  # maximum number of shared points per pair of views; more a
 TEXTS_PER_LEVEL = 4  # number of texts per level and view; each is queried in two views
 
 
-@dataclass(frozen=True)
-class Agreement:
+class Agreement(NamedTuple):
     """Agreement between the masks of one level in two views A and B, or the mean over pairs of views."""
 
     masks: int  # number of masks of A compared, over all pairs
@@ -106,14 +104,6 @@ def shared_points(
     return pixel_a, pixel_b
 
 
-def best_ious(
-    inside_a: Bool[np.ndarray, "Ma P"], inside_b: Bool[np.ndarray, "Mb P"], min_points: int = MIN_POINTS
-) -> Float[np.ndarray, " m"]:
-    """Return the highest IoU, in points, of each sufficiently large mask of A with any mask of B."""
-    large = inside_a[inside_a.sum(axis=1) >= min_points]
-    return iou_matrix(large, inside_b).max(axis=1, initial=0)
-
-
 def pair_disagreement(
     labels_a: Int[np.ndarray, " P"], labels_b: Int[np.ndarray, " P"]
 ) -> tuple[float, float]:
@@ -158,24 +148,21 @@ def view_agreement(
 ) -> Agreement:
     """Return the agreement of the masks of one level between two views, at shared points.
 
-    Masks of a view may overlap. `best_iou` uses them unchanged; the disagreements use the smallest mask at
-    each point, like the language field.
+    Masks of a view may overlap. `best_iou` uses A's masks with at least `MIN_POINTS` points; the
+    disagreements use the smallest mask at each point, like the language field.
     """
     (inside_a, labels_a), (inside_b, labels_b) = a.at(pixel_a), b.at(pixel_b)
-    ious = best_ious(inside_a, inside_b)
+    large = inside_a[inside_a.sum(axis=1) >= MIN_POINTS]
+    ious = iou_matrix(large, inside_b).max(axis=1, initial=0)
     all_pairs, joined = pair_disagreement(labels_a, labels_b)
     return Agreement(len(ious), float(ious.mean()) if len(ious) else np.nan, all_pairs, joined)
 
 
 def mean_agreement(parts: Sequence[Agreement]) -> Agreement:
     """Sum the counts, and average the shares over the pairs of views for which they are defined."""
-
-    def mean(name: str) -> float:
-        values = [value for part in parts if (value := getattr(part, name)) == value]
-        return sum(values) / len(values) if values else np.nan
-
-    masks = sum(part.masks for part in parts)
-    return Agreement(masks, mean("best_iou"), mean("disagreement"), mean("joined_disagreement"))
+    masks, *shares = zip(*parts, strict=True)
+    known = [[share for share in column if share == share] for column in shares]
+    return Agreement(sum(masks), *(sum(values) / len(values) if values else np.nan for values in known))
 
 
 def neighbours(cameras: Cameras, views: Sequence[str], count: int) -> list[tuple[str, str]]:

@@ -1,4 +1,4 @@
-"""Kinds of synthetic scene, with functions that build the scenes and choose their cameras."""
+"""Kinds of synthetic scene, which build scenes and choose cameras, and the reserved scene seeds."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -40,3 +40,14 @@ def scene_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float |
     """Return the views of a scene that the world stage renders: square images 000.png, 001.png, ..."""
     sights, fov_deg = KINDS[scene.kind].sights(scene, views, arc_deg)
     return numbered_cameras(sights, image_px, fov_deg)
+
+
+TRAINING_SEEDS = range(1_000_000, 2_000_000)  # scenes on which the small embedded models are trained
+
+SPLITS = {"training": TRAINING_SEEDS, "development": range(100, 200), "benchmark": range(200, 300)}
+"""Scenes for training, for choosing settings, and for reported results; no scene has two of these uses."""
+
+
+def split_of_seed(seed: int) -> str:
+    """Return "training", "development", "benchmark", or "free" for a seed in no split."""
+    return next((split for split, seeds in SPLITS.items() if seed in seeds), "free")

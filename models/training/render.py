@@ -19,9 +19,8 @@ from hilsplat.datasets.hierarchy import AnnotatedNode
 from hilsplat_world.objects.builder import ObjectModel
 from hilsplat_world.objects.catalogue import CLASSES, GENERATOR_VERSION, build_object
 from hilsplat_world.render import label_view, render_view
-from hilsplat_world.scenes.kinds import KINDS, build_scene
+from hilsplat_world.scenes.kinds import KINDS, TRAINING_SEEDS, build_scene, split_of_seed
 from hilsplat_world.scenes.scene import WorldScene
-from hilsplat_world.seeds import TRAINING_SEEDS, split_of_seed
 from models.training.cameras import training_camera
 from models.training.data import LabelledNode, LabelledViews
 from models.training.sam import FRAME_PX

@@ -15,7 +15,7 @@ from hilsplat.base.levels import LEVELS, Level, path_of
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.registry import open_labelled
 from hilsplat.evaluate.metrics.masks import iou
-from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
+from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_answer
 from hilsplat.evaluate.protocols.answers import peaks_of_answer
 from hilsplat.evaluate.protocols.view_truth import ViewTruth, truths_of
 from hilsplat.evaluate.protocols.views import rule_of
@@ -194,35 +194,33 @@ def draw_queries(
 ) -> None:
     """Draw one row per query: ground truth, answers of tree and field, field relevancy at three levels.
 
-    An orange frame marks the level of the answer, a ring the field's localization point.
+    Without an annotated level, the tree and the field each choose their own, as in the protocols. An orange
+    frame marks the field's level, a ring its localization point.
     """
     grid = figure.subplots(len(rows), columns, squeeze=False)
-    figure.supxlabel(
-        "orange frame: level of the answer; white ring: localization point of the field", fontsize=9
-    )
+    figure.supxlabel("of the field's answer: orange frame: level; white ring: localization point", fontsize=9)
     rule = rule_of(evaluate)
     for axes, row in zip(grid, track(rows, "queries drawn"), strict=True):
         image = answers.views.image(row.view)
         relevancy = np.asarray(answers.field.relevancy(row.path[-1:], row.view))[0]
         hits = row.hits(answers)
-        level = row.level or hits.level
         smoothed = SmoothedRelevancy.of(relevancy, rule)
-        field_mask = relevancy_mask(smoothed, level, rule)
-        points = peaks_of_answer(relevancy, smoothed.filtered, level)
+        field_level, field_mask = relevancy_answer(smoothed, row.level, rule)
+        points = peaks_of_answer(relevancy, smoothed.filtered, row.level)
         pictures = [("tree", answers.views.node_masks(row.view, hits.ids))]
         if columns == 7:
             pictures.append(("tree, path", row.tree_mask(answers, by_path=True)))
         pictures.append(("field", field_mask))
         show(axes[0], paint_answer(image, None, row.truth), row.title)
-        label_left(axes[0], row.text, level, letters=20)
+        label_left(axes[0], row.text, row.level or hits.level, letters=20)
         for axis, (name, mask) in zip(axes[1:], pictures, strict=False):
             score = row.score(mask)
             show(axis, paint_answer(image, mask, row.truth), f"{name}: {score}" if score else name)
         if len(points):
             axes[len(pictures)].plot(*points[0], "o", **RING)
         low, high = float(relevancy.min()), float(relevancy.max())
-        for each_level in LEVELS:
-            top = float(relevancy[each_level.index].max())
-            picture = paint_relevancy(image, relevancy[each_level.index], low, high)
-            title = f"relevancy, {each_level.label}: {top:.2f}"
-            show(axes[columns - 3 + each_level.index], picture, title, bold=each_level is level)
+        for level in LEVELS:
+            top = float(relevancy[level.index].max())
+            picture = paint_relevancy(image, relevancy[level.index], low, high)
+            title = f"relevancy, {level.label}: {top:.2f}"
+            show(axes[columns - 3 + level.index], picture, title, bold=level is field_level)

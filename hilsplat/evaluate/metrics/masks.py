@@ -51,11 +51,14 @@ def best_threshold_iou(score: Float[np.ndarray, "H W"], truth: Bool[np.ndarray, 
 
     Testing the scores of ground-truth pixels is sufficient: other thresholds only add false positives.
     """
-    inside, outside = np.sort(score[truth]), np.sort(score[~truth])
+    inside, outside = np.sort(score[truth]), score[~truth]
+    if not inside.size:
+        return 0.0
+    outside = np.sort(outside[outside >= inside[0]])  # the others, mostly nine of ten, are above no threshold
     cuts = np.unique(inside)
     hits = inside.size - np.searchsorted(inside, cuts)
     false = outside.size - np.searchsorted(outside, cuts)
-    return float((hits / (inside.size + false)).max()) if cuts.size else 0.0
+    return float((hits / (inside.size + false)).max())
 
 
 def argmax_masks(similarity: Float[np.ndarray, "K H W"]) -> Bool[np.ndarray, "K H W"]:

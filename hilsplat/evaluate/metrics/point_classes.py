@@ -4,6 +4,7 @@ Labels are 1 .. K; 0 means no class, which is ignored in the ground truth and a 
 Benchmarks differ in whether counts are summed per scene or over all scenes, and in which classes count.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,19 +50,6 @@ def class_accuracy(counts: ClassCounts) -> Float[np.ndarray, " K"]:
     return _ratio(counts.hits, counts.truth)
 
 
-def miou_over_present(counts: ClassCounts) -> float:
-    """Return the mean IoU over the ground-truth classes; nan if there are none (OpenGaussian, per scene).
-
-    A wrong prediction of an absent class lowers only the true class's IoU.
-    """
-    return _mean(class_iou(counts)[counts.truth > 0])
-
-
-def macc_over_present(counts: ClassCounts) -> float:
-    """Return the mean accuracy over the ground-truth classes; nan if none (OpenGaussian, per scene)."""
-    return _mean(class_accuracy(counts)[counts.truth > 0])
-
-
 def miou_over_occurring(counts: ClassCounts, among: Bool[np.ndarray, " K"] | None = None) -> float:
     """Return the mean IoU over the classes in ground truth or prediction; nan if there are none.
 
@@ -71,31 +59,27 @@ def miou_over_occurring(counts: ClassCounts, among: Bool[np.ndarray, " K"] | Non
     return _mean(class_iou(counts)[(counts.union > 0) & (True if among is None else among)])
 
 
-def miou_over_all(counts: ClassCounts) -> float:
-    """Return the mean IoU over all K classes; a class that doesn't occur counts as 0 (OpenNeRF)."""
-    return _mean(np.nan_to_num(class_iou(counts), nan=0.0))
-
-
-def macc_over_all(counts: ClassCounts) -> float:
-    """Return the mean accuracy over all K classes; a class without ground truth counts as 0 (OpenNeRF)."""
-    return _mean(np.nan_to_num(class_accuracy(counts), nan=0.0))
-
-
-def miou_absent_as_one(counts: ClassCounts) -> float:
-    """Return the mean IoU over all K classes; a class that doesn't occur counts as 1.
-
-    Source: waymo-research/waymo-open-dataset `metrics/segmentation_metrics.cc`. The value is inflated for
-    subsets that lack classes; also report `miou_over_present`.
-    """
-    return _mean(np.nan_to_num(class_iou(counts), nan=1.0))
-
-
 def frequency_weighted_iou(counts: ClassCounts) -> float:
     """Return the mean IoU over the ground-truth classes, weighted by their points; nan if there are none."""
     points = counts.truth.sum()
-    if not points:
-        return float("nan")
-    return float(np.nan_to_num(class_iou(counts)) @ counts.truth / points)
+    return float(np.nan_to_num(class_iou(counts)) @ counts.truth / points) if points else float("nan")
+
+
+MEANS: dict[str, Callable[[ClassCounts], float]] = {
+    # Over the ground-truth classes, nan if there are none (OpenGaussian, per scene): a wrong prediction of an
+    # absent class lowers only the true class's IoU.
+    "miou_present": lambda counts: _mean(class_iou(counts)[counts.truth > 0]),
+    "macc_present": lambda counts: _mean(class_accuracy(counts)[counts.truth > 0]),
+    "miou_occurring": miou_over_occurring,
+    # Over all classes; one without points (IoU) or ground truth (accuracy) counts as 0 (OpenNeRF).
+    "miou_all": lambda counts: _mean(np.nan_to_num(class_iou(counts), nan=0.0)),
+    "macc_all": lambda counts: _mean(np.nan_to_num(class_accuracy(counts), nan=0.0)),
+    # One without points counts as 1, so that subsets that lack classes score too high: also report
+    # `miou_present`. Source: waymo-research/waymo-open-dataset `metrics/segmentation_metrics.cc`.
+    "miou_absent_as_one": lambda counts: _mean(np.nan_to_num(class_iou(counts), nan=1.0)),
+    "frequency_weighted_iou": frequency_weighted_iou,
+}
+"""Metrics with one number per scene, or one number for all scenes under a pooled protocol."""
 
 
 def _ratio(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:

@@ -142,13 +142,13 @@ def smoothing_of(relevancy: Float[np.ndarray, "3 H W"]) -> Smooth:
     return lambda rule: by_filter(rule.filter_px, rule.mix, rule.border)
 
 
-def relevancy_mask(
+def relevancy_answer(
     smoothed: SmoothedRelevancy,
     level: Level | None,
     rule: RelevancyRule,
     united: Float[np.ndarray, "3 H W"] | None = None,
-) -> Bool[np.ndarray, "H W"]:
-    """Return the mask of a level, or of the level that the rule chooses if `level` is None; finer wins ties.
+) -> tuple[Level, Bool[np.ndarray, "H W"]]:
+    """Return a level and its mask; if `level` is None, the rule chooses the level, and finer wins ties.
 
     `united` is the unfiltered relevancy of a second text, whose mask is merged with the first text's mask
     before the majority filter; the level is chosen by the first text alone.
@@ -160,10 +160,10 @@ def relevancy_mask(
             mask = mask | threshold_mask(united[level.index], rule.threshold, rule.threshold_on)
         return majority_smooth(mask, rule.border) if rule.majority else mask
 
+    if level is None and rule.level_rule == "max":
+        level = max(rule.levels, key=lambda choice: (smoothed.mixed[choice.index].max(), choice))
     if level is not None:
-        return mask_of(level)
-    if rule.level_rule == "max":
-        return mask_of(max(rule.levels, key=lambda choice: (smoothed.mixed[choice.index].max(), choice)))
+        return level, mask_of(level)
     masks = {choice: mask_of(choice) for choice in rule.levels}
 
     def mean_in_mask(level: Level) -> float:
@@ -171,4 +171,15 @@ def relevancy_mask(
             return np.inf if rule.empty_wins else -np.inf
         return float(smoothed.mixed[level.index][masks[level]].mean())
 
-    return masks[max(rule.levels, key=lambda choice: (mean_in_mask(choice), choice))]
+    level = max(rule.levels, key=lambda choice: (mean_in_mask(choice), choice))
+    return level, masks[level]
+
+
+def relevancy_mask(
+    smoothed: SmoothedRelevancy,
+    level: Level | None,
+    rule: RelevancyRule,
+    united: Float[np.ndarray, "3 H W"] | None = None,
+) -> Bool[np.ndarray, "H W"]:
+    """Return the mask of `relevancy_answer`."""
+    return relevancy_answer(smoothed, level, rule, united)[1]

@@ -5,7 +5,7 @@ Scores depend on the mode by which predictions are transferred from Gaussians to
 field has no instances.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -24,17 +24,6 @@ if TYPE_CHECKING:
     from hilsplat.query.language_scene import LanguageScene
 
 Mode = Literal["frozen", "nearest"]
-
-MEANS: dict[str, Callable[[point_classes.ClassCounts], float]] = {
-    "miou_present": point_classes.miou_over_present,
-    "macc_present": point_classes.macc_over_present,
-    "miou_occurring": point_classes.miou_over_occurring,
-    "miou_all": point_classes.miou_over_all,
-    "macc_all": point_classes.macc_over_all,
-    "miou_absent_as_one": point_classes.miou_absent_as_one,
-    "frequency_weighted_iou": point_classes.frequency_weighted_iou,
-}
-"""Metrics with one number per scene, or one number for all scenes under a pooled protocol."""
 
 LEVEL = Level.WHOLE
 """Level of all predictions: the classes of these data sets are objects and surfaces, not parts."""
@@ -124,8 +113,9 @@ def measure_points(
             value, n = float(values[row]), int(points[row])
             yield Measured(method, classes.texts[row], "", metric, protocol, value, n)
     if card.averaging == "scenes" and counts.truth.any():
-        for metric in filter(MEANS.__contains__, card.metrics):
-            yield Measured(method, "", "", metric, protocol, MEANS[metric](counts), int(counts.truth.sum()))
+        for metric in filter(point_classes.MEANS.__contains__, card.metrics):
+            value = point_classes.MEANS[metric](counts)
+            yield Measured(method, "", "", metric, protocol, value, int(counts.truth.sum()))
 
 
 def pooled_points(card: ProtocolCard, rows: Iterable[Any], classes: ClassSet) -> dict[str, float]:
@@ -142,7 +132,8 @@ def pooled_points(card: ProtocolCard, rows: Iterable[Any], classes: ClassSet) ->
         elif row.metric == "class_accuracy":
             truth[row_of_text[row.query]] += row.n
     counts = point_classes.ClassCounts(hits, truth, union - truth + hits)
-    values = {metric: MEANS[metric](counts) for metric in card.metrics if metric in MEANS}
+    means = point_classes.MEANS
+    values = {metric: means[metric](counts) for metric in card.metrics if metric in means}
     if "miou_head" in card.metrics:
         for split, members in splits_of(classes).items():
             values[f"miou_{split}"] = point_classes.miou_over_occurring(counts, np.array(members))

@@ -11,10 +11,15 @@ from hilsplat.base.files import project_path
 from hilsplat.base.tables import write_csv
 from hilsplat.evaluate.costs import read_costs
 from hilsplat.evaluate.scores import read_instances, read_scores
-from hilsplat.evaluate.tables.ablation import ablation_blocks
 from hilsplat.evaluate.tables.cost_tables import cost_blocks, quality_blocks, without_costs
 from hilsplat.evaluate.tables.formats import as_html, as_latex, as_markdown, csv_rows
-from hilsplat.evaluate.tables.image_tables import frames_blocks, hierarchy_cells, lerf_cells, ovs_cells
+from hilsplat.evaluate.tables.image_tables import (
+    ablation_blocks,
+    frames_blocks,
+    hierarchy_cells,
+    lerf_cells,
+    ovs_cells,
+)
 from hilsplat.evaluate.tables.kinds import NOTES, SECONDS, TABLES, TableKind
 from hilsplat.evaluate.tables.measured import measured_blocks
 from hilsplat.evaluate.tables.point_tables import interval_cells, replica_cells, scannet_blocks, waymo_cells

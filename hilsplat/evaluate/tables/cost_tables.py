@@ -9,7 +9,7 @@ import numpy as np
 from hilsplat.configuration import seed_parts
 from hilsplat.datasets.sources import LEVELLED
 from hilsplat.evaluate.costs import Cost
-from hilsplat.evaluate.tables.ablation import component_cells
+from hilsplat.evaluate.tables.image_tables import component_cells
 from hilsplat.evaluate.tables.kinds import TableKind
 from hilsplat.evaluate.tables.measured import kind_and_title, measured_blocks, row_name, row_of, row_place
 from hilsplat.evaluate.tables.rows import Block, Cell, Sources

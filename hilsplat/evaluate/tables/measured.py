@@ -136,10 +136,10 @@ def row_of(
 
 
 def with_seeds(scores: "pd.DataFrame") -> "pd.DataFrame":
-    """Move the seed into its own column; the first seed is 0."""
+    """Move the seed into its own column (the first seed is 0); `seeded_variant` keeps the whole name."""
     parts = {name: seed_parts(name) for name in scores["variant"].unique()}
     variant, seed = (scores["variant"].map(lambda name, part=part: parts[name][part]) for part in (0, 1))
-    return scores.assign(variant=variant, seed=seed)
+    return scores.assign(variant=variant, seed=seed, seeded_variant=scores["variant"])
 
 
 def mean_over_seeds(seeds: Sequence[Mapping[str, Cell]]) -> dict[str, Cell]:

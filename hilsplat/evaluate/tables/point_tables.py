@@ -63,8 +63,7 @@ def scannet_cells(sources: Sources, _: "pd.DataFrame", part: "pd.DataFrame") -> 
         for mean, metric in (("mIoU", "miou_present"), ("mAcc", "macc_present")):
             cells[f"{name} {mean}"] = percent(of_protocol, metric)
     first = part.iloc[0]
-    variant = first["variant"] if first["seed"] == 0 else f"{first['variant']}.seed{first['seed']}"
-    key = (first["dataset"], variant, first["masks"], first["method"])
+    key = tuple(first[["dataset", "seeded_variant", "masks", "method"]])
     scenes = set(part["scene"])  # another row may have those that were scored under other settings
     scans = {
         scene: matches

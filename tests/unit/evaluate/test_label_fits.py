@@ -10,7 +10,7 @@ from hilsplat.annotate.labels import Label, label_path, traced, write_labels
 from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.base.levels import Level
 from hilsplat.cli.main import app
-from hilsplat.evaluate.label_fits import Fits, add_view, masks_of_view, run_label_fits
+from hilsplat.evaluate.label_fits import masks_of_view, region_fits, run_label_fits
 from hilsplat.query.names import NO_FILE
 from tests.unit.evaluate.builders import box, masks_of, region_of
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, region_mask
@@ -32,11 +32,10 @@ def test_levels_are_compared_with_their_own_and_with_all_and_children_with_their
         Level.PART: strip(0, 2),
         Level.SUBPART: np.zeros((0, 12), bool),
     }
-    fits = {level: Fits() for level in Level}
-    add_view(fits, regions, found)
-    assert fits[Level.WHOLE].best == [7 / 8] and fits[Level.WHOLE].containment == []
-    assert fits[Level.PART].best == [2 / 4] and fits[Level.PART].anywhere == [1.0]
-    assert fits[Level.PART].containment == [1 / 2]  # pixel 1 of the rim's best mask 0..1 is in the mug's 1..7
+    whole, part = region_fits(regions, found)
+    assert whole == (Level.WHOLE, (7 / 8, 7 / 8, pytest.approx(np.nan, nan_ok=True)))
+    # pixel 1 of the rim's best mask 0..1 is in the mug's 1..7
+    assert part == (Level.PART, (2 / 4, 1.0, 1 / 2))
 
 
 def test_a_view_may_lack_masks_at_a_level(tmp_path):

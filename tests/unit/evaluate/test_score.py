@@ -186,6 +186,9 @@ SCAN = "scannet200/instances"
         ({"a": {}}, {"a": {"cup": CUP[:0]}}, LANGSPLAT, "label 'cup' is not a region"),
         ([CUP], [CUP], LANGSPLAT, "the predictions are not arrays by view and text"),
         (LABELS, {"a": CUP}, LANGSPLAT, "the labels are not arrays by view and text"),
+        ({"a": {0: CUP}}, {"a": {0: CUP}}, LANGSPLAT, "the predictions are not arrays by view and text"),
+        ({"a": {"cup": np.zeros((0, *SIZE))}}, LABELS, ARGMAX, "a: cup cannot be scored"),
+        ((CUP[:2], [1] * 2, [0.5] * 2), 3, SCAN, r"masks \(M, P\) bool"),
         ({"a": {"cup": None}}, LABELS, LANGSPLAT, r"a: cup cannot be scored(.|\n)*\(\) object"),
         ({"a": {}}, {"a": {"cup": CUP & False}}, LANGSPLAT, "contain nothing that lerf/langsplat@3"),
         ({"a": {}}, {"a": {"a > b > c > d": CUP}}, LEVELLED, "more than 3 levels"),
@@ -214,4 +217,6 @@ def test_masks_and_relevancy_cannot_be_mixed():
     with pytest.raises(HilsplatError, match="cannot score these predictions"):
         hilsplat.score({"a": {"cup": CUP, "mug": np.zeros((3, *SIZE))}}, labels)
     cosines = {"cup": np.where(CUP, 0.9, 0.1)[None], "mug": np.full((1, *SIZE), 0.5)}
+    assert hilsplat.score({"a": cosines}, labels, ARGMAX).means["pixel_accuracy"] == 1.0
+    cosines["cup"] = np.stack([0 * cosines["cup"][0], cosines["cup"][0]])  # two levels; the mug has one
     assert hilsplat.score({"a": cosines}, labels, ARGMAX).means["pixel_accuracy"] == 1.0

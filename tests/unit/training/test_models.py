@@ -9,7 +9,7 @@ from hilsplat.embed.clip import ClipModel
 from hilsplat.segment.sam import SamModel, enlarged
 from hilsplat_world.objects.catalogue import GENERATOR_VERSION
 from hilsplat_world.render import label_view, render_view
-from hilsplat_world.seeds import TRAINING_SEEDS
+from hilsplat_world.scenes.kinds import TRAINING_SEEDS
 from models.training.cameras import training_camera
 from models.training.card import CARD, RECORD, digests
 from models.training.crops import list_crops

@@ -7,11 +7,10 @@ import pytest
 
 from hilsplat_world.objects.catalogue import CLASSES
 from hilsplat_world.scenes import tabletop
-from hilsplat_world.scenes.kinds import KINDS, build_scene, scene_cameras
+from hilsplat_world.scenes.kinds import KINDS, SPLITS, build_scene, scene_cameras, split_of_seed
 from hilsplat_world.scenes.room import room_of
 from hilsplat_world.scenes.scene import footprint_of
 from hilsplat_world.scenes.street import part_boxes
-from hilsplat_world.seeds import SPLITS, split_of_seed
 from tests.unit.world.scenes import built
 
 

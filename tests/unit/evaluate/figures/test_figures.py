@@ -4,6 +4,7 @@ import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -69,6 +70,21 @@ def test_panel_without_annotations_shows_given_texts_below_the_overview(block_wo
     figure = draw_panel(block_world.answers, block_world.folder / "masks", rows, EVALUATE)
     save_figure(figure, tmp_path / "panel.png")
     assert (tmp_path / "panel.png").stat().st_size > 10_000
+
+
+def test_without_an_annotated_level_the_field_answers_at_its_own_level_not_the_trees(block_world, rows):
+    real = block_world.answers
+    at_subpart = partial(real.select, level=Level.SUBPART)
+    answers = SimpleNamespace(
+        **{name: getattr(real, name) for name in ("scene", "views", "field", "caution")},
+        select=lambda path, level, view: at_subpart(path, view=view),
+    )
+    bear = replace(rows[1][0], level=None)
+    panel = draw_panel(answers, block_world.folder / "masks", [bear], EVALUATE)
+    (title,) = [title for axes in panel.axes if (title := axes.get_title()).startswith("field: IoU")]
+    assert float(title.split()[-1]) > 0.9
+    framed = [axes.get_title() for axes in panel.axes if axes.title.get_fontweight() == "bold"]
+    assert [title.split(":")[0] for title in framed] == ["relevancy, whole"]
 
 
 def test_a_panel_of_meaningless_answers_or_true_masks_is_marked(block_world, tmp_path):

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from hilsplat.base.errors import MisalignedArtifactError, SceneError
 from hilsplat.datasets import classes as sets
@@ -159,10 +160,10 @@ def test_rows_name_the_mode_and_are_moved_into_the_frame_of_the_scene(block_worl
 
 
 def cameras_at(centres, rotation):
-    """Cameras with given centres, all with the same rotation."""
+    """Cameras with given centres, with one rotation or one each."""
     poses = np.tile(np.eye(4), (len(centres), 1, 1))
     poses[:, :3, :3] = rotation
-    poses[:, :3, 3] = -np.asarray(centres, dtype=float) @ rotation.T
+    poses[:, :3, 3:] = -rotation @ np.asarray(centres, dtype=float)[:, :, None]
     return cameras_of(poses, np.eye(3), (8, 8))
 
 
@@ -180,6 +181,17 @@ def test_cameras_on_a_line_still_fix_the_similarity(moved, error):
     transform, median = scene_from_true(cameras_at(line, rotation), found)
     assert np.allclose(transform, expected)
     assert median == pytest.approx(error, abs=1e-9)
+
+
+def test_cameras_that_do_not_fix_the_similarity_are_refused():
+    turned = Rotation.from_rotvec([[0, 0, 0], [0.1, 0.2, 0.3], [0.3, 0.1, 0.2]]).as_matrix()
+    line = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    for centres in (-line, np.zeros((3, 3)), np.tile([0.1, 0.2, 0.3], (3, 1)), np.tile([5, 0, 1], (3, 1))):
+        for pair in (centres, line), (line, centres):
+            with pytest.raises(MisalignedArtifactError, match="coincident or mirrored centres"):
+                scene_from_true(*(cameras_at(positions, turned) for positions in pair))
+    with pytest.raises(MisalignedArtifactError, match="at least 3 shared view names"):
+        scene_from_true(cameras_at(line, turned), cameras_at(line[:2], turned[:2]))
 
 
 def test_stand_ins_and_data_sets_name_protocols_that_exist():

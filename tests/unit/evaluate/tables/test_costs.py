@@ -173,6 +173,7 @@ def test_missing_and_damaged_benchmarks_are_named(tmp_path):
     with pytest.raises(ArtifactError, match="run the workflow first"):
         run_efficiency(tmp_path, tmp_path / "x.csv")
     record(tmp_path, "masks", 1, 1)
-    (tmp_path / "benchmarks" / "masks.jsonl").write_text("no json\n")
-    with pytest.raises(ArtifactError, match=r"masks\.jsonl is not a valid benchmark file"):
-        run_efficiency(tmp_path, tmp_path / "x.csv")
+    for damaged in (b"no json\n", b"", b"\xff", b"[]"):
+        (tmp_path / "benchmarks" / "masks.jsonl").write_bytes(damaged)
+        with pytest.raises(ArtifactError, match=r"masks\.jsonl is not a valid benchmark file"):
+            run_efficiency(tmp_path, tmp_path / "x.csv")

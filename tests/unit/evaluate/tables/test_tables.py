@@ -17,9 +17,9 @@ from hilsplat.datasets.classes import SCANNET200_INSTANCES
 from hilsplat.evaluate.metrics.instances import match_instances
 from hilsplat.evaluate.protocols.cards import INSTANCES, LERF_MASK, OVS_ARGMAX
 from hilsplat.evaluate.scores import write_instances, write_scores
-from hilsplat.evaluate.tables.ablation import mean_difference
 from hilsplat.evaluate.tables.build import TABLES, published_values, run_table
 from hilsplat.evaluate.tables.formats import latex_text
+from hilsplat.evaluate.tables.image_tables import mean_difference
 from hilsplat.evaluate.tables.measured import table_value
 from hilsplat.evaluate.tables.point_tables import bootstrap_mean
 from hilsplat.evaluate.tables.rows import Block, Cell, Row, read_published
@@ -291,7 +291,8 @@ def class_scores(protocol, value, n, **more):
     return [point_score(protocol, metric, value, n, **more) for metric in metrics]
 
 
-def test_scannet_shows_all_sets_of_classes_in_one_row_and_instances_of_all_scans_together(tmp_path):
+@pytest.mark.parametrize("variant", ["default", "default.seed01"])
+def test_scannet_shows_all_sets_of_classes_in_one_row_and_instances_of_all_scans_together(tmp_path, variant):
     scores = [
         point_score("scannet/opengaussian-19", "miou_present", 0.2),
         point_score("scannet/opengaussian-19", "miou_present", 0.4, scene="room-2"),
@@ -305,11 +306,11 @@ def test_scannet_shows_all_sets_of_classes_in_one_row_and_instances_of_all_scans
         "room-2": match_instances(truth, found[:0], np.zeros(0, int), np.zeros(0), ids),
     }
     matches["frozen"] = matches["room-2"]
-    keyed = {("synthetic-rooms", name, "default", "sam-tiny", "tree"): each for name, each in matches.items()}
+    keyed = {("synthetic-rooms", name, variant, "sam-tiny", "tree"): each for name, each in matches.items()}
     write_instances(tmp_path / "scores.csv", keyed)
     frozen = "scannet200/opengaussian@1 (points: frozen)"
     scores.append(replace(scores[2], scene="frozen", protocol=frozen))
-    rows, _ = built(tmp_path, "scannet", scores)
+    rows, _ = built(tmp_path, "scannet", [replace(row, variant=variant) for row in scores])
     assert measured(rows, protocol="points: frozen")["ScanNet200 AP"] == "0.00"
     row = measured(rows, protocol="points: nearest")
     assert cells(row, "19 classes mIoU", "ScanNet200 mAcc") == ["30.00", "10.00"]
