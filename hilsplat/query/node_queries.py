@@ -74,9 +74,7 @@ class NodeQueries(ABC):
         """
         path = path_of(path) if isinstance(path, str) else tuple(path)
         if answerer not in ANSWERERS:
-            raise SettingsError(
-                f"answerer {answerer!r} is unknown", expected=" or ".join(ANSWERERS), found=answerer
-            )
+            raise SettingsError(f"answerer {answerer!r} is unknown", expected=" or ".join(ANSWERERS))
         visible = np.ones(len(self.tree), np.bool_) if visible is None else visible
         nodes = search(
             self.tree,
