@@ -100,6 +100,7 @@ def _spz(shown: ViewerScene, asked: wire.Edited) -> partial[bytes]:
 
 
 def _boxes(shown: ViewerScene, asked: wire.Selection) -> dict[str, Any]:
+    """Return the boxes of nodes."""
     return payload.boxes(*_selected(shown, asked))
 
 
