@@ -229,6 +229,12 @@ def test_queries_with_an_image_a_framed_part_of_the_view_and_a_node(opened, desk
     page.drag(low, high, held="Alt")
     page.answers().first.wait_for()
     assert page.locator("#answers li").first.get_attribute("data-node") == str(book)
+    page.press("Escape")
+    mug = scene.query("mug", "whole")[0].node
+    ((x, y),) = page.on_page((14, 16, 0))
+    page.drag((x, y), (PANEL_PX - 40, y + 30), held="Alt")  # ends beside the view
+    page.answers().first.wait_for()
+    assert page.locator("#answers li").first.get_attribute("data-node") == str(mug)
     page.get_by_label("Beside").select_option("default|field")
     for moved in (0, 0.01):  # from the photograph and from the rendered picture, both in the right half
         page.press("Escape")

@@ -127,6 +127,8 @@ def test_a_pick_ignores_what_the_style_hides(shown, client, camera):
         sent = {"camera": wire_camera(camera), "x": 8.5, "y": 8.5, "style": style}
         assert (client.post("/api/pick", json=sent).json()["alpha"] > 0.9) == is_shown  # of the mug
         assert client.post("/api/pick", json={**sent, "x": 24.5}).json()["alpha"] > 0.9
+    wide = {"camera": wire_camera(camera.scaled((24, 5000))), "x": 24.5 * 5000 / 42, "y": 8.5}
+    assert client.post("/api/pick", json=wide).json()["alpha"] > 0.9  # of a screen that is 5120 px wide
 
 
 def test_saved_masks_leave_out_removed_gaussians(shown, client, left):
