@@ -98,7 +98,6 @@ class NodeNaming:
     surfaces: tuple[bool, ...]
     rivals: Float32[np.ndarray, "W C"]
 
-
     @staticmethod
     def load(folder: Path, semantic_tree: Path, clip_folder: Path) -> "NodeNaming | None":
         """Read the artifact; return None if it is missing or was computed for a different tree or vectors.

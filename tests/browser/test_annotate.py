@@ -509,7 +509,11 @@ def test_two_fingers_move_the_photograph_without_drawing(annotating, desk, tmp_p
     for tool, moves in (("b", True), ("p", True), ("p", False)):
         page.press(tool)
         scale = page.evaluate("hilsplat.sheet.scale")
-        touches = {"Start": ([10], [10, 20]), "Move": ([8, 26],) if moves else (), "End": ([8] if moves else [10], [])}
+        touches = {
+            "Start": ([10], [10, 20]),
+            "Move": ([8, 26],) if moves else (),
+            "End": ([8] if moves else [10], []),
+        }
         for kind, columns in ((kind, columns) for kind, steps in touches.items() for columns in steps):
             points = [dict(zip("xy", place(page, column, 10), strict=True)) for column in columns]
             fingers.send("Input.dispatchTouchEvent", {"type": f"touch{kind}", "touchPoints": points})

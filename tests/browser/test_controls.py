@@ -111,3 +111,14 @@ def test_another_scene_opens_on_the_same_server(three_scenes, served):
     scenes.nth(1).wait_for()
     assert scenes.nth(1).locator("a").get_attribute("aria-current") == "page"
     assert scenes.nth(2).locator("a").get_attribute("href") is None
+
+
+def test_two_fingers_do_not_choose_a_node(opened, desk_address):
+    page = opened(desk_address, has_touch=True)
+    ((x, y),) = page.on_page((6, 6, 0))
+    fingers = page.context.new_cdp_session(page.page)
+    for kind, count in (("Start", 1), ("Start", 2), ("End", 1), ("End", 0)):
+        points = [{"x": x + 40 * number, "y": y} for number in range(count)]
+        fingers.send("Input.dispatchTouchEvent", {"type": f"touch{kind}", "touchPoints": points})
+    page.wait_for_timeout(500)
+    assert not page.get_by_role("region", name="Chosen node").is_visible()
