@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int64, UInt8
+from jaxtyping import Bool, Float32, Int64, UInt8
 
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import LEVELS, Level
@@ -247,21 +247,8 @@ class LanguageScene(NodeQueries):
             self.views,
         )
 
-    def select(
-        self,
-        path: str | Sequence[str],
-        *,
-        level: Level | str | None = None,
-        answerer: str = "tree",
-        view: str | None = None,
-        threshold: float | None = None,
-    ) -> NodeHits:
-        """Return the answers of `query` as rows of the tree; the path may also be a sequence of texts.
-
-        For arguments and errors, see `query`; level None means "auto".
-        """
-        visible = None if view is None else self.views.visible_nodes(view)
-        return self.find(path, level=level, answerer=answerer, threshold=threshold, visible=visible)
+    def _visible(self, view: str | None) -> Bool[np.ndarray, " n"]:
+        return super()._visible(view) if view is None else self.views.visible_nodes(view)
 
     # -- relevancy --------------------------------------------------------------------------------
 

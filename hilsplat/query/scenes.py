@@ -160,7 +160,7 @@ class Scenes:
         limit, each = checked_count(limit), checked_count(each, "each")
 
         def answers(scene: IndexedScene) -> NodeHits:
-            return scene.find(text, level=level, threshold=threshold)
+            return scene.select(text, level=level, threshold=threshold)
 
         best: list[tuple[float, str, FoundScene]] = []
         for entry in self.found:
