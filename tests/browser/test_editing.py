@@ -141,15 +141,6 @@ def test_an_answer_is_removed_and_the_rest_is_saved(opened, desk_address, desk, 
     assert (desk / "gaussians.ply").read_bytes() == before
 
 
-def test_loose_gaussians_are_selected_and_removed(own_desk, served):
-    loosen(own_desk, np.arange(100, 140))
-    page = served(own_desk)
-    edit(page)
-    page.get_by_role("button", name="Select loose").click()
-    has(page, 40, 0)
-    page.press("Delete")
-    has(page, 0, 40)
-
 
 def test_what_is_done_while_a_selection_is_on_its_way_acts_on_it(opened, desk_address, tmp_path):
     page = opened(desk_address)
@@ -168,9 +159,14 @@ def test_what_is_done_while_a_selection_is_on_its_way_acts_on_it(opened, desk_ad
     has(page, 10 * 6 - 32, 32)
 
 
-def test_steps_that_take_much_memory_are_forgotten(opened, desk_address):
-    page = opened(desk_address)
+def test_loose_gaussians_are_selected_and_steps_that_take_much_memory_are_forgotten(own_desk, served):
+    loosen(own_desk, np.arange(100, 140))
+    page = served(own_desk)
     edit(page)
+    page.get_by_role("button", name="Select loose").click()
+    has(page, 40, 0)
+    page.press("Control+z")
+    has(page, 0, 0)
     click = "([id, times]) => { while (times--) document.getElementById(id).click(); }"
     page.evaluate(click, ["edit-invert", 31])
     has(page, 864, 0)
