@@ -104,11 +104,11 @@ class Proposals:
         path = self.masks / f"{view}.npz"  # test views have no masks
         if not path.is_file():
             return []
-        masks = HierarchicalMasks.load(path)
-        dense = masks.dense()
-        rows = [int(row) for row in np.argsort(-masks.area_px, kind="stable") if dense[row, y, x]]
-        levels = masks.level.tolist()
-        return _proposals([(f"mask {row}", "", Level(levels[row]), dense[row]) for row in rows[-MAX_MASKS:]])
+        masks, pixel = HierarchicalMasks.load(path), (x, y, x + 1, y + 1)
+        order = np.argsort(-masks.area_px, kind="stable").tolist()
+        rows = np.array([row for row in order if masks.window(row, pixel).any()][-MAX_MASKS:], np.int64)
+        largest_first = zip(rows, masks.level[rows], masks.dense(rows), strict=True)
+        return _proposals([(f"mask {row}", "", Level(int(level)), mask) for row, level, mask in largest_first])
 
     # -- from other views -------------------------------------------------------------------------
 

@@ -252,8 +252,8 @@ def open_scenes(results: Path | str = "results", pattern: str = "*", variant: st
     return Scenes(tuple(found), skipped)
 
 
-def report_of(scenes: Scenes, text: str, hits: Sequence[SceneHit]) -> str:
-    """Return answers, doubts and skipped scenes as text."""
+def report_of(scenes: Scenes, text: str, hits: Sequence[SceneHit], level: str = "auto") -> str:
+    """Return answers, doubts and skipped scenes as text; `level` is that of the query."""
     lines = [f"{counted(len(hits), 'answer')} to {text!r} in {counted(len(scenes.found), 'scene')}"]
     if hits:
         columns = "score", "scene", "node", "level", "name", "picture"
@@ -263,8 +263,9 @@ def report_of(scenes: Scenes, text: str, hits: Sequence[SceneHit]) -> str:
         ]
         lines += aligned_table([columns, *rows], {"scene", "level", "name", "picture"})
         variant = scenes.found[0].finished.variant
-        of_variant = [] if variant == "default" else ["--variant", variant]
-        command = shlex.join(["hilsplat", "query", _shown(hits[0].folder), text, *of_variant])
+        options = [] if level == "auto" else ["--level", level]
+        options += [] if variant == "default" else ["--variant", variant]
+        command = shlex.join(["hilsplat", "query", _shown(hits[0].folder), text, *options])
         lines.append(f"more about the best: {command}")
     lines += [f"doubtful: {doubt}" for hit in hits[:1] for doubt in hit.doubts]
     lines += dict.fromkeys(hit.caution for hit in hits if hit.caution)
