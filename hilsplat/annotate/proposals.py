@@ -107,8 +107,9 @@ class Proposals:
         masks, pixel = HierarchicalMasks.load(path), (x, y, x + 1, y + 1)
         order = np.argsort(-masks.area_px, kind="stable").tolist()
         rows = np.array([row for row in order if masks.window(row, pixel).any()][-MAX_MASKS:], np.int64)
-        largest_first = zip(rows, masks.level[rows], masks.dense(rows), strict=True)
-        return _proposals([(f"mask {row}", "", Level(int(level)), mask) for row, level, mask in largest_first])
+        levels = map(Level, masks.level[rows].tolist())
+        regions = zip(rows.tolist(), levels, masks.dense(rows), strict=True)
+        return _proposals([(f"mask {row}", "", level, mask) for row, level, mask in regions])
 
     # -- from other views -------------------------------------------------------------------------
 

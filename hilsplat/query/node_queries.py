@@ -71,9 +71,9 @@ class NodeQueries(ABC):
         view: str | None = None,
         threshold: float | None = None,
     ) -> NodeHits:
-        """Return the answers of `LanguageScene.query` as rows of the tree; for arguments and errors, see there.
+        """Return the answers of `LanguageScene.query` as rows of the tree.
 
-        The path may also be a sequence of texts, and level None means "auto".
+        For arguments and errors, see there. The path may also be a sequence of texts; level None is "auto".
         """
         path = path_of(path) if isinstance(path, str) else tuple(path)
         if answerer not in ANSWERERS:

@@ -119,7 +119,7 @@ def _film(shown: ViewerScene, asked: wire.Film) -> exports.Steps:
 
 
 def _rows(shown: ViewerScene, asked: wire.Edited) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
-    """Return the rows of the scene or of nodes, without removed Gaussians; labels, and comments about them."""
+    """Return the remaining rows of the scene or of nodes, and the nodes' labels with comments about them."""
     if not isinstance(asked, wire.Selection):
         return np.sort(shown.kept_rows(asked.removed)), None, []
     scene, groups = _selected(shown, asked)

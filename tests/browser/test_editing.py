@@ -141,7 +141,6 @@ def test_an_answer_is_removed_and_the_rest_is_saved(opened, desk_address, desk, 
     assert (desk / "gaussians.ply").read_bytes() == before
 
 
-
 def test_what_is_done_while_a_selection_is_on_its_way_acts_on_it(opened, desk_address, tmp_path):
     page = opened(desk_address)
     page.late("api/within")
