@@ -12,9 +12,8 @@ def distance(page) -> float:
     return page.evaluate("Math.hypot(...hilsplat.camera.c.map((v, k) => v - hilsplat.camera.target[k]))")
 
 
-def test_a_refused_query_removes_the_previous_answers(opened, desk_address):
+def test_a_refused_query_removes_the_previous_answers(page, opened):
     opened.expected.append("422")
-    page = opened(desk_address)
     page.ask_and_wait("mug > handle")
     page.ask("mug > ")
     page.locator("#status.error").wait_for()
@@ -22,8 +21,7 @@ def test_a_refused_query_removes_the_previous_answers(opened, desk_address):
     assert page.evaluate("hilsplat.painted()[0].style.table.every((value) => value === 0)")
 
 
-def test_zooming_out_is_limited_and_home_returns_to_the_start(opened, desk_address):
-    page = opened(desk_address)
+def test_zooming_out_is_limited_and_home_returns_to_the_start(page):
     begun = page.wire_camera()
     page.locator("#view").focus()
     for _ in range(120):
@@ -57,8 +55,7 @@ def test_a_held_key_moves_evenly(opened, desk_address):
     assert page.evaluate("hilsplat.camera.c") == before
 
 
-def test_back_returns_to_the_previous_query(opened, desk_address):
-    page = opened(desk_address)
+def test_back_returns_to_the_previous_query(page):
     page.until(lambda: "#" in page.url)
     for text in ("mug > handle", "book"):
         page.ask_and_wait(text)

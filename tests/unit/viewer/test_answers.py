@@ -38,11 +38,6 @@ from tests.unit.splat.spz_reader import decoded
 from tests.unit.viewer.conftest import TOKEN, browser_of, browsing, in_steps, run_apart, wire_camera
 
 
-@pytest.fixture
-def scene(shown):
-    return shown.answering("default")
-
-
 def ask(client, text: str, **more) -> dict:
     return client.post("/api/query", json={"text": text, **more}).json()
 
