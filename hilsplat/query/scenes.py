@@ -167,7 +167,7 @@ class Scenes:
             with self._skipping(entry.name):
                 best += [(-score, entry.name, entry) for score in _scores(answers(entry.opened()), entry, 1)]
         hits: dict[str, list[SceneHit]] = {}
-        for _, name, entry in sorted(best, key=lambda each: each[:2]):
+        for _, name, entry in sorted(best, key=lambda entry: entry[:2]):
             if len(hits) < limit:
                 with self._skipping(name):
                     scene = entry.opened(entry.naming())

@@ -38,9 +38,9 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
     scene, rows = shown.answering(asked.variant), shown.kept_rows(asked.removed)
     with shown.unchanged():
         images = [resize_to_fit(scene.views.image(view), PHOTO_PX) for view in scene.views.names]
-    own = {"variants": [asked.variant], "gaussians": len(rows), "chunk": len(rows), "restart": ""}
+    of_page = {"variants": [asked.variant], "gaussians": len(rows), "chunk": len(rows), "restart": ""}
     described: dict[str, Any] = {
-        "scene": {**shown.described(), **own},
+        "scene": {**shown.described(), **of_page},
         "variant": shown.described_variant(asked.variant),
         "asked": [question.model_dump(exclude_none=True) for question in asked.asked],
         "answers": [payload.answer(scene, question, asked.answerer) for question in asked.asked],
