@@ -275,6 +275,10 @@ def test_films_show_progress_and_gifs_and_pictures_have_the_chosen_size(opened, 
     page.get_by_text("of 120 pictures").wait_for()
     page.get_by_role("button", name="Cancel").click()
     page.get_by_role("status").get_by_text("Cancelled: nothing was saved.").wait_for()
+    body = "new ReadableStream({ start(body) { body.error(new TypeError('network error')); } })"
+    read = f"import('/static/http.js').then((own) => own.streamed(new Response({body})))"
+    read += ".catch(({ status, message }) => [status, message])"
+    assert page.evaluate(read) == [0, "The server has stopped."]
     page.locator("#save summary").click()
     assert page.get_by_role("button", name="Film, MP4").is_enabled()
 
