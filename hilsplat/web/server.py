@@ -1,6 +1,7 @@
 """Code shared by both page servers: static files, responses, errors, a local socket."""
 
 import json
+import logging
 import secrets
 import socket
 import webbrowser
@@ -139,8 +140,18 @@ def listening_at(port: int) -> socket.socket:
 
 
 def configured(app: Guard) -> uvicorn.Config:
-    """Return the configuration of a server that logs only warnings, through the handlers of this process."""
-    return uvicorn.Config(app, log_config=None, log_level="warning", access_log=False, server_header=False)
+    """Return the configuration of a server that logs only warnings, through the handlers of this process.
+
+    When it is stopped, unfinished responses, such as films, end after a second.
+    """
+    logging.getLogger("uvicorn.error").addFilter(_is_unexpected)
+    options: dict[str, Any] = {"log_config": None, "log_level": "warning", "access_log": False}
+    return uvicorn.Config(app, **options, server_header=False, timeout_graceful_shutdown=1)
+
+
+def _is_unexpected(record: logging.LogRecord) -> bool:
+    """Return whether a log record is about anything but responses that end with the server."""
+    return "graceful shutdown" not in f"{record.getMessage()} {record.exc_info and record.exc_info[1]}"
 
 
 def serve(

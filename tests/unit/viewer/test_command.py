@@ -7,7 +7,7 @@ import socket
 import subprocess
 import sys
 import time
-from urllib.request import urlopen
+from urllib.request import Request, urlopen
 
 import pytest
 
@@ -24,7 +24,7 @@ def test_a_taken_port_is_refused_and_a_free_one_sends_without_delay():
 
 
 @pytest.mark.parametrize("name", ["w3m", "firefox"])
-def test_the_page_is_served_while_a_browser_waits(desk, tmp_path, name):
+def test_the_page_is_served_while_a_browser_waits_and_stops_while_it_sends_a_film(desk, tmp_path, name):
     (tmp_path / name).write_text('#!/bin/sh\necho opened > "$0.txt"\nexec sleep 25\n')
     (tmp_path / name).chmod(0o700)
     kept = {key: value for key, value in os.environ.items() if "DISPLAY" not in key and key != "BROWSER"}
@@ -32,13 +32,20 @@ def test_the_page_is_served_while_a_browser_waits(desk, tmp_path, name):
     if name == "firefox":
         environment["BROWSER"] = str(tmp_path / name)
     command = [sys.executable, "-u", "-c", "from hilsplat.cli.main import main; main()", "view", str(desk)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as server:
+    output = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    with subprocess.Popen(command, **output, env=environment) as server:
         try:
             address = re.search(r"http://\S+", server.stdout.readline()).group()
             with urlopen(address, timeout=20) as reply:
-                assert reply.status == 200
+                cookie, origin = reply.headers["set-cookie"].partition(";")[0], address.partition("/?")[0]
             while name == "firefox" and not (tmp_path / "firefox.txt").exists():
                 time.sleep(0.1)
+            headers = {"cookie": cookie, "origin": origin, "content-type": "application/json"}
+            film = Request(f"{origin}/api/export/film", b'{"frames": 480, "side_px": 1920}', headers)
+            with urlopen(film, timeout=20) as reply:  # which takes minutes
+                assert reply.readline() == b'{"made":0,"of":480}\n'
+                server.send_signal(signal.SIGINT)
+                assert "Traceback" not in server.communicate(timeout=60)[0]
         finally:
-            server.send_signal(signal.SIGINT)
+            server.kill()
     assert not (tmp_path / "w3m.txt").exists()
