@@ -166,16 +166,18 @@ def serve(
         port: 0 uses the page's own port, or any free port if that is taken.
         browser: whether to open the page in a browser.
     """
-    try:  # what a browser keeps for a page, such as removed Gaussians, belongs to the port
-        listening = listening_at(port or OWN_PORTS[zlib.crc32(page.encode()) % len(OWN_PORTS)])
+    note, usual = "", OWN_PORTS[zlib.crc32(page.encode()) % len(OWN_PORTS)]
+    try:
+        listening = listening_at(port or usual)
     except SettingsError:
         if port:
             raise
         listening = listening_at(0)
+        note = f"Port {usual} is in use: what the browser keeps for this page there is not shown here\n"
     token = secrets.token_urlsafe(24)
     address = f"http://127.0.0.1:{listening.getsockname()[1]}/?token={token}"
     config = configured(app(token))
-    on_ready(f"{about} at {address}\nPress Ctrl-C to stop")
+    on_ready(f"{about} at {address}\n{note}Press Ctrl-C to stop")
     with suppress(webbrowser.Error):  # none is installed
         if browser and getattr(webbrowser.get(), "name", "") not in TEXT_BROWSERS:
             Thread(target=webbrowser.open, args=(address,), daemon=True).start()  # may wait for its end
