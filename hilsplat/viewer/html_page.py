@@ -29,34 +29,37 @@ POLICY = (
 
 
 def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> exports.Steps:
-    """Make the page of a scene, with one step per crop.
+    """Make the page of a scene, with one step per photograph and crop.
 
     Raises:
         SettingsError: a text is empty, or the variant cannot be queried.
         StaleSceneError: a part of the scene was rewritten since it was opened.
     """
     scene, rows = shown.answering(asked.variant), shown.kept_rows(asked.removed)
-    with shown.unchanged():
-        images = [resize_to_fit(scene.views.image(view), PHOTO_PX) for view in scene.views.names]
     of_page = {"variants": [asked.variant], "gaussians": len(rows), "chunk": len(rows), "restart": ""}
     described: dict[str, Any] = {
         "scene": {**shown.described(), **of_page},
         "variant": shown.described_variant(asked.variant),
         "asked": [question.model_dump(exclude_none=True) for question in asked.asked],
         "answers": [payload.answer(scene, question, asked.answerer) for question in asked.asked],
-        "photos": [_text(encoded(image, quality=75)) for image in images],
         "link": asked.link,
+        "photos": [],
         "crops": {},
     }
     nodes = list(range(len(scene.tree)))
     if len(nodes) > MAX_CROPS:
         answers = {hit["node"] for answer in described["answers"] for hit in answer["hits"]}
         nodes = sorted(answers.union(scene.tree.nodes_of(Level.WHOLE).tolist()))
-    yield 0, len(nodes)
-    for done, node in enumerate(nodes, 1):
+    views = scene.views.names
+    yield 0, len(views) + len(nodes)
+    for done, pictured in enumerate((*views, *nodes), 1):
         with shown.unchanged():
-            described["crops"][node] = _text(encoded(crop(scene, node)))
-        yield done, len(nodes)
+            if isinstance(pictured, str):
+                small = resize_to_fit(scene.scene.image(pictured), PHOTO_PX)
+                described["photos"].append(_text(encoded(small, quality=75)))
+            else:
+                described["crops"][pictured] = _text(encoded(crop(scene, pictured)))
+        yield done, len(views) + len(nodes)
     packed = payload.packed_nodes(scene.tree, rows)
     return partial(_assembled, described, partial(shown.spz, rows), packed, static)
 

@@ -348,8 +348,8 @@ def test_an_exported_page_sends_no_requests_and_escapes_texts(client, shown):
     evil = "mug </script><script>alert(1)</script>".replace(">", "")
     kept = {"text": "mug > handle", "level": "part", "threshold": 0.3}
     progress, data = in_steps(client, "page", asked=[kept, {"text": evil}], link="c=v3")
-    nodes = len(shown.answering("default").tree)
-    assert progress == [(made, nodes) for made in range(nodes + 1)]
+    pictures = len(shown.scene.cameras) + len(shown.answering("default").tree)
+    assert progress == [(made, pictures) for made in range(pictures + 1)]
     page = data.decode()
     assert not re.search(r"""(src|href)=["'](?!data:)""", page) and "http://127" not in page
     held = dict(re.findall(r'<script type="text/plain" id="(\w+)">(.*?)</script>', page, re.S))
