@@ -71,7 +71,7 @@ class NodeQueries(ABC):
         view: str | None = None,
         threshold: float | None = None,
     ) -> NodeHits:
-        """Return the answers of `LanguageScene.query` as rows of the tree.
+        """Return the nodes that `LanguageScene.query` finds, as rows of the tree.
 
         For arguments and errors, see there. The path may also be a sequence of texts; level None is "auto".
         """
