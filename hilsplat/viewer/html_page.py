@@ -51,15 +51,17 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
         answers = {hit["node"] for answer in described["answers"] for hit in answer["hits"]}
         nodes = sorted(answers.union(scene.tree.nodes_of(Level.WHOLE).tolist()))
     views = scene.views.names
-    yield 0, len(views) + len(nodes)
-    for done, pictured in enumerate((*views, *nodes), 1):
+    total = len(views) + len(nodes)
+    yield 0, total
+    for done, view in enumerate(views, 1):
         with shown.unchanged():
-            if isinstance(pictured, str):
-                small = resize_to_fit(scene.scene.image(pictured), PHOTO_PX)
-                described["photos"].append(_text(encoded(small, quality=75)))
-            else:
-                described["crops"][pictured] = _text(encoded(crop(scene, pictured)))
-        yield done, len(views) + len(nodes)
+            photo = resize_to_fit(scene.scene.image(view), PHOTO_PX)
+        described["photos"].append(_text(encoded(photo, quality=75)))
+        yield done, total
+    for done, node in enumerate(nodes, 1 + len(views)):
+        with shown.unchanged():
+            described["crops"][node] = _text(encoded(crop(scene, node)))
+        yield done, total
     packed = payload.packed_nodes(scene.tree, rows)
     return partial(_assembled, described, partial(shown.spz, rows), packed, static)
 
