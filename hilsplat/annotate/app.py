@@ -170,8 +170,8 @@ class OpenedScene(ShownScene):
         except ArtifactError as error:
             return first_line(error)
         best: dict[str, dict[str, str]] = {}
-        own = [(row.get("labels") == "annotated", row.get("queries", "").zfill(9)) for row in rows]
-        for _, row in sorted(zip(own, rows, strict=True), key=lambda pair: pair[0], reverse=True):
+        ranks = [(row.get("labels") == "annotated", row.get("queries", "").zfill(9)) for row in rows]
+        for _, row in sorted(zip(ranks, rows, strict=True), key=lambda pair: pair[0], reverse=True):
             best.setdefault(row["method"], row)
         lines = [f"{row['method']} {row['mIoU']} % ({row['protocol']})" for row in [*best.values()][:SCORES]]
         more = [f"all in {means.with_suffix('.md')}"] if len(rows) > SCORES else []

@@ -104,11 +104,12 @@ class Proposals:
         path = self.masks / f"{view}.npz"  # test views have no masks
         if not path.is_file():
             return []
-        masks = HierarchicalMasks.load(path)
-        dense = masks.dense()
-        rows = [int(row) for row in np.argsort(-masks.area_px, kind="stable") if dense[row, y, x]]
-        levels = masks.level.tolist()
-        return _proposals([(f"mask {row}", "", Level(levels[row]), dense[row]) for row in rows[-MAX_MASKS:]])
+        masks, pixel = HierarchicalMasks.load(path), (x, y, x + 1, y + 1)
+        order = np.argsort(-masks.area_px, kind="stable").tolist()
+        rows = np.array([row for row in order if masks.window(row, pixel).any()][-MAX_MASKS:], np.int64)
+        levels = map(Level, masks.level[rows].tolist())
+        regions = zip(rows.tolist(), levels, masks.dense(rows), strict=True)
+        return _proposals([(f"mask {row}", "", level, mask) for row, level, mask in regions])
 
     # -- from other views -------------------------------------------------------------------------
 
@@ -244,11 +245,11 @@ class Clicks:
         height, width = self.scene.cameras[view].size_hw
         points = np.array([[x + 0.5, y + 0.5] for x, y, _ in clicks]).reshape(-1, 2)
         inside = np.array([is_inside for *_, is_inside in clicks], np.bool_)
-        corners = np.array(box if box else (0, 0, 0, 0))
+        corners = np.array(box or (0, 0, 0, 0))
         if not (inside.any() or box) or (points < 0).any() or (points > (width, height)).any():
             raise SettingsError(
                 "no click is on the object, or one is outside the photograph",
-                expected=f"a click or box on the object, x <= {width}, y <= {height}",
+                expected=f"a click or box on the object, x < {width}, y < {height}",
             )
         encoded = self.encoded(view)
         sides = corners[2:] + 1 - corners[:2]
@@ -259,7 +260,7 @@ class Clicks:
             more_iou, more = self.model.decode_clicks(encoded, points, inside)
             iou, logits = np.concatenate([more_iou, iou]), np.concatenate([more, logits])
         masks = enlarged(logits, encoded.frame)
-        columns, rows = points.astype(np.int64).T if clicks else (np.zeros(0, np.int64),) * 2
+        columns, rows = points.astype(np.int64).T
         satisfied = (masks[:, rows, columns] == inside).sum(axis=1)
         fits = iou
         if box:

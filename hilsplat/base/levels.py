@@ -23,7 +23,8 @@ class Level(IntEnum):
         for known in Level:
             if level in (known, known.label):
                 return known
-        raise SettingsError(f"level {level!r} is unknown", expected="whole, part or subpart")
+        expected = "whole, part or subpart; queries also accept auto"
+        raise SettingsError(f"level {level!r} is unknown", expected=expected)
 
     @property
     def label(self) -> str:

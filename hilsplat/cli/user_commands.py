@@ -63,7 +63,7 @@ def query(
         scenes = open_scenes(results, pattern, variant)
         hits = scenes.query(wanted, level, threshold=threshold, limit=limit)
         rows = [hit.as_json() for hit in hits]
-        echo(json.dumps(rows, indent=1) if as_json else report_of(scenes, wanted, hits))
+        echo(json.dumps(rows, indent=1) if as_json else report_of(scenes, wanted, hits, level))
         return
     refuse_options(context, ("limit", "as_json"), "--all")
     folder = scene_folder(scene, results)

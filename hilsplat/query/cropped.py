@@ -27,7 +27,7 @@ def remaining_rows(
     lines = []
     for keeps, whats in ((True, only), (False, without)):
         for what in whats:
-            rows, line = _found(scene, what)
+            rows, line = _matching(scene, what)
             is_kept[rows] = keeps
             lines.append(f"{'only' if keeps else 'without'} {line}")
     if clean:
@@ -39,7 +39,7 @@ def remaining_rows(
     return np.flatnonzero(is_kept), lines
 
 
-def _found(scene: LanguageScene, what: str) -> tuple[Int64[np.ndarray, " g"], str]:
+def _matching(scene: LanguageScene, what: str) -> tuple[Int64[np.ndarray, " g"], str]:
     """Return the Gaussians of a node, or of all answers to a query, and a description."""
     if what.isdecimal():
         nodes, doubts = [scene.existing_node(int(what))], ""

@@ -54,9 +54,8 @@ class FieldAnswers:
                 of_texts = relevancy.exact(latents, vectors)
             else:
                 of_texts = relevancy.fast(prepared[index], vectors)
-            for text_map, values in zip(maps[:, index], of_texts, strict=True):
-                text_map[:] = values.min()
-                text_map[pixels] = values
+            maps[:, index] = of_texts.min(axis=1, keepdims=True)
+            maps[:, index, pixels] = of_texts
         return maps.reshape(len(texts), len(LEVELS), height, width)
 
     def cosine(
@@ -118,16 +117,15 @@ def field_colours(features: Float32[np.ndarray, "N D"]) -> Float32[np.ndarray, "
     span the colour range, so that all views use the same colours. Gaussians without a feature are black; with
     fewer than three directions, the remaining channels are 0.
     """
-    values = features.astype(np.float64)
-    seen = np.square(values).sum(axis=1) > 0
-    centred = values - values[seen].mean(axis=0) if seen.any() else values
-    covariance = np.einsum("nc,nd->cd", centred[seen], centred[seen])
-    _, directions = np.linalg.eigh(covariance)
-    directions = directions[:, ::-1][:, :3]
-    peak = np.abs(directions).argmax(axis=0)
-    directions = directions * np.sign(directions[peak, np.arange(directions.shape[1])])
     colours = np.zeros((len(features), 3), np.float32)
-    for channel, along in enumerate((centred @ directions).T):
-        low, high = np.percentile(along[seen], (2, 98)) if seen.any() else (0.0, 1.0)
-        colours[:, channel] = np.clip((along - low) / max(high - low, 1e-9), 0, 1) * seen
+    has_feature = (features != 0).any(axis=1)
+    if not has_feature.any():
+        return colours
+    values = features[has_feature].astype(np.float64)
+    centred = values - values.mean(axis=0)
+    directions = np.linalg.eigh(np.einsum("nc,nd->cd", centred, centred))[1][:, ::-1][:, :3]
+    peak = np.abs(directions).argmax(axis=0)
+    along = centred @ (directions * np.sign(directions[peak, np.arange(directions.shape[1])]))
+    low, high = np.percentile(along, (2, 98), axis=0)
+    colours[has_feature, : along.shape[1]] = np.clip((along - low) / np.maximum(high - low, 1e-9), 0, 1)
     return colours

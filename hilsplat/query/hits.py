@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import zip_longest
 
 import numpy as np
 from jaxtyping import Bool, Int64
@@ -39,13 +40,13 @@ class Doubt:
     unknown: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        kind = "node" if self.level is None else self.level.label
         if self.unknown:
             words = ", ".join(map(repr, self.unknown))
             return f"{self.text!r} may not be in the scene: the model's vocabulary lacks {words}"
         if self.chance is None:
+            kind = "node" if self.level is None else self.level.label
             return f"no {kind} is closer to {self.text!r} than to a generic word"
-        share = f"{max(self.chance, 0.01):.0%} of words for absent things"
+        share = f"{self.chance:.0%} of words for absent things"
         return f"{self.text!r} may not be in the scene: {share} score as high"
 
 
@@ -132,9 +133,10 @@ class NodeGroup:
         nodes, scores = tuple(hit.node for hit in hits), tuple(round(hit.score, 4) for hit in hits)
         return NodeGroup(text, nodes, scores, tuple(str(doubt) for doubt in hits[0].doubts) if hits else ())
 
-    def score_of(self, node: int) -> float | None:
-        """Return the score of a node of the group, or None if the nodes are not answers."""
-        return self.scores[self.nodes.index(node)] if self.scores else None
+    @property
+    def score_of(self) -> dict[int, float | None]:
+        """The score of each node; None if the nodes are not answers."""
+        return dict(zip_longest(self.nodes, self.scores))
 
 
 def label_comments(groups: Sequence[NodeGroup], name_of: Callable[[int], str]) -> list[str]:
@@ -142,8 +144,7 @@ def label_comments(groups: Sequence[NodeGroup], name_of: Callable[[int], str]) -
     comments = []
     for number, group in enumerate(groups, 1):
         comments.append(f"label {number}: {group.name}")
-        for node in group.nodes:
-            score = group.score_of(node)
+        for node, score in group.score_of.items():
             named = f"label {number}, node {node}: {name_of(node) or '?'}"
             comments.append(named if score is None else f"{named}, score {score:.4f}")
         comments += [f"label {number}, doubtful: {doubt}" for doubt in group.doubts]

@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int64, UInt8
+from jaxtyping import Bool, Float32, Int64, UInt8
 
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import LEVELS, Level
@@ -47,10 +47,7 @@ class LanguageScene(NodeQueries):
 
     Attributes:
         views: the views, with the Gaussians and nodes that they show.
-        clip: the model that embedded the scene's masks.
         decoded_field: relevancy from the language field; None if the run has not computed it yet.
-        names: the user's names for nodes, which are matched first.
-        naming: vocabulary names of the nodes, and words for absent objects; None if the stage has not run.
     """
 
     views: SceneViews
@@ -60,7 +57,6 @@ class LanguageScene(NodeQueries):
     names: NodeNames = dataclasses.field(default_factory=NodeNames)
     naming: NodeNaming | None = None
     _rival_margins: dict[str, np.ndarray] = dataclasses.field(default_factory=dict, repr=False, kw_only=True)
-    """Margins (W, n) of all nodes for `naming.rivals`, by answerer."""
 
     def __repr__(self) -> str:
         nodes = ", ".join(f"{len(self.tree.nodes_of(level))} {level.label}" for level in LEVELS)
@@ -74,8 +70,9 @@ class LanguageScene(NodeQueries):
         scene = LanguageScene.from_parts(parts, finished.evaluate_settings(), threads=threads, opened=opened)
         names = read_names(finished.folder, parts.semantic_tree)
         naming = NodeNaming.load(parts.clip.parent / "names", parts.semantic_tree, parts.clip)
-        if naming is not None and scene.caution:
-            naming = naming.hidden()
+        if naming is not None and scene.caution:  # the vocabulary's model cannot describe this scene
+            count = len(naming.of_node)
+            naming = replace(naming, of_node=("",) * count, surfaces=(False,) * count)
         return replace(scene, names=names, naming=naming)
 
     @staticmethod
@@ -146,10 +143,8 @@ class LanguageScene(NodeQueries):
     def field(self) -> FieldAnswers:
         """Relevancy from the language field; raises ArtifactError if it is not computed yet."""
         if self.decoded_field is None:
-            raise ArtifactError(
-                f"{self.scene.name} has no language field yet",
-                fix="query its tree, or wait for the run to end",
-            )
+            fix = "query its tree, or wait for the run to end"
+            raise ArtifactError(f"{self.scene.name} has no language field yet", fix=fix)
         return self.decoded_field
 
     @cached_property
@@ -219,8 +214,9 @@ class LanguageScene(NodeQueries):
     def _nearest(
         self, vector: Float32[np.ndarray, " C"], nodes: Int64[np.ndarray, " n"], limit: int
     ) -> list[Hit]:
+        """Return the nodes, given in ascending order, whose vectors are nearest to a vector."""
         cosine = self.tree.clip[nodes] @ vector
-        order = np.lexsort((nodes, -cosine))[: checked_count(limit)]
+        order = np.argsort(-cosine, kind="stable")[: checked_count(limit)]
         return [self._hit(int(nodes[row]), float(cosine[row]), "like", ()) for row in order]
 
     def hits_of(self, nodes: NodeHits, limit: int) -> list[Hit]:
@@ -251,21 +247,8 @@ class LanguageScene(NodeQueries):
             self.views,
         )
 
-    def select(
-        self,
-        path: str | Sequence[str],
-        *,
-        level: Level | str | None = None,
-        answerer: str = "tree",
-        view: str | None = None,
-        threshold: float | None = None,
-    ) -> NodeHits:
-        """Return the answers of `query` as rows of the tree; the path may also be a sequence of texts.
-
-        For arguments and errors, see `query`; level None means "auto".
-        """
-        visible = None if view is None else self.views.visible_nodes(view)
-        return self.find(path, level=level, answerer=answerer, threshold=threshold, visible=visible)
+    def _visible(self, view: str | None) -> Bool[np.ndarray, " n"]:
+        return super()._visible(view) if view is None else self.views.visible_nodes(view)
 
     # -- relevancy --------------------------------------------------------------------------------
 

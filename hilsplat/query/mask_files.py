@@ -18,9 +18,11 @@ def mask_files(scene: LanguageScene, groups: Sequence[NodeGroup]) -> Iterator[di
     The last view's files include `coco.json`. Groups are the COCO categories, with their doubts; a node in
     several groups has one annotation per group, with the node's name and score.
     """
-    nodes = sorted({node for group in groups for node in group.nodes})
+    scores = [group.score_of for group in groups]
+    nodes = sorted(set().union(*scores))
     views, description = scene.views.names, f"{scene.scene.name}: masks of nodes, by hilsplat"
     coco = coco_content(description, views, scene.scene.cameras, [group.name for group in groups])
+    annotations = coco["annotations"]
     for category, group in zip(coco["categories"], groups, strict=True):
         category["doubts"] = group.doubts
     for number, view in enumerate(views):
@@ -33,11 +35,11 @@ def mask_files(scene: LanguageScene, groups: Sequence[NodeGroup]) -> Iterator[di
             Image.fromarray(mask).save(png, format="PNG")
             files[f"{Path(view).stem}/{node}.png"] = png.getvalue()
             region = {"image_id": number, "node": node, "name": scene.name_of(node), **coco_region(mask)}
-            for category, group in enumerate(groups, 1):
-                if node in group.nodes:
-                    ids = {"id": len(coco["annotations"]) + 1, "category_id": category}
-                    scored = {} if group.score_of(node) is None else {"score": group.score_of(node)}
-                    coco["annotations"].append({**ids, **region, **scored})
+            for category, of_group in enumerate(scores, 1):
+                if node in of_group:
+                    ids = {"id": len(annotations) + 1, "category_id": category}
+                    scored = {} if of_group[node] is None else {"score": of_group[node]}
+                    annotations.append({**ids, **region, **scored})
         if number == len(views) - 1:
             files["coco.json"] = json.dumps(coco, ensure_ascii=False).encode()
         yield files

@@ -1,7 +1,7 @@
 """Stage `names`: the best vocabulary word for each node, and vectors of words for absent objects."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -97,10 +97,6 @@ class NodeNaming:
     of_node: tuple[str, ...]
     surfaces: tuple[bool, ...]
     rivals: Float32[np.ndarray, "W C"]
-
-    def hidden(self) -> "NodeNaming":
-        """Return this naming without names, for a scene that the vocabulary's model cannot describe."""
-        return replace(self, of_node=("",) * len(self.of_node), surfaces=(False,) * len(self.surfaces))
 
     @staticmethod
     def load(folder: Path, semantic_tree: Path, clip_folder: Path) -> "NodeNaming | None":

@@ -58,26 +58,27 @@ class NodeQueries(ABC):
     def node_vectors(self, answerer: str = "tree") -> Float32[np.ndarray, "n C"]:
         """Return the nodes' unit vectors: those of the tree, or those decoded from their Gaussians' field."""
 
-    def find(
+    def _visible(self, view: str | None) -> Bool[np.ndarray, " n"]:
+        """Return whether a view shows each node; all nodes compete if it is None."""
+        return np.ones(len(self.tree), np.bool_)
+
+    def select(
         self,
         path: str | Sequence[str],
         *,
         level: Level | str | None = None,
         answerer: str = "tree",
+        view: str | None = None,
         threshold: float | None = None,
-        visible: Bool[np.ndarray, " n"] | None = None,
     ) -> NodeHits:
-        """Return what `LanguageScene.query` finds, as rows of the tree.
+        """Return the nodes that `LanguageScene.query` finds, as rows of the tree.
 
-        For arguments and errors, see there; the path may also be a sequence of texts, and level None means
-        "auto". Only nodes that are `visible` compete.
+        For arguments and errors, see there. The path may also be a sequence of texts; level None is "auto".
         """
         path = path_of(path) if isinstance(path, str) else tuple(path)
         if answerer not in ANSWERERS:
-            raise SettingsError(
-                f"answerer {answerer!r} is unknown", expected=" or ".join(ANSWERERS), found=answerer
-            )
-        visible = np.ones(len(self.tree), np.bool_) if visible is None else visible
+            raise SettingsError(f"answerer {answerer!r} is unknown", expected=" or ".join(ANSWERERS))
+        visible = self._visible(view)
         nodes = search(
             self.tree,
             self.node_margins(path, answerer),

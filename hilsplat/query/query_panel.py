@@ -67,7 +67,7 @@ def query_panel(
         if answerer == "tree":
             relevancy = scene.node_relevancy_map([last], view)[0]
         else:
-            relevancy = scene.field.relevancy([last], view, exact=False)[0]
+            relevancy = scene.field.relevancy([last], view)[0]
         low, high = float(relevancy.min()), float(relevancy.max())
         pictures = [(image, view), (paint_answer(image, mask), f"answer: {mask.mean():.1%} of the view")]
         for level in LEVELS:

@@ -160,14 +160,14 @@ class Scenes:
         limit, each = checked_count(limit), checked_count(each, "each")
 
         def answers(scene: IndexedScene) -> NodeHits:
-            return scene.find(text, level=level, threshold=threshold)
+            return scene.select(text, level=level, threshold=threshold)
 
         best: list[tuple[float, str, FoundScene]] = []
         for entry in self.found:
             with self._skipping(entry.name):
                 best += [(-score, entry.name, entry) for score in _scores(answers(entry.opened()), entry, 1)]
         hits: dict[str, list[SceneHit]] = {}
-        for _, name, entry in sorted(best, key=lambda each: each[:2]):
+        for _, name, entry in sorted(best, key=lambda entry: entry[:2]):
             if len(hits) < limit:
                 with self._skipping(name):
                     scene = entry.opened(entry.naming())
@@ -252,8 +252,8 @@ def open_scenes(results: Path | str = "results", pattern: str = "*", variant: st
     return Scenes(tuple(found), skipped)
 
 
-def report_of(scenes: Scenes, text: str, hits: Sequence[SceneHit]) -> str:
-    """Return answers, doubts and skipped scenes as text."""
+def report_of(scenes: Scenes, text: str, hits: Sequence[SceneHit], level: str = "auto") -> str:
+    """Return answers, doubts and skipped scenes as text; `level` is that of the query."""
     lines = [f"{counted(len(hits), 'answer')} to {text!r} in {counted(len(scenes.found), 'scene')}"]
     if hits:
         columns = "score", "scene", "node", "level", "name", "picture"
@@ -263,8 +263,9 @@ def report_of(scenes: Scenes, text: str, hits: Sequence[SceneHit]) -> str:
         ]
         lines += aligned_table([columns, *rows], {"scene", "level", "name", "picture"})
         variant = scenes.found[0].finished.variant
-        of_variant = [] if variant == "default" else ["--variant", variant]
-        command = shlex.join(["hilsplat", "query", _shown(hits[0].folder), text, *of_variant])
+        options = [] if level == "auto" else ["--level", level]
+        options += [] if variant == "default" else ["--variant", variant]
+        command = shlex.join(["hilsplat", "query", _shown(hits[0].folder), text, *options])
         lines.append(f"more about the best: {command}")
     lines += [f"doubtful: {doubt}" for hit in hits[:1] for doubt in hit.doubts]
     lines += dict.fromkeys(hit.caution for hit in hits if hit.caution)

@@ -74,36 +74,33 @@ def tree_picture(scene: LanguageScene) -> UInt8[np.ndarray, "H W 3"]:
     height = len(LEVELS) * ROW_PX + BLOCK_GAP_PX
     width = max(sum(columns(root) * step + BLOCK_GAP_PX for root in row) for row in rows)
     canvas = np.full((len(rows) * height, MARGIN_PX + width, 3), BACKGROUND, np.uint8)
-    placed: list[tuple[int, int, int]] = []
+    labels: list[tuple[str, int, int]] = []
 
-    def place(node: int, left: int, top: int) -> int:
-        """Place a node and its descendants, draw their lines, and return the node's horizontal centre."""
+    def draw(node: int, left: int, top: int) -> int:
+        """Draw a node and its descendants, with lines, and return the node's horizontal centre."""
         x = left + (columns(node) - 1) * step // 2
         y = top + Level(int(tree.level[node])).index * ROW_PX
         centre = x + CELL_PX // 2
         bar = y + CELL_PX + LABEL_PX + GAP_PX  # below this line, children do not share columns
         for child in children[node]:
-            middle = place(child, left, top)
+            middle = draw(child, left, top)
             left += columns(child) * step
             canvas[bar : top + Level(int(tree.level[child])).index * ROW_PX, middle] = LINE
             canvas[bar, min(middle, centre) : max(middle, centre) + 1] = LINE
             canvas[bar - GAP_PX : bar, centre] = LINE
-        placed.append((node, x, y))
+        canvas[y : y + CELL_PX, x : x + CELL_PX] = crop(scene, node, CELL_PX, 0.35, BACKGROUND)
+        first, line = y + CELL_PX + LABEL_PX // 4, LABEL_PX // 2
+        labels.extend([(scene.own_name_of(node) or "?", centre, first), (str(node), centre, first + line)])
         return centre
 
-    labels: list[tuple[str, int, int]] = []
     for number, row in enumerate(rows):
         left, top = MARGIN_PX, number * height + GAP_PX
         for root in row:
-            place(root, left, top)
+            draw(root, left, top)
             left += columns(root) * step + BLOCK_GAP_PX
         labels += [
             (level.label, MARGIN_PX // 2, top + level.index * ROW_PX + CELL_PX // 2) for level in LEVELS
         ]
-    for node, x, y in placed:
-        canvas[y : y + CELL_PX, x : x + CELL_PX] = crop(scene, node, CELL_PX, 0.35, BACKGROUND)
-        name, middle, line = scene.own_name_of(node) or "?", x + CELL_PX // 2, LABEL_PX // 2
-        labels += [(name, middle, y + CELL_PX + line // 2), (str(node), middle, y + CELL_PX + line * 3 // 2)]
     return _labelled(canvas, labels)
 
 

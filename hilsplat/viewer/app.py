@@ -200,7 +200,7 @@ class EmbeddedViewer:
     @property
     def address(self) -> str:
         """Address of the page; anyone who has the address can see the scene until the server stops."""
-        base = self.proxy.format(port=self.port) if self.proxy else f"http://127.0.0.1:{self.port}/"
+        base = self.proxy.replace("{port}", str(self.port)) or f"http://127.0.0.1:{self.port}/"
         query = f"#{urlencode({'q': self.text})}" if self.text else ""
         return f"{base}?{urlencode({'token': self.token, 'embedded': 1})}{query}"
 

@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any
 
 from hilsplat.base.images import resize_to_fit
+from hilsplat.base.levels import Level
 from hilsplat.query.tree_picture import crop
 from hilsplat.viewer import exports, payload
 from hilsplat.viewer.viewer_scene import ViewerScene
@@ -28,39 +29,39 @@ POLICY = (
 
 
 def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> exports.Steps:
-    """Make the page of a scene, with one step per crop; 60,000 Gaussians take 8 MB.
+    """Make the page of a scene, with one step per photograph and crop.
 
     Raises:
         SettingsError: a text is empty, or the variant cannot be queried.
         StaleSceneError: a part of the scene was rewritten since it was opened.
     """
     scene, rows = shown.answering(asked.variant), shown.kept_rows(asked.removed)
-    with shown.unchanged():
-        images = [resize_to_fit(scene.views.image(view), PHOTO_PX) for view in scene.views.names]
+    of_page = {"variants": [asked.variant], "gaussians": len(rows), "chunk": len(rows), "restart": ""}
     described: dict[str, Any] = {
-        "scene": {
-            **shown.described(),
-            "variants": [asked.variant],
-            "gaussians": len(rows),
-            "chunk": len(rows),
-            "restart": "",
-        },
+        "scene": {**shown.described(), **of_page},
         "variant": shown.described_variant(asked.variant),
         "asked": [question.model_dump(exclude_none=True) for question in asked.asked],
         "answers": [payload.answer(scene, question, asked.answerer) for question in asked.asked],
-        "photos": [_text(encoded(image, quality=75)) for image in images],
         "link": asked.link,
+        "photos": [],
         "crops": {},
     }
     nodes = list(range(len(scene.tree)))
     if len(nodes) > MAX_CROPS:
-        wholes = {int(node) for node in nodes if scene.tree.level[node] == 1}
-        nodes = sorted(wholes | {hit["node"] for answer in described["answers"] for hit in answer["hits"]})
-    yield 0, len(nodes)
-    for done, node in enumerate(nodes, 1):
+        answers = {hit["node"] for answer in described["answers"] for hit in answer["hits"]}
+        nodes = sorted(answers.union(scene.tree.nodes_of(Level.WHOLE).tolist()))
+    views = scene.views.names
+    total = len(views) + len(nodes)
+    yield 0, total
+    for done, view in enumerate(views, 1):
+        with shown.unchanged():
+            photo = resize_to_fit(scene.scene.image(view), PHOTO_PX)
+        described["photos"].append(_text(encoded(photo, quality=75)))
+        yield done, total
+    for done, node in enumerate(nodes, 1 + len(views)):
         with shown.unchanged():
             described["crops"][node] = _text(encoded(crop(scene, node)))
-        yield done, len(nodes)
+        yield done, total
     packed = payload.packed_nodes(scene.tree, rows)
     return partial(_assembled, described, partial(shown.spz, rows), packed, static)
 

@@ -6,7 +6,7 @@ from functools import partial
 from typing import Any
 
 from pydantic import TypeAdapter
-from starlette.convertors import IntegerConvertor
+from starlette.convertors import IntegerConvertor, StringConvertor
 from starlette.responses import Response
 from starlette.routing import Route
 
@@ -14,6 +14,7 @@ from hilsplat.viewer.payload import Answer
 from hilsplat.web.server import BYTES
 
 JSON = "application/json"
+KINDS = {IntegerConvertor: "integer", StringConvertor: "string"}
 CONTENT = {bytes: BYTES, partial[bytes]: BYTES, Response: "image/jpeg"}
 """Content type of each type that a request's function returns; other types are sent as JSON."""
 
@@ -38,26 +39,21 @@ def description(routes: Sequence[Route]) -> dict[str, Any]:
         returned = inspect.signature(work).return_annotation
         content = {CONTENT.get(returned, JSON): schema_of(Answer) if returned is Answer else {}}
         body = {"requestBody": {"required": True, "content": {JSON: schema_of(kind)}}} if kind else {}
-        parameters = {
-            name: "integer" if isinstance(convertor, IntegerConvertor) else "string"
-            for name, convertor in route.param_convertors.items()
+        described = {
+            "summary": summary,
+            "parameters": [
+                {"name": name, "in": "path", "required": True, "schema": {"type": KINDS[type(convertor)]}}
+                for name, convertor in route.param_convertors.items()
+            ],
+            **body,
+            "responses": {
+                "200": {"description": summary, "content": content},
+                "400": {"description": "the request is malformed: {error}"},
+                "403": {"description": "the cookie, the host or the origin is missing or wrong"},
+                "422": {"description": "the request cannot be fulfilled: {error}"},
+            },
         }
-        paths[route.path_format] = {
-            "post" if kind else "get": {
-                "summary": summary,
-                "parameters": [
-                    {"name": name, "in": "path", "required": True, "schema": {"type": parameter}}
-                    for name, parameter in parameters.items()
-                ],
-                **body,
-                "responses": {
-                    "200": {"description": summary, "content": content},
-                    "400": {"description": "the request is malformed: {error}"},
-                    "403": {"description": "the cookie, the host or the origin is missing or wrong"},
-                    "422": {"description": "the request cannot be fulfilled: {error}"},
-                },
-            }
-        }
+        paths[route.path_format] = {"post" if kind else "get": described}
     return {
         "openapi": "3.1.0",
         "info": {

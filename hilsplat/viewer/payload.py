@@ -210,7 +210,7 @@ def boxes(scene: LanguageScene, groups: Sequence[NodeGroup]) -> dict[str, Any]:
                 "group": group.name,
                 "node": node,
                 "name": scene.name_of(node),
-                "score": group.score_of(node),
+                "score": score,
                 "doubts": group.doubts,
                 "level": int(tree.level[node]),
                 "parent": int(tree.parent[node]),
@@ -223,6 +223,6 @@ def boxes(scene: LanguageScene, groups: Sequence[NodeGroup]) -> dict[str, Any]:
                 "centroid": tree.centroid[node].tolist(),
             }
             for group in groups
-            for node in group.nodes
+            for node, score in group.score_of.items()
         ],
     }

@@ -86,11 +86,7 @@ class SavedFiles:
 
 def _ply(shown: ViewerScene, asked: wire.Edited) -> bytes:
     """Return the scene, or nodes with labels, without removed Gaussians as a 3DGS PLY."""
-    rows, labels = _rows(shown, asked)
-    comments = []
-    if isinstance(asked, wire.Selection):
-        scene, groups = _selected(shown, asked)
-        comments = label_comments(groups, scene.name_of)
+    rows, labels, comments = _rows(shown, asked)
     with shown.unchanged(), TemporaryDirectory() as folder:
         out = Path(folder) / "selection.ply"
         write_selection_ply(shown.ply, rows, out, labels, comments)
@@ -99,11 +95,12 @@ def _ply(shown: ViewerScene, asked: wire.Edited) -> bytes:
 
 def _spz(shown: ViewerScene, asked: wire.Edited) -> partial[bytes]:
     """Return the scene, or nodes, without removed Gaussians as SPZ."""
-    rows, _ = _rows(shown, asked)
+    rows, *_ = _rows(shown, asked)
     return partial(shown.spz, rows[morton_order(shown.gaussians.means[rows])])
 
 
 def _boxes(shown: ViewerScene, asked: wire.Selection) -> dict[str, Any]:
+    """Return the boxes of nodes."""
     return payload.boxes(*_selected(shown, asked))
 
 
@@ -121,23 +118,23 @@ def _film(shown: ViewerScene, asked: wire.Film) -> exports.Steps:
     return exports.film(gaussians, cameras, paint, kind=asked.format, threads=shown.threads)
 
 
-def _rows(shown: ViewerScene, asked: wire.Edited) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the rows of the scene or of nodes, without removed Gaussians, and labels of the nodes' rows."""
+def _rows(shown: ViewerScene, asked: wire.Edited) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
+    """Return the remaining rows of the scene or of nodes, and the nodes' labels with comments about them."""
     if not isinstance(asked, wire.Selection):
-        return np.sort(shown.kept_rows(asked.removed)), None
-    rows, labels = exports.labelled(*_selected(shown, asked))
+        return np.sort(shown.kept_rows(asked.removed)), None, []
+    scene, groups = _selected(shown, asked)
+    rows, labels = exports.labelled(scene, groups)
     remains = ~shown.marked(asked.removed)[rows]
     if not remains.any():
         raise SettingsError("no Gaussian remains to be saved", fix="undo the removal, or select other nodes")
-    return rows[remains], labels[remains]
+    return rows[remains], labels[remains], label_comments(groups, scene.name_of)
 
 
 def _selected(shown: ViewerScene, asked: wire.Selection) -> tuple[LanguageScene, list[NodeGroup]]:
     """Return the variant and the groups; raise SettingsError if a node does not exist."""
     scene = shown.answering(asked.variant)
     for group in asked.groups:
-        for node in group.nodes:
-            scene.existing_node(node)
+        scene.views.existing(group.nodes)
     return scene, [group.group() for group in asked.groups]
 
 

@@ -235,14 +235,14 @@ class ViewerScene(ShownScene):
         Raises:
             SettingsError: the style does not fit the tree.
         """
-        if not (style.table or style.ramp or style.marked):
-            return None
         if style.table or style.ramp:
             scene = self.answering(variant)
             relevancy = self.field_relevancy(variant, style.text, style.level) if style.ramp else None
             paint = Paint.of(style, scene.tree.node_of_gaussian, len(scene.tree), relevancy)
-        else:
+        elif style.marked:
             paint = Paint.plain(len(self.gaussians))
+        else:
+            return None
         return paint.marking(self.marked(style.marked)) if style.marked else paint
 
     def warm_up(self) -> None:

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import UInt8
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import MAX_TEXT
@@ -35,12 +35,17 @@ MAX_BODY_BYTES = 4 << 20
 """Maximum size of a request: the table of a style, and the marks of two sets of Gaussians."""
 
 
+Side = Annotated[
+    int, Field(ge=1, le=2 * MAX_SIDE_PX)
+]  # of a view of the page, which may be wider than 4096 px
+
+
 class WireCamera(Message):
     """A camera with OpenCV axes; the centre of the top-left pixel is at (0.5, 0.5)."""
 
     cam_from_world: tuple[Row4, Row4, Row4, Row4]
     K: tuple[Row3, Row3, Row3]
-    size_hw: tuple[Annotated[int, Field(ge=1, le=MAX_SIDE_PX)], Annotated[int, Field(ge=1, le=MAX_SIDE_PX)]]
+    size_hw: tuple[Side, Side]
 
     def camera(self) -> Camera:
         """Return the camera as the package's type; raise SceneError if it is impossible."""
@@ -162,6 +167,13 @@ class Frame(Edited):
     style: Style = Style()
     quality: Annotated[int, Field(ge=20, le=100)] = 80
     image: Literal["jpeg", "png"] = "jpeg"
+
+    @field_validator("camera")
+    @classmethod
+    def _can_be_rendered(cls, camera: WireCamera) -> WireCamera:
+        if max(camera.size_hw) > MAX_SIDE_PX:
+            raise ValueError(f"a picture has sides of at most {MAX_SIDE_PX} px")
+        return camera
 
 
 class Film(Edited):

@@ -206,7 +206,7 @@ class SceneThread(Generic[Shown]):
         """Describe the scene: views, Gaussians, variants; if it has changed, it is reopened."""
         if not shown.changed():
             return shown.described()
-        (name,) = [name for name, each in self.opened.items() if each is shown]
+        (name,) = [name for name, scene in self.opened.items() if scene is shown]
         self.opened[name] = shown.opened_again()
         return self.opened[name].described()
 

@@ -1,6 +1,7 @@
 """Code shared by both page servers: static files, responses, errors, a local socket."""
 
 import json
+import logging
 import secrets
 import socket
 import webbrowser
@@ -139,8 +140,18 @@ def listening_at(port: int) -> socket.socket:
 
 
 def configured(app: Guard) -> uvicorn.Config:
-    """Return the configuration of a server that logs only warnings, through the handlers of this process."""
-    return uvicorn.Config(app, log_config=None, log_level="warning", access_log=False, server_header=False)
+    """Return the configuration of a server that logs only warnings, through the handlers of this process.
+
+    When it is stopped, unfinished responses, such as films, end after a second.
+    """
+    logging.getLogger("uvicorn.error").addFilter(_is_unexpected)
+    options: dict[str, Any] = {"log_config": None, "log_level": "warning", "access_log": False}
+    return uvicorn.Config(app, **options, server_header=False, timeout_graceful_shutdown=1)
+
+
+def _is_unexpected(record: logging.LogRecord) -> bool:
+    """Return whether a log record is about anything but responses that end with the server."""
+    return "graceful shutdown" not in f"{record.getMessage()} {record.exc_info and record.exc_info[1]}"
 
 
 def serve(
@@ -155,16 +166,18 @@ def serve(
         port: 0 uses the page's own port, or any free port if that is taken.
         browser: whether to open the page in a browser.
     """
-    try:  # what a browser keeps for a page, such as removed Gaussians, belongs to the port
-        listening = listening_at(port or OWN_PORTS[zlib.crc32(page.encode()) % len(OWN_PORTS)])
+    note, usual = "", OWN_PORTS[zlib.crc32(page.encode()) % len(OWN_PORTS)]
+    try:
+        listening = listening_at(port or usual)
     except SettingsError:
         if port:
             raise
         listening = listening_at(0)
+        note = f"Port {usual} is in use: what the browser keeps for this page there is not shown here\n"
     token = secrets.token_urlsafe(24)
     address = f"http://127.0.0.1:{listening.getsockname()[1]}/?token={token}"
     config = configured(app(token))
-    on_ready(f"{about} at {address}\nPress Ctrl-C to stop")
+    on_ready(f"{about} at {address}\n{note}Press Ctrl-C to stop")
     with suppress(webbrowser.Error):  # none is installed
         if browser and getattr(webbrowser.get(), "name", "") not in TEXT_BROWSERS:
             Thread(target=webbrowser.open, args=(address,), daemon=True).start()  # may wait for its end

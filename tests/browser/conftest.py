@@ -278,6 +278,12 @@ def opened(browser) -> Iterator[Callable]:
 
 
 @pytest.fixture
+def page(opened, desk_address) -> ScenePage:
+    """The viewer's page of the desk, with WebGL."""
+    return opened(desk_address)
+
+
+@pytest.fixture
 def opened_here(opened) -> Iterator[Callable]:
     """A function that serves a page and opens it; it is closed before its server, which it polls."""
     with ExitStack() as stack:

@@ -41,8 +41,7 @@ def test_a_query_typed_after_the_slash_key_paints_its_answer(opened, desk_addres
     assert status.index(doubt) < status.index("answer")  # a doubt comes first
 
 
-def test_an_answer_outside_the_view_is_one_click_away_until_it_is_cleared(opened, desk_address):
-    page = opened(desk_address)
+def test_an_answer_outside_the_view_is_one_click_away_until_it_is_cleared(page):
     page.locator("#colour").select_option("relevancy")
     page.get_by_text("Run a query first").wait_for()
     page.locator("#colour").select_option("answers")
@@ -75,8 +74,7 @@ def test_what_others_hides_is_not_chosen(opened, desk_address, painter):
     assert not card.is_visible()
 
 
-def test_a_photograph_is_not_shown_over_the_view_of_another(opened, desk_address):
-    page = opened(desk_address)
+def test_a_photograph_is_not_shown_over_the_view_of_another(page):
     page.press("o")
     page.locator("#photo").wait_for()
     held = []
@@ -89,11 +87,8 @@ def test_a_photograph_is_not_shown_over_the_view_of_another(opened, desk_address
 
 
 @pytest.mark.parametrize("path", ["splats/0", "variant/default", "nodes/default"])
-def test_what_a_lost_connection_interrupts_is_loaded_later_with_the_query_typed_meanwhile(
-    opened, desk_address, path
-):
+def test_what_a_lost_connection_interrupts_is_loaded_later_with_the_query_typed_meanwhile(page, opened, path):
     opened.expected.append("ERR_FAILED")
-    page = opened(desk_address)
     lost = []
     page.route(f"**/api/{path}?**", lambda route: route.abort() or lost.append(1), times=1)
     page.reload()
@@ -104,8 +99,7 @@ def test_what_a_lost_connection_interrupts_is_loaded_later_with_the_query_typed_
     assert page.locator("#text").input_value() == "mug > handle"
 
 
-def test_labels_of_boxes_end_in_the_picture_of_a_phone_and_do_not_cover_each_other(opened, desk_address):
-    page = opened(desk_address)
+def test_labels_of_boxes_end_in_the_picture_of_a_phone_and_do_not_cover_each_other(page):
     page.set_viewport_size({"width": 390, "height": 780})
     for text in (
         "mug",
@@ -169,8 +163,7 @@ def test_a_click_chooses_the_whole_and_the_next_click_its_part(opened, desk_addr
     page.locator("#overlay path.chosen").first.wait_for(state="detached")
 
 
-def test_quick_picks_agree_with_exact_ones(opened, desk_address, scene):
-    page = opened(desk_address)
+def test_quick_picks_agree_with_exact_ones(page, scene):
     wire = page.wire_camera()
     height, width = wire["size_hw"]
     rng = np.random.default_rng(1)
@@ -186,8 +179,7 @@ def test_quick_picks_agree_with_exact_ones(opened, desk_address, scene):
     assert len(agree) > 20 and np.mean(agree) > 0.8
 
 
-def test_keys_move_in_the_outline(opened, desk_address, scene):
-    page = opened(desk_address)
+def test_keys_move_in_the_outline(page, scene):
     tree = page.get_by_role("tree")
     items = tree.get_by_role("treeitem")
     items.last.wait_for()
@@ -213,8 +205,8 @@ def test_keys_move_in_the_outline(opened, desk_address, scene):
     page.locator(f"#overlay path.chosen[data-node='{child}']").wait_for(state="attached")
 
 
-def test_queries_with_an_image_a_framed_part_of_the_view_and_a_node(opened, desk_address, scene, tmp_path):
-    page = opened(desk_address)
+def test_queries_with_an_image_a_framed_part_of_the_view_and_a_node(page, opened, scene, tmp_path):
+    opened.expected.append("ERR_FAILED")
     book = scene.query("book", "whole")[0].node
     write_png(tmp_path / "blue.png", np.full((40, 30, 3), (0, 0, 250), np.uint8))
     page.get_by_label("Picture to look for").set_input_files(tmp_path / "blue.png")
@@ -222,9 +214,18 @@ def test_queries_with_an_image_a_framed_part_of_the_view_and_a_node(opened, desk
     assert page.locator("#answers li").first.get_attribute("data-node") == str(book)
     page.press("Escape")
     low, high = page.on_page((18, 18, 0), (34, 22, 0))  # corners of the book
+    page.route("**/api/photo/**", lambda route: route.abort(), times=1)
+    page.drag(low, high, held="Alt")
+    page.locator("#status.error").get_by_text("The server has stopped.").wait_for()
     page.drag(low, high, held="Alt")
     page.answers().first.wait_for()
     assert page.locator("#answers li").first.get_attribute("data-node") == str(book)
+    page.press("Escape")
+    mug = scene.query("mug", "whole")[0].node
+    ((x, y),) = page.on_page((14, 16, 0))
+    page.drag((x, y), (PANEL_PX - 40, y + 30), held="Alt")  # ends beside the view
+    page.answers().first.wait_for()
+    assert page.locator("#answers li").first.get_attribute("data-node") == str(mug)
     page.get_by_label("Beside").select_option("default|field")
     for moved in (0, 0.01):  # from the photograph and from the rendered picture, both in the right half
         page.press("Escape")
@@ -246,8 +247,7 @@ def test_queries_with_an_image_a_framed_part_of_the_view_and_a_node(opened, desk
     )
 
 
-def test_two_answerers_are_shown_side_by_side(opened, desk_address):
-    page = opened(desk_address)
+def test_two_answerers_are_shown_side_by_side(page):
     page.ask_and_wait("mug")
     page.drawn(lambda: page.get_by_label("Beside").select_option("default|field"))
     right = page.get_by_role("list", name="On the right, by default, field: 1 of 1 are on the left too")
@@ -275,12 +275,15 @@ def test_films_show_progress_and_gifs_and_pictures_have_the_chosen_size(opened, 
     page.get_by_text("of 120 pictures").wait_for()
     page.get_by_role("button", name="Cancel").click()
     page.get_by_role("status").get_by_text("Cancelled: nothing was saved.").wait_for()
+    body = "new ReadableStream({ start(body) { body.error(new TypeError('network error')); } })"
+    read = f"import('/static/http.js').then((own) => own.streamed(new Response({body})))"
+    read += ".catch(({ status, message }) => [status, message])"
+    assert page.evaluate(read) == [0, "The server has stopped."]
     page.locator("#save summary").click()
     assert page.get_by_role("button", name="Film, MP4").is_enabled()
 
 
-def test_an_exported_page_opens_from_a_file_with_its_answers(opened, browser, desk_address, tmp_path, scene):
-    page = opened(desk_address)
+def test_an_exported_page_opens_from_a_file_with_its_answers(page, browser, tmp_path, scene):
     page.keep("book")
     page.ask_and_wait("mug > handle")
     page.press("ArrowLeft")
@@ -374,10 +377,14 @@ def test_late_replies_do_not_undo_what_was_done_meanwhile(served, own_desk):
     names = read_names(own_desk, own_desk / "default/semantic_tree").of_node
     assert names == {0: "frog", 1: "hat"}
     assert page.locator("[role=treeitem][aria-selected=true]").get_attribute("data-node") == "3"
+    page.late("api/like")
+    page.press("m")
+    page.ask_and_wait("book")
+    page.wait_for_timeout(900)
+    assert page.get_by_role("status").inner_text().startswith("1 answer")
 
 
-def test_the_field_of_an_earlier_query_is_not_painted(opened, desk_address):
-    page = opened(desk_address)
+def test_the_field_of_an_earlier_query_is_not_painted(page):
     held = []
     page.route("**/api/field**", lambda route: route.continue_() if held else held.append(route))
     page.ask_and_wait("mug")

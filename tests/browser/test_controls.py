@@ -1,5 +1,6 @@
-"""Camera, history, pending pictures and refused queries of the viewer."""
+"""Camera, labels, history, pending pictures and refused queries of the viewer."""
 
+import re
 from urllib.parse import quote_plus
 
 import numpy as np
@@ -11,9 +12,8 @@ def distance(page) -> float:
     return page.evaluate("Math.hypot(...hilsplat.camera.c.map((v, k) => v - hilsplat.camera.target[k]))")
 
 
-def test_a_refused_query_removes_the_previous_answers(opened, desk_address):
+def test_a_refused_query_removes_the_previous_answers(page, opened):
     opened.expected.append("422")
-    page = opened(desk_address)
     page.ask_and_wait("mug > handle")
     page.ask("mug > ")
     page.locator("#status.error").wait_for()
@@ -21,8 +21,7 @@ def test_a_refused_query_removes_the_previous_answers(opened, desk_address):
     assert page.evaluate("hilsplat.painted()[0].style.table.every((value) => value === 0)")
 
 
-def test_zooming_out_is_limited_and_home_returns_to_the_start(opened, desk_address):
-    page = opened(desk_address)
+def test_zooming_out_is_limited_and_home_returns_to_the_start(page):
     begun = page.wire_camera()
     page.locator("#view").focus()
     for _ in range(120):
@@ -56,8 +55,7 @@ def test_a_held_key_moves_evenly(opened, desk_address):
     assert page.evaluate("hilsplat.camera.c") == before
 
 
-def test_back_returns_to_the_previous_query(opened, desk_address):
-    page = opened(desk_address)
+def test_back_returns_to_the_previous_query(page):
     page.until(lambda: "#" in page.url)
     for text in ("mug > handle", "book"):
         page.ask_and_wait(text)
@@ -111,3 +109,47 @@ def test_another_scene_opens_on_the_same_server(three_scenes, served):
     scenes.nth(1).wait_for()
     assert scenes.nth(1).locator("a").get_attribute("aria-current") == "page"
     assert scenes.nth(2).locator("a").get_attribute("href") is None
+
+
+def test_two_fingers_do_not_choose_a_node(opened, desk_address):
+    page = opened(desk_address, has_touch=True)
+    ((x, y),) = page.on_page((6, 6, 0))
+    fingers = page.context.new_cdp_session(page.page)
+    for kind, count in (("Start", 1), ("Start", 2), ("End", 1), ("End", 0)):
+        points = [{"x": x + 40 * number, "y": y} for number in range(count)]
+        fingers.send("Input.dispatchTouchEvent", {"type": f"touch{kind}", "touchPoints": points})
+    page.wait_for_timeout(500)
+    assert not page.get_by_role("region", name="Chosen node").is_visible()
+
+
+def test_a_box_beside_the_picture_has_no_label_and_labels_stay_clear_of_the_tools(opened, desk_address):
+    page = opened(desk_address, "server")
+    page.ask("mug > handle")
+    label = page.locator("#overlay text")
+    label.first.wait_for(state="attached")
+    tools = page.locator("#tools").bounding_box()
+    for _ in range(40):
+        page.evaluate("hilsplat.camera.move(0, 3, 0); hilsplat.redraw()")  # until the box leaves the picture
+        page.wait_for_timeout(100)
+        top = page.evaluate("document.querySelector('#overlay text')?.getBoundingClientRect().toJSON()")
+        if top is None:
+            break
+        assert top["y"] + top["height"] > tools["y"] + tools["height"]
+    page.wait_for_function("!document.querySelector('#overlay text')")  # the last picture may be on its way
+
+
+def test_a_flight_ends_with_the_whole_node_in_view_and_no_node_hovered(opened, desk_address, scene):
+    page = opened(desk_address, "server")
+    for text in ("mug", "mug > handle"):
+        page.choose_row(scene.query(text)[0].node)
+        page.locator("[role=treeitem] > .row .label").last.hover()
+        page.locator("#overlay path.hover").first.wait_for(state="attached")
+        page.press("f")
+        page.locator("#overlay path.hover").first.wait_for(state="detached")
+        page.wait_for_timeout(1500)
+        box = page.locator("#overlay path.chosen")
+        box.wait_for(state="attached")
+        places = np.array(re.findall(r"[-\d.]+", box.get_attribute("d")), float).reshape(-1, 2)
+        wire = page.wire_camera()
+        middle, half = np.array(wire["K"])[:2, 2], np.array(wire["size_hw"])[::-1] / 2
+        assert (np.abs(places - middle) < half).all() and np.ptp(places, axis=0).max() > 0.3 * half.min()

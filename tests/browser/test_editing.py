@@ -84,8 +84,7 @@ def test_gaussians_in_a_box_are_selected_removed_and_restored(opened, desk_addre
     has(page, 0, 864 - 16 * 24)
 
 
-def test_the_brush_adds_and_subtracts(opened, desk_address, desk):
-    page = opened(desk_address)
+def test_the_brush_adds_and_subtracts(page, desk):
     gaussians = load_ply(desk / "gaussians.ply")
     edit(page)
     page.press("c")
@@ -115,8 +114,7 @@ def test_the_brush_adds_and_subtracts(opened, desk_address, desk):
     assert page.phone_fits()
 
 
-def test_an_answer_is_removed_and_the_rest_is_saved(opened, desk_address, desk, scene, tmp_path):
-    page = opened(desk_address)
+def test_an_answer_is_removed_and_the_rest_is_saved(page, desk, scene, tmp_path):
     page.keep("book")
     page.ask_and_wait("mug > handle")
     (book,), (handle,) = scene.query("book"), scene.query("mug > handle")
@@ -141,18 +139,7 @@ def test_an_answer_is_removed_and_the_rest_is_saved(opened, desk_address, desk, 
     assert (desk / "gaussians.ply").read_bytes() == before
 
 
-def test_loose_gaussians_are_selected_and_removed(own_desk, served):
-    loosen(own_desk, np.arange(100, 140))
-    page = served(own_desk)
-    edit(page)
-    page.get_by_role("button", name="Select loose").click()
-    has(page, 40, 0)
-    page.press("Delete")
-    has(page, 0, 40)
-
-
-def test_what_is_done_while_a_selection_is_on_its_way_acts_on_it(opened, desk_address, tmp_path):
-    page = opened(desk_address)
+def test_what_is_done_while_a_selection_is_on_its_way_acts_on_it(page, tmp_path):
     page.late("api/within")
     edit(page)
     use(page, "box")
@@ -168,9 +155,14 @@ def test_what_is_done_while_a_selection_is_on_its_way_acts_on_it(opened, desk_ad
     has(page, 10 * 6 - 32, 32)
 
 
-def test_steps_that_take_much_memory_are_forgotten(opened, desk_address):
-    page = opened(desk_address)
+def test_loose_gaussians_are_selected_and_steps_that_take_much_memory_are_forgotten(own_desk, served):
+    loosen(own_desk, np.arange(100, 140))
+    page = served(own_desk)
     edit(page)
+    page.get_by_role("button", name="Select loose").click()
+    has(page, 40, 0)
+    page.press("Control+z")
+    has(page, 0, 0)
     click = "([id, times]) => { while (times--) document.getElementById(id).click(); }"
     page.evaluate(click, ["edit-invert", 31])
     has(page, 864, 0)
@@ -197,8 +189,7 @@ def test_removed_gaussians_are_kept_over_a_reload_until_they_are_restored(opened
     has(page, 0, 32)
 
 
-def test_what_is_removed_in_one_tab_is_removed_in_another(opened, desk_address):
-    page = opened(desk_address)
+def test_what_is_removed_in_one_tab_is_removed_in_another(page):
     other = page.beside()
     for tab, columns in ((page, (-0.5, 1.5)), (other, (1.5, 3.5))):
         edit(tab)

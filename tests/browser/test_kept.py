@@ -18,8 +18,7 @@ def greenish(page) -> float:
     return float(((picture[..., 1] - picture[..., 0] > 60) & (picture[..., 2] > 60)).mean())
 
 
-def test_kept_queries_have_colours_and_can_be_hidden_and_dropped(opened, desk_address, scene):
-    page = opened(desk_address)
+def test_kept_queries_have_colours_and_can_be_hidden_and_dropped(page, scene):
     page.keep("book")
     page.keep("mug > handle")
     assert page.evaluate("document.activeElement.id") == "text" and not page.answers().count()
@@ -52,8 +51,7 @@ def test_kept_queries_have_colours_and_can_be_hidden_and_dropped(opened, desk_ad
     page.get_by_text("At most 12 queries can be kept").wait_for()
 
 
-def test_the_overlap_of_two_queries_is_reported(opened, desk_address):
-    page = opened(desk_address)
+def test_the_overlap_of_two_queries_is_reported(page):
     page.keep("mug")
     page.ask("mug > handle")
     page.get_by_text("1 answer inside an answer to another query.").wait_for()
@@ -62,8 +60,7 @@ def test_the_overlap_of_two_queries_is_reported(opened, desk_address):
     page.locator("#overlay text", has_text=re.compile(r"^mug 0\.\d\d \+ ")).wait_for()
 
 
-def test_a_kept_query_is_edited_with_its_threshold_at_its_photograph(opened, desk_address):
-    page = opened(desk_address)
+def test_a_kept_query_is_edited_with_its_threshold_at_its_photograph(page):
     options = [
         page.get_by_role("checkbox", name=name) for name in ("score at least", "only what this photograph")
     ]
@@ -84,8 +81,7 @@ def test_a_kept_query_is_edited_with_its_threshold_at_its_photograph(opened, des
     assert page.evaluate("hilsplat.camera.view") == view
 
 
-def test_kept_queries_and_saved_files_have_scores_and_doubts(opened, desk_address, scene, tmp_path):
-    page = opened(desk_address)
+def test_kept_queries_and_saved_files_have_scores_and_doubts(page, scene, tmp_path):
     page.keep("book")
     page.keep("unicorn > rim")
     (book,), (rim,) = scene.query("book"), scene.query("unicorn > rim")
@@ -115,10 +111,7 @@ def test_kept_queries_and_saved_files_have_scores_and_doubts(opened, desk_addres
 
 
 @pytest.mark.parametrize("answerer", ["tree", "field"])
-def test_a_saved_page_has_the_answers_and_settings_of_the_page(
-    opened, desk_address, scene, tmp_path, answerer
-):
-    page = opened(desk_address)
+def test_a_saved_page_has_the_answers_and_settings_of_the_page(page, scene, tmp_path, answerer):
     page.get_by_label("Answers by").select_option(f"default|{answerer}")
     page.keep("mug")
     page.get_by_role("radio", name="part", exact=True).check(force=True)
@@ -146,8 +139,7 @@ def test_a_kept_answer_has_the_present_name_of_its_node(served, own_desk):
     page.locator("#overlay text", has_text=re.compile(r"^book: atlas 0\.\d\d$")).wait_for()
 
 
-def test_a_link_and_back_restore_the_settings_of_a_query(opened, desk_address):
-    page = opened(desk_address)
+def test_a_link_and_back_restore_the_settings_of_a_query(page, opened, desk_address):
     page.keep("book")
     page.keep("mug")
     page.get_by_role("button", name="Show book").click()  # hides it
@@ -194,9 +186,10 @@ def test_a_film_follows_the_path_of_the_user(opened, desk_address, tmp_path):
     page.get_by_role("option", name="003.png").click()
     page.press("v")
     page.get_by_text("2 views in the path").wait_for()
+    page.locator("#seconds").evaluate("input => { input.value = 1; }")
     film = page.save("Film, MP4", tmp_path / "film.mp4")
     with av.open(str(film)) as frames:
-        assert sum(1 for _ in frames.decode(video=0)) == 120
+        assert sum(1 for _ in frames.decode(video=0)) == 24
     page.locator("#save summary").click()
     assert page.locator("#path").input_value() == "path"
     page.locator("#path").select_option("around")

@@ -113,8 +113,7 @@ def test_the_server_renders_a_picture_of_a_large_screen(opened, desk_address, tm
     assert height == pytest.approx(box["height"] * width / box["width"], abs=1)
 
 
-def test_the_server_renders_once_the_graphics_card_is_lost(opened, desk_address):
-    page = opened(desk_address)
+def test_the_server_renders_once_the_graphics_card_is_lost(page):
     view = page.locator("#view")
     page.drawn(lambda: page.evaluate("hilsplat.painter.gl.getExtension('WEBGL_lose_context').loseContext()"))
     page.get_by_role("status").get_by_text("the server renders the scene").wait_for()

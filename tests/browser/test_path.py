@@ -51,8 +51,7 @@ def test_the_cameras_of_the_photographs_are_drawn_and_a_click_flies_there(
     page.until(lambda: shown.count() == 0)
 
 
-def test_the_views_of_a_path_are_reordered_replaced_removed_and_kept(opened, desk_address):
-    page = opened(desk_address)
+def test_the_views_of_a_path_are_reordered_replaced_removed_and_kept(page):
     add(page, "000.png", "003.png", "001.png")
     assert places(page) == ["000.png", "003.png", "001.png"]
     page.get_by_role("button", name="Move view 3 up").click()
@@ -79,8 +78,7 @@ def test_the_views_of_a_path_are_reordered_replaced_removed_and_kept(opened, des
     assert not steps(page).count()
 
 
-def test_the_preview_shows_the_cameras_of_the_film_until_it_is_stopped(opened, desk_address):
-    page = opened(desk_address)
+def test_the_preview_shows_the_cameras_of_the_film_until_it_is_stopped(page):
     add(page, "000.png", "004.png")
     page.locator("#save summary").click()
     page.get_by_label("Length, s").fill("2")
@@ -115,8 +113,7 @@ def test_the_preview_shows_the_cameras_of_the_film_until_it_is_stopped(opened, d
     assert page.wire_camera() == before
 
 
-def test_a_path_is_saved_as_json_and_opened_again(opened, desk_address, tmp_path):
-    page = opened(desk_address)
+def test_a_path_is_saved_as_json_and_opened_again(page, tmp_path):
     add(page, "000.png", "004.png")
     with page.expect_download() as started:
         page.get_by_role("button", name="Save JSON").click()

@@ -9,7 +9,12 @@ export function attachHands(sheet, { drawing, down, drag, up, cancel, hover, clo
   host.addEventListener("pointerdown", (event) => {
     host.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, { x: event.clientX, y: event.clientY, moved: 0 });
-    if (pointers.size === 2) { if (acting) ([...pointers.values()][0].moved < STILL_PX ? cancel : up)(); acting = false; apart = 0; return; }
+    if (pointers.size > 1) {
+      if (acting) ([...pointers.values()][0].moved < STILL_PX ? cancel : up)();
+      for (const pointer of pointers.values()) pointer.moved = STILL_PX;   // two fingers do not click
+      acting = false; apart = 0;
+      return;
+    }
     acting = event.button === 0 && Boolean(drawing(event));
     if (acting) down(sheet.pixel(event), event);
   });
@@ -21,7 +26,7 @@ export function attachHands(sheet, { drawing, down, drag, up, cancel, hover, clo
     Object.assign(last, { x: event.clientX, y: event.clientY, moved: last.moved + Math.abs(dx) + Math.abs(dy) });
     if (acting) { for (const each of event.getCoalescedEvents?.() ?? [event]) drag(sheet.pixel(each)); return; }
     host.classList.add("moving");
-    if (pointers.size === 2) {
+    if (pointers.size > 1) {
       const [a, b] = [...pointers.values()], now = Math.hypot(a.x - b.x, a.y - b.y), box = host.getBoundingClientRect();
       if (apart) sheet.zoom(now / apart, (a.x + b.x) / 2 - box.left, (a.y + b.y) / 2 - box.top);
       apart = now;

@@ -29,6 +29,7 @@ export const variant = async (name) => (await loaded(`api/variant/${encodeURICom
 export const splats = async (chunk) => (await loaded(`api/splats/${chunk}`)).arrayBuffer();
 export const nodes = async (name) => (await loaded(`api/nodes/${encodeURIComponent(name)}`)).arrayBuffer();
 export const photoUrl = (number) => at(`api/photo/${number}`);
+export const photo = async (number) => (await get(photoUrl(number))).blob();
 export const thumbUrl = (number) => at(`api/thumb/${number}`);
 export const cropUrl = (variant, node) => at(`api/crop/${encodeURIComponent(variant)}/${node}`);
 export const sorter = () => new Worker("static/sorter.js");

@@ -12,10 +12,15 @@ import { base64, styleOf } from "./styles.js";
 const PICTURE_PX = 512;
 let aborting = new AbortController();
 
-async function askAll(what, work) {
+// Abort the previous query, and return the signal that aborts the new one.
+function begin() {
   aborting.abort();
   aborting = new AbortController();
-  const signal = aborting.signal;
+  return aborting.signal;
+}
+
+async function askAll(what, work) {
+  const signal = begin();
   tell("…");
   try {
     for (const [k, pane] of panes.entries()) {
@@ -39,7 +44,7 @@ function refused(error) {
 
 function answered(what, answer) {
   page.asked = { ...what, shows: answer.hits[0]?.best_views ?? [] };
-  tell(summary(answer));
+  tell(`${what.alike ? `Like ${what.alike}: ` : ""}${summary(answer)}`);
   listAnswers();
   page.outline.answered(answer.hits.map((hit) => hit.node));
   page.photos.reveal(page.asked.shows);
@@ -110,22 +115,22 @@ whenReopened((asked) => {
 export async function like(node) {
   if (node < 0 || api.offline) return;
   $("text").value = "";
-  const name = nameOf(main(), node);
-  await askAll({}, (pane, signal) => outlines.get(variantOf(pane)).tree === main().tree ? api.like({ variant: variantOf(pane), node }, signal) : null);   // another tree has other nodes
-  tell(`Like ${name}: ${$("status").textContent}`);
+  await askAll({ alike: nameOf(main(), node) }, (pane, signal) => outlines.get(variantOf(pane)).tree === main().tree ? api.like({ variant: variantOf(pane), node }, signal) : null);   // another tree has other nodes
 }
 
-// Query with a picture, or with its part [x, y, width, height], px.
+// Query with a picture, which may be a promise, or with its part [x, y, width, height], px.
 export async function askPicture(source, part = null) {
+  const signal = begin();
   try {
-    const image = await createImageBitmap(source), [x, y, w, h] = part ?? [0, 0, image.width, image.height];
+    const image = await createImageBitmap(await source), [x, y, w, h] = part ?? [0, 0, image.width, image.height];
     const scale = Math.min(1, PICTURE_PX / Math.max(w, h)), canvas = new OffscreenCanvas(Math.max(1, Math.round(w * scale)), Math.max(1, Math.round(h * scale)));
     canvas.getContext("2d").drawImage(image, x, y, w, h, 0, 0, canvas.width, canvas.height);
     const bytes = new Uint8Array(await (await canvas.convertToBlob({ type: "image/jpeg", quality: 0.9 })).arrayBuffer());
+    if (signal.aborted) return;
     $("text").value = "";
     choose(-1);
     await askAll({}, (pane, signal) => api.like({ variant: variantOf(pane), picture: base64(bytes) }, signal));
-  } catch (error) { failed(error); }
+  } catch (error) { if (!signal.aborted) refused(error); }
 }
 
 // Query with the framed part of the photograph, or of the rendered picture.
@@ -136,11 +141,11 @@ export async function framed(points, done) {
   if (!done || x1 - x0 < 6 || y1 - y0 < 6 || api.offline) return;
   const { k, width, height } = paneAt(x0), left = x0 - k * width;
   if (page.camera.view >= 0) {
-    const photo = await (await fetch(api.photoUrl(page.camera.view))).blob(), { s, x, y } = page.camera.frame(width, height);
-    await askPicture(photo, [(left - x) / s, (y0 - y) / s, (x1 - x0) / s, (y1 - y0) / s]);
+    const { s, x, y } = page.camera.frame(width, height);
+    await askPicture(api.photo(page.camera.view), [(left - x) / s, (y0 - y) / s, (x1 - x0) / s, (y1 - y0) / s]);
   } else {
     const plain = [{ variant: "", style: styleOf({ outline: null, colour: "none", mode: "plain", chosen: -1, hover: -1 }), removed: page.removed }];
-    await askPicture(await page.painter.capture(page.camera, plain, Math.round(width), height), [left, y0, x1 - x0, y1 - y0]);
+    await askPicture(page.painter.capture(page.camera, plain, Math.round(width), height), [left, y0, x1 - x0, y1 - y0]);
     redraw();
   }
 }

@@ -32,7 +32,7 @@ export function setHover(node) {
 }
 
 export function paneAt(x) {
-  const each = host.clientWidth / panes.length, k = Math.min(panes.length - 1, Math.floor(x / each));
+  const each = host.clientWidth / panes.length, k = Math.max(0, Math.min(panes.length - 1, Math.floor(x / each)));   // a drag may end outside
   return { k, x: x - k * each, width: each, height: host.clientHeight };
 }
 

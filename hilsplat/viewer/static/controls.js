@@ -16,7 +16,8 @@ export function attach(host, { camera, changed, rested, tapped, pointed, tool })
     host.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, { x: event.clientX, y: event.clientY, button: event.button });
     stroke = pointers.size === 1 ? tool(event) : null;   // a second finger moves the camera instead
-    if (pointers.size === 1) { moved = 0; points = [place(event)]; }
+    moved = pointers.size === 1 ? 0 : TAP_PX;   // nor do two fingers tap
+    points = [place(event)];
     apart = 0;
   });
 

@@ -1,11 +1,10 @@
 // Redraw the picture and its overlay after a change, and update the address that opens the same view.
 
 import * as api from "./api.js";
-import { $, nameOf } from "./elements.js";
+import { $, counted, nameOf } from "./elements.js";
 import { drawOverlay, inPicture } from "./overlay.js";
-import { showScale } from "./scale.js";
 import { host, keptIn, level, levelIndex, main, options, outlines, page, panes, threshold, variantOf } from "./state.js";
-import { LISTED, shownHits, styleOf } from "./styles.js";
+import { LISTED, RAMP, shownHits, styleOf } from "./styles.js";
 
 const SLOW_MS = 60, FRUSTUM = 0.08;   // depth of a drawn camera, in multiples of the photographs' mean distance
 let dirty = true, styles = [], lastFrame = 0, frames = 0;
@@ -47,6 +46,31 @@ export function overlay() {
   $("look").hidden = !hits.length || hits.some((hit) => inPicture(page.camera, own.nodes[hit.node].corners, each, height));
   page.photos.place(page.camera, width, height, panes.length);
   page.photos.mark(page.camera.view, page.asked?.shows ?? []);
+}
+
+// Show the relevancy colour bar, and the number of Gaussians at or above the threshold.
+let shown = null;
+
+function showScale(style) {
+  const has = style.high !== undefined && Boolean(panes[0].answer);
+  $("scale").hidden = !has;
+  if (!has || style === shown) return;
+  shown = style;
+  const least = threshold(), bar = $("scale-bar"), context = bar.getContext("2d"), pixels = context.createImageData(256, 1);
+  for (let i = 0; i < 256; i++) {
+    const value = style.low + i / 255 * (style.high - style.low), below = least !== null && value < least;
+    pixels.data.set(below ? [28, 28, 28, 255] : [...RAMP.subarray(3 * i, 3 * i + 3), 255], 4 * i);
+  }
+  context.putImageData(pixels, 0, 0);
+  $("scale-low").textContent = style.low.toFixed(2);
+  $("scale-high").textContent = style.high.toFixed(2);
+  $("scale-told").textContent = least === null ? "" : `${counted(above(style, least), "Gaussian")} at or above ${least.toFixed(2)}`;
+}
+
+function above(style, least) {
+  if (style.ramp) return panes[0].values.reduce((count, value) => count + (value >= 255 * least), 0);
+  const answer = panes[0].answer, level = levelIndex(answer);
+  return main().nodes.reduce((sum, node, row) => sum + (node.level === level && answer.relevancy[row] >= least ? node.gaussians : 0), 0);
 }
 
 // Cameras of the photographs, and views of the path.

@@ -7,14 +7,13 @@ import { choose, pointed, tapped } from "./choosing.js";
 import { attach } from "./controls.js";
 import { attachEditing, draw, edit, edited, leaveTool, placeBrush, pressed, redo, resizeBrush, tool, undo } from "./editing.js";
 import { currentStyles, link, painted, redraw, rememberedAs, restyle } from "./drawing.js";
-import { $, attachMenu, counted, nameOf } from "./elements.js";
+import { $, attachMenu, counted, make, nameOf } from "./elements.js";
 import { flyTo, nearestView, setMoving, stand, step, touched } from "./flights.js";
 import { groups, scoreOf } from "./kept.js";
 import { attachKeys } from "./keyboard.js";
 import { addToPath, attachPath, flown } from "./path.js";
 import { save } from "./saves.js";
-import { attachScenes } from "./scenes.js";
-import { answererOf, failed, host, main, openLink, page, panes, tell, variantOf } from "./state.js";
+import { answererOf, failed, host, main, openLink, options, page, panes, tell, variantOf } from "./state.js";
 import { choosePanes } from "./variants.js";
 
 function showFrustums() {
@@ -29,6 +28,23 @@ function tappedFrustum(x, y) {
   if (number === undefined) return false;
   stand(Number(number));
   return true;
+}
+
+// List the scenes of the results folder, of which each opens in this page, on the same server.
+function addressOf(name) {
+  const search = new URLSearchParams({ scene: name });
+  if (options.get("painter")) search.set("painter", options.get("painter"));
+  return `${location.pathname}?${search}`;
+}
+
+async function listScenes() {
+  if (!$("scenes").open) return;
+  try {
+    const scenes = await api.scenes();
+    $("scene-list").replaceChildren(...scenes.map(({ name, state, date, can_open, current }) => make("li", {},
+      make("a", { href: can_open ? addressOf(name) : null, "aria-current": current ? "page" : null, "aria-disabled": can_open ? null : "true" },
+        name, make("small", {}, [state, date].filter(Boolean).join(" · "))))));
+  } catch (error) { failed(error); }
 }
 
 const MODES = ["tint", "ghost", "isolate", "plain"];
@@ -62,7 +78,8 @@ export function attachHands() {
   $("keep").addEventListener("click", keepAnswer);
   attachEditing();
   attachPath();
-  attachScenes();
+  $("scenes").hidden = api.offline || options.has("embedded");
+  $("scenes").addEventListener("toggle", listScenes);
   $("mode").addEventListener("change", restyle);
   const thresholdChanged = () => {
     $("threshold-at").disabled = !$("threshold-on").checked;

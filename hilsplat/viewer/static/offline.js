@@ -30,4 +30,4 @@ export async function query({ text, level, threshold, view }) {
   return found;
 }
 
-export const scenes = none, changes = none, like = none, field = none, pick = none, path = none, members = none, within = none, frame = none, names = none, saved = none, savedInSteps = none;
+export const scenes = none, changes = none, photo = none, like = none, field = none, pick = none, path = none, members = none, within = none, frame = none, names = none, saved = none, savedInSteps = none;

@@ -29,8 +29,7 @@ export function drawOverlay(svg, camera, panes, width, height, covered = 0) {
     }
     for (const { corners, kind, label: whole, node, stroke = null } of pane.boxes) {
       const at = corners.map((corner) => camera.project(corner, k));
-      if (at.some((point) => !point)) continue;   // a corner is behind the camera
-      if (isOutside(at, each, height)) continue;
+      if (at.some((point) => !point) || isOutside(at, each, height)) continue;   // a point is null if it is behind the camera
       const d = EDGES.map(([a, b]) => `M${at[a][0].toFixed(1)} ${at[a][1].toFixed(1)}L${at[b][0].toFixed(1)} ${at[b][1].toFixed(1)}`).join("");
       group.append(shape("path", { d, class: "shadow" }), shape("path", { d, class: kind, "data-node": node, stroke }));
       const top = at.reduce((best, point) => point[1] < best[1] ? point : best);

@@ -2,9 +2,32 @@
 
 import * as api from "./api.js";
 import { fragment, vertex } from "./shaders.js";
-import { readChunk, unzipped } from "./spz.js";
 
 const WIDTH = 4096;
+
+async function unzipped(buffer) {
+  return new Response(new Blob([buffer]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
+}
+
+// Read SPZ version 2 as texels: one has position, opacity and log scales; `texels` more have colour, rotation and harmonics, a byte each.
+async function readChunk(buffer) {
+  const bytes = new Uint8Array(await unzipped(buffer)), head = new DataView(bytes.buffer);
+  const count = head.getUint32(8, true), degree = bytes[12], unit = 2 ** -bytes[13], others = 3 * ((degree + 1) ** 2 - 1);
+  const texels = Math.ceil((6 + others) / 16), geometry = new ArrayBuffer(16 * count), places = new Float32Array(geometry), rest = new Uint8Array(16 * texels * count);
+  let at = 16;
+  for (let i = 0; i < count; i++) for (let axis = 0; axis < 3; axis++, at += 3)
+    places[4 * i + axis] = unit * (bytes[at] + 256 * bytes[at + 1] + 65536 * (bytes[at + 2] << 24 >> 24));
+  const column = (target, stride, first, width) => {
+    for (let i = 0; i < count; i++) for (let k = 0; k < width; k++) target[stride * i + first + k] = bytes[at++];
+  };
+  const small = new Uint8Array(geometry);
+  column(small, 16, 12, 1);             // opacity
+  column(rest, 16 * texels, 0, 3);      // colour
+  column(small, 16, 13, 3);             // scales
+  column(rest, 16 * texels, 3, 3);      // rotation
+  column(rest, 16 * texels, 6, others); // harmonics
+  return { count, bases: (degree + 1) ** 2, texels, geometry: new Uint32Array(geometry), rest: new Uint32Array(rest.buffer), places };
+}
 
 export function describe() {
   const gl = document.createElement("canvas").getContext("webgl2");
@@ -36,13 +59,13 @@ export class Renderer {
     if (Math.ceil(gaussians * texels / WIDTH) > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error(`${gaussians} Gaussians exceed this browser's maximum texture size`);
     this.count = gaussians;
     this.here = 0;
-    this.program = this.link(vertex(bases, texels), fragment);
+    this.program = this.link(vertex(bases, texels));
     this.geometry = this.texture(gl.RGBA32UI, gaussians);
     this.rest = this.texture(gl.RGBA32UI, texels * gaussians);
     this.nodeTextures.set("", this.texture(gl.RGBA16UI, gaussians));
     this.marks = this.texture(gl.R8UI, gaussians);
     this.style = gl.createTexture(); this.ramp = gl.createTexture();
-    this.styleBytes = null;
+    this.target = gl.createFramebuffer(); this.targetTexture = gl.createTexture();
     this.arrays();
     this.worker.postMessage({ count: gaussians });
     this.arrived(first);
@@ -59,9 +82,8 @@ export class Renderer {
   }
 
   arrived({ count, texels, geometry, rest, places }) {
-    const gl = this.gl;
-    this.fill(this.geometry, geometry, this.here, gl.RGBA_INTEGER, gl.UNSIGNED_INT);
-    this.fill(this.rest, rest, texels * this.here, gl.RGBA_INTEGER, gl.UNSIGNED_INT);
+    this.fill(this.geometry, geometry, this.here);
+    this.fill(this.rest, rest, texels * this.here);
     const means = new Float32Array(3 * count);
     for (let i = 0; i < count; i++) for (let axis = 0; axis < 3; axis++) means[3 * i + axis] = places[4 * i + axis];
     this.worker.postMessage({ means, first: this.here }, [means.buffer]);
@@ -76,8 +98,8 @@ export class Renderer {
   }
 
   putNodes(variant, values) {
-    const gl = this.gl, long = values instanceof Uint32Array, texture = this.texture(long ? gl.RGBA32UI : gl.RGBA16UI, this.count);
-    this.fill(texture, values, 0, gl.RGBA_INTEGER, long ? gl.UNSIGNED_INT : gl.UNSIGNED_SHORT);
+    const texture = this.texture(values instanceof Uint32Array ? this.gl.RGBA32UI : this.gl.RGBA16UI, this.count);
+    this.fill(texture, values, 0);
     this.nodeTextures.set(variant, texture);
     (this.nodeValues ??= new Map()).set(variant, values);
   }
@@ -98,9 +120,9 @@ export class Renderer {
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, rows, gl.RED_INTEGER, gl.UNSIGNED_BYTE, full);
   }
 
-  link(vertexText, fragmentText) {
+  link(vertexText) {
     const gl = this.gl, program = gl.createProgram();
-    for (const [kind, text] of [[gl.VERTEX_SHADER, vertexText], [gl.FRAGMENT_SHADER, fragmentText]]) {
+    for (const [kind, text] of [[gl.VERTEX_SHADER, vertexText], [gl.FRAGMENT_SHADER, fragment]]) {
       const shader = gl.createShader(kind);
       gl.shaderSource(shader, text);
       gl.compileShader(shader);
@@ -123,12 +145,13 @@ export class Renderer {
     return texture;
   }
 
-  // Write texels from `first`, which starts a row; the last row may be incomplete.
-  fill(texture, data, first, format, type) {
+  // Write texels, of 16 or 32 bits, from `first`, which starts a row; the last row may be incomplete.
+  fill(texture, data, first) {
     const gl = this.gl, texels = data.length / 4, full = Math.floor(texels / WIDTH), rest = texels - full * WIDTH, row = first / WIDTH;
+    const type = data instanceof Uint32Array ? gl.UNSIGNED_INT : gl.UNSIGNED_SHORT;
     gl.bindTexture(gl.TEXTURE_2D, texture);
-    if (full) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, WIDTH, full, format, type, data, 0);
-    if (rest) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row + full, rest, 1, format, type, data, full * WIDTH * 4);
+    if (full) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, WIDTH, full, gl.RGBA_INTEGER, type, data, 0);
+    if (rest) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row + full, rest, 1, gl.RGBA_INTEGER, type, data, full * WIDTH * 4);
   }
 
   nearest() {
@@ -172,14 +195,11 @@ export class Renderer {
 
   get settled() { return !this.sorted.pending && this.sorted.row && this.sorted.wanted.every((v, k) => v === this.sorted.row[k]); }
 
-  resize(width, height) {
-    if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
-  }
 
   // panes: [{variant, style}], side by side with one camera. width and height: of the whole canvas, px.
   draw(camera, panes, width, height) {
     const gl = this.gl;
-    this.resize(width, height);
+    if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
     this.order(camera);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.disable(gl.SCISSOR_TEST);
@@ -221,34 +241,30 @@ export class Renderer {
   }
 
   uploadStyle(style) {
-    const gl = this.gl, put = (texture, bytes, width, rows) => {
-      gl.activeTexture(gl.TEXTURE0);
-      gl.bindTexture(gl.TEXTURE_2D, texture);
-      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, width, rows, 0, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
-      this.nearest();
-    };
     if (this.styleBytes === style.table && this.rampBytes === style.ramp) return;
     this.styleBytes = style.table; this.rampBytes = style.ramp;
-    const rows = Math.max(1, Math.ceil(style.table.length / 4 / WIDTH)), full = new Uint8Array(4 * WIDTH * rows);
+    const rows = Math.max(1, Math.ceil(style.table.length / 4 / WIDTH)), full = new Uint8Array(4 * WIDTH * rows), ramp = new Uint8Array(4 * 256);
     full.set(style.table);
-    put(this.style, full, WIDTH, rows);
-    const ramp = new Uint8Array(4 * 256).fill(255);
     if (style.ramp) for (let i = 0; i < 256; i++) ramp.set(style.ramp.subarray(3 * i, 3 * i + 3), 4 * i);
-    put(this.ramp, ramp, 256, 1);
+    this.gl.activeTexture(this.gl.TEXTURE0);
+    this.colours(this.style, WIDTH, rows, full);
+    this.colours(this.ramp, 256, 1, ramp);
+  }
+
+  // Make a texture of RGBA bytes, empty without `bytes`.
+  colours(texture, width, height, bytes = null) {
+    const gl = this.gl;
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, width, height, 0, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+    this.nearest();
   }
 
   // Return the Gaussian shown at a pixel of a pane, or -1; Gaussian numbers are drawn once per camera.
   gaussianAt(camera, pane, x, y, width, height) {
     const gl = this.gl, w = Math.max(1, Math.round(width / 2)), h = Math.max(1, Math.round(height / 2));
     if (!this.numbers || this.numbers.w !== w || this.numbers.h !== h) {
-      if (!this.target) {
-        this.target = gl.createFramebuffer();
-        this.targetTexture = gl.createTexture();
-      }
       gl.activeTexture(gl.TEXTURE7);
-      gl.bindTexture(gl.TEXTURE_2D, this.targetTexture);
-      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, w, h, 0, gl.RGBA, gl.UNSIGNED_BYTE, null);
-      this.nearest();
+      this.colours(this.targetTexture, w, h);
       gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
       gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.targetTexture, 0);
       gl.disable(gl.BLEND); gl.disable(gl.SCISSOR_TEST);

@@ -13,7 +13,7 @@ export function download(blob, name) {
 }
 
 const KINDS = { "scene-ply": "scene.ply", "scene-spz": "scene.spz", ply: "selection.ply", spz: "selection.spz", boxes: "boxes.json", masks: "masks.zip", still: "picture.png", mp4: "flight.mp4", gif: "flight.gif", page: "page.html" };
-const IN_STEPS = { masks: ["Masks", "photographs"], mp4: ["Film", "pictures"], gif: ["Film", "pictures"], page: ["Page", "crops"] };
+const IN_STEPS = { masks: ["Masks", "photographs"], mp4: ["Film", "pictures"], gif: ["Film", "pictures"], page: ["Page", "pictures"] };
 const sized = (bytes) => bytes < 1e6 ? `${Math.ceil(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`;
 
 export async function save(kind, { variant, answerer, groups, removed, style, capture, flown, queries, link, name, told }) {

@@ -24,7 +24,6 @@ export class ServerPainter {
     });
   }
 
-  async load() {}
   async loadNodes() {}
   loadField() {}   // a frame request contains the text
   mark() {}        // and the marks

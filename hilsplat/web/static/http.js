@@ -4,10 +4,11 @@ export class Refused extends Error {
   constructor(message, status) { super(message); this.status = status; }
 }
 
-// A server that doesn't answer refuses with status 0.
+// A server that doesn't answer, or stops answering, refuses with status 0.
+const lost = (error) => { throw error.name === "AbortError" ? error : new Refused("The server has stopped.", 0); };
+
 async function checked(path, options) {
-  let response;
-  try { response = await fetch(path, options); } catch (error) { throw error.name === "AbortError" ? error : new Refused("The server has stopped.", 0); }
+  const response = await fetch(path, options).catch(lost);
   if (response.ok) return response;
   let message = `${response.status} ${response.statusText}`;
   try { message = (await response.clone().json()).error; } catch { message = await response.text() || message; }
@@ -24,7 +25,7 @@ export async function streamed(response, told) {
   const reader = response.body.getReader(), decoder = new TextDecoder(), parts = [];
   let head = new Uint8Array(0), wanted = -1, got = 0;
   for (;;) {
-    const { value, done } = await reader.read();
+    const { value, done } = await reader.read().catch(lost);
     if (done) break;
     if (wanted < 0) {
       const both = new Uint8Array(head.length + value.length);
@@ -39,6 +40,6 @@ export async function streamed(response, told) {
       parts.push(head); got = head.length;
     } else { parts.push(value); got += value.length; }
   }
-  if (got !== wanted) throw new Refused("The file is incomplete: the server has stopped.");
+  if (got !== wanted) throw new Refused("The file is incomplete: the server has stopped.", 0);
   return new Blob(parts);
 }

@@ -80,7 +80,6 @@ def shapes(shape: str, size_hw: tuple = SIZE) -> str:
     ("content", "message"),
     [
         ("{", "cannot be read"),
-        ("[]", "has an unknown format"),
         ('{"shapes": [], "imagePath": "DSC_9.jpg"}', "not match a photograph"),
         (shapes('{"label": "a", "points": [[1, 1], [9, 1], [9, 9]]}', (61, 99)), "99 x 61 px"),
         (shapes('{"label": "a", "points": [[1, 1]], "shape_type": "circle"}'), "circle"),
@@ -92,7 +91,6 @@ def shapes(shape: str, size_hw: tuple = SIZE) -> str:
         (shapes("7"), "read"),
         (shapes('{"label": "a", "points": [[1, 1], [9, 1], [9, 9]]}', ("[1]", "NaN")), "valid image size"),
         ('{"objects": [7], "info": {"name": "DSC_1", "width": 40, "height": 30}}', "file.json, object 0"),
-        ('{"objects": [], "info": 7}', "valid image size"),
         ('{"annotations": [{}], "images": []}', "'categories'"),
     ],
 )

@@ -124,7 +124,7 @@ def test_scenes_opened_by_a_relative_path_do_not_follow_the_working_folder(chang
     assert hit.picture.is_file() and hilsplat.open_scene(hit.folder).query("mug")[0].node == hit.node
 
 
-def test_a_name_given_by_hand_is_found_first_and_the_next_command_queries_the_same_variant(changed):
+def test_a_name_given_by_hand_is_found_first_and_the_next_command_repeats_the_query(changed):
     scene = changed.parents[1] / "photos/desk-4"
     tree = scene / "default/semantic_tree"
     write_names(scene, tree, {2: "my mug"}, 5, hilsplat.open_scene(scene).names.version)
@@ -132,8 +132,8 @@ def test_a_name_given_by_hand_is_found_first_and_the_next_command_queries_the_sa
     assert (first.scene, first.node, first.name, first.doubts) == ("photos/desk-4", 2, "my mug", ())
     scenes = hilsplat.open_scenes(changed.parents[1])
     of_paper = [replace(scene, finished=replace(scene.finished, variant="paper")) for scene in scenes.found]
-    report = report_of(Scenes(tuple(of_paper), {}), "mug", scenes.query("mug", limit=1))
-    assert report.splitlines()[-1].endswith(" mug --variant paper")
+    report = report_of(Scenes(tuple(of_paper), {}), "mug", scenes.query("mug", limit=1), "part")
+    assert report.splitlines()[-1].endswith(" mug --level part --variant paper")
 
 
 def test_the_command_prints_a_table_or_json(changed, capsys):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
+from hilsplat.query.language_scene import LanguageScene
 from hilsplat.viewer.app import Viewer
 from hilsplat.viewer.viewer_scene import ViewerScene
 from hilsplat.web.guard import Guard
@@ -46,6 +47,11 @@ def run_apart(work: Callable[[], Coroutine]):
 def client(shown) -> Iterator[TestClient]:
     with browsing(shown) as browser:
         yield browser
+
+
+@pytest.fixture
+def scene(shown) -> LanguageScene:
+    return shown.answering("default")
 
 
 @pytest.fixture(scope="module")

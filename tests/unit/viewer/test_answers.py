@@ -38,11 +38,6 @@ from tests.unit.splat.spz_reader import decoded
 from tests.unit.viewer.conftest import TOKEN, browser_of, browsing, in_steps, run_apart, wire_camera
 
 
-@pytest.fixture
-def scene(shown):
-    return shown.answering("default")
-
-
 def ask(client, text: str, **more) -> dict:
     return client.post("/api/query", json={"text": text, **more}).json()
 
@@ -75,6 +70,7 @@ def test_requests_match_their_openapi_description(client):
         "/api/export/boxes": {"groups": [{"name": "mug", "nodes": [0]}]},
         "/api/field": {"text": "mug"},
     }
+    assert bodies.keys() <= described["paths"].keys()
     for path, methods in described["paths"].items():
         ((method, of),) = methods.items()
         body = bodies.get(path)
@@ -352,8 +348,8 @@ def test_an_exported_page_sends_no_requests_and_escapes_texts(client, shown):
     evil = "mug </script><script>alert(1)</script>".replace(">", "")
     kept = {"text": "mug > handle", "level": "part", "threshold": 0.3}
     progress, data = in_steps(client, "page", asked=[kept, {"text": evil}], link="c=v3")
-    nodes = len(shown.answering("default").tree)
-    assert progress == [(made, nodes) for made in range(nodes + 1)]
+    pictures = len(shown.scene.cameras) + len(shown.answering("default").tree)
+    assert progress == [(made, pictures) for made in range(pictures + 1)]
     page = data.decode()
     assert not re.search(r"""(src|href)=["'](?!data:)""", page) and "http://127" not in page
     held = dict(re.findall(r'<script type="text/plain" id="(\w+)">(.*?)</script>', page, re.S))

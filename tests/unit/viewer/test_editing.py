@@ -43,16 +43,15 @@ def left(shown) -> np.ndarray:
     return shown.gaussians.means[:, 0] < 18
 
 
-def test_a_rectangle_selects_the_visible_gaussians_whose_centres_are_projected_into_it(shown, client, camera):
+def test_a_rectangle_selects_the_visible_gaussians_whose_centres_are_in_it(shown, scene, client, camera):
     region = {"camera": wire_camera(camera), "points": [(20.5, 3), (4, 12.5)]}
     found = marked(shown, client.post("/api/within", json=region).content)
     x, y, _ = shown.gaussians.means.T  # the camera shows Gaussian (x, y) at pixel (x + 1, y)
     np.testing.assert_array_equal(found, (x + 1 >= 4) & (x + 1 <= 20) & (y >= 3) & (y <= 12))
-    tree = shown.answering("default").tree
     style = {"table": table(shown, {0: (255, 255, 255, 255)}), "mode": "isolate"}
     region = {"camera": wire_camera(camera), "points": [(0, 0), (42, 24)], "style": style}
     found = marked(shown, client.post("/api/within", json=region).content)
-    np.testing.assert_array_equal(found, (tree.node_of_gaussian == 0).any(axis=1))
+    np.testing.assert_array_equal(found, (scene.tree.node_of_gaussian == 0).any(axis=1))
 
 
 def test_a_stroke_selects_what_is_within_its_radius():
@@ -78,8 +77,7 @@ def test_a_stroke_selects_what_is_within_its_radius():
     assert single == 0
 
 
-def test_nodes_select_their_gaussians(shown, client):
-    scene = shown.answering("default")
+def test_nodes_select_their_gaussians(shown, scene, client):
     (mug,), (handle,) = scene.query("mug", "whole"), scene.query("mug > handle")
     found = marked(shown, client.post("/api/members", json={"nodes": [handle.node]}).content)
     np.testing.assert_array_equal(np.flatnonzero(found), scene.views.gaussians_of([handle.node]))
@@ -119,18 +117,19 @@ def test_pictures_picks_and_films_leave_out_removed_gaussians(shown, client, cam
     assert sizes[1] < 0.8 * sizes[0]  # one Gaussian remains
 
 
-def test_a_pick_ignores_what_the_style_hides(shown, client, camera):
-    (book,) = shown.answering("default").query("book")
+def test_a_pick_ignores_what_the_style_hides(shown, scene, client, camera):
+    (book,) = scene.query("book")
     of_book = table(shown, {book.node: (255, 255, 255, 255)})
     for mode, is_shown in (("isolate", False), ("tint", True), ("ghost", True)):
         style = {"table": of_book, "mode": mode}
         sent = {"camera": wire_camera(camera), "x": 8.5, "y": 8.5, "style": style}
         assert (client.post("/api/pick", json=sent).json()["alpha"] > 0.9) == is_shown  # of the mug
         assert client.post("/api/pick", json={**sent, "x": 24.5}).json()["alpha"] > 0.9
+    wide = {"camera": wire_camera(camera.scaled((24, 5000))), "x": 24.5 * 5000 / 42, "y": 8.5}
+    assert client.post("/api/pick", json=wide).json()["alpha"] > 0.9  # of a screen that is 5120 px wide
 
 
-def test_saved_masks_leave_out_removed_gaussians(shown, client, left):
-    scene = shown.answering("default")
+def test_saved_masks_leave_out_removed_gaussians(shown, scene, client, left):
     (book,) = scene.query("book", "whole")
     groups = [{"name": "book", "nodes": [book.node]}]
     _, data = in_steps(client, "masks", groups=groups, removed=bits(shown, left))
@@ -166,8 +165,9 @@ def test_the_cleaned_scene_has_the_values_of_the_scene_and_its_files_do_not_chan
     assert ply.read_bytes() == before
 
 
-def test_selections_and_pages_leave_out_removed_gaussians_and_wrong_marks_are_refused(shown, client, left):
-    scene = shown.answering("default")
+def test_selections_and_pages_leave_out_removed_gaussians_and_wrong_marks_are_refused(
+    shown, scene, client, left
+):
     (mug,) = scene.query("mug", "whole")
     rows = scene.views.gaussians_of([mug.node])
     removed = shown.gaussians.means[:, 0] < 5

@@ -24,27 +24,26 @@ def test_a_frame_without_a_style_equals_the_pipeline(shown, client, camera):
     np.testing.assert_array_equal(got, expected)
 
 
-def test_the_finest_used_level_with_a_colour_decides(shown):
-    nodes = shown.answering("default").tree.node_of_gaussian
+def test_the_finest_used_level_with_a_colour_decides(shown, scene):
+    nodes = scene.tree.node_of_gaussian
     whole, part = nodes[nodes[:, 1] >= 0][0, :2]
     colours = {whole: (255, 0, 0, 255), part: (0, 0, 255, 51)}
     style = Style(table=table(shown, colours), mode="tint")
-    num = len(shown.answering("default").tree)
-    paint = Paint.of(style, nodes, num)
+    paint = Paint.of(style, nodes, len(scene.tree))
     inside_part, only_whole = nodes[:, 1] == part, (nodes[:, 0] == whole) & (nodes[:, 1] != part)
     assert np.allclose(paint.rgb[inside_part], (0, 0, 1)) and np.allclose(paint.share[inside_part], 0.2)
     assert np.allclose(paint.rgb[only_whole], (1, 0, 0)) and np.allclose(paint.share[only_whole], 1)
     assert not paint.share[nodes[:, 0] != whole].any()
-    coarse = Paint.of(style.model_copy(update={"use": (True, False, False)}), nodes, num)
+    coarse = Paint.of(style.model_copy(update={"use": (True, False, False)}), nodes, len(scene.tree))
     assert np.allclose(coarse.rgb[nodes[:, 0] == whole], (1, 0, 0))
 
 
 @pytest.mark.parametrize("mode", ["plain", "tint", "ghost", "isolate"])
-def test_unselected_gaussians_are_unchanged_grey_faint_or_hidden(shown, camera, mode):
-    nodes = shown.answering("default").tree.node_of_gaussian
+def test_unselected_gaussians_are_unchanged_grey_faint_or_hidden(shown, scene, camera, mode):
+    nodes = scene.tree.node_of_gaussian
     whole = int(nodes[0, 0])
     style = Style(table=table(shown, {whole: (0, 255, 0, 255)}), mode=mode)
-    frame = painted(shown.gaussians, camera, Paint.of(style, nodes, len(shown.answering("default").tree)))
+    frame = painted(shown.gaussians, camera, Paint.of(style, nodes, len(scene.tree)))
     chosen = (nodes[:, 0] == whole).astype(np.float32)
     own = draw(shown.gaussians, camera, 0, features=np.stack([chosen, 1 - chosen], axis=1)).image
     plain = render(shown.gaussians, camera)
@@ -62,8 +61,7 @@ def test_unselected_gaussians_are_unchanged_grey_faint_or_hidden(shown, camera, 
         assert 0 < frame[outside].mean() < 3 * GHOST * 255 * plain[outside].mean()
 
 
-def test_a_pick_returns_the_nodes_with_the_largest_shares_and_the_point(shown, client, camera):
-    tree = shown.answering("default").tree
+def test_a_pick_returns_the_nodes_with_the_largest_shares_and_the_point(shown, scene, client, camera):
     every = pixel_weights(shown.gaussians, camera, min_weight=0.0)
     height, width = camera.size_hw
     for x, y in np.random.default_rng(3).integers(0, (width, height), (40, 2)).tolist():
@@ -75,12 +73,11 @@ def test_a_pick_returns_the_nodes_with_the_largest_shares_and_the_point(shown, c
             continue
         assert found["alpha"] == pytest.approx(row.sum(), abs=1e-4)
         np.testing.assert_allclose(found["point"], row @ shown.gaussians.means / row.sum(), atol=1e-3)
-        for own, (node, share) in zip(tree.node_of_gaussian.T, found["nodes"], strict=True):
+        for own, (node, share) in zip(scene.tree.node_of_gaussian.T, found["nodes"], strict=True):
             shares = np.bincount(own + 1, row)
             shares[0] = 0  # Gaussians without a node
             assert node == (shares.argmax() - 1 if shares.any() else NONE)
             assert share == pytest.approx(shares.max() / row.sum(), abs=1e-4)
-    height, width = camera.size_hw
     for x, y in ((-1.0, 3.0), (float(width), 3.0), (3.0, float(height))):
         assert pick(shown.gaussians, None, camera, x, y) is None
 
