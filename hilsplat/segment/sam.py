@@ -177,14 +177,14 @@ class SamModel:
 
         if self.stretches or not isinstance(vision, dict) or self.device != CPU:
             return open_as(None)
-        layers = vision.get("global_attn_indexes", (2, 5, 8, 11))
-        heads = vision.get("num_attention_heads", 12)
-        side = vision.get("image_size", 1024) // vision.get("patch_size", 16)
+
+        def rowwise() -> tuple[Graph | None, Network]:
+            side = vision.get("image_size", 1024) // vision.get("patch_size", 16)
+            layers = vision.get("global_attn_indexes", (2, 5, 8, 11))
+            return open_as(with_rowwise_attention(path, layers, vision.get("num_attention_heads", 12), side))
+
         cost = "each image takes about 5 times as much memory"
-        rowwise = or_as_exported(
-            path, cost, lambda: open_as(with_rowwise_attention(path, layers, heads, side))
-        )
-        return rowwise or open_as(None)
+        return or_as_exported(path, cost, rowwise) or open_as(None)
 
     def _random_features(self) -> dict[str, np.ndarray]:
         """Return random image features; the encoder runs only if no network declares their shapes."""

@@ -104,7 +104,7 @@ def seen_sizes(begin, end, masks, visible, pairs, out, out_views, full):
 
 @compiled
 def _more_pairs(firsts, seconds, sums, count, room):
-    """Return larger copies of three arrays with their first `kept` entries."""
+    """Return larger copies of three arrays with their first `count` entries."""
     more = np.empty(room, np.int32)
     more[:count] = firsts[:count]
     return more, *enlarged(seconds, sums, count, room)
