@@ -27,8 +27,7 @@ from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
-from hilsplat.semantic_tree.evidence import mask_evidence
-from hilsplat.semantic_tree.linkage import pooled_linkage
+from hilsplat.semantic_tree.linkage import mask_evidence, pooled_linkage
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.semantic_tree.view_pairs import view_pairs
 from hilsplat.settings import AutoencoderSettings

@@ -129,8 +129,8 @@ class DecoderGraph:
             raise _unusual(f"{module} has no constant weights")
         return values[0], values[1]
 
-    def has(self, module: str, operator: str) -> bool:
-        return any(f"{module}/" in name and node.op_type == operator for name, node in self._nodes.items())
+    def has_sigmoid(self, module: str) -> bool:
+        return any(f"{module}/" in name and node.op_type == "Sigmoid" for name, node in self._nodes.items())
 
     def until(self, *modules: str) -> Graph:
         """Return the subgraph whose outputs are the inputs of the given modules."""

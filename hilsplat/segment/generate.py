@@ -259,9 +259,9 @@ def edge_windows(
     reach = np.array([-BAND_PX, -BAND_PX, BAND_PX, BAND_PX], np.int32)
     windows = np.clip(boxes[rows] + reach, 0, np.array([width, height, width, height], np.int32))
     if not isinstance(logits, np.ndarray):
-        from hilsplat.segment import torch_masks
+        from hilsplat.segment import torch_decoder
 
-        values = torch_masks.windows(logits, rows, windows, BAND_PX)
+        values = torch_decoder.windows(logits, rows, windows, BAND_PX)
         sizes = (windows[:, 2:] - windows[:, :2]).prod(axis=1, dtype=np.int64)
         return values, np.concatenate([[0], np.cumsum(sizes)]), windows
     square = np.ones((2 * BAND_PX + 1, 2 * BAND_PX + 1), np.uint8)

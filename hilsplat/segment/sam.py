@@ -394,9 +394,9 @@ def read_logits(
     # an integer exceeds x if and only if it exceeds floor(x)
     upper, lower = math.floor(offset / LOGIT_STEP), math.floor(-offset / LOGIT_STEP)
     if not isinstance(logits, np.ndarray):
-        from hilsplat.segment import torch_masks
+        from hilsplat.segment import torch_decoder
 
-        on_card, areas = torch_masks.steps_and_areas(logits, LOGIT_STEP, (upper, lower), (height, width))
+        on_card, areas = torch_decoder.steps_and_areas(logits, LOGIT_STEP, (upper, lower), (height, width))
         return on_card, (areas[0] / np.maximum(areas[1], 1)).astype(np.float32), positive_boxes(on_card)
     steps, stability = np.empty(logits.shape, np.int8), np.empty(len(logits), np.float32)
     for row, values in enumerate(logits):  # one by one, in the processor's cache
@@ -409,9 +409,9 @@ def read_logits(
 def positive_boxes(logits: Real[Array, "K h w"]) -> Int32[np.ndarray, "K 4"]:
     """Return the box (xyxy, end exclusive) of the positive logits of each mask, all 0 if there are none."""
     if not isinstance(logits, np.ndarray):
-        from hilsplat.segment import torch_masks
+        from hilsplat.segment import torch_decoder
 
-        return torch_masks.positive_boxes(logits)
+        return torch_decoder.positive_boxes(logits)
     boxes = np.empty((len(logits), 4), np.int32)
     for row, values in enumerate(logits):
         x, y, width, height = cv2.boundingRect((values > 0).view(np.uint8))

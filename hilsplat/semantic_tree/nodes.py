@@ -12,9 +12,8 @@ from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt8
 from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.base.memory import MIB, limit_mib, require_memory
 from hilsplat.contributions.compositing import column_sums
-from hilsplat.semantic_tree.evidence import Evidence, mask_evidence
 from hilsplat.semantic_tree.kernels import add_views, divide_by_unions
-from hilsplat.semantic_tree.linkage import pooled_linkage
+from hilsplat.semantic_tree.linkage import Evidence, mask_evidence, pooled_linkage
 from hilsplat.semantic_tree.view_pairs import ViewPairs, view_pairs
 from hilsplat.settings import SemanticTreeSettings
 
