@@ -213,7 +213,7 @@ def write_report(
     background = (float(settings.background == "white"),) * 3
 
     def picture(camera: Camera, threads: int = threads) -> UInt8[np.ndarray, "H W 3"]:
-        color = render(gaussians, camera, background=background, threads=threads)
+        color = render(gaussians, camera, background=background, threads=threads).colours
         return np.round(color.clip(0, 1) * 255).astype(np.uint8)
 
     test, train = (load_views(scene, split, settings.image_scale) for split in ("test", "train"))

@@ -79,7 +79,7 @@ def test_gaussians_blend_front_to_back_and_at_equal_depths_in_row_order(depths, 
 
 
 def test_the_background_shows_through():
-    color = render(round_gaussian(0.5, 5.0, 2.0), straight_camera(), background=(0.0, 1.0, 0.0))
+    color = render(round_gaussian(0.5, 5.0, 2.0), straight_camera(), background=(0.0, 1.0, 0.0)).colours
     # in the middle alpha is 0.5: white over green
     np.testing.assert_allclose(color[12, 16], [0.5, 1.0, 0.5], atol=1e-3)
 
