@@ -140,7 +140,7 @@ class DecoderGraph:
         return node
 
     def _weights(self, module: str, number: int, *nodes: Any) -> list[np.ndarray]:
-        """Return the constant inputs of a module's nodes, of which there must be `number`."""
+        """Return the constant inputs of a module's nodes; there must be `number` in total."""
         names = [name for node in nodes for name in node.input]
         values = [value for name in names if (value := self._constant(name)) is not None]
         if len(values) != number:
