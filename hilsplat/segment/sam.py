@@ -8,7 +8,7 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Literal
 
@@ -116,11 +116,7 @@ class SamModel:
         if self.factored is None and device != CPU:
             self.decoder = DecoderNetwork(model, DECODER, device)
         for decoder in filter(None, (self.decoder, self.previewer)):
-            in_turn(
-                device,
-                "masks",
-                lambda of=decoder: of.require_repeatable(features, self.padded_hw[0]),  # type: ignore[misc]
-            )
+            in_turn(device, "masks", partial(decoder.require_repeatable, features, self.padded_hw[0]))
         self.as_exported = device == CPU and (
             self.factored is None or (self._graph is None and not self.stretches)
         )
