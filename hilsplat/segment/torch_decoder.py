@@ -1,8 +1,8 @@
 """The factored mask decoder (`factored_decoder`) and the reading of its masks, in torch on a card.
 
 Arrays have one row per prompt, and pixels last. H: heads; T: tokens; D: channels of a head; P: pixels of the
-image embedding; F: factors of a layer, H (T - 1). `sam` and `generate` read masks of arrays with functions of
-the same names.
+image embedding; F: factors of a layer, H (T - 1). `sam` and `generate` read the masks of
+arrays.
 """
 
 from collections.abc import Mapping
