@@ -54,7 +54,7 @@ def test_opacities_and_scales_may_have_their_extreme_values(opacity, scale):
     assert alphas[0, 12, 16, 0] == pytest.approx(expected, rel=1e-5)
 
 
-@pytest.mark.parametrize(("depth", "scale"), [(1e-19, 1.0), (1e-17, 1.0), (2.0, 1e9)])
+@pytest.mark.parametrize(("depth", "scale"), [(1e-22, 1.0), (1e-17, 1.0), (2.0, 1e9)])
 def test_a_gaussian_that_is_far_wider_than_the_view_covers_it(depth, scale):
     huge = one_gaussian(means=[[0, 0, depth]], scales=[3 * [scale]])
     _, alphas, meta = rasterization(**huge, near_plane=0.0)
